@@ -1,0 +1,63 @@
+"""Errors that imud raises on purpose. Each message names what was expected, what came, and what to look at.
+
+ImudError
+ ├─ ConfigError          the configuration file cannot be used
+ ├─ LinkError            a port, bus or file cannot be used
+ │   ├─ LinkMissing      it is not there (unplugged, misspelt); it may come back
+ │   ├─ LinkDenied       it is there, but this user may not open it
+ │   └─ LinkBusy         another program holds it
+ ├─ CommandError         a command to a device
+ │   ├─ BadArgument      cannot be sent: an argument is out of range
+ │   ├─ NoReply          no reply came in time
+ │   └─ Rejected         the device answered that it will not
+ ├─ NothingHeard         detection found no device
+ └─ ServerError          the daemon's own interfaces: socket in use, shared memory not writable, protocol violated
+"""
+
+
+class ImudError(Exception):
+    """Root of all errors that imud raises on purpose."""
+
+
+class ConfigError(ImudError):
+    """The configuration file cannot be used. Example: an unknown key, a rate of NaN, a device without a link."""
+
+
+class LinkError(ImudError):
+    """A port, bus or file cannot be used. Example: the adapter was pulled out while reading."""
+
+
+class LinkMissing(LinkError):
+    """The port is not there, and may come back. Example: /dev/ttyUSB0 after the cable moved."""
+
+
+class LinkDenied(LinkError):
+    """The port is there but may not be opened. Example: the user is not in group dialout."""
+
+
+class LinkBusy(LinkError):
+    """Another program holds the port. Example: a terminal program is still open on it."""
+
+
+class CommandError(ImudError):
+    """A command could not be carried out by a device."""
+
+
+class BadArgument(CommandError, ValueError):
+    """A command cannot be encoded. Example: a baud rate that the device does not have."""
+
+
+class NoReply(CommandError):
+    """No reply came in time. Example: the device is in another mode, or its receive line is not connected."""
+
+
+class Rejected(CommandError):
+    """The device answered that it will not. Example: `ERR` after a command with a value it does not take."""
+
+
+class NothingHeard(ImudError):
+    """Detection found no device on a link. Example: nothing valid at any of the six baud rates."""
+
+
+class ServerError(ImudError):
+    """One of the daemon's own interfaces cannot be used. Example: the socket belongs to another running daemon."""

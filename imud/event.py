@@ -1,0 +1,36 @@
+"""What happens to a device besides samples: told to event subscribers and to the log."""
+
+from enum import StrEnum
+
+import msgspec
+
+
+class EventKind(StrEnum):
+    """Kinds of events; readers must accept kinds they do not know."""
+
+    UP = "up"
+    """The device is found and identified; samples follow."""
+    DOWN = "down"
+    """The device or its link is gone; `detail` says how."""
+    SYNC = "sync"
+    """The source of time stamps changed."""
+    LOSS = "loss"
+    """Samples were lost; `detail` says how many and by which cause. Sent at most once a second and device."""
+    CONFIGURATION = "configuration"
+    """The device's own settings, or the daemon's configuration, are not what they were."""
+    ALARM = "alarm"
+    """The alarm line or the alarm status of a device changed."""
+    BAD_FRAME = "bad-frame"
+    """A damaged or unknown frame was heard. Sent at most once a second and device."""
+
+
+class Event(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One event of one device, or of the daemon itself when `device` is empty."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC when it was noticed."""
+    device: str
+    kind: EventKind
+    message: str
+    """One sentence for people."""
+    detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default

@@ -1,0 +1,1 @@
+"""Parts that more than one leaf needs: codec and driver contracts, sessions, tables, formats shared with clients."""

@@ -1,0 +1,59 @@
+"""What a codec is: bytes in, events out, no I/O. The answer to bad bytes is `BadFrame`, never an exception."""
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Protocol
+
+import msgspec
+
+from imud.ledger import Ledger
+from imud.sample import Measurement
+
+
+class BadReason(StrEnum):
+    """Why a frame was refused; each reason has its own counter in the ledger."""
+
+    CRC = "crc"
+    """The check value does not match: damaged on the wire, or a sync word inside other data."""
+    LENGTH = "length"
+    """The length field is outside what the protocol allows."""
+    CONTENT = "content"
+    """The check value is right but the content is impossible, for example a sub-packet cut off by the frame's end."""
+
+
+class BadFrame(msgspec.Struct, frozen=True, gc=False):
+    """Bytes that looked like a frame and were none."""
+
+    reason: BadReason
+    raw: bytes
+    """The bytes as they came, from the sync word to where the frame claimed to end (as far as they are there)."""
+
+
+class TextLine(msgspec.Struct, frozen=True, gc=False):
+    """One line of text found between binary frames, without its line end."""
+
+    text: str
+
+
+CodecEvent = Measurement | TextLine | BadFrame
+
+
+class StreamCodec(Protocol):
+    """Turns a byte stream into events. Any split of the bytes gives the same events.
+
+    Synchronization: one thread. Memory is bounded by the longest frame plus the longest text line.
+    """
+
+    ledger: Ledger
+
+    def feed(self, data: bytes) -> Sequence[CodecEvent]:
+        """Take bytes in the order they came; return what they completed. Never raises for any bytes."""
+        ...
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """The line is idle: return whole frames that wait inside a longer frame that never came. Loses nothing."""
+        ...
+
+    def reset(self) -> None:
+        """The stream broke (unplugged, other baud rate): what is pending becomes skipped."""
+        ...

@@ -1,0 +1,43 @@
+"""What a publisher is: an output that takes samples and events and never makes the pipeline wait."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from imud.event import Event
+from imud.kit.batch import Batch
+from imud.kit.status import DeviceStatus
+
+StatusSource = Callable[[], Sequence[DeviceStatus]]
+"""The state of every device now. To be called in the event loop's thread only."""
+
+
+class Publisher(Protocol):
+    """An output of samples. Every method returns at once and is called in the event loop's thread only."""
+
+    def start(self) -> None:
+        """Open what it needs (files, sockets, threads). Raises ServerError. Needs a running asyncio loop."""
+        ...
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """A device of the configuration appears: make room for it."""
+        ...
+
+    def remove_device(self, name: str) -> None:
+        """The device left the configuration."""
+        ...
+
+    def publish(self, batch: Batch) -> None:
+        """Give the samples to readers; drop for readers that are slow, and count that."""
+        ...
+
+    def event(self, event: Event) -> None:
+        """Tell readers of an event."""
+        ...
+
+    def tick(self, now_ns: int) -> None:
+        """Called ten times a second: heartbeats, ledgers, time-outs."""
+        ...
+
+    def close(self) -> None:
+        """Release everything; may be called twice."""
+        ...

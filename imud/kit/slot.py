@@ -1,0 +1,169 @@
+"""One `Sample` as 256 fixed little-endian bytes: the slot of the shared-memory ring and of the binary socket encoding.
+
+`SLOT_FIELDS` is the one table of the layout; the packing here and the check of the C header are made from it.
+
+     0        8      16       24      32        40        48        52       56     60         62    63
+    +--------+------+--------+-------+---------+---------+---------+--------+------+----------+-----+---+
+    | seq    | t_ns | t_rx_ns| utc_ns| t_dev_ns| edge_seq| t_err_ns| present|status| device_id| sync| 0 |
+    +--------+------+--------+-------+---------+---------+---------+--------+------+----------+-----+---+
+    | 64: accel, gyro, mag 3×f64 each | 136: quat 4×f64 | 168: euler 3×f64 | temperature, pressure, incli | 0… | crc |
+    +-----------------------------------------------------------------------------------------------+ 252 +-----+
+
+CRC-32 (IEEE 802.3, as zlib.crc32) is over bytes 0…251, the sequence number included.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import Final
+
+from imud.sample import Pair, Quaternion, Sample, Sync, Vector3
+
+SLOT_BYTES: Final = 256
+SLOT_LAYOUT_VERSION: Final = 1
+SEQ_INVALID: Final = 0xFFFF_FFFF_FFFF_FFFF
+"""Stands in `seq` while a slot of shared memory is being written."""
+CRC_OFFSET: Final = SLOT_BYTES - 4
+
+
+@dataclass(frozen=True, slots=True)
+class SlotField:
+    """A field of the slot: its name in C, its `struct` code, how many, and where it begins."""
+
+    name: str
+    code: str
+    count: int
+    offset: int
+
+
+SLOT_FIELDS: Final = (
+    SlotField("seq", "Q", 1, 0),
+    SlotField("t_ns", "q", 1, 8),
+    SlotField("t_rx_ns", "q", 1, 16),
+    SlotField("utc_ns", "q", 1, 24),
+    SlotField("t_dev_ns", "q", 1, 32),
+    SlotField("edge_seq", "Q", 1, 40),
+    SlotField("t_err_ns", "I", 1, 48),
+    SlotField("present", "I", 1, 52),
+    SlotField("status", "I", 1, 56),
+    SlotField("device_id", "H", 1, 60),
+    SlotField("sync", "B", 1, 62),
+    SlotField("reserved0", "B", 1, 63),
+    SlotField("accel_m_s2", "d", 3, 64),
+    SlotField("gyro_rad_s", "d", 3, 88),
+    SlotField("mag_t", "d", 3, 112),
+    SlotField("quat_wxyz", "d", 4, 136),
+    SlotField("euler_rad", "d", 3, 168),
+    SlotField("temperature_c", "d", 1, 192),
+    SlotField("pressure_pa", "d", 1, 200),
+    SlotField("incli_rad", "d", 2, 208),
+    SlotField("pps_age_ms", "I", 1, 224),
+    SlotField("reserved1", "B", 24, 228),
+    SlotField("crc32", "I", 1, 252),
+)
+
+HAS_T_DEV: Final = 1 << 0
+HAS_ACCEL: Final = 1 << 1
+HAS_GYRO: Final = 1 << 2
+HAS_MAG: Final = 1 << 3
+HAS_QUAT: Final = 1 << 4
+HAS_EULER: Final = 1 << 5
+HAS_TEMPERATURE: Final = 1 << 6
+HAS_PRESSURE: Final = 1 << 7
+HAS_INCLI: Final = 1 << 8
+HAS_STATUS: Final = 1 << 9
+HAS_PPS_AGE: Final = 1 << 10
+HAS_EDGE: Final = 1 << 11
+
+PRESENT_BITS: Final = {
+    "t_dev_ns": HAS_T_DEV,
+    "accel_m_s2": HAS_ACCEL,
+    "gyro_rad_s": HAS_GYRO,
+    "mag_t": HAS_MAG,
+    "quat_wxyz": HAS_QUAT,
+    "euler_rad": HAS_EULER,
+    "temperature_c": HAS_TEMPERATURE,
+    "pressure_pa": HAS_PRESSURE,
+    "incli_rad": HAS_INCLI,
+    "status": HAS_STATUS,
+    "pps_age_ms": HAS_PPS_AGE,
+    "edge_seq": HAS_EDGE,
+}
+"""Bit of `present` that says the field has a value: absent is not zero."""
+
+SYNC_CODES: Final = {sync: code for code, sync in enumerate(Sync)}
+"""`sync` in the slot: 0 arrival, 1 regression, 2 edge, 3 utc."""
+SYNC_BY_CODE: Final = tuple(Sync)
+
+_BODY = struct.Struct("<" + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:-2]) + "24x")
+_CRC = struct.Struct("<I")
+_ZERO3: Vector3 = (0.0, 0.0, 0.0)
+_ZERO4: Quaternion = (0.0, 0.0, 0.0, 0.0)
+_ZERO2: Pair = (0.0, 0.0)
+
+
+def encode_slot(sample: Sample, device_id: int) -> bytes:
+    """`sample` as SLOT_BYTES bytes, CRC included. `device_id` is the daemon's number of the device, 0…65535."""
+    t_dev, accel, gyro, mag = sample.t_dev_ns, sample.accel_m_s2, sample.gyro_rad_s, sample.mag_t
+    quat, euler, temperature, pressure = sample.quat_wxyz, sample.euler_rad, sample.temperature_c, sample.pressure_pa
+    incli, status, pps, edge = sample.incli_rad, sample.status, sample.pps_age_ms, sample.edge_seq
+    present = 0
+    if t_dev is not None:
+        present |= HAS_T_DEV
+    if accel is not None:
+        present |= HAS_ACCEL
+    if gyro is not None:
+        present |= HAS_GYRO
+    if mag is not None:
+        present |= HAS_MAG
+    if quat is not None:
+        present |= HAS_QUAT
+    if euler is not None:
+        present |= HAS_EULER
+    if temperature is not None:
+        present |= HAS_TEMPERATURE
+    if pressure is not None:
+        present |= HAS_PRESSURE
+    if incli is not None:
+        present |= HAS_INCLI
+    if status is not None:
+        present |= HAS_STATUS
+    if pps is not None:
+        present |= HAS_PPS_AGE
+    if edge is not None:
+        present |= HAS_EDGE
+    body = _BODY.pack(
+        sample.seq, sample.t_ns, sample.t_rx_ns, sample.utc_ns, t_dev or 0, edge or 0,
+        sample.t_err_ns, present, status or 0, device_id, SYNC_CODES[sample.sync], 0,
+        *(accel or _ZERO3), *(gyro or _ZERO3), *(mag or _ZERO3), *(quat or _ZERO4), *(euler or _ZERO3),
+        temperature or 0.0, pressure or 0.0, *(incli or _ZERO2), pps or 0,
+    )  # fmt: skip
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def slot_is_whole(slot: bytes) -> bool:
+    """Whether the CRC of a slot matches its content."""
+    return len(slot) == SLOT_BYTES and zlib.crc32(slot[:CRC_OFFSET]) == _CRC.unpack_from(slot, CRC_OFFSET)[0]
+
+
+def decode_slot(slot: bytes, device: str) -> Sample:
+    """The sample in `slot`; the inverse of `encode_slot`. Raises ValueError when the CRC does not match."""
+    if not slot_is_whole(slot):
+        raise ValueError(f"slot of {len(slot)} bytes: expected {SLOT_BYTES} with a matching CRC-32; torn or cut short")
+    v = _BODY.unpack_from(slot)
+    has = v[7]
+    return Sample(
+        device, v[0], v[1], v[6], SYNC_BY_CODE[v[10]], v[2], v[3],
+        t_dev_ns=v[4] if has & HAS_T_DEV else None,
+        accel_m_s2=v[12:15] if has & HAS_ACCEL else None,
+        gyro_rad_s=v[15:18] if has & HAS_GYRO else None,
+        mag_t=v[18:21] if has & HAS_MAG else None,
+        quat_wxyz=v[21:25] if has & HAS_QUAT else None,
+        euler_rad=v[25:28] if has & HAS_EULER else None,
+        temperature_c=v[28] if has & HAS_TEMPERATURE else None,
+        pressure_pa=v[29] if has & HAS_PRESSURE else None,
+        incli_rad=v[30:32] if has & HAS_INCLI else None,
+        status=v[8] if has & HAS_STATUS else None,
+        pps_age_ms=v[32] if has & HAS_PPS_AGE else None,
+        edge_seq=v[5] if has & HAS_EDGE else None,
+    )  # fmt: skip

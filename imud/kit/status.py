@@ -1,0 +1,97 @@
+"""What is known of one device at one moment: the one record behind `status`, shared memory and the metrics."""
+
+from enum import StrEnum
+
+import msgspec
+
+from imud.sample import Sync
+
+
+class DeviceState(StrEnum):
+    """Where a device is in its life."""
+
+    MISSING = "missing"
+    """Its link is not there; imud waits for it."""
+    SEARCHING = "searching"
+    """The link is open; no valid frame was heard yet."""
+    RUNNING = "running"
+    """Samples flow."""
+    SILENT = "silent"
+    """It was running and sends nothing now, though the link is there."""
+    FINISHED = "finished"
+    """A replay came to its end."""
+    FAILED = "failed"
+    """It cannot be used until someone acts; `problem` says why. imud tries again all the same."""
+
+
+class ClockStatus(msgspec.Struct, frozen=True):
+    """State of one device's clock estimate."""
+
+    sync: Sync = Sync.ARRIVAL
+    offset_ns: int = 0
+    """Host CLOCK_MONOTONIC minus unwrapped device time, at the newest sample."""
+    skew_ppm: float = 0.0
+    """How much faster than the host's the device's clock runs; +40 means 40 µs more per second."""
+    residual_ns: int = 0
+    """One-sigma spread of the lower envelope of arrival times around the fit."""
+    t_err_ns: int = 0
+    """As in the newest sample."""
+    resets: int = 0
+    """Times the device's clock started anew (restart of the device, jump of its counter)."""
+
+
+class KernelCounters(msgspec.Struct, frozen=True):
+    """Errors the kernel's driver counted since the link was opened."""
+
+    overrun: int = 0
+    """UART FIFO or tty buffer overruns (TIOCGICOUNT), CAN receive queue overflows."""
+    framing: int = 0
+    parity: int = 0
+    break_: int = msgspec.field(default=0, name="break")
+
+
+LATENCY_BOUNDS_NS = (
+    50_000,
+    100_000,
+    200_000,
+    500_000,
+    1_000_000,
+    2_000_000,
+    5_000_000,
+    10_000_000,
+    20_000_000,
+    50_000_000,
+)
+"""Upper bounds of the buckets of the latency histogram, ns; a last bucket without bound follows."""
+
+
+class DeviceStatus(msgspec.Struct, frozen=True):
+    """One device, all that imud can say of it. Lives for one answer; nothing in it changes afterwards."""
+
+    name: str
+    device_id: int
+    driver: str
+    link: str
+    """The link for people, for example `/dev/ttyUSB0 at 115200 baud`."""
+    state: DeviceState
+    problem: str
+    """Why it is not running, one sentence; empty when it runs."""
+    identity: dict[str, str]
+    """`product`, `serial_number`, `firmware` and what else the device told."""
+    settings: dict[str, str]
+    """The device's own settings as read back."""
+    rate_hz: float
+    """Samples per second over the last seconds."""
+    expected_rate_hz: float
+    """Rate by the device's own time stamps; 0 while unknown."""
+    newest_seq: int
+    clock: ClockStatus
+    ledger: dict[str, int]
+    kernel: KernelCounters
+    latency_buckets: tuple[int, ...]
+    """Samples per bucket of LATENCY_BOUNDS_NS, the unbounded last included: time from measurement to publication."""
+    latency_sum_ns: int
+    temperature_c: float | None
+    status_bits: int | None
+    connects: int
+    """Times the link was opened since start."""

@@ -1,0 +1,31 @@
+"""A lazy table: name → "module:NAME", imported on first use, so that one missing library costs one row only."""
+
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Generic, TypeVar, cast
+
+T = TypeVar("T")
+
+
+class Table(Mapping[str, T], Generic[T]):
+    """Maps a name to the object that its row points at. A new plug-in is one new file and one row.
+
+    Raises KeyError for a name without a row; the message lists the names there are.
+    """
+
+    def __init__(self, kind: str, rows: Mapping[str, str]) -> None:
+        self.kind = kind
+        self.rows = dict(rows)
+
+    def __getitem__(self, name: str) -> T:
+        try:
+            module, _, attribute = self.rows[name].partition(":")
+        except KeyError:
+            raise KeyError(f"no {self.kind} named {name!r}; there are: {', '.join(sorted(self.rows))}") from None
+        return cast(T, getattr(import_module(module), attribute))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)

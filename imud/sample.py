@@ -1,0 +1,88 @@
+"""The two records of the sample path: what a device said, and what imud makes of it.
+
+A codec yields `Measurement`: device time and physical values, no host time. Only `imud.clock` makes a `Sample`,
+so a path that skips the clock does not type-check. All values are SI, in the right-handed sensor frame; a field is
+None where the message has none, because absent is not zero.
+"""
+
+from enum import StrEnum
+
+import msgspec
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Pair = tuple[float, float]
+
+
+class Sync(StrEnum):
+    """Where a time stamp comes from, worst first."""
+
+    ARRIVAL = "arrival"
+    """Time of arrival less the time on the wire; the device sends no usable time."""
+    REGRESSION = "regression"
+    """Device time fitted to arrival times."""
+    EDGE = "edge"
+    """Device time fitted to SOUT or PPS edges that the kernel stamped."""
+    UTC = "utc"
+    """The device itself is disciplined to UTC."""
+
+
+class Measurement(msgspec.Struct, frozen=True, gc=False):
+    """One message of a device, decoded to SI units, without host time."""
+
+    size_bytes: int
+    """Bytes of the message on the wire, all framing included."""
+    trailing_bytes: int
+    """Bytes of the same read that follow it: they were on the wire later, so the message came earlier than the read."""
+    dev_ticks: int | None
+    """Device time as sent, in the driver's ticks, still wrapping; None where the message has none."""
+    accel_m_s2: Vector3 | None = None
+    gyro_rad_s: Vector3 | None = None
+    mag_t: Vector3 | None = None
+    quat_wxyz: Quaternion | None = None
+    """Rotation from body to navigation frame, scalar first."""
+    euler_rad: Vector3 | None = None
+    """Roll, pitch, yaw in the device's own convention, which the driver names."""
+    temperature_c: float | None = None
+    pressure_pa: float | None = None
+    incli_rad: Pair | None = None
+    """Inclinometer X and Y."""
+    status: int | None = None
+    """Status bits as sent."""
+    pps_age_ms: int | None = None
+    """Time from the last edge on the device's PPS/SIN input to this measurement; wraps as the device says."""
+
+
+class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
+    """One measurement with its place in time. Field names are the names in JSON; absent fields are left out there."""
+
+    device: str
+    """Name of the device in the configuration."""
+    seq: int
+    """Counts from 1 per device, +1 for every sample since start: a gap a reader sees is a sample that reader lost."""
+    t_ns: int
+    """CLOCK_MONOTONIC of the instant of measurement; strictly increasing, never later than the last byte's arrival."""
+    t_err_ns: int
+    """One-sigma error of `t_ns`: residual spread plus the known bias bound of the source."""
+    sync: Sync
+    t_rx_ns: int
+    """CLOCK_MONOTONIC when the last byte was read."""
+    utc_ns: int
+    """`t_ns` on CLOCK_REALTIME (ns since 1970-01-01 UTC), from an offset sampled at arrival."""
+    t_dev_ns: int | None = None
+    """Device time unwrapped to 64 bits."""
+    accel_m_s2: Vector3 | None = None
+    gyro_rad_s: Vector3 | None = None
+    mag_t: Vector3 | None = None
+    quat_wxyz: Quaternion | None = None
+    euler_rad: Vector3 | None = None
+    temperature_c: float | None = None
+    pressure_pa: float | None = None
+    incli_rad: Pair | None = None
+    status: int | None = None
+    pps_age_ms: int | None = None
+    edge_seq: int | None = None
+    """Number of the SOUT or PPS edge that belongs to this sample."""
+
+
+SAMPLE_FIELDS: tuple[str, ...] = Sample.__struct_fields__
