@@ -3,9 +3,11 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from random import Random
+from typing import Any
 
 from imud.kit.codec import StreamCodec
 from imud.kit.session import Conversation
+from imud.kit.settings import Settings
 from imud.ledger import Ledger
 
 
@@ -30,7 +32,10 @@ class StreamDriver:
     """Vendor and products, for people."""
     baud_rates: tuple[int, ...]
     """Rates the device knows, in bit/s, most likely first: detection tries them in this order."""
-    make_codec: Callable[[Ledger], StreamCodec]
+    settings: type[Settings]
+    """What can be configured of the codec (`options` of a device)."""
+    make_codec: Callable[[Ledger, Any], StreamCodec]
+    """Makes a codec that counts into the ledger, from an instance of `settings`."""
     tick_ns: int
     """Length of one device tick in ns."""
     tick_modulus: int

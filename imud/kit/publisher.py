@@ -1,10 +1,12 @@
 """What a publisher is: an output that takes samples and events and never makes the pipeline wait."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 from imud.event import Event
 from imud.kit.batch import Batch
+from imud.kit.settings import Settings
 from imud.kit.status import DeviceStatus
 
 StatusSource = Callable[[], Sequence[DeviceStatus]]
@@ -41,3 +43,24 @@ class Publisher(Protocol):
     def close(self) -> None:
         """Release everything; may be called twice."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherContext:
+    """What every publisher may know of the daemon."""
+
+    status: StatusSource
+    epoch: int
+    """Random number of this start of the daemon, 64 bits: readers see a restart by it."""
+    now_ns: Callable[[], int]
+    """CLOCK_MONOTONIC."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherType:
+    """The row a publisher file ends with."""
+
+    name: str
+    """The top-level key in the configuration."""
+    settings: type[Settings]
+    make: Callable[[Any, PublisherContext], Publisher]

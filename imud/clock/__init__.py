@@ -1,0 +1,1 @@
+"""Time: device ticks to host time, with an honest error. Pure: no I/O, every time is an argument."""
