@@ -27,6 +27,8 @@ class StreamLink(Protocol):
     """Present rate in bit/s; 0 where there is no such thing."""
     auto_baud: bool
     """Whether the rate is to be found by detection."""
+    writable: bool
+    """Whether a device listens at the far end (a replay has none)."""
     hold_ns: int
     """How long the adapter may hold bytes back before it hands them over (USB latency timer), 0 if it does not."""
 

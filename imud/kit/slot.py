@@ -17,6 +17,8 @@ import zlib
 from dataclasses import dataclass
 from typing import Final
 
+import msgspec
+
 from imud.sample import Pair, Quaternion, Sample, Sync, Vector3
 
 SLOT_BYTES: Final = 256
@@ -97,13 +99,29 @@ SYNC_BY_CODE: Final = tuple(Sync)
 
 _BODY = struct.Struct("<" + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:-2]) + "24x")
 _CRC = struct.Struct("<I")
+_U16_MAX: Final = 0xFFFF
+_U32_MAX: Final = 0xFFFF_FFFF
+_U64_MAX: Final = 0xFFFF_FFFF_FFFF_FFFF
+_I64_MIN: Final = -(1 << 63)
+_I64_MAX: Final = (1 << 63) - 1
 _ZERO3: Vector3 = (0.0, 0.0, 0.0)
 _ZERO4: Quaternion = (0.0, 0.0, 0.0, 0.0)
 _ZERO2: Pair = (0.0, 0.0)
 
 
 def encode_slot(sample: Sample, device_id: int) -> bytes:
-    """`sample` as SLOT_BYTES bytes, CRC included. `device_id` is the daemon's number of the device, 0…65535."""
+    """`sample` as SLOT_BYTES bytes, CRC included. `device_id` is the daemon's number of the device, 0…65535.
+
+    A value that its field cannot hold is replaced as `_fitted` says, so that no sample can stop the daemon.
+    """
+    try:
+        return _encode(sample, device_id)
+    except struct.error:
+        return _encode(_fitted(sample), device_id & _U16_MAX)
+
+
+def _encode(sample: Sample, device_id: int) -> bytes:
+    """`encode_slot` for values that fit. Raises struct.error for others."""
     t_dev, accel, gyro, mag = sample.t_dev_ns, sample.accel_m_s2, sample.gyro_rad_s, sample.mag_t
     quat, euler, temperature, pressure = sample.quat_wxyz, sample.euler_rad, sample.temperature_c, sample.pressure_pa
     incli, status, pps, edge = sample.incli_rad, sample.status, sample.pps_age_ms, sample.edge_seq
@@ -141,17 +159,43 @@ def encode_slot(sample: Sample, device_id: int) -> bytes:
     return body + _CRC.pack(zlib.crc32(body))
 
 
+def _fitted(sample: Sample) -> Sample:
+    """`sample` with integers that the slot can hold: quantities clipped, status bits cut to the low 32."""
+    t_dev, status, pps, edge = sample.t_dev_ns, sample.status, sample.pps_age_ms, sample.edge_seq
+    return msgspec.structs.replace(
+        sample,
+        seq=_clipped(sample.seq, 0, _U64_MAX),
+        t_ns=_clipped(sample.t_ns, _I64_MIN, _I64_MAX),
+        t_err_ns=_clipped(sample.t_err_ns, 0, _U32_MAX),
+        t_rx_ns=_clipped(sample.t_rx_ns, _I64_MIN, _I64_MAX),
+        utc_ns=_clipped(sample.utc_ns, _I64_MIN, _I64_MAX),
+        t_dev_ns=None if t_dev is None else _clipped(t_dev, _I64_MIN, _I64_MAX),
+        status=None if status is None else status & _U32_MAX,
+        pps_age_ms=None if pps is None else _clipped(pps, 0, _U32_MAX),
+        edge_seq=None if edge is None else _clipped(edge, 0, _U64_MAX),
+    )
+
+
+def _clipped(value: int, low: int, high: int) -> int:
+    return min(max(value, low), high)
+
+
 def slot_is_whole(slot: bytes) -> bool:
     """Whether the CRC of a slot matches its content."""
     return len(slot) == SLOT_BYTES and zlib.crc32(slot[:CRC_OFFSET]) == _CRC.unpack_from(slot, CRC_OFFSET)[0]
 
 
 def decode_slot(slot: bytes, device: str) -> Sample:
-    """The sample in `slot`; the inverse of `encode_slot`. Raises ValueError when the CRC does not match."""
+    """The sample in `slot`; the inverse of `encode_slot`.
+
+    Raises ValueError when the CRC does not match, or for a `sync` of a newer layout.
+    """
     if not slot_is_whole(slot):
         raise ValueError(f"slot of {len(slot)} bytes: expected {SLOT_BYTES} with a matching CRC-32; torn or cut short")
     v = _BODY.unpack_from(slot)
     has = v[7]
+    if v[10] >= len(SYNC_BY_CODE):
+        raise ValueError(f"slot with sync {v[10]}: expected 0 to {len(SYNC_BY_CODE) - 1}; written by a newer imud")
     return Sample(
         device, v[0], v[1], v[6], SYNC_BY_CODE[v[10]], v[2], v[3],
         t_dev_ns=v[4] if has & HAS_T_DEV else None,

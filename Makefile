@@ -1,0 +1,45 @@
+# make demo   one simulated sensor through the real daemon          make test   everything that needs no lab
+# make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
+SHELL := /bin/sh
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+ARGS ?=
+
+.PHONY: all demo test lint check bench soak clean lab lab-deps
+
+all: check
+
+# The virtual environment is made anew when the dependencies change.
+$(VENV)/made: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: $(VENV)/made
+	$(BIN)/imud demo $(ARGS)
+
+test: $(VENV)/made
+	$(BIN)/pytest $(ARGS)
+
+lint: $(VENV)/made
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+check: lint test
+
+bench: $(VENV)/made
+	$(BIN)/python -m tests.bench $(ARGS)
+
+soak: $(VENV)/made
+	$(BIN)/python -m tests.bench.soak $(ARGS)
+
+lab-deps:
+	tests/lab/deps
+
+lab: $(VENV)/made
+	tests/lab/run $(ARGS)
+
+clean:
+	rm -rf build $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,90 @@
+"""`imud replay`: run a capture through the daemon's whole path, for clients to read, or printed."""
+
+import argparse
+import asyncio
+import sys
+from pathlib import Path
+
+import msgspec
+
+from imud import config
+from imud.cli.run import start_log
+from imud.cli.status import block
+from imud.daemon import Daemon
+from imud.devices import DRIVERS
+from imud.event import Event
+from imud.kit.batch import Batch
+
+SPEEDS = ("recorded", "real", "maximum")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud replay`."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="capture, raw or time-stamped")
+    parser.add_argument("--driver", default="hipnuc-uart", choices=sorted(DRIVERS), help="default: %(default)s")
+    parser.add_argument("--speed", default="maximum", choices=SPEEDS, help="default: %(default)s")
+    parser.add_argument("--baud", type=int, default=115200, help="rate of a raw capture (default: %(default)s)")
+    parser.add_argument("--socket", type=Path, metavar="PATH", help="serve the samples on this socket, as the daemon does")
+    parser.add_argument("--json", action="store_true", help="print every sample, one JSON object per line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play the file to its end; the ledger goes to standard error. 1 when there was no sample in it."""
+    start_log("warning")
+    settings = config.parse(configuration(args), str(args.file))
+    daemon = Daemon(settings, extra={"print": Printer()} if args.json else {}, until_finished=True)
+    asyncio.run(serve(daemon))
+    status = daemon.status()[0]
+    print(block(status), file=sys.stderr)
+    return 0 if status.ledger["samples"] else 1
+
+
+async def serve(daemon: Daemon) -> None:
+    """Run until the capture ends or someone interrupts."""
+    daemon.install_signals()
+    await daemon.run()
+
+
+def configuration(args: argparse.Namespace) -> str:
+    """The configuration of a daemon that does only this, as text: it takes the same way as a file."""
+    tree = {
+        "socket": {"enabled": args.socket is not None, **({"path": str(args.socket)} if args.socket else {})},
+        "shm": {"enabled": False},
+        "metrics": {"enabled": False},
+        "devices": {
+            "replay": {
+                "driver": args.driver,
+                "identify": False,
+                "replay": {"path": str(args.file), "speed": args.speed, "baud": args.baud},
+            }
+        },
+    }
+    return msgspec.json.encode(tree).decode()
+
+
+class Printer:
+    """A publisher that prints samples as JSON lines."""
+
+    def start(self) -> None:
+        """Nothing to open."""
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """Every device is printed."""
+
+    def remove_device(self, name: str) -> None:
+        """Nothing is kept per device."""
+
+    def publish(self, batch: Batch) -> None:
+        """One line per sample."""
+        for sample in batch.samples:
+            sys.stdout.write(msgspec.json.encode(sample).decode() + "\n")
+
+    def event(self, event: Event) -> None:
+        """Events go to the log already."""
+
+    def tick(self, now_ns: int) -> None:
+        """Nothing is timed."""
+
+    def close(self) -> None:
+        """Leave nothing in the buffer."""
+        sys.stdout.flush()

@@ -1,0 +1,206 @@
+"""The daemon: one event loop that owns every configured device and every output.
+
+DeviceRunner ──Batch──▶ Publisher ×n        (publish: a plain loop over bound methods)
+tick, 10 Hz ──▶ runners, publishers         SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
+"""
+
+import asyncio
+import logging
+import secrets
+import signal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from time import monotonic_ns
+
+from imud import config as configuration
+from imud.config import Config, DeviceConfig
+from imud.errors import ConfigError
+from imud.event import Event, EventKind
+from imud.kit.batch import Batch
+from imud.kit.publisher import Publisher, PublisherContext
+from imud.kit.status import DeviceState, DeviceStatus
+from imud.notify import notify, watchdog_interval_s
+from imud.pipeline.remembered import Remembered
+from imud.pipeline.runner import DeviceRunner
+from imud.publishers import PUBLISHERS
+from imud.units import NS_PER_S
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.1
+
+
+class Daemon:
+    """Runs one configuration. Synchronization: all in the event loop's thread.
+
+    `file` is read again on SIGHUP; `state_dir` is where found devices are remembered (None remembers nothing);
+    `extra` are publishers besides the configured ones; `until_finished` ends the run with the last replay.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        *,
+        file: Path | None = None,
+        state_dir: Path | None = None,
+        extra: Mapping[str, Publisher] | None = None,
+        until_finished: bool = False,
+    ) -> None:
+        self.config = config
+        self._file = file
+        self._remembered = Remembered(state_dir)
+        self._context = PublisherContext(self.status, secrets.randbits(63) | 1, monotonic_ns)
+        self._extra = dict(extra or {})
+        self._until_finished = until_finished
+        self._publishers: dict[str, Publisher] = {}
+        self._sinks: list[Callable[[Batch], None]] = []
+        self._runners: dict[str, DeviceRunner] = {}
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._ids: dict[str, int] = {}
+        self._stop = asyncio.Event()
+        self._failure: BaseException | None = None
+        self._watchdog_s = watchdog_interval_s()
+        self._watchdog_due_ns = 0
+
+    # --- life ------------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Run until stopped. Raises ServerError when an output cannot start, and whatever a device's task died of."""
+        try:
+            for name, settings in self.config.publishers.items():
+                self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
+            for name, publisher in self._extra.items():
+                self._start_publisher(name, publisher)
+            for device in self.config.devices:
+                self._start_device(device)
+            notify("READY=1")
+            await self._tick_until_stopped()
+        finally:
+            notify("STOPPING=1")
+            await self._close()
+        if self._failure is not None:
+            raise self._failure
+
+    def stop(self) -> None:
+        """Ask `run` to end; it closes everything first."""
+        self._stop.set()
+
+    def install_signals(self) -> None:
+        """SIGTERM and SIGINT stop, SIGHUP reloads. Needs a running loop in the main thread."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.stop)
+        loop.add_signal_handler(signal.SIGHUP, self.reload)
+
+    @property
+    def finished(self) -> bool:
+        """Whether every device is a replay that came to its end."""
+        return all(runner.state is DeviceState.FINISHED for runner in self._runners.values())
+
+    # --- reload ----------------------------------------------------------------------------------------------------
+
+    def reload(self) -> None:
+        """Read the configuration file again and change what differs; a bad file leaves everything as it is."""
+        if self._file is None:
+            return
+        notify(f"RELOADING=1\nMONOTONIC_USEC={monotonic_ns() // 1000}")
+        try:
+            new = configuration.load(self._file)
+        except ConfigError as error:
+            log.error("the configuration stays as it was: %s", error)
+            self._tell(Event(monotonic_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}"))
+        else:
+            self._change_to(new)
+        notify("READY=1")
+
+    def _change_to(self, new: Config) -> None:
+        change = configuration.differences(self.config, new)
+        self.config = new
+        logging.getLogger().setLevel(new.log_level.upper())
+        for name in (*change.devices_removed, *change.devices_changed):
+            self._stop_device(name)
+        for name in change.publishers_changed:
+            self._publishers.pop(name).close()
+            self._start_publisher(name, PUBLISHERS[name].make(new.publishers[name], self._context))
+        for device in new.devices:
+            if device.name not in self._runners:
+                self._start_device(device)
+        words = f"configuration read again: {change}"
+        log.info("%s", words)
+        self._tell(Event(monotonic_ns(), "", EventKind.CONFIGURATION, words))
+
+    # --- devices and outputs ----------------------------------------------------------------------------------------
+
+    def status(self) -> list[DeviceStatus]:
+        """The state of every device now."""
+        return [runner.status() for runner in self._runners.values()]
+
+    def _start_publisher(self, name: str, publisher: Publisher) -> None:
+        for device, runner in self._runners.items():
+            publisher.add_device(device, runner.device_id)
+        publisher.start()
+        self._publishers[name] = publisher
+        self._sinks[:] = [p.publish for p in self._publishers.values()]
+
+    def _start_device(self, device: DeviceConfig) -> None:
+        device_id = self._ids.setdefault(device.name, len(self._ids))
+        for publisher in self._publishers.values():
+            publisher.add_device(device.name, device_id)
+        runner = DeviceRunner(device, device_id, self._publish, self._tell, self._remembered)
+        self._runners[device.name] = runner
+        task = asyncio.create_task(runner.run(), name=device.name)
+        task.add_done_callback(self._on_done)
+        self._tasks[device.name] = task
+
+    def _stop_device(self, name: str) -> None:
+        self._tasks.pop(name).cancel()
+        self._runners.pop(name).close()
+        for publisher in self._publishers.values():
+            publisher.remove_device(name)
+
+    def _on_done(self, task: asyncio.Task[None]) -> None:
+        """A device's task that dies of an error ends the process with that error; the service manager restarts it."""
+        if not task.cancelled() and task.exception() is not None:
+            self._failure = task.exception()
+            self._stop.set()
+        if self._until_finished and self.finished:
+            self._stop.set()
+
+    def _publish(self, batch: Batch) -> None:
+        for publish in self._sinks:
+            publish(batch)
+
+    def _tell(self, event: Event) -> None:
+        for publisher in self._publishers.values():
+            publisher.event(event)
+
+    # --- time -------------------------------------------------------------------------------------------------------
+
+    async def _tick_until_stopped(self) -> None:
+        while not self._stop.is_set():
+            now_ns = monotonic_ns()
+            for runner in self._runners.values():
+                runner.tick(now_ns)
+            for publisher in self._publishers.values():
+                publisher.tick(now_ns)
+            self._feed_watchdog(now_ns)
+            try:
+                await asyncio.wait_for(self._stop.wait(), TICK_S)
+            except TimeoutError:
+                continue
+
+    def _feed_watchdog(self, now_ns: int) -> None:
+        if self._watchdog_s is not None and now_ns >= self._watchdog_due_ns:
+            notify("WATCHDOG=1")
+            self._watchdog_due_ns = now_ns + int(self._watchdog_s * NS_PER_S)
+
+    async def _close(self) -> None:
+        tasks = list(self._tasks.values())
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for runner in self._runners.values():
+            runner.close()
+        for publisher in self._publishers.values():
+            publisher.tick(monotonic_ns())
+            publisher.close()

@@ -1,0 +1,62 @@
+"""Drives conversations with one device: sends requests over the link, feeds it the text that comes back."""
+
+import asyncio
+from collections.abc import Callable
+from time import monotonic_ns
+from typing import TypeVar
+
+from imud.kit.session import Conversation, Outcome, Reply, Request, TextSession
+from imud.ledger import Ledger
+from imud.units import NS_PER_S
+
+T = TypeVar("T")
+
+
+class Talk:
+    """One conversation at a time with one device. Synchronization: the event loop's thread only."""
+
+    def __init__(self, ledger: Ledger, write: Callable[[bytes], None]) -> None:
+        self._session = TextSession(ledger)
+        self._write = write
+        self._lock = asyncio.Lock()
+        self._outcome: asyncio.Future[Outcome] | None = None
+
+    async def hold(self, conversation: Conversation[T]) -> T:
+        """Run `conversation` to its end and return its value. Raises what it raises, and LinkError when unplugged."""
+        async with self._lock:
+            try:
+                request = next(conversation)
+                while True:
+                    request = conversation.send(await self._ask(request))
+            except StopIteration as end:
+                value: T = end.value
+                return value
+            finally:
+                conversation.close()
+
+    def on_text(self, text: str, t_rx_ns: int) -> None:
+        """Take one line of text from the codec."""
+        self._settle(self._session.on_line(text, t_rx_ns))
+
+    async def _ask(self, request: Request) -> Outcome:
+        loop = asyncio.get_running_loop()
+        self._write(self._session.start(request, monotonic_ns()))
+        if request.silent:
+            return Reply(())
+        self._outcome = loop.create_future()
+        timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
+        try:
+            return await self._outcome
+        finally:
+            timer.cancel()
+            self._outcome = None
+            self._session.cancel()
+
+    def _expire(self) -> None:
+        deadline_ns = self._session.deadline_ns
+        if deadline_ns is not None:  # the loop's timer may fire a little early against CLOCK_MONOTONIC
+            self._settle(self._session.on_time(max(monotonic_ns(), deadline_ns)))
+
+    def _settle(self, outcome: Outcome | None) -> None:
+        if outcome is not None and self._outcome is not None and not self._outcome.done():
+            self._outcome.set_result(outcome)

@@ -1,0 +1,80 @@
+"""The least a Python process can do: epoll, read, find/crc/unpack, pack, send. What imud is measured against.
+
+No clock, no ledger, no shared memory, no slow-client care. `python -m tests.bench.bare_loop SOCKET ENCODING PTY…`
+prints `ready` and serves every client that connects until SIGTERM.
+"""
+
+import binascii
+import os
+import select
+import socket
+import struct
+import sys
+import time
+import tty
+
+import msgspec
+
+from imud.devices.hipnuc.frames import encode_hi91  # noqa: F401 - the same start-up cost on both sides
+
+HEAD = struct.Struct("<2sHH")
+BODY = struct.Struct("<BHbfI16f")
+OUT = struct.Struct("<IQqqqqQIIIHBx3d3d3d4d3d2d2d32x")
+JSON = msgspec.json.Encoder()
+
+
+def binary(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:
+    """One length-prefixed slot."""
+    return OUT.pack(256, seq, now_ns, now_ns, now_ns, 0, 0, 0, 0, 0, device, 0, *v[5:21], v[2], v[3], 0.0, 0.0)
+
+
+def as_json(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:
+    """One notification line."""
+    params = {"device": str(device), "seq": seq, "t_ns": now_ns, "accel": v[5:8], "gyro": v[8:11], "mag": v[11:14],
+              "euler": v[14:17], "quat": v[17:21], "temperature": v[2], "pressure_pa": v[3]}  # fmt: skip
+    return JSON.encode({"jsonrpc": "2.0", "method": "sample", "params": params}) + b"\n"
+
+
+def serve(path: str, encoding: str, ports: list[str]) -> None:
+    """Run for ever."""
+    pack = binary if encoding == "binary" else as_json
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(path)
+    listener.listen(256)
+    poll = select.epoll()
+    poll.register(listener.fileno(), select.EPOLLIN)
+    tails: dict[int, bytes] = {}
+    seqs: dict[int, int] = {}
+    for port in ports:
+        fd = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        tty.setraw(fd)
+        poll.register(fd, select.EPOLLIN)
+        tails[fd], seqs[fd] = b"", 0
+    clients: list[socket.socket] = []
+    print("ready", flush=True)
+    crc = binascii.crc_hqx
+    while True:
+        for fd, _ in poll.poll():
+            if fd not in tails:
+                clients.append(listener.accept()[0])
+                continue
+            data = tails[fd] + os.read(fd, 65536)
+            out = []
+            at = data.find(b"\x5a\xa5")
+            while at >= 0 and len(data) - at >= 82:
+                _, length, check = HEAD.unpack_from(data, at)
+                if length == 76 and crc(data[at + 6 : at + 82], crc(data[at : at + 4], 0)) == check:
+                    seqs[fd] += 1
+                    out.append(pack(fd, seqs[fd], time.monotonic_ns(), BODY.unpack_from(data, at + 6)))
+                    at = data.find(b"\x5a\xa5", at + 82)
+                else:
+                    at = data.find(b"\x5a\xa5", at + 2)
+            tails[fd] = data[at:] if at >= 0 else b""
+            message = b"".join(out)
+            if message:
+                for client in clients:
+                    client.send(message)
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1], sys.argv[2], sys.argv[3:])

@@ -1,0 +1,72 @@
+"""End to end against the bare loop: pty → decode → clock → shared memory → socket client's receive, in one run."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from tests.bench.rig import Load, Outcome, run
+from tests.bench.rows import Row, at_least, at_most
+
+CPU_LIMIT = 2.0
+P99_LIMIT = 2.0
+DEVICES_AIM = 32
+RSS_LIMIT_MB = 45.0
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """All figures of the whole path."""
+    seconds = 2.0 if quick else 6.0
+    for encoding in ("binary", "json"):
+        for clients in (1, 10, 100):
+            yield from compare(Load(clients=clients, encoding=encoding, seconds=seconds), rounds=1 if quick else 3)
+    yield from growth(seconds)
+    yield from coalesced(seconds)
+
+
+def compare(load: Load, rounds: int) -> Iterator[Row]:
+    """The daemon and the bare loop in turns; the best round of each, as both share the machine with whatever else runs."""
+    pairs = [(run(load), run(replace(load, bare=True))) for _ in range(rounds)]
+    imud = min((a for a, _ in pairs), key=lambda o: o.cpu_us_per_sample)
+    bare = min((b for _, b in pairs), key=lambda o: o.cpu_us_per_sample)
+    name = f"1 kHz, {load.clients} {load.encoding} clients"
+    for who, outcome in (("bare loop", bare), ("imud", imud)):
+        yield Row(f"{name}: CPU per sample, {who}", outcome.cpu_us_per_sample, "us")
+    yield at_most(f"{name}: CPU ratio", imud.cpu_us_per_sample / bare.cpu_us_per_sample, "x", CPU_LIMIT)
+    quiet_imud = min((a for a, _ in pairs), key=lambda o: o.p99_us)
+    quiet_bare = min((b for _, b in pairs), key=lambda o: o.p99_us)
+    for who, outcome in (("bare loop", quiet_bare), ("imud", quiet_imud)):
+        yield Row(f"{name}: latency p50, {who}", outcome.p50_us, "us")
+        yield Row(f"{name}: latency p99, {who}", outcome.p99_us, "us")
+        yield Row(f"{name}: latency max, {who}", outcome.max_us, "us")
+    yield at_most(f"{name}: p99 ratio", quiet_imud.p99_us / quiet_bare.p99_us, "x", P99_LIMIT)
+    yield at_most(f"{name}: samples lost, imud", float(max(a.lost for a, _ in pairs)), "samples", 0)
+
+
+def many(devices: int, seconds: float, **more: object) -> tuple[Outcome, Outcome]:
+    """The daemon and the bare loop with many devices and one client."""
+    load = Load(devices=devices, seconds=seconds, phases=4, **more)  # type: ignore[arg-type]  # keywords of Load
+    return run(load), run(replace(load, bare=True, coalesce_ms=0.0))
+
+
+def growth(seconds: float) -> Iterator[Row]:
+    """Cost by the number of devices, and how many go on one core without loss."""
+    most = 0
+    for devices in (1, 4, 16, 32, 48, 64):
+        imud, bare = many(devices, seconds)
+        yield Row(f"{devices} devices at 1 kHz: CPU per sample, imud", imud.cpu_us_per_sample, "us")
+        yield Row(f"{devices} devices at 1 kHz: CPU per sample, bare loop", bare.cpu_us_per_sample, "us")
+        yield Row(f"{devices} devices at 1 kHz: share of one core, imud", imud.cpu_share, "")
+        yield Row(f"{devices} devices at 1 kHz: samples lost, imud", float(imud.lost), "samples")
+        yield Row(f"{devices} devices at 1 kHz: RSS, imud", imud.rss_mb, "MB")
+        if imud.lost == 0:
+            most = devices
+        if devices == 1:
+            yield at_most("RSS with 1 device", imud.rss_mb, "MB", RSS_LIMIT_MB)
+    yield at_least("devices at 1 kHz on one core without loss", float(most), "devices", DEVICES_AIM)
+
+
+def coalesced(seconds: float) -> Iterator[Row]:
+    """What holding a batch for 2 ms saves at 16 devices."""
+    plain, _ = many(16, seconds)
+    held, _ = many(16, seconds, coalesce_ms=2.0)
+    yield Row("16 devices, coalesce 2 ms: CPU against none", held.cpu_us_per_sample / plain.cpu_us_per_sample, "x")
+    yield Row("16 devices, coalesce 2 ms: latency p99", held.p99_us, "us")

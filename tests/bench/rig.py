@@ -1,0 +1,224 @@
+"""Starts writer, server and readers as processes, the server alone on one core, and reads what the server cost."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic, sleep
+
+import msgspec
+
+from imud.client import Client
+from imud.kit.status import DeviceStatus
+
+CORES = sorted(os.sched_getaffinity(0))
+SERVER_CORE = {CORES[-1]}
+REST_CORES = set(CORES[:-1]) or SERVER_CORE
+START_LIMIT_S = 20.0
+
+
+@dataclass(frozen=True)
+class Load:
+    """What to run."""
+
+    devices: int = 1
+    clients: int = 1
+    encoding: str = "binary"
+    rate_hz: float = 1000.0
+    seconds: float = 5.0
+    bare: bool = False
+    coalesce_ms: float = 0.0
+    stuck: bool = False
+    phases: int = 1
+    shm: bool = True
+
+    @property
+    def frames(self) -> int:
+        """Frames per device."""
+        return int(self.seconds * self.rate_hz)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of it."""
+
+    cpu_us_per_sample: float
+    cpu_share: float
+    p50_us: float
+    p99_us: float
+    max_us: float
+    received: int
+    gaps: int
+    refused: int
+    rss_mb: float
+    statuses: tuple[DeviceStatus, ...]
+
+    @property
+    def lost(self) -> int:
+        """Samples that did not reach the first client, or that the daemon says are lost."""
+        return (
+            self.gaps
+            + self.refused
+            + sum(sum(v for k, v in s.ledger.items() if k.startswith("lost_")) for s in self.statuses)
+        )
+
+
+class Process:
+    """A child that speaks in lines."""
+
+    def __init__(self, cores: set[int], *argv: str) -> None:
+        self.popen = subprocess.Popen(
+            [sys.executable, *argv],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=Path(__file__).parents[2],
+        )
+        os.sched_setaffinity(self.popen.pid, cores)
+
+    def line(self) -> str:
+        """The next line it prints."""
+        assert self.popen.stdout is not None
+        text = self.popen.stdout.readline()
+        if not text:
+            raise RuntimeError(f"{self.popen.args} ended with {self.popen.wait()}")
+        return text.strip()
+
+    def say(self, text: str) -> None:
+        """One line to it."""
+        assert self.popen.stdin is not None
+        self.popen.stdin.write(text + "\n")
+        self.popen.stdin.flush()
+
+    def __enter__(self) -> "Process":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.popen.terminate()
+        self.popen.communicate(timeout=10)
+
+
+def cpu_ns(pid: int) -> int:
+    """CPU time of all threads of a process so far, by the scheduler's own account."""
+    total = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        total += int((task / "schedstat").read_text().split()[0])
+    return total
+
+
+def rss_mb(pid: int) -> float:
+    """Resident memory of a process in MB (10⁶ bytes)."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
+    """An imud configuration for these ports."""
+    devices = {
+        f"d{i}": {
+            "driver": "hipnuc-uart",
+            "identify": False,
+            "uart": {"port": port, "baud": 921600, "coalesce_ms": load.coalesce_ms},
+        }
+        for i, port in enumerate(ports)
+    }
+    tree = {
+        "log_level": "error",
+        "state_dir": str(folder),
+        "socket": {"path": str(folder / "s")},
+        "shm": {"enabled": load.shm, "directory": str(folder)},
+        "metrics": {"port": 0},
+        "devices": devices,
+    }
+    file = folder / "imud.yaml"
+    file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
+    return file
+
+
+def wait_for(path: Path) -> None:
+    """Wait until a file is there."""
+    end = monotonic() + START_LIMIT_S
+    while not path.exists():
+        if monotonic() > end:
+            raise TimeoutError(f"{path} did not appear within {START_LIMIT_S} s")
+        sleep(0.01)
+
+
+def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Load) -> Process:
+    """The daemon or the bare loop, ready for clients."""
+    path = folder / "s"
+    if load.bare:
+        server = stack.enter_context(
+            Process(SERVER_CORE, "-m", "tests.bench.bare_loop", str(path), load.encoding, *ports)
+        )
+        server.line()
+        return server
+    file = configuration(folder, ports, load)
+    server = stack.enter_context(Process(SERVER_CORE, "-m", "imud", "run", "-c", str(file)))
+    wait_for(path)
+    end = monotonic() + START_LIMIT_S
+    with Client(str(path)) as client:
+        while any(status.state != "searching" for status in client.status()):
+            if monotonic() > end:
+                raise TimeoutError("the daemon did not open all ports")
+            sleep(0.05)
+    return server
+
+
+def start_readers(stack: ExitStack, folder: Path, load: Load) -> Process:
+    """The client process, subscribed."""
+    args = ["--socket", str(folder / "s"), "--clients", str(load.clients), "--encoding", load.encoding]
+    args += ["--times", str(folder / "times"), "--frames", str(load.frames)]
+    args += ["--bare"] * load.bare + ["--stuck"] * load.stuck
+    readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *args))
+    readers.line()
+    return readers
+
+
+def run(load: Load) -> Outcome:
+    """One measurement from start to end."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
+        folder = Path(name)
+        (folder / "times").write_bytes(bytes(8 * load.frames))
+        writer = stack.enter_context(
+            Process(
+                REST_CORES, "-m", "tests.bench.writer", "--devices", str(load.devices), "--rate", str(load.rate_hz),
+                "--frames", str(load.frames), "--phases", str(load.phases), "--times", str(folder / "times"),
+            )
+        )  # fmt: skip
+        ports = writer.line().split()
+        server = start_server(stack, folder, ports, load)
+        readers = start_readers(stack, folder, load)
+        pid = server.popen.pid
+        before_ns, begun = cpu_ns(pid), monotonic()
+        writer.say("go")
+        refused = int(writer.line())
+        sleep(0.05)  # what is on its way arrives
+        used_ns, elapsed = cpu_ns(pid) - before_ns, monotonic() - begun
+        memory_mb = rss_mb(pid)
+        statuses = () if load.bare else tuple(ask(folder / "s"))
+        readers.say("end")
+        figures = json.loads(readers.line())
+    total = load.frames * load.devices
+    return Outcome(
+        cpu_us_per_sample=used_ns / 1e3 / total,
+        cpu_share=used_ns / 1e9 / elapsed,
+        p50_us=figures["p50_us"],
+        p99_us=figures["p99_us"],
+        max_us=figures["max_us"],
+        received=figures["samples"],
+        gaps=figures["gaps"] + total - figures["samples"] if load.clients else 0,
+        refused=refused,
+        rss_mb=memory_mb,
+        statuses=statuses,
+    )
+
+
+def ask(path: Path) -> list[DeviceStatus]:
+    """The daemon's own account."""
+    with Client(str(path)) as client:
+        return list(client.status())

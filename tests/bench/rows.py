@@ -1,0 +1,23 @@
+"""A measurement as it is printed and written to build/bench.json."""
+
+from typing import NamedTuple
+
+
+class Row(NamedTuple):
+    """One figure. `reach` is what was aimed at in words, `reached` whether it was; both empty for a plain figure."""
+
+    name: str
+    value: float
+    unit: str
+    reach: str = ""
+    reached: bool | None = None
+
+
+def at_most(name: str, value: float, unit: str, limit: float) -> Row:
+    """A figure that should not exceed `limit`."""
+    return Row(name, value, unit, f"<= {limit:g}", value <= limit)
+
+
+def at_least(name: str, value: float, unit: str, limit: float) -> Row:
+    """A figure that should not fall below `limit`."""
+    return Row(name, value, unit, f">= {limit:g}", value >= limit)

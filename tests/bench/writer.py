@@ -1,0 +1,99 @@
+"""A process that plays N HiPNUC modules into N ptys at a fixed rate, as cheaply as Python can.
+
+Prints one line with the slave paths, waits for a line on standard input, writes, prints how many frames each pty took.
+Frame i carries i in its pressure field, and the time of its write stands in an array of i64 in the file `--times`, so
+that a reader knows each sample's true moment without any cost on the measured side.
+"""
+
+import argparse
+import binascii
+import mmap
+import os
+import pty
+import struct
+import sys
+import time
+import tty
+
+from imud.devices.hipnuc.frames import encode_hi91
+
+LATE_LIMIT_NS = 50_000_000
+"""A writer this late has lost its deadlines: it counts them and starts anew."""
+
+
+def open_ptys(count: int) -> list[tuple[int, int]]:
+    """`count` raw pty pairs; the slave stays open here so that a reader may come and go."""
+    pairs = []
+    for _ in range(count):
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        pairs.append((master, slave))
+    return pairs
+
+
+def template() -> bytearray:
+    """A HI91 frame to patch: pressure at 10, system time at 14, CRC at 4 (offsets in the frame)."""
+    frame = encode_hi91(
+        system_time_ms=0,
+        accel_m_s2=(0.1, 0.2, 9.8),
+        gyro_rad_s=(0.01, 0.02, 0.03),
+        mag_t=(2e-5, 1e-6, -4e-5),
+        euler_rad=(0.1, 0.2, 0.3),
+        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
+        temperature_c=30.0,
+        pressure_pa=0.0,
+    )
+    return bytearray(frame)
+
+
+def play(masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap) -> int:
+    """Write `frames` frames to every master, in `phases` groups spread over each period; return how many were refused."""
+    frame = template()
+    crc, pack = binascii.crc_hqx, struct.pack_into
+    head = crc(bytes(frame[:4]), 0)
+    period_ns = int(1e9 / rate_hz)
+    groups = [masters[i::phases] for i in range(phases)]
+    refused = 0
+    start_ns = time.monotonic_ns() + 10_000_000
+    for i in range(frames):
+        pack("<f", frame, 10, float(i))
+        pack("<I", frame, 14, int(i * 1000 / rate_hz))
+        pack("<H", frame, 4, crc(frame[6:], head))
+        for phase, group in enumerate(groups):
+            due_ns = start_ns + i * period_ns + phase * period_ns // phases
+            wait_ns = due_ns - time.monotonic_ns()
+            if wait_ns > 0:
+                time.sleep(wait_ns / 1e9)
+            elif wait_ns < -LATE_LIMIT_NS:
+                start_ns -= wait_ns
+            if phase == 0:
+                pack("<q", times, 8 * i, time.monotonic_ns())
+            for master in group:
+                try:
+                    os.write(master, frame)
+                except BlockingIOError:
+                    refused += 1
+    return refused
+
+
+def main() -> None:
+    """Run as `python -m tests.bench.writer`."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--devices", type=int, default=1)
+    parser.add_argument("--rate", type=float, default=1000.0)
+    parser.add_argument("--frames", type=int, required=True)
+    parser.add_argument("--phases", type=int, default=1)
+    parser.add_argument("--times", required=True)
+    args = parser.parse_args()
+    with open(args.times, "r+b") as file:
+        times = mmap.mmap(file.fileno(), 8 * args.frames)
+    pairs = open_ptys(args.devices)
+    print(*(os.ttyname(slave) for _, slave in pairs), flush=True)
+    sys.stdin.readline()
+    print(play([master for master, _ in pairs], args.rate, args.frames, args.phases, times), flush=True)
+    sys.stdin.readline()
+
+
+if __name__ == "__main__":
+    main()
