@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     ledger = Ledger()
     write = sys.stdout.write
     try:
-        with sys.stdin.buffer if args.file == "-" else open(args.file, "rb") as file:  # noqa: SIM115 - it is closed here
+        with sys.stdin.buffer if args.file == "-" else open(args.file, "rb") as file:
             for line in decode(file, driver, ledger):
                 write(line)
     except OSError as error:

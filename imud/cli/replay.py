@@ -24,7 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--driver", default="hipnuc-uart", choices=sorted(DRIVERS), help="default: %(default)s")
     parser.add_argument("--speed", default="maximum", choices=SPEEDS, help="default: %(default)s")
     parser.add_argument("--baud", type=int, default=115200, help="rate of a raw capture (default: %(default)s)")
-    parser.add_argument("--socket", type=Path, metavar="PATH", help="serve the samples on this socket, as the daemon does")
+    parser.add_argument(
+        "--socket", type=Path, metavar="PATH", help="serve the samples on this socket, as the daemon does"
+    )
     parser.add_argument("--json", action="store_true", help="print every sample, one JSON object per line")
 
 

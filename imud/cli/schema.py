@@ -2,10 +2,7 @@
 
 import argparse
 
-import msgspec
-
-from imud.cli.connect import add_socket, connect
-from imud.cli.table import table
+from imud.cli.connect import add_socket
 
 HEAD = ("FIELD", "TYPE", "UNIT", "MEANING")
 
