@@ -66,6 +66,7 @@ class Daemon:
 
     async def run(self) -> None:
         """Run until stopped. Raises ServerError when an output cannot start, and whatever a device's task died of."""
+        asyncio.get_running_loop().set_exception_handler(self._on_loop_error)
         try:
             for name, settings in self.config.publishers.items():
                 self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
@@ -165,6 +166,13 @@ class Daemon:
             self._stop.set()
         if self._until_finished and self.finished:
             self._stop.set()
+
+    def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
+        """A callback that raised is a mistake of ours: end with it instead of limping on."""
+        error = context.get("exception")
+        log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
+        self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
+        self._stop.set()
 
     def _publish(self, batch: Batch) -> None:
         for publish in self._sinks:

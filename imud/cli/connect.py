@@ -1,18 +1,20 @@
-"""What the commands that ask a running daemon share: the socket option and the connection."""
+"""What the commands that ask a running daemon share: the socket option, the connection, the status."""
 
 import argparse
 import os
 
-from imud.client import Client
+import msgspec
 
-DEFAULT_SOCKET = "/run/imud/imud.sock"
+from imud.client import Client
+from imud.kit.jsonrpc import DEFAULT_PATH
+from imud.kit.status import DeviceStatus
 
 
 def add_socket(parser: argparse.ArgumentParser) -> None:
     """`--socket PATH`, with the environment variable IMUD_SOCKET as its default."""
     parser.add_argument(
         "--socket",
-        default=os.environ.get("IMUD_SOCKET", DEFAULT_SOCKET),
+        default=os.environ.get("IMUD_SOCKET", DEFAULT_PATH),
         metavar="PATH",
         help="the daemon's socket (default: $IMUD_SOCKET or %(default)s)",
     )
@@ -21,3 +23,8 @@ def add_socket(parser: argparse.ArgumentParser) -> None:
 def connect(args: argparse.Namespace) -> Client:
     """A connection to the daemon. Raises LinkMissing, LinkDenied, ServerError with what to look at."""
     return Client(args.socket)
+
+
+def statuses(client: Client) -> list[DeviceStatus]:
+    """The state of every device."""
+    return msgspec.convert(client.status()["devices"], list[DeviceStatus])

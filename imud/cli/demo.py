@@ -18,6 +18,7 @@ from time import monotonic, sleep
 import msgspec
 
 from imud.cli.demo_view import View
+from imud.cli.connect import statuses
 from imud.cli.status import block, closes
 from imud.client import Client
 from imud.errors import ImudError, LinkMissing
@@ -63,7 +64,7 @@ def show(path: Path, args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         pass
     with Client(str(path)) as client:
-        status = client.status()[0]
+        status = statuses(client)[0]
     view.end()
     print(block(status))
     print(view.account())
@@ -83,7 +84,7 @@ def simulator(folder: Path, device: str, rate_hz: float) -> Iterator[None]:
         device,
         "--rate",
         str(rate_hz),
-        "--link",
+        "--path",
         str(folder / "port"),
     ]
     with child(argv, "the simulator", stdout=subprocess.PIPE) as process:

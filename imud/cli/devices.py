@@ -2,7 +2,7 @@
 
 import argparse
 
-from imud.cli.connect import add_socket, connect
+from imud.cli.connect import add_socket, connect, statuses
 from imud.cli.table import table
 
 HEAD = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the table; 1 when no device is running."""
     with connect(args) as client:
-        devices = client.status()
+        devices = statuses(client)
     rows = [
         (
             d.name,

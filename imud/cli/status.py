@@ -4,7 +4,7 @@ import argparse
 
 import msgspec
 
-from imud.cli.connect import add_socket, connect
+from imud.cli.connect import add_socket, connect, statuses
 from imud.kit.status import DeviceStatus
 from imud.units import NS_PER_MS, NS_PER_US
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print one block per device; 1 when a ledger does not close or a device does not run."""
     with connect(args) as client:
-        devices = client.status()
+        devices = statuses(client)
     if args.json:
         print(msgspec.json.encode(devices).decode())
     else:

@@ -18,6 +18,7 @@ from imud.errors import CommandError, LinkError, LinkMissing, NothingHeard
 from imud.event import Event, EventKind
 from imud.kit.batch import Batch
 from imud.kit.driver import Identity, StreamDriver
+from imud.kit.link import StreamLink
 from imud.kit.status import ClockStatus, DeviceState, DeviceStatus
 from imud.ledger import Ledger
 from imud.links import LINKS
@@ -63,12 +64,13 @@ class DeviceRunner:
         self._publish = publish
         self._notices = Notices(config.name, self.ledger, tell)
         self._remembered = remembered
-        self._link = LINKS[config.link].make(config.link_settings)
-        self._talk = Talk(self.ledger, self._link.write)
+        self.link: StreamLink = LINKS[config.link].make(config.link_settings)
+        self._talk = Talk(self.ledger, self.link.write)
         self._driver: StreamDriver | None = None
         self._clock: SampleClock | None = None
         self._path: SamplePath | None = None
         self._take: Callable[[bytes, int], None] = self._ignore
+        self._finder: Finder | None = None
         self._identity = Identity()
         self._settings: Mapping[str, str] = {}
         self._rate = RateMeter()
@@ -81,10 +83,10 @@ class DeviceRunner:
         """Keep the device alive until cancelled, or until a replay ends."""
         while True:
             try:
-                await self._link.wait_present()
-                if await self._live() is None:
-                    self._set(DeviceState.FINISHED)
-                    return
+                await self.link.wait_present()
+                await self._live()
+                self._set(DeviceState.FINISHED)
+                return
             except LinkMissing as error:
                 self._down(DeviceState.MISSING, str(error))
             except LinkError as error:
@@ -104,60 +106,70 @@ class DeviceRunner:
 
     def close(self) -> None:
         """Release the link; may be called twice."""
-        self._link.close()
+        self.link.close()
         self._take = self._ignore
 
     # --- the link's life -----------------------------------------------------------------------------------------
 
-    async def _live(self) -> LinkError | None:
-        """From open to the end of the link. Raises LinkError; returns None after the regular end of a replay."""
-        self._link.open()
+    async def _live(self) -> None:
+        """From open to the end of the link; returns at the regular end of a replay. Raises LinkError."""
+        self.link.open()
         self._connects += 1
+        self._problem = ""
         ended = self._ended = asyncio.get_running_loop().create_future()
-        self._link.start(self._receive, self._on_end)
+        self.link.start(self._receive, self._on_end)
+        self._seek()
         working = asyncio.create_task(self._work(), name=f"{self.config.name} work")
         try:
             await asyncio.wait({working, ended}, return_when=asyncio.FIRST_COMPLETED)
-            if ended.done():
-                error = ended.result()
-                if error is not None:
-                    raise error
-                return None
-            await working
-            return LinkError("unreachable: the work of a device ends only with its link")
+            if not ended.done():
+                await working  # it ends before its link only by an error
+            elif error := ended.result():
+                raise error
         finally:
             working.cancel()
             await asyncio.gather(working, return_exceptions=True)
+            self._end_search()
             self.close()
             if self._path is not None:
                 self._path.codec.reset()
 
+    def _end_search(self) -> None:
+        if self._finder is not None:
+            self._finder.cancel()
+            self._finder = None
+
     async def _work(self) -> None:
+        """Find, ask, and find again when told so; ends only with the link."""
         while True:
-            self._search_again.clear()
-            finding = await self._find()
-            self._begin(finding)
-            if self.config.identify and self._link.writable:
+            while self._finder is not None:
+                try:
+                    await self._finder.finished()
+                    self._finder = None
+                except NothingHeard as error:
+                    self._complain(str(error))
+                    self._seek()
+            if self._may_ask:
                 await self._identify()
             await self._search_again.wait()
+            self._seek()
 
-    async def _find(self) -> Finding:
-        """Search until something is found; a named driver at a fixed rate needs no search."""
-        self._set(DeviceState.SEARCHING)
-        config, link = self.config, self._link
-        if config.driver != "auto" and not link.auto_baud:
-            return Finding(DRIVERS[config.driver], link.baud, ())
-        while True:
-            finder = Finder(config, link, self.ledger, self._remembered.get(config.name))
-            self._take = finder.take
-            try:
-                return await finder.run()
-            except NothingHeard as error:
-                self._complain(str(error))
+    def _seek(self) -> None:
+        """Begin a search, or take what comes at once where driver and rate are given."""
+        self._search_again.clear()
+        self.state = DeviceState.SEARCHING
+        config, link = self.config, self.link
+        if not self._searchable:
+            self._begin(Finding(DRIVERS[config.driver], ()))
+            return
+        last = self._remembered.get(config.name)
+        self._finder = Finder(config, link, self.ledger, last, self._begin, may_ask=self._may_ask)
+        self._take = self._finder.take
+        self._finder.start()
 
     def _begin(self, finding: Finding) -> None:
         """Set up codec and clock for what was found, and give them what was heard during the search."""
-        driver, link = finding.driver, self._link
+        driver, link = finding.driver, self.link
         if self._path is None or self._clock is None or driver is not self._driver:
             self._driver = driver
             self._clock = self._new_clock(driver)
@@ -171,19 +183,27 @@ class DeviceRunner:
         self._clock.link_changed(byte_ns=uart_byte_ns(link.baud), hold_ns=link.hold_ns)
         self._path.loss.link_opened()
         self._path.begin(monotonic_ns())
-        if link.auto_baud or self.config.driver == "auto":
+        if self._searchable:
             self._remembered.put(self.config.name, Found(driver.name, link.baud))
         self._take = self._path.on_data
         for data, t_rx_ns in finding.chunks:
             self._path.on_data(data, t_rx_ns)
+
+    @property
+    def _searchable(self) -> bool:
+        return self.link.auto_baud or self.config.driver == "auto"
+
+    @property
+    def _may_ask(self) -> bool:
+        return self.config.identify and self.link.writable
 
     def _new_clock(self, driver: StreamDriver) -> SampleClock:
         clock = SampleClock(
             self.config.name,
             tick_ns=driver.tick_ns,
             tick_modulus=driver.tick_modulus,
-            byte_ns=uart_byte_ns(self._link.baud),
-            hold_ns=self._link.hold_ns,
+            byte_ns=uart_byte_ns(self.link.baud),
+            hold_ns=self.link.hold_ns,
         )
         if self._clock is not None:
             clock.follow(self._clock)
@@ -251,9 +271,8 @@ class DeviceRunner:
             self._complain(f"bytes come on {self._where()}, but no valid frame: wrong baud rate or device?")
         elif self.state is DeviceState.SEARCHING:
             self._complain(f"nothing is heard on {self._where()}: is it powered, are TX and RX swapped?")
-        searchable = self._link.auto_baud or self.config.driver == "auto"
         silent_long = self.state is DeviceState.SILENT and now_ns - self._silent_since_ns > SILENT_SEARCH_NS
-        if searchable and (unheard or silent_long):
+        if self._searchable and (unheard or silent_long):
             self._search_again.set()
 
     def _silence_limit_ns(self) -> int:
@@ -263,7 +282,7 @@ class DeviceRunner:
     def _up(self, now_ns: int, path: SamplePath) -> None:
         self._set(DeviceState.RUNNING)
         driver = self._driver.name if self._driver else ""
-        self._notices.tell(now_ns, EventKind.UP, f"{driver} on {self._where()}", driver=driver, baud=self._link.baud)
+        self._notices.tell(now_ns, EventKind.UP, f"{driver} on {self._where()}", driver=driver, baud=self.link.baud)
 
     def _down(self, state: DeviceState, problem: str) -> None:
         was_up = self.state in (DeviceState.RUNNING, DeviceState.SILENT)
@@ -283,10 +302,10 @@ class DeviceRunner:
         self.state, self._problem = state, problem
 
     def _overruns(self) -> int:
-        return self._link.kernel_counters().overrun
+        return self.link.kernel_counters().overrun
 
     def _where(self) -> str:
-        return f"{self._link.title} at {self._link.baud} baud" if self._link.baud else self._link.title
+        return f"{self.link.title} at {self.link.baud} baud" if self.link.baud else self.link.title
 
     # --- what it looks like from outside ---------------------------------------------------------------------------
 
@@ -310,7 +329,7 @@ class DeviceRunner:
             newest_seq=newest.seq if newest else 0,
             clock=clock.status() if clock else ClockStatus(),
             ledger=self.ledger.snapshot(),
-            kernel=self._link.kernel_counters(),
+            kernel=self.link.kernel_counters(),
             latency_buckets=tuple(latency.buckets),
             latency_sum_ns=latency.sum_ns,
             temperature_c=newest.temperature_c if newest else None,

@@ -40,12 +40,12 @@ class Talk:
 
     async def _ask(self, request: Request) -> Outcome:
         loop = asyncio.get_running_loop()
-        self._write(self._session.start(request, monotonic_ns()))
-        if request.silent:
-            return Reply(())
-        self._outcome = loop.create_future()
         timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
         try:
+            self._write(self._session.start(request, monotonic_ns()))
+            if request.silent:
+                return Reply(())
+            self._outcome = loop.create_future()
             return await self._outcome
         finally:
             timer.cancel()

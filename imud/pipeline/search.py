@@ -1,0 +1,123 @@
+"""Runs a detection (`imud.detect`, without I/O) on an open link: sets rates, sends queries, keeps its time."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic_ns
+
+from imud.config import DeviceConfig
+from imud.detect import Found, GaveUp, Listen, Search, Step
+from imud.devices import DRIVERS
+from imud.errors import LinkError, NothingHeard
+from imud.kit.driver import StreamDriver
+from imud.kit.link import StreamLink
+from imud.ledger import Ledger
+from imud.pipeline import remembered
+from imud.units import NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What talks on a link, and what was heard of it while searching."""
+
+    driver: StreamDriver
+    chunks: tuple[tuple[bytes, int], ...]
+    """Bytes with CLOCK_MONOTONIC of their reads, taken out of the ledger again for the device's own codec to count."""
+
+
+class Finder:
+    """One round of detection. `on_found` is called inside the callback that completed it, so that the next bytes
+    already go to the device's own codec. Synchronization: the event loop's thread only.
+    """
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        link: StreamLink,
+        ledger: Ledger,
+        last: remembered.Found | None,
+        on_found: Callable[[Finding], None],
+        *,
+        may_ask: bool,
+    ) -> None:
+        self._link = link
+        self._ledger = ledger
+        self._on_found = on_found
+        named = config.driver != "auto"
+        self._search = Search(
+            [DRIVERS[config.driver]] if named else list(DRIVERS.values()),
+            bauds=() if link.auto_baud else (link.baud,),
+            remembered=(last.driver, last.baud) if last else None,
+            may_ask=may_ask,
+            hold_ns=link.hold_ns,
+            options=config.options if named else None,
+        )
+        self._timer: asyncio.TimerHandle | None = None
+        self._done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def start(self) -> None:
+        """Begin; from now on bytes go to `take`."""
+        self._follow(self._search.start(monotonic_ns()))
+
+    async def finished(self) -> None:
+        """Return when a device was found. Raises NothingHeard with what was heard instead, and LinkError."""
+        try:
+            await self._done
+        finally:
+            self.cancel()
+
+    def cancel(self) -> None:
+        """Stop searching; may be called twice."""
+        if self._timer is not None:
+            self._timer.cancel()
+        if not self._done.done():
+            self._done.cancel()
+
+    def take(self, data: bytes, t_rx_ns: int) -> None:
+        """Bytes from the link; they count as skipped until a device is found in them."""
+        self._ledger.bytes_in += len(data)
+        self._ledger.bytes_skipped += len(data)
+        if not self._done.done():
+            self._follow(self._search.on_data(data, t_rx_ns))
+
+    def _on_time(self) -> None:
+        """The loop's timer; it may fire a little early against CLOCK_MONOTONIC, then the search says nothing new."""
+        if not self._done.done():
+            step = self._search.on_time(monotonic_ns())
+            if step is None:
+                self._timer = asyncio.get_running_loop().call_later(0.001, self._on_time)
+            else:
+                self._follow(step)
+
+    def _follow(self, step: Step | None) -> None:
+        while isinstance(step, Listen):
+            step = self._listen(step)
+        if isinstance(step, GaveUp):
+            self._done.set_exception(NothingHeard(step.summary))
+        elif step is not None:
+            self._finish(step)
+
+    def _finish(self, found: Found) -> None:
+        heard = sum(len(data) for data, _ in found.chunks)
+        self._ledger.bytes_in -= heard
+        self._ledger.bytes_skipped -= heard
+        self._done.set_result(None)
+        self._on_found(Finding(found.driver, found.chunks))
+
+    def _listen(self, step: Listen) -> Step | None:
+        if self._timer is not None:
+            self._timer.cancel()
+        if step.baud != self._link.baud:
+            try:
+                self._link.set_baud(step.baud)
+            except LinkError as error:
+                return self._search.refused(str(error), monotonic_ns())
+        if step.send:
+            try:
+                self._link.write(step.send)
+            except LinkError as error:
+                self._done.set_exception(error)
+                return None
+        delay_s = max(0, step.until_ns - monotonic_ns()) / NS_PER_S
+        self._timer = asyncio.get_running_loop().call_later(delay_s, self._on_time)
+        return None

@@ -1,0 +1,132 @@
+"""Conversations over a line that is also used by others: in order, one at a time, late and missing replies apart."""
+
+import asyncio
+
+import pytest
+
+from imud.devices import DRIVERS
+from imud.errors import LinkMissing, NoReply
+from imud.kit.session import Conversation, Outcome, Reply, Request, Silence
+from imud.ledger import Ledger
+from imud.pipeline.talk import Talk
+
+
+def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
+    return Request(
+        payload=name.encode() + b"\r\n",
+        name=name,
+        is_end=lambda text: text == "OK",
+        is_rejection=lambda text: text.startswith("ERR"),
+        is_part=lambda text: text.startswith(name),
+        timeout_ns=timeout_ns,
+        silent=silent,
+    )
+
+
+def ask(*requests: Request) -> Conversation[list[Outcome]]:
+    outcomes = []
+    for one in requests:
+        outcomes.append((yield one))
+    return outcomes
+
+
+def test_requests_go_out_one_after_the_other() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        talk = Talk(Ledger(), written.append)
+        task = asyncio.create_task(talk.hold(ask(request("A"), request("B"))))
+        await asyncio.sleep(0)
+        assert written == [b"A\r\n"]
+        talk.on_text("A=1", 0)
+        talk.on_text("OK", 0)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert written == [b"A\r\n", b"B\r\n"]
+        talk.on_text("ERR", 0)
+        outcomes = await task
+        assert outcomes[0] == Reply(("A=1", "OK"))
+        assert outcomes[1].lines == ("ERR",)
+
+    asyncio.run(story())
+
+
+def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
+    async def story() -> None:
+        ledger = Ledger()
+        talk = Talk(ledger, lambda data: None)
+        assert await talk.hold(ask(request("A", timeout_ns=1))) == [Silence(())]
+        talk.on_text("A=1", 0)
+        talk.on_text("OK", 0)
+        assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
+        talk.on_text("OK", 0)
+        assert ledger.replies_unsolicited == 1
+
+    asyncio.run(story())
+
+
+def test_request_without_reply_is_done_once_sent() -> None:
+    async def story() -> None:
+        talk = Talk(Ledger(), lambda data: None)
+        assert await talk.hold(ask(request("REBOOT", silent=True))) == [Reply(())]
+
+    asyncio.run(story())
+
+
+def test_link_that_is_gone_ends_the_conversation_and_the_next_one_works() -> None:
+    async def story() -> None:
+        gone = True
+
+        def write(data: bytes) -> None:
+            if gone:
+                raise LinkMissing("pulled out")
+
+        talk = Talk(Ledger(), write)
+        with pytest.raises(LinkMissing):
+            await talk.hold(ask(request("A")))
+        gone = False
+        assert await talk.hold(ask(request("B", silent=True))) == [Reply(())]
+
+    asyncio.run(story())
+
+
+def test_second_conversation_waits_for_the_first() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        talk = Talk(Ledger(), written.append)
+        first = asyncio.create_task(talk.hold(ask(request("A"))))
+        second = asyncio.create_task(talk.hold(ask(request("B"))))
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert written == [b"A\r\n"]
+        talk.on_text("OK", 0)
+        await first
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert written == [b"A\r\n", b"B\r\n"]
+        talk.on_text("OK", 0)
+        await second
+
+    asyncio.run(story())
+
+
+def test_cancelled_conversation_leaves_the_line_free() -> None:
+    async def story() -> None:
+        talk = Talk(Ledger(), lambda data: None)
+        task = asyncio.create_task(talk.hold(ask(request("A"))))
+        await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        assert await talk.hold(ask(request("B", silent=True))) == [Reply(())]
+
+    asyncio.run(story())
+
+
+def test_device_that_never_answers_is_no_reply() -> None:
+    async def story() -> None:
+        talk = Talk(Ledger(), lambda data: None)
+        conversation = DRIVERS["hipnuc-uart"].identify()
+        task = asyncio.create_task(talk.hold(conversation))
+        with pytest.raises(NoReply, match="LOG VERSION"):
+            await asyncio.wait_for(task, 5)
+
+    asyncio.run(story())
