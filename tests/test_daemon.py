@@ -1,0 +1,230 @@
+"""The daemon as a process: it comes back when the cable does, reads its configuration again, and dies with a reason."""
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import tty
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.client import Ring
+from imud.devices.hipnuc.frames import encode_hi91
+from tests.running import RunningDaemon, running_daemon, wait_until, write_config
+
+
+def frame(ms: int) -> bytes:
+    return encode_hi91(
+        system_time_ms=ms,
+        accel_m_s2=(0.0, 0.0, 9.8),
+        gyro_rad_s=(0.0, 0.0, 0.0),
+        mag_t=(0.0, 0.0, 0.0),
+        euler_rad=(0.0, 0.0, 0.0),
+        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
+        temperature_c=20.0,
+        pressure_pa=1e5,
+    )
+
+
+class Cable:
+    """A pty whose slave has a stable name, as an adapter has below /dev/serial/by-id."""
+
+    def __init__(self, name: Path) -> None:
+        self.name = name
+        self.ms = 0
+        self.plug()
+
+    def plug(self) -> None:
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.name.symlink_to(os.ttyname(slave))
+        self.slave: int | None = slave
+
+    def hold_no_more(self) -> None:
+        """Let only the daemon have the slave open."""
+        if self.slave is not None:
+            os.close(self.slave)
+            self.slave = None
+
+    def unplug(self) -> None:
+        self.name.unlink()
+        self.hold_no_more()
+        os.close(self.master)
+
+    def send(self, frames: int = 1) -> None:
+        for _ in range(frames):
+            self.ms += 10
+            os.write(self.master, frame(self.ms))
+
+
+@contextmanager
+def cable(folder: Path) -> Iterator[Cable]:
+    one = Cable(folder / "port")
+    try:
+        yield one
+    finally:
+        one.unplug()
+
+
+def device(path: Path, **more: Any) -> dict[str, Any]:
+    return {"driver": "hipnuc-uart", "identify": False, "uart": {"port": str(path), "baud": 115200}, **more}
+
+
+def samples(daemon: RunningDaemon, name: str = "bow") -> int:
+    return daemon.statuses()[name].ledger["samples"]
+
+
+def test_back_within_a_second_of_the_node(tmp_path: Path) -> None:
+    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
+        daemon.wait_for("bow", "searching")
+        port.send(5)
+        wait_until(lambda: samples(daemon) == 5, "five samples")
+        port.unplug()
+        daemon.wait_for("bow", "missing")
+        port.plug()
+        plugged = monotonic()
+        wait_until(lambda: daemon.statuses()["bow"].connects == 2, "the port is open again")
+        assert monotonic() - plugged < 1.0
+        port.send(5)
+        wait_until(lambda: samples(daemon) == 10, "five more samples")
+        status = daemon.statuses()["bow"]
+        assert status.newest_seq == 10
+        assert status.ledger["bytes_in"] == 10 * 82
+        assert status.ledger["bytes_in_good_frames"] == 10 * 82
+
+
+def test_port_that_appears_later_is_taken(tmp_path: Path) -> None:
+    with running_daemon(tmp_path, {"bow": device(tmp_path / "port")}) as daemon:
+        assert daemon.wait_for("bow", "missing").connects == 0
+        with cable(tmp_path) as port:
+            daemon.wait_for("bow", "searching")
+            port.send(3)
+            daemon.wait_for("bow", "running")
+
+
+def test_reload_changes_what_differs_and_keeps_the_rest(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    with cable(tmp_path / "a") as bow, cable(tmp_path / "b") as stern:
+        with running_daemon(tmp_path, {"bow": device(bow.name)}) as daemon:
+            daemon.wait_for("bow", "searching")
+            bow.send(3)
+            wait_until(lambda: samples(daemon) == 3, "three samples")
+            write_config(tmp_path, {"bow": device(bow.name), "stern": device(stern.name)})
+            daemon.signal(signal.SIGHUP)
+            wait_until(lambda: "stern" in daemon.statuses(), "the new device is there")
+            daemon.wait_for("stern", "searching")
+            stern.send(2)
+            wait_until(lambda: samples(daemon, "stern") == 2, "samples of the new device")
+            assert samples(daemon) == 3
+            assert daemon.statuses()["bow"].connects == 1
+            assert Ring(tmp_path / "imud.stern").newest_seq == 2
+            write_config(tmp_path, {"stern": device(stern.name)})
+            daemon.signal(signal.SIGHUP)
+            wait_until(lambda: "bow" not in daemon.statuses(), "the old device is gone")
+            assert not (tmp_path / "imud.bow").exists()
+            assert samples(daemon, "stern") == 2
+
+
+def test_bad_new_file_leaves_the_old_running(tmp_path: Path) -> None:
+    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
+        daemon.wait_for("bow", "searching")
+        with daemon.client() as client:
+            events = client.events(timeout_s=10)
+            (tmp_path / "imud.yaml").write_text("devices:\n  bow:\n    baudd: 9600\n")
+            daemon.signal(signal.SIGHUP)
+            event = next(events)
+            assert event.kind == "configuration"
+            assert "imud.yaml:3" in event.message
+            assert "baudd" in event.message
+        port.send(2)
+        wait_until(lambda: samples(daemon) == 2, "samples still flow")
+
+
+def test_second_daemon_is_refused_with_the_reason(tmp_path: Path) -> None:
+    with running_daemon(tmp_path, {}) as daemon:
+        again = subprocess.run(
+            [sys.executable, "-m", "imud", "run", "--config", str(tmp_path / "imud.yaml")],
+            capture_output=True, text=True, timeout=20, check=False,
+        )  # fmt: skip
+        assert again.returncode == 2
+        assert re.search(r"imud run: .*imud\.sock", again.stderr)
+        assert "Traceback" not in again.stderr
+        assert daemon.statuses() == {}
+
+
+def test_port_in_use_is_told_and_taken_when_free(tmp_path: Path) -> None:
+    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as first:
+        first.wait_for("bow", "searching")
+        other = tmp_path / "other"
+        other.mkdir()
+        with running_daemon(other, {"bow": device(port.name)}) as second:
+            status = second.wait_for("bow", "failed")
+            assert str(port.name) in status.problem
+            first.signal(signal.SIGTERM)
+            second.wait_for("bow", "searching")
+            port.send(3)
+            second.wait_for("bow", "running")
+        first.socket.touch()  # the first has removed it, which its own end checks
+        first.socket.unlink()
+
+
+def test_metrics_and_socket_and_shared_memory_show_the_same_ledger(tmp_path: Path) -> None:
+    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
+        daemon.wait_for("bow", "searching")
+        port.send(4)
+        os.write(port.master, b"\x00garbage\xff" + frame(1)[:50])
+        wait_until(lambda: daemon.statuses()["bow"].ledger["bytes_in"] == 4 * 82 + 59, "all bytes are in")
+        ledger = daemon.statuses()["bow"].ledger
+        with Ring(tmp_path / "imud.bow") as ring:
+            wait_until(lambda: ring.ledger() == ledger, "the ring shows the same ledger")
+        log = (tmp_path / "log").read_text()
+        found = re.search(r"http://[\d.]+:(\d+)", log)
+        assert found, log
+        with urllib.request.urlopen(f"http://127.0.0.1:{found[1]}/metrics", timeout=5) as answer:
+            text = answer.read().decode()
+        assert f'imud_bytes_in_total{{device="bow"}} {float(ledger["bytes_in"])}' in text
+        assert f'imud_samples_total{{device="bow"}} {float(ledger["samples"])}' in text
+
+
+def test_found_device_is_remembered_over_a_restart(tmp_path: Path) -> None:
+    auto = {"driver": "auto", "identify": False, "uart": {"port": str(tmp_path / "port"), "baud": "auto"}}
+    with cable(tmp_path) as port:
+        with running_daemon(tmp_path, {"bow": auto}) as daemon:
+            daemon.wait_for("bow", "searching")
+
+            def heard() -> bool:
+                port.send(1)
+                return daemon.statuses()["bow"].state == "running"
+
+            wait_until(heard, "the device is found")
+        remembered = msgspec.json.decode((tmp_path / "found.json").read_bytes())
+        assert remembered["bow"]["driver"] == "hipnuc-uart"
+
+
+def test_missing_configuration_is_one_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "imud", "run", "-c", str(tmp_path / "none.yaml")],
+        capture_output=True, text=True, timeout=20, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "none.yaml" in done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
+    with running_daemon(tmp_path, {}) as daemon:
+        daemon.signal(number)
+        assert daemon.process.wait(10) == 0
+        daemon.socket.touch()
+        daemon.socket.unlink()

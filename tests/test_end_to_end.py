@@ -1,0 +1,104 @@
+"""The whole way, through real processes: bytes into a pty, samples out of the socket and out of shared memory."""
+
+import csv
+import os
+import pty
+import struct
+import tty
+from collections.abc import Iterator
+from math import radians
+from pathlib import Path
+
+import pytest
+
+from imud.client import Ring
+from imud.devices.hipnuc.frames import encode_hi91
+from imud.sample import Sample
+from tests.running import SHARED, running_daemon, wait_until
+
+RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
+G = 9.8
+
+
+@pytest.fixture
+def port() -> Iterator[tuple[int, str]]:
+    """The master of a raw pty, and the path of its slave, which stays open."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+def f32(value: float) -> float:
+    """The nearest 32-bit float, as the wire carries it."""
+    result: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    return result
+
+
+Row = dict[str, str]
+
+
+def frame(row: Row) -> bytes:
+    """A row of the recording as the module sent it."""
+    three = {name: tuple(float(row[f"{name}_{axis}"]) for axis in "xyz") for name in ("acc", "gyr", "mag")}
+    acc, gyr, mag = three["acc"], three["gyr"], three["mag"]
+    return encode_hi91(
+        system_time_ms=int(row["sys_time"]),
+        accel_m_s2=(acc[0] * G, acc[1] * G, acc[2] * G),
+        gyro_rad_s=(radians(gyr[0]), radians(gyr[1]), radians(gyr[2])),
+        mag_t=(mag[0] * 1e-6, mag[1] * 1e-6, mag[2] * 1e-6),
+        euler_rad=(radians(float(row["roll"])), radians(float(row["pitch"])), radians(float(row["yaw"]))),
+        quat_wxyz=(float(row["quat_w"]), float(row["quat_x"]), float(row["quat_y"]), float(row["quat_z"])),
+        temperature_c=float(row["temperature"]),
+        pressure_pa=float(row["pressure"]),
+        word_1_2=round(float(row["pps_sync_stamp"]) * 1000),
+    )
+
+
+def check(sample: Sample, row: Row) -> None:
+    """The sample says what the row says, to the precision of 32-bit floats."""
+    assert sample.t_dev_ns is not None
+    assert sample.t_dev_ns == int(row["sys_time"]) * 1_000_000
+    expected = {
+        "accel_m_s2": [f32(float(row[f"acc_{axis}"])) * G for axis in "xyz"],
+        "gyro_rad_s": [radians(f32(float(row[f"gyr_{axis}"]))) for axis in "xyz"],
+        "mag_t": [f32(float(row[f"mag_{axis}"])) * 1e-6 for axis in "xyz"],
+        "euler_rad": [radians(f32(float(row[name]))) for name in ("roll", "pitch", "yaw")],
+        "quat_wxyz": [f32(float(row[f"quat_{axis}"])) for axis in "wxyz"],
+    }
+    for name, values in expected.items():
+        assert getattr(sample, name) == pytest.approx(values, rel=2e-7, abs=1e-12), name
+    assert sample.temperature_c == float(row["temperature"])
+    assert sample.pressure_pa == pytest.approx(f32(float(row["pressure"])), rel=1e-7)
+    assert sample.pps_age_ms == round(float(row["pps_sync_stamp"]) * 1000)
+
+
+@pytest.mark.skipif(not RECORDING.exists(), reason=f"the recording {RECORDING} is not on this machine")
+def test_every_row_of_a_real_recording_arrives_on_both_ways(port: tuple[int, str], tmp_path: Path) -> None:
+    with RECORDING.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 1000
+    master, path = port
+    device = {"driver": "hipnuc-uart", "identify": False, "uart": {"port": path, "baud": 921600}}
+    with running_daemon(tmp_path, {"bow": device}) as daemon, daemon.client() as client:
+        daemon.wait_for("bow", "searching")
+        with Ring(tmp_path / "imud.bow") as ring:
+            watch = client.watch(timeout_s=10)
+            for row in rows:
+                os.write(master, frame(row))
+            by_socket = [next(watch) for _ in rows]
+            wait_until(lambda: ring.newest_seq == 1000, "the ring holds 1000 samples")
+            by_shm = ring.read()
+        ledger = daemon.wait_for("bow", "running").ledger
+    assert by_shm.missed == 0
+    assert by_shm.samples == by_socket
+    assert [sample.seq for sample in by_socket] == list(range(1, 1001))
+    for sample, row in zip(by_socket, rows, strict=True):
+        check(sample, row)
+        assert sample.t_ns <= sample.t_rx_ns
+    times = [sample.t_ns for sample in by_socket]
+    assert times == sorted(set(times))
+    assert ledger["bytes_in"] == ledger["bytes_in_good_frames"] == 1000 * 82
+    assert ledger["frames_good"] == ledger["frames_in_samples"] == ledger["samples"] == 1000
+    assert sum(ledger[name] for name in ledger if name.startswith("lost_")) == 0
