@@ -19,7 +19,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 LEAVES = LAYERS[3]
 IO_MODULES = {
-    "asyncio", "fcntl", "io", "os", "pathlib", "select", "serial", "socket", "subprocess", "termios", "threading", "time",
+    "asyncio", "fcntl", "io", "os", "pathlib", "select", "serial", "socket", "subprocess", "termios", "threading",
+    "time",
 }  # fmt: skip
 
 
@@ -88,7 +89,7 @@ def test_there_is_no_import_cycle() -> None:
     done: set[str] = set()
 
     def visit(name: str, trail: tuple[str, ...]) -> None:
-        assert name not in trail, f"import cycle: {' → '.join([*trail[trail.index(name):], name])}"
+        assert name not in trail, f"import cycle: {' → '.join([*trail[trail.index(name) :], name])}"
         if name not in done:
             for target in graph[name]:
                 visit(target, (*trail, name))

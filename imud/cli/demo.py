@@ -17,8 +17,8 @@ from time import monotonic, sleep
 
 import msgspec
 
-from imud.cli.demo_view import View
 from imud.cli.connect import statuses
+from imud.cli.demo_view import View
 from imud.cli.status import block, closes
 from imud.client import Client
 from imud.errors import ImudError, LinkMissing

@@ -1,7 +1,124 @@
-"""`imud probe`: list what is attached. Writes nothing to a port that it was not told to ask."""
+"""`imud probe`: list what is attached. Listens only; sends a query only to ports named with `--active`."""
 
 import argparse
+import asyncio
+import contextlib
+
+import msgspec
+
+from imud.cli.table import table
+from imud.config import DeviceConfig
+from imud.errors import CommandError, ImudError
+from imud.kit.codec import TextLine
+from imud.kit.driver import Identity
+from imud.kit.link import StreamLink
+from imud.ledger import Ledger
+from imud.links import LINKS
+from imud.pipeline.runner import identity_words
+from imud.pipeline.search import Finder, Finding
+from imud.pipeline.talk import Talk
+from imud.ports import list_ports
+
+HEAD = ("PORT", "DRIVER", "BAUD", "PRODUCT", "SERIAL NUMBER", "")
+
+
+class Report(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What stands at one port."""
+
+    port: str
+    title: str = ""
+    """What the adapter calls itself."""
+    driver: str = ""
+    baud: int = 0
+    identity: dict[str, str] = {}  # msgspec copies a mutable default
+    problem: str = ""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud probe`."""
+    parser.add_argument("port", nargs="*", metavar="PORT", help="ports to listen on (default: all of this machine)")
+    parser.add_argument("--active", action="append", default=[], metavar="PORT", help="a port that may be sent a query")
+    parser.add_argument("--json", action="store_true", help="one JSON object per port")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print one line per port; 1 when no device was found."""
+    titles = {port.path: port.title for port in list_ports()}
+    chosen = [*args.port, *args.active] or list(titles)
+    reports = asyncio.run(examine_all(list(dict.fromkeys(chosen)), set(args.active), titles))
+    if args.json:
+        for report in reports:
+            print(msgspec.json.encode(report).decode())
+    elif reports:
+        print(table(HEAD, [row(report) for report in reports]))
+    else:
+        print("no serial port on this machine: is the adapter plugged in, is the UART switched on?")
+    return 0 if any(report.driver for report in reports) else 1
+
+
+def row(report: Report) -> tuple[object, ...]:
+    """A report as a line of the table."""
+    identity = report.identity
+    return (
+        report.port,
+        report.driver or "-",
+        report.baud or "-",
+        identity.get("product", "-"),
+        identity.get("serial_number", "-"),
+        report.problem or report.title,
+    )
+
+
+async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]) -> list[Report]:
+    """All ports at the same time."""
+    return list(await asyncio.gather(*(examine(port, port in active, titles.get(port, "")) for port in ports)))
+
+
+async def examine(port: str, may_ask: bool, title: str) -> Report:
+    """Open a port, find what talks there, ask it who it is if that is allowed."""
+    settings = msgspec.convert({"port": port, "baud": "auto"}, LINKS["uart"].settings)
+    config = DeviceConfig("probe", "auto", None, may_ask, "uart", settings)
+    link = LINKS["uart"].make(settings)
+    try:
+        link.open()
+        found = await find(config, link)
+        identity = await ask(found, link) if may_ask else Identity()
+        return Report(port, title, found.driver.name, link.baud, identity_words(identity))
+    except ImudError as error:
+        return Report(port, title, problem=str(error))
+    finally:
+        link.close()
+
+
+async def find(config: DeviceConfig, link: StreamLink) -> Finding:
+    """One round of detection. Raises NothingHeard and LinkError."""
+    findings: list[Finding] = []
+    finder = Finder(config, link, Ledger(), None, findings.append, may_ask=config.identify)
+    ended = asyncio.get_running_loop().create_future()
+    link.start(finder.take, ended.set_result)
+    finder.start()
+    searching = asyncio.ensure_future(finder.finished())
+    await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
+    if not searching.done():
+        searching.cancel()
+        error = ended.result()
+        raise error if error is not None else ImudError(f"{link.title} ended")
+    await searching
+    return findings[0]
+
+
+async def ask(found: Finding, link: StreamLink) -> Identity:
+    """Who it is; nothing when it does not answer."""
+    ledger = Ledger()
+    codec = found.driver.make_codec(ledger, found.driver.settings())
+    talk = Talk(ledger, link.write)
+
+    def take(data: bytes, t_rx_ns: int) -> None:
+        for event in codec.feed(data):
+            if isinstance(event, TextLine):
+                talk.on_text(event.text, t_rx_ns)
+
+    link.start(take, lambda error: None)
+    with contextlib.suppress(CommandError):
+        return await talk.hold(found.driver.identify())
+    return Identity()

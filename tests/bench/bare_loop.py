@@ -14,6 +14,7 @@ import time
 import tty
 
 import msgspec
+
 from imud.devices.hipnuc.frames import encode_hi91  # noqa: F401 - the same start-up cost on both sides
 
 HEAD = struct.Struct("<2sHH")

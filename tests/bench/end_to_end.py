@@ -23,7 +23,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 def compare(load: Load, rounds: int) -> Iterator[Row]:
-    """The daemon and the bare loop in turns; the best round of each, as both share the machine with whatever else runs."""
+    """The daemon and the bare loop in turns, the best round of each: other programs share the machine."""
     pairs = [(run(load), run(replace(load, bare=True))) for _ in range(rounds)]
     imud = min((a for a, _ in pairs), key=lambda o: o.cpu_us_per_sample)
     bare = min((b for _, b in pairs), key=lambda o: o.cpu_us_per_sample)

@@ -13,6 +13,7 @@ from time import monotonic, sleep
 
 import msgspec
 
+from imud.cli.connect import statuses
 from imud.client import Client
 from imud.kit.status import DeviceStatus
 
@@ -86,7 +87,7 @@ class Process:
         assert self.popen.stdout is not None
         text = self.popen.stdout.readline()
         if not text:
-            raise RuntimeError(f"{self.popen.args} ended with {self.popen.wait()}")
+            raise RuntimeError(f"{self.popen.args!r} ended with {self.popen.wait()}")
         return text.strip()
 
     def say(self, text: str) -> None:
@@ -162,7 +163,7 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
     wait_for(path)
     end = monotonic() + START_LIMIT_S
     with Client(str(path)) as client:
-        while any(status.state != "searching" for status in client.status()):
+        while any(status.state != "searching" for status in statuses(client)):
             if monotonic() > end:
                 raise TimeoutError("the daemon did not open all ports")
             sleep(0.05)
@@ -221,4 +222,4 @@ def run(load: Load) -> Outcome:
 def ask(path: Path) -> list[DeviceStatus]:
     """The daemon's own account."""
     with Client(str(path)) as client:
-        return list(client.status())
+        return statuses(client)

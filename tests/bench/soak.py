@@ -1,4 +1,4 @@
-"""`make soak`: ten minutes at 1 kHz with ten clients and one that never reads. Nothing may be lost, memory may not grow."""
+"""`make soak`: ten minutes at 1 kHz, ten clients and one that never reads: nothing lost, memory flat."""
 
 import argparse
 import sys
@@ -65,7 +65,7 @@ def main() -> int:
     print(f"first client: {figures}")
     if points:
         print(
-            f"RSS {points[0][1]:.2f} MB at {points[0][0]:.0f} s, {points[-1][1]:.2f} MB at the end, slope {slope:+.3f} MB/h"
+            f"RSS {points[0][1]:.2f} MB at {points[0][0]:.0f} s, {points[-1][1]:.2f} MB at the end, {slope:+.3f} MB/h"
         )
     good = lost == 0 and refused == 0 and status.ledger["samples"] == load.frames and slope < SLOPE_LIMIT_MB_PER_H
     print("passed" if good and '"gaps": 0' in figures else "FAILED")

@@ -48,7 +48,7 @@ def template() -> bytearray:
 
 
 def play(masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap) -> int:
-    """Write `frames` frames to every master, in `phases` groups spread over each period; return how many were refused."""
+    """Write `frames` frames to every master, in `phases` groups over each period; return how many were refused."""
     frame = template()
     crc, pack = binascii.crc_hqx, struct.pack_into
     head = crc(bytes(frame[:4]), 0)

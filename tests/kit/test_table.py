@@ -28,7 +28,7 @@ def test_rows_lead_to_objects_that_know_their_name(table: Table[Any], kind: type
 
 
 def test_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(KeyError, match="no driver named 'bno055'; there are: .*hipnuc-uart"):
+    with pytest.raises(KeyError, match=r"no driver named 'bno055'; there are: .*hipnuc-uart"):
         DRIVERS["bno055"]
 
 

@@ -22,7 +22,9 @@ def test_unchanged_finding_does_not_write(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"bow": {"driver": 1, "baud": "x"}}', b"\xff\xfe"])
-def test_damaged_file_is_reported_and_replaced(tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_file_is_reported_and_replaced(
+    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / FILE_NAME).write_bytes(content)
     memory = Remembered(tmp_path)
     assert "cannot be used" in caplog.text
