@@ -1,0 +1,496 @@
+/* imud.h - reads the shared-memory rings of imud, the inertial sensor daemon. One header, C99 or C++, libc only.
+ *
+ *   imud_ring ring;
+ *   int error = imud_open(&ring, "imu0");             // or a path: "/dev/shm/imud.imu0"
+ *   if (error) { fprintf(stderr, "%s\n", imud_strerror(error)); return 1; }
+ *   for (;;) {
+ *       imud_slot sample;
+ *       uint64_t missed;
+ *       while (imud_next(&ring, &sample, &missed) == 1)   // `missed`: samples lost right before this one
+ *           use(sample.accel_m_s2, sample.present & IMUD_HAS_ACCEL);
+ *       if (imud_health(&ring, imud_now_ns()) != IMUD_HEALTH_LIVE)
+ *           imud_reopen(&ring);                           // a restarted daemon has a new ring
+ *       imud_wait(eventfd, 100);                          // eventfd of your own, from imud's UNIX socket
+ *   }
+ *
+ * Units: m/s2, rad/s, tesla, rad, degrees Celsius, pascal; times are ns of CLOCK_MONOTONIC, `utc_ns` of CLOCK_REALTIME.
+ * A field without its bit in `present` has no value: absent is not zero.
+ *
+ * The writer has no memory fence, so a slot is trusted only if its sequence number before the copy, its CRC-32, and its
+ * sequence number after the copy agree. Nothing here waits busily: a slot that is not whole yet is given by a later call.
+ * Synchronization: a ring belongs to one thread; several threads or processes may each open their own.
+ *
+ * With -std=c99 (no GNU extensions) include it before other headers, or compile with -D_POSIX_C_SOURCE=200809L.
+ * SPDX-License-Identifier: Apache-2.0
+ */
+#ifndef IMUD_H
+#define IMUD_H
+
+#if defined(__STRICT_ANSI__) && !defined(_POSIX_C_SOURCE) && !defined(_GNU_SOURCE)
+#define _POSIX_C_SOURCE 200809L
+#endif
+
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <time.h>
+#include <unistd.h>
+
+#ifndef CLOCK_MONOTONIC
+#error "imud.h: include it before other headers, or compile with -D_POSIX_C_SOURCE=200809L"
+#endif
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "imud.h: the rings are little-endian and this machine is not"
+#endif
+
+/* ---- layout -------------------------------------------------------------------------------------------------- */
+
+#define IMUD_MAGIC "imudshm" /* with the final zero, 8 bytes */
+#define IMUD_LAYOUT_VERSION 1u
+#define IMUD_SLOT_LAYOUT_VERSION 1u
+#define IMUD_HEADER_BYTES 4096u
+#define IMUD_SLOT_BYTES 256u
+#define IMUD_LEDGER_ROOM 59
+#define IMUD_SEQ_INVALID UINT64_MAX       /* stands in `seq` and `ledger_update` while their block is written */
+#define IMUD_HEARTBEAT_LIMIT_NS 1000000000 /* the heartbeat comes ten times a second */
+
+enum { IMUD_STATE_LIVE = 1, IMUD_STATE_CLOSED = 2 };
+
+/* Where `t_ns` comes from, worst first. */
+enum { IMUD_SYNC_ARRIVAL = 0, IMUD_SYNC_REGRESSION = 1, IMUD_SYNC_EDGE = 2, IMUD_SYNC_UTC = 3 };
+
+/* Bits of `present`. */
+enum {
+    IMUD_HAS_T_DEV = 1 << 0,
+    IMUD_HAS_ACCEL = 1 << 1,
+    IMUD_HAS_GYRO = 1 << 2,
+    IMUD_HAS_MAG = 1 << 3,
+    IMUD_HAS_QUAT = 1 << 4,
+    IMUD_HAS_EULER = 1 << 5,
+    IMUD_HAS_TEMPERATURE = 1 << 6,
+    IMUD_HAS_PRESSURE = 1 << 7,
+    IMUD_HAS_INCLI = 1 << 8,
+    IMUD_HAS_STATUS = 1 << 9,
+    IMUD_HAS_PPS_AGE = 1 << 10,
+    IMUD_HAS_EDGE = 1 << 11
+};
+
+/* Places in `ledger`. */
+enum {
+    IMUD_LEDGER_BYTES_IN,
+    IMUD_LEDGER_BYTES_IN_GOOD_FRAMES,
+    IMUD_LEDGER_BYTES_IN_BAD_FRAMES,
+    IMUD_LEDGER_BYTES_SKIPPED,
+    IMUD_LEDGER_BYTES_PENDING,
+    IMUD_LEDGER_FRAMES_GOOD,
+    IMUD_LEDGER_FRAMES_IN_SAMPLES,
+    IMUD_LEDGER_FRAMES_IN_REPLIES,
+    IMUD_LEDGER_FRAMES_IGNORED,
+    IMUD_LEDGER_FRAMES_PENDING,
+    IMUD_LEDGER_FRAMES_BAD_CRC,
+    IMUD_LEDGER_FRAMES_BAD_LENGTH,
+    IMUD_LEDGER_FRAMES_BAD_CONTENT,
+    IMUD_LEDGER_UNKNOWN_TAGS,
+    IMUD_LEDGER_SAMPLES,
+    IMUD_LEDGER_LOST_GAP_DEVICE,
+    IMUD_LEDGER_LOST_CRC,
+    IMUD_LEDGER_LOST_OVERRUN,
+    IMUD_LEDGER_LOST_QUEUE,
+    IMUD_LEDGER_REPLIES_LATE,
+    IMUD_LEDGER_REPLIES_UNSOLICITED
+};
+
+/* One sample: a slot of the ring, and a record of the socket's binary encoding. */
+typedef struct imud_slot {
+    uint64_t seq;     /* counts from 1 per device */
+    int64_t t_ns;     /* instant of measurement, CLOCK_MONOTONIC, strictly increasing */
+    int64_t t_rx_ns;  /* when the last byte was read, CLOCK_MONOTONIC */
+    int64_t utc_ns;   /* t_ns on CLOCK_REALTIME */
+    int64_t t_dev_ns; /* device time, unwrapped */
+    uint64_t edge_seq;
+    uint32_t t_err_ns; /* one-sigma error of t_ns */
+    uint32_t present;  /* IMUD_HAS_... */
+    uint32_t status;   /* status bits as sent */
+    uint16_t device_id;
+    uint8_t sync; /* IMUD_SYNC_... */
+    uint8_t reserved0;
+    double accel_m_s2[3];
+    double gyro_rad_s[3];
+    double mag_t[3];
+    double quat_wxyz[4]; /* body to navigation frame */
+    double euler_rad[3]; /* roll, pitch, yaw in the device's own convention */
+    double temperature_c;
+    double pressure_pa;
+    double incli_rad[2];
+    uint32_t pps_age_ms;
+    uint8_t reserved1[24];
+    uint32_t crc32; /* of the bytes before it */
+} imud_slot;
+
+/* First page of a ring. */
+typedef struct imud_header {
+    char magic[8];
+    uint32_t layout_version;
+    uint32_t slot_layout_version;
+    uint32_t header_bytes;
+    uint32_t slot_bytes;
+    uint32_t slot_count; /* a power of two */
+    uint32_t ledger_count;
+    uint64_t epoch; /* another number after every start of the daemon */
+    uint32_t pid;
+    uint32_t state; /* IMUD_STATE_... */
+    uint32_t device_id;
+    uint8_t reserved0[12];
+    char device[64];
+    uint8_t reserved1[64];
+    uint64_t newest_seq; /* 0 before the first sample */
+    uint64_t first_seq;  /* older samples were never in this ring */
+    int64_t heartbeat_ns;
+    uint8_t reserved2[40];
+    uint64_t ledger_update;
+    char driver[32];
+    uint64_t ledger[IMUD_LEDGER_ROOM];
+    uint32_t ledger_crc32; /* of ledger_update, driver and ledger */
+    uint8_t reserved3[3324];
+} imud_header;
+
+/* Copy of the ledger block. */
+typedef struct imud_ledger {
+    uint64_t update; /* +1 for every change */
+    char driver[32];
+    uint64_t values[IMUD_LEDGER_ROOM]; /* IMUD_LEDGER_..., header->ledger_count of them in use */
+    uint32_t crc32;
+    uint32_t padding;
+} imud_ledger;
+
+/* Compilation stops here if the compiler lays the records out differently. */
+typedef char imud_check_slot[sizeof(imud_slot) == IMUD_SLOT_BYTES ? 1 : -1];
+typedef char imud_check_header[sizeof(imud_header) == IMUD_HEADER_BYTES ? 1 : -1];
+typedef char imud_check_ledger[offsetof(imud_ledger, crc32) == offsetof(imud_header, ledger_crc32) - 256 ? 1 : -1];
+
+/* ---- results ------------------------------------------------------------------------------------------------- */
+
+enum {
+    IMUD_E_MISSING = -1, /* no such ring: the daemon does not run, or has no such device */
+    IMUD_E_DENIED = -2,  /* this user may not read it: look at the group of the file */
+    IMUD_E_FORMAT = -3,  /* the file is no ring */
+    IMUD_E_VERSION = -4, /* a ring of another layout version */
+    IMUD_E_SYSTEM = -5,  /* see errno */
+    IMUD_E_NAME = -6     /* name too long or empty */
+};
+
+typedef enum imud_health_state {
+    IMUD_HEALTH_LIVE = 0,
+    IMUD_HEALTH_CLOSED = 1, /* the daemon ended the ring on purpose */
+    IMUD_HEALTH_STALE = 2   /* no heartbeat for IMUD_HEARTBEAT_LIMIT_NS: the daemon died or hangs */
+} imud_health_state;
+
+/* An open ring. Read `path`, `epoch` and `missed_total` at will; leave the rest alone. */
+typedef struct imud_ring {
+    const unsigned char *base; /* NULL when closed */
+    size_t size_bytes;
+    uint64_t mask;
+    uint64_t epoch;
+    uint64_t next_seq;     /* what imud_next gives next */
+    uint64_t missed_total; /* samples missed since imud_open */
+    uint64_t torn_seq;     /* a slot that was not whole, and ... */
+    uint64_t torn_newest;  /* ... the newest sequence number then */
+    dev_t dev;
+    ino_t ino;
+    char path[256];
+    uint32_t crc_table[256];
+} imud_ring;
+
+static inline const char *imud_strerror(int error)
+{
+    switch (error) {
+    case IMUD_E_MISSING: return "no such ring: is imud running, and is the device in its configuration?";
+    case IMUD_E_DENIED: return "the ring may not be read: is this user in group imud?";
+    case IMUD_E_FORMAT: return "the file is no ring of imud";
+    case IMUD_E_VERSION: return "the ring has another layout version: build with the imud.h of the running daemon";
+    case IMUD_E_NAME: return "expected a device name or a path of less than 256 characters";
+    case IMUD_E_SYSTEM: return strerror(errno);
+    default: return "no error";
+    }
+}
+
+static inline int64_t imud_now_ns(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+}
+
+/* ---- inner parts --------------------------------------------------------------------------------------------- */
+
+/* CRC-32 of IEEE 802.3, reflected polynomial 0xEDB88320. */
+static inline void imud_crc_init_(uint32_t table[256])
+{
+    for (uint32_t i = 0; i < 256; i++) {
+        uint32_t value = i;
+        for (int bit = 0; bit < 8; bit++)
+            value = (value >> 1) ^ ((value & 1u) ? 0xEDB88320u : 0u);
+        table[i] = value;
+    }
+}
+
+static inline uint32_t imud_crc_(const uint32_t table[256], const void *data, size_t size_bytes)
+{
+    const unsigned char *byte = (const unsigned char *)data;
+    uint32_t crc = 0xFFFFFFFFu;
+    while (size_bytes--)
+        crc = (crc >> 8) ^ table[(crc ^ *byte++) & 0xFFu];
+    return ~crc;
+}
+
+static inline uint64_t imud_load_(const unsigned char *at)
+{
+    return __atomic_load_n((const uint64_t *)(const void *)at, __ATOMIC_ACQUIRE);
+}
+
+/* Copies a block of u64 words that may change meanwhile. Returns whether its first word, its sequence number, was the
+ * same before, in, and after the copy, and its CRC (in the 4 bytes at `crc_at`) is right. */
+static inline int imud_copy_(const imud_ring *ring, const unsigned char *from, void *to, size_t size_bytes, size_t crc_at)
+{
+    uint32_t crc;
+    uint64_t word, before = imud_load_(from);
+    unsigned char *target = (unsigned char *)to;
+    if (before == IMUD_SEQ_INVALID)
+        return 0;
+    for (size_t at = 0; at < size_bytes; at += 8) {
+        word = __atomic_load_n((const uint64_t *)(const void *)(from + at), __ATOMIC_RELAXED);
+        memcpy(target + at, &word, 8);
+    }
+    __atomic_thread_fence(__ATOMIC_ACQUIRE);
+    if (imud_load_(from) != before || memcmp(target, &before, 8) != 0)
+        return 0;
+    memcpy(&crc, target + crc_at, 4);
+    return imud_crc_(ring->crc_table, target, crc_at) == crc;
+}
+
+static inline int imud_read_slot_(const imud_ring *ring, uint64_t seq, imud_slot *out)
+{
+    const unsigned char *slot = ring->base + IMUD_HEADER_BYTES + (seq & ring->mask) * IMUD_SLOT_BYTES;
+    return imud_copy_(ring, slot, out, IMUD_SLOT_BYTES, offsetof(imud_slot, crc32)) && out->seq == seq;
+}
+
+/* Oldest sample the ring can still hold when `newest` is its newest. */
+static inline uint64_t imud_oldest_(const imud_ring *ring, uint64_t newest)
+{
+    uint64_t first = imud_load_(ring->base + offsetof(imud_header, first_seq));
+    uint64_t kept = newest > ring->mask ? newest - ring->mask : 1;
+    return first > kept && first <= newest ? first : kept; /* `first` may be seen before the newest it belongs to */
+}
+
+static inline int imud_errno_(void)
+{
+    if (errno == ENOENT)
+        return IMUD_E_MISSING;
+    return errno == EACCES || errno == EPERM ? IMUD_E_DENIED : IMUD_E_SYSTEM;
+}
+
+static inline int imud_check_(const imud_header *header, size_t size_bytes)
+{
+    uint64_t count = header->slot_count;
+    if (memcmp(header->magic, IMUD_MAGIC, 8) != 0)
+        return IMUD_E_FORMAT;
+    if (header->layout_version != IMUD_LAYOUT_VERSION || header->slot_layout_version != IMUD_SLOT_LAYOUT_VERSION ||
+        header->header_bytes != IMUD_HEADER_BYTES || header->slot_bytes != IMUD_SLOT_BYTES)
+        return IMUD_E_VERSION;
+    if (count == 0 || (count & (count - 1)) || header->ledger_count > IMUD_LEDGER_ROOM ||
+        size_bytes < IMUD_HEADER_BYTES + count * IMUD_SLOT_BYTES)
+        return IMUD_E_FORMAT;
+    return 0;
+}
+
+/* Maps the file at ring->path into ring; leaves ring as it was on error. */
+static inline int imud_map_(imud_ring *ring)
+{
+    struct stat status;
+    void *base;
+    int error, fd = open(ring->path, O_RDONLY | O_CLOEXEC);
+    if (fd < 0)
+        return imud_errno_();
+    if (fstat(fd, &status) != 0) {
+        error = imud_errno_();
+        close(fd);
+        return error;
+    }
+    if (!S_ISREG(status.st_mode) || (size_t)status.st_size < IMUD_HEADER_BYTES) {
+        close(fd);
+        return IMUD_E_FORMAT;
+    }
+    base = mmap(NULL, (size_t)status.st_size, PROT_READ, MAP_SHARED, fd, 0);
+    error = base == MAP_FAILED ? imud_errno_() : 0;
+    close(fd);
+    if (error)
+        return error;
+    error = imud_check_((const imud_header *)base, (size_t)status.st_size);
+    if (error) {
+        munmap(base, (size_t)status.st_size);
+        return error;
+    }
+    if (ring->base)
+        munmap((void *)(uintptr_t)ring->base, ring->size_bytes);
+    ring->base = (const unsigned char *)base;
+    ring->size_bytes = (size_t)status.st_size;
+    ring->mask = ((const imud_header *)base)->slot_count - 1;
+    ring->epoch = ((const imud_header *)base)->epoch;
+    ring->torn_seq = 0;
+    ring->dev = status.st_dev;
+    ring->ino = status.st_ino;
+    return 0;
+}
+
+/* ---- what you call ------------------------------------------------------------------------------------------- */
+
+/* The header: names, sizes, epoch, process. Read `driver` and `ledger` with imud_read_ledger instead. */
+static inline const imud_header *imud_get_header(const imud_ring *ring)
+{
+    return (const imud_header *)(const void *)ring->base;
+}
+
+/* Sequence number of the newest sample, 0 before the first. */
+static inline uint64_t imud_newest_seq(const imud_ring *ring)
+{
+    return imud_load_(ring->base + offsetof(imud_header, newest_seq));
+}
+
+/* Opens the ring of a device, or a path if there is a '/' in it. imud_next will give the samples that come after this
+ * call. Returns 0 or IMUD_E_...; after an error the ring is closed. */
+static inline int imud_open(imud_ring *ring, const char *device_or_path)
+{
+    int length, error;
+    const char *prefix = strchr(device_or_path, '/') ? "" : "/dev/shm/imud.";
+    memset(ring, 0, sizeof *ring);
+    length = snprintf(ring->path, sizeof ring->path, "%s%s", prefix, device_or_path);
+    if (length < 0 || (size_t)length >= sizeof ring->path || !*device_or_path)
+        return IMUD_E_NAME;
+    imud_crc_init_(ring->crc_table);
+    error = imud_map_(ring);
+    if (!error)
+        ring->next_seq = imud_newest_seq(ring) + 1;
+    return error;
+}
+
+/* Releases the ring; may be called twice. */
+static inline void imud_close(imud_ring *ring)
+{
+    if (ring->base)
+        munmap((void *)(uintptr_t)ring->base, ring->size_bytes);
+    ring->base = NULL;
+}
+
+/* Whether there is a daemon behind the ring. `now_ns` is imud_now_ns(). */
+static inline imud_health_state imud_health(const imud_ring *ring, int64_t now_ns)
+{
+    int64_t heartbeat_ns = (int64_t)imud_load_(ring->base + offsetof(imud_header, heartbeat_ns));
+    const uint32_t *state = (const uint32_t *)(const void *)(ring->base + offsetof(imud_header, state));
+    if (__atomic_load_n(state, __ATOMIC_ACQUIRE) != IMUD_STATE_LIVE)
+        return IMUD_HEALTH_CLOSED;
+    return now_ns - heartbeat_ns < IMUD_HEARTBEAT_LIMIT_NS ? IMUD_HEALTH_LIVE : IMUD_HEALTH_STALE;
+}
+
+/* Maps the ring of a restarted daemon. Returns 1 if there is a new one (its samples come from the first on, with those
+ * it no longer holds counted as missed), 0 if the mapped one is still the one there is, IMUD_E_... if there is none;
+ * the old one stays mapped then. */
+static inline int imud_reopen(imud_ring *ring)
+{
+    struct stat status;
+    int error;
+    if (stat(ring->path, &status) != 0)
+        return imud_errno_();
+    if (status.st_dev == ring->dev && status.st_ino == ring->ino)
+        return 0;
+    error = imud_map_(ring);
+    if (error)
+        return error;
+    ring->next_seq = 1;
+    return 1;
+}
+
+/* The newest sample. Returns 1, or 0 if there is none (or none whole just now). Does not move imud_next. */
+static inline int imud_latest(const imud_ring *ring, imud_slot *out)
+{
+    for (int attempt = 0; attempt < 3; attempt++) { /* the writer may overtake one copy, hardly three */
+        uint64_t newest = imud_newest_seq(ring);
+        if (newest == 0)
+            return 0;
+        if (imud_read_slot_(ring, newest, out))
+            return 1;
+    }
+    return 0;
+}
+
+/* The next sample in order. Returns 1, or 0 if there is none yet. `missed` (may be NULL) is set to how many samples
+ * were overwritten before they could be read since the call before. */
+static inline int imud_next(imud_ring *ring, imud_slot *out, uint64_t *missed)
+{
+    uint64_t newest = imud_newest_seq(ring), oldest, lost = 0;
+    int got = 0;
+    if (newest + 1 < ring->next_seq) /* the numbers began anew in the same ring */
+        ring->next_seq = imud_oldest_(ring, newest);
+    while (!got && newest >= ring->next_seq) {
+        oldest = imud_oldest_(ring, newest);
+        if (oldest > ring->next_seq) {
+            lost += oldest - ring->next_seq;
+            ring->next_seq = oldest;
+        }
+        got = imud_read_slot_(ring, ring->next_seq, out);
+        if (got) {
+            ring->next_seq++;
+            break;
+        }
+        newest = imud_newest_seq(ring);
+        if (imud_oldest_(ring, newest) > ring->next_seq)
+            continue; /* overtaken while copying */
+        if (ring->torn_seq != ring->next_seq) { /* not whole yet: a later call will find it so */
+            ring->torn_seq = ring->next_seq;
+            ring->torn_newest = newest;
+        }
+        if (newest == ring->torn_newest)
+            break;
+        lost++; /* newer ones were finished meanwhile and this one still is not: it never will be */
+        ring->next_seq++;
+    }
+    ring->missed_total += lost;
+    if (missed)
+        *missed = lost;
+    return got;
+}
+
+/* The ledger and the driver in use. Returns 1, or 0 if there is none (or none whole just now). */
+static inline int imud_read_ledger(const imud_ring *ring, imud_ledger *out)
+{
+    const unsigned char *block = ring->base + offsetof(imud_header, ledger_update);
+    for (int attempt = 0; attempt < 3; attempt++)
+        if (imud_load_(block) != 0 && imud_copy_(ring, block, out, sizeof *out, offsetof(imud_ledger, crc32)))
+            return 1;
+    return 0;
+}
+
+/* Waits until the eventfd is signalled, and clears it. The descriptor comes from imud's UNIX socket (SCM_RIGHTS).
+ * Returns 1, or 0 after `timeout_ms` (-1: never), or IMUD_E_SYSTEM (errno EINTR after a signal). */
+static inline int imud_wait(int eventfd, int timeout_ms)
+{
+    struct pollfd poller;
+    uint64_t count;
+    int ready;
+    poller.fd = eventfd;
+    poller.events = POLLIN;
+    poller.revents = 0;
+    ready = poll(&poller, 1, timeout_ms);
+    if (ready <= 0)
+        return ready < 0 ? IMUD_E_SYSTEM : 0;
+    if (read(eventfd, &count, sizeof count) != (ssize_t)sizeof count && errno != EAGAIN)
+        return IMUD_E_SYSTEM;
+    return 1;
+}
+
+#endif

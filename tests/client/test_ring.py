@@ -1,0 +1,345 @@
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from imud.client.ring import Ring
+from imud.errors import ServerError
+from imud.kit.shm_layout import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode_ledger_block
+from imud.kit.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, encode_slot
+from tests.publishers.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+
+
+@pytest.fixture(name="board")
+def _board(tmp_path: Path) -> Iterator[Board]:
+    board = Board(tmp_path)
+    yield board
+    board.publisher.close()
+
+
+@pytest.fixture(name="ring")
+def _ring(board: Board) -> Iterator[Ring]:
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        yield ring
+
+
+def slot_at(seq: int) -> int:
+    return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
+
+
+def numbers(ring: Ring) -> tuple[list[int], int]:
+    """What one read gives, each sample checked against what was published."""
+    samples, missed = ring.read()
+    for sample in samples:
+        assert sample == make_sample(sample.seq)
+    return [sample.seq for sample in samples], missed
+
+
+def test_opens_by_name(board: Board) -> None:
+    board.publish([1])
+    with Ring(DEVICE, directory=str(board.path.parent)) as ring:
+        assert (ring.path, ring.epoch, ring.newest_seq) == (board.path, 77, 1)
+        assert (ring.header.device, ring.header.pid, ring.header.slot_count) == (DEVICE, os.getpid(), SLOTS)
+
+
+def test_no_such_ring(board: Board) -> None:
+    with pytest.raises(ServerError, match=r"imud.imu9: no such ring; there are rings for: imu0"):
+        Ring("imu9", directory=str(board.path.parent))
+
+
+def test_no_rings_at_all(tmp_path: Path) -> None:
+    with pytest.raises(ServerError, match="is imud running"):
+        Ring("imu9", directory=str(tmp_path))
+
+
+def test_no_ring_but_a_file(tmp_path: Path) -> None:
+    (tmp_path / "imud.x").write_bytes(b"hello")
+    with pytest.raises(ServerError, match="is no ring of imud"):
+        Ring("x", directory=str(tmp_path))
+
+
+def test_directory_instead_of_a_ring(tmp_path: Path) -> None:
+    with pytest.raises(ServerError, match="cannot be read: Is a directory"):
+        Ring(tmp_path)
+
+
+def test_permission(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(ServerError, match="is this user in the group"):
+        Ring(board.path)
+
+
+def test_cut_file_is_refused(board: Board) -> None:
+    os.truncate(board.path, HEADER_BYTES + SLOTS * SLOT_BYTES - 1)
+    with pytest.raises(ServerError, match="expected 20480 bytes, found 20479"):
+        Ring(board.path)
+
+
+def test_reader_cannot_write(ring: Ring) -> None:
+    with pytest.raises(TypeError):
+        ring._memory[0] = 1  # the private mapping is what is tested
+
+
+def test_latest(board: Board, ring: Ring) -> None:
+    assert ring.latest() is None
+    board.publish([1, 2])
+    assert ring.latest() == make_sample(2)
+    assert numbers(ring) == ([1, 2], 0)
+    assert ring.latest() == make_sample(2)
+
+
+def test_read_gives_what_comes_after_opening(board: Board) -> None:
+    board.publish(range(1, 6))
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        assert numbers(ring) == ([], 0)
+        board.publish([6])
+        assert numbers(ring) == ([6], 0)
+        assert numbers(ring) == ([], 0)
+
+
+@pytest.mark.parametrize("count", [1, SLOTS - 1, SLOTS, SLOTS + 1, 3 * SLOTS + 5])
+def test_slow_reader_learns_exactly_what_it_missed(board: Board, ring: Ring, count: int) -> None:
+    board.publish(range(1, count + 1))
+    first = max(1, count - SLOTS + 1)
+    assert numbers(ring) == (list(range(first, count + 1)), first - 1)
+    assert ring.missed == first - 1
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_every_sample_is_read_or_missed(board: Board, ring: Ring, seed: int) -> None:
+    random, last, seen, missed = Random(seed), 0, 0, 0
+    for _ in range(30):
+        count = random.choice((0, 1, 5, SLOTS - 1, SLOTS, SLOTS + 1, 2 * SLOTS))
+        board.publish(range(last + 1, last + 1 + count))
+        last += count
+        if random.random() < 0.6:
+            got, lost = numbers(ring)
+            assert got == list(range(seen + missed + lost + 1, last + 1))
+            seen, missed = seen + len(got), missed + lost
+            assert seen + missed == last
+    assert ring.missed == missed
+
+
+def reseal(slot: bytes, seq: int) -> bytes:
+    """`slot` with another number and a CRC that matches."""
+    body = struct.pack("<Q", seq) + slot[8:CRC_OFFSET]
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+WHOLE = encode_slot(make_sample(2), 3)
+TORN = {
+    "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:],
+    "number not there yet": bytes(8) + WHOLE[8:],
+    "payload of another sample": WHOLE[:8] + encode_slot(make_sample(66), 3)[8:],
+    "payload half old": WHOLE[:128] + encode_slot(make_sample(66), 3)[128:],
+    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]),
+    "whole, but of an earlier round": reseal(WHOLE, 2 + SLOTS),
+    "never written": bytes(SLOT_BYTES),
+}
+
+
+@pytest.mark.parametrize("name", TORN)
+def test_torn_slot_is_refused_until_it_is_whole(board: Board, ring: Ring, name: str) -> None:
+    board.publish([1, 2])
+    board.poke(slot_at(2), TORN[name])
+    assert ring.latest() is None
+    assert numbers(ring) == ([1], 0)
+    assert numbers(ring) == ([], 0)  # it may still come: a store that another core sees late
+    board.poke(slot_at(2), WHOLE)
+    assert numbers(ring) == ([2], 0)
+
+
+@pytest.mark.parametrize("name", TORN)
+def test_slot_that_never_becomes_whole_is_missed(board: Board, ring: Ring, name: str) -> None:
+    board.publish([1, 2])
+    board.poke(slot_at(2), TORN[name])
+    assert numbers(ring) == ([1], 0)
+    board.publish([3])
+    assert numbers(ring) == ([3], 1)
+    assert numbers(ring) == ([], 0)
+
+
+class MeanwhileRing(Ring):
+    """Lets something happen between the look at a slot's number and the copy, or right after the copy."""
+
+    before: Callable[[], None] | None = None
+    after: Callable[[], None] | None = None
+
+    def _copy(self, at: int, size_bytes: int) -> bytes:
+        before, self.before = self.before, None
+        if before is not None:
+            before()
+        raw = super()._copy(at, size_bytes)
+        after, self.after = self.after, None
+        if after is not None:
+            after()
+        return raw
+
+
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_overwritten_while_reading(board: Board, moment: str) -> None:
+    with MeanwhileRing(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish(range(1, SLOTS + 1))
+        setattr(ring, moment, lambda: board.publish([SLOTS + 1]))
+        assert numbers(ring) == (list(range(2, SLOTS + 2)), 1)
+
+
+def test_writer_begins_the_slot_while_it_is_copied(board: Board) -> None:
+    with MeanwhileRing(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish(range(1, SLOTS + 1))
+        ring.after = lambda: board.poke(slot_at(1), struct.pack("<Q", SEQ_INVALID))
+        assert numbers(ring) == ([], 0)
+        board.publish([SLOTS + 1])
+        assert numbers(ring) == (list(range(2, SLOTS + 2)), 1)
+
+
+def test_latest_overtaken_while_copying(board: Board) -> None:
+    with MeanwhileRing(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1])
+        ring.before = lambda: board.publish(range(2, SLOTS + 2))
+        assert ring.latest() == make_sample(SLOTS + 1)
+
+
+def test_gap_in_the_numbers_is_missed(board: Board, ring: Ring) -> None:
+    board.publish([1, 2, 3])
+    board.publish([5000, 5001])
+    assert numbers(ring) == ([5000, 5001], 4999)
+
+
+def test_first_number_seen_before_the_newest_it_belongs_to(board: Board, ring: Ring) -> None:
+    board.publish([1, 2])
+    board.poke(OFFSETS["first_seq"], struct.pack("<Q", 5000))
+    assert numbers(ring) == ([1, 2], 0)
+    board.publish([5000])
+    assert numbers(ring) == ([5000], 4997)
+
+
+def test_numbers_begin_anew(board: Board, ring: Ring) -> None:
+    board.publish(range(1, 10))
+    assert numbers(ring) == (list(range(1, 10)), 0)
+    board.publish([1, 2])
+    assert numbers(ring) == ([1, 2], 0)
+
+
+def test_restart_after_a_clean_end(board: Board, ring: Ring, tmp_path: Path) -> None:
+    board.publish([1, 2, 3])
+    board.publisher.close()
+    assert not ring.alive(board.now_ns)
+    assert numbers(ring) == ([1, 2, 3], 0)  # the old ring is read to its end
+    assert numbers(ring) == ([], 0)
+    assert ring.epoch == 77
+    successor = Board(tmp_path, epoch=78)
+    successor.publish([1, 2])
+    assert numbers(ring) == ([1, 2], 0)
+    assert ring.epoch == 78
+    assert ring.alive(successor.now_ns)
+    successor.publisher.close()
+
+
+def test_restart_after_a_daemon_that_died(board: Board, ring: Ring, tmp_path: Path) -> None:
+    board.publish([1, 2])
+    assert numbers(ring) == ([1, 2], 0)
+    successor = Board(tmp_path, epoch=78)
+    successor.publish(range(1, SLOTS + 4))
+    board.now_ns = START_NS + 999_999_999
+    assert numbers(ring) == ([], 0)  # the old heartbeat is not stale yet
+    board.now_ns += 1
+    assert ring.latest() == make_sample(SLOTS + 3)
+    assert numbers(ring) == (list(range(4, SLOTS + 4)), 3)
+    assert ring.epoch == 78
+    successor.publisher.close()
+
+
+def test_torn_slot_does_not_hold_a_reader_at_a_dead_daemon(board: Board, ring: Ring, tmp_path: Path) -> None:
+    board.publish([1, 2])
+    board.poke(slot_at(1), bytes(8))
+    board.publisher.close()
+    successor = Board(tmp_path, epoch=78)
+    successor.publish([1])
+    assert numbers(ring) == ([1], 0)
+    assert ring.epoch == 78
+    successor.publisher.close()
+
+
+def test_successor_of_another_layout(board: Board, ring: Ring) -> None:
+    board.publisher.close()
+    board.path.write_bytes(b"imudshm\0" + bytes(HEADER_BYTES))
+    with pytest.raises(ServerError, match="different versions"):
+        ring.read()
+
+
+def test_reopen_while_nothing_changed(board: Board, ring: Ring) -> None:
+    assert not ring.reopen()
+    board.publisher.close()
+    assert not ring.reopen()
+
+
+def test_heartbeat(board: Board, ring: Ring) -> None:
+    assert ring.alive(START_NS + 999_999_999)
+    assert not ring.alive(START_NS + 1_000_000_000)
+    board.tick(900_000_000)
+    assert ring.alive(START_NS + 1_800_000_000)
+
+
+def test_ledger(board: Board, ring: Ring) -> None:
+    assert ring.ledger() is None
+    board.ledger.bytes_in = board.ledger.bytes_skipped = 12345678901
+    board.tick()
+    block = ring.ledger()
+    assert block is not None
+    assert (block.update, block.driver, block.ledger) == (1, "hipnuc-uart", board.ledger.snapshot())
+
+
+@pytest.mark.parametrize(
+    ("at", "data"),
+    [
+        (0, b"\xff" * 8),
+        (8, b"X"),
+        (40, b"\1"),
+        (0, struct.pack("<Q", 2)),
+        (512, b"\0\0\0\0"),
+        (0, encode_ledger_block(SEQ_INVALID, "", {})),
+    ],
+)
+def test_torn_ledger_is_refused(board: Board, ring: Ring, at: int, data: bytes) -> None:
+    board.tick()
+    board.poke(LEDGER_BLOCK_OFFSET + at, data)
+    assert ring.ledger() is None
+
+
+def test_ledger_that_changes_while_it_is_copied(board: Board) -> None:
+    with MeanwhileRing(board.path) as ring:
+        board.tick()
+
+        def change() -> None:
+            board.ledger.bytes_in = 5
+            board.tick()
+
+        ring.after = change
+        block = ring.ledger()
+        assert block is not None
+        assert (block.update, block.ledger["bytes_in"]) == (2, 5)
+
+
+def test_wait(ring: Ring) -> None:
+    event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+    try:
+        assert not ring.wait(event, 0)
+        os.eventfd_write(event, 3)
+        assert ring.wait(event)
+        assert not ring.wait(event, 0)
+    finally:
+        os.close(event)
+
+
+def test_close_twice(board: Board) -> None:
+    ring = Ring(board.path)
+    ring.close()
+    ring.close()

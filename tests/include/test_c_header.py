@@ -1,0 +1,332 @@
+import json
+import os
+import shutil
+import struct
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+from typing import Final, Self
+
+import pytest
+
+from imud.kit import shm_layout, slot
+from imud.kit.shm_layout import (
+    HEADER_BYTES,
+    HEADER_FIELDS,
+    LEDGER_BLOCK_OFFSET,
+    OFFSETS,
+    RingHeader,
+    encode_header,
+    encode_ledger_block,
+)
+from imud.kit.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES, encode_slot
+from imud.ledger import LEDGER_FIELDS
+from imud.sample import Sample
+from tests.publishers.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+
+INCLUDE = Path(__file__).parents[2] / "imud" / "include"
+READER = Path(__file__).with_name("reader.c")
+STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow", "-O2", f"-I{INCLUDE}")
+LANGUAGES: Final = {
+    "c99": ("cc", "-std=c99", "-x", "c"),
+    "gnu17": ("cc", "-std=gnu17", "-x", "c"),
+    "c++11": ("c++", "-std=c++11", "-x", "c++"),
+    "c++17": ("c++", "-std=c++17", "-x", "c++"),
+}
+STRESS_SAMPLES, STRESS_NS = 10_000, 200_000_000  # whichever comes first
+
+Build = Callable[[Path, str], Path]
+
+
+@pytest.fixture(scope="module", name="build")
+def _build(tmp_path_factory: pytest.TempPathFactory) -> Build:
+    folder = tmp_path_factory.mktemp("build")
+
+    def build(source: Path, language: str) -> Path:
+        compiler, *options = LANGUAGES[language]
+        if shutil.which(compiler) is None:
+            pytest.skip(f"no {compiler} on this machine: the C header cannot be compiled")
+        program = folder / f"{source.stem}-{language}"
+        if not program.exists():
+            command = [compiler, *STRICT, *options, str(source), "-o", str(program)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            assert done.stderr == ""
+        return program
+
+    return build
+
+
+@pytest.fixture(name="board")
+def _board(tmp_path: Path) -> Iterator[Board]:
+    board = Board(tmp_path)
+    yield board
+    board.publisher.close()
+
+
+class Reader:
+    """The compiled reader; each `ask` is one command and its answer."""
+
+    def __init__(self, program: Path, ring: str | Path, files: tuple[int, ...] = ()) -> None:
+        self._process = subprocess.Popen(
+            [program, "commands", str(ring)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=files
+        )
+
+    def ask(self, command: str) -> list[str]:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(command + "\n")
+        self._process.stdin.flush()
+        return self._process.stdout.readline().split()
+
+    def next(self) -> tuple[int, int]:
+        """Number of the sample (0: none) and how many were missed before it."""
+        _, _, seq, missed = self.ask("next")
+        return int(seq), int(missed)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._process.communicate()
+        assert kind is not None or self._process.returncode == 0
+
+
+@pytest.fixture(name="reader")
+def _reader(build: Build, board: Board) -> Iterator[Reader]:
+    program = build(READER, "c99")
+    with Reader(program, board.path) as reader:
+        assert reader.ask("latest") == ["latest", "0", "0"]  # it is open from here on
+        yield reader
+
+
+def layout_program() -> tuple[str, list[str]]:
+    """A C program that prints the layout as the compiler sees it, and what the Python tables say it must print."""
+    lines, expected = [], []
+
+    def add(name: str, expression: str, value: int) -> None:
+        lines.append(f'    printf("{name} %llu\\n", (unsigned long long)({expression}));')
+        expected.append(f"{name} {value}")
+
+    for record, fields in (("slot", SLOT_FIELDS), ("header", HEADER_FIELDS)):
+        for field in fields:
+            size = struct.calcsize(f"<{field.count}{field.code}")
+            add(f"{record}.{field.name}", f"offsetof(imud_{record}, {field.name})", field.offset)
+            add(f"{record}.{field.name}.size", f"sizeof(((imud_{record} *)0)->{field.name})", size)
+    for place, name in enumerate(LEDGER_FIELDS):
+        add(name, f"IMUD_LEDGER_{name.upper()}", place)
+    for sync, code in SYNC_CODES.items():
+        add(sync, f"IMUD_SYNC_{sync.upper()}", code)
+    bits = {name: bit for name, bit in vars(slot).items() if name.startswith("HAS_")}
+    assert sorted(bits.values()) == sorted(PRESENT_BITS.values())
+    for name, bit in bits.items():
+        add(name, f"IMUD_{name}", bit)
+    for name in ("HEADER_BYTES", "LEDGER_ROOM", "HEARTBEAT_LIMIT_NS", "STATE_LIVE", "STATE_CLOSED"):
+        add(name, f"IMUD_{name}", getattr(shm_layout, name))
+    add("slot bytes", "sizeof(imud_slot)", SLOT_BYTES)
+    add("header bytes", "sizeof(imud_header)", HEADER_BYTES)
+    add("layout", "IMUD_LAYOUT_VERSION", shm_layout.RING_LAYOUT_VERSION)
+    add("slot layout", "IMUD_SLOT_LAYOUT_VERSION", slot.SLOT_LAYOUT_VERSION)
+    add("invalid", "IMUD_SEQ_INVALID", SEQ_INVALID)
+    add("magic", "sizeof IMUD_MAGIC", len(shm_layout.MAGIC))
+    for name, at in (("update", 0), ("driver", 8), ("values", 40), ("crc32", 512)):
+        add(f"ledger.{name}", f"offsetof(imud_ledger, {name})", at)
+    return '#include "imud.h"\nint main(void)\n{\n' + "\n".join(lines) + "\n    return 0;\n}\n", expected
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_layout_is_that_of_the_tables(build: Build, tmp_path: Path, language: str) -> None:
+    source = tmp_path / "layout.c"
+    text, expected = layout_program()
+    source.write_text(text)
+    done = subprocess.run([build(source, language)], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == expected
+
+
+def numbers_of(s: Sample) -> list[float]:
+    """What the reader prints of a sample."""
+    assert s.accel_m_s2 is not None
+    assert s.gyro_rad_s is not None
+    assert s.temperature_c is not None
+    vectors = [part for pair in zip(s.accel_m_s2, s.gyro_rad_s, strict=True) for part in pair]
+    present = slot.HAS_ACCEL | slot.HAS_GYRO | slot.HAS_TEMPERATURE
+    return [s.seq, s.t_ns, s.t_rx_ns, s.utc_ns, s.t_err_ns, present, 3, 1, *vectors, s.temperature_c]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_reads_what_the_publisher_wrote(build: Build, board: Board, language: str) -> None:
+    with Reader(build(READER, language), board.path) as reader:
+        assert reader.ask("latest") == ["latest", "0", "0"]
+        board.publish([1, 2])
+        for seq in (1, 2):
+            assert [json.loads(word) for word in reader.ask("sample")] == numbers_of(make_sample(seq))
+        assert reader.ask("latest") == ["latest", "1", "2"]
+        assert reader.next() == (0, 0)
+
+
+@pytest.mark.parametrize("count", [1, SLOTS - 1, SLOTS, SLOTS + 1, 3 * SLOTS + 5])
+def test_slow_reader_learns_exactly_what_it_missed(board: Board, reader: Reader, count: int) -> None:
+    board.publish(range(1, count + 1))
+    first = max(1, count - SLOTS + 1)
+    assert reader.next() == (first, first - 1)
+    for seq in range(first + 1, count + 1):
+        assert reader.next() == (seq, 0)
+    assert reader.next() == (0, 0)
+
+
+def slot_at(seq: int) -> int:
+    return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
+
+
+WHOLE = encode_slot(make_sample(2), 3)
+TORN = {
+    "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:],
+    "number not there yet": bytes(8) + WHOLE[8:],
+    "payload of another sample": WHOLE[:8] + encode_slot(make_sample(66), 3)[8:],
+    "payload half old": WHOLE[:128] + encode_slot(make_sample(66), 3)[128:],
+    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]),
+    "whole, but of another round": encode_slot(make_sample(2 + SLOTS), 3),
+    "never written": bytes(SLOT_BYTES),
+}
+
+
+@pytest.mark.parametrize("name", TORN)
+def test_torn_slot_is_refused(board: Board, reader: Reader, name: str) -> None:
+    board.publish([1, 2])
+    board.poke(slot_at(2), TORN[name])
+    assert [reader.next(), reader.next()] == [(1, 0), (0, 0)]
+    assert reader.ask("latest") == ["latest", "0", "0"]
+    board.poke(slot_at(2), WHOLE)
+    assert reader.next() == (2, 0)
+    board.publish([3, 4])
+    board.poke(slot_at(3), TORN[name])
+    assert reader.next() == (0, 0)
+    board.publish([5])
+    assert [reader.next(), reader.next(), reader.next()] == [(4, 1), (5, 0), (0, 0)]
+
+
+def test_number_that_changes_during_the_copy(board: Board, reader: Reader) -> None:
+    board.publish([1])
+    reader.ask(f"poke {board.path} {slot_at(1) + 7} 255 1")  # high byte of the number
+    assert reader.next() == (0, 0)
+    board.poke(slot_at(1) + 7, b"\0")
+    assert reader.next() == (1, 0)
+
+
+def test_gap_in_the_numbers_is_missed(board: Board, reader: Reader) -> None:
+    board.publish([1])
+    board.publish([5000])
+    assert reader.next() == (5000, 4999)
+    board.publish([1])
+    assert reader.next() == (1, 0)  # numbers that begin anew
+
+
+def test_health(board: Board, reader: Reader) -> None:
+    assert reader.ask(f"health {START_NS + 999_999_999}") == ["health", "0"]
+    assert reader.ask(f"health {START_NS + 1_000_000_000}") == ["health", "2"]
+    board.publisher.close()
+    assert reader.ask(f"health {START_NS}") == ["health", "1"]
+
+
+def test_restarted_daemon(board: Board, reader: Reader, tmp_path: Path) -> None:
+    board.publish([1])
+    assert reader.ask("reopen") == ["reopen", "0", "77"]
+    board.publisher.close()
+    assert reader.ask("reopen") == ["reopen", "-1", "77"]
+    successor = Board(tmp_path, epoch=78)
+    successor.publish(range(1, SLOTS + 3))
+    assert reader.next() == (1, 0)  # the old ring is still mapped
+    assert reader.ask("reopen") == ["reopen", "1", "78"]
+    assert reader.next() == (3, 2)
+    successor.publisher.close()
+
+
+def test_ledger(board: Board, reader: Reader) -> None:
+    assert reader.ask("ledger") == ["ledger", "0"]
+    for number, name in enumerate(LEDGER_FIELDS):
+        setattr(board.ledger, name, (1 << 40) + number)
+    board.tick()
+    expected = ["ledger", "1", *(str((1 << 40) + i) for i in range(len(LEDGER_FIELDS))), "hipnuc-uart"]
+    assert reader.ask("ledger") == expected
+    reader.ask(f"poke {board.path} {LEDGER_BLOCK_OFFSET + 7} 255 1")
+    assert reader.ask("ledger") == ["ledger", "0"]  # its number changed during the copy
+    board.poke(LEDGER_BLOCK_OFFSET + 7, b"\0")
+    assert reader.ask("ledger") == expected
+    board.poke(LEDGER_BLOCK_OFFSET + 100, b"\1")
+    assert reader.ask("ledger") == ["ledger", "0"]
+    board.poke(LEDGER_BLOCK_OFFSET, encode_ledger_block(SEQ_INVALID, "", {}))
+    assert reader.ask("ledger") == ["ledger", "0"]
+
+
+def test_wait(build: Build, board: Board) -> None:
+    event = os.eventfd(2, os.EFD_CLOEXEC)
+    with Reader(build(READER, "c99"), board.path, (event,)) as reader:
+        assert reader.ask(f"wait {event} 10000") == ["wait", "1"]
+        assert reader.ask(f"wait {event} 0") == ["wait", "0"]
+    os.close(event)
+
+
+def header_with(name: str, value: int) -> bytes:
+    raw = bytearray(encode_header(RingHeader(1, 2, 1, DEVICE, 0, SLOTS)))
+    struct.pack_into("<I", raw, OFFSETS[name], value)
+    return bytes(raw) + bytes(SLOTS * SLOT_BYTES)
+
+
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        (None, -1),
+        (b"", -3),
+        (bytes(HEADER_BYTES), -3),
+        (header_with("layout_version", 2), -4),
+        (header_with("slot_layout_version", 2), -4),
+        (header_with("slot_bytes", 512), -4),
+        (header_with("header_bytes", 8192), -4),
+        (header_with("slot_count", 63), -3),
+        (header_with("slot_count", 2 * SLOTS), -3),
+        (header_with("ledger_count", 60), -3),
+    ],
+)
+def test_what_cannot_be_opened(build: Build, tmp_path: Path, content: bytes | None, code: int) -> None:
+    path = tmp_path / "imud.x"
+    if content is not None:
+        path.write_bytes(content)
+    command = [str(build(READER, "c99")), "commands", str(path)]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith(f"error {code} ")
+    assert done.returncode == 1
+
+
+@pytest.mark.parametrize(("name", "code"), [("", -6), ("x" * 250, -6), ("no-such-device-of-the-tests", -1)])
+def test_names_that_cannot_be_opened(build: Build, name: str, code: int) -> None:
+    command = [str(build(READER, "c99")), "commands", name]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith(f"error {code} ")
+
+
+@pytest.mark.parametrize("slots_in_ring", [1, SLOTS])
+def test_no_torn_sample_and_none_unaccounted_under_stress(build: Build, tmp_path: Path, slots_in_ring: int) -> None:
+    """In a ring of one slot, reader and writer meet all the time."""
+    board = Board(tmp_path, slots=slots_in_ring)
+    ring = board.publisher._rings[DEVICE]
+    samples = [make_sample(seq) for seq in range(1, STRESS_SAMPLES + 1)]
+    slots = [encode_slot(sample, 3) for sample in samples]
+    command = [str(build(READER, "c99")), "stress", str(board.path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        done, random, end_ns = 0, Random(2), time.monotonic_ns() + STRESS_NS
+        while done < STRESS_SAMPLES and time.monotonic_ns() < end_ns:
+            end = done + random.choice((1, 1, 1, 5, 20, 100))  # the reader keeps up with some, and is lapped by others
+            ring.write(samples[done:end], slots[done:end])
+            done = end
+            os.sched_yield()
+        board.publisher.close()
+        read, missed, torn, missed_total = (int(word) for word in process.stdout.readline().split())
+    assert process.returncode == 0
+    assert torn == 0
+    assert read + missed == min(done, STRESS_SAMPLES)
+    assert missed == missed_total
+    assert read > 0
