@@ -1,0 +1,167 @@
+"""Captures: what a link delivered, in a file. A raw capture is the bytes; a stamped one also says when each read came.
+
+A stamped capture begins with one line of ASCII, then come records to the end of the file, little-endian::
+
+    #imud-capture 1 driver=hipnuc-uart baud=115200 start_utc_ns=1763717507000000000\\n
+    ┌───────────────┬─────────────┬───────────────┐
+    │ t_ns i64      │ length u32  │ length bytes  │  t_ns is CLOCK_MONOTONIC right after the read
+    └───────────────┴─────────────┴───────────────┘
+
+Values of the first line are percent-encoded (RFC 3986), unknown keys are kept, their order is free. Any file that does
+not begin with the magic is a raw capture. A last record that is cut short (power loss) is normal; a length over
+RECORD_BYTES_MAX or a time before its predecessor's means damage: reading stops there and `problem` says so.
+"""
+
+import struct
+from collections.abc import Iterator, Mapping
+from typing import BinaryIO, Final, NamedTuple
+from urllib.parse import quote, unquote
+
+from imud.errors import ImudError
+
+MAGIC: Final = b"#imud-capture "
+VERSION: Final = "1"
+HEADER_BYTES_MAX: Final = 4096
+RECORD_BYTES_MAX: Final = 1 << 20
+"""No link reads more at once; a larger length is damage."""
+RAW_CHUNK_BYTES: Final = 4096
+"""Size of the pieces of a raw capture: as much as a tty hands over at once."""
+WRITE_BYTES_MAX: Final = 1 << 30
+"""Default bound of a capture being written: 1 GiB, 26 hours at 115200 baud."""
+
+_RECORD = struct.Struct("<qI")
+
+
+class Chunk(NamedTuple):
+    """Bytes of one read."""
+
+    t_ns: int | None
+    """CLOCK_MONOTONIC right after the read; None in a raw capture."""
+    data: bytes
+
+
+class CaptureReader:
+    """Reads raw and stamped captures from any binary stream, seekable or not. Iterate once."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        """Raises ImudError for a stamped capture of another version, or with a broken first line."""
+        self._file = file
+        self._offset = 0
+        self.problem = ""
+        """After iterating: how the file is cut short or damaged, one sentence; empty when it is whole."""
+        self._head = _read_fully(file, len(MAGIC))
+        self.stamped = self._head == MAGIC
+        self.details: Mapping[str, str] = self._read_details() if self.stamped else {}
+        """Everything in the first line, decoded."""
+
+    @property
+    def driver(self) -> str:
+        """Driver named in the first line; empty when none is."""
+        return self.details.get("driver", "")
+
+    @property
+    def baud(self) -> int:
+        """Rate named in the first line, bit/s; 0 when none is."""
+        return self._number("baud")
+
+    @property
+    def hold_ns(self) -> int:
+        """How long the adapter may have held bytes back, as named in the first line, ns; 0 when it is not."""
+        return self._number("hold_ns")
+
+    def __iter__(self) -> Iterator[Chunk]:
+        return self._records() if self.stamped else self._pieces()
+
+    def _number(self, key: str) -> int:
+        text = self.details.get(key, "")
+        return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else 0
+
+    def _read_details(self) -> dict[str, str]:
+        line = self._file.readline(HEADER_BYTES_MAX)
+        self._offset = len(MAGIC) + len(line)
+        version, *pairs = line.decode("ascii", "replace").split() or [""]
+        if version != VERSION or not line.endswith(b"\n"):
+            raise ImudError(
+                f"capture of version {version[:20]!r}: this imud reads version {VERSION}; or is it damaged?"
+            )
+        return {key: unquote(value) for key, _, value in (pair.partition("=") for pair in pairs)}
+
+    def _pieces(self) -> Iterator[Chunk]:
+        data = self._head + _read_fully(self._file, RAW_CHUNK_BYTES - len(self._head))
+        while data:
+            yield Chunk(None, data)
+            data = self._file.read(RAW_CHUNK_BYTES)
+
+    def _records(self) -> Iterator[Chunk]:
+        newest_ns: int | None = None
+        while header := _read_fully(self._file, _RECORD.size):
+            if len(header) < _RECORD.size:
+                self.problem = f"the last {len(header)} bytes are a record cut short, left out"
+                return
+            t_ns, length = _RECORD.unpack(header)
+            if length > RECORD_BYTES_MAX or (newest_ns is not None and t_ns < newest_ns):
+                self.problem = (
+                    f"damaged at byte {self._offset}: record of {length} bytes at {t_ns} ns; the rest is left out"
+                )
+                return
+            data = _read_fully(self._file, length)
+            if len(data) < length:
+                self.problem = f"the last {len(header) + len(data)} bytes are a record cut short, left out"
+                return
+            self._offset += len(header) + length
+            newest_ns = t_ns
+            yield Chunk(t_ns, data)
+
+
+def read_capture(file: BinaryIO) -> CaptureReader:
+    """The chunks in a raw or stamped capture, told apart by its first bytes. Raises ImudError for another version."""
+    return CaptureReader(file)
+
+
+class CaptureWriter:
+    """Writes a stamped capture, up to a bound. The file stays the caller's to flush and close."""
+
+    def __init__(
+        self,
+        file: BinaryIO,
+        *,
+        driver: str = "",
+        baud: int = 0,
+        details: Mapping[str, str | int] | None = None,
+        bytes_max: int = WRITE_BYTES_MAX,
+    ) -> None:
+        """Writes the first line; empty and zero values are left out of it. Raises ValueError when it gets too long."""
+        self._file = file
+        self._room = bytes_max
+        self._newest_ns = -(1 << 63)
+        self.bytes_refused = 0
+        """Bytes that were not written because the bound was reached."""
+        values: dict[str, str | int] = {"driver": driver, "baud": baud, **(details or {})}
+        pairs = [f"{key}={quote(str(value), safe='')}" for key, value in values.items() if value not in ("", 0)]
+        header = MAGIC + " ".join([VERSION, *pairs]).encode("ascii") + b"\n"
+        if len(header) > HEADER_BYTES_MAX:
+            raise ValueError(f"first line of {len(header)} bytes: at most {HEADER_BYTES_MAX} can be read back")
+        self._room -= self._file.write(header)
+
+    def write(self, data: bytes, t_ns: int) -> bool:
+        """Append one read; False once the bound is reached, and from then on. A time that ran back is held."""
+        if not data:
+            return self.bytes_refused == 0
+        if self.bytes_refused or _RECORD.size + len(data) > self._room:
+            self.bytes_refused += len(data)
+            return False
+        self._newest_ns = max(self._newest_ns, t_ns)
+        for start in range(0, len(data), RECORD_BYTES_MAX):
+            piece = data[start : start + RECORD_BYTES_MAX]
+            self._file.write(_RECORD.pack(self._newest_ns, len(piece)) + piece)
+            self._room -= _RECORD.size + len(piece)
+        return True
+
+
+def _read_fully(file: BinaryIO, size: int) -> bytes:
+    """Up to `size` bytes; fewer only at the end (a pipe hands over less at a time)."""
+    parts = []
+    while size > 0 and (part := file.read(size)):
+        parts.append(part)
+        size -= len(part)
+    return b"".join(parts)

@@ -1,0 +1,125 @@
+"""A link inside the process, for tests: bytes are fed by hand, writes and rates are kept.
+
+A fault is a subclass of three lines, for example::
+
+    class Stuck(MemoryLink):
+        def write(self, data: bytes) -> None:
+            raise LinkError("memory does not send")
+"""
+
+import asyncio
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from imud.errors import LinkBusy, LinkError, LinkMissing
+from imud.kit.link import LinkType, OnData, OnEnd
+from imud.kit.settings import Settings
+from imud.kit.status import KernelCounters
+
+
+class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a link inside the process."""
+
+    name: str = "memory"
+    """Its title."""
+    baud: Annotated[int, Meta(ge=0)] | Literal["auto"] = 0
+    """Rate it pretends to have, in bit/s; 0 is none."""
+    hold_ns: Annotated[int, Meta(ge=0)] = 0
+    """How long it pretends to hold bytes back, ns."""
+    writable: bool = True
+    """Whether it pretends that a device listens."""
+
+
+class MemoryLink:
+    """A `StreamLink` whose far end is the test. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: MemorySettings) -> None:
+        self.title = settings.name
+        self.auto_baud = settings.baud == "auto"
+        self.baud: int = 0 if settings.baud == "auto" else settings.baud
+        self.writable = settings.writable
+        self.hold_ns = settings.hold_ns
+        self.written: list[bytes] = []
+        """Every `write`, in order."""
+        self.bauds: list[int] = []
+        """Every `set_baud`, in order."""
+        self.counters = KernelCounters()
+        """What `kernel_counters` returns; set it at will."""
+        self.is_open = False
+        self._present = asyncio.Event()
+        self._present.set()
+        self._on_data: OnData | None = None
+        self._on_end: OnEnd | None = None
+
+    # --- the test's side -----------------------------------------------------------------------------------------
+
+    @property
+    def listening(self) -> bool:
+        """Whether `start` was called and the link did not end since."""
+        return self._on_data is not None
+
+    def feed(self, data: bytes, t_rx_ns: int) -> bool:
+        """Deliver bytes as if read at `t_rx_ns`; False when nobody listens, and then they are lost."""
+        if self._on_data is None:
+            return False
+        self._on_data(data, t_rx_ns)
+        return True
+
+    def end(self, error: LinkError | None = None) -> None:
+        """The link ends by itself: with an error, or None for the regular end."""
+        on_end, self._on_end, self._on_data = self._on_end, None, None
+        if on_end is not None:
+            on_end(error)
+
+    def appear(self) -> None:
+        """The port is there (as it is in the beginning)."""
+        self._present.set()
+
+    def disappear(self) -> None:
+        """The port is pulled out: `wait_present` waits, and a running link ends with LinkMissing."""
+        self._present.clear()
+        self.end(LinkMissing(f"{self.title} is gone: the test pulled it out"))
+
+    # --- the StreamLink ------------------------------------------------------------------------------------------
+
+    async def wait_present(self) -> None:
+        """Return when the port is there."""
+        await self._present.wait()
+
+    def open(self) -> None:
+        """Raises LinkMissing after `disappear`, LinkBusy when it is open already."""
+        if not self._present.is_set():
+            raise LinkMissing(f"{self.title} is not there: the test pulled it out")
+        if self.is_open:
+            raise LinkBusy(f"{self.title} is open already")
+        self.is_open = True
+
+    def start(self, on_data: OnData, on_end: OnEnd) -> None:
+        """Deliver what is fed from now on."""
+        self._on_data, self._on_end = on_data, on_end
+
+    def write(self, data: bytes) -> None:
+        """Keep the bytes in `written`. Raises LinkError when closed."""
+        if not self.is_open:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        self.written.append(data)
+
+    def set_baud(self, baud: int) -> None:
+        """Keep the rate in `bauds`. Raises LinkError when closed."""
+        if not self.is_open:
+            raise LinkError(f"{self.title} is not open: its rate cannot be set")
+        self.bauds.append(baud)
+        self.baud = baud
+
+    def kernel_counters(self) -> KernelCounters:
+        """What the test put into `counters`."""
+        return self.counters
+
+    def close(self) -> None:
+        """Nobody listens from now on; may be called twice."""
+        self.is_open = False
+        self._on_data = self._on_end = None
+
+
+LINK = LinkType("memory", MemorySettings, MemoryLink)

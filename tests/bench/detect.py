@@ -1,0 +1,96 @@
+"""How long detection takes, in virtual time, at every baud rate and random phases. Run: python -m tests.bench.detect
+
+The device sends at 100 Hz (at 9600 baud as often as the line carries); the line is modelled bit by bit, so that wrong
+rates deliver the garbage that they would. `quick` draws fewer phases.
+"""
+
+from collections.abc import Iterator
+from random import Random
+from statistics import quantiles
+
+from imud.detect import Found, Search
+from imud.devices.hipnuc.frames import DRIVER, encode_hi91
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.rows import Row, at_most
+from tests.uart_wire import FakeDevice, run_search
+
+COLD_S = 2.0
+REMEMBERED_S = 0.3
+HOLDS_MS = (0, 16)
+
+
+def random_hi91(random: Random) -> bytes:
+    """The frame that the module sends as delivered, 82 bytes, at rest within its noise."""
+
+    def three(scale: float) -> tuple[float, float, float]:
+        return (random.gauss(0, scale), random.gauss(0, scale), random.gauss(0, scale))
+
+    return encode_hi91(
+        system_time_ms=random.randrange(1 << 32),
+        accel_m_s2=three(9.8),
+        gyro_rad_s=three(0.01),
+        mag_t=three(5e-5),
+        euler_rad=three(1.0),
+        quat_wxyz=(1.0, *three(0.1)),
+        temperature_c=25.0,
+        pressure_pa=random.gauss(101_325, 10),
+    )
+
+
+def measure(baud: int, hold_ms: int, phases: int, *, remembered: bool) -> tuple[list[float], int]:
+    """Times to lock in s, and how many searches found something false or nothing."""
+    random = Random(f"{baud} {hold_ms} {remembered}")
+    far = FakeDevice(DRIVER, baud, 100, poll_ns=max(hold_ms, 1) * NS_PER_MS, random=random, make_frame=random_hi91)
+    times_s, wrong = [], 0
+    for _ in range(phases):
+        far.phase_ns = random.randrange(NS_PER_S)
+        memory = (DRIVER.name, baud) if remembered else None
+        search = Search([DRIVER], remembered=memory, may_ask=True, hold_ns=hold_ms * NS_PER_MS)
+        found, took_ns, _ = run_search(search, far, start_ns=10 * NS_PER_S + random.randrange(NS_PER_S))
+        times_s.append(took_ns / NS_PER_S)
+        wrong += not isinstance(found, Found) or found.baud != baud
+    return times_s, wrong
+
+
+def measure_rare(rate_hz: float, phases: int) -> tuple[list[float], int]:
+    """Times in s to find a device at `rate_hz` (0: it only answers a query) at random baud rates, and failures."""
+    random, times_s, wrong = Random(f"{rate_hz}"), [], 0
+    for _ in range(phases):
+        baud = random.choice(DRIVER.baud_rates)
+        far = FakeDevice(
+            DRIVER, baud, rate_hz, random.randrange(NS_PER_S), random=random, make_frame=random_hi91,
+            query=b"LOG VERSION\r\n", reply=b"PNAME=HI14R3\r\nAPP_VER=156\r\nOK\r\n",
+        )  # fmt: skip
+        found, took_ns, _ = run_search(Search([DRIVER], may_ask=True), far, start_ns=10 * NS_PER_S)
+        times_s.append(took_ns / NS_PER_S)
+        wrong += not isinstance(found, Found) or found.baud != baud
+    return times_s, wrong
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """Median and 95th percentile of the time to lock, cold and remembered, without and with a USB adapter's 16 ms."""
+    phases = 100 if quick else 1000
+    failed = 0
+    for remembered, limit_s in ((False, COLD_S), (True, REMEMBERED_S)):
+        for hold_ms in HOLDS_MS:
+            everything: list[float] = []
+            how = f"{'remembered' if remembered else 'cold'}, {hold_ms} ms adapter"
+            for baud in sorted(DRIVER.baud_rates):
+                times_s, wrong = measure(baud, hold_ms, phases, remembered=remembered)
+                failed += wrong
+                everything += times_s
+                yield at_most(f"detect {how}, {baud} baud, p95", quantiles(times_s, n=20)[-1], "s", limit_s)
+            yield Row(f"detect {how}, all rates, p50", quantiles(everything, n=2)[0], "s")
+            yield at_most(f"detect {how}, all rates, p95", quantiles(everything, n=20)[-1], "s", limit_s)
+            yield at_most(f"detect {how}, all rates, max", max(everything), "s", limit_s)
+    for name, rate_hz in (("10 Hz", 10), ("1 Hz", 1), ("silent, asked", 0)):
+        times_s, wrong = measure_rare(rate_hz, phases // 5)
+        failed += wrong
+        yield Row(f"detect cold, device {name}, p50", quantiles(times_s, n=2)[0], "s")
+        yield Row(f"detect cold, device {name}, p95", quantiles(times_s, n=20)[-1], "s")
+    yield at_most("detect: searches without or with a false result", failed, "", 0)
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(f"{row.name:64} {row.value:8.3f} {row.unit:4} {row.reach}")

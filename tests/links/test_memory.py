@@ -1,0 +1,97 @@
+"""The link for tests."""
+
+import asyncio
+
+import msgspec
+import pytest
+
+from imud.errors import LinkBusy, LinkError, LinkMissing
+from imud.kit.link import StreamLink
+from imud.kit.status import KernelCounters
+from imud.links import LINKS
+from imud.links.memory import MemoryLink, MemorySettings
+
+
+class Listener:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.chunks: list[tuple[bytes, int]] = []
+        self.ends: list[LinkError | None] = []
+
+    def on_data(self, data: bytes, t_rx_ns: int) -> None:
+        self.chunks.append((data, t_rx_ns))
+
+    def on_end(self, error: LinkError | None) -> None:
+        self.ends.append(error)
+
+
+def opened() -> tuple[MemoryLink, Listener]:
+    link, listener = MemoryLink(MemorySettings()), Listener()
+    link.open()
+    link.start(listener.on_data, listener.on_end)
+    return link, listener
+
+
+def test_what_is_fed_arrives_with_its_time() -> None:
+    link, listener = opened()
+    assert link.feed(b"a", 5)
+    assert listener.chunks == [(b"a", 5)]
+    link.close()
+    link.close()
+    assert not link.feed(b"b", 6)
+    assert listener.chunks == [(b"a", 5)]
+    assert listener.ends == []
+
+
+def test_writes_and_rates_are_kept() -> None:
+    link, _ = opened()
+    link.write(b"LOG VERSION\r\n")
+    link.set_baud(9600)
+    assert (link.written, link.bauds, link.baud) == ([b"LOG VERSION\r\n"], [9600], 9600)
+    link.counters = KernelCounters(overrun=3)
+    assert link.kernel_counters().overrun == 3
+
+
+def test_the_end_is_told_once() -> None:
+    link, listener = opened()
+    link.end(None)
+    link.end(LinkError("late"))
+    assert listener.ends == [None]
+    assert not link.listening
+
+
+def test_pulling_it_out_ends_it_until_it_appears() -> None:
+    async def scene() -> None:
+        link, listener = opened()
+        await link.wait_present()
+        link.disappear()
+        assert isinstance(listener.ends[0], LinkMissing)
+        link.close()
+        with pytest.raises(LinkMissing):
+            link.open()
+        waiting = asyncio.create_task(link.wait_present())
+        await asyncio.sleep(0)
+        assert not waiting.done()
+        link.appear()
+        await asyncio.wait_for(waiting, 5)
+        link.open()
+
+    asyncio.run(scene())
+
+
+def test_misuse_is_an_error() -> None:
+    link, _ = opened()
+    with pytest.raises(LinkBusy):
+        link.open()
+    link.close()
+    with pytest.raises(LinkError, match="nothing can be sent"):
+        link.write(b"x")
+    with pytest.raises(LinkError, match="rate cannot be set"):
+        link.set_baud(9600)
+
+
+def test_the_row() -> None:
+    row = LINKS["memory"]
+    link: StreamLink = row.make(msgspec.convert({"baud": "auto", "hold_ns": 7, "writable": False}, row.settings))
+    assert (link.auto_baud, link.baud, link.hold_ns, link.writable) == (True, 0, 7, False)

@@ -1,0 +1,47 @@
+"""Who holds a port, from a made-up /proc."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from imud.links.port_owner import SERIAL_GROUP, group_of, holders_of, user_name
+
+
+def process(proc: Path, pid: int, name: str, *targets: str) -> None:
+    (proc / str(pid) / "fd").mkdir(parents=True)
+    (proc / str(pid) / "comm").write_text(f"{name}\n")
+    for number, target in enumerate(targets):
+        (proc / str(pid) / "fd" / str(number)).symlink_to(target)
+
+
+def test_every_holder_is_named_by_program_and_pid(tmp_path: Path) -> None:
+    port, link = tmp_path / "ttyUSB0", tmp_path / "by-id"
+    port.touch()
+    link.symlink_to(port)
+    proc = tmp_path / "proc"
+    process(proc, 10, "minicom", "/dev/null", str(port))
+    process(proc, 11, "bash", "/dev/null")
+    process(proc, 12, "screen", str(port))
+    (proc / "13").mkdir()  # ended, or another user's
+    (proc / "self").mkdir()
+    assert holders_of(str(link), proc) == "minicom (pid 10), screen (pid 12)"
+    assert holders_of("/dev/ttyUSB9", proc) == ""
+
+
+def test_a_process_without_a_name(tmp_path: Path) -> None:
+    process(tmp_path, 10, "x", "/dev/ttyUSB0")
+    (tmp_path / "10" / "comm").unlink()
+    assert holders_of("/dev/ttyUSB0", tmp_path) == "a process (pid 10)"
+
+
+def test_the_group_of_serial_ports_where_only_root_may(tmp_path: Path) -> None:
+    assert group_of(str(tmp_path / "missing")) == SERIAL_GROUP
+    if os.stat("/dev/null").st_gid == 0:
+        assert group_of("/dev/null") == SERIAL_GROUP
+
+
+@pytest.mark.parametrize(("uid", "name"), [(0, "root"), (4_242_424, "4242424")])
+def test_the_user_has_a_name_or_a_number(monkeypatch: pytest.MonkeyPatch, uid: int, name: str) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: uid)
+    assert user_name() == name
