@@ -1,0 +1,74 @@
+"""Makes the tables of docs/configuration.md from the settings classes: `python -m tests.config_reference`."""
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from imud.config import TABLES, DeviceGeneral, General
+from imud.kit.expected import expected, shown
+from imud.kit.settings import Settings
+
+FILE = Path(__file__).parent.parent / "docs/configuration.md"
+BEGIN, END = "<!-- keys: begin -->\n", "<!-- keys: end -->\n"
+
+
+def docs_of(schema: type[Settings]) -> dict[str, str]:
+    """The docstring below each field."""
+    (made,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
+    assert isinstance(made, ast.ClassDef)
+    found, name = {}, ""
+    for node in made.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            name = node.target.id
+        elif name and isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            found[name] = " ".join(str(node.value.value).split())
+            name = ""
+    return found
+
+
+def parts() -> Iterator[tuple[str, str, type[Settings]]]:
+    """Title, path in the file, and schema of every part."""
+    yield "The daemon", "", General
+    for name, publisher in TABLES.publishers.items():
+        yield f"Output `{name}`", f"{name}.", publisher.settings
+    yield "Each device", "devices.NAME.", DeviceGeneral
+    for name, link in TABLES.links.items():
+        yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings
+    for name, driver in TABLES.drivers.items():
+        yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
+
+
+def default_of(field: msgspec.structs.FieldInfo) -> str:
+    """The default as one would write it; file modes in octal."""
+    if field.required:
+        return "needed"
+    return f"`{field.default:#o}`" if field.name == "mode" else f"`{shown(field.default)}`"
+
+
+def tables() -> str:
+    """The whole generated part."""
+    text = []
+    for title, path, schema in parts():
+        text += [f"### {title}", "", "| key | expected | default | meaning |", "|---|---|---|---|"]
+        docs = docs_of(schema)
+        for field in msgspec.structs.fields(schema):
+            words = expected(field.type).replace("|", "\\|")
+            text.append(f"| `{path}{field.name}` | {words} | {default_of(field)} | {docs[field.name]} |")
+        if not msgspec.structs.fields(schema):
+            text.append("| (none) | | | |")
+        text.append("")
+    return "\n".join(text)
+
+
+def whole(page: str) -> str:
+    """`page` with its tables made anew."""
+    return re.sub(f"(?s){BEGIN}.*{END}", lambda _: f"{BEGIN}\n{tables()}\n{END}", page)
+
+
+if __name__ == "__main__":
+    FILE.write_text(whole(FILE.read_text()))
