@@ -1,0 +1,91 @@
+"""Cost of one scrape: CPU of rendering, and how long it keeps a busy event loop from its next turn.
+
+The stall is measured where it hurts: a loop in the main thread turns without a break while another thread renders,
+and the longest time between two turns is noted. `python -m tests.bench.metrics`.
+"""
+
+import asyncio
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from threading import Event, Thread
+
+from imud.publishers.metrics import Renderer, Snapshot
+from tests.bench.rows import Row, at_most
+from tests.publishers.device_status import client, device
+
+STALL_MS_MAX = 1.0
+"""A sample every millisecond: a stall below this delays one wake-up and loses nothing."""
+
+
+def snapshot(devices: int) -> Snapshot:
+    """Devices and ten clients."""
+    return Snapshot(
+        tuple(device(f"imu{n}", n) for n in range(devices)), tuple(client(n, sent=5) for n in range(10)), (), 1
+    )
+
+
+def render_ms(devices: int, repeats: int) -> tuple[float, int]:
+    """CPU ms of one rendering without pauses (best of `repeats`), and bytes of it."""
+    renderer, shown = Renderer(pause=lambda: None), snapshot(devices)
+    best_ns, size = 1 << 62, 0
+    for _ in range(repeats):
+        begin_ns = time.thread_time_ns()
+        size = len(renderer.render(shown, "").body)
+        best_ns = min(best_ns, time.thread_time_ns() - begin_ns)
+    return best_ns / 1e6, size
+
+
+async def stalls_ms(work: Callable[[], object], repeats: int) -> list[float]:
+    """The longest time between two turns of this loop, for each run of `work` in another thread; sorted."""
+    longest = []
+    for _ in range(repeats):
+        go = Event()
+        thread = Thread(target=lambda go=go: (go.wait(), work()))
+        thread.start()
+        worst_ns, last_ns = 0, time.perf_counter_ns()
+        go.set()
+        while thread.is_alive():
+            await asyncio.sleep(0)
+            now_ns = time.perf_counter_ns()
+            worst_ns, last_ns = max(worst_ns, now_ns - last_ns), now_ns
+        longest.append(worst_ns / 1e6)
+    return sorted(longest)
+
+
+def wall_ms(renderer: Renderer, shown: Snapshot) -> float:
+    """Time of one rendering with its pauses on an idle machine."""
+    begin_ns = time.perf_counter_ns()
+    renderer.render(shown, "")
+    return (time.perf_counter_ns() - begin_ns) / 1e6
+
+
+def stall_rows(name: str, stalls: list[float], limit_ms: float | None = None) -> Iterator[Row]:
+    """The quietest run, which other programs disturbed least, and the median."""
+    best, median = stalls[0], stalls[len(stalls) // 2]
+    yield at_most(f"{name}, best run", best, "ms", limit_ms) if limit_ms else Row(f"{name}, best run", best, "ms")
+    yield Row(f"{name}, median run", median, "ms")
+
+
+def rows(quick: bool = False) -> Iterator[Row]:
+    """Figures for 1 and 16 devices."""
+    repeats = 10 if quick else 60
+    yield from stall_rows(
+        "metrics: loop stall without scrape", asyncio.run(stalls_ms(lambda: time.sleep(0.01), repeats))
+    )
+    for devices in (1, 16):
+        cpu_ms, size = render_ms(devices, repeats)
+        yield Row(f"metrics: render {devices} devices, CPU", cpu_ms, "ms")
+        yield Row(f"metrics: render {devices} devices, size", size / 1000, "kB")
+        shown = snapshot(devices)
+        yield Row(f"metrics: render {devices} devices, wall with pauses", wall_ms(Renderer(), shown), "ms")
+        straight = asyncio.run(stalls_ms(partial(Renderer(pause=lambda: None).render, shown, ""), repeats))
+        yield from stall_rows(f"metrics: loop stall, {devices} devices, no pauses", straight)
+        paused = asyncio.run(stalls_ms(partial(Renderer().render, shown, ""), repeats))
+        yield from stall_rows(f"metrics: loop stall, {devices} devices", paused, STALL_MS_MAX)
+
+
+if __name__ == "__main__":
+    for row in rows("--quick" in sys.argv):
+        print(f"{row.name:64} {row.value:12.3f} {row.unit:6} {row.reach} {row.reached}")

@@ -1,0 +1,254 @@
+"""Metrics: every number is that of the status, in base units; documentation and alerts name what exists."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from prometheus_client.core import Metric
+from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
+from prometheus_client.parser import text_string_to_metric_families as parse_text
+
+import imud
+from imud.kit.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState
+from imud.ledger import LEDGER_FIELDS
+from imud.publishers.client_metrics import ClientTotals
+from imud.publishers.metrics import SAMPLES_PER_TURN, Renderer, Snapshot
+from imud.sample import Sync
+from tests.publishers.device_status import client, device
+
+ROOT = Path(__file__).parent.parent.parent
+Key = tuple[str, frozenset[tuple[str, str]]]
+
+
+def values(metrics: Sequence[Metric]) -> dict[Key, float]:
+    """Every line by name and labels; a line that stands twice is an error."""
+    found: dict[Key, float] = {}
+    for metric in metrics:
+        for line in metric.samples:
+            key = (line.name, frozenset(line.labels.items()))
+            assert key not in found, key
+            found[key] = line.value
+    return found
+
+
+def rendered(snapshot: Snapshot) -> dict[Key, float]:
+    """The values of a snapshot after text and parser."""
+    body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
+    return values(list(parse_text(body)))
+
+
+def key(name: str, **labels: str) -> Key:
+    return name, frozenset(labels.items())
+
+
+DEVICES = (
+    device("front", 0),
+    device(
+        "rear", 1, state=DeviceState.MISSING, clock=ClockStatus(), temperature_c=None, status_bits=None,
+        expected_rate_hz=0.0, identity={},
+    ),
+)  # fmt: skip
+
+LEDGER_LINES = {
+    "bytes_in": ("imud_bytes_in_total", {}),
+    "bytes_in_good_frames": ("imud_bytes_total", {"fate": "good_frames"}),
+    "bytes_in_bad_frames": ("imud_bytes_total", {"fate": "bad_frames"}),
+    "bytes_skipped": ("imud_bytes_total", {"fate": "skipped"}),
+    "bytes_pending": ("imud_bytes_pending", {}),
+    "frames_good": ("imud_frames_good_total", {}),
+    "frames_in_samples": ("imud_frames_total", {"fate": "samples"}),
+    "frames_in_replies": ("imud_frames_total", {"fate": "replies"}),
+    "frames_ignored": ("imud_frames_total", {"fate": "ignored"}),
+    "frames_pending": ("imud_frames_pending", {}),
+    "frames_bad_crc": ("imud_frames_bad_total", {"reason": "crc"}),
+    "frames_bad_length": ("imud_frames_bad_total", {"reason": "length"}),
+    "frames_bad_content": ("imud_frames_bad_total", {"reason": "content"}),
+    "unknown_tags": ("imud_unknown_tags_total", {}),
+    "samples": ("imud_samples_total", {}),
+    "lost_gap_device": ("imud_samples_lost_total", {"cause": "gap_device"}),
+    "lost_crc": ("imud_samples_lost_total", {"cause": "crc"}),
+    "lost_overrun": ("imud_samples_lost_total", {"cause": "overrun"}),
+    "lost_queue": ("imud_samples_lost_total", {"cause": "queue"}),
+    "replies_late": ("imud_replies_stray_total", {"kind": "late"}),
+    "replies_unsolicited": ("imud_replies_stray_total", {"kind": "unsolicited"}),
+}
+
+
+def test_every_ledger_number_is_shown_as_it_is() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    assert set(LEDGER_LINES) == set(LEDGER_FIELDS)
+    for status in DEVICES:
+        for field, (name, labels) in LEDGER_LINES.items():
+            assert shown[key(name, device=status.name, **labels)] == status.ledger[field], field
+
+
+def test_ledger_closes_in_the_scrape_and_a_hole_shows() -> None:
+    ledger = dict(DEVICES[0].ledger)
+    ledger["bytes_in"] += 3
+    ledger["frames_in_replies"] += 2
+    shown = rendered(Snapshot((*DEVICES, device("leaky", 2, ledger=ledger))))
+    for name in ("front", "rear"):
+        assert shown[key("imud_ledger_unaccounted_bytes", device=name)] == 0
+        assert shown[key("imud_ledger_unaccounted_frames", device=name)] == 0
+    assert shown[key("imud_ledger_unaccounted_bytes", device="leaky")] == 3
+    assert shown[key("imud_ledger_unaccounted_frames", device="leaky")] == -2
+
+
+def test_values_in_base_units() -> None:
+    shown = rendered(Snapshot(DEVICES, heartbeat_age_ns=250_000_000))
+    front = {"device": "front"}
+    expected = {
+        "imud_clock_offset_seconds": 5.25,
+        "imud_clock_skew_ratio": -4e-05,
+        "imud_clock_residual_seconds": 3e-05,
+        "imud_clock_error_seconds": 4.5e-05,
+        "imud_clock_resets_total": 2,
+        "imud_sample_rate_hertz": 999.5,
+        "imud_sample_rate_expected_hertz": 1000.25,
+        "imud_temperature_celsius": 36.5,
+        "imud_status_bits": 4,
+        "imud_device_connects_total": 3,
+    }
+    for name, value in expected.items():
+        assert shown[key(name, **front)] == pytest.approx(value, rel=1e-12), name
+    kinds = {"overrun": 7, "framing": 8, "parity": 9, "break": 10}
+    for kind, count in kinds.items():
+        assert shown[key("imud_kernel_errors_total", kind=kind, **front)] == count
+    assert shown[key("imud_heartbeat_age_seconds")] == 0.25
+
+
+def test_absent_is_not_zero() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    for name in ("imud_temperature_celsius", "imud_status_bits", "imud_sample_rate_expected_hertz"):
+        assert key(name, device="front") in shown
+        assert key(name, device="rear") not in shown
+
+
+def test_state_and_sync_are_one_hot() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
+        assert shown[key("imud_device_up", device=name)] == up
+        for other in DeviceState:
+            assert shown[key("imud_device_state", device=name, state=other.value)] == (other.value == state)
+    for sync in Sync:
+        assert shown[key("imud_clock_sync", device="front", sync=sync.value)] == (sync is Sync.REGRESSION)
+
+
+def test_latency_histogram_is_cumulative() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    bounds = [f"{bound / 1e9:.6g}" for bound in LATENCY_BOUNDS_NS]
+    counts = {
+        float(dict(labels)["le"]): value
+        for (name, labels), value in shown.items()
+        if name == "imud_sample_latency_seconds_bucket" and ("device", "front") in labels
+    }
+    assert [f"{bound:.6g}" for bound in sorted(counts)] == [*bounds, "inf"]
+    assert [counts[bound] for bound in sorted(counts)] == [1, 3, 6, 10, 15, 21, 28, 36, 45, 55, 66]
+    assert shown[key("imud_sample_latency_seconds_count", device="front")] == 66
+    assert shown[key("imud_sample_latency_seconds_sum", device="front")] == 2.5
+
+
+def test_identity_build_and_process() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    identity = {"product": "HI13", "serial_number": "00000000", "firmware": "1.7.6"}
+    link = "/dev/ttyUSB0 at 115200 baud"
+    assert shown[key("imud_device_info", device="front", driver="hipnuc-uart", link=link, **identity)] == 1
+    (build,) = [dict(labels) for name, labels in shown if name == "imud_build_info"]
+    assert build["version"] == imud.__version__
+    assert shown[key("process_resident_memory_bytes")] > 1_000_000
+    assert key("process_cpu_seconds_total") in shown
+
+
+def test_identity_with_quotes_and_newlines_stays_one_label() -> None:
+    odd = 'a"b\\c\nd'
+    shown = rendered(Snapshot((device("x", identity={"product": odd}),)))
+    (labels,) = [dict(labels) for name, labels in shown if name == "imud_device_info"]
+    assert labels["product"] == odd
+
+
+def test_clients_are_summed_and_totals_never_fall() -> None:
+    totals = ClientTotals()
+    totals.update([client(1, sent=10, dropped=2), client(2, sent=5)])
+    totals.update([client(2, sent=6, dropped=1), client(3, sent=4)])  # 1 left
+    totals.update([])
+    assert (totals.sent, totals.dropped) == (10 + 6 + 4, 2 + 1)
+    clients: Sequence[ClientStatus] = [client(1, queue=7), client(2, "binary", queue=2), client(3, ""), client(4)]
+    shown = rendered(Snapshot(clients=clients))
+    assert {e: shown[key("imud_clients", encoding=e)] for e in ("json", "binary", "none")} == {
+        "json": 2, "binary": 1, "none": 1,
+    }  # fmt: skip
+    assert shown[key("imud_client_queue_samples")] == 9
+    assert shown[key("imud_client_queue_samples_max")] == 7
+    assert shown[key("imud_client_queue_bytes")] == 9 * 256
+
+
+def test_both_formats_say_the_same() -> None:
+    renderer = Renderer(pause=lambda: None)
+    plain = renderer.render(Snapshot(DEVICES), "text/html, */*;q=0.1")
+    rich = renderer.render(Snapshot(DEVICES), "application/openmetrics-text; version=1.0.0, text/plain;q=0.5")
+    assert plain.content_type == "text/plain; version=0.0.4; charset=utf-8"
+    assert rich.content_type.startswith("application/openmetrics-text; version=1.0.0")
+    assert rich.body.endswith(b"# EOF\n")
+    ours = re.compile("imud_")
+    from_plain, from_rich = (
+        {k: v for k, v in values(list(found)).items() if ours.match(k[0])}
+        for found in (parse_text(plain.body.decode()), parse_openmetrics(rich.body.decode()))  # type: ignore[no-untyped-call]  # the library's parser has no types
+    )
+    assert from_plain == from_rich
+
+
+def test_rendering_pauses_often() -> None:
+    """No stretch between two pauses renders more than SAMPLES_PER_TURN lines of ours."""
+    pauses = 0
+
+    def pause() -> None:
+        nonlocal pauses
+        pauses += 1
+
+    devices = [device(f"d{n}", n) for n in range(16)]
+    body = Renderer(pause).render(Snapshot(devices), "").body
+    lines = sum(line.startswith(b"imud_") for line in body.splitlines())
+    assert lines > 900
+    assert pauses >= lines / SAMPLES_PER_TURN
+    assert pauses >= sum(line.startswith(b"# HELP imud_") for line in body.splitlines()) - 1  # events: none yet
+
+
+# --- documentation and alerts ---------------------------------------------------------------------------------------
+
+
+def shown_names() -> set[str]:
+    """Names of all families as they stand after `# HELP`."""
+    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1)
+    body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
+    return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))
+
+
+def test_every_metric_is_documented_and_nothing_else() -> None:
+    documented = set(re.findall(r"^\| `([a-z_]+)`", (ROOT / "docs/metrics.md").read_text(), re.MULTILINE))
+    assert documented == shown_names()
+
+
+def test_names_follow_the_conventions() -> None:
+    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1)
+    for metric in parse_text(Renderer(pause=lambda: None).render(snapshot, "").body.decode()):
+        assert metric.name.startswith(("imud_", "process_"))
+        assert metric.documentation.endswith(".")
+        for line in metric.samples:
+            assert (metric.type == "counter") == line.name.endswith("_total")
+
+
+def test_alerts_use_metrics_that_exist() -> None:
+    import yaml
+
+    rules = yaml.safe_load((ROOT / "etc/prometheus/imud.rules.yml").read_text())
+    alerts = [rule for group in rules["groups"] for rule in group["rules"]]
+    assert {alert["alert"] for alert in alerts} >= {
+        "ImudDown", "ImudDeviceDown", "ImudSamplesLost", "ImudSyncLost", "ImudLedgerOpen",
+    }  # fmt: skip
+    for alert in alerts:
+        used = set(re.findall(r"\bimud_\w+", alert["expr"]))
+        assert used <= shown_names(), alert["alert"]
+        assert used or "up{" in alert["expr"]
+        assert {"summary", "description"} <= set(alert["annotations"])
+        assert alert["labels"]["severity"] in ("warning", "critical")
