@@ -14,7 +14,7 @@ from time import monotonic_ns
 
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
-from imud.errors import ConfigError
+from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
 from imud.kit.batch import Batch
 from imud.kit.publisher import Publisher, PublisherContext
@@ -123,10 +123,15 @@ class Daemon:
         for name in change.publishers_changed:
             self._publishers.pop(name).close()
             self._start_publisher(name, PUBLISHERS[name].make(new.publishers[name], self._context))
+        problems = ""
         for device in new.devices:
             if device.name not in self._runners:
-                self._start_device(device)
-        words = f"configuration read again: {change}"
+                try:
+                    self._start_device(device)
+                except ServerError as error:
+                    log.error("%s cannot be started: %s", device.name, error)
+                    problems += f"; {device.name} cannot be started: {error}"
+        words = f"configuration read again: {change}{problems}"
         log.info("%s", words)
         self._tell(Event(monotonic_ns(), "", EventKind.CONFIGURATION, words))
 

@@ -33,16 +33,21 @@ def run(args: argparse.Namespace) -> int:
     driver = DRIVERS[args.driver]
     ledger = Ledger()
     write = sys.stdout.write
-    try:
-        with sys.stdin.buffer if args.file == "-" else open(args.file, "rb") as file:
-            for line in decode(file, driver, ledger):
-                write(line)
-    except OSError as error:
-        raise ImudError(f"{args.file}: {error.strerror}") from error
+    with open_capture(args.file) as file:
+        for line in decode(file, driver, ledger):
+            write(line)
     sys.stdout.flush()
     shown = {name: value for name, value in ledger.snapshot().items() if value}
     print(msgspec.json.encode(shown).decode(), file=sys.stderr)
     return 0 if ledger.frames_good else 1
+
+
+def open_capture(name: str) -> BinaryIO:
+    """The file, or standard input for `-`. Raises ImudError."""
+    try:
+        return sys.stdin.buffer if name == "-" else open(name, "rb")
+    except OSError as error:
+        raise ImudError(f"{name}: {error.strerror}") from error
 
 
 def decode(file: BinaryIO, driver: StreamDriver, ledger: Ledger) -> Iterator[str]:

@@ -34,6 +34,9 @@ log = logging.getLogger(__name__)
 
 RETRY_S = 0.5
 """Pause before a port that refused is opened again: short enough to be back within a second of its coming back."""
+GONE_S = 0.02
+"""The same after a port has gone; its coming back is waited for without polling, so this only keeps a node that is
+there and cannot be opened from being tried without end."""
 IDLE_FLUSH_NS = 50 * NS_PER_MS
 """A line idle for longer than any adapter's latency timer (16 ms) sends no more of the frame that is pending."""
 UNHEARD_NS = 2 * NS_PER_S
@@ -89,9 +92,10 @@ class DeviceRunner:
                 return
             except LinkMissing as error:
                 self._down(DeviceState.MISSING, str(error))
+                await asyncio.sleep(GONE_S)
             except LinkError as error:
                 self._down(DeviceState.FAILED, str(error))
-            await asyncio.sleep(RETRY_S)
+                await asyncio.sleep(RETRY_S)
 
     def tick(self, now_ns: int) -> None:
         """Ten times a second: states, idle line, events that gathered."""
@@ -254,9 +258,9 @@ class DeviceRunner:
 
     def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
         quiet_ns = now_ns - path.last_sample_ns
-        if self.state is DeviceState.SEARCHING and path.fresh:
-            self._up(now_ns, path)
-        elif self.state is DeviceState.SILENT and quiet_ns < SILENCE_NS:
+        if (self.state is DeviceState.SEARCHING and path.fresh) or (
+            self.state is DeviceState.SILENT and quiet_ns < SILENCE_NS
+        ):
             self._up(now_ns, path)
         elif self.state is DeviceState.RUNNING and quiet_ns > self._silence_limit_ns():
             self._silent_since_ns = now_ns

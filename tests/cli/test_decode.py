@@ -1,0 +1,60 @@
+"""`imud decode`: a capture in, JSON lines out; the manual's own frame as it would come from a module."""
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from imud.cli import main
+
+MANUAL_FRAME = bytes.fromhex(
+    "5AA54C0014BB910815 2309A2C447 08151C00 CCE861BE9A35563E65EA723F 31D07CBD75DDC5BB6BD724BC"
+    "8988FC4001006A41AB2A70C2 96D45041ED03434141F4F4C2 CCCAF8BE736A19BEF0001C3D8D375C3F".replace(" ", "")
+)
+"""Section 3.5 of the manual."""
+
+
+def lines(text: str) -> list[dict[str, object]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_one_object_per_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged = bytearray(MANUAL_FRAME)
+    damaged[40] ^= 0xFF
+    capture = tmp_path / "capture.raw"
+    capture.write_bytes(MANUAL_FRAME + b"OK\r\n" + bytes(damaged) + b"\x00")
+    assert main(["decode", "--driver", "hipnuc-uart", str(capture)]) == 0
+    printed = capsys.readouterr()
+    sample, text, bad = lines(printed.out)
+    assert sample["t_dev_ns"] == 1_840_392_000_000  # 1,840,392 ms in the manual's table
+    assert sample["accel_m_s2"] == pytest.approx([-0.220615 * 9.8, 0.209189 * 9.8, 0.948889 * 9.8], rel=1e-5)
+    assert sample["temperature_c"] == 35
+    assert sample["pressure_pa"] == pytest.approx(100676, abs=1)
+    assert sample["pps_age_ms"] == 0x1508
+    assert text == {"text": "OK"}
+    assert bad == {"bad_frame": "crc", "raw": bytes(damaged).hex()}
+    ledger = json.loads(printed.err)
+    assert ledger["bytes_in"] == 82 + 4 + 82 + 1
+    assert ledger["frames_in_samples"] == 1
+
+
+def test_standard_input(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(MANUAL_FRAME * 3)))
+    assert main(["decode", "--driver", "hipnuc-uart", "-"]) == 0
+    assert len(lines(capsys.readouterr().out)) == 3
+
+
+def test_nothing_in_it_is_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = tmp_path / "noise"
+    capture.write_bytes(bytes(range(128, 256)) * 8)
+    assert main(["decode", "--driver", "hipnuc-uart", str(capture)]) == 1
+    assert json.loads(capsys.readouterr().err)["bytes_in"] == 1024
+
+
+def test_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["decode", "--driver", "hipnuc-uart", str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "No such file" in error

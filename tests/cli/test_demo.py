@@ -1,0 +1,49 @@
+"""`imud demo`: three real processes, and the account at the end."""
+
+import io
+import re
+from pathlib import Path
+
+import pytest
+
+from imud.cli import main
+from imud.cli.demo_view import View
+from imud.sample import Sample, Sync
+
+
+def test_samples_flow_and_the_ledger_closes(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--duration", "1", "--rate", "200", "--plain"]) == 0
+    out = capfd.readouterr().out
+    assert "the ledger closes to zero" in out
+    assert re.search(r"client +\d+ samples at \d+\.\d+ Hz, 0 missed", out)
+    assert "product=HI14R3" in out or "identity" in out
+    folder = re.search(r"daemon at (\S+)/imud.sock", out)
+    assert folder is not None
+    assert not Path(folder[1]).exists()
+
+
+def sample(seq: int) -> Sample:
+    t_ns = seq * 10_000_000
+    return Sample("demo", seq, t_ns, 50_000, Sync.REGRESSION, t_ns + 100, 0, euler_rad=(0.1, 0, 0))
+
+
+def test_view_counts_what_is_missing() -> None:
+    view = View(io.StringIO(), live=False)
+    for seq in (1, 2, 5):
+        view.add(sample(seq))
+    assert (view.samples, view.missed) == (3, 2)
+    assert "3 samples at 100.00 Hz, 2 missed" in view.account()
+
+
+def test_live_view_draws_in_place() -> None:
+    out = io.StringIO()
+    view = View(out, live=True)
+    view.add(sample(1))
+    first = out.getvalue()
+    assert "demo #1" in first
+    assert "5.730" in first  # 0.1 rad in degrees
+    assert "\x1b[5A" not in first
+
+
+def test_account_without_samples() -> None:
+    assert "no sample arrived" in View(io.StringIO(), live=False).account()

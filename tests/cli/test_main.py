@@ -1,0 +1,68 @@
+"""Every command is reachable, explains itself, and answers mistakes with one line."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from imud import __version__
+from imud.cli import COMMANDS, main
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as done:
+        main([command, "--help"])
+    assert done.value.code == 0
+    assert f"imud {command}" in capsys.readouterr().out
+
+
+def test_every_command_file_is_in_the_table() -> None:
+    folder = Path(sys.modules["imud.cli"].__path__[0])
+    files = {path.stem for path in folder.glob("*.py") if "def add_arguments" in path.read_text()}
+    assert files == set(COMMANDS)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"imud {__version__}\n"
+
+
+@pytest.mark.parametrize("command", ["devices", "status", "watch"])
+def test_no_daemon_is_one_line(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--socket", str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "is imud running?" in error
+
+
+def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shipped = Path(__file__).parents[2] / "etc" / "imud.yaml"
+    assert main(["check", str(shipped)]) == 0
+    assert "good" in capsys.readouterr().out
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("devices:\n  bow:\n    uart:\n      port: /dev/ttyUSB0\n      baut: 9600\n")
+    assert main(["check", str(bad)]) == 2
+    error = capsys.readouterr().err
+    assert "bad.yaml:5:" in error
+    assert "baud" in error
+
+
+def test_schema_names_every_field_with_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["schema"]) == 0
+    text = capsys.readouterr().out
+    for word in ("accel_m_s2", "m/s²", "gyro_rad_s", "rad/s", "hipnuc-uart", "ENU"):
+        assert word in text
+
+
+def test_reader_of_the_output_that_goes_away_is_no_error(tmp_path: Path) -> None:
+    capture = tmp_path / "noise"
+    capture.write_bytes(b"A\r\n" * 100_000)
+    decode = f"{sys.executable} -m imud decode --driver hipnuc-uart {capture} 2>/dev/null"
+    script = decode + " | head -n 1; echo ${PIPESTATUS[0]}"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=30, check=True)
+    first, status = done.stdout.splitlines()
+    assert first == '{"text":"A"}'
+    assert status == "0"
