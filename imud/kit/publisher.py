@@ -1,13 +1,13 @@
 """What a publisher is: an output that takes samples and events and never makes the pipeline wait."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from imud.event import Event
 from imud.kit.batch import Batch
 from imud.kit.settings import Settings
-from imud.kit.status import DeviceStatus
+from imud.kit.status import ClientStatus, DeviceStatus
 
 StatusSource = Callable[[], Sequence[DeviceStatus]]
 """The state of every device now. To be called in the event loop's thread only."""
@@ -54,6 +54,12 @@ class PublisherContext:
     """Random number of this start of the daemon, 64 bits: readers see a restart by it."""
     now_ns: Callable[[], int]
     """CLOCK_MONOTONIC."""
+    client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
+    """Publishers that serve clients add a callable while they are open, so that another can show them."""
+
+    def clients(self) -> list[ClientStatus]:
+        """The clients of all publishers now. To be called in the event loop's thread only."""
+        return [client for source in self.client_sources for client in source()]
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,3 +95,41 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     status_bits: int | None
     connects: int
     """Times the link was opened since start."""
+    euler_convention: str = ""
+    """Order, axes and signs of `euler_rad`, as the driver says; empty while the driver is not known."""
+    navigation_frame: str = ""
+    """The frame that `quat_wxyz` turns into; empty while the driver is not known."""
+
+
+class ClientStatus(msgspec.Struct, frozen=True):
+    """One client of the UNIX socket."""
+
+    number: int
+    """Counts connections since start."""
+    pid: int
+    uid: int
+    control: bool
+    """Whether it may change things."""
+    encoding: str
+    """`json` or `binary` while it watches, otherwise empty."""
+    sent: int
+    """Samples given to its socket."""
+    dropped: int
+    """Samples dropped because it did not read fast enough."""
+    queue_samples: int
+    """Samples that wait for it now."""
+    queue_bytes: int
+    """Bytes that wait for it now, replies included."""
+
+
+class SocketStatus(msgspec.Struct, frozen=True):
+    """The UNIX socket and its clients."""
+
+    path: str
+    clients: tuple[ClientStatus, ...]
+    accepted: int
+    """Connections since start."""
+    refused: int
+    """Connections refused since start: too many, or no right to read."""
+    evicted: int
+    """Clients disconnected since start because they asked without reading, or sent a line over the limit."""

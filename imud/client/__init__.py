@@ -1,0 +1,8 @@
+"""Readers for programs on the gateway: `Client` for the UNIX socket, `Ring` for shared memory."""
+
+from imud.client.connection import Client, Hello
+from imud.client.ring import Ring, RingRead
+from imud.client.watch import EventStream, Watch
+from imud.kit.jsonrpc import RpcError
+
+__all__ = ["Client", "EventStream", "Hello", "Ring", "RingRead", "RpcError", "Watch"]

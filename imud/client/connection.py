@@ -1,0 +1,318 @@
+"""A blocking client of the daemon's UNIX socket.
+
+    with Client() as imud:
+        print(imud.hello.version, [device["name"] for device in imud.devices()])
+        for sample in imud.watch(rate_hz=100):
+            print(sample.t_ns, sample.accel_m_s2)
+
+A lost connection raises LinkMissing; to connect again, make another Client. Synchronization: one thread at a time.
+"""
+
+import errno
+import os
+import socket
+from collections import deque
+from collections.abc import Iterable
+from time import monotonic
+from types import TracebackType
+from typing import Any, Final, Self
+
+import msgspec
+
+from imud.client.watch import EventStream, Watch, sample_of
+from imud.errors import LinkDenied, LinkError, LinkMissing, ServerError
+from imud.kit.jsonrpc import (
+    DEFAULT_PATH,
+    FRAME_HEADER,
+    FRAME_MAX_BYTES,
+    PROTOCOL,
+    RpcError,
+    encode_request,
+    line_of,
+    parse_object,
+)
+from imud.kit.slot import SLOT_BYTES
+from imud.sample import Sample
+
+RECV_BYTES: Final = 65536
+FDS_MAX: Final = 4
+INBOX_MAX: Final = 65536
+"""Messages kept for an iterator while another one, or a question, waits for something else."""
+
+Message = dict[str, Any] | bytes
+"""A JSON object, or whole slots."""
+
+
+class Hello(msgspec.Struct, frozen=True):
+    """How the daemon greets."""
+
+    protocol: int
+    version: str
+    """Version of the daemon."""
+    epoch: int
+    """Random number of this start of the daemon."""
+    rights: tuple[str, ...]
+    """`read`, `control`."""
+
+
+class Client:
+    """A connection to the daemon at `path`.
+
+    Raises LinkMissing (nobody serves there), LinkDenied (no right), ServerError (answers that are not the protocol's),
+    TimeoutError where an answer takes longer than `timeout_s`. RpcError, a ServerError, is what the daemon refused.
+    """
+
+    def __init__(self, path: str | os.PathLike[str] = DEFAULT_PATH, *, timeout_s: float = 5.0) -> None:
+        self.path = os.fspath(path)
+        self.timeout_s = timeout_s
+        self._buffer = bytearray()
+        self.given_up = 0
+        """Messages thrown away because no iterator took them while `INBOX_MAX` others waited."""
+        self._inbox: deque[Message] = deque()
+        self._watch: Watch | None = None
+        self._fds: list[int] = []
+        self._framed = False
+        self._id = 0
+        self._sock = _connect(self.path, timeout_s)
+        try:
+            self.hello = self._greet()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
+        self._sock.close()
+        while self._fds:
+            os.close(self._fds.pop())
+
+    def fileno(self) -> int:
+        """The descriptor, to wait on with others."""
+        return self._sock.fileno()
+
+    # --- questions --------------------------------------------------------------------------------------------------
+
+    def devices(self) -> list[dict[str, Any]]:
+        """What there is, one mapping per device."""
+        return msgspec.convert(self.call("devices"), list[dict[str, Any]])
+
+    def status(self) -> dict[str, Any]:
+        """Everything the daemon knows: `now_ns`, `devices`, `socket`."""
+        return msgspec.convert(self.call("status"), dict[str, Any])
+
+    def schema(self) -> dict[str, Any]:
+        """What the members of samples mean: `fields`, `devices`, `slot`."""
+        return msgspec.convert(self.call("schema"), dict[str, Any])
+
+    def poll(self, devices: Iterable[str] | None = None) -> list[Sample]:
+        """The newest sample of each device that has one."""
+        reply = self.call("poll", devices=_listed(devices))
+        return [sample_of(params) for params in reply["samples"]]
+
+    def call(self, method: str, **params: object) -> Any:
+        """Any method by its name; parameters that are None are left out. Returns the result as JSON values."""
+        self._id += 1
+        chosen = {name: value for name, value in params.items() if value is not None}
+        self._send(line_of(encode_request(method, chosen, self._id)))
+        deadline_s = monotonic() + self.timeout_s
+        while True:
+            message = self._receive(deadline_s, method)
+            if isinstance(message, bytes) or "id" not in message or "method" in message:
+                self._keep(message)
+            elif message["id"] in (self._id, None):  # another id answers a call that was given up
+                if "error" in message:
+                    raise rpc_error(message["error"])
+                return message.get("result")
+
+    # --- streams ----------------------------------------------------------------------------------------------------
+
+    def watch(
+        self,
+        devices: Iterable[str] | None = None,
+        fields: Iterable[str] | None = None,
+        rate_hz: float | None = None,
+        encoding: str = "binary",
+        timeout_s: float | None = None,
+    ) -> Watch:
+        """Samples as they come, an endless iterator; it replaces an earlier one. None asks for all.
+
+        `fields` names the values that are wanted of JSON samples, the others are None then; binary ones are complete
+        always. Waiting longer than `timeout_s` for a sample raises TimeoutError.
+        """
+        wanted = None if fields is None else sorted({*fields, "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
+        reply = self.call("watch", devices=_listed(devices), fields=wanted, rate_hz=rate_hz, encoding=encoding)
+        if encoding == "binary":
+            self._framed = True
+        self._end_watch()
+        while self.take_kept(Watch.NAMES) is not None:
+            pass  # of the earlier one
+        self._watch = Watch(self, reply["devices"], timeout_s)
+        return self._watch
+
+    def unwatch(self) -> None:
+        """No more samples. Those that came meanwhile still come out of the iterator, which ends then."""
+        self.call("unwatch")
+        self._end_watch()
+
+    def events(self, devices: Iterable[str] | None = None, timeout_s: float | None = None) -> EventStream:
+        """Events as they come, an endless iterator. Waiting longer than `timeout_s` for one raises TimeoutError."""
+        self.call("events", devices=_listed(devices))
+        return EventStream(self, timeout_s)
+
+    def notify(self, device: str) -> int:
+        """An eventfd that the daemon adds 1 to after each batch of samples of `device`. The caller closes it."""
+        self.call("notify", device=device)
+        if not self._fds:
+            raise ServerError("the daemon's answer to notify came without a descriptor")
+        return self._fds.pop()
+
+    def take_kept(self, names: frozenset[str]) -> Message | None:
+        """Like `take`, of the messages that came while something else was waited for; None when there is none."""
+        for index, message in enumerate(self._inbox):
+            if _is_one_of(message, names):
+                del self._inbox[index]
+                return message
+        return None
+
+    def take(self, names: frozenset[str], timeout_s: float | None) -> Message:
+        """The next message: slots, or a notification whose method is among `names`; others are kept for others."""
+        kept = self.take_kept(names)
+        if kept is not None:
+            return kept
+        deadline_s = None if timeout_s is None else monotonic() + timeout_s
+        while not _is_one_of(message := self._receive(deadline_s, " or ".join(sorted(names))), names):
+            self._keep(message)
+        return message
+
+    # --- messages ---------------------------------------------------------------------------------------------------
+
+    def _greet(self) -> Hello:
+        message = self._receive(monotonic() + self.timeout_s, "hello")
+        if isinstance(message, dict) and "error" in message:
+            error = rpc_error(message["error"])
+            raise LinkDenied(f"{self.path}: the daemon refuses: {error}") from error
+        if isinstance(message, bytes) or message.get("method") != "hello":
+            raise ServerError(f"{self.path}: expected the daemon's hello, got {message!r:.200}")
+        try:
+            hello = msgspec.convert(message.get("params"), Hello)
+        except msgspec.ValidationError as error:
+            raise ServerError(f"{self.path}: hello that is not understood: {error}") from error
+        if hello.protocol != PROTOCOL:
+            raise ServerError(f"{self.path}: the daemon speaks protocol {hello.protocol}, this client {PROTOCOL}")
+        return hello
+
+    def _keep(self, message: Message) -> None:
+        """Keep a message for another iterator; without one that reads, only the newest are kept."""
+        self._inbox.append(message)
+        if len(self._inbox) > INBOX_MAX:
+            self._inbox.popleft()
+            self.given_up += 1
+
+    def _end_watch(self) -> None:
+        if self._watch is not None:
+            self._watch.ended = True
+            self._watch = None
+
+    def _send(self, data: bytes) -> None:
+        try:
+            self._sock.settimeout(self.timeout_s)
+            self._sock.sendall(data)
+        except TimeoutError:
+            raise TimeoutError(f"{self.path}: the daemon took nothing for {self.timeout_s} s") from None
+        except OSError as error:
+            raise _lost(self.path, error) from error
+
+    def _receive(self, deadline_s: float | None, what: str) -> Message:
+        """The next message in order of arrival."""
+        while (message := self._parse()) is None:
+            left_s = None if deadline_s is None else deadline_s - monotonic()
+            if left_s is not None and left_s <= 0:
+                raise TimeoutError(f"{self.path}: waited in vain for {what}")
+            try:
+                self._sock.settimeout(left_s)
+                data, fds, _flags, _address = socket.recv_fds(self._sock, RECV_BYTES, FDS_MAX)
+            except TimeoutError:
+                raise TimeoutError(f"{self.path}: waited in vain for {what}") from None
+            except OSError as error:
+                raise _lost(self.path, error) from error
+            self._fds.extend(fds)
+            if not data:
+                raise LinkMissing(f"{self.path}: the daemon closed the connection")
+            self._buffer += data
+        return message
+
+    def _parse(self) -> Message | None:
+        """Take a whole message off the buffer."""
+        buffer = self._buffer
+        if not self._framed:
+            end = buffer.find(b"\n")
+            if end < 0:
+                return None
+            line = bytes(buffer[:end])
+            del buffer[: end + 1]
+            return self._object(line)
+        if len(buffer) < FRAME_HEADER.size:
+            return None
+        (length,) = FRAME_HEADER.unpack_from(buffer)
+        if length > FRAME_MAX_BYTES:
+            raise ServerError(f"{self.path}: a frame of {length} bytes; the boundary between frames is lost")
+        end = FRAME_HEADER.size + length
+        if len(buffer) < end:
+            return None
+        body = bytes(buffer[FRAME_HEADER.size : end])
+        del buffer[:end]
+        return self._object(body) if length % SLOT_BYTES else body
+
+    def _object(self, body: bytes) -> dict[str, Any]:
+        try:
+            return parse_object(body)
+        except RpcError as error:
+            raise ServerError(f"{self.path}: expected a JSON object, {error}: {body[:80]!r}") from error
+
+
+def rpc_error(error: object) -> RpcError:
+    """The exception for the `error` member of a reply."""
+    if isinstance(error, dict):
+        return RpcError(error.get("code", 0), str(error.get("message", "without a message")))
+    return RpcError(0, f"an error that is not understood: {error!r}")
+
+
+def _is_one_of(message: Message, names: frozenset[str]) -> bool:
+    return "sample" in names if isinstance(message, bytes) else message.get("method") in names
+
+
+def _listed(names: Iterable[str] | None) -> list[str] | None:
+    if isinstance(names, str):
+        raise TypeError(f"expected a list of names, got the string {names!r}")
+    return None if names is None else list(names)
+
+
+def _connect(path: str, timeout_s: float) -> socket.socket:
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    sock.settimeout(timeout_s)
+    try:
+        sock.connect(path)
+    except OSError as error:
+        sock.close()
+        raise _unreachable(path, error) from error
+    return sock
+
+
+def _unreachable(path: str, error: OSError) -> LinkError:
+    if error.errno in (errno.ENOENT, errno.ECONNREFUSED):
+        return LinkMissing(f"no daemon at {path}: is imud running? (systemctl status imud, or imud run)")
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return LinkDenied(f"no permission for {path}: is this user in group imud? (adduser USER imud, log in again)")
+    return LinkError(f"cannot connect to {path}: {error}")
+
+
+def _lost(path: str, error: OSError) -> LinkMissing:
+    return LinkMissing(f"{path}: the connection to the daemon is lost: {error.strerror or error}")

@@ -1,0 +1,141 @@
+"""The client's iterators: samples and events as they come."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, Final, Protocol, Self, cast
+
+import msgspec
+
+from imud.errors import ServerError
+from imud.event import Event, EventKind
+from imud.kit.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
+from imud.sample import Sample
+
+_DEVICE_ID_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")
+
+
+class Source(Protocol):
+    """Where the iterators take their messages from."""
+
+    def take_kept(self, names: frozenset[str]) -> dict[str, Any] | bytes | None:
+        """A message that came before, or None."""
+        ...
+
+    def take(self, names: frozenset[str], timeout_s: float | None) -> dict[str, Any] | bytes:
+        """The next message: slots, or a notification with one of these methods."""
+        ...
+
+
+class Watch:
+    """Samples as they come; ends when the client asks for something else or for no more.
+
+    `on_dropped`, where it is set, is called with device and number before the first sample after the loss.
+    """
+
+    NAMES: Final = frozenset(("sample", "dropped", "device"))
+
+    def __init__(self, source: Source, devices: Mapping[str, int], timeout_s: float | None) -> None:
+        self.device_ids = dict(devices)
+        """Device → its number in slots."""
+        self.dropped: dict[str, int] = {}
+        """Samples per device that the daemon dropped because this client read too slowly."""
+        self.on_dropped: Callable[[str, int], None] | None = None
+        self.ended = False
+        self._names = {number: name for name, number in self.device_ids.items()}
+        self._source = source
+        self._timeout_s = timeout_s
+        self._ready: deque[Sample] = deque()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Sample:
+        while not self._ready:
+            message = self._source.take_kept(self.NAMES)
+            if message is None and self.ended:
+                raise StopIteration
+            self._handle(self._source.take(self.NAMES, self._timeout_s) if message is None else message)
+        return self._ready.popleft()
+
+    def _handle(self, message: dict[str, Any] | bytes) -> None:
+        if isinstance(message, bytes):
+            for start in range(0, len(message), SLOT_BYTES):
+                self._ready.append(self._decode(message[start : start + SLOT_BYTES]))
+            return
+        params = message.get("params", {})
+        if message["method"] == "device":
+            self.device_ids[params["device"]] = params["device_id"]
+            self._names[params["device_id"]] = params["device"]
+            return
+        dropped = params.pop("dropped", 0)
+        if dropped:
+            self._note_dropped(params["device"], dropped)
+        if message["method"] == "sample":
+            self._ready.append(sample_of(params))
+
+    def _note_dropped(self, device: str, count: int) -> None:
+        self.dropped[device] = self.dropped.get(device, 0) + count
+        if self.on_dropped is not None:
+            self.on_dropped(device, count)
+
+    def _decode(self, slot: bytes) -> Sample:
+        number = int.from_bytes(slot[_DEVICE_ID_OFFSET : _DEVICE_ID_OFFSET + 2], "little")
+        name = self._names.get(number)
+        if name is None:
+            raise ServerError(f"a slot of device number {number}; known are {self._names}")
+        try:
+            return decode_slot(slot, name)
+        except ValueError as error:
+            raise ServerError(str(error)) from error
+
+
+class EventStream:
+    """Events as they come, an endless iterator."""
+
+    NAMES: Final = frozenset(("event",))
+
+    def __init__(self, source: Source, timeout_s: float | None) -> None:
+        self._source = source
+        self._timeout_s = timeout_s
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Event:
+        message = self._source.take(self.NAMES, self._timeout_s)
+        assert isinstance(message, dict)
+        return event_of(message.get("params", {}))
+
+
+def sample_of(params: Mapping[str, Any]) -> Sample:
+    """The sample in a JSON notification; null is NaN. Raises ServerError."""
+    values = {name: _with_nan(value) for name, value in params.items()}
+    try:
+        return msgspec.convert(values, Sample)
+    except msgspec.ValidationError as error:
+        raise ServerError(f"a sample that is not understood: {error}") from error
+
+
+def event_of(params: Mapping[str, Any]) -> Event:
+    """The event in a JSON notification. A kind this client does not know stays a plain string. Raises ServerError."""
+    try:
+        kind = params["kind"]
+        known = kind in EventKind.__members__.values()
+        event = Event(
+            params["t_ns"],
+            params["device"],
+            EventKind(kind) if known else cast("EventKind", kind),
+            params["message"],
+            params.get("detail", {}),
+        )
+    except KeyError as error:
+        raise ServerError(f"an event without its member {error}") from error
+    return event
+
+
+def _with_nan(value: object) -> object:
+    if value is None:
+        return float("nan")
+    if isinstance(value, list):
+        return [float("nan") if item is None else item for item in value]
+    return value

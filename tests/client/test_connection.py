@@ -1,0 +1,228 @@
+"""The blocking client against the real server, and against servers that misbehave."""
+
+import math
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from imud.client import Client, RpcError
+from imud.client.watch import event_of
+from imud.errors import LinkDenied, LinkMissing, ServerError
+from imud.event import Event, EventKind
+from imud.kit.batch import Batch
+from imud.publishers.socket import SocketServer
+from tests.client.socket_daemon import Daemon, daemon
+from tests.publishers.socket_rig import DEVICES, EPOCH, NOW_NS, batch, sample
+
+HELLO = b'{"jsonrpc":"2.0","method":"hello","params":{"protocol":1,"version":"9","epoch":7,"rights":["read"],"x":1}}\n'
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Daemon]:
+    with daemon(tmp_path) as running:
+        yield running
+
+
+def publish(served: Daemon, *batches: Batch) -> None:
+    def work(server: SocketServer) -> None:
+        for each in batches:
+            server.publish(each)
+
+    served.do(work)
+
+
+def test_questions(served: Daemon) -> None:
+    with Client(served.path) as client:
+        assert (client.hello.protocol, client.hello.epoch) == (1, EPOCH)
+        assert "read" in client.hello.rights
+        assert [device["name"] for device in client.devices()] == ["imu0", "imu1"]
+        assert client.status()["now_ns"] == NOW_NS
+        assert client.schema()["slot"]["bytes"] == 256
+        assert client.poll() == []
+        publish(served, batch("imu0", 4), batch("imu1", 5))
+        assert client.poll() == [sample("imu0", 4), sample("imu1", 5)]
+        assert client.poll(["imu1"]) == [sample("imu1", 5)]
+
+
+def test_what_the_daemon_refuses_is_raised_and_the_connection_lives_on(served: Daemon) -> None:
+    with Client(served.path) as client:
+        with pytest.raises(RpcError, match="there are: imu0, imu1") as caught:
+            client.watch(["imu7"])
+        assert caught.value.code == -32602
+        with pytest.raises(RpcError, match="no method"):
+            client.call("config.get")
+        with pytest.raises(TypeError, match="list of names"):
+            client.poll("imu0")
+        assert len(client.devices()) == 2
+
+
+@pytest.mark.parametrize("encoding", ["json", "binary"])
+def test_watch_gives_whole_samples_and_questions_go_between(served: Daemon, encoding: str) -> None:
+    with Client(served.path) as client:
+        watch = client.watch(encoding=encoding, timeout_s=5)
+        assert watch.device_ids == DEVICES
+        publish(served, batch("imu0", 1, 2), batch("imu1", 123))
+        assert len(client.devices()) == 2  # samples that come meanwhile wait
+        publish(served, batch("imu0", 3))
+        wanted = [sample("imu0", 1), sample("imu0", 2), sample("imu1", 123), sample("imu0", 3)]
+        assert list(islice(watch, 4)) == wanted
+        served.do(lambda server: server.add_device("imu9", 9))
+        publish(served, batch("imu9"))
+        assert next(watch) == sample("imu9")
+        assert watch.dropped == {}
+        publish(served, batch("imu0", 4))
+        client.unwatch()
+        publish(served, batch("imu0", 5))
+        assert list(watch) == [sample("imu0", 4)]
+
+
+def test_watch_selects(served: Daemon) -> None:
+    with Client(served.path) as client:
+        watch = client.watch(["imu0"], ["accel_m_s2"], 100, "json", timeout_s=5)
+        publish(served, batch("imu1"), batch("imu0", 1, 12))
+        first, second = islice(watch, 2)
+        assert (first.seq, second.seq) == (1, 11)
+        assert first == replace(sample("imu0"), gyro_rad_s=None, temperature_c=None, t_dev_ns=None)
+
+
+def test_a_second_watch_ends_the_first(served: Daemon) -> None:
+    with Client(served.path) as client:
+        first = client.watch(["imu0"])
+        publish(served, batch("imu0"))
+        second = client.watch(["imu1"], encoding="json", timeout_s=5)
+        publish(served, batch("imu0", 2), batch("imu1"))
+        assert next(second) == sample("imu1")
+        assert list(first) == []
+
+
+@pytest.mark.parametrize("encoding", ["json", "binary"])
+def test_dropped_samples_are_told(served: Daemon, encoding: str) -> None:
+    with Client(served.path) as client:
+        watch = client.watch(encoding=encoding, timeout_s=5)
+        calls: list[tuple[str, int]] = []
+        watch.on_dropped = lambda device, count: calls.append((device, count))
+        for first in range(1, 8000, 100):
+            publish(served, batch("imu0", first, 100), batch("imu1", first, 100))
+        seen = {"imu0": 0, "imu1": 0}
+        for each in watch:
+            seen[each.device] += 1
+            if (each.device, each.seq) == ("imu1", 8000):
+                break
+        for name, count in seen.items():
+            assert count + watch.dropped[name] == 8000
+        assert dict(calls) == watch.dropped
+        assert min(watch.dropped.values()) > 1000
+
+
+def test_null_is_nan(served: Daemon) -> None:
+    with Client(served.path) as client:
+        watch = client.watch(encoding="json", timeout_s=5)
+        odd = replace(sample(), gyro_rad_s=(math.nan, 1.0, math.inf), temperature_c=math.nan)
+        publish(served, Batch("imu0", 0, [odd]))
+        got = next(watch)
+        assert got.gyro_rad_s is not None
+        assert got.temperature_c is not None
+        assert [math.isnan(value) for value in (*got.gyro_rad_s, got.temperature_c)] == [True, False, True, True]
+
+
+def test_events(served: Daemon) -> None:
+    with Client(served.path) as client:
+        events = client.events(["imu1"], timeout_s=5)
+        down = Event(7, "imu1", EventKind.DOWN, "the adapter was pulled out", {"errno": 5})
+        served.do(lambda server: server.event(replace(down, device="imu0")))
+        served.do(lambda server: server.event(down))
+        assert next(events) == down
+        short = client.events(timeout_s=0.01)
+        with pytest.raises(TimeoutError, match="waited in vain for event"):
+            next(short)
+
+
+def test_an_event_of_a_kind_to_come_is_accepted() -> None:
+    event = event_of({"t_ns": 1, "device": "imu0", "kind": "earthquake", "message": "m", "later": 1})
+    assert event.kind == "earthquake"
+    with pytest.raises(ServerError, match="kind"):
+        event_of({"t_ns": 1})
+
+
+def test_notify_gives_a_descriptor_that_counts(served: Daemon) -> None:
+    with Client(served.path) as client:
+        watch = client.watch(timeout_s=5)
+        publish(served, batch("imu0"))
+        fd = client.notify("imu0")
+        publish(served, batch("imu0", 2, 3), batch("imu1"), batch("imu0", 5))
+        assert len(client.devices()) == 2  # behind the wake-ups
+        assert os.eventfd_read(fd) == 2
+        os.close(fd)
+        assert next(watch).seq == 1
+
+
+def test_nobody_there(tmp_path: Path) -> None:
+    path = tmp_path / "imud.sock"
+    with pytest.raises(LinkMissing, match="is imud running"):
+        Client(path)
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    with pytest.raises(LinkMissing, match="is imud running"):
+        Client(path)
+
+
+def test_no_permission_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    def deny(_sock: socket.socket, _path: str) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "connect", deny)
+    with pytest.raises(LinkDenied, match="group imud"):
+        Client("/x")
+
+
+def test_the_daemon_goes_away(tmp_path: Path) -> None:
+    with daemon(tmp_path) as served:
+        client = Client(served.path)
+        watch = client.watch()
+    with pytest.raises(LinkMissing, match="closed the connection"):
+        next(watch)
+    client.close()
+    client.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "error", "words"),
+    [
+        (b'{"jsonrpc":"2.0","id":null,"error":{"code":-32001,"message":"uid 5 may not"}}\n', LinkDenied, "uid 5 may"),
+        (b"SSH-2.0\n", ServerError, "expected a JSON object"),
+        (b"{}\n", ServerError, "expected the daemon's hello"),
+        (HELLO.replace(b'"protocol":1', b'"protocol":2'), ServerError, "speaks protocol 2, this client 1"),
+        (HELLO.replace(b'"epoch":7', b'"epoch":"x"'), ServerError, "not understood"),
+        (b"", TimeoutError, "waited in vain for hello"),
+        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\xff\xff\xff\xff', ServerError, "boundary"),
+        (HELLO + b'{"id":1,"result":{"devices":{"a":0}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "CRC"),
+        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "device number 0"),
+    ],
+)
+def test_servers_that_misbehave(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:
+    path = tmp_path / "s"
+    done = threading.Event()
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve() -> None:
+            sock, _ = listener.accept()
+            with sock:
+                sock.sendall(answer)
+                done.wait(10)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            with pytest.raises(error, match=words), Client(path, timeout_s=0.2) as client:
+                next(client.watch(timeout_s=0.2))
+        finally:
+            done.set()
+            thread.join()
