@@ -38,6 +38,8 @@ class Request:
     timeout_ns: int = NS_PER_S // 2
     silent: bool = False
     """The device never answers this one (it reboots, say): it is done once sent."""
+    lines_min: int = 1
+    """Fewest lines of a good reply, end line included: an end that comes sooner is that of an earlier, late reply."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,10 @@ Conversation = Generator[Request, Outcome, T]
 class TextSession:
     """One outstanding request at a time; late replies are told from fresh ones and counted.
 
+    Devices answer in the order they were asked. A line is late when it can belong to the request that timed out and
+    not to the outstanding one, or when it ends a reply whose lines were late. Two requests whose replies are the end
+    line alone cannot be told apart: there the first end line counts for the outstanding one.
+
     Synchronization: one thread. The owner sends `start()`'s bytes, passes every text line to `on_line()`, and calls
     `on_time()` at `deadline_ns`.
     """
@@ -78,6 +84,8 @@ class TextSession:
         self._lines: deque[str] = deque(maxlen=REPLY_LINES_MAX)
         self._timed_out: Request | None = None
         self._timed_out_ns = 0
+        self._late_lines = 0
+        """Lines of the late reply that is just arriving."""
         self.deadline_ns: int | None = None
         """When the outstanding request times out (CLOCK_MONOTONIC), or None."""
 
@@ -99,9 +107,10 @@ class TextSession:
     def on_line(self, text: str, now_ns: int) -> Outcome | None:
         """Take one line; return the outcome when it ends the outstanding request."""
         request = self._request
-        if request is None or not self._belongs(request, text):
+        if request is None or not self._belongs(request, text) or self._ends_late(request, text, now_ns):
             self._count_stray(text, now_ns)
             return None
+        self._late_lines = 0
         self._lines.append(text)
         if request.is_rejection(text):
             return self._finish(Rejection)
@@ -114,6 +123,7 @@ class TextSession:
         if self._request is None or self.deadline_ns is None or now_ns < self.deadline_ns:
             return None
         self._timed_out, self._timed_out_ns = self._request, now_ns
+        self._late_lines = len(self._lines)
         self._request = self.deadline_ns = None
         return Silence(tuple(self._lines))
 
@@ -123,7 +133,17 @@ class TextSession:
         self._lines.clear()
 
     def _belongs(self, request: Request, text: str) -> bool:
-        return request.is_end(text) or request.is_rejection(text) or request.is_part(text)
+        return _ends(request, text) or request.is_part(text)
+
+    def _ends_late(self, request: Request, text: str, now_ns: int) -> bool:
+        """Whether `text` is an end line, but not that of the outstanding request: its own lines have not come."""
+        if not _ends(request, text) or self._lines:
+            return False
+        late_is_arriving = self._late_lines > 0 and self._expects_late(now_ns)
+        return late_is_arriving or (request.is_end(text) and request.lines_min > 1)
+
+    def _expects_late(self, now_ns: int) -> bool:
+        return self._timed_out is not None and now_ns - self._timed_out_ns <= LATE_WINDOW_NS
 
     def _finish(self, outcome: type[Reply] | type[Rejection]) -> Reply | Rejection:
         self._request = self.deadline_ns = None
@@ -131,9 +151,15 @@ class TextSession:
 
     def _count_stray(self, text: str, now_ns: int) -> None:
         late = self._timed_out
-        if late is None or now_ns - self._timed_out_ns > LATE_WINDOW_NS or not self._belongs(late, text):
+        if late is None or not self._expects_late(now_ns) or not self._belongs(late, text):
             self._ledger.replies_unsolicited += 1
             return
-        if late.is_end(text) or late.is_rejection(text):
+        self._late_lines += 1
+        if _ends(late, text):
             self._ledger.replies_late += 1
             self._timed_out = None
+            self._late_lines = 0
+
+
+def _ends(request: Request, text: str) -> bool:
+    return request.is_end(text) or request.is_rejection(text)

@@ -1,0 +1,150 @@
+"""Replies of HiPNUC modules to ASCII commands: which line is what, and the four reports of LOG as records.
+
+Manual "IMU配置手冊" V1.5.9 sections 2.2.5 and 8.1.1, which show one line of USRCONFIG and one of MAGCONFIG; LOG VERSION
+as modules with firmware 1.5.6 answer it:
+
+    PNAME=HI14R3 | BUILD=Oct 15 2024 | UUID=043995698D6E1708 | APP_VER=156 | BL_VER=109 | OK
+    ATT_MODE: 0  | …                                                                    | OK
+    …            | MB=14.14, -2.08, -8.75                                               | OK
+
+The rest is not documented, so every line is kept: NAME=VALUE and NAME: VALUE by name, others as they came.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Final
+
+from imud.sample import Vector3
+
+_VERSION_NAMES: Final = ("PNAME", "BUILD", "UUID", "APP_VER", "BL_VER")
+_VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s*")
+_COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
+_OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
+
+
+def is_end(line: str) -> bool:
+    """Whether `line` ends a reply well."""
+    return line.strip() == "OK"
+
+
+def is_rejection(line: str) -> bool:
+    """Whether `line` is a refusal: ERR and whatever follows, but not a setting whose name begins so."""
+    return line.startswith("ERR") and "=" not in line
+
+
+def is_version_line(line: str) -> bool:
+    """Whether `line` can be part of the reply to LOG VERSION."""
+    match = _VALUE_LINE.fullmatch(line)
+    return match is not None and match[1] in _VERSION_NAMES
+
+
+def is_setting_line(line: str) -> bool:
+    """Whether `line` can be part of another report. Their form is not documented: anything but a version line."""
+    return not is_version_line(line)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A reply, taken apart as far as it can be without knowing it."""
+
+    values: Mapping[str, str]
+    """Values by the device's own names."""
+    other: tuple[str, ...]
+    """Lines of another form, as they came."""
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """Reply to LOG VERSION. Empty or None where the device does not say."""
+
+    product: str
+    build: str
+    uuid: str
+    app_ver: int | None
+    """156 for firmware 1.5.6."""
+    bl_ver: int | None
+    """Version of the boot loader."""
+    report: Report
+
+
+@dataclass(frozen=True, slots=True)
+class UserConfig:
+    """Reply to LOG USRCONFIG."""
+
+    att_mode: int | None
+    """0: 6-axis, 1: 9-axis."""
+    report: Report
+
+
+@dataclass(frozen=True, slots=True)
+class ComConfig:
+    """Reply to LOG COMCONFIG. Its form is in no source: output periods are looked for as the command writes them."""
+
+    periods_s: Mapping[str, float]
+    """Output periods by message (`HI91`, `HI92`); 0 is off."""
+    report: Report
+
+
+@dataclass(frozen=True, slots=True)
+class MagConfig:
+    """Reply to LOG MAGCONFIG."""
+
+    bias_ut: Vector3 | None
+    """Offset that calibration found (`MB`), in µT; all zero means not calibrated."""
+    report: Report
+
+
+def parse_report(lines: Sequence[str]) -> Report:
+    """The lines of a reply by name; the end line and comments (`/* … */`) are left out."""
+    values: dict[str, str] = {}
+    other: list[str] = []
+    for line in lines:
+        match = _VALUE_LINE.fullmatch(_COMMENT.sub("", line))
+        if is_end(line):
+            continue
+        if match and match[1] not in values:
+            values[match[1]] = match[2]
+        else:
+            other.append(line)
+    return Report(values, tuple(other))
+
+
+def parse_version(lines: Sequence[str]) -> Version:
+    """The reply to LOG VERSION."""
+    report = parse_report(lines)
+    get = report.values.get
+    return Version(
+        get("PNAME", ""), get("BUILD", ""), get("UUID", ""), _whole(get("APP_VER")), _whole(get("BL_VER")), report
+    )
+
+
+def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
+    """The reply to LOG USRCONFIG."""
+    report = parse_report(lines)
+    return UserConfig(_whole(report.values.get("ATT_MODE")), report)
+
+
+def parse_comconfig(lines: Sequence[str]) -> ComConfig:
+    """The reply to LOG COMCONFIG."""
+    periods_s = {f"HI{message}": float(period) for line in lines for message, period in _OUTPUT.findall(line)}
+    return ComConfig(periods_s, parse_report(lines))
+
+
+def parse_magconfig(lines: Sequence[str]) -> MagConfig:
+    """The reply to LOG MAGCONFIG."""
+    report = parse_report(lines)
+    return MagConfig(_vector(report.values.get("MB", "")), report)
+
+
+def _whole(text: str | None) -> int | None:
+    return int(text) if text is not None and text.isdecimal() else None
+
+
+def _vector(text: str) -> Vector3 | None:
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        return None
+    return (x, y, z) if isfinite(x) and isfinite(y) and isfinite(z) else None

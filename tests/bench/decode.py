@@ -1,0 +1,132 @@
+"""Cost of decoding HI91 to SI values, against the floor: `binascii.crc_hqx` and `struct.unpack_from` on the same bytes.
+
+    python tests/bench/decode.py
+
+Prints ns per frame, best of many short runs taken in turns, so that all see the same machine. The streams are fed in
+reads of 4096 bytes (a busy port or a replay) and frame by frame (a quiet port at 1 kHz); `noisy` has one damaged frame
+in ten, and garbage, cut frames and text between others.
+"""
+
+import binascii
+import struct
+from collections.abc import Callable
+from random import Random
+from time import perf_counter_ns
+
+from imud.devices.hipnuc.frames import HipnucCodec, HipnucSettings, encode_hi91
+from imud.kit.codec import CodecEvent
+from imud.ledger import Ledger
+from imud.sample import Measurement
+
+FRAMES = 250  # a run of 0.2 ms fits between the interruptions of a busy machine
+ROUNDS = 400
+READ_BYTES = 4096
+HI91_FRAME_BYTES = 82
+REACH_RATIO = 1.6
+
+Row = dict[str, str | float | bool | None]
+
+
+def _frames(random: Random) -> list[bytes]:
+    def vector(spread: float) -> tuple[float, float, float]:
+        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
+
+    return [
+        encode_hi91(
+            system_time_ms=1_000_000 + index, accel_m_s2=vector(5), gyro_rad_s=vector(1), mag_t=vector(3e-5),
+            euler_rad=vector(0.5), quat_wxyz=(1.0, *vector(0.1)), temperature_c=31, pressure_pa=101_325,
+        )
+        for index in range(FRAMES)
+    ]  # fmt: skip
+
+
+def _noisy(frames: list[bytes], random: Random) -> bytes:
+    parts: list[bytes] = []
+    for index, frame in enumerate(frames):
+        parts.append(frame)
+        if index % 10 == 3:
+            damaged = bytearray(frame)
+            damaged[random.randrange(len(frame))] ^= 1 << random.randrange(8)
+            parts[-1] = bytes(damaged)
+        elif index % 10 == 7:
+            parts.append(random.choice((random.randbytes(20), frame[: random.randrange(82)], b"APP_VER=156\r\n")))
+    return b"".join(parts)
+
+
+def _floor(stream: bytes) -> None:
+    crc, unpack = binascii.crc_hqx, struct.Struct("<BHbfI16f").unpack_from
+    for at in range(0, len(stream), HI91_FRAME_BYTES):
+        crc(stream[at + 6 : at + HI91_FRAME_BYTES], crc(stream[at : at + 4], 0))
+        unpack(stream, at + 6)
+
+
+def _decoder(reads: list[bytes]) -> Callable[[], None]:
+    """What feeds `reads` to one codec; events are dropped as they come."""
+    codec = HipnucCodec(Ledger(), HipnucSettings())
+
+    def run() -> None:
+        feed = codec.feed
+        for read in reads:
+            feed(read)
+        codec.reset()
+
+    return run
+
+
+def _split(stream: bytes, size: int) -> list[bytes]:
+    return [stream[at : at + size] for at in range(0, len(stream), size)]
+
+
+def _best_ns(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
+    best = dict.fromkeys(runs, float("inf"))
+    for _ in range(ROUNDS):
+        for name, run in runs.items():
+            begin = perf_counter_ns()
+            run()
+            best[name] = min(best[name], perf_counter_ns() - begin)
+    return {name: ns / FRAMES for name, ns in best.items()}
+
+
+def _good(events: list[CodecEvent]) -> int:
+    return sum(type(event) is Measurement for event in events)
+
+
+def rows() -> list[Row]:
+    """Rows of name, value, unit, reach (None where there is no goal) and reached."""
+    random = Random(1)
+    frames = _frames(random)
+    clean, noisy = b"".join(frames), _noisy(frames, random)
+    assert _good(list(HipnucCodec(Ledger(), HipnucSettings()).feed(clean))) == FRAMES
+    best = _best_ns(
+        {
+            "floor": lambda: _floor(clean),
+            "clean": _decoder(_split(clean, READ_BYTES)),
+            "single": _decoder(frames),
+            "noisy": _decoder(_split(noisy, READ_BYTES)),
+        }
+    )
+    ratio = best["clean"] / best["floor"]
+    return [
+        _row("decode floor (crc_hqx + unpack_from)", best["floor"], "ns/frame"),
+        _row("decode clean, reads of 4096 bytes", best["clean"], "ns/frame"),
+        _row("decode clean, one frame per read", best["single"], "ns/frame"),
+        _row("decode noisy, reads of 4096 bytes", best["noisy"], "ns/frame"),
+        _row("decode clean / floor", ratio, "ratio", REACH_RATIO),
+        _row("decode noisy / floor", best["noisy"] / best["floor"], "ratio"),
+    ]
+
+
+def _row(name: str, value: float, unit: str, reach: float | None = None) -> Row:
+    reached = None if reach is None else value <= reach
+    return {"name": name, "value": round(value, 3), "unit": unit, "reach": reach, "reached": reached}
+
+
+def main() -> None:
+    """Print the rows."""
+    for row in rows():
+        goal = "" if row["reach"] is None else f"   reach <= {row['reach']}: {'yes' if row['reached'] else 'NO'}"
+        print(f"{row['name']:<40} {row['value']:>10} {row['unit']}{goal}")
+
+
+if __name__ == "__main__":
+    main()
