@@ -1,0 +1,90 @@
+"""Where the delay of a message can lie when nothing but its arrival is known: the bias of a link and its spread."""
+
+from typing import Final
+
+from imud.units import NS_PER_MS, NS_PER_US
+
+WAKE_NS: Final = 100 * NS_PER_US
+"""Shortest way from the interrupt to the reader, at most (30–100 µs on small boards)."""
+FIFO_BYTES: Final = 4
+"""A 16550 or PL011 receive FIFO tells of a tail below its trigger level after up to four byte times."""
+USB_POLL_NS: Final = 125 * NS_PER_US
+"""One micro-frame: how long a full adapter waits for the host to ask."""
+FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
+"""Spread assumed of arrivals before any is known."""
+SMOOTHING: Final = 1 / 32
+
+
+class LinkDelay:
+    """Bounds of the part of the delay that never varies, and so cannot be seen: 0 … a bias that the link can have."""
+
+    __slots__ = ("byte_ns", "hold_ns")
+
+    def __init__(self, byte_ns: int, hold_ns: int) -> None:
+        self.byte_ns = byte_ns
+        self.hold_ns = hold_ns
+
+    @property
+    def floor_ns(self) -> int:
+        """Bound of the delay of even the luckiest message."""
+        if self.hold_ns:
+            return WAKE_NS + USB_POLL_NS
+        return WAKE_NS + FIFO_BYTES * self.byte_ns
+
+    def held_ns(self, period_ns: float, size_bytes: int) -> float:
+        """Longest time an adapter's timer can hide behind bytes that follow.
+
+        A read ends either in the pause after a message or inside the next one, and then counting back the bytes that
+        trail leaves the pause: with messages every `period_ns`, no more than that pause, and never more than the timer.
+        """
+        if not period_ns:
+            return self.hold_ns
+        return min(self.hold_ns, max(period_ns - size_bytes * self.byte_ns, 0.0))
+
+    def hidden_ns(self, held_ns: float, wait_excess_ns: float, wait_band_ns: float) -> float:
+        """Bound of what a timer that beats with the samples hides from the envelope now.
+
+        Over a second, waits that sweep the timer's whole period are on average half of it longer than the luckiest.
+        Where n phases repeat (100 Hz on 16 ms: 8) they are (hold - hold / n) / 2 longer, so twice the excess leaves of
+        `hold` the step between phases, and the luckiest message of a second waited up to one step. As the two clocks
+        drift, that wait moves through the step; the band it has been seen to fill is not hidden any more.
+        """
+        if not held_ns:
+            return 0.0
+        step_ns = self.hold_ns - 2 * wait_excess_ns
+        return min(held_ns, max(step_ns - max(wait_band_ns, 0.0), 0.0))
+
+
+class ArrivalSpread:
+    """Mean and spread of the steps between arrivals, for devices that send no time."""
+
+    __slots__ = ("_last", "_spread", "period_ns")
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._spread = 0.0
+        self.period_ns = 0.0
+        """Mean step between messages; 0 while unknown."""
+
+    def add(self, y: int) -> None:
+        """Take the arrival of a message, less its wire time."""
+        last, self._last = self._last, y
+        if not last:
+            return
+        step = float(y - last)
+        if not self.period_ns:
+            self.period_ns = step
+            self._spread = FIRST_SPREAD_NS
+            return
+        off = step - self.period_ns
+        self.period_ns += off * SMOOTHING
+        self._spread += (abs(off) - self._spread) * SMOOTHING
+
+    @property
+    def sigma_ns(self) -> float:
+        """One-sigma spread of a single arrival.
+
+        Mean absolute deviation of a step; for delays that fall off exponentially it equals their scale, which is
+        their spread, and their mean above the floor is as large again.
+        """
+        return 1.5 * self._spread if self.period_ns else FIRST_SPREAD_NS

@@ -1,0 +1,66 @@
+"""Samples missing by the device's own time, and device time finer than its tick: the period is learned, not nominal."""
+
+from typing import Final
+
+CONSISTENT: Final = 4
+"""So many equal steps in a row are a rate; losses rarely leave the same hole four times."""
+MEMORY: Final = 4096
+"""Steps in the mean of a period that is no whole number of ticks; then both sums are halved."""
+
+
+class PeriodLearner:
+    """Learns the step between samples, in device ticks, and counts what is missing in a longer one."""
+
+    __slots__ = ("_candidate", "_count", "_run", "_run_sum", "_sum", "period_ticks")
+
+    def __init__(self) -> None:
+        self.period_ticks = 0.0
+        """Mean step; 0 while unknown."""
+        self._sum = 0
+        self._count = 0
+        self._candidate = 0
+        self._run = 0
+        self._run_sum = 0
+
+    @property
+    def fractional_steps(self) -> int:
+        """Steps behind the mean of a period that is no whole number of ticks; 0 where it is one."""
+        return self._count if self.period_ticks % 1 else 0
+
+    def step(self, ticks: int) -> int:
+        """Take the step to the newest sample; returns how many samples are missing in it."""
+        period = self.period_ticks
+        if ticks <= 0:
+            return 0
+        if ticks == period:
+            self._run = 0
+            return 0
+        if period and abs(ticks - period) <= 1 and int(ticks / period + 0.5) == 1:
+            self._refine(ticks)
+            return 0
+        if self._learn(ticks):
+            return 0
+        return max(int(ticks / period + 0.5) - 1, 0) if period else 0
+
+    def _refine(self, ticks: int) -> None:
+        self._run = 0
+        self._sum += ticks
+        self._count += 1
+        self.period_ticks = self._sum / self._count
+        if self._count >= MEMORY:
+            self._sum //= 2
+            self._count //= 2
+
+    def _learn(self, ticks: int) -> bool:
+        """Whether the last steps agree on another period, which is then adopted."""
+        if self._run and abs(ticks - self._candidate) <= 1:
+            self._run += 1
+            self._run_sum += ticks
+        else:
+            self._candidate, self._run, self._run_sum = ticks, 1, ticks
+        if self._run < CONSISTENT:
+            return False
+        self._sum, self._count = self._run_sum, self._run
+        self.period_ticks = self._sum / self._count
+        self._run = 0
+        return True

@@ -1,0 +1,275 @@
+"""The clock of one device: the only maker of `Sample`. It gives each measurement its place in the host's time.
+
+Per message: device time is unwrapped and checked against the host's (`unwrap`, `_believable`), the point (device time,
+arrival less wire time) goes to the lower envelope (`envelope`), and the line of the envelope, less half of the bias
+the link can hide (`arrival`), is the time of measurement; corrections are slewed (`slew`). Until the line has enough
+behind it, and for devices without time, a message is dated by its arrival.
+
+Three rules hold for any input: `t_ns` rises strictly, is never after arrival, and a device clock that jumps starts a
+new fit instead of carrying the stamps along.
+Synchronization: none; one thread.
+"""
+
+from math import hypot, sqrt
+from typing import Final
+
+from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
+from imud.clock.envelope import SLOPE_HIGHEST, Envelope
+from imud.clock.slew import Slew
+from imud.clock.unwrap import DeviceTime
+from imud.kit.status import ClockStatus
+from imud.sample import Measurement, Sample, Sync
+from imud.units import NS_PER_MS, NS_PER_S
+
+ENOUGH_POINTS: Final = 8
+ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
+ENOUGH_HOLDS: Final = 20
+"""A line counts once it is laid under so many points, and spans so much time or so many periods of a latency timer."""
+YOUNG_NS: Final = 32 * NS_PER_S
+YOUNG_FACTOR: Final = 1.5
+"""A corridor this short has not seen the timer's beat, and a stalled read in it weighs more."""
+EARLY_NS: Final = 5 * NS_PER_MS
+EARLY_SIGMAS: Final = 10
+"""A stamp that lies this far ahead of its own arrival says that the device's clock jumped."""
+FIRST_EARLY_NS: Final = NS_PER_S
+"""The same before a line counts: the first message may have waited that long in a buffer."""
+LATE_NS: Final = NS_PER_S // 2
+LATE_READS: Final = 3
+"""Messages may queue up while the host is busy; in so many reads over a second, it is the device's clock."""
+T_ERR_MOST: Final = 0xFFFF_FFFF
+"""`t_err_ns` is 32 bits wide wherever it is published."""
+SIGMA_OF_RANGE: Final = 1 / sqrt(12)
+WIRE_SLACK: Final = 1.05
+"""Messages that follow each other this much faster than the wire can carry them did not come over such a wire."""
+_ARRIVAL: Final = Sync.ARRIVAL
+
+
+class SampleClock:
+    """Makes samples of one device's measurements.
+
+    `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
+    known), `hold_ns` how long an adapter may hold bytes back (USB latency timer).
+    """
+
+    def __init__(self, device: str, *, tick_ns: int, tick_modulus: int, byte_ns: int, hold_ns: int) -> None:
+        self._device = device
+        self._time = DeviceTime(tick_ns, tick_modulus)
+        self._delay = LinkDelay(byte_ns, hold_ns)
+        self._spread = ArrivalSpread()
+        self._slew = Slew()
+        self._envelope: Envelope | None = None
+        self._sync = Sync.ARRIVAL
+        self._seq = 0
+        self._t_ns = 0
+        self._t_err_ns = 0
+        self._t_err = 0.0
+        self._t_rx_ns = 0
+        self._resets = 0
+        self._begun = False
+        self._epoch_x = 0
+        self._shift_ns = 0.0
+        self._error_ns = 0.0
+        self._late_reads = 0
+        self._late_since_ns = 0
+        self.missed = 0
+        """Samples missing right before the newest one, by device time."""
+
+    def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int) -> Sample:
+        """The measurement with its place in time, as the next sample of the device.
+
+        `t_rx_ns` is CLOCK_MONOTONIC right after the read that completed the message; it must not fall. Where it stands
+        still for more messages than there is room for before it, `t_rx_ns` of the sample is lifted by nanoseconds.
+        `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC at the same moment.
+        """
+        if t_rx_ns < self._t_rx_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
+            t_rx_ns = self._t_rx_ns
+        size_bytes, ticks = m.size_bytes, m.dev_ticks
+        byte_ns = self._delay.byte_ns or 1
+        trailing_ns = m.trailing_bytes * byte_ns
+        y = t_rx_ns - size_bytes * byte_ns - trailing_ns
+        if ticks is None:
+            wanted, t_dev_ns, sync = self._by_arrival(y, size_bytes), None, _ARRIVAL
+        else:
+            wanted = self._by_device(ticks, y, trailing_ns, t_rx_ns, size_bytes)
+            t_dev_ns, sync = self._time.raw_ns, self._sync
+        t_ns = wanted if wanted <= y else y
+        if t_ns <= self._t_ns:
+            t_ns = self._t_ns + 1
+        t_err = self._t_err
+        if t_ns != wanted:
+            self._slew.left_ns += t_ns - wanted
+            t_err += abs(t_ns - wanted)
+        if t_ns > t_rx_ns:  # noqa: PLR1730 - as above
+            t_rx_ns = t_ns
+        self._t_ns, self._t_rx_ns = t_ns, t_rx_ns
+        self._seq = seq = self._seq + 1
+        self._t_err_ns = t_err_ns = int(t_err) + 1 if t_err < T_ERR_MOST else T_ERR_MOST
+        return Sample(
+            self._device, seq, t_ns, t_err_ns, sync, t_rx_ns, t_ns + utc_offset_ns, t_dev_ns,
+            m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
+            m.incli_rad, m.status, m.pps_age_ms,
+        )  # fmt: skip
+
+    @property
+    def expected_rate_hz(self) -> float:
+        """Samples per second of the host by the device's own stamps; 0 while unknown."""
+        period_ns = self._period_ns()
+        return NS_PER_S / period_ns if period_ns else 0.0
+
+    def status(self) -> ClockStatus:
+        """The state of the estimate at the newest sample."""
+        fitted = self._envelope if self._sync is not Sync.ARRIVAL else None
+        return ClockStatus(
+            sync=self._sync,
+            offset_ns=self._t_ns - self._time.raw_ns if self._begun else 0,
+            skew_ppm=(1 / fitted.slope - 1) * 1e6 if fitted else 0.0,
+            residual_ns=int(fitted.residual_ns if fitted else self._spread.sigma_ns),
+            t_err_ns=self._t_err_ns,
+            resets=self._resets,
+        )
+
+    def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
+        """Another baud rate or port: what is known of arrivals no longer holds. `t_ns` goes on rising."""
+        self._delay = LinkDelay(byte_ns, hold_ns)
+        self._spread = ArrivalSpread()
+        self._forget()
+
+    def restart(self) -> None:
+        """The device or the link came back: the next stamp begins anew and counts neither as a reset nor as a gap."""
+        self._begun = False
+        self._spread = ArrivalSpread()
+        self.missed = 0
+        self._forget()
+
+    def follow(self, other: "SampleClock") -> None:
+        """Go on where another clock of the same device ends: `seq` and `t_ns` keep rising."""
+        self._seq, self._t_ns, self._t_rx_ns = other._seq, other._t_ns, other._t_rx_ns
+
+    # --- by arrival ----------------------------------------------------------------------------------------------
+
+    def _by_arrival(self, y: int, size_bytes: int) -> int:
+        """Time of a message without device time."""
+        spread = self._spread
+        spread.add(y)
+        self.missed = 0
+        return self._from_arrival(y, size_bytes, spread.period_ns, spread.sigma_ns)
+
+    def _from_arrival(self, y: int, size_bytes: int, period_ns: float, sigma_ns: float) -> int:
+        bias_ns = self._delay.floor_ns + self._delay.held_ns(period_ns, size_bytes)
+        self._t_err = SIGMA_OF_RANGE * bias_ns + sigma_ns
+        return y - int(bias_ns / 2)
+
+    # --- by device time ------------------------------------------------------------------------------------------
+
+    def _by_device(self, ticks: int, y: int, trailing_ns: int, t_rx_ns: int, size_bytes: int) -> int:
+        """Time of a message with device time; leaves its error in `_t_err`."""
+        time, envelope = self._time, self._envelope
+        if envelope is None:
+            self._begin(ticks, y, t_rx_ns)
+            return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+        x_before = time.even_ns
+        time.advance(ticks)
+        x = time.even_ns
+        line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
+        height = y - line
+        if (height < -EARLY_NS or height > LATE_NS or self._late_reads) and self._jumped(height, x - x_before, t_rx_ns):
+            self._reset(ticks, y)
+            return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+        self.missed = time.missed
+        if envelope.add(x, y, trailing_ns, height):
+            if envelope.recent_ns > EARLY_NS + EARLY_SIGMAS * self._error_ns:
+                self._reset(ticks, y)  # messages come late for good: the device's clock stood still for a while
+            elif not self._wire_carries(size_bytes):
+                self._delay = LinkDelay(0, self._delay.hold_ns)
+                self._start(y)
+            else:
+                line = self._refit(x, x - x_before, line, size_bytes)
+        if self._sync is _ARRIVAL:
+            return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+        left = self._slew.over(x - x_before, x - self._epoch_x) if self._slew.left_ns else 0.0
+        error = self._error_ns + envelope.slope_error * (x - envelope.x_fit) + abs(left)
+        self._t_err = error if height < LATE_NS else error + height
+        return int(line - self._shift_ns + left)
+
+    def _begin(self, ticks: int, y: int, t_rx_ns: int) -> None:
+        """Take the first stamp of a fit: of a new device, or of one whose clock runs on over a changed link."""
+        time = self._time
+        if self._begun and time.peek_ns(ticks) <= SLOPE_HIGHEST * (t_rx_ns - self._t_rx_ns) + FIRST_EARLY_NS:
+            time.advance(ticks)
+        else:
+            self._resets += self._begun
+            self._begun = True
+            time.begin(ticks)
+        self.missed = time.missed
+        self._start(y)
+
+    def _reset(self, ticks: int, y: int) -> None:
+        """The device's clock started anew."""
+        self._resets += 1
+        self.missed = 0
+        self._time.begin(ticks)
+        self._start(y)
+
+    def _start(self, y: int) -> None:
+        """A new fit from the present device time on."""
+        self._forget()
+        self._epoch_x = self._time.even_ns
+        self._envelope = Envelope(self._epoch_x, y, self._delay.hold_ns)
+
+    def _forget(self) -> None:
+        self._envelope = None
+        self._sync = _ARRIVAL
+        self._late_reads = 0
+        self._slew.left_ns = 0.0
+
+    def _jumped(self, height: float, elapsed_ns: int, t_rx_ns: int) -> bool:
+        """Whether a message so far before or behind the line says that the device's clock jumped."""
+        envelope = self._envelope
+        assert envelope is not None
+        if height < -EARLY_NS:
+            if self._sync is _ARRIVAL:
+                return height < -FIRST_EARLY_NS - (SLOPE_HIGHEST - 1) * (elapsed_ns + envelope.span_ns)
+            return height < -EARLY_SIGMAS * self._error_ns - EARLY_NS - 4 * envelope.slope_error * elapsed_ns
+        if height < LATE_NS + envelope.slope_error * elapsed_ns:
+            self._late_reads = 0
+            return False
+        if not self._late_reads:
+            self._late_since_ns = t_rx_ns
+        if t_rx_ns > self._t_rx_ns:
+            self._late_reads += 1
+        return self._late_reads >= LATE_READS and t_rx_ns - self._late_since_ns > NS_PER_S
+
+    def _refit(self, x: int, elapsed_ns: int, line_before: float, size_bytes: int) -> float:
+        """Take over a line that changed, without a step; returns its value at `x`."""
+        envelope = self._envelope
+        assert envelope is not None
+        delay = self._delay
+        period_ns = self._period_ns()
+        line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
+        told = line_before - self._shift_ns + self._slew.left_ns
+        if period_ns:
+            envelope.held_ns = delay.held_ns(period_ns, size_bytes)
+            envelope.held_count = int(delay.hold_ns / period_ns) + 2
+        bias_ns = delay.floor_ns + envelope.hidden_ns
+        self._shift_ns = delay.floor_ns / 2 + envelope.shift_ns
+        self._error_ns = hypot(envelope.error_ns, SIGMA_OF_RANGE * bias_ns) + self._time.error_ns
+        if delay.hold_ns and envelope.span_ns < YOUNG_NS:
+            self._error_ns *= YOUNG_FACTOR
+        if self._sync is not _ARRIVAL:
+            self._slew.left_ns = told - (line - self._shift_ns)
+        elif envelope.count >= ENOUGH_POINTS and envelope.span_ns >= max(ENOUGH_SPAN_NS, ENOUGH_HOLDS * delay.hold_ns):
+            self._sync = Sync.REGRESSION
+            self._slew.left_ns = self._t_ns + elapsed_ns * envelope.slope - (line - self._shift_ns)
+        return line
+
+    def _wire_carries(self, size_bytes: int) -> bool:
+        """Whether the wire time fits the rate; a pty or a USB device names any baud rate it likes."""
+        envelope, period_ns = self._envelope, self._period_ns()
+        if envelope is None or not period_ns or envelope.span_ns < NS_PER_S:
+            return True
+        return period_ns * WIRE_SLACK >= size_bytes * self._delay.byte_ns
+
+    def _period_ns(self) -> float:
+        """Host time between samples; 0 while unknown."""
+        time, envelope = self._time, self._envelope
+        return time.period.period_ticks * time.tick_ns * (envelope.slope if envelope else 1.0)

@@ -1,0 +1,166 @@
+"""`python -m imud.sim`: one simulated device behind a pseudo-terminal, as a process of its own.
+
+The first line on stdout is the path to open. It runs until stdin ends, or SIGTERM or SIGINT comes; its last line is
+what it counted, as JSON. Lines on stdin command it:
+
+    unplug SECONDS    the port disappears and comes back, the module loses power
+    reboot            the module starts anew, the port stays
+    mark              a pulse on SIN/PPS, where the device has such an input
+    stats             print what was counted so far, as JSON on one line
+    quit
+"""
+
+import argparse
+import json
+import os
+import select
+import signal
+import sys
+import tempfile
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Final
+
+from imud.sim import SIMULATORS
+from imud.sim.arrival import BARE_UART, USB_1MS, USB_16MS
+from imud.sim.faults import Faults, rates_from
+from imud.sim.motion import GRAVITY_M_S2, MOTIONS
+from imud.sim.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
+from imud.sim.simulator import SimulatorOptions
+from imud.units import NS_PER_S
+
+ADAPTERS: Final = {profile.name: profile for profile in (BARE_UART, USB_1MS, USB_16MS)}
+COMMAND_BYTES_MAX: Final = 4096
+
+
+class BadCommand(ValueError):
+    """A line on stdin that is no command."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run; return the exit code."""
+    options = _parser().parse_args(arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # both end as KeyboardInterrupt
+    now_ns = time.monotonic_ns()
+    try:
+        module = SIMULATORS[options.device].make(_module_options(options), now_ns)
+        faults = Faults(options.seed, rates_from(options.faults)) if options.faults else None
+    except ValueError as error:
+        print(f"imud.sim: {error}", file=sys.stderr)
+        return 2
+    sharpen_timers()
+    with ExitStack() as stack:
+        truth = stack.enter_context(options.truth.open("w")) if options.truth else None
+        path = options.path or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-sim-"))) / "tty"
+        port = SimulatedPort(module, PtyNode(path), Adapter(ADAPTERS[options.adapter], now_ns), faults, truth)
+        stack.callback(port.close)
+        with suppress(KeyboardInterrupt):
+            print(path, flush=True)
+            Control(port).run()
+        print(json.dumps(port.summary()), flush=True)
+    return 0
+
+
+class Control:
+    """Waits for time, bytes and commands, and moves the port along."""
+
+    def __init__(self, port: SimulatedPort) -> None:
+        self._port = port
+        self._text = b""
+        self._running = True
+
+    def run(self) -> None:
+        """Run until told to quit or stdin ends."""
+        port, node, commands = self._port, self._port.node, sys.stdin.fileno()
+        readable = True
+        while self._running:
+            now_ns = time.monotonic_ns()
+            port.step(now_ns, readable)
+            is_open = node.is_open
+            wait_ns = port.next_ns(now_ns) - time.monotonic_ns()
+            # select, because epoll and poll round up to milliseconds
+            watched = [commands, node.fileno()] if is_open else [commands]
+            ready = select.select(watched, [], [], max(wait_ns, 0) / NS_PER_S)[0]
+            readable = not is_open or node.fileno() in ready  # a program may write and be gone
+            if commands in ready:
+                self._take_commands(os.read(commands, COMMAND_BYTES_MAX))
+
+    def _take_commands(self, data: bytes) -> None:
+        if not data:
+            self._running = False
+        *lines, self._text = (self._text + data).split(b"\n")
+        for line in lines:
+            try:
+                self._obey(line.decode(errors="replace").split())
+            except BadCommand as error:
+                print(f"imud.sim: {error}", file=sys.stderr, flush=True)
+
+    def _obey(self, words: list[str]) -> None:
+        port, now_ns = self._port, time.monotonic_ns()
+        match words:
+            case ["unplug", seconds]:
+                port.unplug(now_ns, _duration_ns(seconds))
+            case ["reboot"]:
+                port.module.reboot(now_ns)
+            case ["mark"]:
+                port.module.mark(now_ns)
+            case ["stats"]:
+                print(json.dumps(port.summary()), flush=True)
+            case ["quit"]:
+                self._running = False
+            case []:
+                pass
+            case _:
+                raise BadCommand(f"{' '.join(words)!r}: expected unplug SECONDS, reboot, mark, stats or quit")
+
+
+def _duration_ns(text: str) -> int:
+    try:
+        return round(float(text) * NS_PER_S)
+    except (ValueError, OverflowError):
+        raise BadCommand(f"unplug {text!r}: expected seconds") from None
+
+
+def _module_options(options: argparse.Namespace) -> SimulatorOptions:
+    return SimulatorOptions(
+        rate_hz=options.rate,
+        baud=options.baud,
+        message=options.message,
+        motion=options.motion,
+        gravity_m_s2=options.gravity,
+        noise="real" if options.noise else "none",
+        skew_ppm=options.skew_ppm,
+        firmware=options.firmware,
+        boot_ms=round(options.boot * 1e3),
+        processing_ns=round(options.processing_us * 1e3),
+        seed=options.seed,
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    default = SimulatorOptions()
+    parser = argparse.ArgumentParser("python -m imud.sim", description="A simulated sensor behind a pseudo-terminal.")
+    add = parser.add_argument
+    add("--device", choices=sorted(SIMULATORS), default="hipnuc-uart", help="what to simulate (%(default)s)")
+    add("--rate", type=float, default=default.rate_hz, metavar="HZ", help="samples per second (%(default)s)")
+    add("--baud", type=int, default=0, help="rate of the port (the slowest common one that carries the samples)")
+    add("--message", default="", help="message to send (the factory's)")
+    add("--motion", choices=sorted(MOTIONS), default=default.motion, help="known motion (%(default)s)")
+    add("--gravity", type=float, default=GRAVITY_M_S2, metavar="M_S2", help="local gravity (%(default)s m/s²)")
+    add("--noise", action=argparse.BooleanOptionalAction, default=True, help="sensor noise and bias")
+    add("--skew-ppm", type=float, default=default.skew_ppm, metavar="PPM", help="crystal skew (%(default)s)")
+    add("--firmware", type=int, default=0, metavar="N", help="firmware version, for example 156 or 169")
+    add("--boot", type=float, default=default.boot_ms / 1000, metavar="S", help="silence after power-on (%(default)s)")
+    add("--processing-us", type=float, default=default.processing_ns / 1000, metavar="US",
+        help="time from sample to wire (%(default)s)")  # fmt: skip
+    add("--adapter", choices=list(ADAPTERS), default=BARE_UART.name, help="how bytes are handed over (%(default)s)")
+    add("--faults", default="", metavar="KIND=P,…", help="probability per burst: cut flip drop insert delay unplug …")
+    add("--seed", type=int, default=default.seed, help="seed of noise and faults (%(default)s)")
+    add("--path", type=Path, help="node to make (a temporary one)")
+    add("--truth", type=Path, metavar="FILE", help="write true sample times, CSV: sample_ns,device_ms,written_ns")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,370 @@
+"""A HiPNUC module (CH0x0, CH10x, HI14) at the far end of a UART: IMU configuration manual V1.5.9, chapters 1-3, 8.
+
+Without I/O and without a clock of its own: the owner passes what the host sent to `receive` and collects what the
+module sent with `advance`. What it does as a real one does:
+
+- It samples at whole milliseconds of its own crystal, which runs `skew_ppm` fast; `system_time` counts from power-on.
+- A frame leaves `processing_ns` after its sample, when the wire is free; text goes between whole frames. What does not
+  fit the transmit buffer is never sent: at 115200 baud and 1 kHz six frames of seven are missing.
+- Commands are lines of ASCII, obeyed at once; a known one is answered with `OK` or `ERR`, an unknown one not at all.
+  URFR and SERIALCONFIG act after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved.
+- LOG DISABLE silences frames, not replies, and is forgotten at a reboot (assumed; the manual calls ENABLE the default).
+
+Attitude is the truth in both modes; heading does not start at zero in six-axis mode, as it would in a real module.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from math import pi, radians
+from typing import Final
+
+from imud.devices.hipnuc.commands import BAUD_RATES, MAX_RATE_HZ, Message
+from imud.devices.hipnuc.frames import encode_hi91, encode_hi92
+from imud.sample import Vector3
+from imud.sim.hipnuc_settings import HipnucSettings, Output, Refused, changed, number, rows
+from imud.sim.motion import MOTIONS, Motion, Truth, swing
+from imud.sim.mounting import Mounting, frame_of, level_of
+from imud.sim.noise import Noise
+from imud.sim.simulator import Burst, Simulator, SimulatorOptions
+from imud.sim.transmitter import Transmitter
+from imud.units import NS_PER_MS, NS_PER_S, T_PER_UT
+
+FACTORY_BAUD: Final = HipnucSettings().baud
+MAIN_STATUS_FIRMWARE: Final = 169
+"""From here on HI91 bytes 1-2 are MAIN_STATUS instead of the PPS stamp."""
+TX_BUFFER_BYTES: Final = 512
+"""A frame that would make more than this wait for the wire is not sent."""
+COMMAND_BYTES_MAX: Final = 128
+"""Assumed; the longest command of the manual, URFR, has 123 with nine decimals."""
+REPLY_NS: Final = 200_000
+"""Time from the end of a command to its reply (assumed)."""
+PPS_MODULUS_MS: Final = 8192
+"""The PPS stamp free-runs 0 … 8191 without edges (recorded so)."""
+NEAR_LEVEL_RAD: Final = radians(5)
+"""ATT RST 3 acts within this of level."""
+STATIC_GYRO_RAD_S: Final = 0.02
+GYRO_SETTLED_MS: Final = 5000
+ATTITUDE_SETTLED_MS: Final = 1000
+"""Assumed times after power-on until bias and attitude count as converged."""
+
+GYRO_UNSETTLED, ATTITUDE_UNSETTLED = 1 << 3, 1 << 7
+STATIC, MAG_AIDING, NO_UTC, SYNC_OUT = 1 << 9, 1 << 10, 1 << 11, 1 << 12
+
+_PRINTABLE = range(0x20, 0x7F)
+_FRAME_BYTES: Final = {Message.HI91: 82, Message.HI92: 54}
+
+
+@dataclass(frozen=True, slots=True)
+class HipnucHardware:
+    """What a module is made of and where it is."""
+
+    product: str = "HI14R3"
+    build: str = "Oct 15 2024"
+    uuid: str = "043995698D6E1708"
+    firmware: int = 156
+    bootloader: int = 109
+    motion: Motion = field(default_factory=swing)
+    noise: Noise | None = None
+    skew_ppm: float = 20.0
+    boot_ms: int = 500
+    processing_ns: int = 125_000
+    uptime_ms: int = 0
+    """Device time at the first power-on, to begin near the end of a counter's range."""
+    mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
+    """Result of its magnetic calibration; zero: never calibrated."""
+
+
+class HipnucModule:
+    """One module, powered on when it is made."""
+
+    def __init__(
+        self, now_ns: int, settings: HipnucSettings | None = None, hardware: HipnucHardware | None = None
+    ) -> None:
+        """`settings` are what its flash holds."""
+        self.hardware = hardware or HipnucHardware()
+        self.flash = self.settings = settings or HipnucSettings()
+        self.epoch_ns = now_ns
+        self.frames_sent = 0
+        self.frames_dropped = 0
+        """Frames that did not fit the wire."""
+        self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
+        self._before_reboot: list[Burst] = []
+        self._line = bytearray()
+        self._actions = self._make_actions()
+        self._power_on(now_ns, self.hardware.uptime_ms)
+
+    @property
+    def baud(self) -> int:
+        """Rate in bit/s in force; SERIALCONFIG changes it at the next reboot."""
+        return self._wire.baud
+
+    def reboot(self, now_ns: int) -> None:
+        """Power was lost and came back, or the device was told to: what was not saved is gone."""
+        self._sample(now_ns)
+        self._before_reboot += self._wire.stopped(now_ns)
+        self.settings = self.flash
+        self._power_on(now_ns, 0)
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Take bytes that the host sent, already as the module hears them."""
+        self._sample(now_ns)
+        if now_ns < self._ready_ns:  # still booting
+            return
+        for byte in data:
+            if byte == 0x0A:
+                line, self._line = self._line, bytearray()
+                if len(line) <= COMMAND_BYTES_MAX:
+                    self._obey(line.decode("ascii"), now_ns)
+                if now_ns < self._ready_ns:  # it told the module to reboot
+                    return
+            elif byte in _PRINTABLE:
+                if len(self._line) <= COMMAND_BYTES_MAX:
+                    self._line.append(byte)
+            elif byte != 0x0D:
+                self._line.clear()
+
+    def mark(self, now_ns: int) -> None:
+        """A rising edge on SIN/PPS: the PPS stamp starts anew, and messages set to ONMARK are sent."""
+        self._sample(now_ns)
+        self._pps_ms = self._device_ms(now_ns)
+        for message in self._outputs:
+            self._send_marked(message, now_ns)
+
+    def advance(self, now_ns: int) -> list[Burst]:
+        """Return what has left the wire since the last call, in order."""
+        self._sample(now_ns)
+        done, self._before_reboot = self._before_reboot, []
+        return done + self._wire.sent(now_ns)
+
+    def next_ns(self) -> int | None:
+        """When `advance` will have something next, or None while nothing is to come."""
+        if self._before_reboot:
+            return self._before_reboot[0].due_ns
+        if (due_ns := self._wire.next_ns()) is not None or not self._next_ms:
+            return due_ns
+        message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
+        ready_ns = self._instant_ns(device_ms) + self.hardware.processing_ns
+        return self._wire.due_ns(ready_ns, _FRAME_BYTES[message])
+
+    def counters(self) -> dict[str, int]:
+        """Frames by what became of them."""
+        return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
+
+    def _power_on(self, now_ns: int, uptime_ms: int) -> None:
+        hardware, settings = self.hardware, self.settings
+        self._frame = frame_of(rows(settings.urfr))
+        self._yaw_rad = 0.0
+        self._on_ns, self._on_ms = now_ns, uptime_ms
+        self._ready_ns = now_ns + hardware.boot_ms * NS_PER_MS
+        self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
+        self._pps_ms = 0
+        self._enabled = True
+        self._line.clear()
+        self._settings_changed(self._ready_ns)
+
+    def _settings_changed(self, now_ns: int) -> None:
+        """Schedule the messages after `now_ns` and put the turns of the attitude in force."""
+        settings, device_ms = self.settings, self._device_ms(now_ns)
+        self._outputs = {Message.HI91: settings.hi91, Message.HI92: settings.hi92}
+        self._mounting = Mounting(self._frame, settings.level, settings.level_accel, self._yaw_rad)
+        self._next_ms: dict[Message, int] = {}
+        for message, output in self._outputs.items():
+            if output.period_ms and self._enabled:
+                self._next_ms[message] = (device_ms // output.period_ms + 1) * output.period_ms
+
+    def _device_ms(self, now_ns: int) -> int:
+        """Device time, not wrapped."""
+        return self._on_ms + (now_ns - self._on_ns) * self._scale // (NS_PER_S * NS_PER_MS)
+
+    def _instant_ns(self, device_ms: int) -> int:
+        """First host time at which the device's clock shows `device_ms`."""
+        return self._on_ns - (self._on_ms - device_ms) * NS_PER_MS * NS_PER_S // self._scale
+
+    def _sample(self, now_ns: int) -> None:
+        """Take all samples up to now and queue their frames."""
+        while self._next_ms:
+            message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
+            sample_ns = self._instant_ns(device_ms)
+            if sample_ns > now_ns:
+                return
+            self._next_ms[message] = device_ms + self._outputs[message].period_ms
+            self._queue_frame(message, sample_ns, device_ms)
+
+    def _send_marked(self, message: Message, now_ns: int) -> None:
+        if self._enabled and self._outputs[message].on_mark and now_ns >= self._ready_ns:
+            self._queue_frame(message, now_ns, self._device_ms(now_ns))
+
+    def _queue_frame(self, message: Message, sample_ns: int, device_ms: int) -> None:
+        ready_ns = sample_ns + self.hardware.processing_ns
+        if not self._wire.fits(ready_ns, _FRAME_BYTES[message]):
+            self.frames_dropped += 1
+            return
+        self.frames_sent += 1
+        self._wire.send(ready_ns, self._encode(message, sample_ns, device_ms), sample_ns, device_ms)
+
+    def _encode(self, message: Message, sample_ns: int, device_ms: int) -> bytes:
+        reading = self._reading(sample_ns)
+        accel, gyro, mag, euler, quat, temperature_c, pressure_pa = reading
+        pps_ms = (device_ms - self._pps_ms) % PPS_MODULUS_MS
+        has_status = self.hardware.firmware >= MAIN_STATUS_FIRMWARE
+        status = self._main_status(reading, device_ms) if has_status else 0
+        if message is Message.HI92:
+            return encode_hi92(
+                pps_stamp_ms=pps_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat,
+                temperature_c=temperature_c, pressure_pa=pressure_pa, status=status,
+            )  # fmt: skip
+        return encode_hi91(
+            system_time_ms=device_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler,
+            quat_wxyz=quat, temperature_c=temperature_c, pressure_pa=pressure_pa,
+            word_1_2=status if has_status else pps_ms,
+        )  # fmt: skip
+
+    def _reading(self, sample_ns: int) -> Truth:
+        """What the module measures at an instant, noise and mounting included."""
+        t_s = (sample_ns - self.epoch_ns) / NS_PER_S
+        truth = self.hardware.motion.at(t_s)
+        if self._mounting.active:
+            truth = self._mounting.turned(truth)
+        return self.hardware.noise.add(truth, t_s) if self.hardware.noise else truth
+
+    def _main_status(self, reading: Truth, device_ms: int) -> int:
+        """MAIN_STATUS as far as a module without PPS can be in it; a SOUT pulse goes before every frame."""
+        status = NO_UTC | SYNC_OUT
+        if device_ms - self._on_ms < GYRO_SETTLED_MS:
+            status |= GYRO_UNSETTLED
+        if device_ms - self._on_ms < ATTITUDE_SETTLED_MS:
+            status |= ATTITUDE_UNSETTLED
+        if max(map(abs, reading.gyro_rad_s)) < STATIC_GYRO_RAD_S:
+            status |= STATIC
+        return status | MAG_AIDING if self.settings.att_mode == 1 else status
+
+    def _obey(self, line: str, now_ns: int) -> None:
+        try:
+            settings = changed(self.settings, line, self.hardware.firmware)
+            if settings is not None:
+                self.settings = settings
+                reply: list[str] | None = []
+                self._settings_changed(now_ns)
+            else:
+                reply = self._act(line, now_ns)
+        except Refused:
+            self._say(["ERR"], now_ns)
+            return
+        if reply is not None:
+            self._say([*reply, "OK"], now_ns)
+
+    def _say(self, lines: list[str], now_ns: int) -> None:
+        data = "".join(f"{line}\r\n" for line in lines).encode("ascii")
+        self._wire.send(now_ns + REPLY_NS, data)
+
+    def _make_actions(self) -> dict[str, Callable[[int], list[str] | None]]:
+        """Commands without a value that do more than change settings: reply lines before `OK`, None for no reply."""
+        hardware = self.hardware
+        version = [
+            f"PNAME={hardware.product}",
+            f"BUILD={hardware.build}",
+            f"UUID={hardware.uuid}",
+            f"APP_VER={hardware.firmware}",
+            f"BL_VER={hardware.bootloader}",
+        ]
+        bias = "MB=" + ", ".join(f"{value / T_PER_UT:.2f}" for value in hardware.mag_bias_t)
+        return {
+            "REBOOT": self.reboot,
+            "SAVECONFIG": self._save,
+            "FRESET": self._factory_reset,
+            "LOG ENABLE": lambda now_ns: self._enable(True, now_ns),
+            "LOG DISABLE": lambda now_ns: self._enable(False, now_ns),
+            "LOG VERSION": lambda _: version,
+            "LOG USRCONFIG": lambda _: self.settings.user_lines(),
+            "LOG COMCONFIG": lambda _: self.settings.port_lines(),
+            "LOG MAGCONFIG": lambda _: [bias],
+        }
+
+    def _act(self, line: str, now_ns: int) -> list[str] | None:
+        action = self._actions.get(line)
+        if action is not None:
+            return action(now_ns)
+        match line.split(" "):
+            case ["CONFIG", "ATT", "RST", kind]:
+                return self._level(kind, now_ns)
+            case ["CONFIG", "YAW", mode, value]:
+                return self._set_yaw(mode, value, now_ns)
+            case ["LOG", "IMU91" | "HI91" | "HI92" as message, "ONMARK", "ONCE"]:
+                self._send_marked(Message.HI92 if message == Message.HI92 else Message.HI91, now_ns)
+                return []
+        return None
+
+    def _save(self, _now_ns: int) -> list[str]:
+        self.flash = self.settings
+        return []
+
+    def _factory_reset(self, now_ns: int) -> list[str]:
+        self.flash = self.settings = HipnucSettings()
+        self._settings_changed(now_ns)
+        return []
+
+    def _enable(self, enabled: bool, now_ns: int) -> list[str]:
+        self._enabled = enabled
+        self._settings_changed(now_ns)
+        return []
+
+    def _attitude(self, now_ns: int) -> Truth:
+        """The attitude without levelling and without CONFIG YAW."""
+        return Mounting(self._frame).turned(self.hardware.motion.at((now_ns - self.epoch_ns) / NS_PER_S))
+
+    def _level(self, kind: str, now_ns: int) -> list[str]:
+        """CONFIG ATT RST: 2 levels here, 3 only where nearly level (upside down allowed), 5 cancels."""
+        if kind not in ("2", "3", "5"):
+            raise Refused(kind)
+        attitude = self._attitude(now_ns)
+        roll, pitch, _ = attitude.euler_rad
+        upside_down = kind == "3" and abs(roll) > pi / 2
+        if kind == "3" and max(abs(pitch), pi - abs(roll) if upside_down else abs(roll)) >= NEAR_LEVEL_RAD:
+            raise Refused(kind)  # the manual says it gives up; that it answers ERR is assumed
+        level = HipnucSettings().level if kind == "5" else level_of(attitude.quat_wxyz, upside_down)
+        self.settings = replace(self.settings, level=level, level_accel=kind == "3")
+        self._settings_changed(now_ns)
+        return []
+
+    def _set_yaw(self, mode: str, value: str, now_ns: int) -> list[str]:
+        """CONFIG YAW: 0 adds to the heading, 1 makes it so."""
+        angle_rad = radians(number(value, -180.0, 180.0))
+        if mode not in ("0", "1"):
+            raise Refused(mode)
+        if mode == "1":
+            angle_rad -= self._mounting.turned(self.hardware.motion.at((now_ns - self.epoch_ns) / NS_PER_S)).euler_rad[
+                2
+            ]
+        self._yaw_rad += angle_rad
+        self._settings_changed(now_ns)
+        return []
+
+
+def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
+    """A module from the common options. Raises ValueError naming the option that it cannot have."""
+    period_ms = round(1000 / options.rate_hz) if options.rate_hz > 0 else 0
+    if not 1 <= period_ms <= 1000 or abs(period_ms * options.rate_hz - 1000) > 10:
+        raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … 1000 Hz, and 1000 divided by a whole number")
+    if options.message.upper() not in ("", *Message):
+        raise ValueError(f"message {options.message!r}: expected {' or '.join(Message)}")
+    message = Message(options.message.upper() or Message.HI91)
+    if options.motion not in MOTIONS:
+        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
+    fitting = (b for b, most_hz in MAX_RATE_HZ[message].items() if b >= FACTORY_BAUD and most_hz >= options.rate_hz)
+    baud = options.baud or next(fitting)
+    if baud not in BAUD_RATES:
+        raise ValueError(f"baud {baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
+    output, silent = Output(period_ms), Output()
+    hi91, hi92 = (output, silent) if message is Message.HI91 else (silent, output)
+    hardware = HipnucHardware(
+        firmware=options.firmware or HipnucHardware().firmware,
+        motion=MOTIONS[options.motion](options.gravity_m_s2),
+        noise=Noise(options.seed) if options.noise == "real" else None,
+        skew_ppm=options.skew_ppm,
+        boot_ms=options.boot_ms,
+        processing_ns=options.processing_ns,
+    )
+    return HipnucModule(now_ns, HipnucSettings(baud=baud, hi91=hi91, hi92=hi92), hardware)
+
+
+SIMULATOR = Simulator("hipnuc-uart", "HiPNUC HI14R3 (CH0x0, CH10x, HI14) on a UART", make)

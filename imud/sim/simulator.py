@@ -1,0 +1,92 @@
+"""What a simulated device on a byte stream is: the far end of the wire, without I/O, driven by an explicit clock."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+from imud.sim.motion import GRAVITY_M_S2
+
+
+class Burst(NamedTuple):
+    """Bytes that left the device in one piece."""
+
+    due_ns: int
+    """CLOCK_MONOTONIC at which the last byte has crossed the wire."""
+    data: bytes
+    sample_ns: int | None = None
+    """CLOCK_MONOTONIC of the instant of measurement; None for text."""
+    device_ms: int | None = None
+    """Device time of that instant in ms of its own crystal since power-on, not wrapped."""
+
+
+class StreamModule(Protocol):
+    """A simulated device. Times are CLOCK_MONOTONIC in ns and never go backwards. Synchronization: one thread."""
+
+    @property
+    def baud(self) -> int:
+        """Rate in bit/s at which it sends and listens now."""
+        ...
+
+    epoch_ns: int
+    """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Take bytes that the host sent, already as the device hears them."""
+        ...
+
+    def advance(self, now_ns: int) -> list[Burst]:
+        """Return what has left the wire since the last call, in order."""
+        ...
+
+    def next_ns(self) -> int | None:
+        """When `advance` will have something next, or None while nothing is to come."""
+        ...
+
+    def counters(self) -> dict[str, int]:
+        """What it counts of itself, by name."""
+        ...
+
+    def mark(self, now_ns: int) -> None:
+        """A rising edge on its sync input; ignored by a device without one."""
+        ...
+
+    def reboot(self, now_ns: int) -> None:
+        """Power was lost and came back, or the device was told to: what was not saved is gone."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorOptions:
+    """What every simulated device can be told."""
+
+    rate_hz: float = 100.0
+    """Samples per second of the device's own time."""
+    baud: int = 0
+    """Rate of the port in bit/s; 0 for the slowest common one that carries the samples."""
+    message: str = ""
+    """Name of the message to send, empty for the factory's choice."""
+    motion: str = "swing"
+    """A row of `imud.sim.motion.MOTIONS`."""
+    gravity_m_s2: float = GRAVITY_M_S2
+    noise: Literal["real", "none"] = "real"
+    skew_ppm: float = 20.0
+    """How much faster the device's crystal runs than the host's."""
+    firmware: int = 0
+    """Firmware version as the device states it, 0 for a common one."""
+    boot_ms: int = 500
+    """Silence after power-on and reboot."""
+    processing_ns: int = 125_000
+    """Time from the instant of measurement to the first bit on the wire."""
+    seed: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Simulator:
+    """The row a simulated device's file ends with."""
+
+    name: str
+    """Name of the driver it stands in for."""
+    title: str
+    """The product, for people."""
+    make: Callable[[SimulatorOptions, int], StreamModule]
+    """Makes the module, powered on at the given CLOCK_MONOTONIC. Raises ValueError for options it cannot have."""

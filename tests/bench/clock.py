@@ -1,0 +1,174 @@
+"""How right and how fast the clock is: `python -m tests.bench.clock` prints the table, truth known from simulation.
+
+A row is one profile of arrival, rate and crystal; figures are of all its seeds, after the fit has settled for 70 s.
+`--quick` takes one seed and fewer rows.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from time import perf_counter_ns
+from typing import NamedTuple
+
+from imud.clock import SampleClock
+from imud.sample import Measurement, Sync
+from imud.sim.arrival import BARE_UART, LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.rows import Row, at_least, at_most
+
+TICK_NS = NS_PER_MS
+TICK_MODULUS = 1 << 32
+SETTLED_NS = 70 * NS_PER_S
+SECONDS = {1: 240, 100: 150, 200: 150, 400: 120, 1000: 120}
+"""Simulated time for each rate."""
+BAUD_OF_RATE = {1: 115_200, 100: 115_200, 200: 460_800, 400: 921_600, 1000: 921_600}
+CRYSTALS = {
+    "0 ppm": Crystal(0.0),
+    "+50 ppm": Crystal(50.0),
+    "-50 ppm": Crystal(-50.0),
+    "+5 %": Crystal(50_000.0),
+    "-5 %": Crystal(-50_000.0),
+    "drift": Crystal(20.0, 0.1),
+}
+"""`drift`: 20 ppm and 0.1 ppm/s up and down by 10 ppm."""
+
+
+class Point(NamedTuple):
+    """One sample beside its truth."""
+
+    off_ns: int
+    """t_ns - truth."""
+    t_err_ns: int
+    fitted: bool
+    truth_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """Errors of `t_ns` against the truth."""
+
+    rms_ns: float
+    """About the truth: a constant bias is in it."""
+    sigma_ns: float
+    """About their own mean: what is left when the bias is calibrated away."""
+    p999_ns: float
+    """99.9 of 100 are smaller."""
+    mean_t_err_ns: float
+    share: float
+    """Within twice their stated error, settled."""
+    share_settling: float
+    """The same from the first sample until settled."""
+
+
+def clock_for(model: ArrivalModel) -> SampleClock:
+    """A clock as the pipeline would set it up for the model's link."""
+    return SampleClock(
+        "bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=model.profile.hold_ns
+    )
+
+
+def run(model: ArrivalModel, count: int) -> list[Point]:
+    """The first `count` samples of a model through a new clock."""
+    clock = clock_for(model)
+    points = []
+    for a in model.run(count):
+        ticks = a.dev_ns // TICK_NS % TICK_MODULUS
+        s = clock.sample(Measurement(a.size_bytes, a.trailing_bytes, ticks), a.t_rx_ns, 0)
+        points.append(Point(s.t_ns - a.t_ns, s.t_err_ns, s.sync is Sync.REGRESSION, a.t_ns))
+    return points
+
+
+def accuracy(points: Sequence[Point], settle_ns: int = SETTLED_NS) -> Accuracy:
+    """Figures of one run, split at `settle_ns` after its first sample."""
+    begin = points[0].truth_ns
+    return summary(
+        [p for p in points if p.truth_ns - begin > settle_ns], [p for p in points if p.truth_ns - begin <= settle_ns]
+    )
+
+
+def summary(settled: Sequence[Point], settling: Sequence[Point]) -> Accuracy:
+    """Figures of the settled samples, and the share of the others."""
+    n = len(settled)
+    mean = sum(p.off_ns for p in settled) / n
+    return Accuracy(
+        rms_ns=sqrt(sum(p.off_ns**2 for p in settled) / n),
+        sigma_ns=sqrt(sum((p.off_ns - mean) ** 2 for p in settled) / n),
+        p999_ns=sorted(abs(p.off_ns) for p in settled)[int(n * 0.999)],
+        mean_t_err_ns=sum(p.t_err_ns for p in settled) / n,
+        share=_share(settled),
+        share_settling=_share(settling),
+    )
+
+
+def _share(points: Sequence[Point]) -> float:
+    return sum(abs(p.off_ns) <= 2 * p.t_err_ns for p in points) / len(points)
+
+
+def over_seeds(profile: ArrivalProfile, rate_hz: int, crystal: Crystal, seeds: Sequence[int]) -> Accuracy:
+    """Figures of several runs together."""
+    settled: list[Point] = []
+    settling: list[Point] = []
+    for seed in seeds:
+        points = run(ArrivalModel(profile, rate_hz, seed, crystal, BAUD_OF_RATE[rate_hz]), rate_hz * SECONDS[rate_hz])
+        begin = points[0].truth_ns
+        for p in points:
+            (settled if p.truth_ns - begin > SETTLED_NS else settling).append(p)
+    return summary(settled, settling)
+
+
+def speed_ns(profile: ArrivalProfile, rate_hz: int = 1000, count: int = 20_000) -> float:
+    """Mean time of one `sample()` call with a full measurement, the fit settled; the best of three."""
+    v = (1.0, 2.0, 3.0)
+    model = ArrivalModel(profile, rate_hz, 1, baud=BAUD_OF_RATE[rate_hz])
+    calls = [
+        (Measurement(82, a.trailing_bytes, a.dev_ns // TICK_NS, v, v, v, (1.0, 0.0, 0.0, 0.0), v, 20.0, 1e5), a.t_rx_ns)
+        for a in model.run(count)
+    ]
+    best = float("inf")
+    for _ in range(3):
+        clock = clock_for(model)
+        for m, t_rx_ns in calls[: count // 2]:
+            clock.sample(m, t_rx_ns, 0)
+        begin = perf_counter_ns()
+        for m, t_rx_ns in calls[count // 2 :]:
+            clock.sample(m, t_rx_ns, 0)
+        best = min(best, (perf_counter_ns() - begin) / (count - count // 2))
+    return best
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """The rows of `make bench`: speed, and accuracy at 100 Hz behind each profile."""
+    for profile in (BARE_UART, USB_16MS):
+        yield at_most(f"clock: one sample at 1 kHz, {profile.name}", speed_ns(profile), "ns", 3000)
+    for profile in (BARE_UART, USB_1MS, USB_16MS, LOADED):
+        got = over_seeds(profile, 100, CRYSTALS["+50 ppm"], (1, 2))
+        name = f"clock: t_ns - truth at 100 Hz, {profile.name}"
+        yield Row(f"{name}, sigma", got.sigma_ns / 1000, "us")
+        yield Row(f"{name}, rms", got.rms_ns / 1000, "us")
+        yield Row(f"{name}, p99.9", got.p999_ns / 1000, "us")
+        yield at_least(f"{name}, share within 2 t_err", got.share, "", 0.95)
+
+
+def print_table(seeds: Sequence[int], rates: Sequence[int]) -> None:
+    """The table of the documentation, as Markdown."""
+    print("| arrival | rate, Hz | crystal | σ, µs | rms, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for profile in PROFILES:
+        for rate_hz in rates:
+            for name, crystal in CRYSTALS.items():
+                a = over_seeds(profile, rate_hz, crystal, seeds)
+                micro = " | ".join(f"{ns / 1000:.1f}" for ns in (a.sigma_ns, a.rms_ns, a.p999_ns, a.mean_t_err_ns))
+                print(
+                    f"| {profile.name} | {rate_hz} | {name} | {micro} | {a.share:.3f} | {a.share_settling:.3f} |",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    if "--quick" in sys.argv:
+        print_table((1,), (1, 100, 1000))
+    else:
+        print_table((1, 2, 3), tuple(SECONDS))
+    for row in rows():
+        print(row)

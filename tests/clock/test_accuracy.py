@@ -1,0 +1,44 @@
+"""Against the truth: at least 95 of 100 samples within twice the error they state, over every profile of arrival.
+
+The whole table is printed by `python -m tests.bench.clock`; here a part of it that takes seconds.
+"""
+
+from itertools import product
+
+import pytest
+
+from imud.sim.arrival import PROFILES, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
+from tests.bench.clock import BAUD_OF_RATE, accuracy, run
+
+CRYSTALS = {
+    "exact": Crystal(0.0),
+    "5 % fast": Crystal(50_000.0),
+    "4.08 % fast": Crystal(40_800.0),
+    "50 ppm slow": Crystal(-50.0),
+    "drifting": Crystal(20.0, 0.1),
+}
+
+
+@pytest.mark.parametrize(("profile", "crystal"), list(product(PROFILES, CRYSTALS)), ids=lambda v: getattr(v, "name", v))
+def test_the_error_is_honest(profile: ArrivalProfile, crystal: str) -> None:
+    for rate_hz, seconds in ((100, 40), (1, 100)):
+        model = ArrivalModel(profile, rate_hz, 7, CRYSTALS[crystal], BAUD_OF_RATE[rate_hz])
+        got = accuracy(run(model, rate_hz * seconds), settle_ns=20_000_000_000)
+        assert got.share >= 0.95
+        assert got.share_settling >= 0.95
+
+
+def test_uneven_ticks_are_no_error() -> None:
+    """400 Hz in milliseconds: the truncation of up to 0.5 ms is not in the stamps."""
+    model = ArrivalModel(PROFILES[1], 400, 1, Crystal(0.0), 921_600)
+    assert accuracy(run(model, 8000), settle_ns=5_000_000_000).rms_ns < 60_000
+
+
+@pytest.mark.parametrize("rate_hz", [200, 1000])
+def test_bursts_behind_a_slow_timer(rate_hz: int) -> None:
+    """16 ms of messages in each read: each is dated by the bytes behind it and by what the timer can hide."""
+    model = ArrivalModel(USB_16MS, rate_hz, 3, CRYSTALS["50 ppm slow"], BAUD_OF_RATE[rate_hz])
+    got = accuracy(run(model, 20 * rate_hz), settle_ns=10_000_000_000)
+    assert got.share >= 0.95
+    assert got.rms_ns < 1_500_000
+    assert got.mean_t_err_ns < 4 * got.rms_ns

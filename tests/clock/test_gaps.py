@@ -1,0 +1,55 @@
+"""The learned period and what is missing by it."""
+
+import pytest
+
+from imud.clock.gaps import PeriodLearner
+
+
+def missing(steps: list[int]) -> list[int]:
+    """What a new learner makes of each step."""
+    learner = PeriodLearner()
+    return [learner.step(step) for step in steps]
+
+
+def test_nothing_is_missing_before_a_period_is_known() -> None:
+    assert missing([10, 30, 10, 50, 10]) == [0] * 5
+
+
+@pytest.mark.parametrize(
+    ("step", "lost", "expected"), [(10, 20, 1), (10, 30, 2), (1, 2, 1), (1, 5, 4), (1000, 3000, 2)]
+)
+def test_a_longer_step_is_a_loss(step: int, lost: int, expected: int) -> None:
+    assert missing([step] * 10 + [lost] + [step] * 3)[10:] == [expected, 0, 0, 0]
+
+
+def test_uneven_ticks_are_no_loss() -> None:
+    """400 Hz in milliseconds."""
+    learner = PeriodLearner()
+    assert [learner.step(2 + i % 2) for i in range(1000)] == [0] * 1000
+    assert learner.period_ticks == pytest.approx(2.5, abs=0.01)
+    assert learner.step(8) == 2
+
+
+def test_a_slower_rate_is_adopted() -> None:
+    learner = PeriodLearner()
+    seen = [learner.step(step) for step in [10] * 20 + [20] * 20]
+    assert sum(seen) <= 3
+    assert learner.period_ticks == 20
+    assert learner.step(40) == 1
+
+
+def test_a_faster_rate_costs_nothing() -> None:
+    learner = PeriodLearner()
+    assert sum(learner.step(step) for step in [10] * 20 + [1] * 20) == 0
+    assert learner.period_ticks == 1
+    assert learner.step(10) == 9
+
+
+def test_losses_among_good_steps_do_not_change_the_period() -> None:
+    assert sum(missing([1] * 10 + [2, 1, 3, 1] * 500)) == 500 * 3
+
+
+def test_repeats_are_ignored() -> None:
+    learner = PeriodLearner()
+    assert sum(learner.step(step) for step in [10, 0] * 50) == 0
+    assert learner.period_ticks == 10

@@ -1,0 +1,309 @@
+"""The clock as a whole: three rules for any input, and what devices and hosts do to it."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imud.sample import Measurement, Sample, Sync
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.clock.streams import BEGIN_NS, MODULUS, Point, feed, make_clock, message, rises, steady
+
+NEAR_NS = 2 * NS_PER_MS
+"""Messages are read 1 ms after they were measured and take 0.9 ms on the wire."""
+
+
+def far(samples: Sequence[Sample], points: Sequence[Point]) -> int:
+    """Largest distance of a stamp from the truth, ns."""
+    return max(abs(s.t_ns - BEGIN_NS - ms * NS_PER_MS) for s, (_, ms) in zip(samples, points, strict=True))
+
+
+@settings(derandomize=True, max_examples=150, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.one_of(st.none(), st.integers(0, 999), st.integers(0, 20)),
+            st.one_of(st.integers(0, 3), st.integers(0, 50 * NS_PER_MS), st.integers(0, 100 * NS_PER_S)),
+            st.integers(0, 4096),
+        ),
+        max_size=80,
+    ),
+    st.sampled_from([0, 1_085, 86_805]),
+    st.sampled_from([0, NS_PER_MS, 16 * NS_PER_MS]),
+)
+def test_any_input_gives_rising_stamps_before_arrival(
+    steps: list[tuple[int | None, int, int]], byte_ns: int, hold_ns: int
+) -> None:
+    clock = make_clock(tick_modulus=1000, byte_ns=byte_ns, hold_ns=hold_ns)
+    t_rx_ns = BEGIN_NS
+    samples = []
+    for ticks, wait_ns, trailing in steps:
+        t_rx_ns += wait_ns
+        samples.append(clock.sample(message(ticks, trailing), t_rx_ns, 0))
+        assert clock.missed >= 0
+        assert samples[-1].t_rx_ns - t_rx_ns <= len(samples)
+    assert rises(samples)
+    assert all(0 < s.t_err_ns < 1 << 32 for s in samples)
+    assert [s.seq for s in samples] == list(range(1, len(samples) + 1))
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(st.lists(st.sampled_from([1, 2, 3, 10, 11, 500, 990, 999]), min_size=20, max_size=150), st.integers(0, 999))
+def test_a_believable_device_never_resets(steps: list[int], first: int) -> None:
+    clock = make_clock(tick_modulus=1000)
+    points: list[Point] = []
+    ms = 0
+    for step in steps:
+        points.append(((first + ms) % 1000, ms))
+        ms += step
+    samples = feed(clock, points)
+    assert clock.status().resets == 0
+    assert far(samples, points) < NEAR_NS
+    assert samples[-1].t_dev_ns == (first + points[-1][1]) * NS_PER_MS
+
+
+def test_it_comes_from_arrival_to_regression() -> None:
+    clock = make_clock()
+    samples = feed(clock, steady(5000, 0, 200))
+    assert samples[0].sync is Sync.ARRIVAL
+    assert samples[-1].sync is Sync.REGRESSION
+    assert samples[-1].t_err_ns < samples[0].t_err_ns
+    status = clock.status()
+    assert status.sync is Sync.REGRESSION
+    assert abs(status.skew_ppm) < 1
+    assert status.t_err_ns == samples[-1].t_err_ns
+    assert abs(status.offset_ns - (BEGIN_NS - 5000 * NS_PER_MS)) < NEAR_NS
+
+
+def test_wrap_is_no_reset_and_no_loss() -> None:
+    clock = make_clock()
+    points = [(ticks % MODULUS if ticks is not None else None, ms) for ticks, ms in steady(MODULUS - 1000, 0, 300)]
+    samples = feed(clock, points)
+    assert clock.status().resets == 0
+    assert far(samples, points) < NEAR_NS
+    assert samples[-1].t_dev_ns == (MODULUS - 1000 + 2990) * NS_PER_MS
+
+
+def test_restarted_counter_never_stamps_ahead() -> None:
+    clock = make_clock()
+    points = steady(100_000, 0, 300) + steady(7, 3500, 300)
+    samples = feed(clock, points)
+    assert clock.status().resets == 1
+    assert rises(samples)
+    assert far(samples, points) < NEAR_NS
+    assert samples[300].sync is Sync.ARRIVAL
+    assert samples[-1].sync is Sync.REGRESSION
+
+
+def test_a_counter_set_forward_by_little_is_seen() -> None:
+    """40 ms in the future is impossible, and is no reason to believe in a new minimum for a minute."""
+    clock = make_clock()
+    points = steady(0, 0, 1000) + steady(10_040, 10_000, 500)
+    samples = feed(clock, points)
+    assert clock.status().resets == 1
+    assert far(samples, points) < NEAR_NS
+
+
+def test_a_reset_is_no_loss() -> None:
+    clock = make_clock()
+    feed(clock, steady(100_000, 0, 300))
+    feed(clock, [(7, 3500)])
+    assert clock.missed == 0
+
+
+def test_a_restart_that_lands_ahead_of_the_old_count_is_found() -> None:
+    """Reboot at 3 s, silent for a minute, counter at 5 s: forward, believable alone, and 58 s late."""
+    clock = make_clock()
+    feed(clock, steady(0, 0, 300))
+    points = steady(5000, 63_000, 500)
+    samples = feed(clock, points)
+    assert clock.status().resets == 1
+    assert rises(samples)
+    assert samples[50].t_err_ns == 0xFFFF_FFFF  # a second of doubt, and the error says so as far as 32 bits go
+    assert far(samples[150:], points[150:]) < NEAR_NS
+
+
+def test_a_clock_that_stood_still_is_found() -> None:
+    clock = make_clock()
+    points = steady(0, 0, 2000) + steady(20_000, 20_040, 3000)
+    samples = feed(clock, points)
+    assert clock.status().resets == 1
+    assert far(samples[-500:], points[-500:]) < NEAR_NS
+
+
+def test_a_busy_host_is_no_reset() -> None:
+    """The reader stands still for 2 s; the messages it then finds are old, not the device's clock."""
+    clock = make_clock()
+    feed(clock, steady(0, 0, 2000))
+    samples = [
+        clock.sample(message(20_000 + 10 * i, 82 * (199 - i)), BEGIN_NS + 22_001 * NS_PER_MS, 0) for i in range(200)
+    ]
+    points = steady(20_000, 20_000, 200)
+    assert far(samples, points) < NEAR_NS
+    assert clock.status().resets == 0
+
+
+def test_a_suspended_host_starts_anew() -> None:
+    clock = make_clock()
+    points = steady(0, 0, 500) + steady(3_605_000, 5000, 500)
+    samples = feed(clock, points)
+    assert clock.status().resets == 1
+    assert rises(samples)
+    assert far(samples, points) < NEAR_NS
+
+
+def test_silent_for_minutes_is_a_gap() -> None:
+    clock = make_clock()
+    points = steady(0, 0, 500) + steady(305_000, 305_000, 100)
+    samples = feed(clock, points[:501])
+    assert clock.missed == 30_000
+    samples += feed(clock, points[501:])
+    assert clock.missed == 0
+    assert clock.status().resets == 0
+    assert far(samples, points) < NEAR_NS
+
+
+def test_a_repeated_stamp_still_rises() -> None:
+    clock = make_clock()
+    points = [(10 * (i // 2), 10 * (i // 2) + i % 2) for i in range(400)]
+    samples = feed(clock, points)
+    assert rises(samples)
+    assert clock.missed == 0
+    assert clock.status().resets == 0
+
+
+def test_a_stuck_counter_falls_back_to_arrival() -> None:
+    clock = make_clock()
+    feed(clock, steady(0, 0, 300))
+    points: list[Point] = [(2990, 3000 + 10 * i) for i in range(600)]
+    samples = feed(clock, points)
+    assert rises(samples)
+    assert samples[-1].sync is Sync.ARRIVAL
+    assert samples[-1].t_rx_ns - samples[-1].t_ns < NS_PER_S
+
+
+def test_five_percent_fast_is_learned() -> None:
+    clock = make_clock()
+    points: list[Point] = [(int(10.5 * i), 10 * i) for i in range(6000)]
+    samples = feed(clock, points)
+    assert abs(clock.status().skew_ppm - 50_000) < 20
+    assert abs(clock.expected_rate_hz - 100) < 0.01
+    assert far(samples[1000:], points[1000:]) < NEAR_NS
+
+
+def test_without_device_time() -> None:
+    clock = make_clock()
+    points: list[Point] = [(None, 10 * i) for i in range(100)]
+    samples = feed(clock, points)
+    assert {s.sync for s in samples} == {Sync.ARRIVAL}
+    assert all(s.t_dev_ns is None for s in samples)
+    assert far(samples, points) < NEAR_NS
+    assert clock.missed == 0
+    assert clock.expected_rate_hz == 0.0
+
+
+def test_messages_of_one_burst_keep_their_distance() -> None:
+    clock = make_clock(byte_ns=1000)
+    samples = [clock.sample(message(None, 82 * (3 - i)), BEGIN_NS, 0) for i in range(4)]
+    assert [b.t_ns - a.t_ns for a, b in pairwise(samples)] == [82_000] * 3
+    assert samples[0].t_ns <= BEGIN_NS - 4 * 82_000
+
+
+def test_corrections_are_slewed() -> None:
+    """Arrivals suddenly 3 ms earlier: the step between samples stays within 0.05 %."""
+    clock = make_clock(hold_ns=0)
+    late = [clock.sample(message(10 * i), BEGIN_NS + (10 * i + 4) * NS_PER_MS, 0) for i in range(3000)]
+    steps = [b.t_ns - a.t_ns for a, b in pairwise(late[2000:])]
+    assert max(abs(step - 10 * NS_PER_MS) for step in steps) <= 5_001
+
+
+def test_wall_clock_steps_move_only_utc() -> None:
+    clock, same = make_clock(), make_clock()
+    for i in range(300):
+        at = BEGIN_NS + 10 * i * NS_PER_MS
+        a = clock.sample(message(10 * i), at, 1_700_000_000 * NS_PER_S if i < 150 else 5)
+        b = same.sample(message(10 * i), at, 0)
+        assert a.t_ns == b.t_ns
+        assert a.utc_ns - a.t_ns == (1_700_000_000 * NS_PER_S if i < 150 else 5)
+
+
+def test_a_changed_link_starts_arrival_anew_but_not_time() -> None:
+    clock = make_clock()
+    samples = feed(clock, steady(0, 0, 300))
+    clock.link_changed(byte_ns=1_085, hold_ns=NS_PER_MS)
+    samples += feed(clock, steady(3000, 3000, 300))
+    assert rises(samples)
+    assert samples[300].sync is Sync.ARRIVAL
+    assert samples[-1].sync is Sync.REGRESSION
+    assert clock.status().resets == 0
+
+
+def test_a_restart_counts_neither_reset_nor_gap() -> None:
+    clock = make_clock()
+    samples = feed(clock, steady(100_000, 0, 300))
+    clock.restart()
+    samples += feed(clock, [(7, 9000)])
+    assert clock.missed == 0
+    assert clock.status().resets == 0
+    assert rises(samples)
+
+
+def test_one_clock_follows_another() -> None:
+    first, second = make_clock(), make_clock()
+    samples = feed(first, steady(0, 0, 100))
+    second.follow(first)
+    samples += feed(second, steady(5, 990, 100))
+    assert rises(samples)
+    assert [s.seq for s in samples] == list(range(1, 201))
+
+
+def test_a_wire_too_slow_for_the_rate_is_not_believed() -> None:
+    """A pty says 9600 baud and delivers 1 kHz: counting 85 ms of wire back would be nonsense."""
+    clock = make_clock(byte_ns=1_041_666)
+    points = steady(0, 0, 5000, step_ms=1)
+    samples = feed(clock, points)
+    assert far(samples[-500:], points[-500:]) < NEAR_NS
+    assert clock.status().resets == 0
+
+
+def test_every_value_of_the_measurement_is_in_the_sample() -> None:
+    values = {
+        "accel_m_s2": (1.0, 2.0, 3.0), "gyro_rad_s": (4.0, 5.0, 6.0), "mag_t": (7.0, 8.0, 9.0),
+        "quat_wxyz": (1.0, 0.0, 0.0, 0.0), "euler_rad": (0.1, 0.2, 0.3), "temperature_c": 20.5,
+        "pressure_pa": 101325.0, "incli_rad": (0.01, 0.02), "status": 3, "pps_age_ms": 17,
+    }  # fmt: skip
+    m = Measurement(82, 0, 5, **values)  # type: ignore[arg-type] # a dict of all fields has one value type
+    s = make_clock().sample(m, BEGIN_NS, 0)
+    assert {name: getattr(s, name) for name in values} == values
+    assert s.device == "imu"
+
+
+def test_messages_with_and_without_device_time_mix() -> None:
+    clock = make_clock()
+    points: list[Point] = [(10 * (i // 2) if i % 2 else None, 10 * (i // 2) + 3 * (i % 2)) for i in range(600)]
+    samples = feed(clock, points)
+    assert rises(samples)
+    assert [s.sync for s in samples[-4:]] == [Sync.ARRIVAL, Sync.REGRESSION] * 2
+
+
+def test_two_late_reads_are_no_reset() -> None:
+    """Many messages of one read are one witness."""
+    clock = make_clock()
+    feed(clock, steady(0, 0, 2000))
+    for first, read_ms in ((20_000, 22_001), (21_500, 23_500)):
+        for i in range(150):
+            m = message(first + 10 * i, 82 * (149 - i))
+            clock.sample(m, BEGIN_NS + read_ms * NS_PER_MS, 0)
+    assert clock.status().resets == 0
+
+
+def test_a_device_restarted_behind_a_changed_link_is_a_reset() -> None:
+    clock = make_clock()
+    samples = feed(clock, steady(100_000, 0, 300))
+    clock.link_changed(byte_ns=10_850, hold_ns=0)
+    samples += feed(clock, steady(7, 3500, 300))
+    assert clock.status().resets == 1
+    assert clock.missed == 0
+    assert rises(samples)
+    assert samples[300].t_dev_ns == 7 * NS_PER_MS

@@ -1,0 +1,143 @@
+"""`python -m imud.sim` as the process it is."""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from imud.devices.hipnuc.frames import DRIVER
+from imud.ledger import Ledger
+from imud.sample import Measurement
+
+LIMIT_S = 20.0
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(*arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "imud.sim", "--boot", "0", *arguments]
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            process.communicate(timeout=LIMIT_S)  # the end of stdin ends it, and it tidies up
+
+
+def path_of(process: "subprocess.Popen[str]") -> Path:
+    assert process.stdout
+    return Path(process.stdout.readline().strip())
+
+
+def command(process: "subprocess.Popen[str]", line: str) -> None:
+    assert process.stdin
+    process.stdin.write(line + "\n")
+    process.stdin.flush()
+
+
+def read(fd: int, wanted: int) -> list[Measurement]:
+    codec = DRIVER.make_codec(Ledger(), DRIVER.settings())
+    found: list[Measurement] = []
+    while len(found) < wanted:
+        assert select.select([fd], [], [], LIMIT_S)[0], "nothing came"
+        found += [event for event in codec.feed(os.read(fd, 4096)) if isinstance(event, Measurement)]
+    return found
+
+
+def drain(fd: int) -> None:
+    """Read to the end: of the file, or with EIO if the far end vanishes during a read."""
+    with suppress(OSError):
+        while os.read(fd, 4096):
+            pass
+
+
+def test_frames_commands_and_the_end(start: Start, tmp_path: Path) -> None:
+    truth = tmp_path / "truth.csv"
+    process = start("--rate", "500", "--path", str(tmp_path / "tty"), "--truth", str(truth), "--skew-ppm", "0")
+    path = path_of(process)
+    assert path == tmp_path / "tty"
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    found = read(fd, 100)
+    ticks = [measurement.dev_ticks or 0 for measurement in found]
+    assert {after - before for before, after in pairwise(ticks)} == {2}
+    os.write(fd, b"LOG VERSION\r\n")
+    text = b""
+    while b"BL_VER=109\r\nOK\r\n" not in text:
+        assert select.select([fd], [], [], LIMIT_S)[0], "nothing came"
+        text += os.read(fd, 4096)
+    command(process, "reboot")
+    assert any((measurement.dev_ticks or 0) < ticks[-1] for measurement in read(fd, 50))
+    command(process, "dance")
+    command(process, "unplug soon")
+    command(process, "stats")
+    assert process.stdout
+    assert json.loads(process.stdout.readline())["bytes_written"] > 100 * 82
+    out, err = process.communicate("quit\n", timeout=LIMIT_S)
+    os.close(fd)
+    assert process.returncode == 0
+    assert json.loads(out)["frames_sent"] >= 150
+    assert "dance" in err
+    assert "soon" in err
+    assert not path.is_symlink()
+    sampled = {int(line.split(",")[1]) for line in truth.read_text().splitlines()[2:]}
+    assert set(ticks) <= sampled
+
+
+def test_unplug_closes_the_port_and_a_new_one_appears(start: Start) -> None:
+    process = start()
+    path = path_of(process)
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    read(fd, 5)
+    command(process, "unplug 0.05")
+    drain(fd)
+    with pytest.raises(OSError, match="Input/output error"):
+        os.write(fd, b"anybody there?")
+    os.close(fd)
+    command(process, "stats")
+    assert process.stdout
+    assert json.loads(process.stdout.readline())["unplugs"] == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_end_it_well(start: Start, number: signal.Signals) -> None:
+    process = start()
+    path = path_of(process)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, err) == (0, "")
+    assert "frames_sent" in json.loads(out)
+    assert not path.parent.exists()
+
+
+def test_the_end_of_stdin_ends_it(start: Start) -> None:
+    process = start()
+    path_of(process)
+    process.communicate("", timeout=LIMIT_S)
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [(["--rate", "300"], "rate 300"), (["--faults", "flop=1"], "flop"), (["--baud", "1200"], "baud 1200")],
+)
+def test_bad_arguments_are_explained(start: Start, arguments: list[str], word: str) -> None:
+    process = start(*arguments)
+    out, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 2
+    assert out == ""
+    assert word in err
+    assert "expected" in err
