@@ -9,15 +9,17 @@ import logging
 import secrets
 import signal
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic_ns
+from typing import cast
 
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
 from imud.kit.batch import Batch
-from imud.kit.publisher import Publisher, PublisherContext
+from imud.kit.publisher import Publisher, PublisherContext, PublisherSettings
 from imud.kit.status import DeviceState, DeviceStatus
 from imud.notify import notify, watchdog_interval_s
 from imud.pipeline.remembered import Remembered
@@ -68,8 +70,8 @@ class Daemon:
         """Run until stopped. Raises ServerError when an output cannot start, and whatever a device's task died of."""
         asyncio.get_running_loop().set_exception_handler(self._on_loop_error)
         try:
-            for name, settings in self.config.publishers.items():
-                self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
+            for name in self.config.publishers:
+                self._start_configured(name)
             for name, publisher in self._extra.items():
                 self._start_publisher(name, publisher)
             for device in self.config.devices:
@@ -116,30 +118,49 @@ class Daemon:
 
     def _change_to(self, new: Config) -> None:
         change = configuration.differences(self.config, new)
-        self.config = new
+        old, self.config = self.config, new
         logging.getLogger().setLevel(new.log_level.upper())
         for name in (*change.devices_removed, *change.devices_changed):
             self._stop_device(name)
-        for name in change.publishers_changed:
-            self._publishers.pop(name).close()
-            self._start_publisher(name, PUBLISHERS[name].make(new.publishers[name], self._context))
-        problems = ""
-        for device in new.devices:
-            if device.name not in self._runners:
-                try:
-                    self._start_device(device)
-                except ServerError as error:
-                    log.error("%s cannot be started: %s", device.name, error)
-                    problems += f"; {device.name} cannot be started: {error}"
-        words = f"configuration read again: {change}{problems}"
+        problems = [self._restart_publisher(name, old) for name in change.publishers_changed]
+        problems += [self._try_device(device) for device in new.devices if device.name not in self._runners]
+        words = "; ".join([f"configuration read again: {change}", *filter(None, problems)])
         log.info("%s", words)
         self._tell(Event(monotonic_ns(), "", EventKind.CONFIGURATION, words))
+
+    def _restart_publisher(self, name: str, old: Config) -> str:
+        """With its new settings, or with the old ones if those cannot be used; returns what is wrong, if anything."""
+        if name in self._publishers:
+            self._publishers.pop(name).close()
+        try:
+            self._start_configured(name)
+        except ServerError as error:
+            log.error("%s keeps its old settings: %s", name, error)
+            self.config = replace(self.config, publishers={**self.config.publishers, name: old.publishers[name]})
+            self._start_configured(name)
+            return f"{name} keeps its old settings: {error}"
+        return ""
+
+    def _try_device(self, device: DeviceConfig) -> str:
+        try:
+            self._start_device(device)
+        except ServerError as error:
+            log.error("%s cannot be started: %s", device.name, error)
+            return f"{device.name} cannot be started: {error}"
+        return ""
 
     # --- devices and outputs ----------------------------------------------------------------------------------------
 
     def status(self) -> list[DeviceStatus]:
         """The state of every device now."""
         return [runner.status() for runner in self._runners.values()]
+
+    def _start_configured(self, name: str) -> None:
+        settings = self.config.publishers[name]
+        if cast(PublisherSettings, settings).enabled:
+            self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
+        else:
+            self._sinks[:] = [p.publish for p in self._publishers.values()]
 
     def _start_publisher(self, name: str, publisher: Publisher) -> None:
         for device, runner in self._runners.items():

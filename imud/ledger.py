@@ -29,6 +29,7 @@ LEDGER_FIELDS: Final = (
     "lost_queue",  # samples a queue of the daemon gave up
     "replies_late",  # replies that came after their time-out
     "replies_unsolicited",  # text that answers no request
+    "frames_not_finite",  # good frames whose NaN or infinite values were left out
 )
 """Names in the order of shared memory; new ones go to the end."""
 
@@ -59,6 +60,7 @@ class Ledger:
     lost_queue: int
     replies_late: int
     replies_unsolicited: int
+    frames_not_finite: int
 
     def __init__(self) -> None:
         for name in LEDGER_FIELDS:

@@ -12,6 +12,7 @@ from imud.cli.run import start_log
 from imud.cli.status import block
 from imud.daemon import Daemon
 from imud.devices import DRIVERS
+from imud.errors import ImudError
 from imud.event import Event
 from imud.kit.batch import Batch
 
@@ -33,6 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Play the file to its end; the ledger goes to standard error. 1 when there was no sample in it."""
     start_log("warning")
+    if not args.file.is_file():
+        raise ImudError(f"{args.file}: expected a capture file, found none")
     settings = config.parse(configuration(args), str(args.file))
     daemon = Daemon(settings, extra={"print": Printer()} if args.json else {}, until_finished=True)
     asyncio.run(serve(daemon))

@@ -103,7 +103,8 @@ enum {
     IMUD_LEDGER_LOST_OVERRUN,
     IMUD_LEDGER_LOST_QUEUE,
     IMUD_LEDGER_REPLIES_LATE,
-    IMUD_LEDGER_REPLIES_UNSOLICITED
+    IMUD_LEDGER_REPLIES_UNSOLICITED,
+    IMUD_LEDGER_FRAMES_NOT_FINITE
 };
 
 /* One sample: a slot of the ring, and a record of the socket's binary encoding. */

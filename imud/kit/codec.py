@@ -19,10 +19,12 @@ class BadReason(StrEnum):
     """The length field is outside what the protocol allows."""
     CONTENT = "content"
     """The check value is right but the content is impossible, for example a sub-packet cut off by the frame's end."""
+    NOT_FINITE = "not-finite"
+    """The frame is good and its measurement follows, but without values that came as NaN or infinity."""
 
 
 class BadFrame(msgspec.Struct, frozen=True, gc=False):
-    """Bytes that looked like a frame and were none."""
+    """Bytes that looked like a frame and were none, or (reason NOT_FINITE) a good frame that lacks some values."""
 
     reason: BadReason
     raw: bytes

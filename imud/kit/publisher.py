@@ -62,6 +62,15 @@ class PublisherContext:
         return [client for source in self.client_sources for client in source()]
 
 
+class PublisherSettings(Protocol):
+    """What the settings of every publisher have; the daemon leaves out those that are not enabled."""
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the publisher runs."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class PublisherType:
     """The row a publisher file ends with."""

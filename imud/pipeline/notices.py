@@ -45,14 +45,15 @@ class Notices:
         if now_ns < self._due_ns:
             return
         ledger = self._ledger
-        lost, bad = ledger.lost() - self._lost, ledger.frames_bad() - self._bad
+        troubled = ledger.frames_bad() + ledger.frames_not_finite
+        lost, bad = ledger.lost() - self._lost, troubled - self._bad
         if lost:
             self.tell(now_ns, EventKind.LOSS, f"{lost} samples lost", **self._causes())
         if bad and self._last_bad is not None:
             frame = self._last_bad
             shown = frame.raw[:RAW_SHOWN_BYTES].hex(" ")
             self.tell(now_ns, EventKind.BAD_FRAME, f"{bad} bad frames, the last by {frame.reason}: {shown}", count=bad)
-        self._lost, self._bad = ledger.lost(), ledger.frames_bad()
+        self._lost, self._bad = ledger.lost(), troubled
         if lost or bad:
             self._due_ns = now_ns + INTERVAL_NS
 

@@ -9,7 +9,7 @@ from time import monotonic_ns, time_ns
 
 from imud.clock import SampleClock
 from imud.kit.batch import Batch
-from imud.kit.codec import BadFrame, CodecEvent, StreamCodec, TextLine
+from imud.kit.codec import BadFrame, BadReason, CodecEvent, StreamCodec, TextLine
 from imud.ledger import Ledger
 from imud.pipeline.meters import LatencyMeter, LossMeter
 from imud.sample import Measurement, Sample
@@ -85,7 +85,8 @@ class SamplePath:
             elif type(event) is TextLine:
                 self._on_text(event.text, t_rx_ns)
             elif type(event) is BadFrame:
-                loss.bad_frames += 1
+                if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
+                    loss.bad_frames += 1
                 self._on_bad(event)
         if samples:
             self._finish(samples, t_rx_ns)

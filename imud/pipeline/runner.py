@@ -323,6 +323,8 @@ class DeviceRunner:
             name=self.config.name,
             device_id=self.device_id,
             driver=driver.name if driver else self.config.driver,
+            euler_convention=driver.euler_convention if driver else "",
+            navigation_frame=driver.navigation_frame if driver else "",
             link=self._where(),
             state=self.state,
             problem=self._problem,

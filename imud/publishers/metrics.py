@@ -8,6 +8,7 @@ thread pauses for PAUSE_S before every metric and every SAMPLES_PER_TURN lines o
 """
 
 import asyncio
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +31,8 @@ from imud.kit.status import ClientStatus, DeviceStatus
 from imud.publishers.client_metrics import ClientTotals, client_metrics
 from imud.publishers.metric_families import build_info, device_metrics, events, heartbeat
 from imud.publishers.scrape_server import Answer, Request, ScrapeServer
+
+log = logging.getLogger(__name__)
 
 SNAPSHOT_S: Final = 2.0
 """An event loop that does not answer within this is stuck; the scrape then says so."""
@@ -147,6 +150,7 @@ class MetricsPublisher:
         server = ScrapeServer(self._settings.address, self._settings.port, self._answer)
         server.start()
         self._server = server
+        log.info("metrics at http://%s:%d/metrics", self._settings.address, self.port)
 
     def add_device(self, name: str, device_id: int) -> None:
         """Devices are found in the status at every scrape."""

@@ -36,6 +36,8 @@ ACCEPTS_PER_TURN: Final = 16
 class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the UNIX socket."""
 
+    enabled: bool = True
+    """Whether imud serves the socket."""
     path: Annotated[str, msgspec.Meta(pattern="^/.*[^/]$")] = DEFAULT_PATH
     """Where the socket is, an absolute path."""
     group: str = "imud"

@@ -1,6 +1,6 @@
 """Cost of decoding HI91 to SI values, against the floor: `binascii.crc_hqx` and `struct.unpack_from` on the same bytes.
 
-    python tests/bench/decode.py
+    python -m tests.bench.decode
 
 Prints ns per frame, best of many short runs taken in turns, so that all see the same machine. The streams are fed in
 reads of 4096 bytes (a busy port or a replay) and frame by frame (a quiet port at 1 kHz); `noisy` has one damaged frame
@@ -17,14 +17,13 @@ from imud.devices.hipnuc.frames import HipnucCodec, HipnucSettings, encode_hi91
 from imud.kit.codec import CodecEvent
 from imud.ledger import Ledger
 from imud.sample import Measurement
+from tests.bench.rows import Row, at_most
 
 FRAMES = 250  # a run of 0.2 ms fits between the interruptions of a busy machine
 ROUNDS = 400
 READ_BYTES = 4096
 HI91_FRAME_BYTES = 82
 REACH_RATIO = 1.6
-
-Row = dict[str, str | float | bool | None]
 
 
 def _frames(random: Random) -> list[bytes]:
@@ -77,9 +76,9 @@ def _split(stream: bytes, size: int) -> list[bytes]:
     return [stream[at : at + size] for at in range(0, len(stream), size)]
 
 
-def _best_ns(runs: dict[str, Callable[[], object]]) -> dict[str, float]:
+def _best_ns(rounds: int, runs: dict[str, Callable[[], object]]) -> dict[str, float]:
     best = dict.fromkeys(runs, float("inf"))
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for name, run in runs.items():
             begin = perf_counter_ns()
             run()
@@ -91,41 +90,35 @@ def _good(events: list[CodecEvent]) -> int:
     return sum(type(event) is Measurement for event in events)
 
 
-def rows() -> list[Row]:
-    """Rows of name, value, unit, reach (None where there is no goal) and reached."""
+def rows(*, quick: bool = False) -> list[Row]:
+    """Cost per frame of each way to decode, and the ratio that is aimed at."""
     random = Random(1)
     frames = _frames(random)
     clean, noisy = b"".join(frames), _noisy(frames, random)
     assert _good(list(HipnucCodec(Ledger(), HipnucSettings()).feed(clean))) == FRAMES
     best = _best_ns(
+        ROUNDS // 4 if quick else ROUNDS,
         {
             "floor": lambda: _floor(clean),
             "clean": _decoder(_split(clean, READ_BYTES)),
             "single": _decoder(frames),
             "noisy": _decoder(_split(noisy, READ_BYTES)),
-        }
+        },
     )
-    ratio = best["clean"] / best["floor"]
     return [
-        _row("decode floor (crc_hqx + unpack_from)", best["floor"], "ns/frame"),
-        _row("decode clean, reads of 4096 bytes", best["clean"], "ns/frame"),
-        _row("decode clean, one frame per read", best["single"], "ns/frame"),
-        _row("decode noisy, reads of 4096 bytes", best["noisy"], "ns/frame"),
-        _row("decode clean / floor", ratio, "ratio", REACH_RATIO),
-        _row("decode noisy / floor", best["noisy"] / best["floor"], "ratio"),
+        Row("decode floor (crc_hqx + unpack_from)", best["floor"], "ns/frame"),
+        Row("decode clean, reads of 4096 bytes", best["clean"], "ns/frame"),
+        Row("decode clean, one frame per read", best["single"], "ns/frame"),
+        Row("decode noisy, reads of 4096 bytes", best["noisy"], "ns/frame"),
+        at_most("decode clean / floor", best["clean"] / best["floor"], "x", REACH_RATIO),
+        Row("decode noisy / floor", best["noisy"] / best["floor"], "x"),
     ]
-
-
-def _row(name: str, value: float, unit: str, reach: float | None = None) -> Row:
-    reached = None if reach is None else value <= reach
-    return {"name": name, "value": round(value, 3), "unit": unit, "reach": reach, "reached": reached}
 
 
 def main() -> None:
     """Print the rows."""
     for row in rows():
-        goal = "" if row["reach"] is None else f"   reach <= {row['reach']}: {'yes' if row['reached'] else 'NO'}"
-        print(f"{row['name']:<40} {row['value']:>10} {row['unit']}{goal}")
+        print(f"{row.name:<40} {row.value:>10.3f} {row.unit:10} {row.reach} {row.reached if row.reach else ''}")
 
 
 if __name__ == "__main__":

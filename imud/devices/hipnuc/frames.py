@@ -86,7 +86,7 @@ class HipnucCodec:
 
     Every sub-packet that is known becomes one `Measurement`, with the size of the whole frame, so that all of a frame
     come to the same time. A sub-packet cut off by the end of the payload makes the whole frame bad. A frame with NaN or
-    infinity is delivered without the values concerned, after a `BadFrame` (content) that tells of it; its bytes and
+    infinity is delivered without the values concerned, after a `BadFrame` (not-finite) that tells of it; its bytes and
     itself count as good.
     """
 
@@ -230,8 +230,8 @@ class HipnucCodec:
         else:
             ledger.frames_ignored += 1
         if not finite:
-            ledger.frames_bad_content += 1
-            events.append(BadFrame(BadReason.CONTENT, data[at:end]))
+            ledger.frames_not_finite += 1
+            events.append(BadFrame(BadReason.NOT_FINITE, data[at:end]))
         events += found
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, events: list[CodecEvent]) -> int:

@@ -267,12 +267,12 @@ def test_not_finite_values_are_left_out_and_told() -> None:
             frame = hi91(5, **{name: (*good[:-1], bad) if isinstance(good, tuple) else bad})
             codec = make()
             events = codec.feed(MANUAL_HI91 + frame + MANUAL_HI91)
-            assert events[1] == BadFrame(BadReason.CONTENT, frame)
+            assert events[1] == BadFrame(BadReason.NOT_FINITE, frame)
             assert isinstance(m := events[2], Measurement)
             assert [field for field in names if getattr(m, field) is None] == [name]
             assert m.dev_ticks == 5
             assert len(events) == 4
-            assert (codec.ledger.frames_good, codec.ledger.frames_bad_content) == (3, 1)
+            assert (codec.ledger.frames_good, codec.ledger.frames_not_finite, codec.ledger.frames_bad()) == (3, 1, 0)
             assert codec.ledger.closes()
 
 
