@@ -34,6 +34,7 @@ from imud.devices.hipnuc.packets import (
     PACKETS,
     PPS_STAMP_MODULUS_MS,
     TAG_HI91,
+    decode_finite_hi91,
     pack_hi91,
     pack_hi92,
 )
@@ -69,6 +70,8 @@ _RUN_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") +
 """Values behind the tag, the word in two bytes: in the machine's own layout `struct` reads a float in half the time."""
 _RUN_HIGH_BYTES: Final = slice(7, None, 4)
 """High bytes of all floats (and of system_time) in payloads put together, because 76 is a multiple of 4."""
+_ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, None, 4)
+"""The same in one frame."""
 _IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r?\n\Z" % LINE_CHARACTERS_MAX)
 """A line right before the line went idle. Two characters at least: one can be chance inside half a frame."""
 
@@ -109,7 +112,24 @@ class HipnucCodec:
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
         """Take bytes in the order they came; return what they completed. Never raises for any bytes."""
         self.ledger.bytes_in += len(data)
+        if len(data) == _HI91_FRAME_BYTES and not (self._tail or self._bad_ahead):
+            only = self._take_only(data)
+            if only is not None:
+                return (only,)
         return self._scan(self._tail + data if self._tail else data, 0)
+
+    def _take_only(self, data: bytes) -> Measurement | None:
+        """A read that is one plain HI91 frame, which is what a port at 1 kHz gives: half the cost of `_scan`."""
+        if not data.startswith(_HI91_HEAD) or crc16_xmodem(data[HEADER.size :], _RUN_SEED) != data[4] | data[5] << 8:
+            return None
+        high_bytes = data[_ONLY_HIGH_BYTES]
+        if data[HEADER.size] != TAG_HI91 or 0x7F in high_bytes or 0xFF in high_bytes:  # as in `_take_run`
+            return None
+        ledger = self.ledger
+        ledger.bytes_in_good_frames += _HI91_FRAME_BYTES
+        ledger.frames_good += 1
+        ledger.frames_in_samples += 1
+        return decode_finite_hi91(data, HEADER.size, self.word_is_status, _HI91_FRAME_BYTES, 0)
 
     def flush(self) -> Sequence[CodecEvent]:
         """The line is idle: give up an incomplete frame if something whole waits inside it; otherwise do nothing."""

@@ -62,6 +62,20 @@ def _decode_hi91(v: Sequence[Any], word_is_status: bool, size: int, trailing: in
     )  # fmt: skip
 
 
+def decode_finite_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> Measurement:
+    """The sub-packet at `at`, all of whose values are known to be finite: a third of the cost of the general way."""
+    _, word, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz = (
+        HI91.unpack_from(data, at)
+    )
+    g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
+    return Measurement(
+        size, trailing, ms,
+        (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
+        (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+        word if word_is_status else None, None if word_is_status else word,
+    )  # fmt: skip
+
+
 def _decode_hi92(v: Sequence[Any], _word_is_status: bool, size: int, trailing: int) -> Measurement:
     """HI92 has no device time: `dev_ticks` is None."""
     return Measurement(
