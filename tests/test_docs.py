@@ -15,6 +15,7 @@ import pytest
 from imud import config
 from imud.cli import COMMANDS, build_parser
 from imud.devices import DRIVERS
+from tests import shm_reference
 from tests.running import LIMIT_S, running_daemon
 from tests.test_daemon import cable, device
 
@@ -114,3 +115,9 @@ def test_make_targets_of_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
     for target in re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+
+
+def test_layout_tables_are_those_of_the_code() -> None:
+    text = shm_reference.PAGE.read_text()
+    assert "| 0 | `uint64_t` | `seq` |" in text
+    assert shm_reference.filled(text) == text, "run python -m tests.shm_reference"
