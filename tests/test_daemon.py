@@ -18,21 +18,8 @@ import msgspec
 import pytest
 
 from imud.client import Ring
-from imud.devices.hipnuc.frames import encode_hi91
+from tests.hi91 import hi91
 from tests.running import RunningDaemon, running_daemon, wait_until, write_config
-
-
-def frame(ms: int) -> bytes:
-    return encode_hi91(
-        system_time_ms=ms,
-        accel_m_s2=(0.0, 0.0, 9.8),
-        gyro_rad_s=(0.0, 0.0, 0.0),
-        mag_t=(0.0, 0.0, 0.0),
-        euler_rad=(0.0, 0.0, 0.0),
-        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
-        temperature_c=20.0,
-        pressure_pa=1e5,
-    )
 
 
 class Cable:
@@ -63,7 +50,7 @@ class Cable:
     def send(self, frames: int = 1) -> None:
         for _ in range(frames):
             self.ms += 10
-            os.write(self.master, frame(self.ms))
+            os.write(self.master, hi91(self.ms))
 
 
 @contextmanager
@@ -185,7 +172,7 @@ def test_metrics_and_socket_and_shared_memory_show_the_same_ledger(tmp_path: Pat
     with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
         daemon.wait_for("bow", "searching")
         port.send(4)
-        os.write(port.master, b"\x00garbage\xff" + frame(1)[:50])
+        os.write(port.master, b"\x00garbage\xff" + hi91(1)[:50])
         wait_until(lambda: daemon.statuses()["bow"].ledger["bytes_in"] == 4 * 82 + 59, "all bytes are in")
         ledger = daemon.statuses()["bow"].ledger
         with Ring(tmp_path / "imud.bow") as ring:

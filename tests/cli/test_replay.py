@@ -6,24 +6,11 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
-from imud.devices.hipnuc.frames import encode_hi91
+from tests.hi91 import hi91
 
 
 def capture(file: Path, count: int) -> Path:
-    frames = (
-        encode_hi91(
-            system_time_ms=10 * i,
-            accel_m_s2=(0.0, 0.0, 9.8),
-            gyro_rad_s=(0.0, 0.0, 0.0),
-            mag_t=(0.0, 0.0, 0.0),
-            euler_rad=(0.0, 0.0, 0.0),
-            quat_wxyz=(1.0, 0.0, 0.0, 0.0),
-            temperature_c=20.0,
-            pressure_pa=1e5,
-        )
-        for i in range(count)
-    )
-    file.write_bytes(b"".join(frames))
+    file.write_bytes(b"".join(hi91(10 * i) for i in range(count)))
     return file
 
 

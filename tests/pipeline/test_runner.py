@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
-from imud.devices.hipnuc.frames import encode_hi91
 from imud.errors import LinkBusy, LinkError
 from imud.event import Event, EventKind
 from imud.kit.batch import Batch
@@ -19,23 +18,11 @@ from imud.pipeline import runner as runner_module
 from imud.pipeline.remembered import Remembered
 from imud.pipeline.runner import DeviceRunner
 from imud.sample import Sample
+from tests.hi91 import hi91
 
 MS = 1_000_000
 LIMIT_S = 5.0
 VERSION = b"PNAME=HI14R3\r\nBUILD=Oct 15 2024\r\nUUID=%s\r\nAPP_VER=156\r\nBL_VER=109\r\nOK\r\n"
-
-
-def frame(ms: int, z: float = 9.8) -> bytes:
-    return encode_hi91(
-        system_time_ms=ms,
-        accel_m_s2=(0.0, 0.0, z),
-        gyro_rad_s=(0.0, 0.0, 0.0),
-        mag_t=(0.0, 0.0, 0.0),
-        euler_rad=(0.0, 0.0, 0.0),
-        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
-        temperature_c=20.0,
-        pressure_pa=1e5,
-    )
 
 
 class Bench:
@@ -104,7 +91,7 @@ def test_samples_flow_and_the_device_is_up() -> None:
     async def story(bench: Bench) -> None:
         assert bench.state() is DeviceState.SEARCHING
         for i in range(5):
-            bench.feed(frame(1000 + 10 * i))
+            bench.feed(hi91(1000 + 10 * i))
         bench.tick()
         assert bench.state() is DeviceState.RUNNING
         assert [s.seq for s in bench.samples] == [1, 2, 3, 4, 5]
@@ -121,8 +108,8 @@ def test_samples_flow_and_the_device_is_up() -> None:
 def test_unplugged_and_back_the_count_goes_on_and_time_rises() -> None:
     async def story(bench: Bench) -> None:
         for i in range(5):
-            bench.feed(frame(5000 + 10 * i))
-        bench.feed(frame(5050)[:40])  # the cable goes in the middle of a frame
+            bench.feed(hi91(5000 + 10 * i))
+        bench.feed(hi91(5050)[:40])  # the cable goes in the middle of a frame
         bench.tick()
         bench.link.disappear()
         await bench.until(lambda: bench.runner.state is DeviceState.MISSING)
@@ -132,7 +119,7 @@ def test_unplugged_and_back_the_count_goes_on_and_time_rises() -> None:
         bench.link.appear()
         await bench.until(lambda: bench.runner.state is not DeviceState.MISSING)
         for i in range(3):
-            bench.feed(frame(10 * i))  # the device was without power: its clock starts again
+            bench.feed(hi91(10 * i))  # the device was without power: its clock starts again
         bench.tick()
         assert bench.state() is DeviceState.RUNNING
         assert [s.seq for s in bench.samples] == list(range(1, 9))
@@ -183,7 +170,7 @@ def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> Non
 def test_device_that_does_not_answer_streams_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
     async def story(bench: Bench) -> None:
         await bench.until(lambda: bench.link.written)
-        bench.feed(frame(10) + frame(20))
+        bench.feed(hi91(10) + hi91(20))
         bench.tick()
         assert bench.state() is DeviceState.RUNNING
         assert len(bench.samples) == 2
@@ -194,13 +181,13 @@ def test_device_that_does_not_answer_streams_all_the_same(caplog: pytest.LogCapt
 def test_device_that_falls_silent_is_told_once_and_comes_up_again() -> None:
     async def story(bench: Bench) -> None:
         for i in range(3):
-            bench.feed(frame(10 * i))
+            bench.feed(hi91(10 * i))
         bench.tick()
         bench.tick(ahead_ns=1500 * MS)
         bench.tick(ahead_ns=1600 * MS)
         assert bench.state() is DeviceState.SILENT
         assert bench.kinds() == [EventKind.UP, EventKind.DOWN]
-        bench.feed(frame(1_500))
+        bench.feed(hi91(1_500))
         bench.tick()
         assert bench.state() is DeviceState.RUNNING
         assert bench.kinds() == [EventKind.UP, EventKind.DOWN, EventKind.UP]
@@ -223,7 +210,7 @@ def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
         await bench.until(lambda: bench.runner.state is DeviceState.FAILED)
         assert bench.runner.status().problem == "memory is in use by minicom (pid 4711)"
         await bench.until(lambda: bench.link.listening)
-        bench.feed(frame(10))
+        bench.feed(hi91(10))
         bench.tick()
         assert bench.state() is DeviceState.RUNNING
 
@@ -235,7 +222,7 @@ def test_end_of_a_replay_finishes_the_runner() -> None:
         bench = Bench(writable=False)
         task = asyncio.create_task(bench.runner.run())
         await bench.until(lambda: bench.link.listening)
-        bench.feed(frame(10))
+        bench.feed(hi91(10))
         bench.link.end(None)
         await asyncio.wait_for(task, LIMIT_S)
         assert bench.state() is DeviceState.FINISHED
@@ -247,16 +234,16 @@ def test_end_of_a_replay_finishes_the_runner() -> None:
 def test_missing_samples_are_put_to_their_cause() -> None:
     async def story(bench: Bench) -> None:
         for i in range(20):
-            bench.feed(frame(10 * i))
-        damaged = bytearray(frame(200))
+            bench.feed(hi91(10 * i))
+        damaged = bytearray(hi91(200))
         damaged[50] ^= 1
         bench.feed(bytes(damaged))
-        bench.feed(frame(210))
+        bench.feed(hi91(210))
         assert bench.runner.ledger.lost_crc == 1
         bench.link.counters = KernelCounters(overrun=1)
-        bench.feed(frame(240))  # 220 and 230 are missing
+        bench.feed(hi91(240))  # 220 and 230 are missing
         assert bench.runner.ledger.lost_overrun == 2
-        bench.feed(frame(260))
+        bench.feed(hi91(260))
         assert bench.runner.ledger.lost_gap_device == 1
         bench.tick()
         assert EventKind.LOSS in bench.kinds()
@@ -267,7 +254,7 @@ def test_missing_samples_are_put_to_their_cause() -> None:
 
 def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle() -> None:
     async def story(bench: Bench) -> None:
-        bench.feed(b"\x5a\xa5\xff\x01" + frame(10))
+        bench.feed(b"\x5a\xa5\xff\x01" + hi91(10))
         assert bench.samples == []
         bench.tick(ahead_ns=100 * MS)
         assert len(bench.samples) == 1
@@ -282,7 +269,7 @@ def test_detection_locks_counts_every_byte_and_is_remembered() -> None:
         first = bench.link.baud
         await bench.until(lambda: bench.link.bauds and bench.link.baud != first)
         right = bench.link.baud
-        stream = frame(10) + frame(20) + frame(30)
+        stream = hi91(10) + hi91(20) + hi91(30)
         bench.feed(stream[:100])
         bench.feed(stream[100:])
         await bench.until(lambda: bench.runner.ledger.frames_good)
@@ -295,7 +282,7 @@ def test_detection_locks_counts_every_byte_and_is_remembered() -> None:
         await bench.until(lambda: bench.runner.state is DeviceState.MISSING)
         bench.link.appear()
         await bench.until(lambda: bench.runner.state is not DeviceState.MISSING)
-        bench.feed(frame(1000) + frame(1010))
+        bench.feed(hi91(1000) + hi91(1010))
         await bench.until(lambda: len(bench.samples) == 5)
         assert bench.link.baud == right
 
@@ -325,7 +312,7 @@ def test_error_of_the_link_is_a_failed_device_and_tried_again() -> None:
     async def story(bench: Bench) -> None:
         bench.link.end(LinkError("input/output error: the adapter stopped answering"))
         await bench.until(lambda: bench.runner.status().connects == 2)
-        bench.feed(frame(10))
+        bench.feed(hi91(10))
         bench.tick()
         assert bench.state() is DeviceState.RUNNING
 
