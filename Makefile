@@ -1,10 +1,12 @@
 # make demo   one simulated sensor through the real daemon          make test   everything that needs no lab
+# make lab    tests on a booted kernel          make soak   ten minutes at 1 kHz
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 SHELL := /bin/sh
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+LAB_OPTIONS ?=
 
 .PHONY: all demo test lint check bench soak clean lab lab-deps
 
@@ -39,7 +41,7 @@ lab-deps:
 	tests/lab/deps
 
 lab: $(VENV)/made
-	tests/lab/run $(ARGS)
+	tests/lab/run $(LAB_OPTIONS) -- $(ARGS)
 
 clean:
 	rm -rf build $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,143 @@
+"""Simulated I2C and SPI devices, served in a thread to the kernel's bus drivers.
+
+A device is a function from the transfer to the bytes the host reads; it may raise Refuse, Short or NoAnswer
+(wire.py). The transfers come from any thread or process: i2c-tools, the code under test, the test itself.
+In the same process beware of fcntl.ioctl with more than 1024 bytes (33 SPI transfers or more): it keeps the
+GIL, so the thread cannot answer, and the transfer fails with ETIMEDOUT after the module's timeout_ms.
+"""
+
+import errno
+import os
+import select
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Generic, Self, TypeVar, cast
+
+from tests.lab import wire
+
+STOP_LIMIT_S = 10.0
+OneTransfer = TypeVar("OneTransfer", wire.I2cTransfer, wire.SpiTransfer)
+
+
+class Bus(Generic[OneTransfer]):
+    """The far end of one bus. Use as a context manager; what a device raised besides its faults, close() raises.
+
+    Synchronization: devices run in the serving thread; `attach`, `detach` and `transfers` may be used from any.
+    """
+
+    def __init__(self, path: Path, select_of: Callable[[OneTransfer], int]) -> None:
+        """`path` is the module's device; `select_of` tells the address (I2C) or chip select (SPI) of a transfer."""
+        self._file = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        self._stop = os.eventfd(0, os.EFD_CLOEXEC)
+        self._select_of: Callable[[OneTransfer], int] = select_of
+        self._lock = threading.Lock()
+        self._devices: dict[int, Callable[[OneTransfer], bytes]] = {}
+        self._transfers: list[OneTransfer] = []
+        self._failure: BaseException | None = None
+        self._late = 0
+        self._thread = threading.Thread(target=self._serve, name=path.name, daemon=True)
+        self._thread.start()
+
+    def attach(self, select: int, device: Callable[[OneTransfer], bytes]) -> None:
+        """Puts a device on the bus, in place of the one that has this address or chip select."""
+        with self._lock:
+            self._devices[select] = device
+
+    def detach(self, select: int) -> None:
+        """Takes a device off the bus: I2C answers ENXIO for it, SPI reads zeros."""
+        with self._lock:
+            del self._devices[select]
+
+    @property
+    def transfers(self) -> list[OneTransfer]:
+        """All transfers so far, oldest first, those to absent devices included."""
+        with self._lock:
+            return list(self._transfers)
+
+    @property
+    def late(self) -> int:
+        """Answers that came after the module's time-out."""
+        return self._late
+
+    def close(self) -> None:
+        """Takes the simulator off the bus (every transfer then fails with ENXIO); may be called twice."""
+        if self._file < 0:
+            return
+        os.eventfd_write(self._stop, 1)
+        self._thread.join(STOP_LIMIT_S)
+        stuck = self._thread.is_alive()
+        if not stuck:
+            os.close(self._file)
+            os.close(self._stop)
+        self._file = -1
+        assert not stuck, "a simulated device did not return"
+        if self._failure is not None:
+            raise self._failure
+
+    def __enter__(self) -> Self:
+        """The bus itself; it serves since it was made."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Closes."""
+        self.close()
+
+    def _serve(self) -> None:
+        poll = select.poll()
+        poll.register(self._file, select.POLLIN)
+        poll.register(self._stop, select.POLLIN)
+        while self._stop not in dict(poll.poll()):
+            try:
+                request = os.read(self._file, wire.MAX_BYTES)
+            except BlockingIOError:
+                continue  # the host gave up between poll and read
+            transfer = cast(OneTransfer, wire.parse(request))
+            answer = self._answer(transfer)
+            if answer is not None:
+                self._write(answer)
+
+    def _write(self, answer: bytes) -> None:
+        try:
+            os.write(self._file, answer)
+        except OSError as error:
+            if error.errno == errno.ESTALE:
+                self._late += 1
+            else:
+                self._failure = error
+
+    def _answer(self, transfer: OneTransfer) -> bytes | None:
+        with self._lock:
+            self._transfers.append(transfer)
+            device = self._devices.get(self._select_of(transfer))
+        try:
+            return _served(transfer, device)
+        except wire.Refuse as refusal:
+            return wire.refusal(transfer, refusal.number)
+        except wire.Short as short:
+            return wire.short(transfer, short.done, short.data)
+        except wire.NoAnswer:
+            return None
+        except Exception as error:  # noqa: BLE001 - a mistake in a test's device must fail that test, not hang it
+            self._failure = error
+            return wire.refusal(transfer, errno.EIO)
+
+
+def _served(transfer: OneTransfer, device: Callable[[OneTransfer], bytes] | None) -> bytes:
+    """The answer of a device, or of a bus without one."""
+    if device is not None:
+        return wire.answer(transfer, device(transfer))
+    if isinstance(transfer, wire.I2cTransfer):
+        raise wire.Refuse(errno.ENXIO)
+    return wire.answer(transfer, bytes(transfer.whole))
+
+
+def i2c_bus(number: int = 0) -> Bus[wire.I2cTransfer]:
+    """The devices behind /dev/i2c-<number>, by address."""
+    return Bus(Path(f"/dev/imud-lab-i2c{number}"), lambda transfer: transfer.segments[0].address)
+
+
+def spi_bus(number: int) -> Bus[wire.SpiTransfer]:
+    """The devices behind /dev/spidev<number>.*, by chip select. Bus 0 has 8-bit words only, bus 1 also 16."""
+    return Bus(Path(f"/dev/imud-lab-spi{number}"), lambda transfer: transfer.chip_select)

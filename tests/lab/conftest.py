@@ -1,0 +1,109 @@
+"""Fixtures of the lab. Outside the lab's guest nothing here is collected: `make lab` runs it."""
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.lab.bus import Bus, i2c_bus, spi_bus
+from tests.lab.can_interface import CanInterface, controller_pair, virtual_can
+from tests.lab.gpio_chip import GpioChip, simulated_chip
+from tests.lab.serial_port import PseudoTerminal, pseudo_terminal, uart_pair
+from tests.lab.wire import I2cTransfer, SpiTransfer
+
+SHARE = os.environ.get("IMUD_LAB")
+"""The run's folder on the host; set by tests/lab/run in the guest only."""
+
+GPIO_LINES = ("SOUT", "SIN", "PPS", "ALARM", "", "RESET")
+
+collect_ignore_glob = [] if SHARE else ["*"]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Says why nothing was collected here."""
+    if not SHARE:
+        terminalreporter.write_line("tests/lab left out: it runs in the lab's kernel (make lab)")
+
+
+def pytest_runtest_logstart() -> None:
+    """Marks the first test for the runner's timing."""
+    if SHARE:
+        mark = Path(SHARE) / "first-test"
+        if not mark.exists():
+            mark.touch()
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    """Each test closes its descriptors and ends its threads."""
+    before = _open_descriptors()
+    yield
+    assert _open_descriptors() == before, "descriptors left open"
+    assert threading.enumerate() == [threading.main_thread()], "threads left running"
+
+
+def _open_descriptors() -> dict[str, str]:
+    found = {}
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            found[name] = os.readlink(f"/proc/self/fd/{name}")
+        except FileNotFoundError:
+            continue  # the descriptor of the listing itself
+    return found
+
+
+@pytest.fixture
+def vcan() -> Iterator[CanInterface]:
+    """A virtual CAN interface, up. For more than one: can_interface.virtual_can(name)."""
+    with virtual_can("vcan0") as interface:
+        yield interface
+
+
+@pytest.fixture
+def can_pair() -> Iterator[tuple[CanInterface, CanInterface]]:
+    """Two emulated CAN controllers on one bus, up at 500 kbit/s."""
+    with controller_pair() as pair:
+        yield pair
+
+
+@pytest.fixture
+def gpio_chip() -> Iterator[GpioChip]:
+    """A chip with the lines SOUT, SIN, PPS, ALARM, one without a name, and RESET."""
+    with simulated_chip(GPIO_LINES) as chip:
+        yield chip
+
+
+@pytest.fixture
+def i2c() -> Iterator[Bus[I2cTransfer]]:
+    """The far end of /dev/i2c-0: attach simulated devices by address."""
+    with i2c_bus(0) as bus:
+        yield bus
+
+
+@pytest.fixture
+def spi8() -> Iterator[Bus[SpiTransfer]]:
+    """The far end of /dev/spidev0.*, a controller with 8-bit words only: attach devices by chip select."""
+    with spi_bus(0) as bus:
+        yield bus
+
+
+@pytest.fixture
+def spi16() -> Iterator[Bus[SpiTransfer]]:
+    """The far end of /dev/spidev1.*, a controller with 8- and 16-bit words."""
+    with spi_bus(1) as bus:
+        yield bus
+
+
+@pytest.fixture
+def pty() -> Iterator[PseudoTerminal]:
+    """A raw pseudo terminal."""
+    with pseudo_terminal() as terminal:
+        yield terminal
+
+
+@pytest.fixture
+def uarts() -> tuple[Path, Path]:
+    """Two real UARTs wired to each other."""
+    return uart_pair()

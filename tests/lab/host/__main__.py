@@ -1,0 +1,139 @@
+"""`tests/lab/run`: boots the lab and runs pytest on tests/lab in it.
+
+Exit status: pytest's own (0 all passed, 1 some failed, ... 5 none selected), or that of the --exec command;
+10 if the lab itself failed, with one line on standard error that says why; 130 and 143 after SIGINT and SIGTERM.
+"""
+
+import argparse
+import platform
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import NoReturn
+
+from tests.lab.host import environment, guest, kernel, packages, results
+from tests.lab.host.errors import LabError
+from tests.lab.host.qemu import QEMU, Machine
+
+LAB_FAILED = 10
+MIN_MEMORY_MB = 256
+DEFAULT_MEMORY_MB = 1024
+MAX_PROCESSORS = 2  # the kernel's CONFIG_NR_CPUS
+DEFAULT_PROCESSORS = 1
+"""On a busy two-core host the guest with two took twice as long: 27 and 36 s against 14 and 16 s for boot and
+collection (tests/lab/run --processors N --exec '.venv/bin/python -m pytest --collect-only')."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Bad options are a LabError: one line, like every other failure."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raises instead of printing the usage."""
+        raise LabError(f"{message} (tests/lab/run --help)")
+
+
+def parser() -> Parser:
+    """The options; everything after `--` is pytest's."""
+    options = Parser(prog="tests/lab/run", allow_abbrev=False, description="Runs tests/lab in a kernel under QEMU.")
+    options.add_argument("--ci", action="store_true", help="without QEMU say so and succeed")
+    options.add_argument("--build-only", action="store_true", help="build the kernel and the module, do not boot")
+    options.add_argument("--exec", metavar="COMMAND", help="run this shell command in the guest instead of pytest")
+    options.add_argument("--venv", type=Path, default=environment.ROOT / ".venv", help="default: .venv")
+    options.add_argument("--output", type=Path, default=environment.ROOT / "build" / "lab", help="default: build/lab")
+    options.add_argument("--memory", type=int, default=DEFAULT_MEMORY_MB, metavar="MB", help="default: %(default)s")
+    options.add_argument("--processors", type=int, default=DEFAULT_PROCESSORS, metavar="N", help="default: %(default)s")
+    options.add_argument("--limit", type=float, default=guest.Limits.total_s, metavar="S", help="default: %(default)s")
+    options.add_argument("arguments", nargs="*", metavar="-- PYTEST_ARGUMENT", help="such as: -- -k can -v")
+    return options
+
+
+def say(line: str) -> None:
+    """One line about the lab itself; standard output belongs to the guest."""
+    print(f"lab: {line}", file=sys.stderr, flush=True)
+
+
+def boot(options: argparse.Namespace, python: environment.Python, built: Path) -> int:
+    """One run of the guest: prepares its folder, runs it, keeps its results; returns its status."""
+    command = ["sh", "-c", options.exec] if options.exec else environment.pytest_command(python, options.arguments)
+    limits = guest.Limits(total_s=options.limit)
+    failed = True
+    with results.run_folder(options.output) as folder:
+        shutil.copy(built / kernel.MODULE, folder)
+        shown = "".join(f"{path}\n" for path in environment.shown_folders(python))
+        (folder / "shown").write_text(shown, encoding="utf-8")
+        (folder / "script").write_text(environment.script(python, command), encoding="utf-8")
+
+        def machine(uart_fds: tuple[int, int]) -> list[str]:
+            image, console = built / kernel.IMAGE, folder / "console.log"
+            return Machine(image, folder, console, options.memory, options.processors, uart_fds).command()
+
+        start_s = time.time()
+        try:
+            status = guest.run(machine, guest.Folder(folder), limits, guest.to_terminal)
+            failed = status != 0
+            say(timing(folder, start_s))
+        finally:
+            for path in results.keep(folder, options.output, failed):
+                say(f"kept {path}")
+    return status
+
+
+def timing(folder: Path, start_s: float) -> str:
+    """When the first test began (tests/lab/conftest.py leaves a mark) and how long the guest ran."""
+    ran = f"guest ran {time.time() - start_s:.1f} s"
+    mark = folder / "first-test"
+    return f"first test after {mark.stat().st_mtime - start_s:.1f} s, {ran}" if mark.exists() else ran
+
+
+def check(options: argparse.Namespace) -> None:
+    """Refuses what cannot work before anything is built."""
+    if platform.machine() != "x86_64":
+        raise LabError(f"the guest shares the host's programs, which must be x86_64, not {platform.machine()}")
+    if options.memory < MIN_MEMORY_MB:
+        raise LabError(f"--memory {options.memory}: the guest needs at least {MIN_MEMORY_MB} MB")
+    if not 1 <= options.processors <= MAX_PROCESSORS:
+        raise LabError(f"--processors {options.processors}: give 1 to {MAX_PROCESSORS}")
+    if not options.limit > 0:
+        raise LabError(f"--limit {options.limit}: give seconds above 0")
+    if any(character in str(environment.ROOT) for character in '"\n'):
+        raise LabError(f"repository folder {str(environment.ROOT)!r}: the kernel cannot take its name")
+    packages.require_all()
+
+
+def lab(arguments: list[str]) -> int:
+    """Everything; LabError for what is the lab's own failure."""
+    options = parser().parse_args(arguments)
+    if options.ci and shutil.which(QEMU) is None:
+        say(f"left out: {QEMU} is not installed (make lab-deps installs it)")
+        return 0
+    check(options)
+    python = environment.find_python(options.venv)
+    built = kernel.built(say)
+    if options.build_only:
+        return 0
+    environment.precompile(python)
+    return boot(options, python, built)
+
+
+def terminate(number: int, _frame: object) -> NoReturn:
+    """SIGTERM ends the run in order, with QEMU."""
+    raise SystemExit(128 + number)
+
+
+def main() -> int:
+    """The program."""
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        return lab(sys.argv[1:])
+    except LabError as error:
+        say(str(error))
+        return LAB_FAILED
+    except KeyboardInterrupt:
+        say("interrupted")
+        return 128 + signal.SIGINT
+
+
+if __name__ == "__main__":
+    sys.exit(main())

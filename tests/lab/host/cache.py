@@ -1,0 +1,132 @@
+"""The cache of built kernels: one folder per hash of everything that shapes the result.
+
+Layout under `${XDG_CACHE_HOME:-~/.cache}/imud-lab` (or IMUD_LAB_CACHE):
+
+    lock              held (flock) by the one process that builds
+    failed-build.log  the log of the last build that failed
+    new-*             a build in progress; a leftover of a killed one goes with the next build
+    <name>-<key>/     finished; appears by rename, so it is whole or absent
+
+Finished folders not used for MAX_AGE_S go when the next one is built.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from tests.lab.host.errors import LabError
+
+MAX_AGE_S = 14 * 86400
+LOCK_WAIT_S = 45 * 60  # a cold build takes 5 minutes on two idle cores; a shared machine is slower
+LOCK_POLL_S = 0.2
+
+
+def cache_root() -> Path:
+    """The cache folder. LabError if its path has characters that make cannot carry."""
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    root = Path(os.environ.get("IMUD_LAB_CACHE") or Path(base) / "imud-lab").absolute()
+    if any(character.isspace() or character in ":#$," for character in str(root)):
+        raise LabError(f"cache folder {str(root)!r}: make needs a path without spaces and :#$, (set IMUD_LAB_CACHE)")
+    return root
+
+
+def key_of(*parts: bytes) -> str:
+    """16 hex digits of the SHA-256 over the parts, each with its length so that no two splits agree."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little") + part)
+    return digest.hexdigest()[:16]
+
+
+def require_space(folder: Path, needed_bytes: int) -> None:
+    """Raises LabError unless the file system of `folder` has `needed_bytes` free."""
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < needed_bytes:
+        raise LabError(
+            f"no space: {folder} has {free_bytes / 1e9:.1f} GB free, the build needs {needed_bytes / 1e9:.1f} GB"
+            " (set IMUD_LAB_CACHE to another place)"
+        )
+
+
+@contextlib.contextmanager
+def locked(root: Path, say: Callable[[str], None], wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
+    """Holds the build lock; says so once if another build has it, and gives up (LabError) after `wait_s`."""
+    with open(root / "lock", "w", encoding="ascii") as file:
+        give_up_s = time.monotonic() + wait_s
+        told = False
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() >= give_up_s:
+                    raise LabError(f"another build has held {root / 'lock'} for {wait_s:.0f} s") from error
+            if not told:
+                say("another build is under way; waiting for it")
+                told = True
+            time.sleep(LOCK_POLL_S)
+        yield
+
+
+def find(name: str) -> Path | None:
+    """The finished folder `name`, marked as used now; None if it is not in the cache."""
+    folder = cache_root() / name
+    try:
+        os.utime(folder)
+    except FileNotFoundError:
+        return None
+    return folder
+
+
+def get(name: str, make: Callable[[Path], None], needed_bytes: int, say: Callable[[str], None]) -> Path:
+    """The folder `name` of the cache; if it is absent, `make(folder)` fills a new one that is then renamed.
+
+    Safe against any number of processes at once: one makes, the others wait and take its result. A failed
+    or killed make leaves nothing under `name`. The lock is not recursive: `make` must not call this.
+    """
+    root = cache_root()
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        found = find(name)
+        if found is None:
+            with locked(root, say):
+                found = find(name) or _make_locked(root, name, make, needed_bytes)
+    except OSError as error:
+        raise LabError(f"cache folder {root}: {error}") from error
+    return found
+
+
+def _make_locked(root: Path, name: str, make: Callable[[Path], None], needed_bytes: int) -> Path:
+    _remove_old(root)
+    require_space(root, needed_bytes)
+    fresh = Path(tempfile.mkdtemp(prefix="new-", dir=root))
+    try:
+        make(fresh)
+        fresh.chmod(0o755)
+        return fresh.rename(root / name)
+    except LabError as error:
+        raise LabError(f"{error}{_keep_log(root, fresh)}") from error
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _keep_log(root: Path, fresh: Path) -> str:
+    """Saves the log of a failed build and says where, for the end of the error's line."""
+    log = fresh / "build.log"
+    if not log.exists():
+        return ""
+    return f" (log: {log.rename(root / 'failed-build.log')})"
+
+
+def _remove_old(root: Path) -> None:
+    """Under the lock every `new-*` is a leftover: no other build runs."""
+    oldest_s = time.time() - MAX_AGE_S
+    for folder in root.iterdir():
+        if folder.is_dir() and (folder.name.startswith("new-") or folder.stat().st_mtime < oldest_s):
+            shutil.rmtree(folder, ignore_errors=True)

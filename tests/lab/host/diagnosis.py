@@ -1,0 +1,46 @@
+"""Why a guest ended without a result: its console log read for the known causes."""
+
+import re
+
+CAUSES = (
+    (
+        r"Kernel panic - not syncing: System is deadlocked on memory|Out of memory and no killable",
+        "guest out of memory",
+    ),
+    (r"VFS: Unable to mount root fs|Cannot open root device", "guest could not mount the host's root over 9p"),
+    (r"Requested init .* failed|No working init found", "guest could not start its init"),
+    (r"Out of memory: Killed process", "guest out of memory"),
+    (r"soft lockup|rcu_preempt detected stalls|blocked for more than", "guest kernel stuck"),
+    (r"BUG: |Oops: |general protection fault", "kernel fault in the guest"),
+    (r"Kernel panic", "kernel panic in the guest"),
+    (r"lab init failed", "guest set-up failed"),
+)
+"""Pattern of a console line and what it means, the most telling first."""
+
+KILLED = re.compile(r"Out of memory: Killed process")
+
+
+def cause(console: str) -> str | None:
+    """The most telling cause with the line that shows it, or None."""
+    for pattern, meaning in CAUSES:
+        line = next((line for line in console.splitlines() if re.search(pattern, line)), None)
+        if line is not None:
+            return f"{meaning}: {_bare(line)}"
+    return None
+
+
+def out_of_memory(console: str) -> bool:
+    """Whether the guest's kernel killed a process for want of memory."""
+    return KILLED.search(console) is not None
+
+
+def last_line(console: str) -> str:
+    """The last thing the console said, for a guest that just stopped."""
+    lines = [line for line in console.splitlines() if line.strip()]
+    return _bare(lines[-1]) if lines else "nothing on the console"
+
+
+def _bare(line: str) -> str:
+    """A console line without its time stamp and control characters, cut to 160 characters."""
+    plain = re.sub(r"^\[ *[\d.]+\](\[[^]]*\])? *", "", line.strip())
+    return "".join(character for character in plain if character.isprintable())[:160]

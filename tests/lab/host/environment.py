@@ -1,0 +1,87 @@
+"""What the guest runs: the script that starts pytest, or another command, in the project's own Python.
+
+From start to first test the guest is busy importing, several times slower than the host, hence `precompile` and
+pytest without hypothesis's plugin, whose import alone took half of the collection (12 of 25 s on a busy machine,
+`python -X importtime -m pytest` in the guest). Tests that use hypothesis work without it.
+"""
+
+import contextlib
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.lab.host.errors import LabError
+
+ROOT = Path(__file__).resolve().parents[3]
+TEST_LIMIT_S = 120  # per test: twice the ordinary limit, for a guest several times slower than the host
+PROBE_LIMIT_S = 60
+
+
+@dataclass(frozen=True)
+class Python:
+    """A virtual environment with pytest, and the installation it was made from."""
+
+    venv: Path
+    base: Path
+
+
+def find_python(venv: Path) -> Python:
+    """Checks that `venv` has a Python with pytest and pytest-timeout; LabError if not."""
+    interpreter = venv / "bin" / "python"
+    if not os.access(interpreter, os.X_OK):
+        raise LabError(f"no Python at {interpreter} (make the virtual environment first, or give --venv)")
+    probe = [str(interpreter), "-c", "import sys, pytest, pytest_timeout; print(sys.base_prefix)"]
+    try:
+        result = subprocess.run(probe, capture_output=True, text=True, timeout=PROBE_LIMIT_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise LabError(f"{interpreter} did not start within {PROBE_LIMIT_S} s") from error
+    if result.returncode:
+        why = (result.stderr.strip().splitlines() or ["no output"])[-1]
+        raise LabError(f"{interpreter} cannot run pytest: {why}")
+    return Python(venv.absolute(), Path(result.stdout.strip()))
+
+
+def precompile(python: Python) -> None:
+    """Compiles the repository's modules to bytecode, which the guest can read but not write.
+
+    A failure (a read-only tree, a file with a syntax error) is not reported: it costs the guest time, or shows there.
+    """
+    command = [str(python.venv / "bin" / "python"), "-m", "compileall", "-q", str(ROOT / "imud"), str(ROOT / "tests")]
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        subprocess.run(command, capture_output=True, timeout=PROBE_LIMIT_S, check=False)
+
+
+def pytest_command(python: Python, arguments: list[str]) -> list[str]:
+    """pytest on tests/lab, or on what `arguments` name; they come last and so win."""
+    return [
+        *(str(python.venv / "bin" / "python"), "-m", "pytest", "-o", "testpaths=tests/lab"),
+        *("-p", "no:cacheprovider", "-p", "no:hypothesispytest"),
+        *("--junit-xml=/run/lab/junit.xml", f"--timeout={TEST_LIMIT_S}"),
+        f"--color={'yes' if sys.stdout.isatty() else 'no'}",
+        *arguments,
+    ]
+
+
+def script(python: Python, command: list[str]) -> str:
+    """The shell script that runs `command` from the repository's root in a clean environment."""
+    variables = {
+        "PATH": f"{python.venv}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+        "HOME": "/tmp",
+        "LANG": "C.UTF-8",
+        "TERM": os.environ.get("TERM", "dumb"),
+        "COLUMNS": str(shutil.get_terminal_size().columns),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONUNBUFFERED": "1",
+        "IMUD_LAB": "/run/lab",
+    }
+    settings = [f"{name}={value}" for name, value in variables.items()]
+    return f"cd {shlex.quote(str(ROOT))} &&\nexec {shlex.join(['env', '-i', *settings, *command])}\n"
+
+
+def shown_folders(python: Python) -> list[Path]:
+    """The folders that the guest needs even where it mounts memory file systems (/tmp, /run)."""
+    return [ROOT, python.venv, python.base]

@@ -1,0 +1,148 @@
+"""Runs one guest to its end: starts QEMU, passes its output on, and watches that it lives.
+
+A guest ends in one of four ways: it wrote its status; QEMU ended without one (a panic, a lack of memory, a
+bad command line); it gave no sign of life for too long; or its time is up. All but the first are LabError.
+"""
+
+import os
+import selectors
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.lab.host.diagnosis import cause, last_line, out_of_memory
+from tests.lab.host.errors import LabError
+
+TICK_S = 0.5
+GOODBYE_S = 5.0  # from the status to the end of QEMU; it is about 0.1 s
+CHUNK_BYTES = 65536
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long the runner waits for what."""
+
+    total_s: float = 1200.0
+    boot_s: float = 120.0
+    """From the start to the first sign of life; it is about 5 s on an idle machine."""
+    silence_s: float = 60.0
+    """Between two signs of life; the guest gives one every 5 s."""
+
+
+@dataclass(frozen=True)
+class Folder:
+    """The files of one run, on the host and in the guest's /run/lab."""
+
+    path: Path
+
+    def read(self, name: str) -> str:
+        """A file's text; empty if it is not there."""
+        try:
+            return (self.path / name).read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
+            return ""
+
+    def age_s(self, name: str) -> float | None:
+        """Seconds since a file was written, None if it is not there."""
+        try:
+            return time.time() - (self.path / name).stat().st_mtime
+        except FileNotFoundError:
+            return None
+
+
+def run(
+    make_command: Callable[[tuple[int, int]], list[str]],
+    folder: Folder,
+    limits: Limits,
+    write: Callable[[bytes], object],
+) -> int:
+    """Runs the command that `make_command(uart_fds)` gives and returns the guest's exit status.
+
+    `write` receives the guest's output as it comes. LabError: the guest gave no status. QEMU never outlives
+    this call, and dies with this process (`setpriv --pdeathsig`).
+    """
+    ends = socket.socketpair()
+    fds = (ends[0].fileno(), ends[1].fileno())
+    try:
+        with open(folder.path / "qemu.log", "wb") as errors:
+            process = subprocess.Popen(
+                ["setpriv", "--pdeathsig", "KILL", *make_command(fds)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                pass_fds=fds,
+                start_new_session=True,  # Ctrl-C reaches the runner, which ends QEMU in its own order
+            )
+    finally:
+        for end in ends:
+            end.close()
+    try:
+        _watch(process, folder, limits, write)
+        process.wait(GOODBYE_S)
+    except subprocess.TimeoutExpired:
+        pass  # the status decides
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout:
+            process.stdout.close()
+    return _status(folder, process.returncode)
+
+
+def _watch(process: subprocess.Popen[bytes], folder: Folder, limits: Limits, write: Callable[[bytes], object]) -> None:
+    """Returns when QEMU closed its output, or did not although the status is there; LabError on a limit."""
+    assert process.stdout is not None
+    start_s = time.monotonic()
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        while True:
+            if selector.select(TICK_S):
+                data = os.read(process.stdout.fileno(), CHUNK_BYTES)
+                if not data:
+                    return
+                write(data)
+            if (folder.age_s("status") or 0.0) > GOODBYE_S:
+                return
+            _check_limits(folder, limits, time.monotonic() - start_s)
+
+
+def _check_limits(folder: Folder, limits: Limits, elapsed_s: float) -> None:
+    if elapsed_s > limits.total_s:
+        raise LabError(f"time is up: the guest still ran after {limits.total_s:.0f} s{_hint(folder)}")
+    silence_s = folder.age_s("alive")
+    if silence_s is None and elapsed_s > limits.boot_s:
+        raise LabError(f"hung guest: not booted after {limits.boot_s:.0f} s{_hint(folder)}")
+    if silence_s is not None and silence_s > limits.silence_s:
+        raise LabError(f"hung guest: no sign of life for {silence_s:.0f} s{_hint(folder)}")
+
+
+def _hint(folder: Folder) -> str:
+    found = cause(folder.read("console.log"))
+    return f" ({found})" if found else ""
+
+
+def _status(folder: Folder, qemu_status: int) -> int:
+    """The guest's exit status, or LabError saying why there is none."""
+    console = folder.read("console.log")
+    problem = folder.read("problem").strip()
+    if problem:
+        raise LabError(problem)
+    status = folder.read("status").strip()
+    if status.isdigit():
+        if int(status) != 0 and out_of_memory(console):
+            raise LabError(str(cause(console)))
+        return int(status)
+    qemu = folder.read("qemu.log").strip().splitlines()
+    if qemu_status != 0 and qemu:
+        raise LabError(f"QEMU failed: {qemu[-1]}")
+    raise LabError(cause(console) or f"guest ended without a result; last console line: {last_line(console)}")
+
+
+def to_terminal(data: bytes) -> None:
+    """Writes the guest's output to standard output, at once."""
+    sys.stdout.buffer.write(data)
+    sys.stdout.buffer.flush()

@@ -1,0 +1,56 @@
+"""The guest's machine: the QEMU command line."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+QEMU = "qemu-system-x86_64"
+INIT = Path(__file__).resolve().parents[1] / "guest" / "init"
+SHARING = "security_model=none"
+ROOT_FLAGS = "trans=virtio,version=9p2000.L,msize=262144,cache=loose"
+"""cache=loose: nobody writes through this mount, and without it each import asks the host again."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What differs from run to run."""
+
+    image: Path
+    share: Path
+    """Folder the guest may write, its /run/lab."""
+    console: Path
+    """File that receives the kernel's console."""
+    memory_mb: int
+    processors: int
+    uart_fds: tuple[int, int]
+    """The two ends of a socket pair: the guest's extra UARTs, wired to each other."""
+
+    def command(self) -> list[str]:
+        """QEMU's argument vector. The guest's live output is QEMU's standard output.
+
+        The processors are always emulated (TCG): results must not depend on whether the host has KVM.
+        """
+        first_fd, second_fd = self.uart_fds
+        return [
+            *(QEMU, "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"),
+            *("-machine", "pc,accel=tcg", "-cpu", "max", "-smp", str(self.processors), "-m", str(self.memory_mb)),
+            *("-kernel", str(self.image), "-append", self.kernel_arguments()),
+            *("-virtfs", f"local,path=/,mount_tag=hostroot,{SHARING},readonly=on,multidevs=remap"),
+            *("-virtfs", f"local,path={_escaped(self.share)},mount_tag=lab,{SHARING}"),
+            *("-chardev", f"file,id=console,path={_escaped(self.console)}", "-serial", "chardev:console"),
+            *("-chardev", "file,id=live,path=/dev/stdout,append=on"),
+            *("-device", "virtio-serial-pci", "-device", "virtserialport,chardev=live"),
+            *("-chardev", f"socket,id=uart1,fd={first_fd}", "-chardev", f"socket,id=uart2,fd={second_fd}"),
+            *("-device", "pci-serial-2x,chardev1=uart1,chardev2=uart2"),
+            *("-object", "can-bus,id=can", "-device", "kvaser_pci,canbus=can", "-device", "kvaser_pci,canbus=can"),
+        ]
+
+    def kernel_arguments(self) -> str:
+        """The kernel's command line."""
+        return (
+            f'console=ttyS0 panic=-1 tsc=reliable root=hostroot rootfstype=9p rootflags={ROOT_FLAGS} ro init="{INIT}"'
+        )
+
+
+def _escaped(path: Path) -> str:
+    """QEMU's option syntax doubles commas inside values."""
+    return str(path).replace(",", ",,")

@@ -1,0 +1,56 @@
+"""The output folder: one folder per run while it lasts, and what stays of it."""
+
+import contextlib
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.lab.host.errors import LabError
+
+LOGS = ("console.log", "qemu.log")
+REPORT = "junit.xml"
+LEFTOVER_S = 86400
+
+
+@contextlib.contextmanager
+def run_folder(output: Path) -> Iterator[Path]:
+    """A new folder for one run below `output`, removed afterwards; any number of runs at once."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(output)
+        folder = Path(tempfile.mkdtemp(prefix="run-", dir=output.absolute()))
+    except OSError as error:
+        raise LabError(f"output folder {output}: {error.strerror}") from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def keep(folder: Path, output: Path, failed: bool) -> list[Path]:
+    """Moves the report, and after a failure the logs, to `output`; older ones go. Returns the logs kept."""
+    _move(folder / REPORT, output / REPORT)
+    if failed:
+        return [output / name for name in LOGS if _move(folder / name, output / name)]
+    for name in LOGS:
+        (output / name).unlink(missing_ok=True)
+    return []
+
+
+def _move(source: Path, target: Path) -> bool:
+    """Moves a file over the old one; the old one goes even if there is no new one or it is empty."""
+    target.unlink(missing_ok=True)
+    if not source.exists() or source.stat().st_size == 0:
+        return False
+    os.replace(source, target)
+    return True
+
+
+def _remove_leftovers(output: Path) -> None:
+    """Folders of runs that were killed; a day old, so that no run still uses them."""
+    for folder in output.glob("run-*"):
+        if folder.stat().st_mtime < time.time() - LEFTOVER_S:
+            shutil.rmtree(folder, ignore_errors=True)

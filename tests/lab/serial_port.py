@@ -1,0 +1,51 @@
+"""Serial ports of the guest: pseudo terminals, and two 8250 UARTs wired to each other."""
+
+import os
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class PseudoTerminal:
+    """A raw pty: the device under test opens `path`, the test is the far end."""
+
+    path: Path
+    far_fd: int
+    """The controlling end, blocking."""
+
+    def write(self, data: bytes) -> None:
+        """Sends all of `data` to the device under test."""
+        while data:
+            data = data[os.write(self.far_fd, data) :]
+
+    def read(self, size: int) -> bytes:
+        """Exactly `size` bytes that the device under test sent; waits for them."""
+        data = b""
+        while len(data) < size:
+            data += os.read(self.far_fd, size - len(data))
+        return data
+
+
+@contextmanager
+def pseudo_terminal() -> Iterator[PseudoTerminal]:
+    """A new pty. Its near end stays open, so that a device under test that leaves does not hang up the line."""
+    far_fd, near_fd = os.openpty()
+    try:
+        tty.setraw(near_fd)
+        yield PseudoTerminal(Path(os.ttyname(near_fd)), far_fd)
+    finally:
+        os.close(near_fd)
+        os.close(far_fd)
+
+
+def uart_pair() -> tuple[Path, Path]:
+    """The devices of the two UARTs (16550A on PCI, driver 8250); what one sends the other receives."""
+    first, second = sorted(
+        Path("/dev") / port.name
+        for port in Path("/sys/class/tty").glob("ttyS*")
+        if "/pci" in str((port / "device").resolve())
+    )
+    return first, second

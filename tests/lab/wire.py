@@ -1,0 +1,206 @@
+"""The module's messages (kmod/protocol.h): requests as records, answers as bytes. Pure.
+
+SPI data is shown here as it is on the wire, most significant byte of each word first; the module has words
+of more than 8 bits in the host's byte order, which `SpiTransfer.answer` and the parser convert.
+"""
+
+import struct
+import sys
+from dataclasses import dataclass
+
+KIND_I2C = 1
+KIND_SPI = 2
+I2C_M_RD = 0x0001
+"""Flag of a segment that the host reads (<linux/i2c.h>)."""
+
+REQUEST = struct.Struct("=IIHHII")  # id, size, kind, segments, mode, chip_select
+I2C_SEGMENT = struct.Struct("=HHI")  # address, flags, length
+SPI_SEGMENT = struct.Struct("=IIIIIBBBB")  # length, speed, delay, word delay, cs delay, bits, cs_change, tx, rx
+ANSWER = struct.Struct("=IiII")  # id, status, done, size
+MAX_BYTES = 64 * 1024
+
+
+class Refuse(Exception):
+    """Raised by a simulated device: the host's call fails with this errno."""
+
+    def __init__(self, number: int) -> None:
+        """`number` is an errno: ENXIO for a NAK, ETIMEDOUT for a stuck bus, EAGAIN for a lost arbitration."""
+        super().__init__(number)
+        self.number = number
+
+
+class Short(Exception):
+    """Raised by a simulated device: the transfer ends early, without an error."""
+
+    def __init__(self, done: int, data: bytes = b"") -> None:
+        """`done`: I2C segments or SPI bytes that were transferred; `data`: the bytes read until then."""
+        super().__init__(done)
+        self.done = done
+        self.data = data
+
+
+class NoAnswer(Exception):
+    """Raised by a simulated device: the host waits until the module's time-out (ETIMEDOUT)."""
+
+
+@dataclass(frozen=True, slots=True)
+class I2cSegment:
+    """One I2C message; between two of a transfer is a repeated start."""
+
+    address: int
+    flags: int
+    length: int
+    data: bytes
+    """What the host writes; empty if it reads."""
+
+    @property
+    def reads(self) -> bool:
+        """Whether the host reads."""
+        return bool(self.flags & I2C_M_RD)
+
+
+@dataclass(frozen=True, slots=True)
+class I2cTransfer:
+    """Everything between start and stop."""
+
+    id: int
+    segments: tuple[I2cSegment, ...]
+
+    @property
+    def read_length(self) -> int:
+        """Bytes that a full answer has."""
+        return sum(segment.length for segment in self.segments if segment.reads)
+
+    @property
+    def whole(self) -> int:
+        """`done` of a full transfer."""
+        return len(self.segments)
+
+    def payload(self, data: bytes) -> bytes:
+        """The device's bytes as the module wants them."""
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class SpiSegment:
+    """One spi_ioc_transfer."""
+
+    mosi: bytes
+    """Bytes on the wire, in their order there; zeros if the host sends nothing."""
+    speed_hz: int
+    bits_per_word: int
+    cs_change: bool
+    delay_ns: int
+    word_delay_ns: int
+    cs_change_delay_ns: int
+    sends: bool
+    reads: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SpiTransfer:
+    """One SPI_IOC_MESSAGE: all its transfers."""
+
+    id: int
+    mode: int
+    chip_select: int
+    segments: tuple[SpiSegment, ...]
+
+    @property
+    def selections(self) -> tuple[tuple[SpiSegment, ...], ...]:
+        """The segments grouped by chip-select assertion: a new group after each cs_change but the last."""
+        groups: list[list[SpiSegment]] = [[]]
+        for number, segment in enumerate(self.segments):
+            groups[-1].append(segment)
+            if segment.cs_change and number + 1 < len(self.segments):
+                groups.append([])
+        return tuple(tuple(group) for group in groups)
+
+    @property
+    def stays_selected(self) -> bool:
+        """cs_change of the last segment: the chip stays selected after the message."""
+        return bool(self.segments) and self.segments[-1].cs_change
+
+    @property
+    def read_length(self) -> int:
+        """Bytes that a full answer to the module has."""
+        return sum(len(segment.mosi) for segment in self.segments if segment.reads)
+
+    @property
+    def whole(self) -> int:
+        """`done` of a full transfer."""
+        return sum(len(segment.mosi) for segment in self.segments)
+
+    def payload(self, miso: bytes) -> bytes:
+        """The device's bytes, one per byte of MOSI, as the module wants them: only what the host reads."""
+        kept, start = [], 0
+        for segment in self.segments:
+            part = miso[start : start + len(segment.mosi)]
+            start += len(segment.mosi)
+            if segment.reads:
+                kept.append(swapped(part, segment.bits_per_word))
+        return b"".join(kept)
+
+
+Transfer = I2cTransfer | SpiTransfer
+
+
+def swapped(data: bytes, bits_per_word: int) -> bytes:
+    """Words of 9 to 16 bits from host byte order to wire order, or back; the same for 8-bit words."""
+    if bits_per_word <= 8 or sys.byteorder == "big":
+        return data
+    return b"".join(data[i : i + 2][::-1] for i in range(0, len(data), 2))
+
+
+def parse(request: bytes) -> Transfer:
+    """One read() of the module's device."""
+    identifier, size, kind, count, mode, chip_select = REQUEST.unpack_from(request)
+    assert size == len(request), f"request says {size} bytes, has {len(request)}"
+    assert kind in (KIND_I2C, KIND_SPI), f"unknown kind {kind}"
+    if kind == KIND_I2C:
+        return I2cTransfer(identifier, _i2c_segments(request, count))
+    return SpiTransfer(identifier, mode, chip_select, _spi_segments(request, count))
+
+
+def _i2c_segments(request: bytes, count: int) -> tuple[I2cSegment, ...]:
+    segments, at = [], REQUEST.size
+    for _ in range(count):
+        address, flags, length = I2C_SEGMENT.unpack_from(request, at)
+        at += I2C_SEGMENT.size
+        data = b"" if flags & I2C_M_RD else request[at : at + length]
+        at += len(data)
+        segments.append(I2cSegment(address, flags, length, data))
+    return tuple(segments)
+
+
+def _spi_segments(request: bytes, count: int) -> tuple[SpiSegment, ...]:
+    segments, at = [], REQUEST.size
+    for _ in range(count):
+        length, speed_hz, delay_ns, word_ns, change_ns, bits, change, sends, reads = SPI_SEGMENT.unpack_from(
+            request, at
+        )
+        at += SPI_SEGMENT.size
+        mosi = swapped(request[at : at + length], bits) if sends else bytes(length)
+        at += length if sends else 0
+        segments.append(
+            SpiSegment(mosi, speed_hz, bits, bool(change), delay_ns, word_ns, change_ns, bool(sends), bool(reads))
+        )
+    return tuple(segments)
+
+
+def answer(transfer: Transfer, data: bytes) -> bytes:
+    """The answer of a transfer that went through; `data` is for the segments the host reads, SPI for all."""
+    payload = transfer.payload(data)
+    assert len(payload) == transfer.read_length, f"device gave {len(payload)} bytes, host reads {transfer.read_length}"
+    return ANSWER.pack(transfer.id, 0, transfer.whole, len(payload)) + payload
+
+
+def short(transfer: Transfer, done: int, data: bytes) -> bytes:
+    """The answer of a transfer that ended early."""
+    payload = transfer.payload(data)
+    return ANSWER.pack(transfer.id, 0, done, len(payload)) + payload
+
+
+def refusal(transfer: Transfer, number: int) -> bytes:
+    """The answer that makes the host's call fail with an errno."""
+    return ANSWER.pack(transfer.id, -number, 0, 0)
