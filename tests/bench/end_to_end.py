@@ -44,7 +44,7 @@ def compare(load: Load, rounds: int) -> Iterator[Row]:
 def many(devices: int, seconds: float, **more: object) -> tuple[Outcome, Outcome]:
     """The daemon and the bare loop with many devices and one client."""
     load = Load(devices=devices, seconds=seconds, phases=4, **more)  # type: ignore[arg-type]  # keywords of Load
-    return run(load), run(replace(load, bare=True, coalesce_ms=0.0))
+    return run(load), run(replace(load, bare=True, coalesce_ms=0))
 
 
 def growth(seconds: float) -> Iterator[Row]:
@@ -67,6 +67,6 @@ def growth(seconds: float) -> Iterator[Row]:
 def coalesced(seconds: float) -> Iterator[Row]:
     """What holding a batch for 2 ms saves at 16 devices."""
     plain, _ = many(16, seconds)
-    held, _ = many(16, seconds, coalesce_ms=2.0)
+    held, _ = many(16, seconds, coalesce_ms=2)
     yield Row("16 devices, coalesce 2 ms: CPU against none", held.cpu_us_per_sample / plain.cpu_us_per_sample, "x")
     yield Row("16 devices, coalesce 2 ms: latency p99", held.p99_us, "us")

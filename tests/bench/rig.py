@@ -33,7 +33,7 @@ class Load:
     rate_hz: float = 1000.0
     seconds: float = 5.0
     bare: bool = False
-    coalesce_ms: float = 0.0
+    coalesce_ms: int = 0
     stuck: bool = False
     phases: int = 1
     shm: bool = True
