@@ -168,7 +168,11 @@ class Client:
         return EventStream(self, timeout_s)
 
     def notify(self, device: str) -> int:
-        """An eventfd that the daemon adds 1 to after each batch of samples of `device`. The caller closes it."""
+        """A descriptor that is readable after each batch of samples of `device`, for `Ring.wait`; the caller closes it.
+
+        How many bytes are in it means nothing: read them all. It ends with the connection, and when `notify` is asked
+        for the same device again, which gives a new one.
+        """
         self.call("notify", device=device)
         if not self._fds:
             raise ServerError("the daemon's answer to notify came without a descriptor")

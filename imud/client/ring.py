@@ -4,7 +4,7 @@
         while True:
             for sample in ring.read().samples:
                 print(sample.seq, sample.accel_m_s2)
-            ring.wait(event_fd, timeout_s=1.0)      # an eventfd of one's own, from the daemon's socket
+            ring.wait(wake_fd, timeout_s=1.0)       # a descriptor of one's own, from `imud.client.Client.notify`
 
 Nothing here waits busily: a slot that is not whole yet is given by a later call. A daemon that restarts makes a new
 file; `read` and `latest` change over to it by themselves as soon as the old one is closed or its heartbeat is stale.
@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from imud.errors import ServerError
+from imud.errors import LinkMissing, ServerError
 from imud.kit.shm_layout import (
     DIRECTORY,
     FILE_PREFIX,
@@ -44,6 +44,8 @@ from imud.sample import Sample
 
 _ATTEMPTS = 3
 """The writer may overtake one copy, hardly three in a row."""
+_DRAIN_BYTES = 4096
+"""Far more than wait in a descriptor of the daemon's, so that one read takes all."""
 
 
 class RingRead(NamedTuple):
@@ -146,14 +148,21 @@ class Ring:
         self._next, self._torn = 1, (0, 0)
         return True
 
-    def wait(self, event_fd: int, timeout_s: float | None = None) -> bool:
-        """Wait until `event_fd` (an eventfd the daemon signals) is readable, and clear it; False after `timeout_s`."""
+    def wait(self, fd: int, timeout_s: float | None = None) -> bool:
+        """Wait until `fd`, of `imud.client.Client.notify`, is readable, and drain it; False after `timeout_s`.
+
+        Raises LinkMissing when the daemon ended it: it would be readable for ever.
+        """
         poller = select.poll()
-        poller.register(event_fd, select.POLLIN)
+        poller.register(fd, select.POLLIN)
         if not poller.poll(None if timeout_s is None else timeout_s * 1000):
             return False
-        os.eventfd_read(event_fd)
-        return True
+        try:
+            if os.read(fd, _DRAIN_BYTES):
+                return True
+        except BlockingIOError:  # another thread or process was faster
+            return True
+        raise LinkMissing(f"{self.path}: the daemon ended the descriptor; connect to its socket and ask for another")
 
     def close(self) -> None:
         """Release the ring; may be called twice."""

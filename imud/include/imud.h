@@ -10,7 +10,8 @@
  *           use(sample.accel_m_s2, sample.present & IMUD_HAS_ACCEL);
  *       if (imud_health(&ring, imud_now_ns()) != IMUD_HEALTH_LIVE)
  *           imud_reopen(&ring);                           // a restarted daemon has a new ring
- *       imud_wait(eventfd, 100);                          // eventfd of your own, from imud's UNIX socket
+ *       if (imud_wait(wake_fd, 100) == IMUD_E_ENDED)      // wake_fd: `notify` of imud's UNIX socket gives it
+ *           wake_fd = ask_for_another();                  // the daemon has ended; -1 only waits
  *   }
  *
  * Units: m/s2, rad/s, tesla, rad, degrees Celsius, pascal; times are ns of CLOCK_MONOTONIC, `utc_ns` of CLOCK_REALTIME.
@@ -183,7 +184,8 @@ enum {
     IMUD_E_FORMAT = -3,  /* the file is no ring */
     IMUD_E_VERSION = -4, /* a ring of another layout version */
     IMUD_E_SYSTEM = -5,  /* see errno */
-    IMUD_E_NAME = -6     /* name too long or empty */
+    IMUD_E_NAME = -6,    /* name too long or empty */
+    IMUD_E_ENDED = -7    /* the daemon ended the descriptor to wait on: ask its socket for another */
 };
 
 typedef enum imud_health_state {
@@ -216,6 +218,7 @@ static inline const char *imud_strerror(int error)
     case IMUD_E_FORMAT: return "the file is no ring of imud";
     case IMUD_E_VERSION: return "the ring has another layout version: build with the imud.h of the running daemon";
     case IMUD_E_NAME: return "expected a device name or a path of less than 256 characters";
+    case IMUD_E_ENDED: return "the daemon ended the descriptor: connect to its socket and ask for another";
     case IMUD_E_SYSTEM: return strerror(errno);
     default: return "no error";
     }
@@ -476,22 +479,25 @@ static inline int imud_read_ledger(const imud_ring *ring, imud_ledger *out)
     return 0;
 }
 
-/* Waits until the eventfd is signalled, and clears it. The descriptor comes from imud's UNIX socket (SCM_RIGHTS).
- * Returns 1, or 0 after `timeout_ms` (-1: never), or IMUD_E_SYSTEM (errno EINTR after a signal). */
-static inline int imud_wait(int eventfd, int timeout_ms)
+/* Waits until the descriptor is readable, and drains it. It comes from imud's UNIX socket, method `notify` (SCM_RIGHTS);
+ * -1 stands for none, then this only waits. Returns 1, or 0 after `timeout_ms` (-1: never), or IMUD_E_ENDED when the
+ * daemon ended it (it would be readable for ever), or IMUD_E_SYSTEM (errno EINTR after a signal). */
+static inline int imud_wait(int wake_fd, int timeout_ms)
 {
     struct pollfd poller;
-    uint64_t count;
+    char bytes[256]; /* far more than wait in it: one read takes all */
+    ssize_t size_bytes;
     int ready;
-    poller.fd = eventfd;
+    poller.fd = wake_fd;
     poller.events = POLLIN;
     poller.revents = 0;
     ready = poll(&poller, 1, timeout_ms);
     if (ready <= 0)
         return ready < 0 ? IMUD_E_SYSTEM : 0;
-    if (read(eventfd, &count, sizeof count) != (ssize_t)sizeof count && errno != EAGAIN)
-        return IMUD_E_SYSTEM;
-    return 1;
+    size_bytes = read(wake_fd, bytes, sizeof bytes);
+    if (size_bytes == 0)
+        return IMUD_E_ENDED;
+    return size_bytes > 0 || errno == EAGAIN ? 1 : IMUD_E_SYSTEM; /* EAGAIN: another thread was faster */
 }
 
 #endif

@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import os
 import socket
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from imud.kit.status import ClientStatus
 from imud.publishers.outbox import NO_FD, Limits, Outbox
 from imud.publishers.rights import Peer, Rights
 from imud.publishers.subscription import Subscription
+from imud.publishers.waker import Waker
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +46,8 @@ class Connection:
         """Devices whose events are wanted; None for all, empty for none."""
         self.framed = False
         """Whether messages go out as frames; stays so once it is."""
-        self.eventfds: dict[str, int] = {}
-        """Per device, the descriptor that is counted up with every batch."""
+        self.wakers: dict[str, Waker] = {}
+        """By device whose batches wake the client."""
         self.closed = False
         self._sock = sock
         self._owner = owner
@@ -61,6 +61,8 @@ class Connection:
         """Send one JSON object, with a copy of a descriptor where one is given."""
         if not self.closed:
             self.outbox.put_reply(frame_of(body) if self.framed else line_of(body), fd)
+            if not self.outbox.waiting:
+                self._handed_over()
 
     def wants_events_of(self, device: str) -> bool:
         """Whether events of `device` are wanted; those of the daemon itself ("") go to all who want any."""
@@ -82,11 +84,32 @@ class Connection:
             queue_bytes=outbox.queue_bytes,
         )
 
-    def eventfd_of(self, device: str) -> int:
-        """The descriptor for batches of `device`, made on first use. Raises OSError."""
-        if device not in self.eventfds:
-            self.eventfds[device] = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        return self.eventfds[device]
+    def make_waker(self, device: str) -> int:
+        """A new descriptor for the client, to be sent with the next `post`: batches of `device` wake it, not the old.
+
+        Raises RpcError where that cannot be, for one while the old one still waits to be sent: it is not in place of
+        what the client has not seen, and a client that never reads would gather descriptors of the daemon's.
+        """
+        old = self.wakers.get(device)
+        if old is not None and old.client_end != NO_FD:
+            message = "notify: the reply to the one before still waits for this client; read it, then ask again"
+            raise RpcError(Code.UNAVAILABLE, message)
+        try:
+            waker = Waker()
+        except OSError as error:
+            raise RpcError(Code.UNAVAILABLE, f"notify: the daemon cannot make a descriptor: {error.strerror}") from None
+        if old is not None:
+            old.close()
+        self.wakers[device] = waker
+        return waker.client_end
+
+    def wake(self, device: str) -> bool:
+        """Wake the client if it wants that; False, once, when it has closed its descriptor, which ends it."""
+        waker = self.wakers.get(device)
+        if waker is None or waker.wake():
+            return True
+        self.wakers.pop(device).close()
+        return False
 
     def finish(self) -> None:
         """Take nothing more from the client, give it what waits, then close."""
@@ -112,9 +135,9 @@ class Connection:
         self._loop.remove_reader(self._sock)
         self.outbox.close()
         self._sock.close()
-        for fd in self.eventfds.values():
-            os.close(fd)
-        self.eventfds.clear()
+        for waker in self.wakers.values():
+            waker.close()
+        self.wakers.clear()
         self._input.clear()
         self._owner.on_close(self)
 
@@ -189,5 +212,11 @@ class Connection:
         self._broken("it does not read the answers to what it asks")
 
     def _emptied(self) -> None:
+        self._handed_over()
         if self._linger_ticks is not None:
             self.close()
+
+    def _handed_over(self) -> None:
+        """All that waited is sent, descriptors too."""
+        for waker in self.wakers.values():
+            waker.handed_over()

@@ -1,9 +1,7 @@
 """What all clients of the socket share: devices, newest samples, who wants what, and the way of a batch to them all."""
 
 import asyncio
-import os
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -56,8 +54,8 @@ class Plan:
     """Where a batch of one device goes. Made anew when anything changes, never changed: `publish` iterates over it."""
 
     groups: Sequence[Group]
-    eventfds: bool
-    """Whether any client has a descriptor that counts these batches."""
+    wakes: bool
+    """Whether these batches wake any client."""
 
 
 class Hub:
@@ -83,7 +81,7 @@ class Hub:
             plan = self._plans[batch.device] = self._make_plan(batch.device)
         for group in plan.groups:
             group.send(batch)
-        if plan.eventfds:
+        if plan.wakes:
             # Not now: whoever wakes reads shared memory, and its publisher may have its turn after this one.
             asyncio.get_running_loop().call_soon(self._wake, batch.device)
 
@@ -118,10 +116,9 @@ class Hub:
         return SocketStatus(self.path, self.clients(), self.accepted, self.refused, self.evicted)
 
     def _wake(self, device: str) -> None:
-        for connection in self.connections.values():
-            fd = connection.eventfds.get(device)
-            if fd is not None:
-                count_up(fd)
+        gone = [connection for connection in self.connections.values() if not connection.wake(device)]
+        if gone:
+            self.changed()
 
     def _make_plan(self, device: str) -> Plan:
         groups: dict[tuple[Form, tuple[str, ...] | None, bool], Group] = {}
@@ -138,19 +135,13 @@ class Hub:
                 group.direct.append(connection.outbox)
             else:
                 group.paced.append((pace, connection.outbox))
-        return Plan(tuple(groups.values()), any(device in c.eventfds for c in self.connections.values()))
+        return Plan(tuple(groups.values()), any(device in c.wakers for c in self.connections.values()))
 
 
 def post_all(connections: Iterable[Connection], body: bytes) -> None:
     """Send one JSON object to several clients."""
     for connection in connections:
         connection.post(body)
-
-
-def count_up(fd: int) -> None:
-    """Add one to an eventfd; one that is full is readable anyway."""
-    with suppress(BlockingIOError):
-        os.eventfd_write(fd, 1)
 
 
 def _encoding(wanted: Subscription, framed: bool) -> Encoding:

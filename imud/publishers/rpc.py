@@ -222,12 +222,9 @@ def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
 
 
 def _notify(hub: Hub, connection: Connection, params: NotifyParams) -> Answer:
-    """An eventfd that counts the batches of one device; the same one when asked again."""
+    """A descriptor that becomes readable with each batch of one device; asked again, a new one in place of the old."""
     _known_devices(hub, [params.device])
-    try:
-        fd = connection.eventfd_of(params.device)
-    except OSError as error:
-        raise RpcError(Code.UNAVAILABLE, f"notify: the daemon cannot make an eventfd: {error.strerror}") from None
+    fd = connection.make_waker(params.device)
     hub.changed()
     return Answer({"device": params.device}, fd)
 

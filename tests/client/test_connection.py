@@ -150,15 +150,23 @@ def test_an_event_of_a_kind_to_come_is_accepted() -> None:
         event_of({"t_ns": 1})
 
 
-def test_notify_gives_a_descriptor_that_counts(served: Daemon) -> None:
+def test_notify_gives_a_descriptor_that_wakes(served: Daemon) -> None:
     with Client(served.path) as client:
         watch = client.watch(timeout_s=5)
         publish(served, batch("imu0"))
         fd = client.notify("imu0")
         publish(served, batch("imu0", 2, 3), batch("imu1"), batch("imu0", 5))
         assert len(client.devices()) == 2  # behind the wake-ups
-        assert os.eventfd_read(fd) == 2
+        assert os.read(fd, 64)
+        with pytest.raises(BlockingIOError):
+            os.read(fd, 64)
+        another = client.notify("imu0")
+        assert os.read(fd, 64) == b""
+        publish(served, batch("imu0", 6))
+        assert len(client.devices()) == 2
+        assert os.read(another, 64)
         os.close(fd)
+        os.close(another)
         assert next(watch).seq == 1
 
 

@@ -8,9 +8,10 @@ from random import Random
 import pytest
 
 from imud.client.ring import Ring
-from imud.errors import ServerError
+from imud.errors import LinkMissing, ServerError
 from imud.kit.shm_layout import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode_ledger_block
 from imud.kit.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, encode_slot
+from imud.publishers.waker import Waker
 from tests.publishers.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 
 
@@ -329,14 +330,37 @@ def test_ledger_that_changes_while_it_is_copied(board: Board) -> None:
 
 
 def test_wait(ring: Ring) -> None:
-    event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+    waker = Waker()
+    fd = os.dup(waker.client_end)
     try:
-        assert not ring.wait(event, 0)
-        os.eventfd_write(event, 3)
-        assert ring.wait(event)
-        assert not ring.wait(event, 0)
+        assert not ring.wait(fd, 0)
+        for _ in range(3):
+            assert waker.wake()
+        assert ring.wait(fd)
+        assert not ring.wait(fd, 0)
+        assert waker.wake()
+        waker.close()
+        assert ring.wait(fd)
+        for _ in range(2):  # readable for ever: no busy loop
+            with pytest.raises(LinkMissing, match="ask for another"):
+                ring.wait(fd)
     finally:
-        os.close(event)
+        waker.close()
+        os.close(fd)
+
+
+def test_wait_when_another_was_faster(ring: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
+    waker = Waker()
+    assert waker.wake()
+    read = os.read
+
+    def late(fd: int, size: int) -> bytes:
+        read(fd, size)
+        return read(fd, size)
+
+    monkeypatch.setattr(os, "read", late)
+    assert ring.wait(waker.client_end, 0)
+    waker.close()
 
 
 def test_close_twice(board: Board) -> None:

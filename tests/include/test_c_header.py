@@ -23,6 +23,7 @@ from imud.kit.shm_layout import (
 )
 from imud.kit.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES, encode_slot
 from imud.ledger import LEDGER_FIELDS
+from imud.publishers.waker import Waker
 from imud.sample import Sample
 from tests.publishers.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 
@@ -261,11 +262,20 @@ def test_ledger(board: Board, reader: Reader) -> None:
 
 
 def test_wait(build: Build, board: Board) -> None:
-    event = os.eventfd(2, os.EFD_CLOEXEC)
-    with Reader(build(READER, "c99"), board.path, (event,)) as reader:
-        assert reader.ask(f"wait {event} 10000") == ["wait", "1"]
-        assert reader.ask(f"wait {event} 0") == ["wait", "0"]
-    os.close(event)
+    waker = Waker()
+    fd = waker.client_end
+    with Reader(build(READER, "c99"), board.path, (fd,)) as reader:
+        assert reader.ask(f"wait {fd} 0") == ["wait", "0"]
+        assert reader.ask("wait -1 0") == ["wait", "0"]
+        assert waker.wake()
+        assert waker.wake()
+        assert reader.ask(f"wait {fd} 10000") == ["wait", "1"]
+        assert reader.ask(f"wait {fd} 0") == ["wait", "0"]
+        assert waker.wake()
+        waker.close()
+        assert reader.ask(f"wait {fd} 10000") == ["wait", "1"]
+        assert reader.ask(f"wait {fd} 10000") == ["wait", "-7"]
+        assert reader.ask("wait 999 10000") == ["wait", "-5"]
 
 
 def header_with(name: str, value: int) -> bytes:

@@ -14,8 +14,9 @@ from imud.kit.jsonrpc import encode_notification
 from imud.kit.slot import SLOT_BYTES, decode_slot
 from imud.publishers.connection import Connection
 from imud.publishers.encoding import JsonEncoding
-from imud.publishers.outbox import Limits, Outbox
+from imud.publishers.outbox import NO_FD, Limits, Outbox
 from imud.publishers.socket import SocketServer
+from imud.publishers.waker import BYTE
 from tests.publishers.socket_rig import Peer, batch, run, serving, until
 
 
@@ -236,10 +237,11 @@ def test_a_descriptor_waits_its_turn_behind_what_is_queued(tmp_path: Path) -> No
             fill(server)
             (connection,) = server.hub.connections.values()
             await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
-            await until(lambda: bool(connection.eventfds))
+            await until(lambda: bool(connection.wakers))
             server.publish(batch("imu1", 8000, 2))  # waits behind the reply
             assert await descriptors(peer, connection) == 1
             await until(lambda: not connection.outbox.waiting)
+            assert connection.wakers["imu0"].client_end == NO_FD  # sent, so the daemon has no copy left
             data, fds, _flags, _address = socket.recv_fds(peer.sock, 65536, 4)
             assert b'"seq":8001' in data
             assert not fds
@@ -275,8 +277,8 @@ async def descriptors(peer: Peer, connection: Connection) -> int:
             at = len(data)
             found += fds
     assert at - READ_BYTES <= data.index(b'{"jsonrpc":"2.0","id":7,') < at  # with the first byte of its reply
-    os.eventfd_write(connection.eventfds["imu0"], 5)
-    assert [os.eventfd_read(fd) for fd in found] == [5]
+    assert connection.wake("imu0")
+    assert [os.read(fd, 64) for fd in found] == [BYTE]
     for fd in found:
         os.close(fd)
     return len(found)

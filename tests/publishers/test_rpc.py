@@ -82,7 +82,7 @@ def test_bad_parameters(tmp_path: Path, method: str, params: dict[str, Any], wor
             assert words in message
             (connection,) = server.hub.connections.values()
             assert connection.subscription is None
-            assert not connection.eventfds
+            assert not connection.wakers
             peer.close()
 
     run(body)
@@ -112,7 +112,7 @@ def test_notifications_act_and_are_not_answered(tmp_path: Path) -> None:
             assert (await peer.message())["id"] == 9
             (connection,) = server.hub.connections.values()
             assert connection.subscription is not None
-            assert not connection.eventfds
+            assert not connection.wakers
             peer.close()
 
     run(body)

@@ -249,53 +249,6 @@ def test_events_go_to_those_who_want_them(tmp_path: Path) -> None:
     run(body)
 
 
-def test_notify_counts_batches_of_one_device(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"notify","params":{"device":"imu0"}}\n')
-            await until(lambda: any(c.eventfds for c in server.hub.connections.values()))
-            data, fds, _flags, _address = socket.recv_fds(peer.sock, 4096, 4)
-            assert data == b'{"jsonrpc":"2.0","id":1,"result":{"device":"imu0"}}\n'
-            (fd,) = fds
-            for first in (1, 2, 3):
-                server.publish(batch("imu0", first, 2))
-            server.publish(batch("imu1"))
-            counted = asyncio.Event()
-            asyncio.get_running_loop().call_soon(counted.set)  # behind the wake-ups
-            await counted.wait()
-            assert os.eventfd_read(fd) == 3
-            await peer.result("notify", device="imu0")  # the same one again, not a new one
-            (connection,) = server.hub.connections.values()
-            assert len(connection.eventfds) == 1
-            os.close(fd)
-            await peer.result("notify", device="imu1")
-            server.publish(batch("imu1", 2))
-            await peer.result("poll")
-            assert os.eventfd_read(connection.eventfds["imu1"]) == 1
-            own = connection.eventfds["imu0"]
-            peer.close()
-            await until(lambda: not server.hub.connections)
-            with pytest.raises(OSError, match="Bad file descriptor"):
-                os.fstat(own)
-
-    run(body)
-
-
-def test_a_full_eventfd_stops_nothing(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.result("notify", device="imu0")
-            (connection,) = server.hub.connections.values()
-            os.eventfd_write(connection.eventfds["imu0"], 2**64 - 2)
-            server.publish(batch())
-            assert len(await peer.result("devices")) == 2
-            peer.close()
-
-    run(body)
-
-
 def test_one_client_too_many_is_told_so(tmp_path: Path) -> None:
     async def body() -> None:
         async with serving(tmp_path, clients_max=2) as server:
