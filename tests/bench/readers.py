@@ -25,8 +25,9 @@ CHUNK = 1 << 18
 class Latency:
     """What the first client saw: samples, gaps in `seq`, time from the write into the pty to the receive."""
 
-    def __init__(self, times: mmap.mmap | None) -> None:
+    def __init__(self, times: mmap.mmap | None, skip: int) -> None:
         self.times = times
+        self.skip = skip
         self.latencies_ns: list[int] = []
         self.samples = 0
         self.gaps = 0
@@ -39,7 +40,7 @@ class Latency:
         if last is not None:
             self.gaps += seq - last - 1
         self.last[device] = seq
-        if self.times is not None:
+        if self.times is not None and index >= self.skip:
             self.latencies_ns.append(now_ns - struct.unpack_from("<q", self.times, 8 * index)[0])
 
 
@@ -127,13 +128,14 @@ def main() -> None:
     parser.add_argument("--stuck", action="store_true")
     parser.add_argument("--times")
     parser.add_argument("--frames", type=int, default=0)
+    parser.add_argument("--skip", type=int, default=0, help="frames at the beginning whose latency does not count")
     parser.add_argument("--seconds", type=float, default=3600.0)
     args = parser.parse_args()
     times = None
     if args.times:
         with open(args.times, "rb") as file:
             times = mmap.mmap(file.fileno(), 8 * args.frames, access=mmap.ACCESS_READ)
-    seen = Latency(times)
+    seen = Latency(times, args.skip)
     stuck = subscribe(args.socket, args.encoding, args.bare) if args.stuck else None
     socks = [subscribe(args.socket, args.encoding, args.bare) for _ in range(args.clients)]
     print("ready", flush=True)
