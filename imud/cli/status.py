@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 def block(status: DeviceStatus) -> str:
     """One device for people."""
     clock, ledger = status.clock, status.ledger
-    words = " ".join(f"{name}={value}" for name, value in status.identity.items()) or "not known"
+    words = " ".join(dict.fromkeys(status.identity.values())) or "not known"
     lines = [
         f"{status.name}: {status.state}" + (f" ({status.problem})" if status.problem else ""),
         f"  link      {status.link}, driver {status.driver}, opened {status.connects} times",
