@@ -111,7 +111,8 @@ DEVICE_FAMILIES: Final = (
     ),
     Family("imud_frames_pending", "Good frames that wait for the rest of their sample.", (), _ledger("frames_pending")),
     Family(
-        "imud_frames_bad_total", "Damaged frames by reason; not_finite ones are used, without those values.", ("reason",),
+        "imud_frames_bad_total", "Damaged frames by reason; not_finite ones are used without those values.",
+        ("reason",),
         _ledger(
             "crc=frames_bad_crc", "length=frames_bad_length", "content=frames_bad_content",
             "not_finite=frames_not_finite",
