@@ -11,7 +11,8 @@ A new row of a table is configurable without a change here. Errors name file, li
 what is there; all that can be found in one pass are reported together.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from pathlib import Path
@@ -115,12 +116,25 @@ class Row(Protocol):
         ...
 
 
+class LinkRow(Row, Protocol):
+    """What the configuration needs to know of a link besides."""
+
+    @property
+    def searchable(self) -> bool:
+        """Whether `driver: auto` finds out what talks on it."""
+        ...
+
+    def fits(self, driver: Any) -> bool:
+        """Whether a driver can use such a link."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Tables:
     """The tables that the schema is made from."""
 
     drivers: Mapping[str, Row]
-    links: Mapping[str, Row]
+    links: Mapping[str, LinkRow]
     publishers: Mapping[str, Row]
 
 
@@ -245,6 +259,8 @@ class _Reader:
         if general is None or link is None:
             return None
         link_name, link_settings = link
+        if general.driver == "auto" or options is not None:
+            self._driver_fits(path, general.driver, link_name)
         line = self._tree.key_mark(path).line
         device = DeviceConfig(name, general.driver, options, general.identify, link_name, link_settings, line)
         return device, general.enabled
@@ -273,6 +289,25 @@ class _Reader:
             return None
         settings = self._row(self._tables.links, names[0], keys[names[0]], (*path, names[0]))
         return None if settings is None else (names[0], settings)
+
+    def _driver_fits(self, path: KeyPath, driver: str, link: str) -> None:
+        """Refuse a driver on a link that does not carry what it speaks."""
+        links, drivers = self._tables.links, self._tables.drivers
+        if driver == "auto" and not links[link].searchable:
+            known = ", ".join(self._fitting((name, name, link) for name in drivers))
+            self._problem(path, f"expected a driver to be named for {link} ({known}), got auto", at_key=True)
+        elif driver in drivers and link not in (fitting := self._fitting((name, driver, name) for name in links)):
+            message = f"expected a link that {driver} can use ({', '.join(fitting)}), got {link}"
+            self._problem((*path, link), message, at_key=True)
+
+    def _fitting(self, pairs: Iterable[tuple[str, str, str]]) -> list[str]:
+        """Names of those (name, driver, link) that go together, as far as their parts are installed."""
+        found = []
+        for name, driver, link in pairs:
+            with suppress(ImportError):
+                if self._tables.links[link].fits(self._tables.drivers[driver]):
+                    found.append(name)
+        return found
 
     def _ports_once(self, devices: Sequence[DeviceConfig]) -> None:
         """Refuse two devices on one port. Links that own a port exclusively call its key `port`."""

@@ -1,6 +1,6 @@
 """The daemon: one event loop that owns every configured device and every output.
 
-DeviceRunner ──Batch──▶ Publisher ×n        (publish: a plain loop over bound methods)
+Device ──Batch──▶ Publisher ×n              (publish: a plain loop over bound methods)
 tick, 10 Hz ──▶ runners, publishers         SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
 """
 
@@ -16,12 +16,19 @@ from typing import cast
 
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
+from imud.devices import DRIVERS
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
 from imud.kit.batch import Batch
+from imud.kit.can import CanDriver
 from imud.kit.publisher import Publisher, PublisherContext, PublisherSettings
 from imud.kit.status import DeviceState, DeviceStatus
+from imud.links import LINKS
 from imud.notify import notify, watchdog_interval_s
+from imud.pipeline.bus import Buses
+from imud.pipeline.can_runner import CanRunner
+from imud.pipeline.device import Device
+from imud.pipeline.polled import PolledRunner
 from imud.pipeline.remembered import Remembered
 from imud.pipeline.runner import DeviceRunner
 from imud.publishers import PUBLISHERS
@@ -56,8 +63,9 @@ class Daemon:
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
         self._sinks: list[Callable[[Batch], None]] = []
-        self._runners: dict[str, DeviceRunner] = {}
+        self._runners: dict[str, Device] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._buses = Buses()
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
         self._failure: BaseException | None = None
@@ -173,11 +181,20 @@ class Daemon:
         device_id = self._ids.setdefault(device.name, len(self._ids))
         for publisher in self._publishers.values():
             publisher.add_device(device.name, device_id)
-        runner = DeviceRunner(device, device_id, self._publish, self._tell, self._remembered)
+        runner = self._new_runner(device, device_id)
         self._runners[device.name] = runner
         task = asyncio.create_task(runner.run(), name=device.name)
         task.add_done_callback(self._on_done)
         self._tasks[device.name] = task
+
+    def _new_runner(self, device: DeviceConfig, device_id: int) -> Device:
+        """The kind of runner that the device's link needs."""
+        link, publish, tell = LINKS[device.link], self._publish, self._tell
+        if link.polled:
+            return PolledRunner(device, device_id, publish, tell, self._buses)
+        if isinstance(DRIVERS.get(device.driver), CanDriver):
+            return CanRunner(device, device_id, publish, tell)
+        return DeviceRunner(device, device_id, publish, tell, self._remembered)
 
     def _stop_device(self, name: str) -> None:
         self._tasks.pop(name).cancel()
@@ -235,6 +252,7 @@ class Daemon:
         await asyncio.gather(*tasks, return_exceptions=True)
         for runner in self._runners.values():
             runner.close()
+        self._buses.end()
         for publisher in self._publishers.values():
             publisher.tick(monotonic_ns())
             publisher.close()

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from imud.kit.codec import CodecEvent, StreamCodec, TextLine
+from imud.kit.codec import CodecEvent, StreamCodec, message_of
 from imud.kit.driver import StreamDriver
 from imud.kit.session import Request
 from imud.ledger import Ledger
@@ -315,16 +315,18 @@ class _Visit:
         return max((trial.good_frames() for trial in self.trials), default=0)
 
     def _look_for_reply(self, trial: _Trial, events: Sequence[CodecEvent]) -> None:
-        """A reply is at least one line that belongs to it and its end; an end alone (`OK`) many devices say."""
+        """A reply has as many messages as the question wants: an end alone (`OK`) many devices say."""
         question = self.question
         if question is None or trial.driver is not self.asked:
             return
         for event in events:
-            if isinstance(event, TextLine):
-                if question.is_end(event.text):
-                    self.answered |= self.reply_parts > 0
-                elif question.is_part(event.text):
-                    self.reply_parts += 1
+            message = message_of(event)
+            if message is None:
+                continue
+            if question.is_end(message):
+                self.answered |= self.reply_parts + 1 >= question.messages_min
+            elif question.is_part(message):
+                self.reply_parts += 1
 
 
 def _usable(remembered: tuple[str, int] | None, drivers: Sequence[StreamDriver], bauds: Sequence[int]) -> int | None:

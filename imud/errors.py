@@ -10,9 +10,13 @@ ImudError
  │   ├─ BadArgument      cannot be sent: an argument is out of range
  │   ├─ NoReply          no reply came in time
  │   └─ Rejected         the device answered that it will not
+ ├─ TransferError        one transfer on a bus failed; the next may go through
+ ├─ DeviceRefused        what answers on a bus is not the device, or does not do what it is told
  ├─ NothingHeard         detection found no device
  └─ ServerError          the daemon's own interfaces: socket in use, shared memory not writable, protocol violated
 """
+
+from enum import StrEnum
 
 
 class ImudError(Exception):
@@ -53,6 +57,29 @@ class NoReply(CommandError):
 
 class Rejected(CommandError):
     """The device answered that it will not. Example: `ERR` after a command with a value it does not take."""
+
+
+class Trouble(StrEnum):
+    """How a transfer failed."""
+
+    ABSENT = "absent"
+    """Nobody acknowledges the address: not powered, not wired, another address."""
+    STUCK = "stuck"
+    """The bus did not come free in time: a line held low, a short circuit."""
+    DISTURBED = "disturbed"
+    """The controller saw an error on the bus, or another controller was quicker."""
+
+
+class TransferError(ImudError):
+    """One transfer on a bus failed; the next may go through. Example: no acknowledgement from address 0x18."""
+
+    def __init__(self, trouble: Trouble, message: str) -> None:
+        super().__init__(message)
+        self.trouble = trouble
+
+
+class DeviceRefused(ImudError):
+    """What answers is not the device, or does not do what it is told. Example: a wrong product id."""
 
 
 class NothingHeard(ImudError):

@@ -18,7 +18,15 @@ BEGIN, END = "<!-- keys: begin -->\n", "<!-- keys: end -->\n"
 
 
 def docs_of(schema: type[Settings]) -> dict[str, str]:
-    """The docstring below each field."""
+    """The docstring below each field, its own and those it has from a base class."""
+    found: dict[str, str] = {}
+    for base in reversed(schema.__mro__):
+        if issubclass(base, Settings):
+            found |= _own_docs_of(base)
+    return found
+
+
+def _own_docs_of(schema: type[Settings]) -> dict[str, str]:
     (made,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
     assert isinstance(made, ast.ClassDef)
     found, name = {}, ""
@@ -47,7 +55,8 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
     """The default as one would write it; file modes in octal."""
     if field.required:
         return "needed"
-    return f"`{field.default:#o}`" if field.name == "mode" else f"`{shown(field.default)}`"
+    octal = field.name == "mode" and isinstance(field.default, int)
+    return f"`{field.default:#o}`" if octal else f"`{shown(field.default)}`"
 
 
 def tables() -> str:

@@ -8,7 +8,7 @@ from typing import Final
 
 from imud.kit.codec import BadFrame, BadReason, CodecEvent, StreamCodec, TextLine
 from imud.kit.driver import Identity, StreamDriver
-from imud.kit.session import Outcome, Request
+from imud.kit.session import Outcome, Request, of_text
 from imud.kit.settings import NoSettings
 from imud.ledger import Ledger
 from imud.sample import Measurement
@@ -90,13 +90,20 @@ class FakeCodec:
         return end
 
 
+def _query(payload: bytes, name: str) -> Request:
+    is_end, is_error, is_part = (
+        of_text(holds) for holds in (lambda line: line == "OK", lambda line: line == "ERR", lambda line: "=" in line)
+    )
+    return Request(payload, name, is_end, is_error, is_part, messages_min=2)
+
+
 def _identify() -> Generator[Request, Outcome, Identity]:
-    yield Request(QUERY, "WHO", lambda line: line == "OK", lambda line: line == "ERR", lambda line: "=" in line)
+    yield _query(QUERY, "WHO")
     return Identity("FAKE")
 
 
 def _read_settings() -> Generator[Request, Outcome, Mapping[str, str]]:
-    yield Request(b"SET\r\n", "SET", lambda line: line == "OK", lambda line: line == "ERR", lambda line: "=" in line)
+    yield _query(b"SET\r\n", "SET")
     return {}
 
 

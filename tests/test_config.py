@@ -58,6 +58,12 @@ class DriverSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 @dataclass(frozen=True)
 class FakeRow:
     settings: type[Settings]
+    searchable: bool = True
+    refuses: type[Settings] | None = None
+    """Settings of a driver that does not fit this link."""
+
+    def fits(self, driver: "FakeRow") -> bool:
+        return driver.settings is not self.refuses
 
 
 class Broken(Mapping[str, FakeRow]):
@@ -329,12 +335,19 @@ def test_shipped_file_shows_the_defaults() -> None:
     plain, full = config.load(SHIPPED), config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml")
     assert full.publishers == plain.publishers
     assert (full.log_level, full.state_dir) == (plain.log_level, plain.state_dir)
-    assert [d.link for d in full.devices] == ["uart", "uart", "replay", "memory"]
-    imu, rear, recorded, nothing = full.devices
-    assert replace(imu, line=0) == replace(plain.devices[0], line=0)
-    assert rear.options == DRIVERS["hipnuc-uart"].settings()
-    assert recorded.link_settings == msgspec.convert({"path": "/var/lib/imud/drive.cap"}, LINKS["replay"].settings)
-    assert nothing.link_settings == LINKS["memory"].settings()
+    named = {device.name: device for device in full.devices}
+    assert replace(named["imu"], line=0) == replace(plain.devices[0], line=0)
+    for device in full.devices:
+        if device.options is not None:
+            assert device.options == DRIVERS[device.driver].settings()
+    assert named["recorded"].link_settings == msgspec.convert(
+        {"path": "/var/lib/imud/drive.cap"}, LINKS["replay"].settings
+    )
+    assert named["mast"].link_settings == msgspec.convert({"interface": "can0"}, LINKS["socketcan"].settings)
+    assert named["gimbal"].link_settings == msgspec.convert({"port": "/dev/spidev0.0"}, LINKS["spi"].settings)
+    for name, link in (("keel", "i2c"), ("nothing", "memory")):
+        assert named[name].link_settings == LINKS[link].settings()
+    assert {device.link for device in full.devices} == set(LINKS)
 
 
 def test_shipped_file_has_every_key() -> None:
@@ -374,3 +387,24 @@ def test_loading_opens_only_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
     config.load(SHIPPED)
     assert not [path for path in opened if str(path).startswith("/dev")]
     assert SHIPPED in opened
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("{socketcan: {interface: can0}}", "expected a driver to be named for socketcan (imu61x-can), got auto"),
+        ("{driver: hipnuc-uart, socketcan: {interface: can0}}", "expected a link that hipnuc-uart can use (uart, "),
+        ("{driver: imu61x-can, uart: {port: x}}", "expected a link that imu61x-can can use (socketcan, "),
+        ("{driver: imu61x-can, socketcan: {interface: c, bitrate: 500000}}", "expected none with backend socketcan"),
+    ],
+)
+def test_driver_and_link_must_go_together(device: str, message: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        config.parse(f"devices:\n  a: {device}\n", "x.yaml")
+    assert message in str(refused.value)
+
+
+@pytest.mark.parametrize("link", ["socketcan: {interface: can0}", "replay: {path: a.log}", "memory: {}"])
+def test_a_can_driver_on_the_links_that_carry_frames(link: str) -> None:
+    (device,) = config.parse(f"devices:\n  a: {{driver: imu61x-can, {link}}}\n", "x.yaml").devices
+    assert device.driver == "imu61x-can"

@@ -1,7 +1,9 @@
-"""`imud decode`: a raw capture in, one JSON object per message out, as gpsdecode does for GNSS receivers.
+"""`imud decode`: a capture in, one JSON object per message out, as gpsdecode does for GNSS receivers.
 
-Objects: a measurement with the field names of a sample (`t_dev_ns` unwrapped; no host time, a capture of bytes has
-none), `{"text": …}` for a line of text, `{"bad_frame": reason, "raw": hex}` for a damaged frame.
+A capture is bytes, raw or time-stamped, or for CAN drivers a log of `candump -L`. Objects: a measurement with the field
+names of a sample (`t_dev_ns` unwrapped, or `index` of a device that numbers its samples; no host time),
+`{"text": …}` for a line of text, `{"reply": kind, "payload": hex}` for a binary reply,
+`{"bad_frame": reason, "raw": hex}` for a damaged frame.
 """
 
 import argparse
@@ -13,9 +15,11 @@ import msgspec
 
 from imud.devices import DRIVERS
 from imud.errors import ImudError
+from imud.kit.can import CanDriver
+from imud.kit.candump import CandumpReader
 from imud.kit.capture import read_capture
-from imud.kit.codec import BadFrame, CodecEvent, TextLine
-from imud.kit.driver import StreamDriver
+from imud.kit.codec import BadFrame, CodecEvent, ReplyFrame, TextLine
+from imud.kit.driver import SAMPLE_COUNTER, Driver, StreamDriver
 from imud.ledger import Ledger
 from imud.sample import Measurement
 
@@ -50,27 +54,43 @@ def open_capture(name: str) -> BinaryIO:
         raise ImudError(f"{name}: {error.strerror}") from error
 
 
-def decode(file: BinaryIO, driver: StreamDriver, ledger: Ledger) -> Iterator[str]:
-    """JSON lines of everything in `file`, which is a raw or a time-stamped capture."""
-    codec = driver.make_codec(ledger, driver.settings())
+def decode(file: BinaryIO, driver: Driver, ledger: Ledger) -> Iterator[str]:
+    """JSON lines of everything in `file`. Raises ImudError for a driver without captures, or a file that is none."""
     times = DeviceTime(driver)
-    encode = msgspec.json.encode
-    for _, data in read_capture(file):
-        for event in codec.feed(data):
-            yield encode(as_object(event, times)).decode() + "\n"
-    for event in codec.flush():
-        yield encode(as_object(event, times)).decode() + "\n"
+    for event in events_in(file, driver, ledger):
+        yield msgspec.json.encode(as_object(event, times)).decode() + "\n"
+
+
+def events_in(file: BinaryIO, driver: Driver, ledger: Ledger) -> Iterator[CodecEvent]:
+    """Everything that the driver's codec says of a capture."""
+    if isinstance(driver, StreamDriver):
+        codec = driver.make_codec(ledger, driver.settings())
+        for _, data in read_capture(file):
+            yield from codec.feed(data)
+        yield from codec.flush()
+    elif isinstance(driver, CanDriver):
+        frame_codec = driver.make_codec(ledger, driver.settings())
+        log = CandumpReader(file)
+        for frame in log:
+            yield from frame_codec.feed_frame(frame.can_id, frame.extended, frame.data)
+        yield from frame_codec.flush()
+        if log.problem:
+            print(log.problem, file=sys.stderr)
+    else:
+        raise ImudError(f"{driver.name} has no captures: a device on a polled bus sends nothing by itself")
 
 
 def as_object(event: CodecEvent, times: "DeviceTime") -> dict[str, object]:
     """One codec event as the object that is printed."""
     if isinstance(event, TextLine):
         return {"text": event.text}
+    if isinstance(event, ReplyFrame):
+        return {"reply": event.frame_id, "payload": event.payload.hex()}
     if isinstance(event, BadFrame):
         return {"bad_frame": str(event.reason), "raw": event.raw.hex()}
     shown: dict[str, object] = {}
     if event.dev_ticks is not None:
-        shown["t_dev_ns"] = times.unwrap(event.dev_ticks)
+        shown[times.key] = times.unwrap(event.dev_ticks)
     for name in Measurement.__struct_fields__:
         value = getattr(event, name)
         if value is not None and name not in NOT_SHOWN:
@@ -81,15 +101,18 @@ def as_object(event: CodecEvent, times: "DeviceTime") -> dict[str, object]:
 class DeviceTime:
     """Unwraps device ticks without a host clock: a step back by more than half the range is a rollover."""
 
-    def __init__(self, driver: StreamDriver) -> None:
+    def __init__(self, driver: Driver) -> None:
         self._driver = driver
+        self._tick = 1 if driver.tick_ns == SAMPLE_COUNTER else driver.tick_ns
+        self.key = "index" if driver.tick_ns == SAMPLE_COUNTER else "t_dev_ns"
+        """What the unwrapped ticks are: device time in ns, or the number of the sample."""
         self._last: int | None = None
         self._turns = 0
 
     def unwrap(self, ticks: int) -> int:
-        """Device time in ns since the device's zero."""
+        """Device time in ns since the device's zero, or the sample's number."""
         modulus = self._driver.tick_modulus
         if self._last is not None and self._last - ticks > modulus // 2:
             self._turns += 1
         self._last = ticks
-        return (self._turns * modulus + ticks) * self._driver.tick_ns
+        return (self._turns * modulus + ticks) * self._tick

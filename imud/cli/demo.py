@@ -1,4 +1,4 @@
-"""`imud demo`: the real daemon on a simulated sensor behind a real pty, watched by a real client.
+"""`imud demo`: the real daemon on a simulated sensor behind a real pty or CAN interface, watched by a real client.
 
 Three processes, as in life: the simulator plays the module, `imud run` owns its port, and this one is a client that
 shows what arrives. At the end it prints rates, latency and the ledger.
@@ -22,7 +22,8 @@ from imud.cli.demo_view import View
 from imud.cli.status import block, closes
 from imud.client import Client
 from imud.errors import ImudError, LinkMissing
-from imud.sim import SIMULATORS
+from imud.sim import CAN_SIMULATORS, SIMULATORS
+from imud.sim.can_port import default_interface
 
 START_LIMIT_S = 10.0
 STOP_LIMIT_S = 5.0
@@ -32,7 +33,10 @@ FOUND_LIMIT_S = 10.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud demo`."""
-    parser.add_argument("--device", default="hipnuc-uart", choices=sorted(SIMULATORS), help="default: %(default)s")
+    parser.add_argument(
+        "--device", default="hipnuc-uart", choices=sorted([*SIMULATORS, *CAN_SIMULATORS]), help="default: %(default)s"
+    )
+    parser.add_argument("--interface", metavar="NAME", help="CAN interface of a CAN device (the first that is up)")
     parser.add_argument("--duration", type=float, metavar="S", help="stop after S seconds (default: at Ctrl-C)")
     parser.add_argument(
         "--rate", type=float, default=100.0, metavar="HZ", help="samples a second (default: %(default)s)"
@@ -42,10 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """0 when samples flowed and the ledger closed."""
+    interface = (args.interface or default_interface()) if args.device in CAN_SIMULATORS else ""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-demo-")))
-        stack.enter_context(simulator(folder, args.device, args.rate))
-        stack.enter_context(daemon(folder))
+        stack.enter_context(simulator(folder, args.device, args.rate, interface))
+        stack.enter_context(daemon(folder, device(folder, args.device, interface)))
         return show(folder / "imud.sock", args)
 
 
@@ -74,8 +79,8 @@ def show(path: Path, args: argparse.Namespace) -> int:
 
 
 @contextmanager
-def simulator(folder: Path, device: str, rate_hz: float) -> Iterator[None]:
-    """The simulated sensor, its port at `folder`/port."""
+def simulator(folder: Path, device: str, rate_hz: float, interface: str) -> Iterator[None]:
+    """The simulated sensor, its port at `folder`/port, or on a CAN interface."""
     argv = [
         sys.executable,
         "-m",
@@ -86,6 +91,8 @@ def simulator(folder: Path, device: str, rate_hz: float) -> Iterator[None]:
         str(rate_hz),
         "--path",
         str(folder / "port"),
+        "--interface",
+        interface,
     ]
     with child(argv, "the simulator", stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -94,16 +101,23 @@ def simulator(folder: Path, device: str, rate_hz: float) -> Iterator[None]:
         yield
 
 
+def device(folder: Path, name: str, interface: str) -> dict[str, object]:
+    """Configuration of the device that is simulated."""
+    if interface:
+        return {"driver": name, "socketcan": {"interface": interface}}
+    return {"driver": "auto", "uart": {"port": str(folder / "port"), "baud": "auto"}}
+
+
 @contextmanager
-def daemon(folder: Path) -> Iterator[None]:
-    """`imud run` on the simulator's port, with everything it needs below `folder`."""
+def daemon(folder: Path, settings: dict[str, object]) -> Iterator[None]:
+    """`imud run` on the simulated device, with everything it needs below `folder`."""
     tree = {
         "log_level": "error",
         "state_dir": str(folder),
         "socket": {"path": str(folder / "imud.sock")},
         "shm": {"directory": str(folder)},
         "metrics": {"port": 0},
-        "devices": {"demo": {"driver": "auto", "uart": {"port": str(folder / "port"), "baud": "auto"}}},
+        "devices": {"demo": settings},
     }
     file = folder / "imud.yaml"
     file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML

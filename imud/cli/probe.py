@@ -9,12 +9,12 @@ import msgspec
 from imud.cli.table import table
 from imud.config import DeviceConfig
 from imud.errors import CommandError, ImudError
-from imud.kit.codec import TextLine
+from imud.kit.codec import message_of
 from imud.kit.driver import Identity
 from imud.kit.link import StreamLink
 from imud.ledger import Ledger
 from imud.links import LINKS
-from imud.pipeline.runner import identity_words
+from imud.pipeline.device import identity_words
 from imud.pipeline.search import Finder, Finding
 from imud.pipeline.talk import Talk
 from imud.ports import list_ports
@@ -111,12 +111,12 @@ async def ask(found: Finding, link: StreamLink) -> Identity:
     """Who it is; nothing when it does not answer."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
-    talk = Talk(ledger, link.write)
+    talk = Talk(ledger, link.write, link.set_baud)
 
     def take(data: bytes, t_rx_ns: int) -> None:
         for event in codec.feed(data):
-            if isinstance(event, TextLine):
-                talk.on_text(event.text, t_rx_ns)
+            if (message := message_of(event)) is not None:
+                talk.on_message(message, t_rx_ns)
 
     link.start(take, lambda error: None)
     with contextlib.suppress(CommandError):

@@ -15,13 +15,17 @@ from imud.devices import DRIVERS
 from imud.errors import ImudError
 from imud.event import Event
 from imud.kit.batch import Batch
+from imud.kit.can import CanDriver
+from imud.links import LINKS
 
 SPEEDS = ("recorded", "real", "maximum")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud replay`."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="capture, raw or time-stamped")
+    parser.add_argument(
+        "file", type=Path, metavar="FILE", help="capture, raw or time-stamped; for CAN a log of candump -L"
+    )
     parser.add_argument("--driver", default="hipnuc-uart", choices=sorted(DRIVERS), help="default: %(default)s")
     parser.add_argument("--speed", default="maximum", choices=SPEEDS, help="default: %(default)s")
     parser.add_argument("--baud", type=int, default=115200, help="rate of a raw capture (default: %(default)s)")
@@ -37,11 +41,21 @@ def run(args: argparse.Namespace) -> int:
     if not args.file.is_file():
         raise ImudError(f"{args.file}: expected a capture file, found none")
     settings = config.parse(configuration(args), str(args.file))
+    check(settings.devices[0])
     daemon = Daemon(settings, extra={"print": Printer()} if args.json else {}, until_finished=True)
     asyncio.run(serve(daemon))
     status = daemon.status()[0]
     print(block(status), file=sys.stderr)
     return 0 if status.ledger["samples"] else 1
+
+
+def check(device: config.DeviceConfig) -> None:
+    """Raises LinkError for a file that cannot be played: the daemon would wait for a better one."""
+    row = LINKS[device.link]
+    is_can = isinstance(DRIVERS[device.driver], CanDriver)
+    link = row.make_can(device.link_settings) if is_can else row.make(device.link_settings)
+    link.open()
+    link.close()
 
 
 async def serve(daemon: Daemon) -> None:

@@ -66,12 +66,12 @@ class ArrivalSpread:
         self.period_ns = 0.0
         """Mean step between messages; 0 while unknown."""
 
-    def add(self, y: int) -> None:
-        """Take the arrival of a message, less its wire time."""
+    def add(self, y: int, steps: int = 1) -> None:
+        """Take the arrival of a message, less its wire time; `steps` messages after the one before."""
         last, self._last = self._last, y
         if not last:
             return
-        step = float(y - last)
+        step = (y - last) / steps
         if not self.period_ns:
             self.period_ns = step
             self._spread = FIRST_SPREAD_NS

@@ -15,6 +15,7 @@ from typing import Final
 
 from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
 from imud.clock.envelope import SLOPE_HIGHEST, Envelope
+from imud.clock.number import SampleNumber
 from imud.clock.slew import Slew
 from imud.clock.unwrap import DeviceTime
 from imud.kit.status import ClockStatus
@@ -48,12 +49,14 @@ class SampleClock:
     """Makes samples of one device's measurements.
 
     `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
-    known), `hold_ns` how long an adapter may hold bytes back (USB latency timer).
+    known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
+    the samples: it tells how many are missing, and the arrivals tell when they were.
     """
 
     def __init__(self, device: str, *, tick_ns: int, tick_modulus: int, byte_ns: int, hold_ns: int) -> None:
         self._device = device
         self._time = DeviceTime(tick_ns, tick_modulus)
+        self._number = SampleNumber(tick_modulus) if tick_ns == 0 else None
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._spread = ArrivalSpread()
         self._slew = Slew()
@@ -74,21 +77,22 @@ class SampleClock:
         self.missed = 0
         """Samples missing right before the newest one, by device time."""
 
-    def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int) -> Sample:
+    def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
         """The measurement with its place in time, as the next sample of the device.
 
         `t_rx_ns` is CLOCK_MONOTONIC right after the read that completed the message; it must not fall. Where it stands
         still for more messages than there is room for before it, `t_rx_ns` of the sample is lifted by nanoseconds.
-        `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC at the same moment.
+        `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC at the same moment. `t_begin_ns` is CLOCK_MONOTONIC when
+        the message began on the wire, where that is known (its first frame came earlier); None: by its size.
         """
         if t_rx_ns < self._t_rx_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
             t_rx_ns = self._t_rx_ns
         size_bytes, ticks = m.size_bytes, m.dev_ticks
         byte_ns = self._delay.byte_ns or 1
         trailing_ns = m.trailing_bytes * byte_ns
-        y = t_rx_ns - size_bytes * byte_ns - trailing_ns
-        if ticks is None:
-            wanted, t_dev_ns, sync = self._by_arrival(y, size_bytes), None, _ARRIVAL
+        y = t_rx_ns - size_bytes * byte_ns - trailing_ns if t_begin_ns is None else t_begin_ns
+        if ticks is None or self._number is not None:
+            wanted, t_dev_ns, sync = self._by_arrival(ticks, y, size_bytes), None, _ARRIVAL
         else:
             wanted = self._by_device(ticks, y, trailing_ns, t_rx_ns, size_bytes)
             t_dev_ns, sync = self._time.raw_ns, self._sync
@@ -106,6 +110,25 @@ class SampleClock:
         self._t_err_ns = t_err_ns = int(t_err) + 1 if t_err < T_ERR_MOST else T_ERR_MOST
         return Sample(
             self._device, seq, t_ns, t_err_ns, sync, t_rx_ns, t_ns + utc_offset_ns, t_dev_ns,
+            m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
+            m.incli_rad, m.status, m.pps_age_ms,
+        )  # fmt: skip
+
+    def sample_asked(self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int) -> Sample:
+        """A measurement that the host asked for, as the next sample of the device.
+
+        `t_ns` is CLOCK_MONOTONIC right before the asking, `t_err_ns` its one-sigma error, `t_rx_ns` right after the
+        answer. Where `t_ns` does not rise, it is lifted by nanoseconds.
+        """
+        self.missed = 0
+        self._spread.add(t_ns)
+        t_ns = max(t_ns, self._t_ns + 1)
+        t_rx_ns = max(t_rx_ns, self._t_rx_ns, t_ns)
+        self._t_ns, self._t_rx_ns = t_ns, t_rx_ns
+        self._seq = seq = self._seq + 1
+        self._t_err_ns = t_err_ns = min(t_err_ns, T_ERR_MOST)
+        return Sample(
+            self._device, seq, t_ns, t_err_ns, _ARRIVAL, t_rx_ns, t_ns + utc_offset_ns, None,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
             m.incli_rad, m.status, m.pps_age_ms,
         )  # fmt: skip
@@ -138,6 +161,8 @@ class SampleClock:
         """The device or the link came back: the next stamp begins anew and counts neither as a reset nor as a gap."""
         self._begun = False
         self._spread = ArrivalSpread()
+        if self._number is not None:
+            self._number.begun = False
         self.missed = 0
         self._forget()
 
@@ -147,11 +172,22 @@ class SampleClock:
 
     # --- by arrival ----------------------------------------------------------------------------------------------
 
-    def _by_arrival(self, y: int, size_bytes: int) -> int:
-        """Time of a message without device time."""
-        spread = self._spread
-        spread.add(y)
+    def _by_arrival(self, ticks: int | None, y: int, size_bytes: int) -> int:
+        """Time of a message without device time; it may have a number."""
+        spread, number = self._spread, self._number
         self.missed = 0
+        if number is None or ticks is None:
+            spread.add(y)
+        else:
+            steps = number.steps(ticks, y, spread.period_ns)
+            if steps:
+                self.missed = steps - 1
+                spread.add(y, steps)
+            else:
+                self._resets += number.begun
+                self._spread = spread = ArrivalSpread()
+                spread.add(y)
+            number.take(ticks, y)
         return self._from_arrival(y, size_bytes, spread.period_ns, spread.sigma_ns)
 
     def _from_arrival(self, y: int, size_bytes: int, period_ns: float, sigma_ns: float) -> int:
@@ -271,5 +307,7 @@ class SampleClock:
 
     def _period_ns(self) -> float:
         """Host time between samples; 0 while unknown."""
+        if self._number is not None:
+            return self._spread.period_ns
         time, envelope = self._time, self._envelope
         return time.period.period_ticks * time.tick_ns * (envelope.slope if envelope else 1.0)

@@ -1,4 +1,4 @@
-"""Attitude as quaternion, Euler angles (312) and rotation matrix, and every way between them.
+"""Attitude as quaternion, Euler angles (312 and ZYX) and rotation matrix, and every way between them.
 
 One convention for all: the rotation takes a vector from the body frame (right-handed: x right, y forward, z up) to the
 navigation frame ENU (x east, y north, z up), v_n = C v_b. Quaternions are scalar first and need not be of unit length;
@@ -7,6 +7,10 @@ q and -q are the same rotation. Euler angles are (roll, pitch, yaw) in rad and t
     C = Rz(yaw) · Rx(pitch) · Ry(roll)      yaw and roll in [-π, π], pitch in [-π/2, π/2]
 
 Pitch is about X and roll about Y; yaw is counter-clockwise seen from above. Source: HiPNUC manual V1.5.9, chapter 9.
+
+Other devices turn in the order Z → Y → X (the aerospace order, 321), with roll about X and pitch about Y:
+
+    C = Rz(yaw) · Ry(pitch) · Rx(roll)      yaw and roll in [-π, π], pitch in [-π/2, π/2]
 """
 
 import math
@@ -94,6 +98,35 @@ def quat_from_euler312(euler_rad: Vector3) -> Quaternion:
 def matrix_from_euler312(euler_rad: Vector3) -> Matrix3:
     """Rotation matrix body → navigation of (roll, pitch, yaw) in rad."""
     return matrix_from_quat(quat_from_euler312(euler_rad))
+
+
+def quat_from_euler_zyx(euler_rad: Vector3) -> Quaternion:
+    """Unit quaternion of (roll, pitch, yaw) in rad in the order ZYX: the product of those about Z, Y and X."""
+    roll, pitch, yaw = euler_rad
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    )
+
+
+def euler_zyx_from_matrix(matrix: Matrix3) -> Vector3:
+    """(roll, pitch, yaw) in rad of a rotation matrix in the order ZYX; straight up or down, roll is 0."""
+    (c00, c01, _), (c10, c11, _), (c20, c21, c22) = matrix
+    cos_pitch = math.hypot(c21, c22)
+    pitch = math.atan2(-c20, cos_pitch)
+    if cos_pitch < GIMBAL_COS_PITCH:
+        return (0.0, pitch, math.atan2(-c01, c11))
+    return (math.atan2(c21, c22), pitch, math.atan2(c10, c00))
+
+
+def euler_zyx_from_quat(quat_wxyz: Quaternion) -> Vector3:
+    """(roll, pitch, yaw) in rad in the order ZYX. Raises ValueError for a quaternion without direction."""
+    return euler_zyx_from_matrix(matrix_from_quat(quat_wxyz))
 
 
 def is_rotation(matrix: Matrix3, tolerance: float = 1e-6) -> bool:

@@ -37,7 +37,24 @@ class TextLine(msgspec.Struct, frozen=True, gc=False):
     text: str
 
 
-CodecEvent = Measurement | TextLine | BadFrame
+class ReplyFrame(msgspec.Struct, frozen=True, gc=False):
+    """One binary frame that answers a command and carries no sample; for CAN, a frame that does."""
+
+    frame_id: int
+    """Kind of the frame as the protocol numbers them; for CAN the identifier."""
+    payload: bytes
+
+
+Message = str | ReplyFrame
+"""What can answer a command: a line of text without its end, or a binary frame."""
+CodecEvent = Measurement | TextLine | ReplyFrame | BadFrame
+
+
+def message_of(event: CodecEvent) -> Message | None:
+    """The event as something that can answer a command, or None."""
+    if isinstance(event, TextLine):
+        return event.text
+    return event if isinstance(event, ReplyFrame) else None
 
 
 class StreamCodec(Protocol):

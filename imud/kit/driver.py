@@ -1,14 +1,17 @@
 """The row a device file ends with: everything the rest of imud needs to know about one wire protocol."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from random import Random
-from typing import Any
+from typing import Any, TypeVar
 
 from imud.kit.codec import StreamCodec
 from imud.kit.session import Conversation
 from imud.kit.settings import Settings
 from imud.ledger import Ledger
+
+SAMPLE_COUNTER = 0
+"""`tick_ns` of a device whose counter numbers its samples: a tick is one sample, its length is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,22 +25,18 @@ class Identity:
     """Everything else it said, by the device's own names."""
 
 
-@dataclass(frozen=True, slots=True)
-class StreamDriver:
-    """A device that sends a byte stream by itself (UART, RS-232, USB serial)."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Driver:
+    """What the rows of all wire protocols have; the links that a driver can use follow from its kind."""
 
     name: str
     """Family and link, for example `hipnuc-uart`."""
     title: str
     """Vendor and products, for people."""
-    baud_rates: tuple[int, ...]
-    """Rates the device knows, in bit/s, most likely first: detection tries them in this order."""
     settings: type[Settings]
-    """What can be configured of the codec (`options` of a device)."""
-    make_codec: Callable[[Ledger, Any], StreamCodec]
-    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    """What can be configured of the driver (`options` of a device)."""
     tick_ns: int
-    """Length of one device tick in ns."""
+    """Length of one device tick in ns, or SAMPLE_COUNTER."""
     tick_modulus: int
     """Device time counts 0 … tick_modulus - 1."""
     euler_convention: str
@@ -48,7 +47,25 @@ class StreamDriver:
     """Asks the device what it is. Sends only queries."""
     read_settings: Callable[[], Conversation[Mapping[str, str]]]
     """Reads back the device's own settings, by the device's own names. Sends only queries."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamDriver(Driver):
+    """A device that sends a byte stream by itself (UART, RS-232, USB serial)."""
+
+    baud_rates: tuple[int, ...]
+    """Rates the device knows, in bit/s, most likely first: detection tries them in this order."""
+    make_codec: Callable[[Ledger, Any], StreamCodec]
+    """Makes a codec that counts into the ledger, from an instance of `settings`."""
     apply_identity: Callable[[StreamCodec, Identity], None]
     """Tells the codec what is known of the device (the meaning of a field can depend on the firmware)."""
     example_frame: Callable[[Random], bytes]
     """One valid frame with random values, for the shared property tests and for fault injection."""
+
+
+D = TypeVar("D", bound=Driver)
+
+
+def of_kind(drivers: Iterable[Driver], kind: type[D]) -> list[D]:
+    """The drivers of one kind, in their order."""
+    return [driver for driver in drivers if isinstance(driver, kind)]

@@ -1,7 +1,8 @@
-"""Request and reply over a line that also carries samples, without I/O: text in, outcomes out, time as an argument.
+"""Request and reply over a link that also carries samples, without I/O: messages in, outcomes out, time as an argument.
 
-A dialogue of several requests is a generator (`Conversation`): it yields a `Request` and is sent the `Outcome`. The
-same generator is driven by the daemon's event loop, by a blocking probe, and by a test.
+A message is a line of text or a reply frame. A dialogue of several requests is a generator (`Conversation`): it yields
+a `Request` and is sent the `Outcome`. The same generator is driven by the daemon's event loop, by a blocking probe, and
+by a test.
 """
 
 from collections import deque
@@ -10,15 +11,16 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from imud.errors import CommandError
+from imud.kit.codec import Message, ReplyFrame
 from imud.ledger import Ledger
 from imud.units import NS_PER_S
 
 T = TypeVar("T")
 
-REPLY_LINES_MAX = 256
-"""No reply of either manual has more than some dozens of lines; more means that its end was lost."""
+REPLY_MESSAGES_MAX = 256
+"""No reply of any manual has more than some dozens of messages; more means that its end was lost."""
 LATE_WINDOW_NS = 5 * NS_PER_S
-"""Text up to this long after a time-out is taken for the late reply to the request that timed out."""
+"""What comes up to this long after a time-out is taken for the late reply to the request that timed out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,66 +28,98 @@ class Request:
     """One command, ready to send, with what its reply looks like."""
 
     payload: bytes
-    """Bytes for the wire."""
+    """Bytes for the link; empty sends nothing."""
     name: str
-    """The command as people write it, for messages."""
-    is_end: Callable[[str], bool]
-    """Whether this line ends the reply well."""
-    is_rejection: Callable[[str], bool]
-    """Whether this line ends the reply badly."""
-    is_part: Callable[[str], bool]
-    """Whether this line can belong to the reply; others are text of some other origin."""
+    """The command as people write it, for error messages."""
+    is_end: Callable[[Message], bool]
+    """Whether this message ends the reply well."""
+    is_rejection: Callable[[Message], bool]
+    """Whether this message ends the reply badly."""
+    is_part: Callable[[Message], bool]
+    """Whether this message can belong to the reply; others are of some other origin."""
     timeout_ns: int = NS_PER_S // 2
     silent: bool = False
     """The device never answers this one (it reboots, say): it is done once sent."""
-    lines_min: int = 1
-    """Fewest lines of a good reply, end line included: an end that comes sooner is that of an earlier, late reply."""
+    messages_min: int = 1
+    """Fewest messages of a good reply, its end included: an end that comes sooner is that of an earlier, late reply."""
+    baud: int = 0
+    """Rate in bit/s that the line must have from this request on; 0 for as it is. Serial lines only."""
+
+
+def never(_message: Message) -> bool:
+    """Holds for no message."""
+    return False
+
+
+def of_text(holds: Callable[[str], bool]) -> Callable[[Message], bool]:
+    """What holds for a message that is text for which `holds` does."""
+    return lambda message: isinstance(message, str) and holds(message)
+
+
+def pause(duration_ns: int, *, baud: int = 0) -> Request:
+    """Wait before the next request, at another rate if `baud` is given; its outcome is `Silence`."""
+    return Request(b"", "pause", never, never, never, duration_ns, baud=baud)
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
-    """The device answered: the lines, end line included."""
+class _Messages:
+    messages: tuple[Message, ...]
 
-    lines: tuple[str, ...]
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The messages that are text."""
+        return tuple(message for message in self.messages if isinstance(message, str))
+
+    @property
+    def frames(self) -> tuple[ReplyFrame, ...]:
+        """The messages that are frames."""
+        return tuple(message for message in self.messages if isinstance(message, ReplyFrame))
 
 
 @dataclass(frozen=True, slots=True)
-class Rejection:
-    """The device refused: the lines, the refusing line last."""
-
-    lines: tuple[str, ...]
+class Reply(_Messages):
+    """The device answered: the messages, the one that ends the reply last."""
 
 
 @dataclass(frozen=True, slots=True)
-class Silence:
-    """No complete reply came before the deadline; `lines` is the part that did."""
+class Rejection(_Messages):
+    """The device refused: the messages, the refusing one last."""
 
-    lines: tuple[str, ...]
+
+@dataclass(frozen=True, slots=True)
+class Silence(_Messages):
+    """No complete reply came before the deadline; `messages` is the part that did."""
 
 
 Outcome = Reply | Rejection | Silence
 Conversation = Generator[Request, Outcome, T]
 
 
-class TextSession:
+def says_nothing(value: T) -> Conversation[T]:
+    """The conversation with a device that cannot be asked: no request, and `value` as its end."""
+    return value
+    yield  # makes it a generator
+
+
+class Session:
     """One outstanding request at a time; late replies are told from fresh ones and counted.
 
-    Devices answer in the order they were asked. A line is late when it can belong to the request that timed out and
-    not to the outstanding one, or when it ends a reply whose lines were late. Two requests whose replies are the end
-    line alone cannot be told apart: there the first end line counts for the outstanding one.
+    Devices answer in the order they were asked. A message is late when it can belong to the request that timed out and
+    not to the outstanding one, or when it ends a reply whose messages were late. Two requests whose replies are the
+    same single message cannot be told apart: there the first one counts for the outstanding request.
 
-    Synchronization: one thread. The owner sends `start()`'s bytes, passes every text line to `on_line()`, and calls
+    Synchronization: one thread. The owner sends `start()`'s bytes, passes every message to `on_message()`, and calls
     `on_time()` at `deadline_ns`.
     """
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
         self._request: Request | None = None
-        self._lines: deque[str] = deque(maxlen=REPLY_LINES_MAX)
+        self._messages: deque[Message] = deque(maxlen=REPLY_MESSAGES_MAX)
         self._timed_out: Request | None = None
         self._timed_out_ns = 0
-        self._late_lines = 0
-        """Lines of the late reply that is just arriving."""
+        self._late_messages = 0
+        """Messages of the late reply that is just arriving."""
         self.deadline_ns: int | None = None
         """When the outstanding request times out (CLOCK_MONOTONIC), or None."""
 
@@ -98,23 +132,23 @@ class TextSession:
         """Make `request` the outstanding one and return its bytes. Raises CommandError when one is outstanding."""
         if self._request is not None:
             raise CommandError(f"{request.name}: still waiting for the reply to {self._request.name}")
-        self._lines.clear()
+        self._messages.clear()
         if not request.silent:
             self._request = request
             self.deadline_ns = now_ns + request.timeout_ns
         return request.payload
 
-    def on_line(self, text: str, now_ns: int) -> Outcome | None:
-        """Take one line; return the outcome when it ends the outstanding request."""
+    def on_message(self, message: Message, now_ns: int) -> Outcome | None:
+        """Take one message; return the outcome when it ends the outstanding request."""
         request = self._request
-        if request is None or not self._belongs(request, text) or self._ends_late(request, text, now_ns):
-            self._count_stray(text, now_ns)
+        if request is None or not self._belongs(request, message) or self._ends_late(request, message, now_ns):
+            self._count_stray(message, now_ns)
             return None
-        self._late_lines = 0
-        self._lines.append(text)
-        if request.is_rejection(text):
+        self._late_messages = 0
+        self._messages.append(message)
+        if request.is_rejection(message):
             return self._finish(Rejection)
-        if request.is_end(text):
+        if request.is_end(message):
             return self._finish(Reply)
         return None
 
@@ -122,44 +156,45 @@ class TextSession:
         """Return `Silence` when the deadline has passed."""
         if self._request is None or self.deadline_ns is None or now_ns < self.deadline_ns:
             return None
-        self._timed_out, self._timed_out_ns = self._request, now_ns
-        self._late_lines = len(self._lines)
+        if self._request.payload:  # nothing can come late that was never asked for
+            self._timed_out, self._timed_out_ns = self._request, now_ns
+            self._late_messages = len(self._messages)
         self._request = self.deadline_ns = None
-        return Silence(tuple(self._lines))
+        return Silence(tuple(self._messages))
 
     def cancel(self) -> None:
         """Forget the outstanding request: the link is gone."""
         self._request = self.deadline_ns = None
-        self._lines.clear()
+        self._messages.clear()
 
-    def _belongs(self, request: Request, text: str) -> bool:
-        return _ends(request, text) or request.is_part(text)
+    def _belongs(self, request: Request, message: Message) -> bool:
+        return _ends(request, message) or request.is_part(message)
 
-    def _ends_late(self, request: Request, text: str, now_ns: int) -> bool:
-        """Whether `text` is an end line, but not that of the outstanding request: its own lines have not come."""
-        if not _ends(request, text) or self._lines:
+    def _ends_late(self, request: Request, message: Message, now_ns: int) -> bool:
+        """Whether `message` is an end, but not that of the outstanding request: its own messages have not come."""
+        if not _ends(request, message) or self._messages:
             return False
-        late_is_arriving = self._late_lines > 0 and self._expects_late(now_ns)
-        return late_is_arriving or (request.is_end(text) and request.lines_min > 1)
+        late_is_arriving = self._late_messages > 0 and self._expects_late(now_ns)
+        return late_is_arriving or (request.is_end(message) and request.messages_min > 1)
 
     def _expects_late(self, now_ns: int) -> bool:
         return self._timed_out is not None and now_ns - self._timed_out_ns <= LATE_WINDOW_NS
 
     def _finish(self, outcome: type[Reply] | type[Rejection]) -> Reply | Rejection:
         self._request = self.deadline_ns = None
-        return outcome(tuple(self._lines))
+        return outcome(tuple(self._messages))
 
-    def _count_stray(self, text: str, now_ns: int) -> None:
+    def _count_stray(self, message: Message, now_ns: int) -> None:
         late = self._timed_out
-        if late is None or not self._expects_late(now_ns) or not self._belongs(late, text):
+        if late is None or not self._expects_late(now_ns) or not self._belongs(late, message):
             self._ledger.replies_unsolicited += 1
             return
-        self._late_lines += 1
-        if _ends(late, text):
+        self._late_messages += 1
+        if _ends(late, message):
             self._ledger.replies_late += 1
             self._timed_out = None
-            self._late_lines = 0
+            self._late_messages = 0
 
 
-def _ends(request: Request, text: str) -> bool:
-    return request.is_end(text) or request.is_rejection(text)
+def _ends(request: Request, message: Message) -> bool:
+    return request.is_end(message) or request.is_rejection(message)

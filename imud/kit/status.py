@@ -48,6 +48,31 @@ class KernelCounters(msgspec.Struct, frozen=True):
     framing: int = 0
     parity: int = 0
     break_: int = msgspec.field(default=0, name="break")
+    error_passive: int = 0
+    """Times a CAN controller became error-passive."""
+    bus_off: int = 0
+    """Times a CAN controller left its bus."""
+
+
+class PollingStatus(msgspec.Struct, frozen=True):
+    """How the reading of a device that must be asked goes, since start."""
+
+    polls: int = 0
+    """Deadlines at which it was read."""
+    late: int = 0
+    """Of these, begun later than a quarter of the period after the deadline."""
+    missed: int = 0
+    """Deadlines that passed without a read: the host or the bus was busy. Also in the ledger's `lost_queue`."""
+    stale: int = 0
+    """Reads that gave the same bytes as the one before: the device had nothing new."""
+    failed: int = 0
+    """Transfers that failed."""
+    vanished: int = 0
+    """Times the device had to be identified again."""
+    late_mean_ns: int = 0
+    """From deadline to read, mean over `polls`."""
+    late_worst_ns: int = 0
+    """The longest."""
 
 
 LATENCY_BOUNDS_NS = (
@@ -99,6 +124,8 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     """Order, axes and signs of `euler_rad`, as the driver says; empty while the driver is not known."""
     navigation_frame: str = ""
     """The frame that `quat_wxyz` turns into; empty while the driver is not known."""
+    polling: PollingStatus | None = None
+    """None for a device that sends by itself."""
 
 
 class ClientStatus(msgspec.Struct, frozen=True):

@@ -7,6 +7,9 @@ LINKS: Table[LinkType] = Table(
     "link",
     {
         "uart": "imud.links.uart:LINK",
+        "socketcan": "imud.links.socketcan:LINK",
+        "i2c": "imud.links.i2c:LINK",
+        "spi": "imud.links.spi:LINK",
         "replay": "imud.links.replay:LINK",
         "memory": "imud.links.memory:LINK",
     },

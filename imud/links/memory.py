@@ -8,12 +8,14 @@ A fault is a subclass of three lines, for example::
 """
 
 import asyncio
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from imud.errors import LinkBusy, LinkError, LinkMissing
-from imud.kit.link import LinkType, OnData, OnEnd
+from imud.kit.can import CanFilter, CanFrame
+from imud.kit.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
 from imud.kit.settings import Settings
 from imud.kit.status import KernelCounters
 
@@ -122,4 +124,93 @@ class MemoryLink:
         self._on_data = self._on_end = None
 
 
-LINK = LinkType("memory", MemorySettings, MemoryLink)
+class MemoryCanLink:
+    """A `CanLink` whose far end is the test. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: MemorySettings) -> None:
+        self.title = settings.name
+        self.writable = settings.writable
+        self.filters: Sequence[CanFilter] = ()
+        self.bitrate: int = 0 if settings.baud == "auto" else settings.baud
+        self.written: list[bytes] = []
+        """Every `write`, in order."""
+        self.counters = KernelCounters()
+        """What `kernel_counters` returns; set it at will."""
+        self.is_open = False
+        self._present = asyncio.Event()
+        self._present.set()
+        self._on_frames: OnFrames | None = None
+        self._on_news: OnBusNews | None = None
+        self._on_end: OnEnd | None = None
+
+    # --- the test's side -----------------------------------------------------------------------------------------
+
+    @property
+    def listening(self) -> bool:
+        """Whether `start` was called and the link did not end since."""
+        return self._on_frames is not None
+
+    def feed(self, frames: Sequence[CanFrame]) -> bool:
+        """Deliver those frames that pass the filters; False when nobody listens, and then they are lost."""
+        if self._on_frames is None:
+            return False
+        passed = [f for f in frames if any(wanted.takes(f.can_id, f.extended) for wanted in self.filters)]
+        if passed:
+            self._on_frames(passed)
+        return True
+
+    def news(self, news: str, problem: str) -> None:
+        """The state of the bus changes."""
+        assert self._on_news is not None
+        self._on_news(news, problem)
+
+    def appear(self) -> None:
+        """The bus is there (as it is in the beginning)."""
+        self._present.set()
+
+    def disappear(self) -> None:
+        """The bus goes down: `wait_present` waits, and a running link ends with LinkMissing."""
+        self._present.clear()
+        on_end, self._on_end, self._on_frames = self._on_end, None, None
+        if on_end is not None:
+            on_end(LinkMissing(f"{self.title} was taken down by the test"))
+
+    # --- the CanLink ---------------------------------------------------------------------------------------------
+
+    def absence(self) -> str:
+        """Why the bus is not there; empty when it is."""
+        return "" if self._present.is_set() else f"{self.title} is down: the test took it down"
+
+    async def wait_present(self) -> None:
+        """Return when the bus is there."""
+        await self._present.wait()
+
+    def open(self) -> None:
+        """Raises LinkMissing after `disappear`, LinkBusy when it is open already."""
+        if reason := self.absence():
+            raise LinkMissing(reason)
+        if self.is_open:
+            raise LinkBusy(f"{self.title} is open already")
+        self.is_open = True
+
+    def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
+        """Deliver what is fed from now on."""
+        self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
+
+    def write(self, data: bytes) -> None:
+        """Keep the frames in `written`. Raises LinkError when closed."""
+        if not self.is_open:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        self.written.append(data)
+
+    def kernel_counters(self) -> KernelCounters:
+        """What the test put into `counters`."""
+        return self.counters
+
+    def close(self) -> None:
+        """Nobody listens from now on; may be called twice."""
+        self.is_open = False
+        self._on_frames = self._on_news = self._on_end = None
+
+
+LINK = LinkType("memory", MemorySettings, MemoryLink, MemoryCanLink)

@@ -13,21 +13,19 @@ Speeds, and what `t_rx_ns` is (it never decreases and never lies in the future):
 import asyncio
 import logging
 import os
-import stat
 import time
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, BinaryIO, Final, Literal
+from typing import BinaryIO, Final
 
-from msgspec import Meta
-
-from imud.errors import ImudError, LinkDenied, LinkError, LinkMissing
+from imud.errors import ImudError, LinkError
 from imud.kit.capture import CaptureReader, read_capture
 from imud.kit.link import LinkType, OnData, OnEnd
-from imud.kit.settings import Settings
 from imud.kit.status import KernelCounters
+from imud.links.can_replay import CanReplayLink
 from imud.links.inotify import wait_until
+from imud.links.replay_file import ReplaySettings, open_regular
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 PIECE_NS: Final = 2 * NS_PER_MS
@@ -38,24 +36,6 @@ TURN_BYTES: Final = 16384
 """Delivered in one turn of the event loop, 0.5 ms of decoding: others get their turn between."""
 
 log = logging.getLogger(__name__)
-
-
-class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a replayed capture."""
-
-    path: Annotated[str, Meta(min_length=1)]
-    """Raw or stamped capture file."""
-    speed: Literal["recorded", "real", "maximum"] = "recorded"
-    """`recorded`: by the stamps in the file; `real`: by wire time at `baud`; `maximum`: as fast as possible."""
-    baud: Annotated[int, Meta(ge=0, le=4_000_000)] = 0
-    """Rate of the wire in bit/s; 0 means as the capture says. A raw capture at speed `real` needs it."""
-    repeat: bool = False
-    """Start again at the end of the file; not at speed `maximum`."""
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for keys that exclude each other."""
-        if self.repeat and self.speed == "maximum":
-            raise ValueError("repeat needs speed recorded or real: virtual time would run into the future")
 
 
 class ReplayLink:
@@ -82,7 +62,7 @@ class ReplayLink:
     def open(self) -> None:
         """Open and check the capture. Raises LinkMissing, LinkDenied, LinkError."""
         path, settings = self._settings.path, self._settings
-        self._file = file = _open_regular(path)
+        self._file = file = open_regular(path)
         try:
             reader = self._reader()
             self.baud = settings.baud or reader.baud
@@ -202,17 +182,4 @@ class ReplayLink:
             raise LinkError(f"{self.title}: {error}") from error
 
 
-def _open_regular(path: str) -> BinaryIO:
-    try:
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            raise LinkError(f"{path} is not a regular file: a replay reads a capture file")
-        return open(path, "rb")
-    except FileNotFoundError as error:
-        raise LinkMissing(f"{path} is not there: expected a capture file") from error
-    except PermissionError as error:
-        raise LinkDenied(f"{path} may not be read by this user") from error
-    except OSError as error:
-        raise LinkError(f"{path} cannot be read: {error.strerror}") from error
-
-
-LINK = LinkType("replay", ReplaySettings, ReplayLink)
+LINK = LinkType("replay", ReplaySettings, ReplayLink, CanReplayLink)

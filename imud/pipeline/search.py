@@ -9,7 +9,7 @@ from imud.config import DeviceConfig
 from imud.detect import Found, GaveUp, Listen, Search, Step
 from imud.devices import DRIVERS
 from imud.errors import LinkError, NothingHeard
-from imud.kit.driver import StreamDriver
+from imud.kit.driver import StreamDriver, of_kind
 from imud.kit.link import StreamLink
 from imud.ledger import Ledger
 from imud.pipeline import remembered
@@ -45,7 +45,7 @@ class Finder:
         self._on_found = on_found
         named = config.driver != "auto"
         self._search = Search(
-            [DRIVERS[config.driver]] if named else list(DRIVERS.values()),
+            of_kind([DRIVERS[config.driver]] if named else DRIVERS.values(), StreamDriver),
             bauds=() if link.auto_baud else (link.baud,),
             remembered=(last.driver, last.baud) if last else None,
             may_ask=may_ask,

@@ -1,11 +1,13 @@
-"""Drives conversations with one device: sends requests over the link, feeds it the text that comes back."""
+"""Drives conversations with one device: sends requests over the link, feeds it what comes back."""
 
 import asyncio
 from collections.abc import Callable
 from time import monotonic_ns
 from typing import TypeVar
 
-from imud.kit.session import Conversation, Outcome, Reply, Request, TextSession
+from imud.errors import CommandError
+from imud.kit.codec import Message
+from imud.kit.session import Conversation, Outcome, Reply, Request, Session
 from imud.ledger import Ledger
 from imud.units import NS_PER_S
 
@@ -15,9 +17,13 @@ T = TypeVar("T")
 class Talk:
     """One conversation at a time with one device. Synchronization: the event loop's thread only."""
 
-    def __init__(self, ledger: Ledger, write: Callable[[bytes], None]) -> None:
-        self._session = TextSession(ledger)
+    def __init__(
+        self, ledger: Ledger, write: Callable[[bytes], None], set_baud: Callable[[int], None] | None = None
+    ) -> None:
+        """`set_baud` changes the rate of the link; None where it has none."""
+        self._session = Session(ledger)
         self._write = write
+        self._set_baud = set_baud
         self._lock = asyncio.Lock()
         self._outcome: asyncio.Future[Outcome] | None = None
 
@@ -34,15 +40,19 @@ class Talk:
             finally:
                 conversation.close()
 
-    def on_text(self, text: str, t_rx_ns: int) -> None:
-        """Take one line of text from the codec."""
-        self._settle(self._session.on_line(text, t_rx_ns))
+    def on_message(self, message: Message, t_rx_ns: int) -> None:
+        """Take one line of text or one reply frame from the codec."""
+        self._settle(self._session.on_message(message, t_rx_ns))
 
     async def _ask(self, request: Request) -> Outcome:
+        if request.baud:
+            self._change_rate(request)
         loop = asyncio.get_running_loop()
         timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
         try:
-            self._write(self._session.start(request, monotonic_ns()))
+            payload = self._session.start(request, monotonic_ns())
+            if payload:
+                self._write(payload)
             if request.silent:
                 return Reply(())
             self._outcome = loop.create_future()
@@ -51,6 +61,11 @@ class Talk:
             timer.cancel()
             self._outcome = None
             self._session.cancel()
+
+    def _change_rate(self, request: Request) -> None:
+        if self._set_baud is None:
+            raise CommandError(f"{request.name}: expected a serial line to set to {request.baud} baud, got none")
+        self._set_baud(request.baud)
 
     def _expire(self) -> None:
         deadline_ns = self._session.deadline_ns

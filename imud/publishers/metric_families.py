@@ -86,6 +86,8 @@ def _kernel(device: DeviceStatus) -> Labelled:
         (("framing",), kernel.framing),
         (("parity",), kernel.parity),
         (("break",), kernel.break_),
+        (("error_passive",), kernel.error_passive),
+        (("bus_off",), kernel.bus_off),
     )
 
 

@@ -1,6 +1,17 @@
 """Simulated devices with known truth: `imud demo` and the tests run the same ones."""
 
 from imud.kit.table import Table
+from imud.sim.can_module import CanSimulator
 from imud.sim.simulator import Simulator
 
-SIMULATORS: Table[Simulator] = Table("simulator", {"hipnuc-uart": "imud.sim.hipnuc:SIMULATOR"})
+SIMULATORS: Table[Simulator] = Table(
+    "simulator",
+    {
+        "hipnuc-uart": "imud.sim.hipnuc:SIMULATOR",
+        "imu61x-uart": "imud.sim.imu61x_uart:SIMULATOR",
+    },
+)
+"""Devices that stand behind a pseudo-terminal."""
+
+CAN_SIMULATORS: Table[CanSimulator] = Table("simulator on CAN", {"imu61x-can": "imud.sim.imu61x_can:SIMULATOR"})
+"""Devices that stand on a CAN interface."""

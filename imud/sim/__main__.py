@@ -1,7 +1,7 @@
-"""`python -m imud.sim`: one simulated device behind a pseudo-terminal, as a process of its own.
+"""`python -m imud.sim`: one simulated device behind a pseudo-terminal or on a CAN interface, as a process of its own.
 
-The first line on stdout is the path to open. It runs until stdin ends, or SIGTERM or SIGINT comes; its last line is
-what it counted, as JSON. Lines on stdin command it:
+The first line on stdout is the path to open, or the name of the interface. It runs until stdin ends, or SIGTERM or
+SIGINT comes; its last line is what it counted, as JSON. Lines on stdin command it:
 
     unplug SECONDS    the port disappears and comes back, the module loses power
     reboot            the module starts anew, the port stays
@@ -18,12 +18,14 @@ import signal
 import sys
 import tempfile
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Final
 
-from imud.sim import SIMULATORS
+from imud.errors import LinkError
+from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.arrival import BARE_UART, USB_1MS, USB_16MS
+from imud.sim.can_port import CanPort, default_interface
 from imud.sim.faults import Faults, rates_from
 from imud.sim.motion import GRAVITY_M_S2, MOTIONS
 from imud.sim.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
@@ -43,6 +45,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # both end as KeyboardInterrupt
     now_ns = time.monotonic_ns()
+    if options.device in CAN_SIMULATORS:
+        return _run_on_can(options, now_ns)
     try:
         module = SIMULATORS[options.device].make(_module_options(options), now_ns)
         faults = Faults(options.seed, rates_from(options.faults)) if options.faults else None
@@ -62,10 +66,26 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+def _run_on_can(options: argparse.Namespace, now_ns: int) -> int:
+    try:
+        module = CAN_SIMULATORS[options.device].make(_module_options(options), now_ns)
+        port = CanPort(module, options.interface or default_interface())
+    except (ValueError, LinkError) as error:
+        print(f"imud.sim: {error}", file=sys.stderr)
+        return 2
+    sharpen_timers()
+    with closing(port):
+        with suppress(KeyboardInterrupt):
+            print(port.interface, flush=True)
+            Control(port).run()
+        print(json.dumps(port.summary()), flush=True)
+    return 0
+
+
 class Control:
     """Waits for time, bytes and commands, and moves the port along."""
 
-    def __init__(self, port: SimulatedPort) -> None:
+    def __init__(self, port: SimulatedPort | CanPort) -> None:
         self._port = port
         self._text = b""
         self._running = True
@@ -142,7 +162,12 @@ def _parser() -> argparse.ArgumentParser:
     default = SimulatorOptions()
     parser = argparse.ArgumentParser("python -m imud.sim", description="A simulated sensor behind a pseudo-terminal.")
     add = parser.add_argument
-    add("--device", choices=sorted(SIMULATORS), default="hipnuc-uart", help="what to simulate (%(default)s)")
+    add(
+        "--device",
+        choices=sorted([*SIMULATORS, *CAN_SIMULATORS]),
+        default="hipnuc-uart",
+        help="what to simulate (%(default)s)",
+    )
     add("--rate", type=float, default=default.rate_hz, metavar="HZ", help="samples per second (%(default)s)")
     add("--baud", type=int, default=0, help="rate of the port (the slowest common one that carries the samples)")
     add("--message", default="", help="message to send (the factory's)")
@@ -157,6 +182,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--adapter", choices=list(ADAPTERS), default=BARE_UART.name, help="how bytes are handed over (%(default)s)")
     add("--faults", default="", metavar="KIND=P,…", help="probability per burst: cut flip drop insert delay unplug …")
     add("--seed", type=int, default=default.seed, help="seed of noise and faults (%(default)s)")
+    add("--interface", default="", metavar="NAME", help="CAN interface, for CAN devices (the first that is up)")
     add("--path", type=Path, help="node to make (a temporary one)")
     add("--truth", type=Path, metavar="FILE", help="write true sample times, CSV: sample_ns,device_ms,written_ns")
     return parser

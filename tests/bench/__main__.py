@@ -13,7 +13,7 @@ import msgspec
 
 from tests.bench.rows import Row
 
-PARTS = ("decode", "clock", "detect", "coalesce", "shm", "socket", "metrics", "end_to_end")
+PARTS = ("decode", "clock", "polling", "detect", "coalesce", "shm", "socket", "metrics", "end_to_end")
 OUTPUT = Path("build/bench.json")
 
 

@@ -1,4 +1,4 @@
-"""Cost of decoding HI91 to SI values, against the floor: `binascii.crc_hqx` and `struct.unpack_from` on the same bytes.
+"""Cost of decoding HI91 and AHRS frames to SI values, against the floor: check value and `struct.unpack_from` alone.
 
     python -m tests.bench.decode
 
@@ -9,12 +9,15 @@ in ten, and garbage, cut frames and text between others.
 
 import binascii
 import struct
+import zlib
 from collections.abc import Callable
 from random import Random
 from time import perf_counter_ns
 
 from imud.devices.hipnuc.frames import HipnucCodec, HipnucSettings, encode_hi91
-from imud.kit.codec import CodecEvent
+from imud.devices.imu61x.serial import DRIVER as IMU61X
+from imud.devices.imu61x.serial import Imu61xCodec
+from imud.kit.codec import CodecEvent, StreamCodec
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from tests.bench.rows import Row, at_most
@@ -23,6 +26,7 @@ FRAMES = 250  # a run of 0.2 ms fits between the interruptions of a busy machine
 ROUNDS = 400
 READ_BYTES = 4096
 HI91_FRAME_BYTES = 82
+AHRS_FRAME_BYTES = 54
 REACH_RATIO = 1.6
 
 
@@ -59,9 +63,16 @@ def _floor(stream: bytes) -> None:
         unpack(stream, at + 6)
 
 
-def _decoder(reads: list[bytes]) -> Callable[[], None]:
+def _ahrs_floor(stream: bytes) -> None:
+    crc, unpack = zlib.crc32, struct.Struct("<I10fI").unpack_from
+    for at in range(0, len(stream), AHRS_FRAME_BYTES):
+        crc(stream[at : at + 50], 0xFFFFFFFE)
+        unpack(stream, at + 6)
+
+
+def _decoder(reads: list[bytes], codec: StreamCodec | None = None) -> Callable[[], None]:
     """What feeds `reads` to one codec; events are dropped as they come."""
-    codec = HipnucCodec(Ledger(), HipnucSettings())
+    codec = codec or HipnucCodec(Ledger(), HipnucSettings())
 
     def run() -> None:
         feed = codec.feed
@@ -95,6 +106,8 @@ def rows(*, quick: bool = False) -> list[Row]:
     random = Random(1)
     frames = _frames(random)
     clean, noisy = b"".join(frames), _noisy(frames, random)
+    ahrs = [IMU61X.example_frame(random) for _ in range(FRAMES)]
+    assert _good(list(Imu61xCodec(Ledger()).feed(b"".join(ahrs)))) == FRAMES
     assert _good(list(HipnucCodec(Ledger(), HipnucSettings()).feed(clean))) == FRAMES
     best = _best_ns(
         ROUNDS // 4 if quick else ROUNDS,
@@ -103,6 +116,9 @@ def rows(*, quick: bool = False) -> list[Row]:
             "clean": _decoder(_split(clean, READ_BYTES)),
             "single": _decoder(frames),
             "noisy": _decoder(_split(noisy, READ_BYTES)),
+            "ahrs floor": lambda: _ahrs_floor(b"".join(ahrs)),
+            "ahrs clean": _decoder(_split(b"".join(ahrs), READ_BYTES), Imu61xCodec(Ledger())),
+            "ahrs single": _decoder(ahrs, Imu61xCodec(Ledger())),
         },
     )
     return [
@@ -112,6 +128,9 @@ def rows(*, quick: bool = False) -> list[Row]:
         Row("decode noisy, reads of 4096 bytes", best["noisy"], "ns/frame"),
         at_most("decode clean / floor", best["clean"] / best["floor"], "x", REACH_RATIO),
         Row("decode noisy / floor", best["noisy"] / best["floor"], "x"),
+        Row("decode AHRS floor (crc32 + unpack_from)", best["ahrs floor"], "ns/frame"),
+        Row("decode AHRS, reads of 4096 bytes", best["ahrs clean"], "ns/frame"),
+        Row("decode AHRS, one frame per read", best["ahrs single"], "ns/frame"),
     ]
 
 

@@ -1,15 +1,23 @@
 """How long detection takes, in virtual time, at every baud rate and random phases. Run: python -m tests.bench.detect
 
-The device sends at 100 Hz (at 9600 baud as often as the line carries); the line is modelled bit by bit, so that wrong
-rates deliver the garbage that they would. `quick` draws fewer phases.
+Neither driver nor rate is given: every search tries all families. The device sends at 100 Hz (at 9600 baud as often as
+the line carries); the line is modelled bit by bit, so that wrong rates deliver the garbage that they would. `quick`
+draws fewer phases.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from random import Random
 from statistics import quantiles
 
 from imud.detect import Found, Search
-from imud.devices.hipnuc.frames import DRIVER, encode_hi91
+from imud.devices.hipnuc.frames import DRIVER as HIPNUC
+from imud.devices.hipnuc.frames import encode_hi91
+from imud.devices.imu61x.commands import ask_status
+from imud.devices.imu61x.replies import Status
+from imud.devices.imu61x.serial import DRIVER as IMU61X
+from imud.devices.imu61x.serial import encode_status
+from imud.kit.driver import StreamDriver
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.rows import Row, at_most
 from tests.uart_wire import FakeDevice, run_search
@@ -37,33 +45,58 @@ def random_hi91(random: Random) -> bytes:
     )
 
 
-def measure(baud: int, hold_ms: int, phases: int, *, remembered: bool) -> tuple[list[float], int]:
+@dataclass(frozen=True)
+class Family:
+    """A driver, what its devices send as delivered, and how they answer when asked who they are."""
+
+    driver: StreamDriver
+    make_frame: Callable[[Random], bytes]
+    query: bytes
+    reply: bytes
+
+
+FAMILIES = (
+    Family(HIPNUC, random_hi91, b"LOG VERSION\r\n", b"PNAME=HI14R3\r\nAPP_VER=156\r\nOK\r\n"),
+    Family(
+        IMU61X,
+        IMU61X.example_frame,
+        ask_status().payload,
+        encode_status(Status(10203, 2, 614, (1, 2, 3), 0, 0, 0, 0, 0, 0, 0, bytes(32))),
+    ),
+)
+DRIVERS = [family.driver for family in FAMILIES]
+
+
+def measure(family: Family, baud: int, hold_ms: int, phases: int, *, remembered: bool) -> tuple[list[float], int]:
     """Times to lock in s, and how many searches found something false or nothing."""
+    driver = family.driver
     random = Random(f"{baud} {hold_ms} {remembered}")
-    far = FakeDevice(DRIVER, baud, 100, poll_ns=max(hold_ms, 1) * NS_PER_MS, random=random, make_frame=random_hi91)
+    poll_ns = max(hold_ms, 1) * NS_PER_MS
+    far = FakeDevice(driver, baud, 100, poll_ns=poll_ns, random=random, make_frame=family.make_frame)
     times_s, wrong = [], 0
     for _ in range(phases):
         far.phase_ns = random.randrange(NS_PER_S)
-        memory = (DRIVER.name, baud) if remembered else None
-        search = Search([DRIVER], remembered=memory, may_ask=True, hold_ns=hold_ms * NS_PER_MS)
+        memory = (driver.name, baud) if remembered else None
+        search = Search(DRIVERS, remembered=memory, may_ask=True, hold_ns=hold_ms * NS_PER_MS)
         found, took_ns, _ = run_search(search, far, start_ns=10 * NS_PER_S + random.randrange(NS_PER_S))
         times_s.append(took_ns / NS_PER_S)
-        wrong += not isinstance(found, Found) or found.baud != baud
+        wrong += not isinstance(found, Found) or (found.driver, found.baud) != (driver, baud)
     return times_s, wrong
 
 
-def measure_rare(rate_hz: float, phases: int) -> tuple[list[float], int]:
+def measure_rare(family: Family, rate_hz: float, phases: int) -> tuple[list[float], int]:
     """Times in s to find a device at `rate_hz` (0: it only answers a query) at random baud rates, and failures."""
-    random, times_s, wrong = Random(f"{rate_hz}"), [], 0
+    driver, random = family.driver, Random(f"{rate_hz}")
+    times_s, wrong = [], 0
     for _ in range(phases):
-        baud = random.choice(DRIVER.baud_rates)
+        baud = random.choice(driver.baud_rates)
         far = FakeDevice(
-            DRIVER, baud, rate_hz, random.randrange(NS_PER_S), random=random, make_frame=random_hi91,
-            query=b"LOG VERSION\r\n", reply=b"PNAME=HI14R3\r\nAPP_VER=156\r\nOK\r\n",
+            driver, baud, rate_hz, random.randrange(NS_PER_S), random=random, make_frame=family.make_frame,
+            query=family.query, reply=family.reply,
         )  # fmt: skip
-        found, took_ns, _ = run_search(Search([DRIVER], may_ask=True), far, start_ns=10 * NS_PER_S)
+        found, took_ns, _ = run_search(Search(DRIVERS, may_ask=True), far, start_ns=10 * NS_PER_S)
         times_s.append(took_ns / NS_PER_S)
-        wrong += not isinstance(found, Found) or found.baud != baud
+        wrong += not isinstance(found, Found) or (found.driver, found.baud) != (driver, baud)
     return times_s, wrong
 
 
@@ -71,23 +104,24 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
     """Median and 95th percentile of the time to lock, cold and remembered, without and with a USB adapter's 16 ms."""
     phases = 100 if quick else 1000
     failed = 0
-    for remembered, limit_s in ((False, COLD_S), (True, REMEMBERED_S)):
-        for hold_ms in HOLDS_MS:
-            everything: list[float] = []
-            how = f"{'remembered' if remembered else 'cold'}, {hold_ms} ms adapter"
-            for baud in sorted(DRIVER.baud_rates):
-                times_s, wrong = measure(baud, hold_ms, phases, remembered=remembered)
-                failed += wrong
-                everything += times_s
-                yield at_most(f"detect {how}, {baud} baud, p95", quantiles(times_s, n=20)[-1], "s", limit_s)
-            yield Row(f"detect {how}, all rates, p50", quantiles(everything, n=2)[0], "s")
-            yield at_most(f"detect {how}, all rates, p95", quantiles(everything, n=20)[-1], "s", limit_s)
-            yield at_most(f"detect {how}, all rates, max", max(everything), "s", limit_s)
-    for name, rate_hz in (("10 Hz", 10), ("1 Hz", 1), ("silent, asked", 0)):
-        times_s, wrong = measure_rare(rate_hz, phases // 5)
-        failed += wrong
-        yield Row(f"detect cold, device {name}, p50", quantiles(times_s, n=2)[0], "s")
-        yield Row(f"detect cold, device {name}, p95", quantiles(times_s, n=20)[-1], "s")
+    for family in FAMILIES:
+        for remembered, limit_s in ((False, COLD_S), (True, REMEMBERED_S)):
+            for hold_ms in HOLDS_MS:
+                how = f"{family.driver.name} {'remembered' if remembered else 'cold'}, {hold_ms} ms adapter"
+                everything: list[float] = []
+                for baud in sorted(family.driver.baud_rates):
+                    times_s, wrong = measure(family, baud, hold_ms, phases, remembered=remembered)
+                    failed += wrong
+                    everything += times_s
+                    yield at_most(f"detect {how}, {baud} baud, p95", quantiles(times_s, n=20)[-1], "s", limit_s)
+                yield Row(f"detect {how}, all rates, p50", quantiles(everything, n=2)[0], "s")
+                yield at_most(f"detect {how}, all rates, p95", quantiles(everything, n=20)[-1], "s", limit_s)
+                yield at_most(f"detect {how}, all rates, max", max(everything), "s", limit_s)
+        for name, rate_hz in (("10 Hz", 10), ("1 Hz", 1), ("silent, asked", 0)):
+            times_s, wrong = measure_rare(family, rate_hz, phases // 5)
+            failed += wrong
+            yield Row(f"detect {family.driver.name} cold, {name}, p50", quantiles(times_s, n=2)[0], "s")
+            yield Row(f"detect {family.driver.name} cold, {name}, p95", quantiles(times_s, n=20)[-1], "s")
     yield at_most("detect: searches without or with a false result", failed, "", 0)
 
 

@@ -58,3 +58,21 @@ def test_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "No such file" in error
+
+
+def test_log_of_a_can_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from tests.can_logs import imu61x_log
+
+    log = tmp_path / "drive.log"
+    log.write_text(imu61x_log([65535, 65536]) + "(1.0) can0 7FF#00\nnoise\n")
+    assert main(["decode", "--driver", "imu61x-can", str(log)]) == 0
+    printed = capsys.readouterr()
+    first, second = lines(printed.out)
+    assert (first["index"], second["index"]) == (65535, 65536)
+    assert "t_dev_ns" not in first
+    assert first["accel_m_s2"] == pytest.approx([0, 0, 9.80665])
+    problem, counted = printed.err.splitlines()
+    assert "1 lines are none of a candump log" in problem
+    ledger = json.loads(counted)
+    assert (ledger["bytes_in"], ledger["bytes_skipped"]) == (81, 1)
+    assert ledger["frames_in_samples"] == 10

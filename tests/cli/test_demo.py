@@ -11,15 +11,22 @@ from imud.cli.demo_view import View
 from imud.sample import Sample, Sync
 
 
-def test_samples_flow_and_the_ledger_closes(capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", "--duration", "1", "--rate", "200", "--plain"]) == 0
+@pytest.mark.parametrize(("device", "product"), [("hipnuc-uart", "HI14R3"), ("imu61x-uart", "IMU61x")])
+def test_samples_flow_and_the_ledger_closes(device: str, product: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--device", device, "--duration", "1", "--rate", "200", "--plain"]) == 0
     out = capfd.readouterr().out
     assert "the ledger closes to zero" in out
     assert re.search(r"client +\d+ samples at \d+\.\d+ Hz, 0 missed", out)
-    assert "HI14R3" in out or "not known" in out
+    assert product in out or "not known" in out
     folder = re.search(r"daemon at (\S+)/imud.sock", out)
     assert folder is not None
     assert not Path(folder[1]).exists()
+
+
+def test_a_can_device_needs_an_interface(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("imud.sim.can_port.can_interfaces", list)
+    assert main(["demo", "--device", "imu61x-can", "--duration", "1"]) == 2
+    assert "ip link add vcan0 type vcan" in capsys.readouterr().err
 
 
 def sample(seq: int) -> Sample:

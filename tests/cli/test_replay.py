@@ -1,5 +1,6 @@
 """`imud replay`: a capture through the whole path, to its end."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -36,3 +37,27 @@ def test_capture_without_samples_is_status_1(tmp_path: Path, capsys: pytest.Capt
 def test_missing_capture_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(tmp_path / "none")]) == 2
     assert "none" in capsys.readouterr().err
+
+
+def test_log_of_a_can_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from tests.can_logs import imu61x_log
+
+    log = tmp_path / "drive.log"
+    log.write_text(imu61x_log([*range(65500, 65580), *range(65583, 65600)]))
+    assert main(["replay", "--json", "--driver", "imu61x-can", str(log)]) == 0
+    printed = capsys.readouterr()
+    samples = [json.loads(line) for line in printed.out.splitlines()]
+    assert [s["seq"] for s in samples] == list(range(1, 98))
+    steps = [b["t_ns"] - a["t_ns"] for a, b in itertools.pairwise(samples)]
+    assert sum(abs(step - 10_000_000) < 100_000 for step in steps[5:]) == len(steps[5:]) - 1
+    assert "samples   97; lost 3 (device 3," in printed.err
+    assert "closed" in printed.err
+
+
+@pytest.mark.parametrize("content", [b"", b"Z\xa5 no log", b"(1.0) can0 123##1001122\n"])
+def test_file_that_is_no_can_log_is_an_error(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x").write_bytes(content)
+    assert main(["replay", "--driver", "imu61x-can", str(tmp_path / "x")]) == 2
+    assert "candump -L" in capsys.readouterr().err

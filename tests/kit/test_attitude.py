@@ -13,10 +13,13 @@ from imud.kit.attitude import (
     Matrix3,
     euler312_from_matrix,
     euler312_from_quat,
+    euler_zyx_from_matrix,
+    euler_zyx_from_quat,
     is_rotation,
     matrix_from_euler312,
     matrix_from_quat,
     quat_from_euler312,
+    quat_from_euler_zyx,
     quat_from_matrix,
     quat_normalized,
 )
@@ -170,3 +173,65 @@ def test_recording_of_a_module_at_rest() -> None:
         sent = (float(row["roll"]), float(row["pitch"]), float(row["yaw"]))
         worst_deg = max(worst_deg, *(abs(a - b) for a, b in zip(euler, sent, strict=True)))
     assert worst_deg < 1.2e-4
+
+
+# --- order ZYX --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("euler_deg", "quat"),
+    [
+        ((90, 0, 0), (HALF, HALF, 0, 0)),  # roll is about X here
+        ((0, 90, 0), (HALF, 0, HALF, 0)),  # pitch about Y
+        ((0, 0, 90), (HALF, 0, 0, HALF)),
+        ((90, 0, 90), (0.5, 0.5, 0.5, 0.5)),  # Rz(90°) · Rx(90°): x → y → z → x
+    ],
+)
+def test_zyx_turns_about_the_axes(euler_deg: Vector3, quat: Quaternion) -> None:
+    roll, pitch, yaw = map(math.radians, euler_deg)
+    assert quat_from_euler_zyx((roll, pitch, yaw)) == pytest.approx(quat, abs=1e-15)
+
+
+@quick
+@given(roll=angles, pitch=st.floats(-1.57, 1.57), yaw=angles)
+def test_zyx_is_the_product_of_its_turns(roll: float, pitch: float, yaw: float) -> None:
+    """Against the same turns written as 312 turns about one axis each, multiplied as matrices."""
+    about_z, about_y, about_x = (matrix_from_euler312(one) for one in ((0, 0, yaw), (pitch, 0, 0), (0, roll, 0)))
+    wanted = product(product(about_z, about_y), about_x)
+    for row, other in zip(matrix_from_quat(quat_from_euler_zyx((roll, pitch, yaw))), wanted, strict=True):
+        assert row == pytest.approx(other, abs=1e-12)
+
+
+def product(left: Matrix3, right: Matrix3) -> Matrix3:
+    columns = tuple(zip(*right, strict=True))
+    x, y, z = (tuple(sum(a * b for a, b in zip(row, column, strict=True)) for column in columns) for row in left)
+    return (vector(x), vector(y), vector(z))
+
+
+def vector(values: tuple[float, ...]) -> Vector3:
+    x, y, z = values
+    return (x, y, z)
+
+
+@quick
+@given(roll=angles, pitch=steep, yaw=angles)
+def test_zyx_and_back_is_the_same_rotation(roll: float, pitch: float, yaw: float) -> None:
+    quat = quat_from_euler_zyx((roll, pitch, yaw))
+    again = quat_from_euler_zyx(euler_zyx_from_quat(quat))
+    assert abs(sum(a * b for a, b in zip(quat, again, strict=True))) == pytest.approx(1, abs=1e-12)
+
+
+@quick
+@given(roll=angles, pitch=st.floats(-1.5, 1.5), yaw=angles)
+def test_zyx_angles_come_back(roll: float, pitch: float, yaw: float) -> None:
+    found = euler_zyx_from_matrix(matrix_from_quat(quat_from_euler_zyx((roll, pitch, yaw))))
+    for value, wanted in zip(found, (roll, pitch, yaw), strict=True):
+        assert math.remainder(value - wanted, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_zyx_straight_up_and_down_all_of_the_turn_is_yaw(sign: int) -> None:
+    roll, pitch, yaw = euler_zyx_from_quat(quat_from_euler_zyx((0.3, sign * math.pi / 2, 1.0)))
+    assert roll == 0
+    assert pitch == pytest.approx(sign * math.pi / 2, abs=1e-7)
+    assert yaw == pytest.approx(1.0 - sign * 0.3, abs=1e-7)

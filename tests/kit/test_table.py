@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from imud.devices import DRIVERS
-from imud.kit.driver import StreamDriver
+from imud.kit.driver import Driver
 from imud.kit.link import LinkType
 from imud.kit.publisher import PublisherType
 from imud.kit.table import Table
@@ -13,7 +13,7 @@ from imud.links import LINKS
 from imud.publishers import PUBLISHERS
 
 TABLES: list[tuple[Table[Any], type]] = [
-    (DRIVERS, StreamDriver),
+    (DRIVERS, Driver),
     (LINKS, LinkType),
     (PUBLISHERS, PublisherType),
 ]

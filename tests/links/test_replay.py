@@ -12,7 +12,8 @@ from imud.errors import LinkDenied, LinkError, LinkMissing
 from imud.kit.capture import CaptureWriter
 from imud.kit.link import StreamLink
 from imud.links import LINKS
-from imud.links.replay import PIECE_BYTES_MAX, PIECE_NS, ReplayLink, ReplaySettings
+from imud.links.replay import PIECE_BYTES_MAX, PIECE_NS, ReplayLink
+from imud.links.replay_file import ReplaySettings
 from imud.units import NS_PER_MS, uart_byte_ns
 
 LIMIT_S = 5.0
@@ -206,7 +207,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def refuse(path: str) -> None:
         raise PermissionError
 
-    monkeypatch.setattr("imud.links.replay.os.stat", refuse)
+    monkeypatch.setattr("imud.links.replay_file.os.stat", refuse)
     with pytest.raises(LinkDenied):
         ReplayLink(ReplaySettings(path=str(tmp_path))).open()
 

@@ -12,9 +12,10 @@ from imud.config import DeviceConfig
 from imud.errors import LinkBusy, LinkError
 from imud.event import Event, EventKind
 from imud.kit.batch import Batch
+from imud.kit.session import Conversation, Request, never
 from imud.kit.status import DeviceState, KernelCounters
 from imud.links.memory import MemoryLink, MemorySettings
-from imud.pipeline import runner as runner_module
+from imud.pipeline import device as device_module
 from imud.pipeline.remembered import Remembered
 from imud.pipeline.runner import DeviceRunner
 from imud.sample import Sample
@@ -84,7 +85,7 @@ def play(bench: Bench, story: Callable[[Bench], Coroutine[Any, Any, None]]) -> N
 
 @pytest.fixture(autouse=True)
 def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runner_module, "RETRY_S", 0.0)
+    monkeypatch.setattr(device_module, "RETRY_S", 0.0)
 
 
 def test_samples_flow_and_the_device_is_up() -> None:
@@ -317,3 +318,25 @@ def test_error_of_the_link_is_a_failed_device_and_tried_again() -> None:
         assert bench.state() is DeviceState.RUNNING
 
     play(Bench(), story)
+
+
+def test_a_conversation_that_changes_the_rate_takes_port_and_memory_along() -> None:
+    async def story(bench: Bench) -> None:
+        device = bench.runner
+        for ms in range(0, 400, 10):
+            bench.feed(hi91(ms))
+        await bench.until(lambda: device._finder is None)
+        await device._talk.hold(at_921600())
+        assert bench.link.baud == 921600
+        assert bench.link.written[-1] == b"?"
+        last = device._remembered.get("bow")
+        assert last is not None
+        assert (last.driver, last.baud) == ("hipnuc-uart", 921600)
+        bench.feed(hi91(400))
+        assert len(bench.samples) == 41
+
+    play(Bench(baud="auto"), story)
+
+
+def at_921600() -> Conversation[None]:
+    yield Request(b"?", "?", never, never, never, silent=True, baud=921600)

@@ -1,12 +1,14 @@
 """Conversations over a line that is also used by others: in order, one at a time, late and missing replies apart."""
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 
 from imud.devices import DRIVERS
-from imud.errors import LinkMissing, NoReply
-from imud.kit.session import Conversation, Outcome, Reply, Request, Silence
+from imud.errors import CommandError, LinkMissing, NoReply
+from imud.kit.codec import ReplyFrame
+from imud.kit.session import Conversation, Outcome, Reply, Request, Silence, of_text, pause
 from imud.ledger import Ledger
 from imud.pipeline.talk import Talk
 
@@ -15,9 +17,9 @@ def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Req
     return Request(
         payload=name.encode() + b"\r\n",
         name=name,
-        is_end=lambda text: text == "OK",
-        is_rejection=lambda text: text.startswith("ERR"),
-        is_part=lambda text: text.startswith(name),
+        is_end=of_text(lambda text: text == "OK"),
+        is_rejection=of_text(lambda text: text.startswith("ERR")),
+        is_part=of_text(lambda text: text.startswith(name)),
         timeout_ns=timeout_ns,
         silent=silent,
     )
@@ -37,12 +39,12 @@ def test_requests_go_out_one_after_the_other() -> None:
         task = asyncio.create_task(talk.hold(ask(request("A"), request("B"))))
         await asyncio.sleep(0)
         assert written == [b"A\r\n"]
-        talk.on_text("A=1", 0)
-        talk.on_text("OK", 0)
+        talk.on_message("A=1", 0)
+        talk.on_message("OK", 0)
         await asyncio.sleep(0)
         await asyncio.sleep(0)
         assert written == [b"A\r\n", b"B\r\n"]
-        talk.on_text("ERR", 0)
+        talk.on_message("ERR", 0)
         outcomes = await task
         assert outcomes[0] == Reply(("A=1", "OK"))
         assert outcomes[1].lines == ("ERR",)
@@ -55,10 +57,10 @@ def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
         ledger = Ledger()
         talk = Talk(ledger, lambda data: None)
         assert await talk.hold(ask(request("A", timeout_ns=1))) == [Silence(())]
-        talk.on_text("A=1", 0)
-        talk.on_text("OK", 0)
+        talk.on_message("A=1", 0)
+        talk.on_message("OK", 0)
         assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
-        talk.on_text("OK", 0)
+        talk.on_message("OK", 0)
         assert ledger.replies_unsolicited == 1
 
     asyncio.run(story())
@@ -98,12 +100,12 @@ def test_second_conversation_waits_for_the_first() -> None:
         for _ in range(5):
             await asyncio.sleep(0)
         assert written == [b"A\r\n"]
-        talk.on_text("OK", 0)
+        talk.on_message("OK", 0)
         await first
         for _ in range(5):
             await asyncio.sleep(0)
         assert written == [b"A\r\n", b"B\r\n"]
-        talk.on_text("OK", 0)
+        talk.on_message("OK", 0)
         await second
 
     asyncio.run(story())
@@ -128,5 +130,53 @@ def test_device_that_never_answers_is_no_reply() -> None:
         task = asyncio.create_task(talk.hold(conversation))
         with pytest.raises(NoReply, match="LOG VERSION"):
             await asyncio.wait_for(task, 5)
+
+    asyncio.run(story())
+
+
+def test_a_request_can_change_the_rate_before_it_goes_out() -> None:
+    async def story() -> None:
+        happened: list[object] = []
+        talk = Talk(Ledger(), happened.append, happened.append)
+        await talk.hold(ask(request("A", silent=True), replace(request("B", silent=True), baud=9600)))
+        assert happened == [b"A\r\n", 9600, b"B\r\n"]
+
+    asyncio.run(story())
+
+
+def test_a_rate_without_a_line_is_an_error() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        talk = Talk(Ledger(), written.append)
+        with pytest.raises(CommandError, match="9600 baud"):
+            await talk.hold(ask(replace(request("A"), baud=9600)))
+        assert written == []
+
+    asyncio.run(story())
+
+
+def test_a_pause_writes_nothing() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        assert await talk_of(written).hold(ask(pause(1_000_000))) == [Silence(())]
+        assert written == []
+
+    asyncio.run(story())
+
+
+def talk_of(written: list[bytes]) -> Talk:
+    return Talk(Ledger(), written.append)
+
+
+def test_a_frame_is_an_answer() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        talk = talk_of(written)
+        wanted = ReplyFrame(5, b"x")
+        asking = replace(request("A"), is_end=lambda message: message == wanted)
+        task = asyncio.create_task(talk.hold(ask(asking)))
+        await asyncio.sleep(0)
+        talk.on_message(wanted, 0)
+        assert await task == [Reply((wanted,))]
 
     asyncio.run(story())

@@ -8,7 +8,7 @@ import pytest
 from imud.devices.hipnuc.frames import DRIVER
 from imud.kit.codec import TextLine
 from imud.kit.driver import Identity
-from imud.kit.session import Conversation, Outcome, TextSession
+from imud.kit.session import Conversation, Outcome, Session
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim import SIMULATORS
@@ -179,7 +179,7 @@ def test_marked_messages_come_with_the_pulse_and_once() -> None:
 def converse(bench: Bench, conversation: Conversation[Identity]) -> Identity:
     """Run a conversation against the module, frames in between."""
     ledger = Ledger()
-    codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), TextSession(ledger)
+    codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), Session(ledger)
     request = next(conversation)
     while True:
         bench.module.receive(session.start(request, bench.now_ns), bench.now_ns)
@@ -191,7 +191,7 @@ def converse(bench: Bench, conversation: Conversation[Identity]) -> Identity:
                 for event in codec.feed(burst.data)
                 if isinstance(event, TextLine)
             ]
-            outcomes: list[Outcome | None] = [session.on_line(line, bench.now_ns) for line in lines] + [
+            outcomes: list[Outcome | None] = [session.on_message(line, bench.now_ns) for line in lines] + [
                 session.on_time(bench.now_ns)
             ]
             outcome = next((found for found in outcomes if found), None)

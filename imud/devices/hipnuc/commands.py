@@ -9,14 +9,15 @@ Each function returns a `Request` and raises BadArgument for what the device wou
 is off unless `save_config` follows; `mounting`, `serial_config` take effect after `save_config` and `reboot`.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from enum import Enum, StrEnum
-from typing import Final, TypeVar
+from typing import Final
 
 from imud.devices.hipnuc.replies import is_end, is_rejection, is_setting_line, is_version_line
 from imud.errors import BadArgument
+from imud.kit.arguments import listed, member
 from imud.kit.attitude import Matrix3, is_rotation
-from imud.kit.session import Request
+from imud.kit.session import Request, of_text
 from imud.units import NS_PER_S
 
 LINE_END: Final = "\r\n"
@@ -158,24 +159,24 @@ def unlog_all() -> Request:
 def serial_config(baud: int) -> Request:
     """Set the baud rate. A module at a rate that the host does not expect is lost: keep contact or roll back."""
     if baud not in BAUD_RATES:
-        raise BadArgument(f"SERIALCONFIG: expected one of {_listed(sorted(BAUD_RATES))} baud, got {baud!r}")
+        raise BadArgument(f"SERIALCONFIG: expected one of {listed(sorted(BAUD_RATES))} baud, got {baud!r}")
     return _command(f"SERIALCONFIG {int(baud)}")
 
 
 def attitude_mode(mode: AttitudeMode) -> Request:
     """Choose 6-axis or 9-axis (AHRS) mode."""
-    return _command(f"CONFIG ATT MODE {_member('mode', mode, AttitudeMode).value}")
+    return _command(f"CONFIG ATT MODE {member('mode', mode, AttitudeMode).value}")
 
 
 def level_reset(kind: LevelReset) -> Request:
     """Set or cancel the level."""
-    return _command(f"CONFIG ATT RST {_member('kind', kind, LevelReset).value}")
+    return _command(f"CONFIG ATT RST {member('kind', kind, LevelReset).value}")
 
 
 def yaw(mode: YawMode, angle_deg: float) -> Request:
     """Set yaw, -180° … 180°; lost at power-off."""
     angle = _degrees("CONFIG YAW", "angle", angle_deg)
-    return _command(f"CONFIG YAW {_member('mode', mode, YawMode).value} {angle}")
+    return _command(f"CONFIG YAW {member('mode', mode, YawMode).value} {angle}")
 
 
 def mounting(matrix: Mounting | Matrix3) -> Request:
@@ -197,7 +198,7 @@ def magnetic_calibration(enabled: bool) -> Request:
 def pin_function(function: PinFunction, pin: int) -> Request:
     """Give `function` to pin IO1 … IO9. Not every product has every pin."""
     number = _whole("CONFIG PMUX", "pin", pin, 1, PIN_MAX)
-    return _command(f"CONFIG PMUX{_member('function', function, PinFunction).value} IO{number}")
+    return _command(f"CONFIG PMUX{member('function', function, PinFunction).value} IO{number}")
 
 
 def alarm(axis: AlarmAxis, min_deg: float, max_deg: float, enabled: bool) -> Request:
@@ -206,7 +207,7 @@ def alarm(axis: AlarmAxis, min_deg: float, max_deg: float, enabled: bool) -> Req
     low, high = (_degrees(name, what, v) for what, v in (("minimum", min_deg), ("maximum", max_deg)))
     if not min_deg < max_deg:
         raise BadArgument(f"{name}: expected the minimum below the maximum, got {low}° and {high}°")
-    return _command(f"{name} {_member('axis', axis, AlarmAxis)},{low},{high},0,{_flag('enabled', enabled)}")
+    return _command(f"{name} {member('axis', axis, AlarmAxis)},{low},{high},0,{_flag('enabled', enabled)}")
 
 
 def sout_divider(divider: int) -> Request:
@@ -226,9 +227,9 @@ def log_disable() -> Request:
 
 def log_ontime(message: Message, rate_hz: int, baud: int | None = None) -> Request:
     """Send `message` at one of RATES_HZ, or not at all (0). With `baud`, refuses what does not fit through the line."""
-    name = f"LOG {_member('message', message, Message)} ONTIME"
+    name = f"LOG {member('message', message, Message)} ONTIME"
     if rate_hz != 0 and rate_hz not in RATES_HZ:
-        raise BadArgument(f"{name}: expected 0 (off) or one of {_listed(RATES_HZ)} Hz, got {rate_hz!r}")
+        raise BadArgument(f"{name}: expected 0 (off) or one of {listed(RATES_HZ)} Hz, got {rate_hz!r}")
     if baud is not None and rate_hz > max_rate_hz(message, baud):
         raise BadArgument(
             f"{name}: expected at most {max_rate_hz(message, baud)} Hz at {baud} baud, got {rate_hz} Hz; "
@@ -239,26 +240,26 @@ def log_ontime(message: Message, rate_hz: int, baud: int | None = None) -> Reque
 
 def log_onmark(message: Message) -> Request:
     """Send `message` once for each pulse on SIN or `log_once`. Turn timed output off first (`unlog_all`)."""
-    return _command(f"LOG {_member('message', message, Message)} ONMARK 1")
+    return _command(f"LOG {member('message', message, Message)} ONMARK 1")
 
 
 def log_once(message: Message) -> Request:
     """Send `message` once, as a pulse on SIN would. `log_onmark` comes first."""
-    return _command(f"LOG {_member('message', message, Message)} ONMARK ONCE")
+    return _command(f"LOG {member('message', message, Message)} ONMARK ONCE")
 
 
 def ask(query: Query) -> Request:
     """Ask for one of the four reports."""
-    kind = _member("query", query, Query)
+    kind = member("query", query, Query)
     is_part = is_version_line if kind is Query.VERSION else is_setting_line
-    return _command(f"LOG {kind}", is_part=is_part, lines_min=2)
+    return _command(f"LOG {kind}", is_part=is_part, messages_min=2)
 
 
 def max_rate_hz(message: Message, baud: int) -> int:
     """Highest output rate of `message` at `baud` (table 3.7). Raises BadArgument for a rate the table does not have."""
     rates = MAX_RATE_HZ[message]
     if baud not in rates:
-        raise BadArgument(f"baud rate: expected one of {_listed(sorted(rates))}, got {baud!r}")
+        raise BadArgument(f"baud rate: expected one of {listed(sorted(rates))}, got {baud!r}")
     return rates[baud]
 
 
@@ -272,23 +273,15 @@ def _command(
     timeout_ns: int = REPLY_TIMEOUT_NS,
     silent: bool = False,
     is_part: Callable[[str], bool] = _never,
-    lines_min: int = 1,
+    messages_min: int = 1,
 ) -> Request:
     payload = (text + LINE_END).encode("ascii")
-    return Request(payload, text, is_end, is_rejection, is_part, timeout_ns, silent, lines_min)
+    return Request(
+        payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min
+    )
 
 
 # --- argument checks --------------------------------------------------------------------------------------------------
-
-_E = TypeVar("_E", bound=Enum)
-
-
-def _member(name: str, value: _E, kind: type[_E]) -> _E:
-    if not isinstance(value, kind):
-        raise BadArgument(
-            f"{name}: expected one of {_listed(f'{kind.__name__}.{m.name}' for m in kind)}, got {value!r}"
-        )
-    return value
 
 
 def _flag(name: str, value: bool) -> int:
@@ -314,7 +307,3 @@ def _text(value: float) -> str:
     """A number as the manual writes it: no exponent, no trailing zeros, no minus before zero."""
     text = f"{value:.6f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text
-
-
-def _listed(values: Iterable[object]) -> str:
-    return ", ".join(map(str, values))

@@ -8,7 +8,7 @@ import pytest
 from imud.devices.hipnuc.commands import Message, Query, ask, log_ontime
 from imud.devices.hipnuc.session import identify, read_settings
 from imud.errors import NoReply, Rejected
-from imud.kit.session import Conversation, Outcome, Rejection, Reply, Silence, TextSession
+from imud.kit.session import Conversation, Outcome, Rejection, Reply, Session, Silence
 from imud.ledger import Ledger
 
 T = TypeVar("T")
@@ -83,22 +83,22 @@ def test_settings_without_a_reply(silent: str) -> None:
 def test_a_late_version_is_not_taken_for_the_settings() -> None:
     """LOG VERSION times out, LOG USRCONFIG goes out, and only then the version arrives, with its OK."""
     ledger = Ledger()
-    session = TextSession(ledger)
+    session = Session(ledger)
     session.start(ask(Query.VERSION), 0)
     assert isinstance(session.on_time(10**9), Silence)
     session.start(ask(Query.USRCONFIG), 10**9)
-    assert [session.on_line(line, 10**9 + 1) for line in VERSION] == [None] * len(VERSION)
+    assert [session.on_message(line, 10**9 + 1) for line in VERSION] == [None] * len(VERSION)
     assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
-    assert session.on_line("ATT_MODE: 0", 10**9 + 2) is None
-    assert session.on_line("OK", 10**9 + 2) == Reply(("ATT_MODE: 0", "OK"))
+    assert session.on_message("ATT_MODE: 0", 10**9 + 2) is None
+    assert session.on_message("OK", 10**9 + 2) == Reply(("ATT_MODE: 0", "OK"))
 
 
 def test_the_late_ok_of_a_command_does_not_end_a_report() -> None:
     ledger = Ledger()
-    session = TextSession(ledger)
+    session = Session(ledger)
     session.start(log_ontime(Message.HI91, 100), 0)
     session.on_time(10**9)
     session.start(ask(Query.VERSION), 10**9)
-    outcomes = [session.on_line(line, 10**9 + 1) for line in ("OK", *VERSION)]
+    outcomes = [session.on_message(line, 10**9 + 1) for line in ("OK", *VERSION)]
     assert outcomes == [None] * 6 + [Reply(VERSION)]
     assert ledger.replies_late == 1

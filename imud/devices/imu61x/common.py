@@ -1,0 +1,94 @@
+"""What the four wire protocols of the Forsense IMU61x share: check value, product ids, filter codes, units.
+
+Manual "IMU61X Interface Protocol and Instructions". Departures from it: the table of its chapter 5 has misprints, and
+it leaves g open; both are settled as the vendor's own programs have them.
+"""
+
+import zlib
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
+
+_CRC_START: Final = 0xFFFFFFFE
+"""`zlib.crc32` inverts its start value and its result: this start value stands for the register value 1."""
+_CRC_FINAL: Final = 0xFFFFFFFF
+
+
+def crc32(data: bytes | bytearray | memoryview) -> int:
+    """CRC-32 of UART frames and I2C and SPI bursts: reflected polynomial 0xEDB88320, start value 1, no final XOR.
+
+    It covers everything before the check value, frame header included (the manual's note 2 of table 2 and its table
+    in chapter 5 are misprinted). The check value of "123456789" is 0x3A8639CB.
+    """
+    return zlib.crc32(data, _CRC_START) ^ _CRC_FINAL
+
+
+# --- units: floats of the device are in g, °/s, ° and °C --------------------------------------------------------------
+
+M_S2_PER_G: Final = STANDARD_GRAVITY_M_S2
+"""1 g of the device is standard gravity (the manual leaves it open; the vendor's own driver takes 9.80665)."""
+RAD_S_PER_DEG_S: Final = RAD_PER_DEG
+
+EULER_CONVENTION: Final = (
+    "ZYX, assumed (the manual states none): yaw about Z, then pitch about Y, then roll about X; right-handed"
+)
+"""Of `euler_rad`. Both the order and the signs are those that the vendor's own driver takes the angles for."""
+NAVIGATION_FRAME: Final = (
+    "level, Z up; heading from power-on or the last heading reset (assumed, the manual states none)"
+)
+"""The frame that `quat_wxyz`, computed from the Euler angles, turns into."""
+
+# --- identity (tables 22 and 28) --------------------------------------------------------------------------------------
+
+PRODUCT_ID_HEAD: Final = b"\x00\x00IMU61"
+"""The first seven of the eight bytes of PROD_ID, in the order of the registers 0x6A … 0x71; the last is the product."""
+PRODUCTS: Final[Mapping[int, str]] = MappingProxyType(
+    {ord("2"): "IMU612", ord("4"): "IMU614", ord("8"): "IMU618", ord("A"): "IMU6132A", ord("B"): "IMU6132B"}
+)
+"""Product by the last byte of PROD_ID."""
+
+
+def product_of(product_id: bytes) -> str | None:
+    """The product that the eight bytes of PROD_ID name; None if they are not those of an IMU61x."""
+    if len(product_id) != len(PRODUCT_ID_HEAD) + 1 or not product_id.startswith(PRODUCT_ID_HEAD):
+        return None
+    return PRODUCTS.get(product_id[-1])
+
+
+def product_id_of(product: str) -> bytes:
+    """The eight bytes of PROD_ID of a product. Raises ValueError for a name that is none of PRODUCTS."""
+    for last, name in PRODUCTS.items():
+        if name == product:
+            return PRODUCT_ID_HEAD + bytes([last])
+    raise ValueError(f"expected one of {', '.join(PRODUCTS.values())}, got {product!r}")
+
+
+# --- filters (table 21; parameter 31 of the UART has the same codes) --------------------------------------------------
+
+FILTERS: Final = (
+    "0.2 Hz", "1 Hz", "2 Hz", "5 Hz", "10 Hz", "15 Hz", "20 Hz", "25 Hz", "30 Hz", "35 Hz", "40 Hz", "47 Hz",
+    "average 4", "average 16", "average 32", "average 64",
+)  # fmt: skip
+"""Low-pass filters by code 0 … 15: corner frequency of an IIR filter, or number of samples of a moving average."""
+FILTER_DEFAULT: Final = 0xBB
+"""47 Hz for both, as delivered."""
+
+
+def filter_control(accel: int, gyro: int) -> int:
+    """The value of FILTER_CTRL, accelerometer's code in the high half byte. Raises ValueError for codes not 0 … 15."""
+    if not (0 <= accel < len(FILTERS) and 0 <= gyro < len(FILTERS)):
+        raise ValueError(f"expected filter codes 0 … {len(FILTERS) - 1}, got {accel} (accel) and {gyro} (gyro)")
+    return accel << 4 | gyro
+
+
+def filter_codes(control: int) -> tuple[int, int]:
+    """The codes (accelerometer, gyro) in a value of FILTER_CTRL; its high byte is reserved."""
+    return control >> 4 & 0xF, control & 0xF
+
+
+# --- I2C addresses (parameter 30 of the UART sets it) -----------------------------------------------------------------
+
+I2C_ADDRESSES: Final = (0x18, 0x19, 0x1A, 0x1B)
+"""7-bit addresses a device can have, the one as delivered first."""

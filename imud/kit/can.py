@@ -1,0 +1,102 @@
+"""What a CAN device is to the rest of imud: frames, the codec that takes them, and the row a device file ends with.
+
+Frames travel between a link and a codec as `CanFrame`, and to a link as the kernel's 16-byte `struct can_frame`, so
+that a command is bytes on every kind of link.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import Any, Final, NamedTuple, Protocol
+
+from imud.kit.codec import CodecEvent
+from imud.kit.driver import Driver, Identity
+from imud.ledger import Ledger
+
+DATA_BYTES_MAX: Final = 8
+"""Data bytes of a classical CAN frame (ISO 11898-1)."""
+STANDARD_ID_MAX: Final = 0x7FF
+EXTENDED_ID_MAX: Final = 0x1FFF_FFFF
+EXTENDED_FLAG: Final = 0x8000_0000
+"""In the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)."""
+REMOTE_FLAG: Final = 0x4000_0000
+"""The same: a request without data (CAN_RTR_FLAG)."""
+ERROR_FLAG: Final = 0x2000_0000
+"""The same: news of the controller, no frame of the bus (CAN_ERR_FLAG)."""
+
+RAW_FRAME: Final = struct.Struct("=IB3x8s")
+"""`struct can_frame` in the machine's byte order: identifier with flags, length, data."""
+FRAME_BITS: Final = 111
+"""Shortest time of a standard frame with eight data bytes on the wire, pause included, in bits (no stuff bits)."""
+
+
+class CanFrame(NamedTuple):
+    """One data frame as received."""
+
+    can_id: int
+    """Identifier without flags."""
+    extended: bool
+    """Whether the identifier has 29 bits."""
+    data: bytes
+    t_rx_ns: int
+    """CLOCK_MONOTONIC of its arrival: when the kernel had it, where the kernel says so."""
+    after_loss: bool = False
+    """Whether frames are known to be missing right before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanFilter:
+    """Frames that a device needs: those whose identifier agrees with `can_id` in the bits of `mask`."""
+
+    can_id: int
+    mask: int
+    extended: bool
+
+    def takes(self, can_id: int, extended: bool) -> bool:
+        """Whether a frame passes."""
+        return extended == self.extended and not (can_id ^ self.can_id) & self.mask
+
+
+class CanCodec(Protocol):
+    """Turns the frames of one device into events. Frames of others may be among them and change nothing.
+
+    The ledger counts data bytes: those of frames of other devices as skipped. Synchronization: one thread.
+    """
+
+    ledger: Ledger
+
+    def feed_frame(self, can_id: int, extended: bool, data: bytes) -> Sequence[CodecEvent]:
+        """Take one frame; return what it completed. Never raises for any frame."""
+        ...
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """The bus is idle: return what need not wait any longer."""
+        ...
+
+    def reset(self) -> None:
+        """Frames are missing here (overrun, bus gone): frames that wait for the rest of their sample are given up."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanDriver(Driver):
+    """A device on a CAN bus, which it may share with others."""
+
+    make_codec: Callable[[Ledger, Any], CanCodec]
+    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    filters: Callable[[Any], Sequence[CanFilter]]
+    """The frames that a device with these settings sends."""
+    apply_identity: Callable[[CanCodec, Identity], None]
+    """Tells the codec what is known of the device."""
+    sample_frames: int
+    """Frames that make one sample."""
+    example_frames: Callable[[Random], Sequence[CanFrame]]
+    """Valid frames that make one sample, in the order they are sent, with random values and the default settings."""
+
+
+def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:
+    """A frame as `struct can_frame`. Raises ValueError for an identifier or a length that no frame can have."""
+    if not 0 <= can_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) or len(data) > DATA_BYTES_MAX:
+        raise ValueError(f"no CAN frame: identifier {can_id:#x}{' (29 bits)' * extended}, {len(data)} data bytes")
+    return RAW_FRAME.pack(can_id | EXTENDED_FLAG if extended else can_id, len(data), data)

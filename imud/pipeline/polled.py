@@ -1,0 +1,223 @@
+"""A device on a bus that is polled: identified and set up before it is read, and again whenever it vanished.
+
+MISSING ──bus appears──▶ SEARCHING ──identified, set up, samples──▶ RUNNING ──same bytes for a while──▶ SILENT
+   ▲                        ▲                                          │                                   │
+   └──────── bus gone ──────┴──── no answer, wrong id, bad frames ─────┴───────────────────────────────────┘
+
+Bytes are believed only between an identification and the first sign that the device is not there any more.
+"""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import monotonic_ns
+
+import msgspec
+
+from imud.config import DeviceConfig
+from imud.devices import DRIVERS
+from imud.errors import DeviceRefused, LinkError, TransferError, Trouble
+from imud.event import Event
+from imud.kit.batch import Batch
+from imud.kit.driver import Identity, of_kind
+from imud.kit.link import PolledLink
+from imud.kit.polling import PolledDriver, Reading
+from imud.kit.settings import Settings
+from imud.kit.status import DeviceState, DeviceStatus, PollingStatus
+from imud.links import LINKS
+from imud.pipeline.bus import Buses, Member
+from imud.pipeline.device import RETRY_S, SILENCE_NS, Device
+from imud.pipeline.path import SamplePath
+from imud.pipeline.polled_path import PolledPath
+from imud.pipeline.schedule import Deadlines
+from imud.units import NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What was found on the bus."""
+
+    driver: PolledDriver
+    options: Settings
+    target: int
+    identity: Identity
+
+
+class PolledRunner(Device):
+    """Owns one device on a polled bus. Synchronization: the event loop's thread only."""
+
+    link: PolledLink
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        device_id: int,
+        publish: Callable[[Batch], None],
+        tell: Callable[[Event], None],
+        buses: Buses,
+    ) -> None:
+        super().__init__(config, device_id, publish, tell, LINKS[config.link].make_polled(config.link_settings))
+        self._buses = buses
+        self._member: Member | None = None
+        self._deadlines = Deadlines()
+        self._found: Found | None = None
+        self._polled: PolledPath | None = None
+        self._believed = False
+        self._gone: asyncio.Future[str] | None = None
+        self._vanished = 0
+        self._lost_counted = 0
+
+    def tick(self, now_ns: int) -> None:
+        """Ten times a second: as every device, and deadlines that were not kept become lost samples."""
+        lost = self._deadlines.missed
+        self.ledger.lost_queue += lost - self._lost_counted
+        self._lost_counted = lost
+        super().tick(now_ns)
+
+    def close(self) -> None:
+        """Leave the bus, whose thread closes the link; may be called twice."""
+        member, self._member = self._member, None
+        self._believed = False
+        if member is not None:
+            member.leave()
+
+    def status(self) -> DeviceStatus:
+        """Everything there is to say of the device now."""
+        status = super().status()
+        return msgspec.structs.replace(status, expected_rate_hz=self.link.rate_hz, polling=self._polling_status())
+
+    # --- the bus's life ----------------------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        self._set(DeviceState.SEARCHING)
+        bus = self._buses.get(self.link.bus)
+        self._member = bus.join(self.link, self._deadlines, self._take)
+
+    async def _work(self) -> None:
+        """Find, set up, read; and again. Ends only with the bus."""
+        member = self._member
+        assert member is not None
+        while True:
+            found = await self._find(member)
+            if found is not None and await self._set_up(member, found):
+                await self._read(member, found)
+            else:
+                await asyncio.sleep(RETRY_S)
+
+    async def _find(self, member: Member) -> Found | None:
+        """One round of search; None when nothing is there."""
+        problems: list[str] = []
+        for driver in self._candidates():
+            options = self.config.options or driver.settings()
+            for target in self._targets(driver):
+                place = self.link.place(target)
+                if not member.claim(target):
+                    problems.append(f"{place}: another device of this configuration")
+                    continue
+                try:
+                    return Found(driver, options, target, await member.talk(driver.probe(options), target))
+                except (TransferError, DeviceRefused) as error:
+                    member.release()
+                    problems.append(f"{place}: {error}")
+                    if isinstance(error, TransferError) and error.trouble is Trouble.STUCK:
+                        break  # another try would hold up the other devices of the bus
+        self._complain("; ".join(dict.fromkeys(problems)))
+        return None
+
+    async def _set_up(self, member: Member, found: Found) -> bool:
+        """Make the device what the configuration says; False when that failed."""
+        try:
+            settings = await member.talk(found.driver.set_up(found.options), found.target)
+        except (TransferError, DeviceRefused) as error:
+            member.release()
+            self._complain(f"{self.link.place(found.target)}: {error}")
+            return False
+        self._learn(found.identity, settings)
+        return True
+
+    async def _read(self, member: Member, found: Found) -> None:
+        """Read until the device is gone. Raises LinkError when its bus is."""
+        gone = self._gone = asyncio.get_running_loop().create_future()
+        path = self._begin(found)
+        member.start(path.codec.polls)
+        try:
+            why = await gone
+        finally:
+            self._believed = False
+            member.rest()
+            member.release()
+        self._vanished += 1
+        self._down(DeviceState.SEARCHING, why)
+
+    def _begin(self, found: Found) -> PolledPath:
+        path = self._polled
+        if path is None or self._clock is None or found.driver is not self._driver:
+            self._driver = found.driver
+            self._clock = self._new_clock(found.driver)
+            codec = found.driver.make_codec(self.ledger, found.options)
+            period_ns, update_ns = round(NS_PER_S / self.link.rate_hz), found.driver.update_ns(found.options)
+            path = PolledPath(codec, period_ns, update_ns, *self._path_parts(self._clock))
+            self._path = self._polled = path
+        self._clock.restart()
+        self._found = found
+        path.begin(monotonic_ns())
+        self._believed = True
+        return path
+
+    def _candidates(self) -> list[PolledDriver]:
+        named = self.config.driver != "auto"
+        drivers = of_kind([DRIVERS[self.config.driver]] if named else DRIVERS.values(), PolledDriver)
+        return [driver for driver in drivers if LINKS[self.config.link].fits(driver)]
+
+    def _targets(self, driver: PolledDriver) -> Sequence[int]:
+        """Where to look, beginning where it was."""
+        if self.link.target is not None:
+            return (self.link.target,)
+        last = (self._found.target,) if self._found is not None else ()
+        return tuple(dict.fromkeys((*last, *driver.targets)))
+
+    # --- the flow ----------------------------------------------------------------------------------------------------
+
+    def _take(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
+        """What the bus's thread hands over."""
+        path = self._polled
+        why = ""
+        if path is not None and self._believed:
+            why = path.on_readings(readings)
+        elif path is not None:
+            for reading in readings:
+                path.disbelieve(reading)
+        if why or problem is not None:
+            self._believed = False
+        if problem is not None:
+            self._on_end(problem)
+        elif why and self._gone is not None and not self._gone.done():
+            self._gone.set_result(why)
+
+    def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
+        if self._believed:
+            super()._watch_flow(path, now_ns)
+
+    def _watch_lock(self, path: SamplePath, now_ns: int) -> None:
+        if self.state is DeviceState.SEARCHING:
+            self._complain("the device answers, but no value of it is new: is it held in reset?")
+
+    def _silence_limit_ns(self) -> int:
+        return max(SILENCE_NS, int(5 * NS_PER_S / self.link.rate_hz))
+
+    @property
+    def _where(self) -> str:
+        return f"{self.link.title}, {self.link.place(self._found.target)}" if self._found else self.link.title
+
+    def _polling_status(self) -> PollingStatus:
+        path, deadlines = self._polled, self._deadlines
+        return PollingStatus(
+            polls=deadlines.polls,
+            late=deadlines.late,
+            missed=deadlines.missed,
+            stale=path.codec.stale if path else 0,
+            failed=path.failed if path else 0,
+            vanished=self._vanished,
+            late_mean_ns=deadlines.sum_late_ns // deadlines.polls if deadlines.polls else 0,
+            late_worst_ns=deadlines.worst_ns,
+        )

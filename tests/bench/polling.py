@@ -1,0 +1,132 @@
+"""1 kHz SPI burst polling in the daemon's own path, the ioctl stubbed out: jitter, missed deadlines, CPU per sample.
+
+The whole path is real (bus thread, link, codec, clock, batch) except for the ioctl, which copies a burst from memory
+and, like the kernel's, lets other threads run meanwhile: `time.sleep` for as long as the bus takes at 2 MHz.
+"""
+
+import asyncio
+import ctypes
+import errno
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import imud.links.spi as spi_link
+from imud.config import DeviceConfig
+from imud.devices.imu61x import spi
+from imud.kit.batch import Batch
+from imud.kit.link import LinkType
+from imud.links.spi import SpiLink, SpiSettings
+from imud.pipeline.bus import Buses
+from imud.pipeline.polled import PolledRunner
+from imud.sim.imu61x_registers import Imu61xRegisters
+from tests.bench.rows import Row, at_most
+
+RATE_HZ = 1000.0
+BURST_BYTES = 32
+WIRE_S = BURST_BYTES * 8 / 2e6
+"""A standard burst at 2 MHz."""
+PREPARED = 512
+
+
+class Stub:
+    """spidev's ioctl: bursts come from memory, the rest from the simulated device."""
+
+    def __init__(self, wire_s: float) -> None:
+        self._device = Imu61xRegisters(time.monotonic_ns)
+        self._wire_s = wire_s
+        self._bursts = [self._burst(n) for n in range(PREPARED)]
+        self._next = 0
+
+    def _burst(self, number: int) -> bytes:
+        x = 0.001 * number
+        return bytes(spi.PIPELINE_BYTES) + spi.encode_standard(accel_m_s2=(x, -x, 9.8), gyro_rad_s=(x, 0.0, -x))
+
+    def ioctl(self, _fd: int, request: int, argument: bytes) -> int:
+        """One message; others go well."""
+        if request == spi_link.WR_BITS_PER_WORD and argument[0] > 8:
+            raise OSError(errno.EINVAL, "8-bit words only, as on a Raspberry Pi")
+        if len(argument) < spi_link.ROW.size:
+            return 0
+        rows = list(spi_link.ROW.iter_unpack(argument))
+        if self._wire_s:
+            time.sleep(self._wire_s)
+        if rows[0][2] == BURST_BYTES:
+            self._next = (self._next + 1) % PREPARED
+            ctypes.memmove(rows[0][1], self._bursts[self._next], BURST_BYTES)
+            return 0
+        sent = [ctypes.string_at(row[0], row[2]) for row in rows]
+        for row, answer in zip(rows, self._device.spi(sent), strict=True):
+            ctypes.memmove(row[1], answer, len(answer))
+        return 0
+
+    def make(self, settings: SpiSettings) -> SpiLink:
+        """A link on it, as the row of LINKS makes one."""
+        return SpiLink(settings, ioctl=self.ioctl, open_node=lambda _path, _flags: 0, close_node=lambda _fd: None)
+
+
+async def _measured(port: Path, seconds: float, busy_ms: float) -> Sequence[float]:
+    """Mean and worst lateness µs, share late, missed, polls, CPU µs per sample, with `busy_ms` of work every 20 ms."""
+    samples = 0
+
+    def publish(batch: Batch) -> None:
+        nonlocal samples
+        samples += len(batch.samples)
+
+    settings = SpiSettings(port=str(port), rate_hz=RATE_HZ, speed_hz=2_000_000, mode=0)
+    config = DeviceConfig("imu", "imu61x-spi", None, True, "spi", settings)
+    buses = Buses()
+    runner = PolledRunner(config, 0, publish, lambda _event: None, buses)
+    task = asyncio.create_task(runner.run())
+    while samples < RATE_HZ / 4:
+        await asyncio.sleep(0.01)
+    before, begun, cpu_s, polling = runner.status().polling, samples, time.process_time(), None
+    end_s = time.monotonic() + seconds
+    used_s = 0.0
+    while time.monotonic() < end_s:
+        await asyncio.sleep(0.02)
+        used_s += _busy(busy_ms)
+    polling, cpu_s = runner.status().polling, time.process_time() - cpu_s - used_s
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    buses.end()
+    assert before is not None
+    assert polling is not None
+    polls = polling.polls - before.polls
+    mean_ns = (polling.late_mean_ns * polling.polls - before.late_mean_ns * before.polls) / polls
+    late, missed = polling.late - before.late, polling.missed - before.missed
+    return mean_ns / 1e3, polling.late_worst_ns / 1e3, late / polls, missed, polls, cpu_s * 1e6 / (samples - begun)
+
+
+def _busy(milliseconds: float) -> float:
+    """Compute for so long; returns the CPU time it took, in s."""
+    begin = time.thread_time()
+    while time.thread_time() - begin < milliseconds / 1e3:
+        pass
+    return time.thread_time() - begin
+
+
+def rows(*, quick: bool = False) -> list[Row]:
+    """The figures."""
+    seconds = 3.0 if quick else 20.0
+    found: list[Row] = []
+    for name, wire_s, busy_ms in (("", WIRE_S, 0.0), (", ioctl at once", 0.0, 0.0), (", loop busy 10 %", WIRE_S, 2.0)):
+        stub = Stub(wire_s)
+        row, spi_link.LINK = spi_link.LINK, LinkType("spi", SpiSettings, make_polled=stub.make)
+        try:
+            with TemporaryDirectory() as folder:
+                port = Path(folder) / "spidev0.0"
+                port.touch()
+                mean_us, worst_us, late, missed, polls, cpu_us = asyncio.run(_measured(port, seconds, busy_ms))
+        finally:
+            spi_link.LINK = row
+        title = f"SPI burst, 1 kHz{name}"
+        found += [
+            Row(f"{title}: from deadline to read, mean", mean_us, "us"),
+            Row(f"{title}: worst", worst_us, "us"),
+            Row(f"{title}: reads a quarter of a period late", late * 100, "%"),
+            at_most(f"{title}: deadlines missed of {polls:.0f}", missed, "", 0.001 * polls),
+            Row(f"{title}: CPU per sample", cpu_us, "us"),
+        ]
+    return found

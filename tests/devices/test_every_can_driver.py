@@ -1,0 +1,203 @@
+"""What every CAN codec must do, from its row in DRIVERS alone: foreign, missing, repeated and random frames."""
+
+from collections.abc import Iterable, Sequence
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imud import devices
+from imud.kit.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanCodec, CanDriver, CanFrame, pack_frame
+from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
+from imud.kit.driver import of_kind
+from imud.ledger import Ledger
+from imud.sample import Measurement
+
+quick = settings(max_examples=40, derandomize=True, deadline=None, database=None)
+DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), CanDriver)}
+every_driver = pytest.mark.parametrize("name", list(DRIVERS))
+seeds = st.integers(0, 2**32)
+PENDING_FRAMES_MAX = 16
+"""No sample is made of more frames."""
+
+
+def make(driver: CanDriver) -> CanCodec:
+    return driver.make_codec(Ledger(), driver.settings())
+
+
+def is_own(driver: CanDriver, frame: CanFrame) -> bool:
+    return any(wanted.takes(frame.can_id, frame.extended) for wanted in driver.filters(driver.settings()))
+
+
+def foreign(driver: CanDriver, random: Random) -> CanFrame:
+    """A frame of another device: any identifier that is not the device's own, often one beside it."""
+    while True:
+        extended = random.random() < 0.4
+        most = EXTENDED_ID_MAX if extended else STANDARD_ID_MAX
+        own = random.choice(driver.example_frames(random)).can_id
+        near = (own + random.randint(-8, 8)) % (most + 1)
+        can_id = random.choice((random.randrange(most + 1), near, own & most))
+        frame = CanFrame(can_id, extended, random.randbytes(random.randint(0, 8)), 0)
+        if not is_own(driver, frame):
+            return frame
+
+
+def feed_checked(codec: CanCodec, frames: Iterable[CanFrame]) -> list[CodecEvent]:
+    """Feed frames, checking after each that the ledger closes and memory is bounded."""
+    events: list[CodecEvent] = []
+    fed = 0
+    for frame in frames:
+        new = codec.feed_frame(frame.can_id, frame.extended, frame.data)
+        events += new
+        fed += len(frame.data)
+        ledger = codec.ledger
+        assert ledger.bytes_in == fed
+        assert ledger.closes(), ledger.snapshot()
+        assert min(ledger.values()) >= 0
+        assert ledger.frames_pending <= PENDING_FRAMES_MAX
+    ledger = codec.ledger
+    bad = [event for event in events if isinstance(event, BadFrame)]
+    assert ledger.frames_bad() == sum(event.reason is not BadReason.NOT_FINITE for event in bad)
+    assert ledger.frames_not_finite == sum(event.reason is BadReason.NOT_FINITE for event in bad)
+    assert ledger.frames_in_replies == sum(isinstance(event, ReplyFrame) for event in events)
+    return events
+
+
+def measurements(events: Iterable[CodecEvent]) -> list[Measurement]:
+    return [event for event in events if isinstance(event, Measurement)]
+
+
+def sets(driver: CanDriver, random: Random, count: int) -> list[Sequence[CanFrame]]:
+    return [driver.example_frames(random) for _ in range(count)]
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_frames_of_a_sample_make_one(name: str, seed: int) -> None:
+    driver, random = DRIVERS[name], Random(seed)
+    groups = sets(driver, random, 8)
+    codec = make(driver)
+    for group in groups:
+        assert len(group) == driver.sample_frames
+        assert len(measurements(feed_checked(make(driver), group))) == 1
+    events = feed_checked(codec, (frame for group in groups for frame in group))
+    assert len(measurements(events)) == len(events) == len(groups)
+    assert codec.ledger.frames_in_samples == codec.ledger.frames_good == len(groups) * driver.sample_frames
+    assert codec.ledger.bytes_in_good_frames == codec.ledger.bytes_in
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_frames_of_others_change_nothing(name: str, seed: int) -> None:
+    driver, random = DRIVERS[name], Random(seed)
+    own = [frame for group in sets(driver, random, 6) for frame in group]
+    expected = feed_checked(make(driver), own)
+    mixed: list[CanFrame] = []
+    skipped = 0
+    for frame in own:
+        others = [foreign(driver, random) for _ in range(random.randrange(4))]
+        skipped += sum(len(other.data) for other in others)
+        mixed += [*others, frame]
+    codec = make(driver)
+    assert feed_checked(codec, mixed) == expected
+    assert codec.ledger.bytes_skipped == skipped
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_missing_frames_cost_their_samples_only(name: str, seed: int) -> None:
+    """Values are never mixed: each measurement is one of those that the whole sets give."""
+    driver, random = DRIVERS[name], Random(seed)
+    groups = sets(driver, random, 12)
+    whole = [measurements(feed_checked(make(driver), group))[0] for group in groups]
+    heard: list[CanFrame] = []
+    intact: list[Measurement] = []
+    for group, expected in zip(groups, whole, strict=True):
+        lost = {random.randrange(len(group))} if random.random() < 0.3 else set()
+        heard += [frame for place, frame in enumerate(group) if place not in lost]
+        intact += [] if lost else [expected]
+    found = measurements(feed_checked(make(driver), heard))
+    assert found == intact
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_repeated_frames_cost_nothing(name: str, seed: int) -> None:
+    """A receiver may get a frame twice when the sender saw an error in its last bits (ISO 11898-1)."""
+    driver, random = DRIVERS[name], Random(seed)
+    own = [frame for group in sets(driver, random, 6) for frame in group]
+    twice = [frame for original in own for frame in [original] * random.choice((1, 1, 2))]
+    found = measurements(feed_checked(make(driver), twice))
+    assert found == measurements(feed_checked(make(driver), own))
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
+    driver, random = DRIVERS[name], Random(seed)
+    frames: list[CanFrame] = []
+    for group in sets(driver, random, 12):
+        for frame in group:
+            kinds = (
+                frame,
+                frame,
+                foreign(driver, random),
+                frame._replace(data=random.randbytes(len(frame.data))),
+                frame._replace(data=random.randbytes(random.randint(0, 8))),
+                frame._replace(data=b"\x00\x00\x80\x7f\xff\xff\xff\xff"),  # infinity and NaN as floats
+            )
+            frames += random.choices(kinds, k=random.choice((0, 1, 1, 1, 3)))
+    random.shuffle(frames)
+    codec = make(driver)
+    events = feed_checked(codec, frames)
+    codec.reset()
+    assert codec.ledger.frames_pending == codec.ledger.bytes_pending == 0
+    assert codec.ledger.closes()
+    assert all(finite(event) for event in measurements(events))
+
+
+def finite(measurement: Measurement) -> bool:
+    values = (measurement.accel_m_s2, measurement.gyro_rad_s, measurement.euler_rad, measurement.quat_wxyz)
+    return all(-1e40 < number < 1e40 for vector in values if vector is not None for number in vector)
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_reset_never_mixes_what_was_before_with_what_comes(name: str, seed: int) -> None:
+    driver, random = DRIVERS[name], Random(seed)
+    before, after = sets(driver, random, 2)
+    cut = random.randrange(len(before))
+    codec = make(driver)
+    feed_checked(codec, before[:cut])
+    codec.reset()
+    assert codec.ledger.frames_pending == 0
+    assert codec.ledger.closes()
+    events = [event for frame in after for event in codec.feed_frame(frame.can_id, frame.extended, frame.data)]
+    assert events == feed_checked(make(driver), after)
+
+
+@every_driver
+def test_examples_differ_and_are_the_same_for_a_seed(name: str) -> None:
+    example = DRIVERS[name].example_frames
+    assert example(Random(5)) == example(Random(5)) != example(Random(6))
+
+
+@every_driver
+def test_rows_are_complete(name: str) -> None:
+    driver = DRIVERS[name]
+    assert driver.name == name
+    assert driver.title
+    assert driver.navigation_frame
+    assert driver.euler_convention
+    assert driver.tick_ns >= 0
+    assert driver.tick_modulus > 1
+    filters = driver.filters(driver.settings())
+    assert all(pack_frame(wanted.can_id, wanted.extended, b"") for wanted in filters)
+    assert all(is_own(driver, frame) for frame in driver.example_frames(Random(1)))

@@ -1,0 +1,163 @@
+"""What every polled driver must do, from its row in DRIVERS alone: damage is told, nothing raises, ledgers close."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from random import Random
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imud.devices import DRIVERS
+from imud.errors import DeviceRefused, TransferError, Trouble
+from imud.kit.codec import BadFrame
+from imud.kit.driver import of_kind
+from imud.kit.polling import PolledCodec, PolledDriver, PolledEvent, Transfer, Vanished, run_dialogue
+from imud.ledger import Ledger
+from imud.links import LINKS
+from imud.sample import Measurement
+
+NAMES = [driver.name for driver in of_kind(DRIVERS.values(), PolledDriver)]
+TRANSFERS_MAX = 20
+"""No dialogue has more, whatever it is answered."""
+
+quick = settings(max_examples=60, derandomize=True, deadline=None, database=None)
+every_driver = pytest.mark.parametrize("name", NAMES)
+seeds = st.integers(0, 2**32)
+
+
+def row(name: str) -> PolledDriver:
+    driver = DRIVERS[name]
+    assert isinstance(driver, PolledDriver)
+    return driver
+
+
+def make(driver: PolledDriver) -> PolledCodec:
+    return driver.make_codec(Ledger(), driver.settings())
+
+
+def take(codec: PolledCodec, poll: int, data: bytes) -> Sequence[PolledEvent]:
+    """Take checked: every byte is in the ledger, and it closes."""
+    ledger = codec.ledger
+    before, bad = ledger.bytes_in, ledger.frames_bad()
+    events = codec.take(poll, data)
+    assert before <= ledger.bytes_in <= before + len(data)
+    assert ledger.closes(), ledger.snapshot()
+    assert min(ledger.values()) >= 0
+    told = sum(isinstance(event, BadFrame) for event in events) - ledger.frames_not_finite
+    assert ledger.frames_bad() - bad == told
+    return events
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_good_frames_make_one_measurement_each(name: str, seed: int) -> None:
+    driver, random = row(name), Random(seed)
+    codec = make(driver)
+    for number in range(1, 6):
+        (event,) = take(codec, 0, driver.example_reading(random))
+        assert isinstance(event, Measurement)
+        assert event.size_bytes * number == codec.ledger.bytes_in_good_frames
+    assert codec.ledger.frames_in_samples == codec.ledger.frames_good == 5
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_damage_never_passes_silently(name: str, seed: int) -> None:
+    """One wrong bit, one wrong byte, or a run of them: the same measurement, or none and an event that tells."""
+    driver, random = row(name), Random(seed)
+    data = driver.example_reading(random)
+    (good,) = make(driver).take(0, data)
+    damaged = bytearray(data)
+    at = random.randrange(len(data))
+    match random.randrange(3):
+        case 0:
+            damaged[at] ^= 1 << random.randrange(8)
+        case 1:
+            damaged[at] = random.randrange(256)
+        case _:
+            damaged[at:] = bytes([random.choice((0x00, 0xFF))]) * (len(data) - at)
+    events = take(make(driver), 0, bytes(damaged))
+    assert events
+    assert events == (good,) or not any(isinstance(event, Measurement) for event in events)
+
+
+@every_driver
+@quick
+@given(data=st.binary(max_size=120), poll=st.integers(0, 2), repeat=st.booleans())
+def test_any_bytes_of_any_length_raise_nothing(name: str, data: bytes, poll: int, repeat: bool) -> None:
+    codec = make(row(name))
+    poll %= len(codec.polls)
+    take(codec, poll, data)
+    take(codec, poll, data * 2 if repeat else data)
+    codec.reset()
+    assert codec.ledger.closes()
+
+
+@every_driver
+@pytest.mark.parametrize("line", [0x00, 0xFF])
+def test_a_line_that_nobody_drives_is_a_device_that_vanished(name: str, line: int) -> None:
+    driver = row(name)
+    codec = make(driver)
+    data = bytes([line]) * len(driver.example_reading(Random(1)))
+    (event,) = take(codec, 0, data)
+    assert isinstance(event, Vanished)
+    assert f"0x{line:02X}" in event.why
+    assert codec.ledger.frames_bad() == 0
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_the_same_bytes_again_are_counted_and_no_sample(name: str, seed: int) -> None:
+    driver = row(name)
+    codec = make(driver)
+    data = driver.example_reading(Random(seed))
+    take(codec, 0, data)
+    assert take(codec, 0, data) == ()
+    assert codec.stale == codec.ledger.frames_ignored == 1
+    codec.reset()
+    assert len(take(codec, 0, data)) == 1
+
+
+@every_driver
+@quick
+@given(seed=seeds)
+def test_dialogues_end_whatever_is_answered(name: str, seed: int) -> None:
+    """With noise and failures in any order they return, or raise what they may, and never go on without end."""
+    driver, random = row(name), Random(seed)
+    transfers = 0
+
+    def transfer(wanted: Transfer) -> bytes:
+        nonlocal transfers
+        transfers += 1
+        assert transfers <= TRANSFERS_MAX
+        if random.random() < 0.2:
+            raise TransferError(random.choice(list(Trouble)), "by the test")
+        size = wanted.read_bytes or sum(map(len, wanted.sends))
+        return random.choice((random.randbytes(size), b"\xff" * size, bytes(size), b""))
+
+    options = driver.settings()
+    for dialogue in (driver.probe(options), driver.set_up(options)):
+        transfers = 0
+        with suppress(TransferError, DeviceRefused):
+            run_dialogue(dialogue, transfer)
+
+
+@every_driver
+def test_rows_are_complete(name: str) -> None:
+    driver = row(name)
+    assert driver.name == name
+    assert driver.title
+    assert driver.euler_convention
+    assert driver.navigation_frame
+    assert len(set(driver.targets)) == len(driver.targets) > 0
+    assert LINKS[driver.link].polled
+    assert LINKS[driver.link].fits(driver)
+    assert [link for link in LINKS if LINKS[link].fits(driver)] == [driver.link]
+    assert make(driver).polls[0].every_ns == 0
+    assert driver.example_reading(Random(5)) == driver.example_reading(Random(5)) != driver.example_reading(Random(6))
+    assert msgspec.structs.fields(driver.settings)

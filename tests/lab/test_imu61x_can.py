@@ -1,0 +1,318 @@
+"""IMU61x on the kernel's CAN: stream, several devices, drops, error states, interface down and up."""
+
+import asyncio
+import json
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Awaitable, Callable
+from time import monotonic, monotonic_ns
+from typing import Any
+
+import can
+import pytest
+
+from imud.config import DeviceConfig
+from imud.devices.imu61x.can import Imu61xCanSettings, encode_set
+from imud.event import Event, EventKind
+from imud.kit.can import pack_frame
+from imud.kit.status import DeviceState
+from imud.links.can_socket import FrameReader
+from imud.links.socketcan import SocketCanSettings, pack_filters
+from imud.pipeline.can_runner import CanRunner
+from imud.sample import Sample
+from imud.sim.can_port import CanPort
+from imud.sim.imu61x_can import Imu61xCanHardware, Imu61xCanModule
+from tests.lab.can_interface import CanInterface
+from tests.lab.tool import tool
+
+LIMIT_S = 20.0
+BUS_OFF, CONTROLLER = 0x2000_0040, 0x2000_0004
+
+
+class Rig:
+    """A device on an interface, and a raw socket at the far end of the bus."""
+
+    def __init__(self, near: str, far: str, *, base_id: int = 101, **link: Any) -> None:
+        settings = SocketCanSettings(interface=near, **link)
+        config = DeviceConfig("mast", "imu61x-can", Imu61xCanSettings(base_id=base_id), True, "socketcan", settings)
+        self.samples: list[Sample] = []
+        self.events: list[Event] = []
+        self.runner = CanRunner(config, 1, lambda batch: self.samples.extend(batch.samples), self.events.append)
+        self.far = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self.far.bind((far,))
+
+    def send(self, *indices: int, base_id: int = 101) -> None:
+        for index in indices:
+            for can_id, data in encode_set(
+                index=index, accel_m_s2=(0, 0, 9.80665), gyro_rad_s=(0, 0, index % 7), euler_rad=(0.1, 0.2, 0.3),
+                temperature_c=25, base_id=base_id,
+            ):  # fmt: skip
+                self.far.send(pack_frame(can_id, False, data))
+
+    def back(self) -> None:
+        """Forget that the far end's socket heard of the interface going down."""
+        self.far.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+
+    def send_error(self, classes: int, status: int) -> None:
+        """An error frame as a controller's driver makes it; on vcan it reaches those who asked for its class."""
+        self.far.send(struct.pack("=IB3x8s", classes, 8, bytes([0, status])))
+
+    async def until(self, condition: Callable[[], object], what: str) -> None:
+        end = monotonic() + LIMIT_S
+        while not condition():
+            assert monotonic() < end, f"not within {LIMIT_S} s: {what}; {self.runner.status()}"
+            self.runner.tick(monotonic_ns())
+            await asyncio.sleep(0.01)
+
+    async def running(self) -> None:
+        """Wait until its socket is open, so that frames sent from now on are its."""
+        await self.until(lambda: self.runner.state is not DeviceState.MISSING, "the bus is open")
+
+    def play(self, story: Callable[["Rig"], Awaitable[None]]) -> None:
+        """Run the device while the story is told."""
+
+        async def both() -> None:
+            task = asyncio.create_task(self.runner.run())
+            try:
+                await story(self)
+            finally:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+                self.runner.close()
+
+        try:
+            asyncio.run(both())
+        finally:
+            self.far.close()
+        assert self.runner.ledger.closes(), self.runner.ledger.snapshot()
+        assert self.runner.ledger.frames_pending == 0
+
+
+def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> None:
+    rig = Rig(vcan.name, vcan.name)
+
+    async def story(rig: Rig) -> None:
+        await rig.running()
+        hardware = Imu61xCanHardware(rate_hz=50, boot_ms=0, index=65500)
+        module = Imu61xCanModule(monotonic_ns(), hardware)
+        port = CanPort(module, vcan.name)
+        while module.samples_sent < 100:
+            port.step(monotonic_ns(), True)
+            await asyncio.sleep(0.001)
+        await rig.until(lambda: len(rig.samples) >= 99, "99 samples")
+        port.close()
+        errors_ms = []
+        for sample in rig.samples:
+            truth = hardware.motion.at((sample.t_ns - module.epoch_ns) / 1e9)
+            assert sample.gyro_rad_s is not None
+            assert sample.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=0.2)
+            assert sample.t_ns <= sample.t_rx_ns
+            errors_ms.append(sample.t_err_ns / 1e6)
+        rig.runner.tick(monotonic_ns())
+        status = rig.runner.status()
+        assert status.state is DeviceState.RUNNING
+        assert status.ledger["lost_gap_device"] == 0
+        assert status.expected_rate_hz == pytest.approx(50, rel=0.05)
+
+    rig.play(story)
+    assert [s.seq for s in rig.samples] == list(range(1, len(rig.samples) + 1))
+    assert rig.events[0].kind is EventKind.UP
+
+
+def test_two_devices_share_a_bus_and_see_only_their_own(vcan: CanInterface) -> None:
+    first, second = Rig(vcan.name, vcan.name), Rig(vcan.name, vcan.name, base_id=200)
+
+    async def other(rig: Rig) -> None:
+        task = asyncio.create_task(second.runner.run())
+        await rig.running()
+        await second.running()
+        tool("cansend", vcan.name, "12345678#DEADBEEF")
+        rig.send(1, 2, 3)
+        second.send(1, 2, base_id=200)
+        await rig.until(lambda: len(rig.samples) == 3, "three of the first")
+        await second.until(lambda: len(second.samples) == 2, "two of the second")
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        second.runner.close()
+
+    first.play(other)
+    second.far.close()
+    for rig, frames in ((first, 15), (second, 10)):
+        assert rig.runner.ledger.bytes_in == 8 * frames
+        assert rig.runner.ledger.bytes_skipped == 0
+
+
+def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface) -> None:
+    rig = Rig(vcan.name, vcan.name, receive_buffer_bytes=4096)
+
+    async def story(rig: Rig) -> None:
+        await rig.running()
+        rig.send(*range(10))  # nobody reads meanwhile: the buffer runs over
+        await rig.until(lambda: rig.runner.ledger.bytes_in, "the first frames")
+        rig.send(10)
+        await rig.until(lambda: rig.samples and rig.samples[-1].seq, "a sample")
+        await rig.until(lambda: rig.runner.ledger.lost_overrun, "loss is counted")
+        rig.runner.tick(monotonic_ns())
+
+    rig.play(story)
+    ledger = rig.runner.ledger
+    assert ledger.samples + ledger.lost_overrun == 11
+    assert ledger.lost_gap_device == 0
+    assert EventKind.LOSS in [event.kind for event in rig.events]
+
+
+def test_a_jump_of_index_without_drops_is_the_devices(vcan: CanInterface) -> None:
+    rig = Rig(vcan.name, vcan.name)
+
+    async def story(rig: Rig) -> None:
+        await rig.running()
+        rig.send(65534, 65535, 65536 + 2)
+        await rig.until(lambda: len(rig.samples) == 3, "three samples")
+
+    rig.play(story)
+    assert rig.runner.ledger.lost_gap_device == 2
+    assert rig.runner.ledger.lost_overrun == 0
+
+
+def test_interface_down_and_up_again(vcan: CanInterface) -> None:
+    rig = Rig(vcan.name, vcan.name)
+
+    async def story(rig: Rig) -> None:
+        await rig.running()
+        rig.send(1, 2)
+        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
+        vcan.down()
+        await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "missing")
+        await rig.until(lambda: "is down" in rig.runner.status().problem, "the problem is told")
+        vcan.up()
+        await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open again")
+        rig.back()
+        rig.send(500, 501)
+        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running again")
+
+    rig.play(story)
+    assert len(rig.samples) == 4
+    assert rig.runner.ledger.lost() == 0
+    assert [e.kind for e in rig.events] == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+    assert rig.runner.status().connects == 2
+
+
+def test_interface_that_is_missing_is_waited_for() -> None:
+    config = SocketCanSettings(interface="vcan7")
+    tool("ip", "link", "add", "dev", "vcan7", "type", "vcan")
+    rig = Rig("vcan7", "vcan7")
+    tool("ip", "link", "delete", "vcan7")
+
+    async def story(rig: Rig) -> None:
+        await rig.until(lambda: "not there" in rig.runner.status().problem, "the problem is told")
+        tool("ip", "link", "add", "dev", config.interface, "type", "vcan")
+        tool("ip", "link", "set", config.interface, "up")
+        await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open")
+        tool("ip", "link", "delete", config.interface)
+        await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "gone")
+
+    rig.play(story)
+
+
+def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
+    rig = Rig(vcan.name, vcan.name)
+
+    async def story(rig: Rig) -> None:
+        await rig.running()
+        rig.send(1)
+        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
+        rig.send_error(CONTROLLER, 0x10)
+        await rig.until(lambda: "error-passive" in rig.runner.status().problem, "error-passive is shown")
+        assert rig.runner.state is DeviceState.RUNNING
+        rig.send_error(BUS_OFF, 0)
+        await rig.until(lambda: "bus-off" in rig.runner.status().problem, "bus-off is shown")
+        await rig.until(lambda: rig.runner.state is DeviceState.SILENT, "silent")
+        assert "bus-off" in rig.runner.status().problem
+        rig.send_error(0x2000_0100, 0)
+        rig.send(2)
+        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running again")
+        assert rig.runner.status().problem == ""
+        rig.send(3)
+        rig.send_error(CONTROLLER, 0x01)  # the controller's own buffer ran over
+        rig.send(5)
+        await rig.until(lambda: len(rig.samples) == 4, "four samples")
+
+    rig.play(story)
+    kernel = rig.runner.status().kernel
+    news = [event.message for event in rig.events if event.kind is EventKind.LINK]
+    assert [message.partition(":")[0] for message in news] == [
+        "vcan0 is error-passive",
+        "vcan0 is bus-off",
+        "vcan0 is error-active again",
+    ]
+    assert rig.runner.ledger.lost_overrun == 1
+    assert (kernel.error_passive, kernel.bus_off) == (1, 1)
+
+
+def test_real_controllers_carry_the_stream(can_pair: tuple[CanInterface, CanInterface]) -> None:
+    near, far = can_pair
+    rig = Rig(near.name, far.name)
+
+    async def story(rig: Rig) -> None:
+        await rig.running()
+        for index in range(20):
+            rig.send(index)
+            await asyncio.sleep(0.01)
+        await rig.until(lambda: len(rig.samples) == 20, "twenty samples")
+        assert rig.runner.status().link == "can0 at 500 kbit/s"
+        near.down()
+        await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "missing")
+        near.up()
+        await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open again")
+        rig.send(90, 91)  # the far controller stayed up
+        await rig.until(lambda: len(rig.samples) == 22, "two more")
+
+    rig.play(story)
+    assert rig.runner.ledger.lost() == 0
+
+
+def test_receive_path_against_python_can(vcan: CanInterface) -> None:
+    """CPU per frame of the receiving call alone, on the same bus in one run; ratios only mean something here."""
+    count, rounds = 60, 10
+    ours = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+    far = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    with ours, far, can.Bus(vcan.name, interface="socketcan") as bus:
+        far.bind((vcan.name,))
+        ours.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters([]) or struct.pack("=II", 0, 0))
+        ours.bind((vcan.name,))
+        reader = FrameReader(ours, lambda classes, data: False)
+        taken_ns = [0, 0]
+        for _ in range(rounds):
+            for number in range(count):
+                far.send(pack_frame(0x100 + number, False, bytes(8)))
+            begin_ns = monotonic_ns()
+            frames = reader.read()
+            middle_ns = monotonic_ns()
+            messages = [bus.recv(0) for _ in range(count)]
+            taken_ns[0] += middle_ns - begin_ns
+            taken_ns[1] += monotonic_ns() - middle_ns
+            assert [f.can_id for f in frames] == [m.arbitration_id for m in messages if m]
+    per_frame = [taken / count / rounds / 1000 for taken in taken_ns]
+    print(f"\nCAN receive, µs per frame: imud {per_frame[0]:.1f}, python-can {per_frame[1]:.1f}, "
+          f"ratio {per_frame[1] / per_frame[0]:.1f}")  # fmt: skip
+    assert per_frame[1] > 3 * per_frame[0]
+
+
+def test_the_simulator_as_a_process_of_its_own(vcan: CanInterface) -> None:
+    """What `imud demo` starts; the interface is found by itself."""
+    rig = Rig(vcan.name, vcan.name)
+    argv = [sys.executable, "-m", "imud.sim", "--device", "imu61x-can", "--boot", "0", "--rate", "20"]
+
+    async def story(rig: Rig) -> None:
+        await rig.until(lambda: len(rig.samples) >= 20, "a second of samples")
+
+    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout.readline().strip() == vcan.name
+        rig.play(story)
+        process.stdin.close()
+        assert json.loads(process.stdout.read())["frames_refused"] == 0
+    assert rig.runner.ledger.lost() == 0

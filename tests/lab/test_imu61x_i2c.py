@@ -1,0 +1,132 @@
+"""The IMU61x on the kernel's i2c-dev: found by its id, set up, streams, faults, recovery."""
+
+import asyncio
+import errno
+
+import pytest
+
+from imud.devices.imu61x import i2c as device_i2c
+from imud.kit.polling import Poll
+from imud.kit.status import DeviceState
+from tests.lab.bus import Bus
+from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, physics_holds, registers, vanishes
+from tests.lab.register_device import RegisterDevice
+from tests.lab.wire import I2cTransfer
+from tests.polled import device_config, running
+
+RESOLUTION_M_S2 = 0.02
+ADDRESS = 0x1A
+
+
+def test_found_by_its_id_and_streams_the_truth(i2c: Bus[I2cTransfer]) -> None:
+    """Another sensor answers at the first address; the device is at the third."""
+    other = RegisterDevice({0x6A: 0x12})
+    device = registers(product="IMU6132B")
+    i2c.attach(0x18, other)
+    i2c.attach(ADDRESS, on_i2c(device))
+    config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20}, accel_filter=2)
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(20, LIMIT_S)
+            status = rig.runner.status()
+            assert status.identity == {"product": "IMU6132B"}
+            assert status.link == "/dev/i2c-0, address 0x1a"
+            assert status.settings == {"accel_filter": "2 Hz", "gyro_filter": "47 Hz"}
+            assert device.filter == 0x2B
+            physics_holds(rig, device, RESOLUTION_M_S2)
+
+    asyncio.run(body())
+    assert not any(other.registers[register] for register in range(0x20)), "nothing is written to another device"
+    bursts = [t for t in i2c.transfers if t.segments[0].data == b"\x12"]
+    assert len(bursts) >= 20
+    assert {tuple((s.reads, s.length) for s in t.segments) for t in bursts} == {((False, 1), (True, 32))}
+
+
+FAULTS: dict[str, tuple[dict[str, object], str]] = {
+    "not acknowledged": ({"error": errno.ENXIO}, "no acknowledgement"),
+    "not acknowledged, as on a Raspberry Pi": ({"error": errno.EREMOTEIO}, "no acknowledgement"),
+    "bus stuck": ({"error": errno.ETIMEDOUT}, "held low"),
+    "arbitration lost again and again": ({"error": errno.EAGAIN}, "transfer failed"),
+    "line high": ({"line": 0xFF}, "only 0xFF"),
+    "line low": ({"line": 0x00}, "only 0x00"),
+    "wrong id": ({"product_id": b"\x00\x00ICM206"}, "product id"),
+    "damaged for good": ({"flips": 1000}, "damaged frames"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_vanishes_and_is_identified_before_it_is_believed(
+    i2c: Bus[I2cTransfer], fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    polls = (Poll(device_i2c.READ_BURST), Poll(device_i2c.READ_ID, 10**8))
+    if fault == "wrong id":  # otherwise its reading tells of other faults as well, and sooner
+        monkeypatch.setattr(device_i2c.Imu61xI2cCodec, "polls", polls)
+    device = registers()
+    i2c.attach(ADDRESS, on_i2c(device))
+    config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "address": ADDRESS, "rate_hz": 20})
+    values, why = FAULTS[fault]
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(3, LIMIT_S)
+            for name, value in values.items():
+                setattr(device.faults, name, value)
+            await vanishes(rig, why)
+            device.faults = type(device.faults)()
+            await comes_back(rig)
+
+    asyncio.run(body())
+
+
+def test_unplugged_and_plugged(i2c: Bus[I2cTransfer]) -> None:
+    device = registers()
+    i2c.attach(0x18, on_i2c(device))
+    config = device_config("imu", "auto", "i2c", {"bus": 0, "rate_hz": 20})
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(3, LIMIT_S)
+            i2c.detach(0x18)
+            await vanishes(rig, "no acknowledgement")
+            i2c.attach(0x1B, on_i2c(device))  # its address was changed meanwhile
+            await comes_back(rig)
+            assert rig.runner.status().link == "/dev/i2c-0, address 0x1b"
+
+    asyncio.run(body())
+
+
+def test_repeated_bytes_are_counted_and_no_samples(i2c: Bus[I2cTransfer]) -> None:
+    device = registers()
+    i2c.attach(0x18, on_i2c(device))
+    config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20})
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(3, LIMIT_S)
+            device.faults.frozen = True
+            await rig.until(lambda: rig.state is DeviceState.SILENT, "silent", LIMIT_S)
+            polling = rig.runner.status().polling
+            assert polling is not None
+            assert polling.stale > 5
+            assert rig.runner.ledger.frames_ignored == polling.stale
+            device.faults.frozen = False
+            await comes_back(rig)
+
+    asyncio.run(body())
+
+
+def test_two_devices_on_one_bus_are_found_by_themselves(i2c: Bus[I2cTransfer]) -> None:
+    first, second = registers(product="IMU612"), registers(product="IMU618")
+    i2c.attach(0x18, on_i2c(first))
+    i2c.attach(0x19, on_i2c(second))
+    configs = [device_config(name, "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20}) for name in ("a", "b")]
+
+    async def body() -> None:
+        async with running(*configs) as (a, b):
+            await a.until_samples(5, LIMIT_S)
+            await b.until_samples(5, LIMIT_S)
+            links = {rig.runner.status().link for rig in (a, b)}
+            assert links == {"/dev/i2c-0, address 0x18", "/dev/i2c-0, address 0x19"}
+
+    asyncio.run(body())

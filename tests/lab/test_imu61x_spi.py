@@ -1,0 +1,144 @@
+"""The IMU61x on the kernel's spidev: identify, set up, stream, faults, recovery; 8-bit words only, and 16."""
+
+import asyncio
+import errno
+
+import pytest
+
+from imud.devices.imu61x import spi
+from imud.kit.polling import Poll
+from imud.kit.status import DeviceState
+from tests.lab.bus import Bus
+from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes
+from tests.lab.wire import SpiTransfer
+from tests.polled import Rig, device_config, running
+
+RESOLUTION_M_S2 = 0.02
+PORTS = {"spi8": "/dev/spidev0.0", "spi16": "/dev/spidev1.0"}
+
+
+@pytest.fixture(params=list(PORTS))
+def bus(request: pytest.FixtureRequest) -> tuple[Bus[SpiTransfer], str]:
+    """Either controller, with the port of its first chip select."""
+    return request.getfixturevalue(request.param), PORTS[request.param]
+
+
+@pytest.mark.parametrize("burst", ["standard", "extended", "registers"])
+def test_streams_the_truth(bus: tuple[Bus[SpiTransfer], str], burst: str) -> None:
+    far, port = bus
+    device = registers(modes=frozenset({3}))
+    far.attach(0, on_spi(device))
+    config = device_config(
+        "imu", "imu61x-spi", "spi", {"port": port, "rate_hz": 20, "speed_hz": 500_000}, burst=burst, gyro_filter=3
+    )
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(20, LIMIT_S)
+            status = rig.runner.status()
+            assert status.identity == {"product": "IMU614"}
+            assert status.link == f"{port}, mode 3"
+            assert status.settings["gyro_filter"] == "5 Hz"
+            assert status.ledger["frames_bad_crc"] == 0
+            assert device.filter == 0xB3
+            assert device.window == 0
+            physics_holds(rig, device, RESOLUTION_M_S2)
+
+    asyncio.run(body())
+    sizes = {"standard": 32, "extended": 52, "registers": 2}
+    bursts = [
+        t for t in far.transfers if len(t.segments[0].mosi) == sizes[burst] and t.segments[0].mosi[0] in (0x80, 0x0E)
+    ]
+    assert len(bursts) >= 20
+    bits = 8 if port == PORTS["spi8"] else 16
+    assert {(s.bits_per_word, s.speed_hz) for t in bursts for s in t.segments} == {(bits, 500_000)}
+    if burst != "registers":  # one ioctl, one selection
+        assert {len(t.segments) for t in bursts} == {1}
+        assert not any(t.stays_selected for t in bursts)
+
+
+FAULTS: dict[str, tuple[dict[str, object], str]] = {
+    "unplugged, line high": ({"line": 0xFF}, "only 0xFF"),
+    "unplugged, line low": ({"line": 0x00}, "only 0x00"),
+    "wrong id": ({"product_id": b"\x00\x00ICM206"}, "PROD_ID"),
+    "bus stuck": ({"error": errno.ETIMEDOUT}, "held low"),
+    "controller error": ({"error": errno.EIO}, "transfer failed"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_vanishes_and_is_identified_before_it_is_believed(
+    bus: tuple[Bus[SpiTransfer], str], fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spi, "_POLLS", {"standard": (spi._POLLS["standard"][0], Poll(spi.READ_STATE, 10**8))})
+    far, port = bus
+    device = registers()
+    far.attach(0, on_spi(device))
+    config = device_config("imu", "imu61x-spi", "spi", {"port": port, "rate_hz": 20})
+    values, why = FAULTS[fault]
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(3, LIMIT_S)
+            for name, value in values.items():
+                setattr(device.faults, name, value)
+            await vanishes(rig, why)
+            device.faults = type(device.faults)()
+            device.restart()
+            await comes_back(rig)
+            assert rig.runner.status().polling.vanished >= 1  # type: ignore[union-attr]  # this runner has it
+            assert device.window == 0
+
+    asyncio.run(body())
+
+
+def test_damaged_bytes_cost_their_sample_only(spi8: Bus[SpiTransfer]) -> None:
+    device = registers()
+    spi8.attach(0, on_spi(device))
+    config = device_config("imu", "imu61x-spi", "spi", {"port": PORTS["spi8"], "rate_hz": 20})
+
+    async def damage(rig: Rig) -> None:
+        device.faults.flips = 1
+        await rig.until(lambda: rig.runner.ledger.frames_bad_crc >= 1, "the damage is seen", LIMIT_S)
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(5, LIMIT_S)
+            await damage(rig)
+            await rig.until_samples(5, LIMIT_S)
+            assert rig.state is DeviceState.RUNNING
+            assert rig.runner.ledger.lost_crc == 1
+            physics_holds(rig, device, RESOLUTION_M_S2)
+
+    asyncio.run(body())
+
+
+def test_absent_device_does_not_hold_up_its_neighbour(spi8: Bus[SpiTransfer]) -> None:
+    device = registers()
+    spi8.attach(1, on_spi(device))
+    configs = [
+        device_config(name, "imu61x-spi", "spi", {"port": port, "rate_hz": 20})
+        for name, port in (("absent", "/dev/spidev0.0"), ("there", "/dev/spidev0.1"))
+    ]
+
+    async def body() -> None:
+        async with running(*configs) as (absent, there):
+            await there.until_samples(30, LIMIT_S)
+            assert absent.state is DeviceState.SEARCHING
+            await absent.until(lambda: "only 0x00" in absent.runner.status().problem, "the reason", LIMIT_S)
+
+    asyncio.run(body())
+
+
+def test_bus_that_goes_is_noticed(spi8: Bus[SpiTransfer]) -> None:
+    device = registers()
+    spi8.attach(0, on_spi(device))
+    config = device_config("imu", "imu61x-spi", "spi", {"port": PORTS["spi8"], "rate_hz": 20})
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(3, LIMIT_S)
+            spi8.close()
+            await vanishes(rig, "no acknowledgement")
+
+    asyncio.run(body())

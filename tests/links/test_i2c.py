@@ -1,0 +1,87 @@
+"""The I2C link on a simulated bus: repeated start, the SMBus way, failures."""
+
+import errno
+
+import pytest
+from smbus2 import I2cFunc
+
+from imud.errors import LinkDenied, LinkError, LinkMissing, TransferError, Trouble
+from imud.kit.polling import Transfer
+from imud.links import LINKS
+from imud.links.i2c import I2C_TIMEOUT, I2cLink, I2cSettings
+from imud.sim.imu61x_registers import Imu61xRegisters
+from imud.sim.in_process_bus import InProcessI2c
+
+READ_ID = Transfer((b"\x6a",), 8)
+
+
+def device() -> Imu61xRegisters:
+    return Imu61xRegisters(lambda: 0, product="IMU612")
+
+
+def opened(bus: InProcessI2c, address: int = 0x19) -> I2cLink:
+    link = I2cLink(I2cSettings(bus=1), open_bus=bus.open, ioctl=bus.ioctl)
+    link.open()
+    link.select(address)
+    return link
+
+
+@pytest.mark.parametrize("funcs", [I2cFunc.I2C, I2cFunc.SMBUS_READ_I2C_BLOCK])
+def test_register_is_written_and_read_in_one_transaction(funcs: int) -> None:
+    bus = InProcessI2c({0x19: device()}, funcs)
+    link = opened(bus)
+    assert link.transfer(READ_ID) == b"\x00\x00IMU612"
+    assert link.transfer(Transfer((b"\x06\x4b",))) == b""
+    assert link.transfer(Transfer((b"\x06",), 1)) == b"\x4b"
+    assert bus.calls == [(0x19, (b"\x6a", 8)), (0x19, (b"\x06\x4b",)), (0x19, (b"\x06", 1))]
+
+
+@pytest.mark.parametrize("transfer", [Transfer((b"\x12",), 33), Transfer((b"\x12\x13",), 1), Transfer((bytes(34),))])
+def test_smbus_controller_refuses_what_it_cannot(transfer: Transfer) -> None:
+    link = opened(InProcessI2c({0x19: device()}, I2cFunc.SMBUS_READ_I2C_BLOCK))
+    with pytest.raises(LinkError, match="SMBus"):
+        link.transfer(transfer)
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (errno.ENXIO, Trouble.ABSENT), (errno.EREMOTEIO, Trouble.ABSENT), (errno.ETIMEDOUT, Trouble.STUCK),
+        (errno.EAGAIN, Trouble.DISTURBED), (errno.EIO, Trouble.DISTURBED), (errno.ENODEV, LinkMissing),
+    ],
+)  # fmt: skip
+def test_transfer_that_fails_says_how(number: int, expected: object) -> None:
+    far = device()
+    link = opened(InProcessI2c({0x19: far}))
+    far.faults.error = number
+    with pytest.raises((TransferError, LinkError), match=r"/dev/i2c-1") as error:
+        link.transfer(READ_ID)
+    assert (error.value.trouble if isinstance(error.value, TransferError) else type(error.value)) is expected
+
+
+@pytest.mark.parametrize(("number", "kind"), [(errno.ENOENT, LinkMissing), (errno.EACCES, LinkDenied)])
+def test_open_that_fails_says_why(number: int, kind: type[LinkError]) -> None:
+    bus = InProcessI2c({})
+    bus.open_error = number
+    with pytest.raises(kind, match=r"/dev/i2c-1"):
+        opened(bus)
+
+
+def test_time_out_is_shortened_and_close_is_twice() -> None:
+    bus, requests = InProcessI2c({}), list[tuple[int, int]]()
+    link = I2cLink(I2cSettings(), open_bus=bus.open, ioctl=lambda _fd, *request: requests.append(request))
+    link.open()
+    assert requests == [(I2C_TIMEOUT, 5)]
+    link.close()
+    link.close()
+    assert bus.fd is None
+    with pytest.raises(LinkError, match="not open"):
+        link.transfer(READ_ID)
+
+
+def test_row_and_names() -> None:
+    link = LINKS["i2c"].make_polled(I2cSettings(bus=3, address=0x1B))
+    assert (link.title, link.bus, link.target, link.shared) == ("/dev/i2c-3", "/dev/i2c-3", 0x1B, True)
+    assert link.place(0x1B) == "address 0x1b"
+    with pytest.raises(LinkError):
+        link.write(b"x")

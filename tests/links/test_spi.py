@@ -1,0 +1,128 @@
+"""The SPI link on a simulated spidev: what goes into the ioctl, words of either size, failures."""
+
+import asyncio
+import errno
+import gc
+from pathlib import Path
+
+import pytest
+
+from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
+from imud.kit.polling import Transfer
+from imud.links import LINKS
+from imud.links.spi import WR_MAX_SPEED_HZ, SpiLink, SpiSettings
+from imud.sim.in_process_bus import InProcessSpi
+
+
+def echo(selections: object, _mode: int) -> list[bytes]:
+    assert isinstance(selections, list)
+    return [bytes(byte ^ 0xFF for byte in selection) for selection in selections]
+
+
+def link_to(bus: InProcessSpi, **settings: object) -> SpiLink:
+    made = SpiSettings(port="/dev/spidev0.1", **settings)  # type: ignore[arg-type]  # passed on as given
+    return SpiLink(made, ioctl=bus.ioctl, open_node=bus.open, close_node=bus.close)
+
+
+@pytest.mark.parametrize("word_bits", [8, 16])
+def test_same_bits_on_the_wires_whatever_the_words(word_bits: int) -> None:
+    bus = InProcessSpi(echo, word_bits=word_bits)
+    link = link_to(bus, speed_hz=2_000_000)
+    link.open()
+    link.select(3)
+    assert bus.mode == 3
+    for _ in range(2):  # the second time from what was prepared
+        assert link.transfer(Transfer((b"\x80\x00\x12\x34", b"\xfe\x01"))) == b"\x7f\xff\xed\xcb\x01\xfe"
+    assert bus.messages == [((b"\x80\x00\x12\x34", b"\xfe\x01"), word_bits, 2_000_000)] * 2
+    link.close()
+    link.close()
+    assert not bus.opened
+
+
+def test_buffers_outlive_the_garbage_collector() -> None:
+    bus = InProcessSpi(echo)
+    link = link_to(bus)
+    link.open()
+    link.select(0)
+    transfers = [Transfer((bytes([n, n]),)) for n in range(100)]  # more than are kept
+    for _ in range(2):
+        for n, transfer in enumerate(transfers):
+            assert link.transfer(transfer) == bytes([n ^ 0xFF] * 2)
+        gc.collect()
+
+
+def test_controller_that_refuses_16_bits_in_a_message_only() -> None:
+    bus = InProcessSpi(echo, word_bits=16)
+    link = link_to(bus)
+    link.open()
+    link.select(0)
+    bus._word_bits = 8
+    assert link.transfer(Transfer((b"\x12\x34",))) == b"\xed\xcb"
+    assert bus.messages[-1][1] == 8
+
+
+def test_speed_is_set_at_open() -> None:
+    calls: list[tuple[int, bytes]] = []
+    bus = InProcessSpi(echo)
+
+    def ioctl(fd: int, request: int, argument: bytes) -> int:
+        calls.append((request, argument))
+        return bus.ioctl(fd, request, argument)
+
+    settings = SpiSettings(port="/dev/spidev0.1", speed_hz=250_000)
+    SpiLink(settings, ioctl=ioctl, open_node=bus.open, close_node=bus.close).open()
+    assert calls[0] == (WR_MAX_SPEED_HZ, (250_000).to_bytes(4, "little"))
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        (errno.ENOENT, LinkMissing), (errno.ENXIO, LinkMissing), (errno.EACCES, LinkDenied), (errno.EBUSY, LinkBusy),
+        (errno.EMFILE, LinkError),
+    ],
+)  # fmt: skip
+def test_open_that_fails_says_why(number: int, kind: type[LinkError]) -> None:
+    bus = InProcessSpi(echo)
+    bus.open_error = number
+    with pytest.raises(LinkError, match=r"/dev/spidev0\.1") as error:
+        link_to(bus).open()
+    assert type(error.value) is kind
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (errno.ETIMEDOUT, Trouble.STUCK), (errno.EIO, Trouble.DISTURBED), (errno.ESHUTDOWN, LinkMissing),
+        (errno.ENODEV, LinkMissing),
+    ],
+)  # fmt: skip
+def test_transfer_that_fails_says_whether_the_bus_is_gone(number: int, expected: object) -> None:
+    def fail(_selections: object, _mode: int) -> list[bytes]:
+        raise OSError(number, "by the test")
+
+    link = link_to(InProcessSpi(fail))
+    link.open()
+    link.select(0)
+    with pytest.raises((TransferError, LinkError)) as error:
+        link.transfer(Transfer((b"\x00\x00",)))
+    assert (error.value.trouble if isinstance(error.value, TransferError) else type(error.value)) is expected
+
+
+def test_too_many_items_are_refused() -> None:
+    link = link_to(InProcessSpi(echo))
+    link.open()
+    with pytest.raises(LinkError, match="1 to 32 items"):
+        link.transfer(Transfer((b"\x00\x00",) * 33))
+
+
+def test_row_and_names(tmp_path: Path) -> None:
+    row = LINKS["spi"]
+    node = tmp_path / "spidev3.1"
+    link = row.make_polled(SpiSettings(port=str(node), mode=3))
+    assert (link.bus, link.target, link.shared) == (str(tmp_path / "spidev3"), 3, False)
+    assert link.place(3) == "mode 3"
+    assert row.make_polled(SpiSettings(port="/dev/spidev0.0")).target is None
+    with pytest.raises(LinkError):
+        link.write(b"x")
+    node.touch()
+    asyncio.run(link.wait_present())
