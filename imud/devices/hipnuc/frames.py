@@ -72,8 +72,9 @@ _RUN_HIGH_BYTES: Final = slice(7, None, 4)
 """High bytes of all floats (and of system_time) in payloads put together, because 76 is a multiple of 4."""
 _ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, None, 4)
 """The same in one frame."""
-_IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r?\n\Z" % LINE_CHARACTERS_MAX)
-"""A line right before the line went idle. Two characters at least: one can be chance inside half a frame."""
+_IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r\n\Z" % LINE_CHARACTERS_MAX)
+"""A line right before the port went idle: two characters at least and both characters of the line's end, which the
+device always sends. Less comes by chance inside half a frame, which would then be given up."""
 
 
 class HipnucSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):

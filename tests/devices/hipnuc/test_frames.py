@@ -398,3 +398,13 @@ def test_the_claim_lasts_beyond_a_flush_and_over_half_a_sync_word() -> None:
     assert codec.ledger.bytes_pending == 1
     codec.feed(b"\x00")
     assert (codec.ledger.bytes_in_bad_frames, codec.ledger.bytes_skipped) == (9, 1)
+
+
+def test_half_a_frame_that_looks_like_the_end_of_a_line_survives_an_idle_line() -> None:
+    codec = HipnucCodec(Ledger(), HipnucSettings())
+    frame = encode_frame(b"\x91" + b'\x01"Cs\n' + bytes(70))
+    cut = frame.index(b"\n") + 1
+    assert codec.feed(frame[:cut]) == []
+    assert codec.flush() == []
+    assert len(codec.feed(frame[cut:])) == 1
+    assert codec.ledger.bytes_in_good_frames == len(frame)
