@@ -13,6 +13,7 @@ import os
 import socket
 from collections import deque
 from collections.abc import Iterable
+from contextlib import ExitStack
 from time import monotonic
 from types import TracebackType
 from typing import Any, Final, Self
@@ -74,11 +75,10 @@ class Client:
         self._framed = False
         self._id = 0
         self._sock = _connect(self.path, timeout_s)
-        try:
+        with ExitStack() as undo:
+            undo.callback(self.close)
             self.hello = self._greet()
-        except BaseException:
-            self.close()
-            raise
+            undo.pop_all()
 
     def __enter__(self) -> Self:
         return self
