@@ -1,6 +1,6 @@
 """The daemon: one event loop that owns every configured device and every output.
 
-Device ──Batch──▶ Publisher ×n              (publish: a plain loop over bound methods)
+Device ──Batch──▶ Publisher ×n              (publish: a plain loop)
 tick, 10 Hz ──▶ runners, publishers         SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
 """
 
@@ -8,7 +8,7 @@ import asyncio
 import logging
 import secrets
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic_ns
@@ -62,7 +62,6 @@ class Daemon:
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
-        self._sinks: list[Callable[[Batch], None]] = []
         self._runners: dict[str, Device] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._buses = Buses()
@@ -167,15 +166,12 @@ class Daemon:
         settings = self.config.publishers[name]
         if cast(PublisherSettings, settings).enabled:
             self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
-        else:
-            self._sinks[:] = [p.publish for p in self._publishers.values()]
 
     def _start_publisher(self, name: str, publisher: Publisher) -> None:
         for device, runner in self._runners.items():
             publisher.add_device(device, runner.device_id)
         publisher.start()
         self._publishers[name] = publisher
-        self._sinks[:] = [p.publish for p in self._publishers.values()]
 
     def _start_device(self, device: DeviceConfig) -> None:
         device_id = self._ids.setdefault(device.name, len(self._ids))
@@ -218,8 +214,8 @@ class Daemon:
         self._stop.set()
 
     def _publish(self, batch: Batch) -> None:
-        for publish in self._sinks:
-            publish(batch)
+        for publisher in self._publishers.values():
+            publisher.publish(batch)
 
     def _tell(self, event: Event) -> None:
         for publisher in self._publishers.values():

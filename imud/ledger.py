@@ -4,6 +4,7 @@ Hot paths add to plain integers; the outputs read them. Synchronization: written
 between two callbacks; another thread asks the loop for a snapshot, because inside a callback the sums are not closed.
 """
 
+from collections.abc import Mapping
 from operator import attrgetter
 from typing import Final
 
@@ -68,13 +69,11 @@ class Ledger:
 
     def bytes_open(self) -> int:
         """Bytes unaccounted for; 0 in a ledger that closes."""
-        accounted = self.bytes_in_good_frames + self.bytes_in_bad_frames + self.bytes_skipped + self.bytes_pending
-        return self.bytes_in - accounted
+        return bytes_open(self.snapshot())
 
     def frames_open(self) -> int:
         """Good frames unaccounted for; 0 in a ledger that closes."""
-        accounted = self.frames_in_samples + self.frames_in_replies + self.frames_ignored + self.frames_pending
-        return self.frames_good - accounted
+        return frames_open(self.snapshot())
 
     def closes(self) -> bool:
         """Whether both sums are zero."""
@@ -99,3 +98,15 @@ class Ledger:
 
 
 _ALL = attrgetter(*LEDGER_FIELDS)
+
+
+def bytes_open(counts: Mapping[str, int]) -> int:
+    """Bytes unaccounted for in a snapshot, wherever it was read; 0 in a ledger that closes."""
+    accounted = counts["bytes_in_good_frames"] + counts["bytes_in_bad_frames"] + counts["bytes_skipped"]
+    return counts["bytes_in"] - accounted - counts["bytes_pending"]
+
+
+def frames_open(counts: Mapping[str, int]) -> int:
+    """Good frames unaccounted for in a snapshot; 0 in a ledger that closes."""
+    accounted = counts["frames_in_samples"] + counts["frames_in_replies"] + counts["frames_ignored"]
+    return counts["frames_good"] - accounted - counts["frames_pending"]

@@ -6,6 +6,7 @@ import msgspec
 
 from imud.cli.connect import add_socket, connect, statuses
 from imud.kit.status import DeviceStatus
+from imud.ledger import bytes_open, frames_open
 from imud.units import NS_PER_MS, NS_PER_US
 
 
@@ -50,10 +51,8 @@ def block(status: DeviceStatus) -> str:
 
 
 def closes(ledger: dict[str, int]) -> bool:
-    """Whether both sums of a ledger as shown are zero (see `imud.ledger`)."""
-    accounted = sum(ledger[f"bytes_{fate}"] for fate in ("in_good_frames", "in_bad_frames", "skipped", "pending"))
-    frames = sum(ledger[f"frames_{fate}"] for fate in ("in_samples", "in_replies", "ignored", "pending"))
-    return ledger["bytes_in"] == accounted and ledger["frames_good"] == frames
+    """Whether both sums of a ledger as shown are zero."""
+    return bytes_open(ledger) == 0 and frames_open(ledger) == 0
 
 
 def latency(status: DeviceStatus) -> str:

@@ -19,6 +19,7 @@ from prometheus_client.core import (
 
 import imud
 from imud.kit.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
+from imud.ledger import bytes_open, frames_open
 from imud.sample import Sync
 from imud.units import NS_PER_S
 
@@ -67,18 +68,6 @@ def _ledger(*fields: str) -> Callable[[DeviceStatus], Labelled]:
     return lambda device: ((labels, device.ledger[field]) for labels, field in pairs)
 
 
-def _bytes_open(device: DeviceStatus) -> int:
-    ledger = device.ledger
-    accounted = ledger["bytes_in_good_frames"] + ledger["bytes_in_bad_frames"] + ledger["bytes_skipped"]
-    return ledger["bytes_in"] - accounted - ledger["bytes_pending"]
-
-
-def _frames_open(device: DeviceStatus) -> int:
-    ledger = device.ledger
-    accounted = ledger["frames_in_samples"] + ledger["frames_in_replies"] + ledger["frames_ignored"]
-    return ledger["frames_good"] - accounted - ledger["frames_pending"]
-
-
 def _kernel(device: DeviceStatus) -> Labelled:
     kernel = device.kernel
     return (
@@ -123,11 +112,11 @@ DEVICE_FAMILIES: Final = (
     Family("imud_unknown_tags_total", "Sub-packets of good frames with an unknown tag.", (), _ledger("unknown_tags")),
     Family(
         "imud_ledger_unaccounted_bytes", "Bytes delivered less bytes accounted for; 0 unless imud has a bug.", (),
-        _one(_bytes_open),
+        _one(lambda device: bytes_open(device.ledger)),
     ),
     Family(
         "imud_ledger_unaccounted_frames", "Good frames less frames accounted for; 0 unless imud has a bug.", (),
-        _one(_frames_open),
+        _one(lambda device: frames_open(device.ledger)),
     ),
     Family("imud_samples_total", "Samples made.", (), _ledger("samples")),
     Family(
