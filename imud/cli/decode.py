@@ -72,7 +72,7 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger) -> Iterator[CodecE
         frame_codec = driver.make_codec(ledger, driver.settings())
         log = CandumpReader(file)
         for frame in log:
-            yield from frame_codec.feed_frame(frame.can_id, frame.extended, frame.data)
+            yield from frame_codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
         yield from frame_codec.flush()
         if log.problem:
             print(log.problem, file=sys.stderr)

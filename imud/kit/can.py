@@ -5,13 +5,14 @@ that a command is bytes on every kind of link.
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
 from typing import Any, Final, NamedTuple, Protocol
 
 from imud.kit.codec import CodecEvent
 from imud.kit.driver import Driver, Identity
+from imud.kit.session import Conversation
 from imud.ledger import Ledger
 
 DATA_BYTES_MAX: Final = 8
@@ -66,8 +67,8 @@ class CanCodec(Protocol):
 
     ledger: Ledger
 
-    def feed_frame(self, can_id: int, extended: bool, data: bytes) -> Sequence[CodecEvent]:
-        """Take one frame; return what it completed. Never raises for any frame."""
+    def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
+        """Take one frame that arrived then (CLOCK_MONOTONIC); return what it completed. Never raises for any frame."""
         ...
 
     def flush(self) -> Sequence[CodecEvent]:
@@ -86,7 +87,19 @@ class CanDriver(Driver):
     make_codec: Callable[[Ledger, Any], CanCodec]
     """Makes a codec that counts into the ledger, from an instance of `settings`."""
     filters: Callable[[Any], Sequence[CanFilter]]
-    """The frames that a device with these settings sends."""
+    """The frames that a device with these settings sends, replies included."""
+    node_of: Callable[[int, bool, bytes], int | None]
+    """Which device of this protocol would send such a frame (identifier, 29 bits or not, data): its number, or None.
+
+    A frame that carries samples only; what this says is a guess that a codec must confirm."""
+    node_settings: Callable[[int], Any]
+    """Settings for the device of that number, the rest at its default."""
+    node_title: Callable[[int], str]
+    """The device of that number for people, for example `node 8`."""
+    identify: Callable[[Any], Conversation[Identity]]
+    """Asks the device with these settings what it is, and leaves it as it was."""
+    read_settings: Callable[[Any], Conversation[Mapping[str, str]]]
+    """Reads back the own settings of the device with these settings, by its own names, and leaves it as it was."""
     apply_identity: Callable[[CanCodec, Identity], None]
     """Tells the codec what is known of the device."""
     sample_frames: int

@@ -43,10 +43,6 @@ class Driver:
     """Order, axes and signs of `euler_rad`, in words."""
     navigation_frame: str
     """The frame that `quat_wxyz` turns into, for example `ENU`."""
-    identify: Callable[[], Conversation[Identity]]
-    """Asks the device what it is. Sends only queries."""
-    read_settings: Callable[[], Conversation[Mapping[str, str]]]
-    """Reads back the device's own settings, by the device's own names. Sends only queries."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +53,10 @@ class StreamDriver(Driver):
     """Rates the device knows, in bit/s, most likely first: detection tries them in this order."""
     make_codec: Callable[[Ledger, Any], StreamCodec]
     """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    identify: Callable[[], Conversation[Identity]]
+    """Asks the device what it is, and leaves it as it was."""
+    read_settings: Callable[[], Conversation[Mapping[str, str]]]
+    """Reads back the device's own settings, by the device's own names, and leaves it as it was."""
     apply_identity: Callable[[StreamCodec, Identity], None]
     """Tells the codec what is known of the device (the meaning of a field can depend on the firmware)."""
     example_frame: Callable[[Random], bytes]

@@ -15,7 +15,6 @@ import msgspec
 from imud.errors import TransferError
 from imud.kit.codec import CodecEvent
 from imud.kit.driver import SAMPLE_COUNTER, Driver, Identity
-from imud.kit.session import Conversation
 from imud.ledger import Ledger
 
 T = TypeVar("T")
@@ -96,8 +95,6 @@ class PolledDriver(Driver):
 
     tick_ns: int = SAMPLE_COUNTER
     tick_modulus: int = 2
-    identify: Callable[[], Conversation[Identity]] = lambda: _nothing_said(Identity())
-    read_settings: Callable[[], Conversation[Mapping[str, str]]] = lambda: _nothing_said({})
     link: str
     """Name of the link it hangs on, a row of LINKS."""
     targets: tuple[int, ...]
@@ -112,12 +109,6 @@ class PolledDriver(Driver):
     """Longest time between two updates of the device's registers, from the settings; 0 for not known."""
     example_reading: Callable[[Random], bytes]
     """Bytes of the first poll with random values, for the shared property tests and for fault injection."""
-
-
-def _nothing_said(value: T) -> Conversation[T]:
-    """There are no messages to ask by; `probe` and `set_up` ask by transfers."""
-    return value
-    yield
 
 
 def run_dialogue(dialogue: Dialogue[T], transfer: Callable[[Transfer], bytes]) -> T:

@@ -37,7 +37,7 @@ class CanRunner(Device):
         if not isinstance(driver, CanDriver):
             raise LinkError(f"{config.name}: expected a driver for CAN, got {driver.name}")
         self._driver = self._can_driver = driver
-        options = config.options or driver.settings()
+        self._options = options = config.options or driver.settings()
         self.link.filters = driver.filters(options)
         self._clock = clock = self._new_clock(driver)
         self._codec = driver.make_codec(self.ledger, options)
@@ -62,7 +62,8 @@ class CanRunner(Device):
 
     async def _work(self) -> None:
         if self.config.identify and self.link.writable:
-            await self._identify(self._apply)
+            driver, options = self._can_driver, self._options
+            await self._identify(lambda: driver.identify(options), lambda: driver.read_settings(options), self._apply)
         await asyncio.get_running_loop().create_future()
 
     def _apply(self, identity: Identity) -> None:

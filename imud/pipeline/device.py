@@ -19,6 +19,7 @@ from imud.event import Event, EventKind
 from imud.kit.batch import Batch
 from imud.kit.driver import Driver, Identity
 from imud.kit.link import Link
+from imud.kit.session import Conversation
 from imud.kit.status import ClockStatus, DeviceState, DeviceStatus
 from imud.ledger import Ledger
 from imud.pipeline.meters import LatencyMeter, RateMeter
@@ -190,16 +191,18 @@ class Device(ABC):
 
     # --- who it is -----------------------------------------------------------------------------------------------
 
-    async def _identify(self, apply: Callable[[Identity], None]) -> None:
+    async def _identify(
+        self,
+        identify: Callable[[], Conversation[Identity]],
+        read_settings: Callable[[], Conversation[Mapping[str, str]]],
+        apply: Callable[[Identity], None],
+    ) -> None:
         """Ask who it is and how it is set; a device that does not answer still streams."""
-        driver = self._driver
-        if driver is None:
-            return
         for attempt in range(1, IDENTIFY_TRIES + 1):
             try:
-                identity = await self._talk.hold(driver.identify())
+                identity = await self._talk.hold(identify())
                 apply(identity)
-                self._learn(identity, await self._talk.hold(driver.read_settings()))
+                self._learn(identity, await self._talk.hold(read_settings()))
                 return
             except CommandError as error:
                 log.info("%s: %s (try %d of %d)", self.config.name, error, attempt, IDENTIFY_TRIES)

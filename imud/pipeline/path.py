@@ -162,7 +162,7 @@ class CanPath(SamplePath):
                 self.codec.reset()
             if not ledger.frames_pending:
                 self._first_ns = t_rx_ns
-            events = feed(can_id, extended, data)
+            events = feed(can_id, extended, data, t_rx_ns)
             if events:
                 self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self.frame_ns)
         self.last_data_ns = t_rx_ns

@@ -66,8 +66,8 @@ class DeviceRunner(Device):
                 except NothingHeard as error:
                     self._complain(str(error))
                     self._seek()
-            if self._may_ask:
-                await self._identify(self._apply)
+            if self._may_ask and isinstance(self._driver, StreamDriver):
+                await self._identify(self._driver.identify, self._driver.read_settings, self._apply)
             await self._search_again.wait()
             self._seek()
 

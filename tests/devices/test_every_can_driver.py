@@ -48,7 +48,7 @@ def feed_checked(codec: CanCodec, frames: Iterable[CanFrame]) -> list[CodecEvent
     events: list[CodecEvent] = []
     fed = 0
     for frame in frames:
-        new = codec.feed_frame(frame.can_id, frame.extended, frame.data)
+        new = codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
         events += new
         fed += len(frame.data)
         ledger = codec.ledger
@@ -179,7 +179,9 @@ def test_reset_never_mixes_what_was_before_with_what_comes(name: str, seed: int)
     codec.reset()
     assert codec.ledger.frames_pending == 0
     assert codec.ledger.closes()
-    events = [event for frame in after for event in codec.feed_frame(frame.can_id, frame.extended, frame.data)]
+    events = [
+        event for frame in after for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
+    ]
     assert events == feed_checked(make(driver), after)
 
 

@@ -8,6 +8,7 @@ import pytest
 from imud.devices import DRIVERS
 from imud.errors import CommandError, LinkMissing, NoReply
 from imud.kit.codec import ReplyFrame
+from imud.kit.driver import StreamDriver
 from imud.kit.session import Conversation, Outcome, Reply, Request, Silence, of_text, pause
 from imud.ledger import Ledger
 from imud.pipeline.talk import Talk
@@ -126,7 +127,9 @@ def test_cancelled_conversation_leaves_the_line_free() -> None:
 def test_device_that_never_answers_is_no_reply() -> None:
     async def story() -> None:
         talk = Talk(Ledger(), lambda data: None)
-        conversation = DRIVERS["hipnuc-uart"].identify()
+        driver = DRIVERS["hipnuc-uart"]
+        assert isinstance(driver, StreamDriver)
+        conversation = driver.identify()
         task = asyncio.create_task(talk.hold(conversation))
         with pytest.raises(NoReply, match="LOG VERSION"):
             await asyncio.wait_for(task, 5)

@@ -27,7 +27,7 @@ def run(module: Imu61xCanModule, until_ns: int, step_ns: int = 700_000) -> list[
 
 def decoded(frames: list[SentFrame]) -> list[Measurement]:
     codec = Imu61xCanCodec(Ledger(), Imu61xCanSettings())
-    events = [event for f in frames for event in codec.feed_frame(f.can_id, f.extended, f.data)]
+    events = [event for f in frames for event in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
     return [event for event in events if isinstance(event, Measurement)]
 
 

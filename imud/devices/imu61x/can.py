@@ -75,7 +75,7 @@ class Imu61xCanCodec:
         self._index: int | None = None
         """INDEX of the newest 105."""
 
-    def feed_frame(self, can_id: int, extended: bool, data: bytes) -> Sequence[CodecEvent]:
+    def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Take one frame; return what it completed. Never raises for any frame."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
@@ -211,6 +211,12 @@ def _filters(settings: Imu61xCanSettings) -> list[CanFilter]:
     return [CanFilter(settings.base_id + slot, STANDARD_ID_MAX, False) for slot in range(SET_FRAMES)]
 
 
+def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
+    """The identifiers as delivered; a device that was given others cannot be told from anything else."""
+    slot = can_id - BASE_ID
+    return BASE_ID if 0 <= slot < SET_FRAMES and not extended and len(data) == FRAME_BYTES else None
+
+
 def _apply_identity(_codec: CanCodec, _identity: Identity) -> None:
     """The device says nothing of itself over CAN."""
 
@@ -225,8 +231,11 @@ DRIVER: Final = CanDriver(
     tick_modulus=INDEX_MODULUS,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
-    identify=lambda: says_nothing(Identity()),
-    read_settings=lambda: says_nothing({}),
+    node_of=_node_of,
+    node_settings=lambda base_id: Imu61xCanSettings(base_id=base_id),
+    node_title=lambda base_id: f"base_id {base_id}",
+    identify=lambda _settings: says_nothing(Identity()),
+    read_settings=lambda _settings: says_nothing({}),
     apply_identity=_apply_identity,
     sample_frames=SET_FRAMES,
     example_frames=_example_frames,

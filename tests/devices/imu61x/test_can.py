@@ -31,7 +31,7 @@ def make(base_id: int = 101) -> Imu61xCanCodec:
 
 
 def feed(codec: Imu61xCanCodec, frames: list[tuple[int, bytes]]) -> list[CodecEvent]:
-    events = [event for can_id, data in frames for event in codec.feed_frame(can_id, False, data)]
+    events = [event for can_id, data in frames for event in codec.feed_frame(can_id, False, data, 0)]
     assert codec.ledger.closes()
     return events
 
@@ -155,5 +155,5 @@ def test_values_that_are_not_finite_are_left_out_and_told() -> None:
 def test_extended_identifiers_are_not_ours() -> None:
     codec = make()
     for can_id, data in GOLDEN:
-        assert not codec.feed_frame(can_id, True, data)
+        assert not codec.feed_frame(can_id, True, data, 0)
     assert codec.ledger.bytes_skipped == 40
