@@ -32,6 +32,7 @@ COMMANDS = {
     "devices": Command("imud.cli.devices", "list the devices of the running daemon"),
     "status": Command("imud.cli.status", "show state, rate, clock and ledger of each device"),
     "watch": Command("imud.cli.watch", "print samples as they come"),
+    "clock": Command("imud.cli.clock", "show where time stamps come from, how good they are, and what limits them"),
     "schema": Command("imud.cli.schema", "list the fields of a sample with units and frames"),
 }
 

@@ -149,6 +149,7 @@ class SampleClock:
             residual_ns=int(fitted.residual_ns if fitted else self._spread.sigma_ns),
             t_err_ns=self._t_err_ns,
             resets=self._resets,
+            hold_ns=self._delay.hold_ns,
         )
 
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:

@@ -38,6 +38,8 @@ class ClockStatus(msgspec.Struct, frozen=True):
     """As in the newest sample."""
     resets: int = 0
     """Times the device's clock started anew (restart of the device, jump of its counter)."""
+    hold_ns: int = 0
+    """How long the adapter may hold bytes back (USB latency timer), 0 if it does not."""
 
 
 class KernelCounters(msgspec.Struct, frozen=True):

@@ -1,0 +1,85 @@
+"""`imud clock`: where the time stamps of each device come from, how good they are, and what limits them."""
+
+import argparse
+import sys
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from time import monotonic
+from typing import Final
+
+import msgspec
+
+from imud.cli.connect import add_socket, connect, statuses
+from imud.cli.histogram import histogram
+from imud.cli.verdict import verdict
+from imud.client import Client
+from imud.kit.status import DeviceStatus
+from imud.units import NS_PER_S, NS_PER_US
+
+KEPT: Final = 2000
+"""Newest samples of a device that the histogram is made of."""
+REFRESH_S: Final = 1.0
+CLEAR: Final = "\x1b[H\x1b[2J"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud clock`."""
+    add_socket(parser)
+    parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to look at (default: all)")
+    parser.add_argument("--duration", type=float, metavar="S", help="listen for S seconds, then print once and end")
+    parser.add_argument("--json", action="store_true", help="the clocks once, as the socket sends them")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Live until interrupted; 1 when no sample came."""
+    with connect(args) as asking:
+        chosen = args.device or [status.name for status in statuses(asking)]
+        if args.json:
+            clocks = {status.name: status.clock for status in statuses(asking) if status.name in chosen}
+            print(msgspec.json.encode(clocks).decode())
+            return 0
+        behind: dict[str, deque[int]] = {name: deque(maxlen=KEPT) for name in chosen}
+        with connect(args) as listening, suppress(TimeoutError):  # silence longer than `--duration`
+            for _ in listen(listening, behind, args.duration):
+                sys.stdout.write(CLEAR + page(statuses(asking), behind) + "\n")
+                sys.stdout.flush()
+        if args.duration is not None:
+            print(page(statuses(asking), behind))
+    return 0 if any(behind.values()) else 1
+
+
+def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | None) -> Iterator[None]:
+    """Note of each sample how long after its measurement it was read; yield when it is time to draw.
+
+    With a duration it ends then, and nothing is drawn. Raises TimeoutError when no sample comes for as long.
+    """
+    begun = drawn = monotonic()
+    for sample in client.watch(list(behind), timeout_s=duration_s):
+        behind[sample.device].append(sample.t_rx_ns - sample.t_ns)
+        now = monotonic()
+        if duration_s is not None and now - begun >= duration_s:
+            return
+        if duration_s is None and now - drawn >= REFRESH_S:
+            drawn = now
+            yield
+
+
+def page(devices: list[DeviceStatus], behind: dict[str, deque[int]]) -> str:
+    """All devices that are looked at, one block each."""
+    return "\n\n".join(block(status, behind[status.name]) for status in devices if status.name in behind)
+
+
+def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
+    """One device for people."""
+    clock = status.clock
+    lines = [
+        f"{status.name}: time stamps by {clock.sync}, error {clock.t_err_ns / NS_PER_US:.1f} µs (one sigma)",
+        f"  offset    {clock.offset_ns / NS_PER_S:+.9f} s (host - device), skew {clock.skew_ppm:+.3f} ppm, "
+        f"{clock.resets} resets",
+        f"  residual  {clock.residual_ns / NS_PER_US:.1f} µs (one sigma)",
+        f"  read after measurement, {len(behind_ns)} samples:",
+        *histogram([late_ns / NS_PER_US for late_ns in behind_ns], "µs"),
+        f"  verdict   {verdict(clock, behind_ns)}",
+    ]
+    return "\n".join(lines)

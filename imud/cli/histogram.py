@@ -1,0 +1,41 @@
+"""A histogram in plain characters."""
+
+from collections.abc import Sequence
+from math import floor, log10
+from typing import Final
+
+WIDTH: Final = 40
+"""Characters of the longest bar."""
+BARS: Final = 12
+"""Most lines."""
+STEPS: Final = (1, 2, 5, 10, 20)
+TAIL: Final = 0.005
+"""What lies beyond this share on either side goes into the outermost bars, so that one stray value hides nothing."""
+
+
+def histogram(values: Sequence[float], unit: str) -> list[str]:
+    """Lines with the lower edge of each bar, its share and its length. Nothing for no values."""
+    if not values:
+        return []
+    ordered = sorted(values)
+    low, high = ordered[int(TAIL * len(ordered))], ordered[-1 - int(TAIL * len(ordered))]
+    width = bar_width(high - low)
+    first = floor(low / width)
+    counts = [0] * (floor(high / width) - first + 1)
+    for value in ordered:
+        counts[min(max(floor(value / width) - first, 0), len(counts) - 1)] += 1
+    most = max(counts)
+    digits = max(0, -floor(log10(width)))
+    return [
+        f"{(first + number) * width:12.{digits}f} {unit} {100 * count / len(ordered):5.1f} % "
+        + "#" * round(WIDTH * count / most)
+        for number, count in enumerate(counts)
+    ]
+
+
+def bar_width(span: float) -> float:
+    """The smallest of 1, 2, 5 · 10ⁿ of which at most BARS make up the span; 1 for none."""
+    if span <= 0:
+        return 1.0
+    power = 10.0 ** floor(log10(span / BARS))
+    return next(step * power for step in STEPS if step * power * (BARS - 1) >= span)

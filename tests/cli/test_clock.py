@@ -1,0 +1,61 @@
+"""`imud clock` on a running daemon."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event, Thread
+
+import msgspec
+import pytest
+
+from imud.cli import main
+from imud.kit.status import ClockStatus
+from tests.hi91 import hi91
+from tests.links.pty_port import PtyPort
+from tests.running import RunningDaemon, running_daemon
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[RunningDaemon]:
+    """A daemon with one device that sends 100 frames a second, or nearly."""
+    port = PtyPort()
+    ended = Event()
+
+    def send() -> None:
+        ms = 0
+        while not ended.wait(0.01):
+            ms += 10
+            port.send(hi91(ms))
+
+    sender = Thread(target=send)
+    uart = {"port": port.path, "baud": 115200}
+    device = {"driver": "hipnuc-uart", "identify": False, "uart": uart}
+    with running_daemon(tmp_path, {"bow": device}) as daemon:
+        sender.start()
+        try:
+            daemon.wait_for("bow", "running")
+            yield daemon
+        finally:
+            ended.set()
+            sender.join()
+            port.unplug()
+
+
+def test_a_page_for_people(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["clock", "--socket", str(daemon.socket), "--duration", "0.3"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("bow: time stamps by ")
+    for word in ("offset", "skew", "residual", "verdict", "###"):
+        assert word in out
+
+
+def test_json_has_the_clocks(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["clock", "--socket", str(daemon.socket), "--json"]) == 0
+    clocks = msgspec.json.decode(capsys.readouterr().out, type=dict[str, ClockStatus])
+    assert clocks["bow"].t_err_ns > 0
+
+
+def test_silence_ends_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
+    with running_daemon(tmp_path, {"bow": device}) as daemon:
+        assert main(["clock", "--socket", str(daemon.socket), "--duration", "0.1"]) == 1
+    assert "0 samples" in capsys.readouterr().out

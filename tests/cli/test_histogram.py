@@ -1,0 +1,41 @@
+"""A histogram in plain characters: its bars, their edges and their lengths."""
+
+import pytest
+
+from imud.cli.histogram import BARS, WIDTH, bar_width, histogram
+
+
+def test_nothing_for_no_values() -> None:
+    assert histogram([], "µs") == []
+
+
+def test_equal_values_are_one_bar() -> None:
+    assert histogram([7.0] * 10, "µs") == ["           7 µs 100.0 % " + "#" * WIDTH]
+
+
+def test_bars_have_shares_and_lengths() -> None:
+    lines = histogram([0.0] * 50 + [1.5] * 25 + [8.0] * 25, "ms")
+    assert len(lines) == 9
+    assert lines[0] == "           0 ms  50.0 % " + "#" * WIDTH
+    assert lines[1] == "           1 ms  25.0 % " + "#" * (WIDTH // 2)
+    assert lines[5] == "           5 ms   0.0 % "
+    assert lines[8] == "           8 ms  25.0 % " + "#" * (WIDTH // 2)
+
+
+def test_values_below_zero_and_below_one() -> None:
+    lines = histogram([-0.25, -0.15, 0.05], "ms")
+    assert lines[0].startswith("       -0.25 ms")
+    assert 3 <= len(lines) <= BARS + 1
+    assert sum(float(line.split()[2]) for line in lines) == pytest.approx(100, abs=0.2)
+
+
+def test_a_stray_value_hides_nothing() -> None:
+    values = [float(v % 10) for v in range(999)] + [1e9]
+    lines = histogram(values, "µs")
+    assert len(lines) == 10
+    assert float(lines[-1].split()[2]) == pytest.approx(10.0)  # the stray one is counted in the last bar
+
+
+@pytest.mark.parametrize(("span", "width"), [(0, 1), (11, 1), (11.1, 2), (22, 2), (50, 5), (100, 10), (0.011, 0.001)])
+def test_widths_are_round(span: float, width: float) -> None:
+    assert bar_width(span) == pytest.approx(width)

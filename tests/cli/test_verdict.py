@@ -1,0 +1,29 @@
+"""What limits a clock: the sentence names the cause that the numbers show."""
+
+import pytest
+
+from imud.cli.verdict import ENOUGH, verdict
+from imud.kit.status import ClockStatus
+from imud.sample import Sync
+from imud.units import NS_PER_MS
+
+MS = NS_PER_MS
+WIRE = [9 * MS + 1_000 * (n % 40) for n in range(200)]
+TIMER = [2 * MS + (n * 160 % 16_000) * 1_000 for n in range(200)]
+
+
+@pytest.mark.parametrize(
+    ("clock", "behind_ns", "expected"),
+    [
+        (ClockStatus(Sync.UTC, t_err_ns=300_000), WIRE, "the host knows of UTC limits: 300.0 µs"),
+        (ClockStatus(Sync.EDGE, t_err_ns=4_000), TIMER, "the kernel's stamps of the line: 4.0 µs"),
+        (ClockStatus(Sync.ARRIVAL, t_err_ns=4_000), WIRE, "arrivals are all there is"),
+        (ClockStatus(Sync.REGRESSION), WIRE[: ENOUGH - 1], "too few"),
+        (ClockStatus(Sync.REGRESSION), WIRE, "arrivals spread over 0.0 ms; the constant delay"),
+        (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), TIMER, "USB adapter's latency timer of 16 ms"),
+        (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), WIRE, "the constant delay"),
+        (ClockStatus(Sync.REGRESSION), TIMER, "a loaded system"),
+    ],
+)
+def test_the_cause_is_named(clock: ClockStatus, behind_ns: list[int], expected: str) -> None:
+    assert expected in verdict(clock, behind_ns)
