@@ -12,13 +12,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic_ns
-from typing import cast
+from typing import Any, cast
 
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.devices import DRIVERS
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
+from imud.kit.action import ActionInfo, described
 from imud.kit.batch import Batch
 from imud.kit.can import CanDriver
 from imud.kit.publisher import Publisher, PublisherContext, PublisherSettings
@@ -58,7 +59,7 @@ class Daemon:
         self.config = config
         self._file = file
         self._remembered = Remembered(state_dir)
-        self._context = PublisherContext(self.status, secrets.randbits(63) | 1, monotonic_ns)
+        self._context = PublisherContext(self.status, secrets.randbits(63) | 1, monotonic_ns, self.actions, self.act)
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
@@ -161,6 +162,15 @@ class Daemon:
     def status(self) -> list[DeviceStatus]:
         """The state of every device now."""
         return [runner.status() for runner in self._runners.values()]
+
+    def actions(self, device: str) -> list[ActionInfo]:
+        """What a device can be told to do."""
+        return described(self._runners[device].actions)
+
+    async def act(self, device: str, name: str, arguments: Mapping[str, Any]) -> object:
+        """Have a device do something. Raises ImudError."""
+        log.info("%s: told to %s %s", device, name, dict(arguments) or "")
+        return await self._runners[device].act(name, arguments)
 
     def _start_configured(self, name: str) -> None:
         settings = self.config.publishers[name]

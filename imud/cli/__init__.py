@@ -33,6 +33,7 @@ COMMANDS = {
     "status": Command("imud.cli.status", "show state, rate, clock and ledger of each device"),
     "watch": Command("imud.cli.watch", "print samples as they come"),
     "clock": Command("imud.cli.clock", "show where time stamps come from, how good they are, and what limits them"),
+    "command": Command("imud.cli.command", "list what a device can be told to do, or tell it"),
     "schema": Command("imud.cli.schema", "list the fields of a sample with units and frames"),
 }
 

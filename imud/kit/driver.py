@@ -1,10 +1,11 @@
 """The row a device file ends with: everything the rest of imud needs to know about one wire protocol."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from random import Random
 from typing import Any, TypeVar
 
+from imud.kit.action import Actions
 from imud.kit.codec import StreamCodec
 from imud.kit.session import Conversation
 from imud.kit.settings import Settings
@@ -43,6 +44,10 @@ class Driver:
     """Order, axes and signs of `euler_rad`, in words."""
     navigation_frame: str
     """The frame that `quat_wxyz` turns into, for example `ENU`."""
+    actions: Actions = field(default_factory=dict)
+    """What the device can be told to do, by name."""
+    lines: frozenset[str] = frozenset()
+    """Wires besides its data that such a device can have: names of `imud.kit.lines.DeviceLines`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -49,6 +49,8 @@ class Code(IntEnum):
     LINE_TOO_LONG = -32003
     UNAVAILABLE = -32004
     """The daemon cannot give it now: out of descriptors."""
+    FAILED = -32005
+    """The device refused a command, did not answer, or is not there."""
 
 
 class RpcError(ServerError):

@@ -1,10 +1,12 @@
 """What a publisher is: an output that takes samples and events and never makes the pipeline wait."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from imud.errors import CommandError
 from imud.event import Event
+from imud.kit.action import ActionInfo
 from imud.kit.batch import Batch
 from imud.kit.settings import Settings
 from imud.kit.status import ClientStatus, DeviceStatus
@@ -45,6 +47,10 @@ class Publisher(Protocol):
         ...
 
 
+async def _nobody_acts(device: str, _name: str, _arguments: Mapping[str, Any]) -> object:
+    raise CommandError(f"{device}: nothing here can be told to do anything")
+
+
 @dataclass(frozen=True, slots=True)
 class PublisherContext:
     """What every publisher may know of the daemon."""
@@ -54,6 +60,10 @@ class PublisherContext:
     """Random number of this start of the daemon, 64 bits: readers see a restart by it."""
     now_ns: Callable[[], int]
     """CLOCK_MONOTONIC."""
+    actions: Callable[[str], Sequence[ActionInfo]] = lambda _device: ()
+    """What a device can be told to do."""
+    act: Callable[[str, str, Mapping[str, Any]], Awaitable[object]] = _nobody_acts
+    """Have a device do something: its name, the action's, arguments. Raises ImudError; the answer is JSON's values."""
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
 

@@ -11,15 +11,18 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from time import monotonic_ns
+from typing import Any
 
 from imud.clock import SampleClock
 from imud.config import DeviceConfig
-from imud.errors import CommandError, LinkError, LinkMissing
+from imud.errors import BadArgument, CommandError, LinkError, LinkMissing
 from imud.event import Event, EventKind
+from imud.kit.action import Action, Actions, Target
 from imud.kit.batch import Batch
 from imud.kit.driver import Driver, Identity
 from imud.kit.link import Link
 from imud.kit.session import Conversation
+from imud.kit.settings import Settings
 from imud.kit.status import ClockStatus, DeviceState, DeviceStatus
 from imud.ledger import Ledger
 from imud.pipeline.meters import LatencyMeter, RateMeter
@@ -219,6 +222,35 @@ class Device(ABC):
             words = ", ".join(f"{name} is {value}, was {self._settings[name]}" for name, value in changed.items())
             self._notices.tell(now_ns, EventKind.CONFIGURATION, f"settings of the device changed: {words}", **changed)
         self._identity, self._settings = identity, settings
+
+    # --- what it can be told -----------------------------------------------------------------------------------------
+
+    @property
+    def actions(self) -> Actions:
+        """What it can be told to do, by name; none while its driver is not known."""
+        return self._driver.actions if self._driver is not None else {}
+
+    async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
+        """Have it do something, and return the answer. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        action = self.actions.get(name)
+        if action is None:
+            known = ", ".join(self.actions) or "none" + " while no device is found" * (self._driver is None)
+            raise BadArgument(f"{self.config.name}: no action {name[:64]!r}; there are: {known}")
+        if self.state not in (DeviceState.RUNNING, DeviceState.SILENT):
+            raise CommandError(
+                f"{self.config.name} is {self.state}: {self._problem or 'it cannot be told anything now'}"
+            )
+        return await self._do(action, action.arguments(arguments))
+
+    async def _do(self, action: Action, params: Settings) -> object:
+        """Run an action of the driver."""
+        return await self._talk.hold(action.begin(self._target, params))
+
+    @property
+    def _target(self) -> Target:
+        """The device as actions see it."""
+        options = self.config.options or (self._driver.settings() if self._driver is not None else None)
+        return Target(options, self._rate_bit_s)
 
     # --- the flow ------------------------------------------------------------------------------------------------
 

@@ -1,9 +1,9 @@
 """What all clients of the socket share: devices, newest samples, who wants what, and the way of a batch to them all."""
 
 import asyncio
-from collections.abc import Iterable, Sequence
+from collections.abc import Coroutine, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from imud.event import Event
 from imud.kit.batch import Batch
@@ -72,6 +72,8 @@ class Hub:
         self.refused = 0
         self.evicted = 0
         self._plans: dict[str, Plan] = {}
+        self._work: dict[int, asyncio.Future[None]] = {}
+        """What is being done for clients, by their numbers."""
 
     def publish(self, batch: Batch) -> None:
         """Give a batch to everyone who wants it."""
@@ -102,6 +104,21 @@ class Hub:
         self.devices.pop(name, None)
         self.newest.pop(name, None)
         self._plans.pop(name, None)
+
+    def busy(self, connection: Connection) -> bool:
+        """Whether something is still being done for the client."""
+        return connection.number in self._work
+
+    def do_later(self, connection: Connection, work: Coroutine[Any, Any, None]) -> None:
+        """Have something done whose reply takes its time. It goes on when the client leaves."""
+        number = connection.number
+        task = self._work[number] = asyncio.ensure_future(work)
+        task.add_done_callback(lambda _done: self._work.pop(number, None))
+
+    def end(self) -> None:
+        """Give up what is still being done; may be called twice."""
+        for task in list(self._work.values()):
+            task.cancel()
 
     def changed(self) -> None:
         """A client came, went, or wants something else."""

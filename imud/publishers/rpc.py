@@ -1,12 +1,13 @@
 """The methods of the UNIX socket: a table of name → parameters and handler, and the way from a line to its reply."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 
 from imud import __version__
+from imud.errors import ImudError
 from imud.kit.fields import FIELDS
 from imud.kit.jsonrpc import (
     PROTOCOL,
@@ -62,10 +63,18 @@ class EventsParams(msgspec.Struct):
     enable: bool = True
 
 
-class NotifyParams(msgspec.Struct):
-    """Parameters of `notify`."""
+class DeviceParams(msgspec.Struct):
+    """Parameters of methods about one device."""
 
     device: str
+
+
+class CommandParams(msgspec.Struct):
+    """Parameters of `command`."""
+
+    device: str
+    name: str
+    arguments: dict[str, Any] = {}  # msgspec copies a mutable default
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +88,18 @@ class Answer:
     """Whether everything after this reply goes out as frames."""
 
 
+Later = Coroutine[Any, Any, object]
+"""A result that takes its time; other requests of the client are answered before it. May raise ImudError."""
+
+
 @dataclass(frozen=True, slots=True)
 class Method(Generic[P]):
     """A row of the table."""
 
     params: type[P]
-    run: Callable[[Hub, Connection, P], Answer]
+    run: Callable[[Hub, Connection, P], Answer | Later]
+    right: Rights = Rights.READ
+    """What the client must be allowed to do."""
     acts: bool = False
     """Whether it does something besides answering: only then is there a point in a request that wants no reply."""
 
@@ -112,17 +127,34 @@ def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
         return
     if answer is None:
         return
+    if not isinstance(answer, Answer):
+        hub.do_later(connection, _answer_later(connection, request, answer))
+        return
     if request.wants_reply:
         connection.post(encode_result(request.request_id, answer.result), answer.fd)
     if answer.framed_from_here and not connection.framed:
         connection.framed = True
 
 
-def _call(hub: Hub, connection: Connection, request: Request) -> Answer | None:
+async def _answer_later(connection: Connection, request: Request, later: Later) -> None:
+    """Wait for the result and send it."""
+    try:
+        result = await later
+    except ImudError as error:
+        body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
+    else:
+        body = encode_result(request.request_id, result)
+    if request.wants_reply:
+        connection.post(body)
+
+
+def _call(hub: Hub, connection: Connection, request: Request) -> Answer | Later | None:
     method = METHODS.get(request.method)
     if method is None:
         message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
         raise RpcError(Code.METHOD_NOT_FOUND, message)
+    if method.right not in connection.rights:
+        raise RpcError(Code.DENIED, f"{request.method}: expected root or a member of the control group")
     if not request.wants_reply and not method.acts:
         return None
     try:
@@ -221,12 +253,33 @@ def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
     return Answer({"enable": params.enable})
 
 
-def _notify(hub: Hub, connection: Connection, params: NotifyParams) -> Answer:
+def _notify(hub: Hub, connection: Connection, params: DeviceParams) -> Answer:
     """A descriptor that becomes readable with each batch of one device; asked again, a new one in place of the old."""
     _known_devices(hub, [params.device])
     fd = connection.make_waker(params.device)
     hub.changed()
     return Answer({"device": params.device}, fd)
+
+
+# --- commands -------------------------------------------------------------------------------------------------------
+
+
+def _actions(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
+    """What a device can be told to do."""
+    _known_devices(hub, [params.device])
+    return Answer(hub.context.actions(params.device))
+
+
+def _command(hub: Hub, connection: Connection, params: CommandParams) -> Later:
+    """Have a device do something; the reply comes when it is done."""
+    _known_devices(hub, [params.device])
+    if hub.busy(connection):
+        raise RpcError(Code.UNAVAILABLE, "command: the one before is not done yet; wait for its reply")
+    return _done(hub, params)
+
+
+async def _done(hub: Hub, params: CommandParams) -> object:
+    return await hub.context.act(params.device, params.name, params.arguments)
 
 
 METHODS: Final[Mapping[str, Method[Any]]] = {
@@ -237,7 +290,9 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "unwatch": Method(NoParams, _unwatch, acts=True),
     "poll": Method(PollParams, _poll),
     "events": Method(EventsParams, _events, acts=True),
-    "notify": Method(NotifyParams, _notify),
+    "notify": Method(DeviceParams, _notify),
+    "actions": Method(DeviceParams, _actions),
+    "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
 }
 
 

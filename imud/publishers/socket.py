@@ -110,6 +110,7 @@ class SocketServer:
         self._listener = None
         for connection in list(self.hub.connections.values()):
             connection.close()
+        self.hub.end()
         self._context.client_sources.remove(self.hub.clients)
 
     # --- clients ----------------------------------------------------------------------------------------------------

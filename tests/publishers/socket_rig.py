@@ -6,13 +6,16 @@ import json
 import os
 import socket
 import struct
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+from imud.errors import Rejected
+from imud.kit.action import Action, described
 from imud.kit.batch import Batch
 from imud.kit.publisher import PublisherContext
+from imud.kit.settings import Settings
 from imud.kit.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.publishers.socket import SocketServer, SocketSettings
 from imud.sample import Sample, Sync
@@ -78,7 +81,30 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
 
 def context() -> PublisherContext:
     """A daemon with the devices of `DEVICES` whose clock stands still."""
-    return PublisherContext(lambda: [device_status(*item) for item in DEVICES.items()], EPOCH, lambda: NOW_NS)
+    statuses = [device_status(*item) for item in DEVICES.items()]
+    return PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, lambda _device: described(ACTIONS), act)
+
+
+class OutputParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Arguments of an action."""
+
+    rate_hz: int
+
+
+ACTIONS = {"output": Action("send at a rate", lambda _target, _params: None, OutputParams)}
+done_late = asyncio.Event()
+"""`wait` is done when this is set."""
+
+
+async def act(device: str, name: str, arguments: Mapping[str, Any]) -> object:
+    """A device that obeys `output`, waits on `wait`, and refuses everything else."""
+    if name == "wait":
+        await done_late.wait()
+        return {"waited": device}
+    if name != "output":
+        raise Rejected(f"{device} refuses {name}")
+    ACTIONS[name].arguments(arguments)
+    return None
 
 
 def run(body: Callable[[], Awaitable[T]]) -> T:

@@ -26,6 +26,7 @@ from math import isfinite
 from random import Random
 from typing import Any, Final, Literal, ParamSpec
 
+from imud.devices.hipnuc.actions import ACTIONS
 from imud.devices.hipnuc.commands import BAUD_RATES
 from imud.devices.hipnuc.lines import LINE_CHARACTERS_MAX, LineFinder
 from imud.devices.hipnuc.packets import (
@@ -354,6 +355,8 @@ DRIVER: Final = StreamDriver(
     tick_modulus=2**32,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
     navigation_frame="ENU",
+    lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
+    actions=ACTIONS,
     identify=identify,
     read_settings=read_settings,
     apply_identity=_apply_identity,

@@ -14,6 +14,7 @@ from math import cos, isfinite, sin
 from random import Random
 from typing import Any, Final
 
+from imud.devices.imu61x.actions import ACTIONS
 from imud.devices.imu61x.commands import AHRS_FRAME_BYTES, BAUD_RATES
 from imud.devices.imu61x.common import EULER_CONVENTION, M_S2_PER_G, NAVIGATION_FRAME, RAD_S_PER_DEG_S, crc32
 from imud.devices.imu61x.framing import CRC_BYTES, DEVICE_SYNC, HEADER, Frame, FrameFinder, encode_frame
@@ -228,6 +229,8 @@ DRIVER: Final = StreamDriver(
     tick_modulus=TIMER_MODULUS,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
+    lines=frozenset({"reset"}),
+    actions=ACTIONS,
     identify=identify,
     read_settings=read_settings,
     apply_identity=_apply_identity,
