@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from time import monotonic_ns
 from typing import Any
 
 import msgspec
@@ -26,6 +25,7 @@ class Rig:
     def __init__(self, buses: Buses, config: DeviceConfig, device_id: int = 0) -> None:
         self.samples: list[Sample] = []
         self.events: list[Event] = []
+        self.now_ns = buses.now_ns
         self.runner = PolledRunner(config, device_id, self._publish, self.events.append, buses)
 
     def _publish(self, batch: Batch) -> None:
@@ -43,11 +43,11 @@ class Rig:
 
     async def until(self, holds: Callable[[], object], what: str, limit_s: float = LIMIT_S) -> None:
         """Tick until a condition holds; the ledger closes all the while."""
-        end_ns = monotonic_ns() + int(limit_s * 1e9)
+        end_ns = self.now_ns() + int(limit_s * 1e9)
         while not holds():
-            assert monotonic_ns() < end_ns, f"not within {limit_s} s: {what}; {self.runner.status()}"
+            assert self.now_ns() < end_ns, f"not within {limit_s} s: {what}; {self.runner.status()}"
             await asyncio.sleep(0.002)
-            self.runner.tick(monotonic_ns())
+            self.runner.tick(self.now_ns())
             assert self.runner.ledger.closes(), self.runner.ledger.snapshot()
 
     async def until_samples(self, more: int, limit_s: float = LIMIT_S) -> None:
@@ -66,11 +66,11 @@ def device_config(name: str, driver: str, link: str, settings: dict[str, Any], *
 
 
 @asynccontextmanager
-async def running(*configs: DeviceConfig) -> AsyncIterator[list[Rig]]:
-    """Runners at work, and their buses; all closed at the end."""
+async def running(*configs: DeviceConfig, buses: Buses | None = None) -> AsyncIterator[list[Rig]]:
+    """Runners at work on their buses, with real threads unless others are given; all closed at the end."""
     mistakes: list[object] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: mistakes.append(context))
-    buses = Buses()
+    buses = buses or Buses()
     rigs = [Rig(buses, config, number) for number, config in enumerate(configs)]
     tasks = [asyncio.create_task(rig.runner.run()) for rig in rigs]
     try:

@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 import msgspec
 
+from imud.cli.options import add_option, driver_settings, given_options
 from imud.devices import DRIVERS
 from imud.errors import ImudError
 from imud.kit.can import CanDriver
@@ -20,6 +21,7 @@ from imud.kit.candump import CandumpReader
 from imud.kit.capture import read_capture
 from imud.kit.codec import BadFrame, CodecEvent, ReplyFrame, TextLine
 from imud.kit.driver import SAMPLE_COUNTER, Driver, StreamDriver
+from imud.kit.settings import Settings
 from imud.ledger import Ledger
 from imud.sample import Measurement
 
@@ -30,15 +32,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud decode`."""
     parser.add_argument("--driver", required=True, choices=sorted(DRIVERS), help="wire protocol of the capture")
     parser.add_argument("file", metavar="FILE", help="capture file, or - for standard input")
+    add_option(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Decode to standard output, the ledger to standard error; 1 when no message was found."""
     driver = DRIVERS[args.driver]
+    settings = driver_settings(driver, given_options(driver, args.option))
     ledger = Ledger()
     write = sys.stdout.write
     with open_capture(args.file) as file:
-        for line in decode(file, driver, ledger):
+        for line in decode(file, driver, ledger, settings):
             write(line)
     sys.stdout.flush()
     shown = {name: value for name, value in ledger.snapshot().items() if value}
@@ -54,22 +58,25 @@ def open_capture(name: str) -> BinaryIO:
         raise ImudError(f"{name}: {error.strerror}") from error
 
 
-def decode(file: BinaryIO, driver: Driver, ledger: Ledger) -> Iterator[str]:
-    """JSON lines of everything in `file`. Raises ImudError for a driver without captures, or a file that is none."""
+def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | None = None) -> Iterator[str]:
+    """JSON lines of everything in `file`; the driver's settings are as delivered unless given.
+
+    Raises ImudError for a driver without captures, or a file that is none.
+    """
     times = DeviceTime(driver)
-    for event in events_in(file, driver, ledger):
+    for event in events_in(file, driver, ledger, settings or driver.settings()):
         yield msgspec.json.encode(as_object(event, times)).decode() + "\n"
 
 
-def events_in(file: BinaryIO, driver: Driver, ledger: Ledger) -> Iterator[CodecEvent]:
+def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings) -> Iterator[CodecEvent]:
     """Everything that the driver's codec says of a capture."""
     if isinstance(driver, StreamDriver):
-        codec = driver.make_codec(ledger, driver.settings())
+        codec = driver.make_codec(ledger, settings)
         for _, data in read_capture(file):
             yield from codec.feed(data)
         yield from codec.flush()
     elif isinstance(driver, CanDriver):
-        frame_codec = driver.make_codec(ledger, driver.settings())
+        frame_codec = driver.make_codec(ledger, settings)
         log = CandumpReader(file)
         for frame in log:
             yield from frame_codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)

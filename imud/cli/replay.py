@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 
 from imud import config
+from imud.cli.options import add_option, driver_settings, given_options
 from imud.cli.run import start_log
 from imud.cli.status import block
 from imud.daemon import Daemon
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--socket", type=Path, metavar="PATH", help="serve the samples on this socket, as the daemon does"
     )
+    add_option(parser)
     parser.add_argument("--json", action="store_true", help="print every sample, one JSON object per line")
 
 
@@ -65,7 +67,13 @@ async def serve(daemon: Daemon) -> None:
 
 
 def configuration(args: argparse.Namespace) -> str:
-    """The configuration of a daemon that does only this, as text: it takes the same way as a file."""
+    """The configuration of a daemon that does only this, as text: it takes the same way as a file.
+
+    Raises BadArgument for options that the driver does not take.
+    """
+    driver = DRIVERS[args.driver]
+    options = given_options(driver, args.option)
+    driver_settings(driver, options)
     tree = {
         "socket": {"enabled": args.socket is not None, **({"path": str(args.socket)} if args.socket else {})},
         "shm": {"enabled": False},
@@ -73,6 +81,7 @@ def configuration(args: argparse.Namespace) -> str:
         "devices": {
             "replay": {
                 "driver": args.driver,
+                "options": options,
                 "identify": False,
                 "replay": {"path": str(args.file), "speed": args.speed, "baud": args.baud},
             }

@@ -5,7 +5,7 @@ import argparse
 import msgspec
 
 from imud.cli.connect import add_socket, connect, statuses
-from imud.kit.status import DeviceStatus
+from imud.kit.status import DeviceStatus, PollingStatus
 from imud.ledger import bytes_open, frames_open
 from imud.units import NS_PER_MS, NS_PER_US
 
@@ -47,7 +47,18 @@ def block(status: DeviceStatus) -> str:
         f" + {ledger['bytes_pending']} pending: {'closed' if closes(ledger) else 'DOES NOT CLOSE'}",
         f"  kernel    {status.kernel.overrun} overruns, {status.kernel.framing} framing, {status.kernel.parity} parity",
     ]
+    if status.polling is not None:
+        lines.append(f"  polling   {polling(status.polling)}")
     return "\n".join(lines)
+
+
+def polling(polls: PollingStatus) -> str:
+    """How the reading of a polled device goes."""
+    return (
+        f"{polls.polls} reads, {polls.late} late, {polls.missed} missed, {polls.stale} stale, {polls.failed} failed;"
+        f" {polls.late_mean_ns / NS_PER_US:.1f} µs after the deadline, {polls.late_worst_ns / NS_PER_US:.1f} at worst;"
+        f" vanished {polls.vanished} times"
+    )
 
 
 def closes(ledger: dict[str, int]) -> bool:

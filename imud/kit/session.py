@@ -7,7 +7,7 @@ by a test.
 
 from collections import deque
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from imud.errors import CommandError
@@ -44,6 +44,9 @@ class Request:
     """Fewest messages of a good reply, its end included: an end that comes sooner is that of an earlier, late reply."""
     baud: int = 0
     """Rate in bit/s that the line must have from this request on; 0 for as it is. Serial lines only."""
+    undo: bytes = b""
+    """What is sent if the conversation is given up at this request (cancelled, its owner ends) while the link is still
+    there: a generator that is closed can send nothing by itself. Nothing waits for a reply to it."""
 
 
 def never(_message: Message) -> bool:
@@ -59,6 +62,19 @@ def of_text(holds: Callable[[str], bool]) -> Callable[[Message], bool]:
 def pause(duration_ns: int, *, baud: int = 0) -> Request:
     """Wait before the next request, at another rate if `baud` is given; its outcome is `Silence`."""
     return Request(b"", "pause", never, never, never, duration_ns, baud=baud)
+
+
+def with_undo(conversation: "Conversation[T]", undo: bytes) -> "Conversation[T]":
+    """The same conversation, of which every request has `undo`."""
+    try:
+        request = next(conversation)
+        while True:
+            request = conversation.send((yield replace(request, undo=undo)))
+    except StopIteration as end:
+        value: T = end.value
+        return value
+    finally:
+        conversation.close()
 
 
 @dataclass(frozen=True, slots=True)

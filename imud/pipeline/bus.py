@@ -4,30 +4,29 @@
       ▲                        │ no: one transfer of a dialogue    │ before it sleeps: one wake-up for all of it
       └────────────────────────┴───────────────────────────────────┘
 
-The thread owns the links while they are open. It blocks in transfers and in `Alarm.wait`, nowhere else. A device that
-fails costs the others the time of that transfer.
+The thread owns the links while they are open. It blocks in transfers and between rounds, nowhere else. A device that
+fails costs the others the time of that transfer. What is done in a round, and when, is here; the thread that goes from
+one to the next is in `bus_thread`, and time is `now_ns`: a test puts its own in the place of both.
 """
 
 import asyncio
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from time import monotonic_ns
 from typing import Any, TypeVar
 
 from imud.errors import ImudError, LinkError, TransferError
 from imud.kit.link import PolledLink
 from imud.kit.polling import Dialogue, Poll, Reading, Transfer
+from imud.pipeline.bus_thread import BusThread, StartWorker
+from imud.pipeline.round_robin import RoundRobin
 from imud.pipeline.schedule import Deadlines, Schedule
 from imud.units import NS_PER_S
 
 T = TypeVar("T")
 
-IDLE_WAIT_S = 60.0
-END_LIMIT_S = 5.0
-"""A transfer on a bus that hangs ends with the controller's own time-out, of one second at most."""
+IDLE_NS = 60 * NS_PER_S
 POLLS_IN_ROW = 8
 """On a bus that is never idle, a dialogue has its turn after so many polls."""
 READINGS_MAX = 10_000
@@ -37,31 +36,15 @@ TakeReadings = Callable[[Sequence[Reading], LinkError | None], None]
 """Called in the loop's thread with what was read, oldest first, and the error that ended the bus, if any."""
 
 
-class Alarm:
-    """A wait that another thread can end. A lock's own wait is on CLOCK_MONOTONIC and costs a third of an Event's."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._lock.acquire()
-
-    def wait(self, seconds: float) -> None:
-        """Return after so much time, or when `ring` was called since the last wait."""
-        self._lock.acquire(timeout=seconds)
-
-    def ring(self) -> None:
-        """End the present wait, or the next. From any thread."""
-        with suppress(RuntimeError):  # it rings already
-            self._lock.release()
-
-
 class Member:
     """One device on a bus. Methods: the loop's thread; what begins with an underscore: the bus's."""
 
     def __init__(self, bus: "Bus", link: PolledLink, deadlines: Deadlines, take: TakeReadings) -> None:
         self.link = link
         self._deadlines = deadlines
-        self._schedule: Schedule | None = None
+        self._schedule: Schedule | RoundRobin | None = None
         self._bus = bus
+        self._now_ns = bus.now_ns
         self._take = take
         self._polls: Sequence[Poll] = ()
         self._due_ns: list[int] = []
@@ -87,8 +70,9 @@ class Member:
         self._bus.release(self)
 
     def start(self, polls: Sequence[Poll]) -> None:
-        """Read at deadlines from now on."""
-        schedule = Schedule(self.link.rate_hz, monotonic_ns(), self._deadlines)
+        """Read at deadlines from now on, or in turns where the link has no rate."""
+        rate_hz, begin_ns, counts = self.link.rate_hz, self._now_ns(), self._deadlines
+        schedule = Schedule(rate_hz, begin_ns, counts) if rate_hz else RoundRobin(begin_ns, counts)
 
         def begin() -> None:
             self._polls, self._due_ns = polls, [0] * len(polls)
@@ -109,21 +93,21 @@ class Member:
     def _rest(self) -> None:
         self._schedule = None
 
-    def _poll(self, schedule: Schedule) -> None:
+    def _poll(self, schedule: Schedule | RoundRobin) -> None:
         """All that is due at the present deadline."""
-        start_ns = monotonic_ns()
+        start_ns = self._now_ns()
         schedule.begun(start_ns)
         due_ns = self._due_ns
         for number, poll in enumerate(self._polls):
             if start_ns >= due_ns[number]:
                 due_ns[number] = start_ns + poll.every_ns if poll.every_ns else 0
                 self._read(number, poll.transfer)
-        schedule.done(monotonic_ns())
+        schedule.done(self._now_ns())
 
     def _read(self, number: int, transfer: Transfer) -> None:
         error: TransferError | None = None
         data = b""
-        start_ns = monotonic_ns()
+        start_ns = self._now_ns()
         try:
             data = self.link.transfer(transfer)
         except TransferError as trouble:
@@ -133,7 +117,7 @@ class Member:
             self._rest()
             return
         if len(self._readings) < READINGS_MAX:
-            self._readings.append(Reading(number, data, error, start_ns, monotonic_ns()))
+            self._readings.append(Reading(number, data, error, start_ns, self._now_ns()))
         else:
             self._deadlines.missed += 1
 
@@ -180,21 +164,22 @@ def _settle(future: asyncio.Future[Any], value: object, error: Exception | None)
 
 
 class Bus:
-    """The thread of one bus and its devices."""
+    """One bus and its devices."""
 
-    def __init__(self, name: str, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, name: str, loop: asyncio.AbstractEventLoop, now_ns: Callable[[], int], start_worker: StartWorker
+    ) -> None:
+        self.now_ns = now_ns
+        """CLOCK_MONOTONIC."""
         self._loop = loop
         self._members: list[Member] = []
         self._commands: deque[Callable[[], None]] = deque()
-        self._alarm = Alarm()
         self._news: list[Callable[[], None]] = []
-        self._ended = False
         self._in_row = 0
         self.taken: dict[int, Member] = {}
         """Targets of a shared bus and whose they are. The loop's thread."""
         self.failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        self._worker = start_worker(name, self._round, self._failed)
 
     # --- the loop's side ---------------------------------------------------------------------------------------------
 
@@ -221,45 +206,42 @@ class Bus:
     def command(self, command: Callable[[], None]) -> None:
         """Have something done by the thread between two transfers."""
         self._commands.append(command)
-        self._alarm.ring()
+        self._worker.ring()
 
     def end(self) -> None:
         """Stop the thread after the present transfer and close what is open; may be called twice."""
-        self._ended = True
-        self._alarm.ring()
-        self._thread.join(END_LIMIT_S)
+        self._worker.end()
         for member in self._members:
             member.link.close()
         self._members = []
 
     # --- the thread's side -------------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        _sharpen_timer()
-        try:
-            while not self._ended:
-                self._work()
-        except BaseException as error:  # noqa: BLE001 - a mistake of ours must end the daemon, not just this thread
-            self.failure = error
-            self._call_loop(self._raise)
-
-    def _work(self) -> None:
-        """One round: commands, then what is due or one step of a dialogue, or sleep."""
+    def _round(self) -> int:
+        """Commands, then what is due or one step of a dialogue; how long there is nothing else to do, in ns."""
         commands = self._commands
         while commands:
             commands.popleft()()
         member, due_ns = self._next()
-        now_ns = monotonic_ns()
+        now_ns = self.now_ns()
         if member is not None and member._schedule is not None and due_ns <= now_ns and self._in_row < POLLS_IN_ROW:
             self._in_row += 1
             member._poll(member._schedule)
-            return
+            if not member.link.rate_hz:  # something is always due here: no idle moment comes to hand over in
+                self._hand_over()
+            return 0
         stepped, self._in_row = self._step(), 0
         if stepped:
-            return
+            return 0
         self._hand_over()
-        if not commands and not self._ended:
-            self._alarm.wait(max(0, due_ns - monotonic_ns()) / NS_PER_S if member else IDLE_WAIT_S)
+        if commands:
+            return 0
+        return max(0, due_ns - self.now_ns()) if member is not None else IDLE_NS
+
+    def _failed(self, error: BaseException) -> None:
+        """A round raised: the loop's thread must."""
+        self.failure = error
+        self._call_loop(self._raise)
 
     def _next(self) -> tuple[Member | None, int]:
         first, due_ns = None, 0
@@ -304,23 +286,20 @@ def _delivery(member: Member, readings: Sequence[Reading], problem: LinkError | 
     return lambda: None if member._left else member._take(readings, problem)
 
 
-def _sharpen_timer() -> None:
-    """Ask the kernel to wake this thread within 1 µs instead of 50 µs; without the right to, jitter stays."""
-    with suppress(OSError):
-        Path(f"/proc/{threading.get_native_id()}/timerslack_ns").write_text("1", encoding="ascii")
-
-
 class Buses:
     """The buses in use, by name. Synchronization: the loop's thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, now_ns: Callable[[], int] = monotonic_ns, start_worker: StartWorker = BusThread) -> None:
+        """Time, and what runs the buses, are the real ones unless given."""
+        self.now_ns = now_ns
+        self._start_worker = start_worker
         self._buses: dict[str, Bus] = {}
 
     def get(self, name: str) -> Bus:
         """The bus of that name; its thread starts with its first device."""
         bus = self._buses.get(name)
         if bus is None:
-            bus = self._buses[name] = Bus(name, asyncio.get_running_loop())
+            bus = self._buses[name] = Bus(name, asyncio.get_running_loop(), self.now_ns, self._start_worker)
         return bus
 
     def end(self) -> None:

@@ -10,14 +10,14 @@ Bytes are believed only between an identification and the first sign that the de
 import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from time import monotonic_ns
 
 import msgspec
 
 from imud.config import DeviceConfig
 from imud.devices import DRIVERS
-from imud.errors import DeviceRefused, LinkError, TransferError, Trouble
+from imud.errors import CommandError, DeviceRefused, LinkError, TransferError, Trouble
 from imud.event import Event
+from imud.kit.action import Action
 from imud.kit.batch import Batch
 from imud.kit.driver import Identity, of_kind
 from imud.kit.link import PolledLink
@@ -26,7 +26,7 @@ from imud.kit.settings import Settings
 from imud.kit.status import DeviceState, DeviceStatus, PollingStatus
 from imud.links import LINKS
 from imud.pipeline.bus import Buses, Member
-from imud.pipeline.device import RETRY_S, SILENCE_NS, Device
+from imud.pipeline.device import RETRY_S, SILENCE_NS, UNHEARD_NS, Device
 from imud.pipeline.path import SamplePath
 from imud.pipeline.polled_path import PolledPath
 from imud.pipeline.schedule import Deadlines
@@ -155,12 +155,12 @@ class PolledRunner(Device):
             self._driver = found.driver
             self._clock = self._new_clock(found.driver)
             codec = found.driver.make_codec(self.ledger, found.options)
-            period_ns, update_ns = round(NS_PER_S / self.link.rate_hz), found.driver.update_ns(found.options)
-            path = PolledPath(codec, period_ns, update_ns, *self._path_parts(self._clock))
+            period_ns, update_ns = self._period_ns, found.driver.update_ns(found.options)
+            path = PolledPath(codec, period_ns, update_ns, self._buses.now_ns, *self._path_parts(self._clock))
             self._path = self._polled = path
         self._clock.restart()
         self._found = found
-        path.begin(monotonic_ns())
+        path.begin(self._buses.now_ns())
         self._believed = True
         return path
 
@@ -175,6 +175,13 @@ class PolledRunner(Device):
             return (self.link.target,)
         last = (self._found.target,) if self._found is not None else ()
         return tuple(dict.fromkeys((*last, *driver.targets)))
+
+    async def _do(self, action: Action, params: Settings) -> object:
+        """Run an action of the driver between two reads."""
+        member, found = self._member, self._found
+        if member is None or found is None:
+            raise CommandError(f"{self.config.name} is not there")
+        return await member.talk(action.begin(self._target, params), found.target)
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 
@@ -199,11 +206,16 @@ class PolledRunner(Device):
             super()._watch_flow(path, now_ns)
 
     def _watch_lock(self, path: SamplePath, now_ns: int) -> None:
-        if self.state is DeviceState.SEARCHING:
+        if self.state is DeviceState.SEARCHING and now_ns - path.begun_ns > UNHEARD_NS:
             self._complain("the device answers, but no value of it is new: is it held in reset?")
 
     def _silence_limit_ns(self) -> int:
-        return max(SILENCE_NS, int(5 * NS_PER_S / self.link.rate_hz))
+        return max(SILENCE_NS, 5 * self._period_ns)
+
+    @property
+    def _period_ns(self) -> int:
+        """Time between two reads; the longest that is no silence where the link has no rate."""
+        return round(NS_PER_S / self.link.rate_hz) if self.link.rate_hz else SILENCE_NS // 5
 
     @property
     def _where(self) -> str:
@@ -220,4 +232,5 @@ class PolledRunner(Device):
             vanished=self._vanished,
             late_mean_ns=deadlines.sum_late_ns // deadlines.polls if deadlines.polls else 0,
             late_worst_ns=deadlines.worst_ns,
+            late_sum_ns=deadlines.sum_late_ns,
         )

@@ -5,9 +5,9 @@ the read before (had it been there then, this one would have repeated it), or on
 Synchronization: the event loop's thread only.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import sqrt
-from time import monotonic_ns, time_ns
+from time import time_ns
 from typing import Any, Final
 
 from imud.errors import Trouble
@@ -25,10 +25,12 @@ SIGMA_OF_AGE: Final = 1 / sqrt(3)
 class PolledPath(SamplePath):
     """The path of a device that is asked."""
 
-    def __init__(self, codec: PolledCodec, period_ns: int, update_ns: int, *parts: Any) -> None:
+    def __init__(
+        self, codec: PolledCodec, period_ns: int, update_ns: int, now_ns: Callable[[], int], *parts: Any
+    ) -> None:
         """`update_ns`: longest time between two updates of the device's registers, 0 for not known.
 
-        `parts` are those of `SamplePath`.
+        `now_ns` is CLOCK_MONOTONIC, `parts` are those of `SamplePath`.
         """
         super().__init__(*parts)
         self.codec = codec
@@ -36,6 +38,7 @@ class PolledPath(SamplePath):
         """Transfers that failed."""
         self._period_ns = period_ns
         self._update_ns = update_ns
+        self._now_ns = now_ns
         self._before_ns = 0
         self._faults = 0
 
@@ -55,7 +58,7 @@ class PolledPath(SamplePath):
 
     def on_readings(self, readings: Sequence[Reading]) -> str:
         """Take readings, oldest first; return why the device must be identified again, or an empty string."""
-        utc_offset_ns = time_ns() - monotonic_ns()
+        utc_offset_ns = time_ns() - self._now_ns()
         samples: list[Sample] = []
         gone = ""
         for reading in readings:

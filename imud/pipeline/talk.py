@@ -2,10 +2,11 @@
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from time import monotonic_ns
 from typing import TypeVar
 
-from imud.errors import CommandError
+from imud.errors import CommandError, LinkError
 from imud.kit.codec import Message
 from imud.kit.session import Conversation, Outcome, Reply, Request, Session
 from imud.ledger import Ledger
@@ -28,17 +29,32 @@ class Talk:
         self._outcome: asyncio.Future[Outcome] | None = None
 
     async def hold(self, conversation: Conversation[T]) -> T:
-        """Run `conversation` to its end and return its value. Raises what it raises, and LinkError when unplugged."""
+        """Run `conversation` to its end and return its value. Raises what it raises, and LinkError when unplugged.
+
+        Given up in the middle, cancelled for example, it leaves the device as the request's `undo` makes it.
+        """
         async with self._lock:
+            undo = b""
             try:
                 request = next(conversation)
                 while True:
-                    request = conversation.send(await self._ask(request))
+                    undo = request.undo
+                    outcome = await self._ask(request)
+                    undo = b""
+                    request = conversation.send(outcome)
             except StopIteration as end:
                 value: T = end.value
                 return value
             finally:
                 conversation.close()
+                if undo:
+                    with suppress(LinkError):  # it is gone: there is nothing to leave in order
+                        self._write(undo)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a conversation is going on."""
+        return self._lock.locked()
 
     def on_message(self, message: Message, t_rx_ns: int) -> None:
         """Take one line of text or one reply frame from the codec."""

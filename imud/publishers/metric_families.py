@@ -18,7 +18,7 @@ from prometheus_client.core import (
 )
 
 import imud
-from imud.kit.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
+from imud.kit.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus, PollingStatus
 from imud.ledger import bytes_open, frames_open
 from imud.sample import Sync
 from imud.units import NS_PER_S
@@ -66,6 +66,11 @@ def _ledger(*fields: str) -> Callable[[DeviceStatus], Labelled]:
     """One counter, `bytes_in`; or several with a label, `crc=lost_crc`."""
     pairs = [(tuple(label for label in field.split("=")[:-1]), field.split("=")[-1]) for field in fields]
     return lambda device: ((labels, device.ledger[field]) for labels, field in pairs)
+
+
+def _polling(read: Callable[[PollingStatus], float]) -> Callable[[DeviceStatus], Labelled]:
+    """A value of devices that are asked; absent for those that send by themselves."""
+    return _one(lambda device: None if device.polling is None else read(device.polling))
 
 
 def _kernel(device: DeviceStatus) -> Labelled:
@@ -158,6 +163,26 @@ DEVICE_FAMILIES: Final = (
     Family(
         "imud_kernel_errors_total", "Errors of the port that the kernel counted since the link was opened.", ("kind",),
         _kernel,
+    ),
+    Family("imud_polls_total", "Deadlines at which the device was read.", (), _polling(lambda p: p.polls)),
+    Family(
+        "imud_polls_late_total", "Of these, begun more than a quarter of the period after the deadline.", (),
+        _polling(lambda p: p.late),
+    ),
+    Family("imud_polls_missed_total", "Deadlines that passed without a read.", (), _polling(lambda p: p.missed)),
+    Family("imud_polls_stale_total", "Reads that gave nothing new.", (), _polling(lambda p: p.stale)),
+    Family(
+        "imud_poll_delay_seconds_total", "Time from deadline to read, summed over all polls.", (),
+        _polling(lambda p: p.late_sum_ns / NS_PER_S),
+    ),
+    Family(
+        "imud_poll_delay_worst_seconds", "Longest time from deadline to read since start.", (),
+        _polling(lambda p: p.late_worst_ns / NS_PER_S),
+    ),
+    Family("imud_transfers_failed_total", "Transfers of polls that failed.", (), _polling(lambda p: p.failed)),
+    Family(
+        "imud_device_vanished_total", "Times a polled device had to be identified again.", (),
+        _polling(lambda p: p.vanished),
     ),
 )  # fmt: skip
 """Metrics of a device with one value per label set, in the order they are shown."""

@@ -9,6 +9,7 @@ from imud.devices.imu61x import i2c as device_i2c
 from imud.kit.polling import Poll
 from imud.kit.status import DeviceState
 from tests.lab.bus import Bus
+from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, physics_holds, registers, vanishes
 from tests.lab.register_device import RegisterDevice
 from tests.lab.wire import I2cTransfer
@@ -130,3 +131,13 @@ def test_two_devices_on_one_bus_are_found_by_themselves(i2c: Bus[I2cTransfer]) -
             assert links == {"/dev/i2c-0, address 0x18", "/dev/i2c-0, address 0x19"}
 
     asyncio.run(body())
+
+
+@pytest.mark.timeout(240)
+def test_demo_on_a_bus_that_exists(i2c: Bus[I2cTransfer]) -> None:
+    """Daemon and command are processes of their own; the far end of the bus is the device of this test."""
+    i2c.attach(ADDRESS, on_i2c(registers()))
+    printed = demo("--device", "imu61x-i2c", "--bus", "0", "--rate", "20", "--duration", "5")
+    assert "link      /dev/i2c-0, address 0x1a, driver imu61x-i2c" in printed
+    assert "reads, " in printed
+    assert printed.rstrip().endswith("the ledger closes to zero")

@@ -9,6 +9,7 @@ from imud.devices.imu61x import spi
 from imud.kit.polling import Poll
 from imud.kit.status import DeviceState
 from tests.lab.bus import Bus
+from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes
 from tests.lab.wire import SpiTransfer
 from tests.polled import Rig, device_config, running
@@ -142,3 +143,13 @@ def test_bus_that_goes_is_noticed(spi8: Bus[SpiTransfer]) -> None:
             await vanishes(rig, "no acknowledgement")
 
     asyncio.run(body())
+
+
+@pytest.mark.timeout(240)
+def test_demo_on_a_bus_that_exists(spi8: Bus[SpiTransfer]) -> None:
+    """Daemon and command are processes of their own; the far end of the bus is the device of this test."""
+    spi8.attach(0, on_spi(registers()))
+    printed = demo("--device", "imu61x-spi", "--port", "/dev/spidev0.0", "--rate", "20", "--duration", "5")
+    assert "link      /dev/spidev0.0, mode 0, driver imu61x-spi" in printed
+    assert "reads, " in printed
+    assert printed.rstrip().endswith("the ledger closes to zero")

@@ -10,7 +10,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families as parse_text
 
 import imud
-from imud.kit.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState
+from imud.kit.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState, PollingStatus
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers.client_metrics import ClientTotals
 from imud.publishers.metrics import SAMPLES_PER_TURN, Renderer, Snapshot
@@ -126,6 +126,27 @@ def test_absent_is_not_zero() -> None:
         assert key(name, device="rear") not in shown
 
 
+def test_polling_is_shown_for_devices_that_are_polled_only() -> None:
+    polling = PollingStatus(
+        polls=1000, late=20, missed=3, stale=4, failed=5, vanished=6,
+        late_mean_ns=70_000, late_worst_ns=8_000_000, late_sum_ns=70_000_123,
+    )  # fmt: skip
+    shown = rendered(Snapshot((*DEVICES, device("polled", 2, polling=polling))))
+    expected = {
+        "imud_polls_total": 1000,
+        "imud_polls_late_total": 20,
+        "imud_polls_missed_total": 3,
+        "imud_polls_stale_total": 4,
+        "imud_transfers_failed_total": 5,
+        "imud_device_vanished_total": 6,
+        "imud_poll_delay_seconds_total": 0.070000123,
+        "imud_poll_delay_worst_seconds": 0.008,
+    }
+    for name, value in expected.items():
+        assert shown[key(name, device="polled")] == pytest.approx(value, rel=1e-12), name
+        assert key(name, device="front") not in shown
+
+
 def test_state_and_sync_are_one_hot() -> None:
     shown = rendered(Snapshot(DEVICES))
     for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
@@ -207,7 +228,7 @@ def test_rendering_pauses_often() -> None:
         nonlocal pauses
         pauses += 1
 
-    devices = [device(f"d{n}", n) for n in range(16)]
+    devices = [device(f"d{n}", n, polling=PollingStatus()) for n in range(16)]
     body = Renderer(pause).render(Snapshot(devices), "").body
     lines = sum(line.startswith(b"imud_") for line in body.splitlines())
     assert lines > 900

@@ -17,6 +17,11 @@ samples and wraps at 65536. Never are two samples mixed, where it can be known:
   the frame itself is the bus repeating it, and is ignored).
 - A set that came in another order than 101, 102, 103, 104, 105 counts only if INDEX follows that of the 105 before.
 - Where frames are known to be missing (`reset`), what was held is given up.
+- A set in order whose INDEX does not follow may still be 101 … 103 of one sample and 104, 105 of a later one, what came
+  between having been lost. Time tells: a set takes S from its first frame to its last, and such a mixture at least one
+  period P more. It counts only if it took no more than S + P/2. S and P are learned from sets whose INDEX follows,
+  which cannot be mixed; before SURE_SETS of them every set in order counts. Where a stalled host or adapter has
+  pressed the times of arrival together, nothing can be known this way.
 
 Frames of a set that stays incomplete are valid and come to nothing (`frames_ignored`); the jump of INDEX to the next
 whole set says how many samples were lost. The device takes no commands over CAN.
@@ -50,6 +55,13 @@ FRAME_BYTES: Final = 8
 INDEX_MODULUS: Final = 1 << 16
 C_PER_COUNT: Final = 0.01
 
+DOWN: Final = 4
+UP: Final = 16
+"""Which part of a difference the learned times follow at once."""
+SURE_SETS: Final = 8
+"""So many sets are needed to learn from: fewer, and one that came late says too much."""
+_NEVER_NS: Final = 1 << 63
+
 _CLOSING: Final = SET_FRAMES - 1
 _FLOATS: Final = tuple(struct.Struct(layout) for layout in ("<2f", "<2f", "<2f", "<2f", "<f4x"))
 _IN_ORDER: Final = (0, 1, 2, 3)
@@ -62,6 +74,39 @@ class Imu61xCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fiel
     """Identifier of the first of the five frames, decimal; the others follow it."""
 
 
+class _Pace:
+    """How long a set takes on the bus, and how long a sample; learned from sets that are surely whole."""
+
+    __slots__ = ("_period_ns", "_sets", "_span_ns", "longest_ns")
+
+    def __init__(self) -> None:
+        self.longest_ns = _NEVER_NS
+        """The longest that a set can take which is of one sample."""
+        self._span_ns = 0
+        self._period_ns = 0
+        self._sets = 0
+
+    def learn(self, span_ns: int, period_ns: int) -> None:
+        """A whole set took `span_ns` from its first frame to its last, and ended `period_ns` after the one before.
+
+        Down quickly and up slowly, by no more than twice at once: too low costs a sample beside a lost one, too high
+        could mix two.
+        """
+        self._span_ns = _moved(self._span_ns, span_ns)
+        self._period_ns = _moved(self._period_ns, period_ns)
+        self._sets += 1
+        if self._period_ns and self._sets >= SURE_SETS:
+            self.longest_ns = self._span_ns + self._period_ns // 2
+
+
+def _moved(mean_ns: int, new_ns: int) -> int:
+    if not mean_ns:
+        return max(0, new_ns)
+    if new_ns < mean_ns:
+        return mean_ns - (mean_ns - max(0, new_ns)) // DOWN
+    return mean_ns + (min(new_ns, 2 * mean_ns) - mean_ns) // UP
+
+
 class Imu61xCanCodec:
     """Measurements out of the frames of one device. Synchronization: one thread."""
 
@@ -72,8 +117,13 @@ class Imu61xCanCodec:
         """Data of 101 … 104 by their place, in the order they came."""
         self._newest = -1
         """Place of the newest frame held."""
+        self._first_ns = 0
+        """When the first frame held came."""
         self._index: int | None = None
         """INDEX of the newest 105."""
+        self._closed_ns = 0
+        """When it came."""
+        self._pace = _Pace()
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Take one frame; return what it completed. Never raises for any frame."""
@@ -90,13 +140,15 @@ class Imu61xCanCodec:
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
         if slot == _CLOSING:
-            return self._close(data)
+            return self._close(data, t_rx_ns)
         held = self._held
         if slot in held:
             if slot == self._newest and held[slot] == data:
                 ledger.frames_ignored += 1
                 return ()
             self.reset()
+        if not held:
+            self._first_ns = t_rx_ns
         held[slot] = data
         self._newest = slot
         ledger.frames_pending += 1
@@ -114,17 +166,22 @@ class Imu61xCanCodec:
         held.clear()
         self._newest = -1
 
-    def _close(self, data: bytes) -> Sequence[CodecEvent]:
+    def _close(self, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """105 came: the set is whole, or it is lost."""
-        held, ledger, before = self._held, self.ledger, self._index
+        held, ledger, before, pace = self._held, self.ledger, self._index, self._pace
         self._index = index = data[6] | data[7] << 8
-        places = tuple(held)
-        in_order = places == _IN_ORDER
+        before_ns, self._closed_ns = self._closed_ns, t_rx_ns
+        span_ns = t_rx_ns - self._first_ns
         follows = before is not None and (index - before) % INDEX_MODULUS == 1
-        if not in_order and (len(places) < _CLOSING or not follows):
+        places = tuple(held)
+        in_time = places == _IN_ORDER and span_ns <= pace.longest_ns
+        is_whole = in_time or (follows and len(places) == _CLOSING)
+        if not is_whole:
             self.reset()
             ledger.frames_ignored += 1
             return ()
+        if follows:
+            pace.learn(span_ns, t_rx_ns - before_ns)
         raw = b"".join(held[slot] for slot in _IN_ORDER) + data
         held.clear()
         self._newest = -1

@@ -155,6 +155,7 @@ DRIVER: Final = PolledDriver(
     settings=RegisterSettings,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
+    lines=frozenset({"reset", "data_ready"}),
     link="i2c",
     targets=I2C_ADDRESSES,
     probe=probe,

@@ -28,7 +28,7 @@ from imud.devices.imu61x.replies import (
     pack_parameters,
     pack_status,
 )
-from imud.devices.imu61x.session import identify, read_settings
+from imud.devices.imu61x.session import identify, read_settings, wake
 from imud.kit.attitude import quat_from_euler_zyx
 from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame, StreamCodec
 from imud.kit.driver import Identity, StreamDriver
@@ -234,5 +234,6 @@ DRIVER: Final = StreamDriver(
     identify=identify,
     read_settings=read_settings,
     apply_identity=_apply_identity,
+    wake=wake,
     example_frame=_example_frame,
 )

@@ -5,14 +5,16 @@ and leaves open what a device does with them while it streams. Every conversatio
 An answer means that all else can be asked as it is; no answer, that the device streams and needs command mode for it:
 then that is entered, and streaming is started again at the end, whatever happened. A device that was in command mode
 answers at once and stays there. Where the host's transmit line is not connected nothing is changed and NoReply raised.
-Command mode is never saved: a device that loses its host in the middle streams again after its next power-on.
+Command mode is never saved: a device that loses its host in the middle streams again after its next power-on. If only
+the conversation is given up, the order to stream is the last that is sent (`Request.undo`). For a device that someone
+saved in command mode there is `wake`.
 
 What the codes of acknowledgements mean stands in no source. Changes are confirmed by reading them back where they can
 be; elsewhere result 0 counts as done (assumed), which `done` changes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Final, TypeVar
 
@@ -30,7 +32,7 @@ from imud.devices.imu61x.replies import (
 from imud.errors import BadArgument, CommandError, NoReply, Rejected
 from imud.kit.codec import Message
 from imud.kit.driver import Identity
-from imud.kit.session import Conversation, Reply, Request, pause
+from imud.kit.session import Conversation, Reply, Request, pause, with_undo
 from imud.sample import Vector3
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -51,6 +53,7 @@ POLLS_MAX: Final = 120
 GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
 INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)
 _NAMED_OTHERWISE: Final = ("software_version", "serial_number", "imu_health")
+_STREAM: Final = commands.output_mode(OutputMode.STREAM).payload
 _HEXADECIMAL: Final = (Parameter.I2C_ADDRESS, Parameter.FILTER)
 
 
@@ -85,8 +88,7 @@ def read_settings() -> Conversation[Mapping[str, str]]:
 
 
 def _identity() -> Conversation[Identity]:
-    message = yield from _answered(commands.ask_status())
-    status = parse_status(message)
+    status = parse_status((yield from _answered(commands.ask_status())))
     assert status is not None  # nothing else ends the request
     return identity_of(status)
 
@@ -132,6 +134,12 @@ def start_streaming() -> Conversation[bool]:
         if isinstance((yield commands.output_mode(OutputMode.STREAM)), Reply):
             return True
     return False
+
+
+def wake() -> Conversation[bool]:
+    """Make it stream if it answers; return whether it acknowledged. Not saved. Raises NoReply where nothing answers."""
+    yield from _answered(commands.ask_status())
+    return (yield from start_streaming())
 
 
 def stop_streaming() -> Conversation[None]:
@@ -271,6 +279,10 @@ def change_baud(baud: int, present_baud: int) -> Conversation[BaudChange]:
     Raises BadArgument, Rejected where it stays at the old rate (the line too), and NoReply where it is not heard; if
     nothing was saved, it comes back at the old rate after power-on.
     """
+    return with_undo(_change_baud(baud, present_baud), _STREAM)
+
+
+def _change_baud(baud: int, present_baud: int) -> Conversation[BaudChange]:
     request = commands.set_baud(baud)
     if (yield from _look((present_baud,))) is None:
         yield from start_streaming()
@@ -300,6 +312,10 @@ def factory_reset(present_baud: int) -> Conversation[BaudChange]:
 
     Ends streaming, as delivered.
     """
+    return with_undo(_factory_reset(present_baud), _STREAM)
+
+
+def _factory_reset(present_baud: int) -> Conversation[BaudChange]:
     bauds = (FACTORY_BAUD, present_baud)
     if (yield from _look((present_baud,))) is None:
         yield from start_streaming()
@@ -344,9 +360,9 @@ def _in_contact(ask: Callable[[], Conversation[T]]) -> Conversation[T]:
     """Run `ask` once, in command mode if the device answers only there, and leave it as it was."""
     if isinstance((yield commands.ask_status()), Reply):
         return (yield from ask())
-    yield commands.output_mode(OutputMode.COMMAND)
+    yield replace(commands.output_mode(OutputMode.COMMAND), undo=_STREAM)
     try:
-        value = yield from ask()
+        value = yield from with_undo(ask(), _STREAM)
     except CommandError:
         yield from start_streaming()
         raise

@@ -356,6 +356,7 @@ DRIVER: Final = PolledDriver(
     settings=SpiDeviceSettings,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
+    lines=frozenset({"reset", "data_ready"}),
     link="spi",
     targets=MODES,
     probe=probe,

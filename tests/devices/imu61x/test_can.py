@@ -130,6 +130,82 @@ def test_two_sets_without_the_105_between_them_are_not_mixed() -> None:
     assert events == []
 
 
+PERIOD_NS = 10_000_000
+FRAME_NS = 250_000
+
+
+def timed(
+    codec: Imu61xCanCodec, index: int, places: str = "12345", *, late_ns: int = 0, period_ns: int = PERIOD_NS
+) -> list[int | None]:
+    """Feed some of the frames of a sample, sent one after the other, at the time that its INDEX says."""
+    events: list[CodecEvent] = []
+    for place, (can_id, data) in enumerate(sample(index, float(index % 100))):
+        if str(place + 1) in places:
+            t_ns = index * period_ns + place * FRAME_NS + late_ns
+            events += codec.feed_frame(can_id, False, data, t_ns)
+    assert codec.ledger.closes()
+    return indices(events)
+
+
+def learned(period_ns: int = PERIOD_NS) -> Imu61xCanCodec:
+    """A codec that has seen samples up to INDEX 9, as few as it needs."""
+    codec = make()
+    assert [timed(codec, index, period_ns=period_ns) for index in range(1, 10)] == [[index] for index in range(1, 10)]
+    return codec
+
+
+@pytest.mark.parametrize("cut", range(1, 5))
+def test_frames_of_two_samples_in_order_are_told_by_time(cut: int) -> None:
+    """1 … `cut` of one sample and the rest of another, what was between them lost: in order, and yet no sample."""
+    codec = learned()
+    first, rest = "12345"[:cut], "12345"[cut:]
+    assert timed(codec, 10, first) + timed(codec, 11, rest) == []
+    assert codec.ledger.frames_ignored == 5
+    assert timed(codec, 12) == [12]
+    assert timed(codec, 60, first) + timed(codec, 77, rest) == []
+    assert timed(codec, 78) == [78]
+
+
+def test_whole_set_after_a_gap_counts_though_its_index_does_not_follow() -> None:
+    codec = learned()
+    assert [timed(codec, index) for index in (17, 18, 400, 401)] == [[17], [18], [400], [401]]
+    # the last frame 4.9 ms late: 5.9 ms are less than 1 ms + half of 10 ms
+    assert timed(codec, 410, "1234") + timed(codec, 410, "5", late_ns=4_900_000) == [410]
+    assert timed(codec, 420, "1234") + timed(codec, 420, "5", late_ns=5_100_000) == []
+
+
+def test_bus_that_is_nearly_full_is_told_by_time_as_well() -> None:
+    """Sets of 1 ms every 1.25 ms: a mixture takes 2.25 ms, the limit is 1.625 ms."""
+    period_ns = 1_250_000
+    codec = learned(period_ns)
+    assert timed(codec, 15, period_ns=period_ns) == [15]
+    assert timed(codec, 16, "123", period_ns=period_ns) + timed(codec, 17, "45", period_ns=period_ns) == []
+    assert timed(codec, 19, period_ns=period_ns) == [19]
+
+
+def test_before_anything_is_learned_a_set_in_order_counts() -> None:
+    codec = make()
+    assert timed(codec, 1, "123") + timed(codec, 2, "45") == [2]
+    assert [timed(codec, index) for index in range(3, 10)] == [[index] for index in range(3, 10)]
+    assert timed(codec, 10, "123") + timed(codec, 12, "45") == [12]  # seven sets were seen whose INDEX follows
+    timed(codec, 13)
+    assert timed(codec, 14, "123") + timed(codec, 15, "45") == []
+
+
+def test_what_was_learned_follows_a_faster_rate_and_not_a_pause() -> None:
+    codec = make()
+    for index in range(1, 20):
+        timed(codec, index)
+    assert timed(codec, 20, late_ns=10**9) == [20]  # a second late, and the next come on time again
+    assert timed(codec, 121, "123") + timed(codec, 122, "45") == []
+    codec.reset()
+    begin, fast_ns = 1000, 2_500_000
+    for index in range(begin, begin + 8):
+        assert timed(codec, index, period_ns=fast_ns) == [index]
+    later = begin + 20
+    assert timed(codec, later, "12", period_ns=fast_ns) + timed(codec, later + 1, "345", period_ns=fast_ns) == []
+
+
 def test_wrong_length_is_a_bad_frame() -> None:
     codec = make()
     events = feed(codec, [*sample(1)[:2], (103, b"\1\2\3")])

@@ -1,0 +1,64 @@
+"""Settings of a driver on the command line, for captures of devices that are not set as delivered."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from imud.cli import main
+from tests.can_logs import imu61x_log
+from tests.cli.test_decode import MANUAL_FRAME
+
+
+@pytest.fixture
+def moved(tmp_path: Path) -> Path:
+    """A device whose identifiers begin at 512."""
+    log = tmp_path / "drive.log"
+    text = imu61x_log(range(10))
+    for slot in range(5):
+        text = text.replace(f" {101 + slot:03X}#", f" {512 + slot:03X}#")
+    log.write_text(text)
+    return log
+
+
+def test_decode_and_replay_take_the_drivers_settings(moved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    decode = ["decode", "--driver", "imu61x-can", str(moved)]
+    assert main(decode) == 1
+    assert json.loads(capsys.readouterr().err)["bytes_skipped"] == 400
+    assert main([*decode, "--option", "base_id=512"]) == 0
+    assert [json.loads(line)["index"] for line in capsys.readouterr().out.splitlines()] == list(range(10))
+    replay = ["replay", "--driver", "imu61x-can", "--json", str(moved)]
+    assert main(replay) == 1
+    capsys.readouterr()
+    assert main([*replay, "--option", "base_id=512"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 10
+
+
+def test_settings_of_a_stream_driver(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = tmp_path / "c.raw"
+    capture.write_bytes(MANUAL_FRAME)
+    decode = ["decode", "--driver", "hipnuc-uart", str(capture)]
+    shown = []
+    for meaning in ("pps", "status"):
+        assert main([*decode, "--option", f"hi91_word={meaning}"]) == 0
+        shown.append(json.loads(capsys.readouterr().out))
+    assert "pps_age_ms" in shown[0]
+    assert "pps_age_ms" not in shown[1]
+
+
+@pytest.mark.parametrize("command", ["decode", "replay"])
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("base_id=high", '--option base_id: expected a whole number from 0 to 2043, got "high"'),
+        ("base_id=4000", "--option base_id: expected a whole number from 0 to 2043, got 4000"),
+        ("baseid=201", "--option baseid: expected an option of imu61x-can that imud knows, got \"baseid\"; "
+         "did you mean base_id? known: base_id"),
+        ("base_id", "expected NAME=VALUE, got 'base_id'"),
+    ],
+)  # fmt: skip
+def test_bad_option_is_one_clear_line(
+    command: str, option: str, said: str, moved: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, "--driver", "imu61x-can", "--option", option, str(moved)]) == 2
+    assert capsys.readouterr().err == f"imud {command}: {said}\n"
