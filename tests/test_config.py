@@ -59,6 +59,7 @@ class DriverSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 class FakeRow:
     settings: type[Settings]
     searchable: bool = True
+    lines: frozenset[str] = frozenset()
     refuses: type[Settings] | None = None
     """Settings of a driver that does not fit this link."""
 
@@ -392,7 +393,6 @@ def test_loading_opens_only_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("device", "message"),
     [
-        ("{socketcan: {interface: can0}}", "expected a driver to be named for socketcan (imu61x-can), got auto"),
         ("{driver: hipnuc-uart, socketcan: {interface: can0}}", "expected a link that hipnuc-uart can use (uart, "),
         ("{driver: imu61x-can, uart: {port: x}}", "expected a link that imu61x-can can use (socketcan, "),
         ("{driver: imu61x-can, socketcan: {interface: c, bitrate: 500000}}", "expected none with backend socketcan"),
@@ -402,6 +402,17 @@ def test_driver_and_link_must_go_together(device: str, message: str) -> None:
     with pytest.raises(ConfigError) as refused:
         config.parse(f"devices:\n  a: {device}\n", "x.yaml")
     assert message in str(refused.value)
+
+
+def test_a_link_on_which_nothing_is_searched_needs_a_driver() -> None:
+    tables = Tables(FAKE.drivers, {"port": FakeRow(PortSettings, searchable=False)}, FAKE.publishers)
+    (line,) = errors("devices:\n  a: {port: {port: x}}", tables)
+    assert "expected a driver to be named for port (acme-uart, plain-uart), got auto" in line
+
+
+def test_what_talks_on_a_can_bus_is_searched() -> None:
+    (device,) = config.parse("devices:\n  a: {socketcan: {interface: can0}}\n", "x.yaml").devices
+    assert (device.driver, device.options) == ("auto", None)
 
 
 @pytest.mark.parametrize("link", ["socketcan: {interface: can0}", "replay: {path: a.log}", "memory: {}"])

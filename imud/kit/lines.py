@@ -1,9 +1,11 @@
 """Lines: single wires beside a device's data, which say when something happened (SOUT, PPS) or that it did (ALARM)."""
 
-from collections.abc import Callable, Sequence
-from typing import Annotated, NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol, get_args
 
 from msgspec import Meta
+from msgspec.structs import fields
 
 from imud.errors import LinkError
 from imud.kit.settings import Settings
@@ -17,18 +19,102 @@ class Edge(NamedTuple):
     rising: bool
     """Whether the line became active."""
     number: int
-    """Counts the edges of this line from 1, those that were lost on the way included."""
+    """Counts the edges of this line from 1, rising and falling, those that were lost on the way included. It goes on
+    when the line is opened again."""
 
 
 class LineSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which wire: by chip and number, or by a name that is on one chip only."""
 
-    line: Annotated[int, Meta(ge=0, le=1023)] | Annotated[str, Meta(min_length=1, max_length=64)]
+    line: Annotated[int, Meta(ge=0, le=1023)] | Annotated[str, Meta(min_length=1, max_length=31)]
     """Number of the line on its chip, or its name, for example `GPIO17`."""
     chip: Annotated[str, Meta(max_length=64)] = ""
     """`/dev/gpiochip0`, `gpiochip0`, or a chip's label; empty to look for the line's name on all chips."""
     active_low: bool = False
     """Whether a low level means active: a line behind an inverting level shifter."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.line, int) and not self.chip:
+            raise ValueError("expected the key chip beside the number of a line, got none")
+
+
+class InputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A wire that the device drives."""
+
+    bias: Literal["as-is", "pull-up", "pull-down", "disabled"] = "as-is"
+    """Resistor inside the host's chip: a wire that nobody drives floats, and a floating wire makes edges."""
+
+
+class DividedSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SOUT_DIV."""
+
+    divisor: Annotated[int, Meta(ge=1, le=64)] = 8
+    """How many samples there are to one pulse, as the device is set to (`CONFIG PMUX4 DIV8`; 8 as delivered)."""
+
+
+class PpsSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The pulse per second."""
+
+    chrony: str = ""
+    """Socket of chronyd's SOCK reference clock that is given the pulses, for example `/run/chrony/imud.sock`; empty for
+    none. Which second a pulse is must be known from `rmc`."""
+
+
+class ReadySettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Data ready."""
+
+    edge: Literal["rising", "falling"] = "rising"
+    """The edge after which new data can be read; `rising` is from inactive to active."""
+
+
+class OutputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A wire that imud drives."""
+
+    open_drain: bool = False
+    """Whether high is left to a pull-up resistor, so that no current flows into a device without power."""
+
+
+class TriggerSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SIN."""
+
+    rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 100.0
+    """Rising edges per second; 0 for none but those that are asked for one by one."""
+
+
+class ResetSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Reset."""
+
+    active_low: bool = True
+    """Whether a low level resets the device, as on a pin called nRST."""
+    hold_ms: Annotated[float, Meta(ge=0.01, le=10_000)] = 10.0
+    """How long the line is held active, ms."""
+    wait_s: Annotated[float, Meta(ge=0, le=60)] = 3.0
+    """How long the device needs after it, s: an IMU61x 3 s (manual, note 1 of 2.2)."""
+
+
+class DeviceLines(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The wires of one device besides its data."""
+
+    sout: InputSettings | None = None
+    """SOUT of the device: a pulse before each frame."""
+    sout_div: DividedSettings | None = None
+    """SOUT_DIV of the device: a pulse for every so many samples."""
+    sin: TriggerSettings | None = None
+    """SIN of the device, driven by imud: one frame for each rising edge (ONMARK)."""
+    alarm: InputSettings | None = None
+    """ALARM of the device: active while an angle is out of its range."""
+    reset: ResetSettings | None = None
+    """Reset of the device, driven by imud."""
+    data_ready: ReadySettings | None = None
+    """Data ready of the device: it has new values."""
+    pps: PpsSettings | None = None
+    """The pulse per second that the device's SIN gets, at the host too."""
+
+
+LINE_SCHEMAS: Final[Mapping[str, type[LineSettings]]] = {
+    field.name: get_args(field.type)[0] for field in fields(DeviceLines)
+}
+"""Schema of each key of `DeviceLines`."""
 
 
 OnEdges = Callable[[Sequence[Edge]], None]
@@ -42,8 +128,14 @@ class InputLine(Protocol):
 
     title: str
     """The line for people, for example `gpiochip0 line 17 (GPIO17)`."""
-    edges_lost: int
-    """Edges that the kernel dropped since `open`, because they were not read in time."""
+
+    @property
+    def edges_lost(self) -> int:
+        """Edges that the kernel dropped because they were not read in time, over all times the line was open.
+
+        Edges that follow each other before the kernel's interrupt thread runs become one; nobody counts those.
+        """
+        ...
 
     def open(self) -> None:
         """Request the line. Raises LinkMissing, LinkBusy (naming the holder), LinkDenied, LinkError."""
@@ -82,3 +174,13 @@ class OutputLine(Protocol):
     def close(self) -> None:
         """Make it inactive and release it; may be called twice."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class LineMaker:
+    """Makes closed lines from their settings and a purpose for people, for example `bow sout`."""
+
+    make_input: Callable[[Any, str, bool], InputLine]
+    """From `InputSettings`; the last argument says whether falling edges are of no interest."""
+    make_output: Callable[[Any, str], OutputLine]
+    """From `OutputSettings`."""

@@ -22,6 +22,8 @@ class GpioChip:
     names: tuple[str, ...]
     sysfs: Path
     """Folder with one sim_gpio<offset> per line."""
+    device: Path
+    """Its folder in configfs."""
 
     def drive(self, line: str | int, level: bool) -> None:
         """Sets the level that an input reads, as a circuit outside would; a change is an edge."""
@@ -30,6 +32,14 @@ class GpioChip:
     def level(self, line: str | int) -> bool:
         """The level of the line now, whoever drives it."""
         return self._attribute(line, "value").read_text(encoding="ascii").strip() == "1"
+
+    def unplug(self) -> None:
+        """Removes the chip, whoever uses its lines."""
+        _set(self.device / "live", "0")
+
+    def plug_in(self) -> None:
+        """Brings it back, perhaps under another number: only the names of its lines are what they were."""
+        _set(self.device / "live", "1")
 
     def _attribute(self, line: str | int, name: str) -> Path:
         offset = self.names.index(line) if isinstance(line, str) else line
@@ -52,9 +62,10 @@ def simulated_chip(names: Sequence[str]) -> Iterator[GpioChip]:
         _set(device / "live", "1")
         chip = _get(bank / "chip_name")
         sysfs = Path("/sys/devices/platform") / _get(device / "dev_name") / chip
-        yield GpioChip(Path("/dev") / chip, tuple(names), sysfs)
+        yield GpioChip(Path("/dev") / chip, tuple(names), sysfs, device)
     finally:
-        _set(device / "live", "0")
+        if _get(device / "live") == "1":
+            _set(device / "live", "0")
         for folder in reversed(made):
             folder.rmdir()
 

@@ -1,0 +1,38 @@
+"""The configuration file: read and checked whole, before any port is opened. Loading touches nothing but the file.
+
+    log_level, state_dir          keys of the daemon (`General`)
+    socket, shm, metrics, …       one key per row of PUBLISHERS, with that row's settings
+    devices:
+      NAME:
+        driver, identify, enabled, options        (`DeviceGeneral`; options are the driver's settings)
+        lines                     wires besides the data (`imud.kit.lines.DeviceLines`), as far as the driver has them
+        rmc                       what tells the device UTC (`imud.utc.source.RmcSettings`), as far as it has SIN/PPS
+        uart | replay | …         one key per row of LINKS, with that row's settings
+
+A new row of a table is configurable without a change here. Errors name file, line and column, what was expected and
+what is there; all that can be found in one pass are reported together.
+"""
+
+from imud.config.devices import DEVICE_NAME, DEVICES_MAX
+from imud.config.model import Config, DeviceConfig, DeviceGeneral, Differences, General, differences
+from imud.config.reading import PROBLEMS_SHOWN, load, parse
+from imud.config.tables import TABLES, DriverRow, LinkRow, Row, Tables
+
+__all__ = [
+    "DEVICES_MAX",
+    "DEVICE_NAME",
+    "PROBLEMS_SHOWN",
+    "TABLES",
+    "Config",
+    "DeviceConfig",
+    "DeviceGeneral",
+    "Differences",
+    "DriverRow",
+    "General",
+    "LinkRow",
+    "Row",
+    "Tables",
+    "differences",
+    "load",
+    "parse",
+]

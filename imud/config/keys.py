@@ -1,0 +1,103 @@
+"""Reads the keys of one file against schemas, and collects problems with their places instead of stopping at one."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, TypeVar
+
+import msgspec
+
+from imud.config.tables import Row
+from imud.kit.expected import expected, got
+from imud.kit.settings import Settings
+from imud.kit.yaml_tree import Path as KeyPath
+from imud.kit.yaml_tree import Problem, YamlTree
+
+S = TypeVar("S", bound=Settings)
+
+
+class Keys:
+    """The keys of a file, and the problems found with them so far."""
+
+    def __init__(self, tree: YamlTree) -> None:
+        self.tree = tree
+        self.problems: list[Problem] = []
+
+    def problems_besides(self, known: Sequence[Problem]) -> Iterator[Problem]:
+        """Problems found, without those that only follow from a `known` one at the same place or inside it."""
+        paths = [problem.path for problem in known]
+        return (p for p in self.problems if not any(path[: len(p.path)] == p.path for path in paths))
+
+    def mapping(self, path: KeyPath, data: object) -> Mapping[str, Any] | None:
+        """`data` if it is a mapping; otherwise a problem and None."""
+        if isinstance(data, dict):
+            return data
+        self.problem(path, f"expected keys and values, got {got(data)}")
+        return None
+
+    def unknown_keys(self, path: KeyPath, keys: Mapping[str, Any], known: Sequence[str]) -> None:
+        """A problem for each key that is not `known`."""
+        for key in keys:
+            if key not in known:
+                self.problem((*path, key), choose("a key", key, known), at_key=True)
+
+    def row(self, table: Mapping[str, Row], name: str, data: object, path: KeyPath | None = None) -> Settings | None:
+        """The settings of row `name`; nothing written below a key means its defaults."""
+        path = path or (name,)
+        try:
+            schema = table[name].settings
+        except ImportError as error:
+            self.problem(path, f"expected the parts of {name} to be installed, got: {error}", at_key=True)
+            return None
+        return self.part(schema, data, path)
+
+    def part(self, schema: type[S], data: object, path: KeyPath) -> S | None:
+        """The settings of one part by its schema; nothing written below a key means its defaults."""
+        keys = self.mapping(path, {} if data is None else data)
+        if keys is None:
+            return None
+        self.unknown_keys(path, keys, schema.__struct_fields__)
+        return self.settings(schema, path, {key: keys[key] for key in schema.__struct_fields__ if key in keys})
+
+    def settings(self, schema: type[S], path: KeyPath, keys: Mapping[str, Any]) -> S | None:
+        """Convert the known `keys` to `schema`, each by itself, so that every bad value is reported."""
+        good = True
+        for field in msgspec.structs.fields(schema):
+            if field.name in keys:
+                good &= self._value_fits((*path, field.name), keys[field.name], field.type)
+            elif field.required:
+                self.problem(path, f"expected the key {field.name} ({expected(field.type)}), got none", at_key=True)
+                good = False
+        if not good:
+            return None
+        try:
+            return msgspec.convert(keys, schema)
+        except msgspec.ValidationError as error:  # what __post_init__ says of keys that do not go together
+            message = str(error).partition(" - at `$")[0]
+            key = message.partition(":")[0]
+            if key in keys:
+                self.problem((*path, key), message.removeprefix(f"{key}:").strip())
+            else:
+                self.problem(path, message)
+            return None
+
+    def problem(self, path: KeyPath, message: str, *, at_key: bool = False) -> None:
+        """Something is wrong at `path`, with its value or with the key itself."""
+        mark = self.tree.key_mark(path) if at_key else self.tree.mark(path)
+        self.problems.append(Problem(mark, path, message))
+
+    def _value_fits(self, path: KeyPath, value: object, field_type: Any) -> bool:
+        try:
+            msgspec.convert(value, field_type)
+        except msgspec.ValidationError as error:
+            inside = str(error).partition(" - at `$")[2].rstrip("`")
+            detail = f" ({error})" if inside else ""
+            self.problem(path, f"expected {expected(field_type)}, got {got(value)}{detail}")
+            return False
+        return True
+
+
+def choose(what: str, name: str, known: Sequence[str]) -> str:
+    """What to say of a name that is none of the known."""
+    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]}? " if near else ""
+    return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"

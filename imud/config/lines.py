@@ -1,0 +1,84 @@
+"""Reads the wires of a device besides its data, and sees to it that no wire is used twice."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+from imud.config.keys import Keys
+from imud.config.model import DeviceConfig
+from imud.config.tables import DriverRow
+from imud.kit.expected import shown
+from imud.kit.lines import LINE_SCHEMAS, DeviceLines, LineSettings
+from imud.kit.yaml_tree import Path as KeyPath
+
+
+def read_lines(
+    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
+) -> DeviceLines | None:
+    """The wires below the key `lines` of a device; None where it has none."""
+    if "lines" not in device:
+        return None
+    found = keys.mapping(path, device["lines"])
+    if found is None:
+        return None
+    _fit(keys, path, found, device.get("driver", "auto"), drivers)
+    made: dict[str, LineSettings] = {}
+    for name, schema in LINE_SCHEMAS.items():
+        if name in found:
+            inside = keys.mapping((*path, name), found[name])
+            settings = None if inside is None else keys.part(schema, inside, (*path, name))
+            if settings is not None:
+                made[name] = settings
+    return DeviceLines(**made) if made else None  # type: ignore[arg-type]  # each was made by the schema of its key
+
+
+def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
+    """Refuse one wire under two keys, of one device or of two."""
+    owners: list[tuple[LineSettings, str]] = []
+    for device in devices:
+        for name, settings in _lines_of(device):
+            path: KeyPath = ("devices", device.name, "lines", name)
+            first = next((place for other, place in owners if _same_wire(other, settings)), None)
+            if first is not None:
+                wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
+                keys.problem(path, f"expected a line of its own, got {wire}, which {first} has", at_key=True)
+            owners.append((settings, f"{device.name}.lines.{name} (line {keys.tree.key_mark(path).line})"))
+
+
+def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
+    """Refuse what no device has, and what this driver's devices have not."""
+    keys.unknown_keys(path, found, list(LINE_SCHEMAS))
+    if driver == "auto":
+        message = "expected lines only beside a named driver, got them with driver auto; drivers that have lines"
+        keys.problem(path, f"{message}: {', '.join(_with_lines(drivers))}", at_key=True)
+    if not isinstance(driver, str) or driver not in drivers:
+        return
+    try:
+        lines = drivers[driver].lines
+    except ImportError:
+        return  # it is a problem of its own
+    for name in found:
+        if name in LINE_SCHEMAS and name not in lines:
+            known = ", ".join(key for key in LINE_SCHEMAS if key in lines) or "none"
+            message = f"expected a line that devices of {driver} have, got {shown(name)}; they have: {known}"
+            keys.problem((*path, name), message, at_key=True)
+
+
+def _with_lines(drivers: Mapping[str, DriverRow]) -> Iterator[str]:
+    for name in drivers:
+        with suppress(ImportError):
+            if drivers[name].lines:
+                yield name
+
+
+def _lines_of(device: DeviceConfig) -> Iterator[tuple[str, LineSettings]]:
+    for name in LINE_SCHEMAS if device.lines is not None else ():
+        settings = getattr(device.lines, name)
+        if settings is not None:
+            yield name, settings
+
+
+def _same_wire(one: LineSettings, other: LineSettings) -> bool:
+    """As far as it can be seen here: a name without a chip is on one chip only, whichever that is."""
+    chips = {one.chip.removeprefix("/dev/"), other.chip.removeprefix("/dev/")}
+    return one.line == other.line and (len(chips) == 1 or "" in chips)

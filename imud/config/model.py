@@ -1,0 +1,101 @@
+"""What a configuration is once it is read and checked, and how two of them differ."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal
+
+import msgspec
+
+from imud.kit.lines import DeviceLines
+from imud.kit.settings import Settings
+from imud.utc.source import RmcSettings
+
+
+class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys of the daemon itself."""
+
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """What is written to the log: this and what is more severe."""
+    state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
+    """Folder where imud remembers at which rate each device was found. systemd's STATE_DIRECTORY wins over it."""
+
+
+class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys of a device besides its link and the options of its driver."""
+
+    driver: str = "auto"
+    """Which wire protocol the device speaks, or `auto`: listen and see."""
+    enabled: bool = True
+    """Whether imud uses the device; if not, its keys are checked all the same."""
+    identify: bool = True
+    """Whether imud may send queries (nothing that changes the device) to learn product, serial number and firmware."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceConfig:
+    """One device that imud is to use."""
+
+    name: str
+    driver: str
+    """A name in DRIVERS, or `auto`."""
+    options: Settings | None
+    """Settings of the driver; None with driver `auto`."""
+    identify: bool
+    link: str
+    """A name in LINKS."""
+    link_settings: Settings
+    line: int = 0
+    """Line of its name in the file; says nothing about the device."""
+    lines: DeviceLines | None = None
+    """Its wires besides its data; None where it has none."""
+    rmc: RmcSettings | None = None
+    """Where the RMC sentences come from that it is fed; None for none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A whole configuration, checked."""
+
+    log_level: str
+    state_dir: str
+    publishers: Mapping[str, Settings]
+    """Settings of every row of PUBLISHERS, with their defaults where the file says nothing."""
+    devices: tuple[DeviceConfig, ...]
+    """In the order of the file, without the disabled."""
+    disabled: tuple[str, ...] = ()
+    """Names of devices with `enabled: false`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Differences:
+    """What a new configuration changes, by name. `str()` of it is a sentence for the log."""
+
+    devices_added: tuple[str, ...]
+    devices_removed: tuple[str, ...]
+    devices_changed: tuple[str, ...]
+    publishers_changed: tuple[str, ...]
+    keys_changed: tuple[str, ...]
+    """Of `log_level` and `state_dir`."""
+
+    def __str__(self) -> str:
+        """For example `devices added: front, rear; publishers changed: metrics`, or `nothing differs`."""
+        parts = ((field.name.replace("_", " "), getattr(self, field.name)) for field in fields(self))
+        return "; ".join(f"{title}: {', '.join(names)}" for title, names in parts if names) or "nothing differs"
+
+
+def differences(old: Config, new: Config) -> Differences:
+    """What `new` changes. Where in the file a device stands makes no difference."""
+    before, after = ({d.name: _without_line(d) for d in config.devices} for config in (old, new))
+    return Differences(
+        devices_added=tuple(name for name in after if name not in before),
+        devices_removed=tuple(name for name in before if name not in after),
+        devices_changed=tuple(name for name in after if name in before and after[name] != before[name]),
+        publishers_changed=tuple(
+            name for name, settings in new.publishers.items() if settings != old.publishers.get(name)
+        ),
+        keys_changed=tuple(key for key in ("log_level", "state_dir") if getattr(old, key) != getattr(new, key)),
+    )
+
+
+def _without_line(device: DeviceConfig) -> tuple[object, ...]:
+    return tuple(getattr(device, field.name) for field in fields(device) if field.name != "line")

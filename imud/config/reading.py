@@ -1,0 +1,68 @@
+"""Reads and checks a whole file, before any port is opened. Loading touches nothing but the file."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from imud.config.devices import DeviceReader
+from imud.config.keys import Keys
+from imud.config.model import Config, General
+from imud.config.tables import TABLES, Tables
+from imud.errors import ConfigError
+from imud.kit.yaml_tree import FILE_BYTES_MAX, Problem, path_text, read_yaml
+
+PROBLEMS_SHOWN: Final = 20
+
+
+def load(path: Path | str, tables: Tables = TABLES) -> Config:
+    """Read a configuration file. Raises ConfigError with every problem that was found, one per line."""
+    try:
+        with open(path, "rb") as file:
+            content = file.read(FILE_BYTES_MAX + 1)
+    except OSError as error:
+        hint = "give the file with --config" if isinstance(error, FileNotFoundError) else "look at its owner and mode"
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}; {hint}") from None
+    return parse(content, str(path), tables)
+
+
+def parse(text: str | bytes, filename: str, tables: Tables = TABLES) -> Config:
+    """Read a configuration from text; `filename` is for messages. Raises ConfigError."""
+    tree = read_yaml(text.encode() if isinstance(text, str) else text)
+    keys = Keys(tree)
+    config = _config(keys, tables) if tree.complete else None
+    problems = [*tree.problems, *keys.problems_besides(tree.problems)]
+    if problems or config is None:
+        raise ConfigError(_report(problems, filename))
+    return config
+
+
+def _config(keys: Keys, tables: Tables) -> Config | None:
+    """The configuration, or None where problems do not let it be made."""
+    top = keys.mapping((), keys.tree.data)
+    if top is None:
+        return None
+    known = [*General.__struct_fields__, *tables.publishers, "devices"]
+    keys.unknown_keys((), top, known)
+    general = keys.settings(General, (), {key: top[key] for key in General.__struct_fields__ if key in top})
+    publishers = {name: keys.row(tables.publishers, name, top.get(name)) for name in tables.publishers}
+    devices = DeviceReader(keys, tables).devices(top)
+    if general is None or devices is None or keys.problems:
+        return None
+    used = tuple(device for device, enabled in devices if enabled)
+    return Config(
+        log_level=general.log_level,
+        state_dir=general.state_dir,
+        publishers={name: settings for name, settings in publishers.items() if settings is not None},
+        devices=used,
+        disabled=tuple(device.name for device, enabled in devices if not enabled),
+    )
+
+
+def _report(problems: Sequence[Problem], filename: str) -> str:
+    lines = []
+    for problem in sorted(problems)[:PROBLEMS_SHOWN]:
+        place = f"{filename}:{problem.mark.line}:{problem.mark.column}: "
+        lines.append(place + (f"{path_text(problem.path)}: " if problem.path else "") + problem.message)
+    if len(problems) > PROBLEMS_SHOWN:
+        lines.append(f"… and {len(problems) - PROBLEMS_SHOWN} more problems")
+    return "\n".join(lines)

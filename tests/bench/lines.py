@@ -1,0 +1,122 @@
+"""Lines: what an edge costs to read, how a trigger keeps its deadlines, and why its ioctl keeps the GIL."""
+
+import asyncio
+import ctypes
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from statistics import mean
+
+from gpiod.edge_event import EdgeEvent
+
+from imud.gpio.lines import READ_EVENTS
+from imud.kit.line_events import EVENT, LineEvents
+from imud.kit.timing import TriggerStamp
+from imud.pipeline.trigger import Trigger
+from imud.units import NS_PER_S, NS_PER_US
+from tests.bench.rows import Row
+
+FIONREAD = 0x541B
+"""An ioctl that a pipe answers at once, as a GPIO chip in the processor does."""
+
+
+class PipeLine:
+    """An output whose level nobody sees: an ioctl on a pipe."""
+
+    title = "pipe"
+
+    def __init__(self, ioctl: Callable[..., int]) -> None:
+        self._ioctl = ioctl
+        self._ends: tuple[int, int] = (-1, -1)
+        self._answer = ctypes.byref(ctypes.c_int())
+
+    def open(self) -> None:
+        self._ends = os.pipe()
+
+    def set(self, _active: bool) -> None:
+        self._ioctl(self._ends[0], FIONREAD, self._answer)
+
+    def close(self) -> None:
+        for end in self._ends:
+            os.close(end)
+
+
+def _per_edge_us(read: Callable[[], object], edges: int, times: int) -> float:
+    """Best of five, in µs."""
+    best = float("inf")
+    for _ in range(5):
+        begin_ns = time.thread_time_ns()
+        for _ in range(times):
+            read()
+        best = min(best, (time.thread_time_ns() - begin_ns) / times / edges)
+    return best / NS_PER_US
+
+
+def _reading(quick: bool) -> list[Row]:
+    near, far = os.pipe()
+    events, times = LineEvents(), 200 if quick else 2000
+    found = []
+    for count in (2, READ_EVENTS):
+        data = b"".join(EVENT.pack(n, 1, 0, n, n) for n in range(1, count + 1))
+
+        def read(data: bytes = data) -> None:
+            os.write(far, data)
+            events.edges(os.read(near, READ_EVENTS * EVENT.size))
+
+        found.append(
+            Row(f"edges read {count} at a time, CPU per edge (with the write)", _per_edge_us(read, count, times), "us")
+        )
+    found.append(
+        Row("gpiod's own object for an edge, CPU", _per_edge_us(lambda: EdgeEvent(1, 1, 0, 1, 1), 1, times), "us")
+    )
+    os.close(near)
+    os.close(far)
+    return found
+
+
+async def _trigger(
+    rate_hz: float, seconds: float, library: type[ctypes.CDLL], busy: bool
+) -> tuple[Trigger, Sequence[TriggerStamp], float]:
+    line = PipeLine(library(None).ioctl)
+    line.open()
+    trigger, stamps, stop = Trigger(line, rate_hz), list[TriggerStamp](), threading.Event()
+    load = threading.Thread(target=_compute, args=(stop,))
+    if busy:
+        load.start()
+    begin_s = time.process_time()
+    trigger.start(stamps.extend, print)
+    await asyncio.sleep(seconds)
+    trigger.stop()
+    used_s = time.process_time() - begin_s
+    stop.set()
+    if busy:
+        load.join()
+    line.close()
+    return trigger, stamps, used_s
+
+
+def _compute(stop: threading.Event) -> None:
+    while not stop.is_set():
+        sum(range(1000))
+
+
+def rows(*, quick: bool = False) -> list[Row]:
+    """The figures."""
+    seconds = 2.0 if quick else 10.0
+    found = _reading(quick)
+    for rate_hz in (100.0, 1000.0):
+        trigger, stamps, used_s = asyncio.run(_trigger(rate_hz, seconds, ctypes.PyDLL, False))
+        counts, title = trigger.counts, f"SIN at {rate_hz:g} Hz"
+        found += [
+            Row(f"{title}: from deadline to edge, mean", counts.mean_late_ns / NS_PER_US, "us"),
+            Row(f"{title}: worst", counts.worst_late_ns / NS_PER_US, "us"),
+            Row(f"{title}: error of the stamp, mean", mean(stamp.err_ns for stamp in stamps) / NS_PER_US, "us"),
+            Row(f"{title}: deadlines missed", 100 * counts.missed / (counts.missed + counts.edges), "%"),
+            Row(f"{title}: CPU per edge", used_s / counts.edges * NS_PER_S / NS_PER_US, "us"),
+        ]
+    for name, library in (("GIL kept", ctypes.PyDLL), ("GIL given away", ctypes.CDLL)):
+        _, stamps, _ = asyncio.run(_trigger(40.0, seconds, library, True))
+        error_us = mean(stamp.err_ns for stamp in stamps) / NS_PER_US
+        found.append(Row(f"SIN beside a computing thread, {name}: error of the stamp", error_us, "us"))
+    return found
