@@ -167,7 +167,7 @@ class Envelope:
         bins = self._bins
         origin = bins[0]
         x0, y0 = origin.x, origin.y
-        hull = _lower_hull([(float(b.x - x0), float(b.y - y0)) for b in bins])
+        hull = lower_hull([(float(b.x - x0), float(b.y - y0)) for b in bins])
         slope, dx, dy = _edge_over(hull, SUPPORT_AT * (bins[-1].x - x0), SLOPE_LOWEST, SLOPE_HIGHEST)
         self._move(x0 + int(dx), y0 + int(dy), slope)
         self._judge(x)
@@ -177,9 +177,9 @@ class Envelope:
     def _look_through_timer(self, x: int) -> None:
         """Replace the line by the middle of what the timer leaves open."""
         x0 = self._bins[0].x
-        ceiling = _lower_hull([(float(b.x - x0), b.lowest) for b in self._bins])
+        ceiling = lower_hull([(float(b.x - x0), b.lowest) for b in self._bins])
         floor = [(float(b.x - x0), -f) for b, f in zip(self._bins, self._floors(), strict=True)]
-        floor = [(xf, -f) for xf, f in _lower_hull(floor)]
+        floor = [(xf, -f) for xf, f in lower_hull(floor)]
         for latency_ns in LATENCIES_NS:
             found = corridor(ceiling, [(xf, f - latency_ns) for xf, f in floor], float(x - x0))
             if found is not None:
@@ -246,7 +246,7 @@ def _merged(a: _Bin, b: _Bin) -> _Bin:
     return merged
 
 
-def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """Lower convex hull of points in order of x (Andrew's monotone chain)."""
     hull: list[tuple[float, float]] = []
     for x, y in points:

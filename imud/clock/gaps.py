@@ -3,7 +3,12 @@
 from typing import Final
 
 CONSISTENT: Final = 4
-"""So many equal steps in a row are a rate; losses rarely leave the same hole four times."""
+"""So many equal steps in a row are a rate."""
+CONSISTENT_LONGER: Final = 12
+"""The same for a longer step than before: where one of ten messages is lost, every second minute at 1 kHz leaves the
+same hole four times in a row, and a period of two ticks for one would shift device time by a tick."""
+WHOLE_AFTER: Final = 64
+"""After so many equal steps the period is whole: what differed in the beginning was a loss."""
 MEMORY: Final = 4096
 """Steps in the mean of a period that is no whole number of ticks; then both sums are halved."""
 
@@ -11,21 +16,20 @@ MEMORY: Final = 4096
 class PeriodLearner:
     """Learns the step between samples, in device ticks, and counts what is missing in a longer one."""
 
-    __slots__ = ("_candidate", "_count", "_run", "_run_sum", "_sum", "period_ticks")
+    __slots__ = ("_before", "_candidate", "_count", "_even", "_run", "_run_sum", "_sum", "changes", "period_ticks")
 
     def __init__(self) -> None:
         self.period_ticks = 0.0
         """Mean step; 0 while unknown."""
-        self._sum = 0
-        self._count = 0
+        self._sum = 0.0
+        self._count = 0.0
+        self._even = 0
+        self._before = 0
         self._candidate = 0
         self._run = 0
         self._run_sum = 0
-
-    @property
-    def fractional_steps(self) -> int:
-        """Steps behind the mean of a period that is no whole number of ticks; 0 where it is one."""
-        return self._count if self.period_ticks % 1 else 0
+        self.changes = 0
+        """Times that a period of no whole number of ticks showed where in a tick it is; 0 where it is a whole one."""
 
     def step(self, ticks: int) -> int:
         """Take the step to the newest sample; returns how many samples are missing in it."""
@@ -34,6 +38,7 @@ class PeriodLearner:
             return 0
         if ticks == period:
             self._run = 0
+            self._even += 1
             return 0
         if period and abs(ticks - period) <= 1 and int(ticks / period + 0.5) == 1:
             self._refine(ticks)
@@ -44,12 +49,17 @@ class PeriodLearner:
 
     def _refine(self, ticks: int) -> None:
         self._run = 0
-        self._sum += ticks
-        self._count += 1
+        self._sum += ticks + int(self._even * self.period_ticks)
+        self._count += 1 + self._even
+        self._even = 0
+        same, self._before = ticks == self._before, ticks
+        self.changes += not same
         self.period_ticks = self._sum / self._count
-        if self._count >= MEMORY:
-            self._sum //= 2
-            self._count //= 2
+        if same and self.changes <= 1 and self._count >= WHOLE_AFTER:
+            self.period_ticks, self._sum, self._count, self.changes = float(ticks), float(ticks), 1.0, 0
+        while self._count >= MEMORY:
+            self._sum /= 2
+            self._count /= 2
 
     def _learn(self, ticks: int) -> bool:
         """Whether the last steps agree on another period, which is then adopted."""
@@ -58,9 +68,9 @@ class PeriodLearner:
             self._run_sum += ticks
         else:
             self._candidate, self._run, self._run_sum = ticks, 1, ticks
-        if self._run < CONSISTENT:
+        if self._run < (CONSISTENT_LONGER if 0 < self.period_ticks < self._candidate else CONSISTENT):
             return False
-        self._sum, self._count = self._run_sum, self._run
+        self._sum, self._count = float(self._run_sum), float(self._run)
         self.period_ticks = self._sum / self._count
-        self._run = 0
+        self._run = self._even = self.changes = self._before = 0
         return True

@@ -3,7 +3,8 @@
 Per message: device time is unwrapped and checked against the host's (`unwrap`, `_believable`), the point (device time,
 arrival less wire time) goes to the lower envelope (`envelope`), and the line of the envelope, less half of the bias
 the link can hide (`arrival`), is the time of measurement; corrections are slewed (`slew`). Until the line has enough
-behind it, and for devices without time, a message is dated by its arrival.
+behind it, and for devices without time, a message is dated by its arrival. Lines beside the data and UTC improve on
+that (`aids`) where there are any; without them they cost a comparison.
 
 Three rules hold for any input: `t_ns` rises strictly, is never after arrival, and a device clock that jumps starts a
 new fit instead of carrying the stamps along.
@@ -13,12 +14,16 @@ Synchronization: none; one thread.
 from math import hypot, sqrt
 from typing import Final
 
+from imud.clock.aids import Aids
 from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
+from imud.clock.coast import Coast
 from imud.clock.envelope import SLOPE_HIGHEST, Envelope
+from imud.clock.inputs import LineInputs
 from imud.clock.number import SampleNumber
-from imud.clock.slew import Slew
+from imud.clock.slew import SETTLED_AFTER_NS, Slew
 from imud.clock.unwrap import DeviceTime
 from imud.kit.status import ClockStatus
+from imud.kit.timing import NO_TIME_BITS, SoutTiming, TimeBits, TriggerTiming
 from imud.sample import Measurement, Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -26,6 +31,8 @@ ENOUGH_POINTS: Final = 8
 ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
 ENOUGH_HOLDS: Final = 20
 """A line counts once it is laid under so many points, and spans so much time or so many periods of a latency timer."""
+COAST_NS: Final = 16 * NS_PER_S
+"""The same where a known line goes on: a young one swings, and the known one is 0.3 ms off by then at worst."""
 YOUNG_NS: Final = 32 * NS_PER_S
 YOUNG_FACTOR: Final = 1.5
 """A corridor this short has not seen the timer's beat, and a stalled read in it weighs more."""
@@ -45,15 +52,28 @@ WIRE_SLACK: Final = 1.05
 _ARRIVAL: Final = Sync.ARRIVAL
 
 
-class SampleClock:
+class SampleClock(LineInputs):
     """Makes samples of one device's measurements.
 
     `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
     known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
-    the samples: it tells how many are missing, and the arrivals tell when they were.
+    the samples: it tells how many are missing, and the arrivals tell when they were. `bits`, `sout` and `sin` are for
+    lines, which are given to the methods of `LineInputs`.
     """
 
-    def __init__(self, device: str, *, tick_ns: int, tick_modulus: int, byte_ns: int, hold_ns: int) -> None:
+    def __init__(
+        self,
+        device: str,
+        *,
+        tick_ns: int,
+        tick_modulus: int,
+        byte_ns: int,
+        hold_ns: int,
+        bits: TimeBits = NO_TIME_BITS,
+        sout: SoutTiming | None = None,
+        sin: TriggerTiming | None = None,
+    ) -> None:
+        super().__init__(tick_ns, tick_modulus, bits, sout, sin)
         self._device = device
         self._time = DeviceTime(tick_ns, tick_modulus)
         self._number = SampleNumber(tick_modulus) if tick_ns == 0 else None
@@ -61,7 +81,10 @@ class SampleClock:
         self._spread = ArrivalSpread()
         self._slew = Slew()
         self._envelope: Envelope | None = None
+        self._coast: Coast | None = None
         self._sync = Sync.ARRIVAL
+        """By the fit of arrivals."""
+        self._told_sync = Sync.ARRIVAL
         self._seq = 0
         self._t_ns = 0
         self._t_err_ns = 0
@@ -96,22 +119,30 @@ class SampleClock:
         else:
             wanted = self._by_device(ticks, y, trailing_ns, t_rx_ns, size_bytes)
             t_dev_ns, sync = self._time.raw_ns, self._sync
+        edge_seq, aids, slew = None, self._aids, self._slew
+        if aids is not None:
+            if t_dev_ns is not None and (sync is not _ARRIVAL or self._coast is not None):
+                wanted, slew = self._steered(aids, m, wanted, y), aids.slew
+                sync, edge_seq = aids.sync, aids.edge_seq
+            self._told_sync = sync
         t_ns = wanted if wanted <= y else y
         if t_ns <= self._t_ns:
             t_ns = self._t_ns + 1
         t_err = self._t_err
         if t_ns != wanted:
-            self._slew.left_ns += t_ns - wanted
+            slew.left_ns += t_ns - wanted
             t_err += abs(t_ns - wanted)
         if t_ns > t_rx_ns:  # noqa: PLR1730 - as above
             t_rx_ns = t_ns
         self._t_ns, self._t_rx_ns = t_ns, t_rx_ns
         self._seq = seq = self._seq + 1
         self._t_err_ns = t_err_ns = int(t_err) + 1 if t_err < T_ERR_MOST else T_ERR_MOST
+        if aids is not None and aids.marks is not None:
+            aids.marks.take(t_ns - aids.before_measurement_ns, seq, self._period_ns())
         return Sample(
             self._device, seq, t_ns, t_err_ns, sync, t_rx_ns, t_ns + utc_offset_ns, t_dev_ns,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
-            m.incli_rad, m.status, m.pps_age_ms,
+            m.incli_rad, m.status, m.pps_age_ms, edge_seq,
         )  # fmt: skip
 
     def sample_asked(self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int) -> Sample:
@@ -142,14 +173,22 @@ class SampleClock:
     def status(self) -> ClockStatus:
         """The state of the estimate at the newest sample."""
         fitted = self._envelope if self._sync is not Sync.ARRIVAL else None
+        aids = self._aids
+        sout, sin = (aids.sout, aids.sin) if aids else (None, None)
+        first = sout or sin
         return ClockStatus(
-            sync=self._sync,
+            sync=self._told_sync if aids else self._sync,
             offset_ns=self._t_ns - self._time.raw_ns if self._begun else 0,
             skew_ppm=(1 / fitted.slope - 1) * 1e6 if fitted else 0.0,
             residual_ns=int(fitted.residual_ns if fitted else self._spread.sigma_ns),
             t_err_ns=self._t_err_ns,
             resets=self._resets,
             hold_ns=self._delay.hold_ns,
+            edges=first.pairing.events if first else 0,
+            edges_unpaired=sout.pairing.events_unpaired if sout else 0,
+            samples_unpaired=first.pairing.samples_unpaired if first else 0,
+            triggers_missed=sin.pairing.events_unpaired if sin else 0,
+            reference_error_ns=self.reference.error_ns if self.reference else 0,
         )
 
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
@@ -170,6 +209,7 @@ class SampleClock:
     def follow(self, other: "SampleClock") -> None:
         """Go on where another clock of the same device ends: `seq` and `t_ns` keep rising."""
         self._seq, self._t_ns, self._t_rx_ns = other._seq, other._t_ns, other._t_rx_ns
+        self.reference = other.reference
 
     # --- by arrival ----------------------------------------------------------------------------------------------
 
@@ -210,6 +250,9 @@ class SampleClock:
         line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
         height = y - line
         if (height < -EARLY_NS or height > LATE_NS or self._late_reads) and self._jumped(height, x - x_before, t_rx_ns):
+            told_ns = self._turned(ticks, y)
+            if told_ns is not None:
+                return told_ns
             self._reset(ticks, y)
             return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
         self.missed = time.missed
@@ -222,6 +265,9 @@ class SampleClock:
             else:
                 line = self._refit(x, x - x_before, line, size_bytes)
         if self._sync is _ARRIVAL:
+            if self._coast is not None:
+                self._t_err = self._coast.error_ns(x)
+                return self._coast.at(x)
             return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
         left = self._slew.over(x - x_before, x - self._epoch_x) if self._slew.left_ns else 0.0
         error = self._error_ns + envelope.slope_error * (x - envelope.x_fit) + abs(left)
@@ -247,6 +293,39 @@ class SampleClock:
         self._time.begin(ticks)
         self._start(y)
 
+    def _turned(self, ticks: int, y: int) -> int | None:
+        """Time of a message whose counter jumped, if it jumped to UTC or within it; then time goes on over the jump."""
+        aids, envelope = self._aids, self._envelope
+        if aids is None or envelope is None:
+            return None
+        above = aids.utc.above(ticks, y, FIRST_SPREAD_NS + self._delay.hold_ns)
+        if above is None:
+            return None
+        slope, period_ns, tick_ns = envelope.slope, self._period_ns() or 1.0, self._time.tick_ns
+        by_utc = y + above + tick_ns // 2
+        t_ns = self._t_ns + int(max(round((by_utc - self._t_ns) / period_ns), 1) * period_ns)
+        if abs(t_ns - by_utc) > tick_ns + 2 * self._t_err_ns:  # the device began its samples anew
+            t_ns = max(by_utc, self._t_ns + 1)
+        error_ns = self._t_err_ns
+        self.missed = 0
+        self._time.begin(ticks)
+        self._start(y)
+        aids.utc.turned()
+        self._coast = coast = Coast(self._epoch_x, t_ns, slope, error_ns)
+        self._t_err = coast.error_ns(self._epoch_x)
+        self._epoch_x -= SETTLED_AFTER_NS  # time went on: corrections stay slow
+        return t_ns
+
+    def _steered(self, aids: Aids, m: Measurement, wanted: int, y: int) -> int:
+        """What lines and UTC make of a time by the fit; leaves its error in `_t_err`."""
+        x, coast, envelope = self._time.even_ns, self._coast, self._envelope
+        assert envelope is not None
+        slope = coast.slope if coast else envelope.slope
+        age_ns = x - self._epoch_x
+        t_ns = aids.steer(m, x, y, wanted, self._t_err, self._sync, self._period_ns(), slope, age_ns)
+        self._t_err = aids.error_ns
+        return t_ns
+
     def _start(self, y: int) -> None:
         """A new fit from the present device time on."""
         self._forget()
@@ -254,10 +333,12 @@ class SampleClock:
         self._envelope = Envelope(self._epoch_x, y, self._delay.hold_ns)
 
     def _forget(self) -> None:
-        self._envelope = None
+        self._envelope = self._coast = None
         self._sync = _ARRIVAL
         self._late_reads = 0
         self._slew.left_ns = 0.0
+        if self._aids is not None:
+            self._aids.restart()
 
     def _jumped(self, height: float, elapsed_ns: int, t_rx_ns: int) -> bool:
         """Whether a message so far before or behind the line says that the device's clock jumped."""
@@ -294,9 +375,13 @@ class SampleClock:
             self._error_ns *= YOUNG_FACTOR
         if self._sync is not _ARRIVAL:
             self._slew.left_ns = told - (line - self._shift_ns)
-        elif envelope.count >= ENOUGH_POINTS and envelope.span_ns >= max(ENOUGH_SPAN_NS, ENOUGH_HOLDS * delay.hold_ns):
+        elif envelope.count >= ENOUGH_POINTS and envelope.span_ns >= max(
+            ENOUGH_SPAN_NS if self._coast is None else COAST_NS, ENOUGH_HOLDS * delay.hold_ns
+        ):
             self._sync = Sync.REGRESSION
-            self._slew.left_ns = self._t_ns + elapsed_ns * envelope.slope - (line - self._shift_ns)
+            told = self._coast.at(x) if self._coast else self._t_ns + elapsed_ns * envelope.slope
+            self._coast = None
+            self._slew.left_ns = told - (line - self._shift_ns)
         return line
 
     def _wire_carries(self, size_bytes: int) -> bool:

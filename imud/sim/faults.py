@@ -37,11 +37,13 @@ class FaultKind(StrEnum):
     """The port disappears; this burst and those of the next `unplug_ns` are gone."""
     WRONG_BAUD = "wrong_baud"
     """It is sent at another rate."""
+    LOSE = "lose"
+    """Nothing of it arrives."""
 
 
 _Order = (
     FaultKind.UNPLUG, FaultKind.WRONG_BAUD, FaultKind.CUT, FaultKind.FLIP, FaultKind.DROP, FaultKind.INSERT,
-    FaultKind.DELAY,
+    FaultKind.DELAY, FaultKind.LOSE,
 )  # fmt: skip
 
 
@@ -56,6 +58,7 @@ class FaultRates:
     delay: float = 0.0
     unplug: float = 0.0
     wrong_baud: float = 0.0
+    lose: float = 0.0
     delay_ns: int = 5 * NS_PER_MS
     """Longest delay."""
     unplug_ns: int = 300 * NS_PER_MS
@@ -121,9 +124,13 @@ class Faults:
         return burst._replace(due_ns=due_ns, data=data) if data else None
 
     def _strike(self) -> list[FaultKind]:
-        """The faults of one burst, in the order they act. Draws the same number of times whatever happens."""
+        """The faults of one burst, in the order they act. Draws the same number of times whatever happens.
+
+        For losses it draws only where there are any: seeds of older tests go on to mean the same.
+        """
         rates, random = self.rates, self._random
-        return [kind for kind in _Order if random.random() < getattr(rates, kind.value)]
+        kinds = _Order if rates.lose else _Order[:-1]
+        return [kind for kind in kinds if random.random() < getattr(rates, kind.value)]
 
     def _note(self, fault: Fault) -> None:
         self.counts[fault.kind] += 1
@@ -144,6 +151,8 @@ class Faults:
                 data = data[:at] + data[at + 1 :]
             case FaultKind.INSERT:
                 data = data[:at] + random.randbytes(random.randint(1, INSERT_BYTES_MAX)) + data[at:]
+            case FaultKind.LOSE:
+                data = b""
             case FaultKind.WRONG_BAUD:
                 data = heard(data, random.choice([baud for baud in WRONG_BAUDS if baud != self.baud]), self.baud)
         return data

@@ -8,23 +8,30 @@ module sent with `advance`. What it does as a real one does:
   fit the transmit buffer is never sent: at 115200 baud and 1 kHz six frames of seven are missing.
 - Commands are lines of ASCII, obeyed at once; a known one is answered with `OK` or `ERR`, an unknown one not at all.
   URFR and SERIALCONFIG act after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved.
+- SOUT pulses before every frame, a rising edge on SIN sends messages set to ONMARK, the other pins and UTC are in
+  `hipnuc_pins.py` and `hipnuc_utc.py`; `pins` tells of edges as `advance` does of bytes.
 - LOG DISABLE silences frames, not replies, and is forgotten at a reboot (assumed; the manual calls ENABLE the default).
 
 Attitude is the truth in both modes; heading does not start at zero in six-axis mode, as it would in a real module.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import pi, radians
+from random import Random
 from typing import Final
 
 from imud.devices.hipnuc.commands import BAUD_RATES, MAX_RATE_HZ, Message
 from imud.devices.hipnuc.frames import encode_hi91, encode_hi92
-from imud.sample import Vector3
+from imud.sim.hipnuc_hardware import HipnucHardware
+from imud.sim.hipnuc_pins import ALARM_PERIOD_MS, SOUT_HIGH_NS, HipnucPins, is_alarming
 from imud.sim.hipnuc_settings import HipnucSettings, Output, Refused, changed, number, rows
-from imud.sim.motion import MOTIONS, Motion, Truth, swing
+from imud.sim.hipnuc_status import main_status
+from imud.sim.hipnuc_utc import UtcTime
+from imud.sim.motion import MOTIONS, Truth
 from imud.sim.mounting import Mounting, frame_of, level_of
 from imud.sim.noise import Noise
+from imud.sim.pin import PinEdge
 from imud.sim.simulator import Burst, Simulator, SimulatorOptions
 from imud.sim.transmitter import Transmitter
 from imud.units import NS_PER_MS, NS_PER_S, T_PER_UT
@@ -42,36 +49,8 @@ PPS_MODULUS_MS: Final = 8192
 """The PPS stamp free-runs 0 … 8191 without edges (recorded so)."""
 NEAR_LEVEL_RAD: Final = radians(5)
 """ATT RST 3 acts within this of level."""
-STATIC_GYRO_RAD_S: Final = 0.02
-GYRO_SETTLED_MS: Final = 5000
-ATTITUDE_SETTLED_MS: Final = 1000
-"""Assumed times after power-on until bias and attitude count as converged."""
-
-GYRO_UNSETTLED, ATTITUDE_UNSETTLED = 1 << 3, 1 << 7
-STATIC, MAG_AIDING, NO_UTC, SYNC_OUT = 1 << 9, 1 << 10, 1 << 11, 1 << 12
-
 _PRINTABLE = range(0x20, 0x7F)
 _FRAME_BYTES: Final = {Message.HI91: 82, Message.HI92: 54}
-
-
-@dataclass(frozen=True, slots=True)
-class HipnucHardware:
-    """What a module is made of and where it is."""
-
-    product: str = "HI14R3"
-    build: str = "Oct 15 2024"
-    uuid: str = "043995698D6E1708"
-    firmware: int = 156
-    bootloader: int = 109
-    motion: Motion = field(default_factory=swing)
-    noise: Noise | None = None
-    skew_ppm: float = 20.0
-    boot_ms: int = 500
-    processing_ns: int = 125_000
-    uptime_ms: int = 0
-    """Device time at the first power-on, to begin near the end of a counter's range."""
-    mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
-    """Result of its magnetic calibration; zero: never calibrated."""
 
 
 class HipnucModule:
@@ -89,6 +68,8 @@ class HipnucModule:
         """Frames that did not fit the wire."""
         self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
         self._before_reboot: list[Burst] = []
+        self._pins = HipnucPins()
+        self._random = Random(self.hardware.mark_seed)
         self._line = bytearray()
         self._actions = self._make_actions()
         self._power_on(now_ns, self.hardware.uptime_ms)
@@ -102,6 +83,7 @@ class HipnucModule:
         """Power was lost and came back, or the device was told to: what was not saved is gone."""
         self._sample(now_ns)
         self._before_reboot += self._wire.stopped(now_ns)
+        self._pins.power_lost(now_ns)
         self.settings = self.flash
         self._power_on(now_ns, 0)
 
@@ -126,7 +108,10 @@ class HipnucModule:
     def mark(self, now_ns: int) -> None:
         """A rising edge on SIN/PPS: the PPS stamp starts anew, and messages set to ONMARK are sent."""
         self._sample(now_ns)
-        self._pps_ms = self._device_ms(now_ns)
+        if now_ns < self._ready_ns:  # still booting
+            return
+        self._pps_ns = self._device_ns(now_ns)
+        self._utc.pulse(self._pps_ns)
         for message in self._outputs:
             self._send_marked(message, now_ns)
 
@@ -146,6 +131,20 @@ class HipnucModule:
         ready_ns = self._instant_ns(device_ms) + self.hardware.processing_ns
         return self._wire.due_ns(ready_ns, _FRAME_BYTES[message])
 
+    def pins(self, now_ns: int) -> list[PinEdge]:
+        """Return the edges on the output pins since the last call, in order."""
+        self._sample(now_ns)
+        return self._pins.take(now_ns)
+
+    def next_pin_ns(self) -> int | None:
+        """When `pins` may have something next, or None while nothing is to come."""
+        times = [] if (next_ns := self._pins.next_ns()) is None else [next_ns]
+        if self._next_ms:
+            times.append(self._instant_ns(min(self._next_ms.values())))
+        if self._alarm_ms is not None:
+            times.append(self._instant_ns(self._alarm_ms))
+        return min(times, default=None)
+
     def counters(self) -> dict[str, int]:
         """Frames by what became of them."""
         return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
@@ -157,7 +156,8 @@ class HipnucModule:
         self._on_ns, self._on_ms = now_ns, uptime_ms
         self._ready_ns = now_ns + hardware.boot_ms * NS_PER_MS
         self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
-        self._pps_ms = 0
+        self._pps_ns = 0
+        self._utc = UtcTime(hardware.utc_epoch)
         self._enabled = True
         self._line.clear()
         self._settings_changed(self._ready_ns)
@@ -167,6 +167,10 @@ class HipnucModule:
         settings, device_ms = self.settings, self._device_ms(now_ns)
         self._outputs = {Message.HI91: settings.hi91, Message.HI92: settings.hi92}
         self._mounting = Mounting(self._frame, settings.level, settings.level_accel, self._yaw_rad)
+        watching = settings.alarm_x.enabled or settings.alarm_y.enabled
+        self._alarm_ms = (device_ms // ALARM_PERIOD_MS + 1) * ALARM_PERIOD_MS if watching else None
+        if not watching:
+            self._pins.alarm(now_ns, False)
         self._next_ms: dict[Message, int] = {}
         for message, output in self._outputs.items():
             if output.period_ms and self._enabled:
@@ -174,14 +178,18 @@ class HipnucModule:
 
     def _device_ms(self, now_ns: int) -> int:
         """Device time, not wrapped."""
-        return self._on_ms + (now_ns - self._on_ns) * self._scale // (NS_PER_S * NS_PER_MS)
+        return self._device_ns(now_ns) // NS_PER_MS
+
+    def _device_ns(self, now_ns: int) -> int:
+        return self._on_ms * NS_PER_MS + (now_ns - self._on_ns) * self._scale // NS_PER_S
 
     def _instant_ns(self, device_ms: int) -> int:
         """First host time at which the device's clock shows `device_ms`."""
         return self._on_ns - (self._on_ms - device_ms) * NS_PER_MS * NS_PER_S // self._scale
 
     def _sample(self, now_ns: int) -> None:
-        """Take all samples up to now and queue their frames."""
+        """Take all samples up to now and queue their frames; look at the angles as often as is due."""
+        self._watch_angles(now_ns)
         while self._next_ms:
             message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
             sample_ns = self._instant_ns(device_ms)
@@ -190,58 +198,73 @@ class HipnucModule:
             self._next_ms[message] = device_ms + self._outputs[message].period_ms
             self._queue_frame(message, sample_ns, device_ms)
 
+    def _watch_angles(self, now_ns: int) -> None:
+        while self._alarm_ms is not None and (at_ns := self._instant_ns(self._alarm_ms)) <= now_ns:
+            self._alarm_ms += ALARM_PERIOD_MS
+            self._pins.alarm(at_ns, is_alarming(self.settings, self._truth(at_ns).euler_rad))
+
     def _send_marked(self, message: Message, now_ns: int) -> None:
         if self._enabled and self._outputs[message].on_mark and now_ns >= self._ready_ns:
-            self._queue_frame(message, now_ns, self._device_ms(now_ns))
+            spread_ns = self.hardware.mark_spread_ns
+            self._queue_frame(
+                message, now_ns, self._device_ms(now_ns), round(self._random.uniform(-spread_ns, spread_ns))
+            )
 
-    def _queue_frame(self, message: Message, sample_ns: int, device_ms: int) -> None:
-        ready_ns = sample_ns + self.hardware.processing_ns
-        if not self._wire.fits(ready_ns, _FRAME_BYTES[message]):
+    def _queue_frame(self, message: Message, sample_ns: int, device_ms: int, later_ns: int = 0) -> None:
+        """`later_ns`: how much longer than usual it takes to leave."""
+        processing_ns = max(self.hardware.processing_ns + later_ns, 0)
+        ready_ns, size = sample_ns + processing_ns, _FRAME_BYTES[message]
+        if not self._wire.fits(ready_ns, size):
             self.frames_dropped += 1
             return
         self.frames_sent += 1
+        start_ns = self._wire.due_ns(ready_ns, size) - self._wire.wire_ns(size)
+        self._pins.frame(start_ns, min(SOUT_HIGH_NS, processing_ns), self.settings.sout_div, sample_ns)
         self._wire.send(ready_ns, self._encode(message, sample_ns, device_ms), sample_ns, device_ms)
 
     def _encode(self, message: Message, sample_ns: int, device_ms: int) -> bytes:
         reading = self._reading(sample_ns)
         accel, gyro, mag, euler, quat, temperature_c, pressure_pa = reading
-        pps_ms = (device_ms - self._pps_ms) % PPS_MODULUS_MS
+        device_ns = self._device_ns(sample_ns)
+        pps_ms = (device_ns - self._pps_ns) // NS_PER_MS % PPS_MODULUS_MS
         has_status = self.hardware.firmware >= MAIN_STATUS_FIRMWARE
-        status = self._main_status(reading, device_ms) if has_status else 0
+        status = 0
+        if has_status:
+            uptime_ms, utc = device_ms - self._on_ms, self._utc.synchronised(device_ns)
+            status = main_status(reading, uptime_ms, nine_axis=self.settings.att_mode == 1, utc=utc)
         if message is Message.HI92:
             return encode_hi92(
                 pps_stamp_ms=pps_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat,
                 temperature_c=temperature_c, pressure_pa=pressure_pa, status=status,
             )  # fmt: skip
         return encode_hi91(
-            system_time_ms=device_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler,
+            system_time_ms=self._utc.shown_ms(device_ns), accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler,
             quat_wxyz=quat, temperature_c=temperature_c, pressure_pa=pressure_pa,
             word_1_2=status if has_status else pps_ms,
         )  # fmt: skip
 
     def _reading(self, sample_ns: int) -> Truth:
         """What the module measures at an instant, noise and mounting included."""
-        t_s = (sample_ns - self.epoch_ns) / NS_PER_S
-        truth = self.hardware.motion.at(t_s)
-        if self._mounting.active:
-            truth = self._mounting.turned(truth)
-        return self.hardware.noise.add(truth, t_s) if self.hardware.noise else truth
+        truth = self._truth(sample_ns)
+        return self.hardware.noise.add(truth, self._t_s(sample_ns)) if self.hardware.noise else truth
 
-    def _main_status(self, reading: Truth, device_ms: int) -> int:
-        """MAIN_STATUS as far as a module without PPS can be in it; a SOUT pulse goes before every frame."""
-        status = NO_UTC | SYNC_OUT
-        if device_ms - self._on_ms < GYRO_SETTLED_MS:
-            status |= GYRO_UNSETTLED
-        if device_ms - self._on_ms < ATTITUDE_SETTLED_MS:
-            status |= ATTITUDE_UNSETTLED
-        if max(map(abs, reading.gyro_rad_s)) < STATIC_GYRO_RAD_S:
-            status |= STATIC
-        return status | MAG_AIDING if self.settings.att_mode == 1 else status
+    def _truth(self, at_ns: int) -> Truth:
+        """What a perfect module, mounted and levelled like this one, measures."""
+        truth = self.hardware.motion.at(self._t_s(at_ns))
+        return self._mounting.turned(truth) if self._mounting.active else truth
+
+    def _t_s(self, at_ns: int) -> float:
+        return (at_ns - self.epoch_ns) / NS_PER_S
 
     def _obey(self, line: str, now_ns: int) -> None:
+        if line.startswith("$"):
+            self._utc.sentence(line.encode("ascii"), self._device_ns(now_ns))
+            return
         try:
             settings = changed(self.settings, line, self.hardware.firmware)
             if settings is not None:
+                if settings.sout_div != self.settings.sout_div:
+                    self._pins.restart_divider()
                 self.settings = settings
                 reply: list[str] | None = []
                 self._settings_changed(now_ns)
@@ -310,7 +333,7 @@ class HipnucModule:
 
     def _attitude(self, now_ns: int) -> Truth:
         """The attitude without levelling and without CONFIG YAW."""
-        return Mounting(self._frame).turned(self.hardware.motion.at((now_ns - self.epoch_ns) / NS_PER_S))
+        return Mounting(self._frame).turned(self.hardware.motion.at(self._t_s(now_ns)))
 
     def _level(self, kind: str, now_ns: int) -> list[str]:
         """CONFIG ATT RST: 2 levels here, 3 only where nearly level (upside down allowed), 5 cancels."""
@@ -332,9 +355,7 @@ class HipnucModule:
         if mode not in ("0", "1"):
             raise Refused(mode)
         if mode == "1":
-            angle_rad -= self._mounting.turned(self.hardware.motion.at((now_ns - self.epoch_ns) / NS_PER_S)).euler_rad[
-                2
-            ]
+            angle_rad -= self._mounting.turned(self.hardware.motion.at(self._t_s(now_ns))).euler_rad[2]
         self._yaw_rad += angle_rad
         self._settings_changed(now_ns)
         return []
@@ -363,6 +384,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
         skew_ppm=options.skew_ppm,
         boot_ms=options.boot_ms,
         processing_ns=options.processing_ns,
+        mark_seed=options.seed,
     )
     return HipnucModule(now_ns, HipnucSettings(baud=baud, hi91=hi91, hi92=hi92), hardware)
 

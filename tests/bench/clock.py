@@ -1,7 +1,7 @@
 """How right and how fast the clock is: `python -m tests.bench.clock` prints the table, truth known from simulation.
 
 A row is one profile of arrival, rate and crystal; figures are of all its seeds, after the fit has settled for 70 s.
-`--quick` takes one seed and fewer rows.
+A second table is of lines and UTC (`clock_lines`). `--quick` takes one seed and fewer rows, `--lines` the second table.
 """
 
 import sys
@@ -172,7 +172,11 @@ def print_table(seeds: Sequence[int], rates: Sequence[int]) -> None:
 
 
 if __name__ == "__main__":
+    from tests.bench import clock_lines  # it needs this module
+
     if "--quick" in sys.argv:
         print_table((1,), (1, 100, 1000))
-    else:
+    elif "--lines" not in sys.argv:
         print_table((1, 2, 3), tuple(SECONDS))
+    print()
+    clock_lines.print_table()

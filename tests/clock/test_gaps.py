@@ -1,5 +1,7 @@
 """The learned period and what is missing by it."""
 
+from random import Random
+
 import pytest
 
 from imud.clock.gaps import PeriodLearner
@@ -33,7 +35,7 @@ def test_uneven_ticks_are_no_loss() -> None:
 def test_a_slower_rate_is_adopted() -> None:
     learner = PeriodLearner()
     seen = [learner.step(step) for step in [10] * 20 + [20] * 20]
-    assert sum(seen) <= 3
+    assert sum(seen) <= 11
     assert learner.period_ticks == 20
     assert learner.step(40) == 1
 
@@ -53,3 +55,31 @@ def test_repeats_are_ignored() -> None:
     learner = PeriodLearner()
     assert sum(learner.step(step) for step in [10, 0] * 50) == 0
     assert learner.period_ticks == 10
+
+
+def test_losses_in_the_beginning_leave_no_fraction() -> None:
+    learner = PeriodLearner()
+    for step in [1, 2, 1, 1] + [1] * 100:
+        learner.step(step)
+    assert learner.period_ticks == 1
+    assert learner.changes == 0
+
+
+def test_one_of_ten_lost_at_random_is_no_slower_rate() -> None:
+    random = Random(1)
+    learner = PeriodLearner()
+    for _ in range(200_000):
+        step = 1
+        while random.random() < 0.1:
+            step += 1
+        learner.step(step)
+        assert learner.period_ticks < 2
+    assert learner.period_ticks == 1
+
+
+def test_a_rate_hardly_off_whole_ticks_is_learned_from_its_first_odd_step() -> None:
+    learner = PeriodLearner()
+    for i in range(4001):
+        learner.step(11 if i % 2000 == 1999 else 10)
+    assert learner.period_ticks == pytest.approx(10.0005, abs=1e-5)
+    assert 0 < learner.changes < 5

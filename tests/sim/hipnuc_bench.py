@@ -4,7 +4,8 @@ import struct
 from math import radians
 from typing import NamedTuple
 
-from imud.sim.hipnuc import HipnucHardware, HipnucModule
+from imud.sim.hipnuc import HipnucModule
+from imud.sim.hipnuc_hardware import HipnucHardware
 from imud.sim.hipnuc_settings import HipnucSettings, Output
 from imud.sim.motion import Still
 from imud.sim.simulator import Burst

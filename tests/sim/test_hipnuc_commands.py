@@ -6,7 +6,7 @@ import pytest
 
 from imud.devices.hipnuc import commands
 from imud.kit.attitude import matrix_from_quat
-from imud.sim.hipnuc import HipnucHardware
+from imud.sim.hipnuc_hardware import HipnucHardware
 from imud.sim.hipnuc_settings import HipnucSettings, Output
 from imud.sim.motion import Still
 from imud.units import NS_PER_MS, NS_PER_S

@@ -132,7 +132,14 @@ def test_the_end_of_stdin_ends_it(start: Start) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "word"),
-    [(["--rate", "300"], "rate 300"), (["--faults", "flop=1"], "flop"), (["--baud", "1200"], "baud 1200")],
+    [
+        (["--rate", "300"], "rate 300"),
+        (["--faults", "flop=1"], "flop"),
+        (["--baud", "1200"], "baud 1200"),
+        (["--device", "imu61x-can:101", "--device", "hipnuc-uart"], "one device behind a terminal"),
+        (["--device", "imu61x-can:x"], "with or without :NODE"),
+        (["--device", "imu61x-can:9999", "--interface", "vcan0"], "node 9999"),
+    ],
 )
 def test_bad_arguments_are_explained(start: Start, arguments: list[str], word: str) -> None:
     process = start(*arguments)

@@ -15,7 +15,8 @@ from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.arrival import BARE_UART, USB_16MS, ArrivalProfile
 from imud.sim.faults import FaultRates, Faults
-from imud.sim.hipnuc import HipnucHardware, HipnucModule
+from imud.sim.hipnuc import HipnucModule
+from imud.sim.hipnuc_hardware import HipnucHardware
 from imud.sim.hipnuc_settings import HipnucSettings, Output
 from imud.sim.pty import Adapter, PtyNode, SimulatedPort, set_baud
 from imud.units import NS_PER_MS, NS_PER_S

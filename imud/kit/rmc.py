@@ -1,0 +1,135 @@
+"""RMC sentences of NMEA 0183: the date and time that a GNSS receiver tells, as `$GPRMC` or `$GNRMC`.
+
+    $GPRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,A*57<CR><LF>
+     |   | |         |                                        |        | |
+     |   | hhmmss.ss A: valid, V: a warning                   ddmmyy   | XOR of all between $ and *
+     talker (any two letters)                                          mode indicator (since NMEA 2.3), N: no fix
+
+A second of 60 is a leap second; POSIX time has no number of its own for it and gives it that of the second after.
+Two-digit years stand for 1980 … 2079: GPS time begins in 1980.
+"""
+
+import re
+from calendar import timegm
+from collections.abc import Sequence
+from enum import StrEnum
+from time import gmtime
+from typing import Final, NamedTuple
+
+from imud.units import NS_PER_MS, NS_PER_S
+
+SENTENCE_BYTES_MAX: Final = 120
+"""NMEA 0183 allows 82; receivers that give positions to the millimetre send up to some 100."""
+FIRST_YEAR: Final = 1980
+HUNDREDTH_NS: Final = 10 * NS_PER_MS
+
+_SENTENCE: Final = re.compile(rb"\$([A-Z]{2})RMC,([\x20-\x29\x2b-\x7e]*)\*([0-9A-Fa-f]{2})(?:\r?\n)?")
+_TIME: Final = re.compile(rb"([01][0-9]|2[0-3])([0-5][0-9])([0-5][0-9]|60)(?:\.([0-9]{0,9}))?")
+_DATE: Final = re.compile(rb"([0-3][0-9])([01][0-9])([0-9]{2})")
+_STATUS, _DAY, _MODE = 1, 8, 11  # numbers of the fields after the time
+
+
+class RmcFault(StrEnum):
+    """Why bytes are no usable sentence."""
+
+    LENGTH = "length"
+    """Longer than SENTENCE_BYTES_MAX."""
+    FORM = "form"
+    """Not an RMC sentence: another one, bytes lost, or noise."""
+    CHECKSUM = "checksum"
+    """The checksum does not match."""
+    CONTENT = "content"
+    """Time or date is missing or impossible; a receiver without a fix may send them empty."""
+
+
+class Rmc(NamedTuple):
+    """What a sentence says."""
+
+    unix_s: int
+    """The second it names, since 1970-01-01."""
+    fraction_ns: int
+    """Rest of its time, 0 … 999 999 999."""
+    valid: bool
+    """Whether the receiver stands by it: status A, and not without a fix."""
+    leap: bool = False
+    """Whether the second is a leap second (60); `unix_s` is then that of the second after."""
+
+    @property
+    def utc_ns(self) -> int:
+        """The instant, ns since 1970-01-01."""
+        return self.unix_s * NS_PER_S + self.fraction_ns
+
+
+def parse(sentence: bytes) -> Rmc | RmcFault:
+    """Take a sentence apart, with or without its line end. Never raises, whatever the bytes."""
+    if len(sentence) > SENTENCE_BYTES_MAX:
+        return RmcFault.LENGTH
+    match = _SENTENCE.fullmatch(sentence)
+    if match is None:
+        return RmcFault.FORM
+    if checksum(sentence[1 : match.end(2)]) != int(match[3], 16):
+        return RmcFault.CHECKSUM
+    fields = match[2].split(b",")
+    return _content(fields) if len(fields) > _DAY else RmcFault.FORM
+
+
+def build(utc_ns: int, *, valid: bool = True) -> bytes:
+    """A `$GPRMC` sentence for an instant (ns since 1970-01-01, from 1980 to 2079), truncated to hundredths of a second.
+
+    It is made to tell time: the position is 0° N 0° E. Raises ValueError outside those years.
+    """
+    unix_s, rest_ns = divmod(utc_ns, NS_PER_S)
+    at = gmtime(unix_s)
+    if not FIRST_YEAR <= at.tm_year < FIRST_YEAR + 100:
+        raise ValueError(f"expected a time from {FIRST_YEAR} to {FIRST_YEAR + 99}, got the year {at.tm_year}")
+    time = f"{at.tm_hour:02}{at.tm_min:02}{at.tm_sec:02}.{rest_ns // HUNDREDTH_NS:02}"
+    date = f"{at.tm_mday:02}{at.tm_mon:02}{at.tm_year % 100:02}"
+    status, mode = ("A", "A") if valid else ("V", "N")
+    body = f"GPRMC,{time},{status},0000.0000,N,00000.0000,E,0.0,0.0,{date},,,{mode}".encode("ascii")
+    return b"$%b*%02X\r\n" % (body, checksum(body))
+
+
+def as_gprmc(sentence: bytes) -> bytes:
+    """A well-formed RMC sentence of any talker as `$GPRMC` with its line end, for devices that know no other talker.
+
+    Raises ValueError for what `parse` does not take.
+    """
+    match = _SENTENCE.fullmatch(sentence)
+    if match is None or isinstance(parse(sentence), RmcFault):
+        raise ValueError(f"expected an RMC sentence, got {sentence[:SENTENCE_BYTES_MAX]!r}")
+    body = b"GPRMC," + match[2]
+    return b"$%b*%02X\r\n" % (body, checksum(body))
+
+
+def checksum(body: bytes) -> int:
+    """XOR of all bytes; `body` stands between `$` and `*`."""
+    result = 0
+    for byte in body:
+        result ^= byte
+    return result
+
+
+def _content(fields: Sequence[bytes]) -> Rmc | RmcFault:
+    time, date = _TIME.fullmatch(fields[0]), _DATE.fullmatch(fields[_DAY])
+    midnight_s = date and _midnight_s(int(date[3]), int(date[2]), int(date[1]))
+    if time is None or midnight_s is None:
+        return RmcFault.CONTENT
+    hour, minute, second = int(time[1]), int(time[2]), int(time[3])
+    no_fix = len(fields) > _MODE and fields[_MODE] == b"N"
+    return Rmc(
+        midnight_s + 3600 * hour + 60 * minute + second,
+        int((time[4] or b"").ljust(9, b"0")),
+        fields[_STATUS] == b"A" and not no_fix,
+        second == 60,
+    )
+
+
+def _midnight_s(year_of_century: int, month: int, day: int) -> int | None:
+    """Unix seconds of a day's beginning, None if there is no such day."""
+    year = FIRST_YEAR - FIRST_YEAR % 100 + year_of_century
+    year += 100 * (year < FIRST_YEAR)
+    try:
+        seconds = timegm((year, month, day, 0, 0, 0))
+    except ValueError:
+        return None
+    return seconds if gmtime(seconds)[:3] == (year, month, day) else None

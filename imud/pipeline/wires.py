@@ -1,0 +1,190 @@
+"""The lines of one device: SOUT, SOUT_DIV, PPS and SIN tell its clock when, ALARM that something is wrong.
+
+Edges reach the clock before the frame that follows them: `drain` is called right before what was read is fed.
+A line that fails costs the device nothing but what the line told; it is opened again when it can be.
+"""
+
+from collections.abc import Callable, Sequence
+from time import monotonic_ns
+from typing import Final
+
+from imud.clock import SampleClock
+from imud.errors import CommandError, LinkError
+from imud.event import EventKind
+from imud.kit.lines import DeviceLines, Edge, LineMaker
+from imud.kit.status import LinesStatus
+from imud.kit.timing import Mark, TriggerStamp
+from imud.pipeline.alarm_line import AlarmLine
+from imud.pipeline.notices import Notices
+from imud.pipeline.trigger import Trigger
+from imud.pipeline.watched_line import RETRY_NS, WatchedLine
+
+ALARM_STATUS: Final = 1 << 31
+"""Bit of `Sample.status` that is imud's own: the ALARM line was active. The devices' own bits are below 2¹⁶."""
+OnPulses = Callable[[Sequence[Edge]], None]
+
+
+class Wires:
+    """Owns the lines of one device. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self, device: str, lines: DeviceLines, maker: LineMaker, notices: Notices, on_pulses: OnPulses | None = None
+    ) -> None:
+        """`on_pulses` is told the edges of PPS besides the clock."""
+        self._notices = notices
+        self._on_pulses = on_pulses
+        self._clock: SampleClock | None = None
+        self._alarm = AlarmLine(notices.tell)
+        self._watched: dict[str, WatchedLine] = {}
+        for key, take in (
+            ("sout", self._on_sout),
+            ("sout_div", self._on_divided),
+            ("pps", self._on_pps),
+            ("alarm", self._alarm.edges),
+        ):
+            settings = getattr(lines, key)
+            if settings is not None:
+                on_level = self._on_alarm_level if key == "alarm" else _ignore
+                line = maker.make_input(settings, f"{device} {key}", key != "alarm")
+                self._watched[key] = WatchedLine(line, take, on_level, self._complainer(key))
+        self._drained = [watched for key, watched in self._watched.items() if key != "alarm"]
+        self._sin = maker.make_output(lines.sin, f"{device} sin") if lines.sin is not None else None
+        self._trigger = Trigger(self._sin, lines.sin.rate_hz) if self._sin is not None and lines.sin else None
+        self._triggering = False
+        self._trigger_due_ns = 0
+        self._trigger_problem = ""
+
+    def start(self, clock: SampleClock) -> None:
+        """The device is found: what the lines tell is for this clock, and SIN is driven."""
+        self._clock = clock
+        self.tick(monotonic_ns())
+
+    def drain(self) -> None:
+        """Give the clock all edges there are. Does not wait; one system call per line."""
+        for watched in self._drained:
+            watched.drain()
+        if self._trigger is not None:
+            self._trigger.drain()
+
+    def tick(self, now_ns: int) -> None:
+        """Ten times a second: open what is to be opened, tell what has gathered."""
+        for watched in self._watched.values():
+            watched.tick(now_ns)
+        self._alarm.tick(now_ns)
+        clock = self._clock
+        if clock is None:
+            return
+        if self._trigger is not None and not self._triggering and now_ns >= self._trigger_due_ns:
+            self._start_trigger(now_ns)
+        for mark in clock.take_marks():
+            self._tell_mark(mark)
+
+    def rest(self) -> None:
+        """The device's link ended: SIN is left inactive, and what the other lines tell is for no clock."""
+        self._clock = None
+        if self._trigger is not None and self._sin is not None:
+            self._trigger.stop()
+            self._sin.close()
+            self._triggering = False
+            self._trigger_due_ns = 0
+
+    def stop(self) -> None:
+        """Let go of all lines; may be called twice."""
+        self.rest()
+        for watched in self._watched.values():
+            watched.close()
+
+    def trigger_once(self) -> None:
+        """Make one edge on SIN besides those of its rate. Raises CommandError."""
+        if self._trigger is None:
+            raise CommandError("trigger: expected the key sin below lines of the device, got none")
+        try:
+            self._trigger.once()
+        except LinkError as error:
+            raise CommandError(f"trigger: {error}") from error
+
+    @property
+    def can_trigger(self) -> bool:
+        """Whether there is a line to SIN."""
+        return self._trigger is not None
+
+    def status(self) -> LinesStatus:
+        """How the lines are doing."""
+        problems = {key: watched.problem for key, watched in self._watched.items() if watched.problem}
+        if self._trigger_problem:
+            problems["sin"] = self._trigger_problem
+        counts = self._trigger.counts if self._trigger is not None else None
+        return LinesStatus(
+            problems=problems,
+            edges={key: watched.edges for key, watched in self._watched.items()},
+            edges_lost={key: watched.line.edges_lost for key, watched in self._watched.items()},
+            alarm=self._alarm.active,
+            alarms=self._alarm.raised,
+            triggers=counts.edges if counts else 0,
+            triggers_missed=counts.missed if counts else 0,
+            trigger_late_mean_ns=round(counts.mean_late_ns) if counts else 0,
+            trigger_late_worst_ns=counts.worst_late_ns if counts else 0,
+        )
+
+    # --- what the lines tell -----------------------------------------------------------------------------------------
+
+    def _on_sout(self, edges: Sequence[Edge]) -> None:
+        if self._clock is not None:
+            self._clock.edges(edges)
+
+    def _on_divided(self, edges: Sequence[Edge]) -> None:
+        if self._clock is not None:
+            self._clock.divided(edges)
+
+    def _on_pps(self, edges: Sequence[Edge]) -> None:
+        if self._clock is not None:
+            self._clock.pulses(edges)
+        if self._on_pulses is not None:
+            self._on_pulses(edges)
+
+    def _on_stamps(self, stamps: Sequence[TriggerStamp]) -> None:
+        if self._clock is not None:
+            self._clock.triggers(stamps)
+
+    def _on_alarm_level(self, active: bool | None) -> None:
+        if active is None:
+            self._alarm.unknown()
+        else:
+            self._alarm.level(monotonic_ns(), active)
+
+    def _tell_mark(self, mark: Mark) -> None:
+        words = f"sample {mark.seq}" if mark.seq is not None else "a sample that was lost"
+        self._notices.tell(
+            mark.t_ns, EventKind.MARK, f"pulse {mark.number} on SOUT_DIV belongs to {words}",
+            t_ns=mark.t_ns, edge_seq=mark.number, seq=mark.seq,
+        )  # fmt: skip
+
+    # --- SIN ---------------------------------------------------------------------------------------------------------
+
+    def _start_trigger(self, now_ns: int) -> None:
+        assert self._trigger is not None
+        assert self._sin is not None
+        try:
+            self._sin.open()
+        except LinkError as error:
+            self._end_trigger(error, now_ns)
+            return
+        self._trigger_problem = ""
+        self._triggering = True
+        self._trigger.start(self._on_stamps, self._end_trigger)
+
+    def _end_trigger(self, error: LinkError, now_ns: int | None = None) -> None:
+        assert self._sin is not None
+        self._sin.close()
+        self._triggering = False
+        self._trigger_due_ns = (monotonic_ns() if now_ns is None else now_ns) + RETRY_NS
+        if str(error) != self._trigger_problem:
+            self._trigger_problem = str(error)
+            self._complainer("sin")(self._trigger_problem)
+
+    def _complainer(self, key: str) -> Callable[[str], None]:
+        return lambda problem: self._notices.tell(monotonic_ns(), EventKind.LINK, f"line {key}: {problem}", line=key)
+
+
+def _ignore(_active: bool | None) -> None:
+    """The level of a line that tells by its edges."""

@@ -1,0 +1,167 @@
+"""A device with lines, simulated with the truth known: SOUT pulses, lost and extra edges, and messages that get lost.
+
+The instant of measurement is the rising edge; the pulse takes 80 µs, then the message of `ArrivalModel` begins. The
+kernel stamps an edge late by some microseconds, on a loaded system now and then by some hundred.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from random import Random
+from typing import NamedTuple
+
+from imud.kit.lines import Edge
+from imud.kit.timing import TriggerStamp
+from imud.sim.arrival import Arrival, ArrivalModel
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+PULSE_NS = 80 * NS_PER_US
+SIN_NS = 125 * NS_PER_US
+LATENCY_NS = 3 * NS_PER_US
+JITTER_NS = 4 * NS_PER_US
+STALL_SHARE = 0.01
+STALL_NS = 200 * NS_PER_US
+"""The kernel's interrupt thread: floor and mean of an exponential law, and how often it waits for another one."""
+
+
+@dataclass(frozen=True, slots=True)
+class LineFaults:
+    """What goes wrong; shares of 1."""
+
+    pulse_loss: float = 0.0
+    """Pulses of which nothing is seen."""
+    edge_loss: float = 0.0
+    """Single edges lost."""
+    frame_loss: float = 0.0
+    extra: float = 0.0
+    """Pulses that are no pulses, per true one, at any time."""
+    loaded: bool = False
+
+
+class Heard(NamedTuple):
+    """One read: what the line gave before it, then the messages."""
+
+    edges: list[Edge]
+    arrivals: list[Arrival]
+    numbers: list[int]
+    """The number of the rising edge of each message."""
+    stamps_ns: list[int]
+    """What the kernel said of it, or would have."""
+
+
+def measured_ns(arrival: Arrival) -> int:
+    """The truth of a message: the rising edge of its pulse."""
+    return arrival.t_ns - PULSE_NS
+
+
+def heard(arrivals: Iterable[Arrival], seed: int, faults: LineFaults) -> list[Heard]:
+    """All reads of a run, with the edges that the kernel had by then."""
+    random = Random(f"lines {seed}")
+    all_of = list(arrivals)
+    pulses = [(measured_ns(a), i) for i, a in enumerate(all_of)]
+    edges, numbers, stamps = _edges(pulses, random, faults)
+    reads = []
+    at = 0
+    index = {id(a): i for i, a in enumerate(all_of)}
+    for t_rx_ns, group in groupby(all_of, key=lambda a: a.t_rx_ns):
+        begin = at
+        while at < len(edges) and edges[at].t_ns <= t_rx_ns:
+            at += 1
+        kept = [a for a in group if random.random() >= faults.frame_loss]
+        indices = [index[id(a)] for a in kept]
+        reads.append(Heard(edges[begin:at], kept, [numbers[i] for i in indices], [stamps[i] for i in indices]))
+    return reads
+
+
+def late_ns(random: Random, *, loaded: bool) -> int:
+    """How late the kernel stamps an edge."""
+    late = LATENCY_NS + random.expovariate(1 / JITTER_NS)
+    if loaded and random.random() < STALL_SHARE:
+        late += random.expovariate(1 / STALL_NS)
+    return int(late)
+
+
+def _edges(
+    pulses: Sequence[tuple[int, int]], random: Random, faults: LineFaults
+) -> tuple[list[Edge], list[int], list[int]]:
+    """(edges that are seen, number of each pulse's rising edge, its stamp)."""
+    both: list[tuple[int, int, int | None]] = []  # stamp of the rising edge, of the falling edge, pulse
+    for t_ns, i in pulses:
+        rise = t_ns + late_ns(random, loaded=faults.loaded)
+        both.append((rise, max(t_ns + PULSE_NS + late_ns(random, loaded=faults.loaded), rise + 1000), i))
+    both += [extra for extra in _extra(pulses, random, faults) if _is_free(extra, both)]
+    both.sort()
+    seen: list[Edge] = []
+    numbers, stamps = [0] * len(pulses), [0] * len(pulses)
+    number = 0
+    for rise, fall, pulse in both:
+        if pulse is not None:
+            numbers[pulse], stamps[pulse] = number + 1, rise
+        whole = pulse is not None and random.random() < faults.pulse_loss
+        for t_ns, rising in ((rise, True), (fall, False)):
+            number += 1
+            if not whole and random.random() >= faults.edge_loss:
+                seen.append(Edge(t_ns, rising, number))
+    return seen, numbers, stamps
+
+
+def _extra(
+    pulses: Sequence[tuple[int, int]], random: Random, faults: LineFaults
+) -> Iterator[tuple[int, int, int | None]]:
+    first, last = pulses[0][0], pulses[-1][0]
+    for _ in range(int(len(pulses) * faults.extra)):
+        at = random.randrange(first, last)
+        yield at, at + random.randrange(5 * NS_PER_US, 500 * NS_PER_US), None
+
+
+def _is_free(extra: tuple[int, int, int | None], pulses: Sequence[tuple[int, int, int | None]]) -> bool:
+    """Whether the line is low during an extra pulse; within another one it makes no edges of its own."""
+    at = bisect_right(pulses, extra)
+    return (at == 0 or pulses[at - 1][1] < extra[0]) and (at == len(pulses) or extra[1] < pulses[at][0])
+
+
+def restarted(model: ArrivalModel, count: int, silent_ns: int) -> Iterator[Arrival]:
+    """A run of a device that restarts in the middle: its counter begins at 3 s, `silent_ns` later."""
+    last = None
+    for last in model.run(count // 2):
+        yield last
+    assert last is not None
+    again = replace(
+        model,
+        crystal=replace(model.crystal, start_ns=3_000_000_000),
+        begin_ns=last.t_rx_ns + silent_ns,
+        seed=model.seed + 1,
+    )
+    yield from again.run(count - count // 2)
+
+
+def pulses_per_second(arrivals: Sequence[Arrival], seed: int) -> list[Edge]:
+    """A pulse for every whole second of the host from one before the first message on, as the kernel stamps them."""
+    random = Random(f"pps {seed}")
+    first, last = arrivals[0].t_ns // NS_PER_S, arrivals[-1].t_ns // NS_PER_S
+    return [
+        Edge(second * NS_PER_S + late_ns(random, loaded=False), True, 2 * i + 1)
+        for i, second in enumerate(range(first, last + 1))
+    ]
+
+
+def pps_age_ms(arrival: Arrival, skew_ppm: float) -> int:
+    """What the device says: its time since the newest whole second of the host, cut off to ms."""
+    return int(arrival.t_ns % NS_PER_S * (1 + skew_ppm * 1e-6)) // NS_PER_MS
+
+
+def triggered(model: ArrivalModel, count: int, answered: float) -> Iterator[tuple[TriggerStamp, Arrival | None]]:
+    """Triggers of the host at even times of its own, and the answers 125 µs (± 20 µs) later; a share is not answered.
+
+    The device stamps its time of the trigger in ms, cut off.
+    """
+    random = Random(f"trigger {model.seed}")
+    skew = 1 + model.crystal.skew_ppm * 1e-6
+    for number, a in enumerate(model.run(count), start=1):
+        shift_ns = SIN_NS + random.randrange(-20 * NS_PER_US, 20 * NS_PER_US)
+        t_ns = model.begin_ns + int((number - 1) * NS_PER_S / model.rate_hz)
+        stamp = TriggerStamp(t_ns + random.randrange(-10 * NS_PER_US, 10 * NS_PER_US), 6 * NS_PER_US, number)
+        dev_ns = model.crystal.start_ns + int((t_ns - model.begin_ns) * skew)
+        answer = Arrival(t_ns, dev_ns, a.size_bytes, 0, a.t_rx_ns - a.t_ns + t_ns + shift_ns)
+        yield stamp, answer if random.random() < answered else None

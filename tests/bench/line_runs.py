@@ -1,0 +1,144 @@
+"""Simulated devices with lines through a clock: what came out beside the truth."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+from imud.clock import SampleClock
+from imud.kit.lines import Edge
+from imud.kit.timing import SoutTiming, UtcReference
+from imud.sample import Measurement, Sample, Sync
+from imud.sim.arrival import Arrival, ArrivalModel
+from imud.units import NS_PER_S
+from tests.bench.clock import TICK_MODULUS, TICK_NS, clock_for
+from tests.bench.line_model import (
+    Heard,
+    LineFaults,
+    heard,
+    measured_ns,
+    pps_age_ms,
+    pulses_per_second,
+    triggered,
+)  # fmt: skip
+
+UTC_OFFSET_NS = 1_790_000_000_123_456_789
+REFERENCE = UtcReference(UTC_OFFSET_NS, 20_000)
+
+
+class Told(NamedTuple):
+    """One sample beside its truth."""
+
+    sample: Sample
+    truth_ns: int
+    number: int
+    """Of the event that belongs to it."""
+    begun_ns: int = 0
+    """Latest time that its message can have begun, by its arrival."""
+
+    @property
+    def off_ns(self) -> int:
+        """How much too late it is dated."""
+        return self.sample.t_ns - self.truth_ns
+
+
+def measurement(a: Arrival, ticks: int | None = None, pps_age: int | None = None) -> Measurement:
+    """The message of an arrival."""
+    ticks = (a.dev_ns // TICK_NS if ticks is None else ticks) % TICK_MODULUS
+    return Measurement(a.size_bytes, a.trailing_bytes, ticks, pps_age_ms=pps_age)
+
+
+def begun_ns(model: ArrivalModel, a: Arrival) -> int:
+    """Arrival less the time on the wire."""
+    return a.t_rx_ns - (a.size_bytes + a.trailing_bytes) * model.byte_ns
+
+
+def sout_clock(model: ArrivalModel, timing: SoutTiming | None = None) -> SampleClock:
+    """A clock of a device with SOUT."""
+    return SampleClock(
+        "bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=model.profile.hold_ns,
+        sout=timing,
+    )  # fmt: skip
+
+
+def with_sout(clock: SampleClock, reads: Sequence[Heard], *, silent: range = range(0)) -> list[Told]:
+    """Reads through a clock; those whose place is in `silent` bring no edges."""
+    told = []
+    for i, read in enumerate(reads):
+        if i not in silent:
+            clock.edges(read.edges)
+        for a, number in zip(read.arrivals, read.numbers, strict=True):
+            told.append(Told(clock.sample(measurement(a), a.t_rx_ns, 0), measured_ns(a), number))
+    return told
+
+
+def run_sout(model: ArrivalModel, seconds: int, faults: LineFaults, timing: SoutTiming | None = None) -> list[Told]:
+    """A device with SOUT."""
+    reads = heard(model.run(int(model.rate_hz) * seconds), model.seed, faults)
+    return with_sout(sout_clock(model, timing), reads)
+
+
+def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) -> list[Told]:
+    """A device that says how long ago the pulse per second was; none comes in some seconds of the run."""
+    clock, told = clock_for(model), []
+    arrivals = list(model.run(int(model.rate_hz) * seconds))
+    first_s = arrivals[0].t_ns // NS_PER_S
+    pulses = [p for p in pulses_per_second(arrivals, model.seed) if p.t_ns // NS_PER_S - first_s not in silent_s]
+    given = 0
+    for a in arrivals:
+        due: list[Edge] = [p for p in pulses[given : given + 3] if p.t_ns <= a.t_rx_ns]
+        given += len(due)
+        clock.pulses(due)
+        # without a pulse the age goes on
+        newest = max((p.t_ns // NS_PER_S for p in pulses[:given] if p.t_ns <= a.t_ns), default=a.t_ns // NS_PER_S)
+        age = pps_age_ms(a, model.crystal.skew_ppm) + 1000 * (a.t_ns // NS_PER_S - newest)
+        told.append(Told(clock.sample(measurement(a, pps_age=age % 8192), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a)))
+    return told
+
+
+def run_utc(
+    model: ArrivalModel, seconds: int, *, turn_ms: int, ahead_ns: int = 0, reference: UtcReference = REFERENCE,
+    back_at: float = 1.0,
+) -> tuple[list[Told], SampleClock]:  # fmt: skip
+    """A device whose counter turns into UTC ms modulo `turn_ms` after a quarter, and to its own again at `back_at`."""
+    clock, told = clock_for(model), []
+    clock.reference = reference
+    count = int(model.rate_hz) * seconds
+    for i, a in enumerate(model.run(count)):
+        utc = i >= count // 4 and i < back_at * count
+        ticks = (a.t_ns + UTC_OFFSET_NS + ahead_ns) // TICK_NS % turn_ms if utc else None
+        told.append(Told(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a)))
+    return told, clock
+
+
+def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[list[Told], SampleClock, int]:
+    """A device that answers most triggers; also how many it did not answer."""
+    clock, told, missed = clock_for(model), [], 0
+    for stamp, a in triggered(model, int(model.rate_hz) * seconds, answered):
+        clock.triggers([stamp])
+        if a is None:
+            missed += 1
+        else:
+            told.append(Told(clock.sample(measurement(a), a.t_rx_ns, 0), a.t_ns, stamp.number))
+    return told, clock, missed
+
+
+def after(told: Sequence[Told], seconds: float) -> list[Told]:
+    """Without the beginning."""
+    return [t for t in told if t.truth_ns - told[0].truth_ns > seconds * NS_PER_S]
+
+
+def share_honest(told: Sequence[Told]) -> float:
+    """Of the samples, those within twice their stated error."""
+    return sum(abs(t.off_ns) <= 2 * t.sample.t_err_ns for t in told) / len(told)
+
+
+def steepest(told: Sequence[Told]) -> float:
+    """Largest error of a step between samples, per length of the step; but no stamp is later than its message."""
+    return max(
+        abs(b.off_ns - a.off_ns) / (b.truth_ns - a.truth_ns) for a, b in pairwise(told) if b.sample.t_ns != b.begun_ns
+    )
+
+
+def syncs(told: Sequence[Told]) -> set[Sync]:
+    """All sources that occur."""
+    return {t.sample.sync for t in told}

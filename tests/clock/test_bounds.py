@@ -1,0 +1,58 @@
+"""Intervals of whole milliseconds, together."""
+
+import pytest
+
+from imud.clock.bounds import Bounds
+from imud.units import NS_PER_MS, NS_PER_S
+
+MS = NS_PER_MS
+FAR = 1 << 60
+
+
+def filled(ppm: float, seconds: int = 40) -> tuple[Bounds, int]:
+    """Stamps of a clock that runs `ppm` fast, cut off to ms, of instants that are their own device time."""
+    bounds, x = Bounds(), 0
+    for i in range(seconds * 10):
+        x = i * NS_PER_S // 10 + 400_000
+        low = int((x * (1 + ppm * 1e-6)) // MS * MS / (1 + ppm * 1e-6))
+        bounds.add(x, low, low + MS, FAR, 1.0)
+    return bounds, x
+
+
+def test_lockstep_leaves_a_millisecond() -> None:
+    bounds, x = filled(0.0)
+    fix, error = bounds.improved(x, x, 1e9, 0.0)
+    assert bounds.width_ns == pytest.approx(MS, rel=0.2)
+    assert abs(fix) < 150_000
+    assert error == pytest.approx(289_000, rel=0.2)
+
+
+def test_a_drift_through_the_milliseconds_narrows() -> None:
+    bounds, x = filled(50.0)
+    fix, error = bounds.improved(x, x, 1e9, 0.0)
+    assert error < 100_000
+    assert abs(fix) < 2 * error
+
+
+def test_a_fit_that_knows_more_stays_within() -> None:
+    bounds, x = filled(0.0)
+    assert abs(bounds.improved(x, x + 50_000, 1000.0, 0.0)[0]) < 100
+    fix, error = bounds.improved(x, x + 5 * MS, 1000.0, 0.0)
+    assert -5.7 * MS < fix < -4 * MS
+    assert error > 200_000
+
+
+def test_arrivals_bound_from_above() -> None:
+    bounds = Bounds()
+    for x in range(0, 5 * NS_PER_S, NS_PER_S):
+        bounds.add(x, x, x + MS, x + 100_000, 1.0)
+    assert bounds.width_ns < 200_000
+
+
+def test_contradictions_drop_what_is_old() -> None:
+    bounds, x = filled(0.0)
+    for i in range(1, 200):
+        bounds.add(x + i * NS_PER_S // 10, x + 20 * MS + i * NS_PER_S // 10, x + 21 * MS + i * NS_PER_S // 10, FAR, 1.0)
+    assert bounds.known
+    at = x + 199 * NS_PER_S // 10
+    assert bounds.improved(at, at, 1e9, 0.0)[0] == pytest.approx(20.5 * MS, abs=0.6 * MS)

@@ -1,0 +1,91 @@
+"""Pairs by device time, whichever side loses."""
+
+from imud.clock.pairing import MISSES_MOST, QUEUE_MOST, WRONG_MOST, Pairing
+from imud.units import NS_PER_MS
+
+PERIOD_NS = 10 * NS_PER_MS
+LEAD_NS = 80_000
+ERROR_NS = 100_000.0
+
+
+def pair(pairing: Pairing, i: int, fit_off_ns: int = LEAD_NS) -> bool:
+    """Sample `i`, whose event was at i periods; the fit is where its message began."""
+    at = i * PERIOD_NS
+    return pairing.pair(at, at + NS_PER_MS, at + fit_off_ns, ERROR_NS, float(PERIOD_NS), 1.0)
+
+
+def running(count: int = 100) -> Pairing:
+    pairing = Pairing(LEAD_NS)
+    for i in range(count):
+        pairing.give([(i * PERIOD_NS, i)])
+        pair(pairing, i)
+    assert pairing.running
+    return pairing
+
+
+def test_events_that_come_together_are_told_apart() -> None:
+    pairing = running()
+    pairing.give([(i * PERIOD_NS, i) for i in range(100, 116)])
+    assert [(pair(pairing, i), pairing.number) for i in range(100, 116)] == [(True, i) for i in range(100, 116)]
+
+
+def test_either_side_may_lose() -> None:
+    pairing = running()
+    pairing.give([(i * PERIOD_NS, i) for i in (100, 102, 103)])
+    assert [(pair(pairing, i), pairing.number) for i in (100, 101, 103)] == [(True, 100), (False, 100), (True, 103)]
+    assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
+
+
+def test_the_nearest_is_taken_and_a_distant_one_is_not() -> None:
+    pairing = running()
+    at = 100 * PERIOD_NS
+    pairing.give([(at - 3 * NS_PER_MS, 1), (at - 20_000, 2), (at + 5_000, 3), (at + 3 * NS_PER_MS, 4)])
+    assert pair(pairing, 100)
+    assert (pairing.stamp_ns, pairing.number) == (at + 5_000, 3)
+    assert not pair(pairing, 101)
+
+
+def test_what_is_near_but_not_near_enough_is_counted_on_both_sides() -> None:
+    pairing = running()
+    pairing.give([(100 * PERIOD_NS + NS_PER_MS, 100)])
+    assert not pair(pairing, 100)
+    assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
+
+
+def test_it_begins_only_when_most_agree() -> None:
+    pairing = Pairing(LEAD_NS)
+    for i in range(30):
+        pairing.give([(i * PERIOD_NS + (i % 4) * NS_PER_MS, i)])
+        assert not pair(pairing, i)
+    assert not pairing.running
+
+
+def test_an_unsure_fit_begins_nothing() -> None:
+    pairing = Pairing(LEAD_NS)
+    for i in range(30):
+        pairing.give([(i * PERIOD_NS, i)])
+        at = i * PERIOD_NS
+        pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, 0.5 * PERIOD_NS, float(PERIOD_NS), 1.0)
+    assert not pairing.running
+
+
+def test_a_line_without_events_is_given_up() -> None:
+    pairing = running()
+    assert not any(pair(pairing, 100 + i) for i in range(MISSES_MOST))
+    assert not pairing.running
+    assert pairing.learned
+
+
+def test_a_line_off_by_a_period_is_found_by_the_fit() -> None:
+    pairing = running()
+    for i in range(100, 100 + WRONG_MOST + 200):
+        pairing.give([(i * PERIOD_NS, i)])
+        pair(pairing, i, PERIOD_NS + LEAD_NS)
+    assert pairing.number < 300 + WRONG_MOST
+    assert not pairing.learned or abs(pairing.delay_ns) < PERIOD_NS / 2
+
+
+def test_events_nobody_asks_for_are_bounded() -> None:
+    pairing = Pairing(LEAD_NS)
+    pairing.give([(i, i) for i in range(QUEUE_MOST + 10)])
+    assert pairing.events_unpaired == 10

@@ -1,0 +1,140 @@
+"""Devices on UTC and beside a pulse per second: recognised, bounded, honest, and never a step."""
+
+import pytest
+
+from imud.clock import SampleClock
+from imud.clock.utc import DAY_NS
+from imud.kit.timing import TimeBits, UtcReference
+from imud.sample import Measurement, Sync
+from imud.sim.arrival import BARE_UART, USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.clock import BAUD_OF_RATE, clock_for
+from tests.bench.line_runs import (
+    REFERENCE,
+    UTC_OFFSET_NS,
+    after,
+    run_pps,
+    run_triggers,
+    run_utc,
+    share_honest,
+    steepest,
+    syncs,
+)  # fmt: skip
+from tests.clock.streams import BEGIN_NS, rises
+
+UNIX = 1 << 32
+DAY = DAY_NS // NS_PER_MS
+SLEW = 550e-6
+"""500 ppm, and some for crystals and lines that are not exact."""
+
+
+def model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 0.0, seed: int = 1) -> ArrivalModel:
+    return ArrivalModel(profile, rate_hz, seed, Crystal(ppm), BAUD_OF_RATE.get(rate_hz, 115_200))
+
+
+@pytest.mark.parametrize(
+    ("profile", "turn_ms", "seed"),
+    [(BARE_UART, UNIX, 1), (BARE_UART, DAY, 2), (USB_16MS, UNIX, 1), (USB_16MS_PACKET, DAY, 3)],
+    ids=lambda v: getattr(v, "name", v),
+)
+def test_a_device_that_turns_to_utc_is_recognised(profile: ArrivalProfile, turn_ms: int, seed: int) -> None:
+    told, clock = run_utc(model(profile, seed=seed), 60, turn_ms=turn_ms)
+    assert clock.status().resets == 0
+    assert clock.status().reference_error_ns == REFERENCE.error_ns
+    assert syncs(told[1500:]) == {Sync.UTC}
+    assert share_honest(told) >= 0.95
+    assert steepest(told[1100:]) < 2 * SLEW  # the slews of the fit and of what corrects it
+    assert rises(t.sample for t in told)
+    assert max(abs(t.off_ns) for t in after(told, 30)) < 600_000
+    assert max(t.sample.t_err_ns for t in after(told, 30)) < NS_PER_MS
+
+
+def test_gps_time_is_refused() -> None:
+    told, clock = run_utc(model(BARE_UART), 40, turn_ms=UNIX, ahead_ns=18 * NS_PER_S)
+    assert Sync.UTC not in syncs(told)
+    assert clock.status().resets == 1
+
+
+def test_an_unsure_host_refuses_no_more_than_it_must() -> None:
+    """18 s off is refused even by a host that hardly knows the time."""
+    unsure = UtcReference(UTC_OFFSET_NS, 10 * NS_PER_S)
+    assert Sync.UTC not in syncs(
+        run_utc(model(BARE_UART), 20, turn_ms=UNIX, ahead_ns=18 * NS_PER_S, reference=unsure)[0]
+    )
+
+
+def test_a_device_that_was_on_utc_before_is_recognised() -> None:
+    told, _ = run_utc(model(BARE_UART), 20, turn_ms=UNIX)
+    clock = clock_for(model(BARE_UART))
+    clock.reference = REFERENCE
+    samples = []
+    for t in told[600:]:
+        ticks = (t.truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
+        samples.append(clock.sample(Measurement(82, 0, ticks), t.sample.t_rx_ns, 0))
+    assert [s.sync for s in samples[300:]] == [Sync.UTC] * (len(samples) - 300)
+
+
+def on_utc(clock: SampleClock, count: int, status: int | None, off_ms: float, first: int = 0) -> list[Sync]:
+    """100 Hz on UTC, off by a growing distance."""
+    found = []
+    for i in range(first, first + count):
+        at = BEGIN_NS + 10 * i * NS_PER_MS
+        ticks = (at + UTC_OFFSET_NS + int(off_ms * (i - first) * NS_PER_MS)) // NS_PER_MS % UNIX
+        found.append(clock.sample(Measurement(82, 0, ticks, status=status), at + 2 * NS_PER_MS, 0).sync)
+    return found
+
+
+def test_the_status_bit_is_respected() -> None:
+    bits = TimeBits(not_utc=0x800)
+    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=UNIX, byte_ns=10_850, hold_ns=0, bits=bits)
+    clock.reference = REFERENCE
+    assert Sync.UTC not in on_utc(clock, 500, 0x800, 0.0)
+    assert on_utc(clock, 500, 0, 0.0, 500)[-1] is Sync.UTC
+    assert on_utc(clock, 10, 0x800, 0.0, 1000)[0] is Sync.REGRESSION
+
+
+def test_utc_that_drifts_away_is_given_up() -> None:
+    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=UNIX, byte_ns=10_850, hold_ns=0)
+    clock.reference = REFERENCE
+    assert on_utc(clock, 1000, None, 0.0)[-1] is Sync.UTC
+    assert on_utc(clock, 3000, None, 0.01, 1000)[-1] is Sync.REGRESSION  # 30 ms
+
+
+def test_a_reference_that_goes_away_is_no_step() -> None:
+    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=UNIX, byte_ns=10_850, hold_ns=0)
+    clock.reference = REFERENCE
+    on_utc(clock, 1000, None, 0.0)
+    before = clock.status()
+    clock.reference = None
+    assert on_utc(clock, 1, None, 0.0, 1000) == [Sync.REGRESSION]
+    assert abs(clock.status().offset_ns - before.offset_ns) < 10_000 + NS_PER_MS
+    assert clock.status().reference_error_ns == 0
+
+
+@pytest.mark.parametrize(("rate_hz", "ppm"), [(1, 0.0), (1, 50.0), (100, 50_000.0)])
+def test_a_pulse_per_second_knows_more_than_a_slow_adapter(rate_hz: int, ppm: float) -> None:
+    told = run_pps(model(USB_16MS_PACKET, rate_hz, ppm), 100)
+    assert share_honest(told) >= 0.95
+    assert rises(t.sample for t in told)
+    settled = after(told, 60)
+    assert sum(abs(t.off_ns) for t in settled) < 600_000 * len(settled)  # 1.5 ms at 100 Hz without, 6 ms at 1 Hz
+    assert Sync.EDGE in syncs(settled)
+
+
+def test_losing_and_regaining_the_pulse_makes_no_step() -> None:
+    told = run_pps(model(USB_16MS_PACKET, 50, 50.0), 90, silent_s=range(40, 60))
+    assert {told[1950].sample.sync, told[-1].sample.sync} == {Sync.EDGE}
+    assert told[2500].sample.sync is Sync.REGRESSION
+    assert steepest(told[1000:]) < 2 * SLEW
+    assert share_honest(told) >= 0.95
+
+
+@pytest.mark.parametrize(("rate_hz", "ppm"), [(100, 0.0), (200, 50_000.0), (1000, 0.0)])
+def test_triggers_find_their_answers(rate_hz: int, ppm: float) -> None:
+    told, clock, missed = run_triggers(model(BARE_UART, rate_hz, ppm), 5, 0.95)
+    paired = [t for t in told if t.sample.edge_seq is not None]
+    assert len(paired) > 0.9 * len(told)
+    assert all(t.sample.edge_seq == t.number for t in paired)
+    assert share_honest(told) >= 0.95
+    assert abs(clock.status().triggers_missed - missed) <= 20
+    assert clock.status().edges == rate_hz * 5

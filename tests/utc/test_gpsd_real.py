@@ -1,0 +1,107 @@
+"""A real gpsd with a receiver on a pseudo-terminal, as the source of RMC sentences."""
+
+import asyncio
+import os
+import shutil
+import socket
+import subprocess
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from imud.kit.rmc import Rmc, build, checksum, parse
+from imud.units import NS_PER_S
+from imud.utc.gpsd import GpsdSource
+from imud.utc.retry import Retry
+from imud.utc.source import RmcSettings
+from tests.utc.sentences import Sentences
+
+UTC_S = 1_795_000_000
+LIMIT_S = 30.0
+NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (Debian package gpsd)"
+
+
+class Receiver:
+    """A GNSS receiver with a fix, on a pty: one cycle of sentences after the other."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        os.chmod(self.path, 0o666)  # gpsd gives its rights away
+        self.second = UTC_S
+
+    def cycle(self) -> None:
+        """One second's sentences."""
+        rmc = build(self.second * NS_PER_S)
+        time = rmc.split(b",")[1].decode()
+        gga = f"GPGGA,{time},0000.000,N,00000.000,E,1,08,0.9,12.0,M,0.0,M,,"
+        gsa = "GPGSA,A,3,01,02,03,04,05,06,07,08,,,,,1.6,0.9,1.3"
+        rest = "".join(f"${body}*{checksum(body.encode()):02X}\r\n" for body in (gga, gsa))
+        with suppress(BlockingIOError):
+            os.read(self._master, 4096)  # what gpsd asks of the receiver is not answered
+        os.write(self._master, rmc + rest.encode())
+        self.second += 1
+
+    def close(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+
+
+@contextmanager
+def gpsd(port: int, device: str, folder: Path) -> Iterator[None]:
+    """A gpsd that waits for no client and sends nothing to the receiver."""
+    with (folder / "gpsd.log").open("w") as log:
+        command = ["gpsd", "-N", "-n", "-b", "-D", "2", "-S", str(port), device]
+        process = subprocess.Popen(command, stdout=log, stderr=log)
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(timeout=LIMIT_S)
+            print((folder / "gpsd.log").read_text())
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    made = Receiver()
+    yield made
+    made.close()
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+@pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
+def test_sentences_of_the_receiver_come_through_gpsd(receiver: Receiver, tmp_path: Path) -> None:
+    port = free_port()
+
+    async def scene() -> Sentences:
+        sentences = Sentences()
+        source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port), Retry(lambda _s: asyncio.sleep(0.1)))
+        source.start(sentences)
+        try:
+            async with asyncio.timeout(LIMIT_S):
+                while len(sentences.got) < 5:
+                    receiver.cycle()
+                    await asyncio.sleep(0.05)
+            assert source.problem == ""
+        finally:
+            await source.close()
+        return sentences
+
+    with gpsd(port, receiver.path, tmp_path):
+        sentences = asyncio.run(scene())
+    told = [parse(sentence) for sentence in sentences.data]
+    seconds = [rmc.unix_s for rmc in told if isinstance(rmc, Rmc) and rmc.valid]
+    assert len(seconds) == len(told)
+    assert seconds == sorted(set(seconds))
+    assert set(seconds) <= set(range(UTC_S, receiver.second))

@@ -1,0 +1,160 @@
+"""UTC from pulses and sentences, with known truth."""
+
+from random import Random
+
+import pytest
+
+from imud.kit.rmc import build
+from imud.kit.timing import UtcReference
+from imud.units import NS_PER_MS, NS_PER_S
+from imud.utc.pps import HOLD_NS, PULSES_NEEDED, PpsReference
+
+UTC_S = 1_795_000_000
+BEGIN_NS = 77 * NS_PER_S + 123_456_789
+
+
+class Receiver:
+    """Pulses as a host whose oscillator is `ppm` fast stamps them, and sentences."""
+
+    def __init__(self, ppm: float = 30.0, late_ns: float = 0.0) -> None:
+        self.seconds: list[tuple[int, int]] = []
+        self.reference = PpsReference(lambda t_ns, unix_s: self.seconds.append((t_ns, unix_s)))
+        self.number = 0
+        self._rate = 1 + ppm * 1e-6
+        self._late_ns = late_ns
+        self._random = Random(1)
+
+    def t_ns(self, after_s: float = 0.0) -> int:
+        """CLOCK_MONOTONIC so long after the present full second."""
+        return BEGIN_NS + round((self.number + after_s) * NS_PER_S * self._rate)
+
+    def go(self, seconds: int, *, pulse: bool = True, says: int | None = 0) -> None:
+        for _ in range(seconds):
+            self.number += 1
+            if pulse:
+                self.reference.pulse(self.t_ns() + round(abs(self._random.gauss(0, self._late_ns))))
+            if says is not None:
+                self.reference.sentence(build((UTC_S + self.number + says) * NS_PER_S), self.t_ns(0.3))
+
+    def known(self, after_s: float = 0.0) -> UtcReference:
+        reference = self.reference.reference(self.t_ns(after_s))
+        assert reference is not None
+        return reference
+
+    def error_ns(self, after_s: float = 0.0) -> float:
+        """What is told less the truth."""
+        truth_ns = UTC_S * NS_PER_S + (self.number + after_s) * NS_PER_S
+        return self.known(after_s).offset_ns - (int(truth_ns) - self.t_ns(after_s))
+
+
+def test_three_pulses_and_two_sentences_tell_utc() -> None:
+    receiver = Receiver()
+    receiver.go(PULSES_NEEDED)
+    assert receiver.reference.reference(receiver.t_ns()) is None
+    receiver.go(2)
+    assert abs(receiver.error_ns()) < 1000
+    assert abs(receiver.error_ns(0.9)) < 1000
+    assert receiver.known().error_ns == pytest.approx(5000, rel=0.2)
+    assert receiver.reference.pulses == 5
+
+
+@pytest.mark.parametrize("ppm", [-100.0, 0.0, 100.0])
+@pytest.mark.parametrize("late_ns", [0.0, 5_000.0, 50_000.0])
+def test_the_error_told_is_honest(ppm: float, late_ns: float) -> None:
+    receiver, inside = Receiver(ppm, late_ns), 0
+    receiver.go(20)
+    for _ in range(100):
+        receiver.go(1)
+        inside += abs(receiver.error_ns(0.5)) <= 2 * receiver.known(0.5).error_ns
+    assert inside >= 95
+
+
+def test_without_sentences_only_the_pulses_count() -> None:
+    receiver = Receiver()
+    receiver.go(10, says=None)
+    assert receiver.reference.pulses == 10
+    assert receiver.reference.reference(receiver.t_ns()) is None
+    assert receiver.seconds == []
+
+
+def test_each_pulse_of_a_known_second_is_told() -> None:
+    receiver = Receiver()
+    receiver.go(10)
+    assert [unix_s for _, unix_s in receiver.seconds] == [UTC_S + n for n in range(5, 11)]
+    assert receiver.seconds[-1][0] == receiver.t_ns()
+
+
+def test_disturbances_are_ignored_and_missing_pulses_bridged() -> None:
+    receiver = Receiver()
+    receiver.go(10)
+    for gap in (0, 1, 5, 9):
+        assert not receiver.reference.pulse(receiver.t_ns(0.4))
+        assert not receiver.reference.pulse(receiver.t_ns(0.7))
+        receiver.go(gap, pulse=False)
+        receiver.go(1)
+        assert abs(receiver.error_ns()) < 1000
+    assert receiver.reference.pulses_ignored == 8
+    assert receiver.reference.pulses == 14
+
+
+def test_a_long_silence_costs_precision_and_then_the_reference() -> None:
+    receiver = Receiver()
+    receiver.go(20)
+    receiver.go(100, pulse=False, says=None)
+    assert abs(receiver.error_ns()) < 2 * receiver.known().error_ns
+    assert receiver.known().error_ns > 100_000
+    assert receiver.reference.reference(receiver.t_ns() + HOLD_NS) is None
+
+
+def test_after_a_longer_gap_it_begins_anew() -> None:
+    receiver = Receiver()
+    receiver.go(10)
+    receiver.go(30, pulse=False, says=None)
+    receiver.go(2, says=None)
+    assert receiver.reference.pulses == 10
+    receiver.go(4)
+    assert abs(receiver.error_ns()) < 1000
+    assert receiver.reference.pulses == 16
+
+
+def test_another_receiver_takes_over() -> None:
+    receiver = Receiver()
+    receiver.go(10)
+    for number in range(1, 5):
+        receiver.reference.pulse(receiver.t_ns(number + 0.25))
+    assert receiver.reference.reference(receiver.t_ns(5)) is None
+    for _ in range(2):
+        receiver.reference.sentence(build((UTC_S + 40) * NS_PER_S), receiver.t_ns(4.6))
+    reference = receiver.reference.reference(receiver.t_ns(4.6))
+    assert reference
+    assert reference.offset_ns + receiver.t_ns(4.6) == pytest.approx((UTC_S + 40.35) * NS_PER_S, abs=1000)
+
+
+def test_one_wrong_sentence_is_nothing_and_two_are_believed() -> None:
+    receiver = Receiver()
+    receiver.go(10)
+    receiver.go(1, says=3)
+    receiver.go(1)
+    assert abs(receiver.error_ns()) < 1000
+    receiver.go(2, says=3)
+    assert receiver.error_ns() == pytest.approx(3 * NS_PER_S, abs=1000)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "after_s"),
+    [
+        (build(UTC_S * NS_PER_S, valid=False), 0.3),
+        (build(UTC_S * NS_PER_S)[:-6], 0.3),
+        (build(UTC_S * NS_PER_S + 500 * NS_PER_MS), 0.3),
+        (build(UTC_S * NS_PER_S), 1.1),
+        (build(UTC_S * NS_PER_S), -0.1),
+    ],
+    ids=["status V", "damaged", "not yet", "after the next pulse", "before the pulse"],
+)
+def test_sentences_that_name_no_pulse_are_ignored(sentence: bytes, after_s: float) -> None:
+    receiver = Receiver()
+    receiver.go(5, says=None)
+    for _ in range(3):
+        receiver.reference.sentence(sentence, receiver.t_ns(after_s))
+    assert receiver.reference.sentences_ignored == 3
+    assert receiver.reference.reference(receiver.t_ns()) is None

@@ -1,0 +1,48 @@
+"""RMC sentences are found in any split, among anything, and nothing is kept without bound."""
+
+from random import Random
+
+import pytest
+
+from imud.kit.rmc import build
+from imud.units import NS_PER_S
+from imud.utc.splitter import LINE_BYTES_MAX, SentenceSplitter
+
+SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
+GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+JSON = b'{"class":"TPV","device":"/dev/ttyS0","mode":3}\r\n'
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 64, 10_000])
+def test_any_split_gives_the_same(size: int) -> None:
+    data = JSON + b"".join(sentence + GGA for sentence in SENTENCES)
+    splitter = SentenceSplitter()
+    found = [s for at in range(0, len(data), size) for s in splitter.feed(data[at : at + size])]
+    assert found == SENTENCES
+
+
+def test_a_sentence_behind_a_broken_one_is_found() -> None:
+    broken = SENTENCES[0][:30] + SENTENCES[1]
+    assert SentenceSplitter().feed(broken + b"noise\xff$" + SENTENCES[2]) == SENTENCES[1:3]
+
+
+def test_a_line_without_end_is_passed_over_and_not_kept() -> None:
+    splitter = SentenceSplitter()
+    for _ in range(100):
+        assert splitter.feed(b"$" + b"x" * 1000) == []
+        assert len(splitter._tail) <= LINE_BYTES_MAX + 1001
+    assert splitter.feed(SENTENCES[0][5:] + SENTENCES[1]) == [SENTENCES[1]]
+
+
+def test_what_came_before_a_break_is_forgotten() -> None:
+    splitter = SentenceSplitter()
+    splitter.feed(SENTENCES[0][:20])
+    splitter.clear()
+    assert splitter.feed(SENTENCES[0][20:] + SENTENCES[1]) == [SENTENCES[1]]
+
+
+def test_too_long_sentences_and_noise_are_none() -> None:
+    splitter, random = SentenceSplitter(), Random(1)
+    assert splitter.feed(b"$GPRMC," + b"1" * 120 + b"\r\n") == []
+    for _ in range(500):
+        splitter.feed(random.randbytes(random.randrange(200)))
