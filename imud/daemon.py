@@ -27,6 +27,7 @@ from imud.kit.status import DeviceState, DeviceStatus
 from imud.links import LINKS
 from imud.notify import notify, watchdog_interval_s
 from imud.pipeline.bus import Buses
+from imud.pipeline.can_bus import CanBuses
 from imud.pipeline.can_runner import CanRunner
 from imud.pipeline.device import Device
 from imud.pipeline.polled import PolledRunner
@@ -66,6 +67,7 @@ class Daemon:
         self._runners: dict[str, Device] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._buses = Buses()
+        self._can_buses = CanBuses()
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
         self._failure: BaseException | None = None
@@ -198,8 +200,8 @@ class Daemon:
         link, publish, tell = LINKS[device.link], self._publish, self._tell
         if link.polled:
             return PolledRunner(device, device_id, publish, tell, self._buses)
-        if isinstance(DRIVERS.get(device.driver), CanDriver):
-            return CanRunner(device, device_id, publish, tell)
+        if link.frames_only or isinstance(DRIVERS.get(device.driver), CanDriver):
+            return CanRunner(device, device_id, publish, tell, self._can_buses, self._remembered)
         return DeviceRunner(device, device_id, publish, tell, self._remembered)
 
     def _stop_device(self, name: str) -> None:

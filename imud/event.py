@@ -20,6 +20,8 @@ class EventKind(StrEnum):
     """The device's own settings, or the daemon's configuration, are not what they were."""
     ALARM = "alarm"
     """The alarm line or the alarm status of a device changed."""
+    MARK = "mark"
+    """A pulse came on SOUT_DIV: `detail` has its time, its number, and the `seq` of the sample it belongs to."""
     LINK = "link"
     """The state of the port or bus changed, though the device may go on: a CAN controller became error-passive."""
     BAD_FRAME = "bad-frame"

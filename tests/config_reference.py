@@ -11,7 +11,9 @@ import msgspec
 
 from imud.config import TABLES, DeviceGeneral, General
 from imud.kit.expected import expected, shown
+from imud.kit.lines import LINE_SCHEMAS, DeviceLines
 from imud.kit.settings import Settings
+from imud.utc.source import RmcSettings
 
 FILE = Path(__file__).parent.parent / "docs/configuration.md"
 BEGIN, END = "<!-- keys: begin -->\n", "<!-- keys: end -->\n"
@@ -39,6 +41,9 @@ def _own_docs_of(schema: type[Settings]) -> dict[str, str]:
     return found
 
 
+LINE_TITLES = {name: text.rstrip(".") for name, text in docs_of(DeviceLines).items()}
+
+
 def parts() -> Iterator[tuple[str, str, type[Settings]]]:
     """Title, path in the file, and schema of every part."""
     yield "The daemon", "", General
@@ -49,6 +54,9 @@ def parts() -> Iterator[tuple[str, str, type[Settings]]]:
         yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings
     for name, driver in TABLES.drivers.items():
         yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
+    for name, schema in LINE_SCHEMAS.items():
+        yield f"Line `{name}`: {LINE_TITLES[name]}", f"devices.NAME.lines.{name}.", schema
+    yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcSettings
 
 
 def default_of(field: msgspec.structs.FieldInfo) -> str:

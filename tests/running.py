@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, sleep
@@ -73,22 +73,32 @@ def write_config(folder: Path, devices: Mapping[str, Any], **more: Any) -> Path:
 
 
 @contextmanager
-def running_daemon(folder: Path, devices: Mapping[str, Any], **more: Any) -> Iterator[RunningDaemon]:
-    """Start it, wait for its socket, stop it at the end and see that it ended well."""
+def running_daemon(
+    folder: Path,
+    devices: Mapping[str, Any],
+    *,
+    limit_s: float = LIMIT_S,
+    python: Sequence[str] = ("-X", "dev", "-W", "error"),
+    **more: Any,
+) -> Iterator[RunningDaemon]:
+    """Start it, wait for its socket, stop it at the end and see that it ended well.
+
+    `python` are options of the interpreter; without them it is as fast as in life.
+    """
     file = write_config(folder, devices, **more)
-    argv = [sys.executable, "-X", "dev", "-W", "error", "-m", "imud", "run", "--config", str(file)]
+    argv = [sys.executable, *python, "-m", "imud", "run", "--config", str(file)]
     with (
         (folder / "log").open("w") as log,
         subprocess.Popen(argv, stderr=log, stdin=subprocess.DEVNULL, text=True) as process,
     ):
         daemon = RunningDaemon(folder, process)
         try:
-            wait_until(lambda: daemon.socket.exists() or process.poll() is not None, "the daemon's socket")
+            wait_until(lambda: daemon.socket.exists() or process.poll() is not None, "the daemon's socket", limit_s)
             assert process.poll() is None, (folder / "log").read_text()
             yield daemon
         finally:
             process.terminate()
-            status = process.wait(LIMIT_S)
+            status = process.wait(limit_s)
     text = (folder / "log").read_text()
     assert status == 0, text
     assert "Traceback" not in text, text

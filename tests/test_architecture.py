@@ -11,7 +11,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud", "imud.units"),
     ("imud.sample", "imud.errors", "imud.ledger", "imud.event"),
     ("imud.kit",),
-    ("imud.devices", "imud.clock", "imud.links", "imud.gpio", "imud.publishers"),
+    ("imud.devices", "imud.clock", "imud.links", "imud.gpio", "imud.publishers", "imud.utc"),
     ("imud.sim",),
     ("imud.config", "imud.detect", "imud.ports", "imud.client", "imud.notify", "imud.pipeline"),
     ("imud.daemon",),
@@ -100,4 +100,4 @@ def test_there_is_no_import_cycle() -> None:
 
 
 def test_only_one_module_imports_gpiod() -> None:
-    assert {m for m in MODULES if "gpiod" in imports(MODULES[m])} <= {"imud.gpio"}
+    assert {m for m in MODULES if "gpiod" in imports(MODULES[m])} <= {"imud.gpio.chips"}

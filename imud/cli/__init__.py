@@ -27,6 +27,7 @@ COMMANDS = {
     "demo": Command("imud.cli.demo", "run the daemon on a simulated sensor and show what it does"),
     "check": Command("imud.cli.check", "check a configuration file without opening any port"),
     "probe": Command("imud.cli.probe", "list what is attached"),
+    "modbus": Command("imud.cli.modbus", "find modules on an RS-485 line and give them addresses"),
     "decode": Command("imud.cli.decode", "raw capture in, one JSON object per message out"),
     "replay": Command("imud.cli.replay", "run a capture through the daemon's whole path"),
     "devices": Command("imud.cli.devices", "list the devices of the running daemon"),

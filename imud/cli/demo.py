@@ -21,8 +21,12 @@ from imud.cli.connect import statuses
 from imud.cli.demo_view import View
 from imud.cli.status import block, closes
 from imud.client import Client
+from imud.devices import DRIVERS
 from imud.errors import ImudError, LinkMissing
+from imud.kit.can import CanDriver
+from imud.kit.polling import PolledDriver
 from imud.sim import CAN_SIMULATORS, SIMULATORS
+from imud.sim.__main__ import DEVICE, simulated
 from imud.sim.can_port import default_interface
 
 START_LIMIT_S = 10.0
@@ -34,8 +38,16 @@ FOUND_LIMIT_S = 10.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud demo`."""
     parser.add_argument(
-        "--device", default="hipnuc-uart", choices=sorted([*SIMULATORS, *CAN_SIMULATORS]), help="default: %(default)s"
+        "--device",
+        action="append",
+        type=shown,
+        metavar="NAME[:NODE]",
+        help=f"what to simulate ({DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
+        "several times for several devices on one CAN interface; "
+        "or imu61x-i2c, imu61x-spi: a real one, on --bus or --port",
     )
+    parser.add_argument("--bus", type=int, metavar="N", help="I2C bus that a real device hangs on: 1 for /dev/i2c-1")
+    parser.add_argument("--port", metavar="NODE", help="SPI bus and chip select of a real device: /dev/spidev0.0")
     parser.add_argument("--interface", metavar="NAME", help="CAN interface of a CAN device (the first that is up)")
     parser.add_argument("--duration", type=float, metavar="S", help="stop after S seconds (default: at Ctrl-C)")
     parser.add_argument(
@@ -46,11 +58,47 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """0 when samples flowed and the ledger closed."""
-    interface = (args.interface or default_interface()) if args.device in CAN_SIMULATORS else ""
+    wanted: list[tuple[str, int]] = args.device or [(DEVICE, 0)]
+    if any(bus_of(name) for name, _ in wanted):
+        return run_on_bus(wanted, args)
+    on_can = [name in CAN_SIMULATORS for name, _ in wanted]
+    if len(wanted) > 1 and not all(on_can):
+        raise ImudError("expected one device on a port, or one or more on a CAN bus")
+    if len({*wanted}) < len(wanted):
+        raise ImudError("expected devices that differ, for example --device imu61x-can:101 --device imu61x-can:201")
+    interface = (args.interface or default_interface()) if all(on_can) else ""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-demo-")))
-        stack.enter_context(simulator(folder, args.device, args.rate, interface))
-        stack.enter_context(daemon(folder, device(folder, args.device, interface)))
+        stack.enter_context(simulator(folder, wanted, args.rate, interface))
+        names = ["demo"] if len(wanted) == 1 else [f"{name}-{node}" if node else name for name, node in wanted]
+        found = (device(folder, name, interface, node) for name, node in wanted)
+        stack.enter_context(daemon(folder, dict(zip(names, found, strict=True))))
+        return show(folder / "imud.sock", args)
+
+
+def shown(text: str) -> tuple[str, int]:
+    """Name and node of what is to be shown. Raises ArgumentTypeError."""
+    return (text, 0) if bus_of(text) else simulated(text)
+
+
+def bus_of(name: str) -> str:
+    """`i2c` or `spi` for a driver whose far end only hardware can be, otherwise empty."""
+    driver = DRIVERS.get(name)
+    return driver.link if isinstance(driver, PolledDriver) and driver.link in ("i2c", "spi") else ""
+
+
+def run_on_bus(wanted: list[tuple[str, int]], args: argparse.Namespace) -> int:
+    """The daemon on a bus of this machine with whatever device is there: nothing is simulated. As `run`."""
+    name, bus = wanted[0][0], bus_of(wanted[0][0])
+    if len(wanted) > 1:
+        raise ImudError(f"expected {name} alone, got {len(wanted)} devices")
+    key, value = ("bus", args.bus) if bus == "i2c" else ("port", args.port)
+    if value is None:
+        example = "--bus 1" if bus == "i2c" else "--port /dev/spidev0.0"
+        raise ImudError(f"{name} is not simulated: say where a real one is, for example {example}")
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-demo-")))
+        stack.enter_context(daemon(folder, {"demo": {"driver": name, bus: {key: value, "rate_hz": args.rate}}}))
         return show(folder / "imud.sock", args)
 
 
@@ -69,24 +117,24 @@ def show(path: Path, args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         pass
     with Client(str(path)) as client:
-        status = statuses(client)[0]
+        found = statuses(client)
     view.end()
-    print(block(status))
+    for status in found:
+        print(block(status))
     print(view.account())
-    good = status.ledger["samples"] > 0 and view.samples > 0 and closes(status.ledger)
+    good = view.samples > 0 and all(status.ledger["samples"] > 0 and closes(status.ledger) for status in found)
     print("the ledger closes to zero" if good else "FAILED: no samples, or a ledger that does not close")
     return 0 if good else 1
 
 
 @contextmanager
-def simulator(folder: Path, device: str, rate_hz: float, interface: str) -> Iterator[None]:
-    """The simulated sensor, its port at `folder`/port, or on a CAN interface."""
+def simulator(folder: Path, devices: list[tuple[str, int]], rate_hz: float, interface: str) -> Iterator[None]:
+    """The simulated sensor, its port at `folder`/port, or sensors on a CAN interface."""
     argv = [
         sys.executable,
         "-m",
         "imud.sim",
-        "--device",
-        device,
+        *(word for name, node in devices for word in ("--device", f"{name}:{node}" if node else name)),
         "--rate",
         str(rate_hz),
         "--path",
@@ -101,23 +149,27 @@ def simulator(folder: Path, device: str, rate_hz: float, interface: str) -> Iter
         yield
 
 
-def device(folder: Path, name: str, interface: str) -> dict[str, object]:
-    """Configuration of the device that is simulated."""
+def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, object]:
+    """Configuration of a device that is simulated."""
     if interface:
-        return {"driver": name, "socketcan": {"interface": interface}}
+        driver = DRIVERS[name]
+        options = msgspec.to_builtins(driver.node_settings(node)) if isinstance(driver, CanDriver) and node else {}
+        return {"driver": name, "options": options, "socketcan": {"interface": interface}}
+    if name == "hipnuc-modbus":
+        return {"driver": name, "rs485": {"line": str(folder / "port")}}
     return {"driver": "auto", "uart": {"port": str(folder / "port"), "baud": "auto"}}
 
 
 @contextmanager
-def daemon(folder: Path, settings: dict[str, object]) -> Iterator[None]:
-    """`imud run` on the simulated device, with everything it needs below `folder`."""
+def daemon(folder: Path, devices: dict[str, dict[str, object]]) -> Iterator[None]:
+    """`imud run` on the simulated devices, with everything it needs below `folder`."""
     tree = {
         "log_level": "error",
         "state_dir": str(folder),
         "socket": {"path": str(folder / "imud.sock")},
         "shm": {"directory": str(folder)},
         "metrics": {"port": 0},
-        "devices": {"demo": settings},
+        "devices": devices,
     }
     file = folder / "imud.yaml"
     file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML

@@ -25,6 +25,8 @@ class View:
         self._due_ns = 0
         self._first_ns = 0
         self._last: Sample | None = None
+        self._seqs: dict[str, int] = {}
+        """Number of the newest sample of each device."""
         self._latencies_ns: deque[int] = deque(maxlen=LATENCIES_KEPT)
 
     def add(self, sample: Sample) -> None:
@@ -32,8 +34,8 @@ class View:
         now_ns = monotonic_ns()
         if self._last is None:
             self._first_ns = sample.t_ns
-        else:
-            self.missed += sample.seq - self._last.seq - 1
+        self.missed += sample.seq - self._seqs.get(sample.device, sample.seq - 1) - 1
+        self._seqs[sample.device] = sample.seq
         self.samples += 1
         self._last = sample
         self._latencies_ns.append(now_ns - sample.t_rx_ns)
@@ -51,7 +53,7 @@ class View:
         if self._last is None:
             return "  client    no sample arrived"
         span_ns = self._last.t_ns - self._first_ns
-        rate = (self.samples + self.missed - 1) * NS_PER_S / span_ns if span_ns else 0.0
+        rate = (self.samples + self.missed - len(self._seqs)) * NS_PER_S / span_ns if span_ns else 0.0
         ordered = sorted(self._latencies_ns)
         at = {
             share: ordered[min(len(ordered) - 1, int(share * len(ordered)))] / NS_PER_US for share in (0.5, 0.99, 1.0)

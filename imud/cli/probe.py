@@ -1,4 +1,7 @@
-"""`imud probe`: list what is attached. Listens only; sends a query only to ports named with `--active`."""
+"""`imud probe`: list what is attached to serial ports and CAN buses.
+
+Listens only; sends a query only to ports and buses named with `--active`.
+"""
 
 import argparse
 import asyncio
@@ -6,6 +9,8 @@ import contextlib
 
 import msgspec
 
+from imud.cli.probe_can import examine_bus
+from imud.cli.probe_report import HEAD, Report, row
 from imud.cli.table import table
 from imud.config import DeviceConfig
 from imud.errors import CommandError, ImudError
@@ -14,37 +19,24 @@ from imud.kit.driver import Identity
 from imud.kit.link import StreamLink
 from imud.ledger import Ledger
 from imud.links import LINKS
+from imud.links.netlink import can_interfaces
 from imud.pipeline.device import identity_words
 from imud.pipeline.search import Finder, Finding
 from imud.pipeline.talk import Talk
 from imud.ports import list_ports
 
-HEAD = ("PORT", "DRIVER", "BAUD", "PRODUCT", "SERIAL NUMBER", "")
-
-
-class Report(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What stands at one port."""
-
-    port: str
-    title: str = ""
-    """What the adapter calls itself."""
-    driver: str = ""
-    baud: int = 0
-    identity: dict[str, str] = {}  # msgspec copies a mutable default
-    problem: str = ""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud probe`."""
-    parser.add_argument("port", nargs="*", metavar="PORT", help="ports to listen on (default: all of this machine)")
-    parser.add_argument("--active", action="append", default=[], metavar="PORT", help="a port that may be sent a query")
-    parser.add_argument("--json", action="store_true", help="one JSON object per port")
+    parser.add_argument("port", nargs="*", metavar="PORT", help="ports and CAN interfaces to listen on (default: all)")
+    parser.add_argument("--active", action="append", default=[], metavar="PORT", help="one that may be sent queries")
+    parser.add_argument("--json", action="store_true", help="one JSON object per port, or per device of a bus")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one line per port; 1 when no device was found."""
+    """Print one line per port, or per device of a bus; 1 when no device was found."""
     titles = {port.path: port.title for port in list_ports()}
-    chosen = [*args.port, *args.active] or list(titles)
+    chosen = [*args.port, *args.active] or [*titles, *can_interfaces(down=True)]
     reports = asyncio.run(examine_all(list(dict.fromkeys(chosen)), set(args.active), titles))
     if args.json:
         for report in reports:
@@ -52,30 +44,23 @@ def run(args: argparse.Namespace) -> int:
     elif reports:
         print(table(HEAD, [row(report) for report in reports]))
     else:
-        print("no serial port on this machine: is the adapter plugged in, is the UART switched on?")
+        print("no serial port and no CAN interface here: is the adapter plugged in, is the UART switched on?")
     return 0 if any(report.driver for report in reports) else 1
-
-
-def row(report: Report) -> tuple[object, ...]:
-    """A report as a line of the table."""
-    identity = report.identity
-    return (
-        report.port,
-        report.driver or "-",
-        report.baud or "-",
-        identity.get("product", "-"),
-        identity.get("serial_number", "-"),
-        report.problem or report.title,
-    )
 
 
 async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]) -> list[Report]:
     """All ports at the same time."""
-    return list(await asyncio.gather(*(examine(port, port in active, titles.get(port, "")) for port in ports)))
+    found = await asyncio.gather(
+        *(
+            examine(port, port in active, titles.get(port, "")) if "/" in port else examine_bus(port, port in active)
+            for port in ports
+        )
+    )
+    return [report for reports in found for report in reports]
 
 
-async def examine(port: str, may_ask: bool, title: str) -> Report:
-    """Open a port, find what talks there, ask it who it is if that is allowed."""
+async def examine(port: str, may_ask: bool, title: str) -> list[Report]:
+    """Open a serial port, find what talks there, ask it who it is if that is allowed."""
     settings = msgspec.convert({"port": port, "baud": "auto"}, LINKS["uart"].settings)
     config = DeviceConfig("probe", "auto", None, may_ask, "uart", settings)
     link = LINKS["uart"].make(settings)
@@ -83,9 +68,9 @@ async def examine(port: str, may_ask: bool, title: str) -> Report:
         link.open()
         found = await find(config, link)
         identity = await ask(found, link) if may_ask else Identity()
-        return Report(port, title, found.driver.name, link.baud, identity_words(identity))
+        return [Report(port, title, found.driver.name, baud=link.baud, identity=identity_words(identity))]
     except ImudError as error:
-        return Report(port, title, problem=str(error))
+        return [Report(port, title, problem=str(error))]
     finally:
         link.close()
 

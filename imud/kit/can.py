@@ -59,6 +59,24 @@ class CanFilter:
         return extended == self.extended and not (can_id ^ self.can_id) & self.mask
 
 
+@dataclass(frozen=True, slots=True)
+class CyclicFrame:
+    """A frame that a bus must carry again and again for its devices to work (CANopen SYNC, say); imud sends it.
+
+    One device of a bus has it sent for all of them: a second one with a frame of the same identifier is refused."""
+
+    can_id: int
+    extended: bool
+    data: bytes
+    every_ns: int
+    """Its period, whole microseconds; the first one is sent at once."""
+
+
+def nothing_cyclic(_settings: Any) -> Sequence[CyclicFrame]:
+    """The cyclic frames of a device that needs none."""
+    return ()
+
+
 class CanCodec(Protocol):
     """Turns the frames of one device into events. Frames of others may be among them and change nothing.
 
@@ -106,6 +124,9 @@ class CanDriver(Driver):
     """Frames that make one sample."""
     example_frames: Callable[[Random], Sequence[CanFrame]]
     """Valid frames that make one sample, in the order they are sent, with random values and the default settings."""
+    cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
+    """Frames that imud must send for a device with these settings, as long as the link is open; of a link that may not
+    send, none are."""
 
 
 def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:

@@ -9,6 +9,7 @@ from imud.kit.action import Actions
 from imud.kit.codec import StreamCodec
 from imud.kit.session import Conversation
 from imud.kit.settings import Settings
+from imud.kit.timing import NO_TIME_BITS, TimeBits
 from imud.ledger import Ledger
 
 SAMPLE_COUNTER = 0
@@ -48,6 +49,8 @@ class Driver:
     """What the device can be told to do, by name."""
     lines: frozenset[str] = frozenset()
     """Wires besides its data that such a device can have: names of `imud.kit.lines.DeviceLines`."""
+    time_bits: TimeBits = NO_TIME_BITS
+    """Bits of `Measurement.status` that speak of time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +67,9 @@ class StreamDriver(Driver):
     """Reads back the device's own settings, by the device's own names, and leaves it as it was."""
     apply_identity: Callable[[StreamCodec, Identity], None]
     """Tells the codec what is known of the device (the meaning of a field can depend on the firmware)."""
+    wake: Callable[[], Conversation[bool]] | None = None
+    """Makes a device send samples that answers and sends none, and says whether it acknowledged; nothing is saved.
+    Raises NoReply where nothing answers. None for devices that cannot be silent."""
     example_frame: Callable[[Random], bytes]
     """One valid frame with random values, for the shared property tests and for fault injection."""
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from imud.errors import LinkError
-from imud.kit.can import CanDriver, CanFilter, CanFrame
+from imud.kit.can import CanDriver, CanFilter, CanFrame, CyclicFrame
 from imud.kit.driver import Driver, StreamDriver
 from imud.kit.polling import PolledDriver, Transfer
 from imud.kit.settings import Settings
@@ -76,8 +76,10 @@ class StreamLink(Link, Protocol):
 class CanLink(Link, Protocol):
     """A CAN bus as one device sees it; several devices share a bus, each by a link of its own."""
 
+    bus: str
+    """What it shares with others: links of the same bus hear the same frames."""
     filters: Sequence[CanFilter]
-    """Frames to deliver; set before `open`. Others may come all the same."""
+    """Frames to deliver; holds from the moment it is set. Others may come all the same."""
     bitrate: int
     """Rate of the bus in bit/s, known once open; 0 where there is none (virtual buses) or nobody says."""
 
@@ -87,6 +89,10 @@ class CanLink(Link, Protocol):
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Deliver frames from now on. Needs a running loop and an open bus."""
+        ...
+
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Send these and no others again and again, until `close`. Needs what `start` needs. Raises LinkError."""
         ...
 
 
@@ -153,7 +159,12 @@ class LinkType:
     @property
     def searchable(self) -> bool:
         """Whether `driver: auto` finds out what talks on it."""
-        return self.make is not _no_bytes or self.polled
+        return self.make is not _no_bytes or self.polled or self.frames_only
+
+    @property
+    def frames_only(self) -> bool:
+        """Whether every device on it stands on a CAN bus."""
+        return self.make_can is not _no_frames and self.make is _no_bytes
 
     def fits(self, driver: Driver) -> bool:
         """Whether a driver can use such a link."""

@@ -39,7 +39,17 @@ class ClockStatus(msgspec.Struct, frozen=True):
     resets: int = 0
     """Times the device's clock started anew (restart of the device, jump of its counter)."""
     hold_ns: int = 0
-    """How long the adapter may hold bytes back (USB latency timer), 0 if it does not."""
+    """How long the link's adapter may hold bytes back (USB latency timer); 0 for none."""
+    edges: int = 0
+    """Pulses on the SOUT line, or triggers given on SIN."""
+    edges_unpaired: int = 0
+    """Of the pulses, those that belong to no sample: its frame was lost, or they were no pulses of the device."""
+    samples_unpaired: int = 0
+    """Samples that came while pulses did and whose own was not seen."""
+    triggers_missed: int = 0
+    """Triggers on SIN that no frame answered."""
+    reference_error_ns: int = 0
+    """One-sigma error of what the host knows of UTC; 0 while it knows nothing."""
 
 
 class KernelCounters(msgspec.Struct, frozen=True):
@@ -75,6 +85,53 @@ class PollingStatus(msgspec.Struct, frozen=True):
     """From deadline to read, mean over `polls`."""
     late_worst_ns: int = 0
     """The longest."""
+    late_sum_ns: int = 0
+    """All of them together."""
+
+
+class LinesStatus(msgspec.Struct, frozen=True):
+    """The wires of one device besides its data, since start."""
+
+    problems: dict[str, str]
+    """Why a line is not watched or driven now, by its key in the configuration; empty when all are."""
+    edges: dict[str, int]
+    """Edges seen, by line."""
+    edges_lost: dict[str, int]
+    """Edges that the kernel dropped because they were not read in time, by line."""
+    alarm: bool | None = None
+    """Whether the ALARM line is active; None without one, or while nobody knows."""
+    alarms: int = 0
+    """Times it became active."""
+    triggers: int = 0
+    """Rising edges made on SIN."""
+    triggers_missed: int = 0
+    """Deadlines for which none was made: the host was busy."""
+    trigger_late_mean_ns: int = 0
+    """From deadline to edge, mean over `triggers`."""
+    trigger_late_worst_ns: int = 0
+    """The longest."""
+
+
+class UtcStatus(msgspec.Struct, frozen=True):
+    """How a device is told UTC, and what the host knows of it, since start."""
+
+    source: str
+    """Where RMC sentences come from, for people; empty where it is fed none."""
+    problem: str
+    """What is wrong with that or with the feed of chronyd now, one sentence; empty when all is well."""
+    sentences: int = 0
+    """Sentences that the source gave."""
+    sent: int = 0
+    """Of these, sent to the device."""
+    refused: dict[str, int] = {}  # msgspec copies a mutable default
+    """Sentences that were not sent, by cause."""
+    pulses: int = 0
+    """Pulses per second that counted."""
+    pulses_ignored: int = 0
+    """Those that were in step with none."""
+    chrony_sent: int = 0
+    """Samples given to chronyd."""
+    chrony_refused: int = 0
 
 
 LATENCY_BOUNDS_NS = (
@@ -128,6 +185,10 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     """The frame that `quat_wxyz` turns into; empty while the driver is not known."""
     polling: PollingStatus | None = None
     """None for a device that sends by itself."""
+    lines: LinesStatus | None = None
+    """None for a device without lines."""
+    utc: UtcStatus | None = None
+    """None for a device that is neither fed sentences nor has its pulse per second at the host."""
 
 
 class ClientStatus(msgspec.Struct, frozen=True):

@@ -10,6 +10,7 @@ LINKS: Table[LinkType] = Table(
         "socketcan": "imud.links.socketcan:LINK",
         "i2c": "imud.links.i2c:LINK",
         "spi": "imud.links.spi:LINK",
+        "rs485": "imud.links.rs485:LINK",
         "replay": "imud.links.replay:LINK",
         "memory": "imud.links.memory:LINK",
     },

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from imud.errors import LinkError
-from imud.kit.can import CanFilter, CanFrame
+from imud.kit.can import CanFilter, CanFrame, CyclicFrame
 from imud.kit.candump import CandumpReader
 from imud.kit.link import OnBusNews, OnEnd, OnFrames
 from imud.kit.status import KernelCounters
@@ -36,7 +36,7 @@ class CanReplayLink:
         self._span_ns = 0
         self._frames: Iterator[CanFrame] = iter(())
         self.filters: Sequence[CanFilter] = ()
-        self.title = settings.path
+        self.title = self.bus = settings.path
         self.bitrate = 0
         self.writable = False
 
@@ -68,6 +68,10 @@ class CanReplayLink:
         """Play from the beginning."""
         self._frames = self._play(time.monotonic_ns() - self._span_ns)
         self._handle = asyncio.get_running_loop().call_soon(self._turn, on_frames, on_end, None)
+
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Raises LinkError: there is nobody at the far end."""
+        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
 
     def write(self, data: bytes) -> None:
         """Raises LinkError: there is nobody at the far end."""

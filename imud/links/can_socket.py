@@ -20,6 +20,7 @@ from collections.abc import Callable
 from typing import Final
 
 from imud.kit.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, CanFrame
+from imud.links.mmsg import Message, Vector, libc
 from imud.units import NS_PER_S, NS_PER_US
 
 BATCH_FRAMES: Final = 64
@@ -40,35 +41,6 @@ _CONTROL: Final = struct.Struct(f"={_WORD}iiqq{_WORD}iiI{_CONTROL_BYTES - struct
 
 OnErrorFrame = Callable[[int, bytes], bool]
 """Called with class bits and data of an error frame; returns whether frames are missing since."""
-
-
-class _Header(ctypes.Structure):
-    """`struct msghdr`."""
-
-    _fields_ = (
-        ("name", ctypes.c_void_p),
-        ("name_bytes", ctypes.c_uint32),
-        ("vector", ctypes.c_void_p),
-        ("vector_count", ctypes.c_size_t),
-        ("control", ctypes.c_void_p),
-        ("control_bytes", ctypes.c_size_t),
-        ("flags", ctypes.c_int),
-    )
-
-
-class _Message(ctypes.Structure):
-    """`struct mmsghdr`."""
-
-    _fields_ = (("header", _Header), ("received_bytes", ctypes.c_uint))
-
-
-class _Vector(ctypes.Structure):
-    """`struct iovec`."""
-
-    _fields_ = (("base", ctypes.c_void_p), ("bytes", ctypes.c_size_t))
-
-
-_libc = ctypes.CDLL(None, use_errno=True)
 
 
 class FrameReader:
@@ -92,9 +64,9 @@ class FrameReader:
         self._wall_ns = wall_ns
         self._frames = bytearray(RAW_FRAME.size * BATCH_FRAMES)
         self._control = bytearray(_CONTROL_BYTES * BATCH_FRAMES)
-        self._vectors = (_Vector * BATCH_FRAMES)()
-        self._headers = bytearray(ctypes.sizeof(_Message) * BATCH_FRAMES)
-        self._messages = (_Message * BATCH_FRAMES).from_buffer(self._headers)
+        self._vectors = (Vector * BATCH_FRAMES)()
+        self._headers = bytearray(ctypes.sizeof(Message) * BATCH_FRAMES)
+        self._messages = (Message * BATCH_FRAMES).from_buffer(self._headers)
         self._lay_out()
         self._fresh_headers = bytes(self._headers)
         self._empty_ns = now_ns()
@@ -104,14 +76,14 @@ class FrameReader:
     def read(self) -> list[CanFrame]:
         """Data frames that are there, at most BATCH_FRAMES, oldest first. Raises OSError as the kernel names it."""
         begun_ns = self._now_ns()
-        count = _libc.recvmmsg(self._fd, self._messages, BATCH_FRAMES, socket.MSG_DONTWAIT, None)
+        count = libc.recvmmsg(self._fd, self._messages, BATCH_FRAMES, socket.MSG_DONTWAIT, None)
         if count < 0:
             return self._failed(ctypes.get_errno(), begun_ns)
         offset_ns, now_ns = self._clocks()
         frames = self._taken(count, offset_ns, now_ns)
         if count < BATCH_FRAMES:
             self._empty_ns = begun_ns
-        header_size = count * ctypes.sizeof(_Message)
+        header_size = count * ctypes.sizeof(Message)
         self._headers[:header_size] = self._fresh_headers[:header_size]
         return frames
 
@@ -161,5 +133,5 @@ class FrameReader:
             self._vectors[i].base = frames + i * RAW_FRAME.size
             self._vectors[i].bytes = RAW_FRAME.size
             header = message.header
-            header.vector, header.vector_count = vector + i * ctypes.sizeof(_Vector), 1
+            header.vector, header.vector_count = vector + i * ctypes.sizeof(Vector), 1
             header.control, header.control_bytes = control + i * _CONTROL_BYTES, _CONTROL_BYTES

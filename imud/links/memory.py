@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from imud.errors import LinkBusy, LinkError, LinkMissing
-from imud.kit.can import CanFilter, CanFrame
+from imud.kit.can import CanFilter, CanFrame, CyclicFrame
 from imud.kit.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
 from imud.kit.settings import Settings
 from imud.kit.status import KernelCounters
@@ -128,9 +128,11 @@ class MemoryCanLink:
     """A `CanLink` whose far end is the test. Synchronization: the loop's thread only."""
 
     def __init__(self, settings: MemorySettings) -> None:
-        self.title = settings.name
+        self.title = self.bus = settings.name
         self.writable = settings.writable
         self.filters: Sequence[CanFilter] = ()
+        self.cyclic: Sequence[CyclicFrame] = ()
+        """What `send_cyclic` was given; empty when closed."""
         self.bitrate: int = 0 if settings.baud == "auto" else settings.baud
         self.written: list[bytes] = []
         """Every `write`, in order."""
@@ -197,6 +199,12 @@ class MemoryCanLink:
         """Deliver what is fed from now on."""
         self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
 
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Keep the frames in `cyclic`. Raises LinkError when closed."""
+        if not self.is_open:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        self.cyclic = frames
+
     def write(self, data: bytes) -> None:
         """Keep the frames in `written`. Raises LinkError when closed."""
         if not self.is_open:
@@ -210,6 +218,7 @@ class MemoryCanLink:
     def close(self) -> None:
         """Nobody listens from now on; may be called twice."""
         self.is_open = False
+        self.cyclic = ()
         self._on_frames = self._on_news = self._on_end = None
 
 

@@ -53,12 +53,12 @@ def absence(name: str, sys: Path = SYS) -> str:
     return "" if flags & IFF_UP else f"{name} is down: set its bit rate and take it up (`ip link set {name} up`)"
 
 
-def can_interfaces(sys: Path = SYS) -> list[str]:
-    """Names of the CAN interfaces that are up, in order."""
+def can_interfaces(sys: Path = SYS, *, down: bool = False) -> list[str]:
+    """Names of the CAN interfaces that are up, in order; with `down` of those that are not as well."""
     found = []
     for folder in sorted((sys / "class/net").glob("*")):
         with suppress(LinkError):
-            if not absence(folder.name, sys):
+            if not absence(folder.name, sys) or down:
                 found.append(folder.name)
     return found
 

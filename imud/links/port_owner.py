@@ -1,10 +1,10 @@
 """Who may use a port and who does, for messages to people."""
 
-import grp
 import os
-import pwd
 from pathlib import Path
 from typing import Final
+
+from imud.kit import access
 
 SERIAL_GROUP: Final = "dialout"
 """Group of serial ports on Debian and its relatives; named where a port's own group is of no help."""
@@ -12,20 +12,7 @@ SERIAL_GROUP: Final = "dialout"
 
 def group_of(path: str) -> str:
     """Name of the group that may use the port, `dialout` where only root may or nothing is known."""
-    try:
-        gid = os.stat(path).st_gid
-        return grp.getgrgid(gid).gr_name if gid else SERIAL_GROUP
-    except (OSError, KeyError):
-        return SERIAL_GROUP
-
-
-def user_name() -> str:
-    """Name of the user this process runs as, or its number."""
-    uid = os.geteuid()
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return str(uid)
+    return access.group_of(path, SERIAL_GROUP)
 
 
 def holders_of(path: str, proc: Path) -> str:

@@ -16,7 +16,8 @@ from typing import Final
 import serial
 
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
-from imud.links.port_owner import group_of, holders_of, user_name
+from imud.kit.access import user_name
+from imud.links.port_owner import group_of, holders_of
 
 TCGETS2: Final = 0x802C542A
 """ioctl: struct termios2, which has the rate as a number (asm-generic/termbits.h)."""

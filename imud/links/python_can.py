@@ -11,11 +11,13 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import can
+from can.typechecking import CanFilters
 
 from imud.errors import LinkError
-from imud.kit.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilter, CanFrame
+from imud.kit.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilter, CanFrame, CyclicFrame
 from imud.kit.link import OnBusNews, OnEnd, OnFrames
 from imud.kit.status import KernelCounters
+from imud.links.can_cyclic import LoopSender
 
 LOOK_S: Final = 0.05
 """How long the thread waits for a frame before it looks whether it is to end."""
@@ -31,10 +33,23 @@ class PythonCanLink:
         self._bus: can.BusABC | None = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self.filters: Sequence[CanFilter] = ()
-        self.title = f"{channel} ({backend})"
+        self._filters: Sequence[CanFilter] = ()
+        self._sender: LoopSender | None = None
+        self._on_end: OnEnd | None = None
+        self.title = self.bus = f"{channel} ({backend})"
         self.bitrate = bitrate
         self.writable = True
+
+    @property
+    def filters(self) -> Sequence[CanFilter]:
+        """Frames to deliver."""
+        return self._filters
+
+    @filters.setter
+    def filters(self, filters: Sequence[CanFilter]) -> None:
+        self._filters = filters
+        if self._bus is not None:
+            self._bus.set_filters(_as_python_can(filters))
 
     def absence(self) -> str:
         """Nobody says before it is opened."""
@@ -45,7 +60,7 @@ class PythonCanLink:
 
     def open(self) -> None:
         """Open the bus. Raises LinkError with what python-can says."""
-        filters = [{"can_id": f.can_id, "can_mask": f.mask, "extended": f.extended} for f in self.filters]
+        filters = _as_python_can(self._filters)
         rate: dict[str, Any] = {"bitrate": self.bitrate} if self.bitrate else {}
         try:
             self._bus = can.Bus(self._channel, self._backend, can_filters=filters, ignore_config=True, **rate)
@@ -55,6 +70,7 @@ class PythonCanLink:
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Deliver frames from now on; this kind of bus tells no news."""
         assert self._bus is not None
+        self._on_end = on_end
         self._stop = threading.Event()
         arguments = (self._bus, self._stop, asyncio.get_running_loop(), on_frames, on_end)
         self._thread = threading.Thread(target=self._receive, args=arguments, name=f"can {self._channel}")
@@ -74,6 +90,15 @@ class PythonCanLink:
         except can.CanError as error:
             raise LinkError(f"{self.title} does not send: {error}") from error
 
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Send these from the event loop; the link ends when one cannot be sent. Raises LinkError.
+
+        python-can's own `send_periodic` needs a thread for each frame and tells nobody when it fails.
+        """
+        if self._sender is not None:
+            self._sender.close()
+        self._sender = LoopSender(self.write, self._failed, frames)
+
     def kernel_counters(self) -> KernelCounters:
         """python-can counts nothing."""
         return KernelCounters()
@@ -81,12 +106,19 @@ class PythonCanLink:
     def close(self) -> None:
         """Release the bus; may be called twice. Waits for the thread, LOOK_S at most."""
         self._stop.set()
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join()
         bus, self._bus = self._bus, None
         if bus is not None:
             bus.shutdown()
+
+    def _failed(self, error: LinkError) -> None:
+        if self._on_end is not None:
+            self._on_end(error)
 
     def _receive(
         self,
@@ -114,6 +146,10 @@ class PythonCanLink:
         except (can.CanError, OSError) as error:
             if not stop.is_set():
                 loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {error}"))
+
+
+def _as_python_can(filters: Sequence[CanFilter]) -> CanFilters:
+    return [{"can_id": f.can_id, "can_mask": f.mask, "extended": f.extended} for f in filters]
 
 
 def _batch(bus: can.BusABC) -> list[CanFrame]:

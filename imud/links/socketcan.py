@@ -18,12 +18,13 @@ from typing import Annotated, Final
 from msgspec import Meta
 
 from imud.errors import LinkDenied, LinkError, LinkMissing
-from imud.kit.can import EXTENDED_FLAG, RAW_FRAME, REMOTE_FLAG, CanFilter
+from imud.kit.can import EXTENDED_FLAG, RAW_FRAME, REMOTE_FLAG, CanFilter, CyclicFrame
 from imud.kit.link import CanLink, LinkType, OnBusNews, OnEnd, OnFrames
 from imud.kit.settings import Settings
 from imud.kit.status import KernelCounters
 from imud.links import netlink
-from imud.links.can_socket import FrameReader
+from imud.links.can_cyclic import NO_MANAGER, KernelSender, LoopSender, Sender
+from imud.links.can_socket import BATCH_FRAMES, FrameReader
 from imud.links.can_state import WATCHED, BusState
 
 NATIVE: Final = "socketcan"
@@ -44,6 +45,8 @@ class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fiel
     """Network interface, for example `can0` (`ip link` lists them); for another backend its channel."""
     receive_buffer_bytes: Annotated[int, Meta(ge=4096, le=1 << 26)] = 1 << 20
     """Kernel memory for frames that wait to be read, about 960 bytes each. The system may allow less."""
+    coalesce_ms: Annotated[int, Meta(ge=0, le=100)] = 0
+    """Let frames gather for so long before they are read: less CPU, more delay. Their time stamps stay the kernel's."""
     backend: Annotated[str, Meta(min_length=1)] = NATIVE
     """`socketcan`, or the name of another interface of python-can, for example `virtual` or `slcan`."""
     bitrate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
@@ -60,6 +63,8 @@ class SocketCanLink:
 
     def __init__(self, settings: SocketCanSettings, *, sys: Path = netlink.SYS) -> None:
         self._settings = settings
+        self._coalesce_s = settings.coalesce_ms / 1000
+        self._timer: asyncio.TimerHandle | None = None
         self._sys = sys
         self._socket: socket.socket | None = None
         self._reader: FrameReader | None = None
@@ -68,10 +73,22 @@ class SocketCanLink:
         self._on_frames: OnFrames = _nobody
         self._on_news: OnBusNews = _nobody_hears
         self._on_end: OnEnd = _nobody_ends
-        self.filters: Sequence[CanFilter] = ()
-        self.title = settings.interface
+        self._filters: Sequence[CanFilter] = ()
+        self._sender: Sender | None = None
+        self.title = self.bus = settings.interface
         self.bitrate = 0
         self.writable = True
+
+    @property
+    def filters(self) -> Sequence[CanFilter]:
+        """Frames to deliver."""
+        return self._filters
+
+    @filters.setter
+    def filters(self, filters: Sequence[CanFilter]) -> None:
+        self._filters = filters
+        if self._socket is not None:
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
 
     def absence(self) -> str:
         """Why the interface cannot be used now; empty when it can. Raises LinkError when it is no CAN interface."""
@@ -99,7 +116,7 @@ class SocketCanLink:
         assert self._socket is not None
         self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(self._socket.fileno(), self._read)
+        self._loop.add_reader(self._socket.fileno(), self._read_coalescing if self._coalesce_s else self._read)
         if problem := self._state.problem:
             on_news(problem, problem)
 
@@ -115,6 +132,17 @@ class SocketCanLink:
                 raise LinkError(f"{self.title} does not send, its queue is full: is it alone on the bus?") from error
             raise self._explained(error) from error
 
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Have the kernel send these; by the event loop, less exactly, where it cannot. Raises LinkError."""
+        self._end_sender()
+        try:
+            self._sender = KernelSender(self._settings.interface, frames)
+        except OSError as error:
+            if error.errno not in NO_MANAGER:
+                raise self._explained(error) from error
+            log.info("%s: this kernel has no CAN_BCM (module can_bcm): cyclic frames are less exact", self.title)
+            self._sender = LoopSender(self.write, self._on_end, frames)
+
     def kernel_counters(self) -> KernelCounters:
         """Frames that the kernel or the controller dropped, and states of the controller, since `open`."""
         dropped = self._reader.dropped if self._reader else 0
@@ -123,6 +151,10 @@ class SocketCanLink:
 
     def close(self) -> None:
         """Release the socket; may be called twice."""
+        self._end_sender()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
         if self._loop is not None and self._socket is not None:
             self._loop.remove_reader(self._socket.fileno())
         self._loop = None
@@ -131,10 +163,15 @@ class SocketCanLink:
         if opened is not None:
             opened.close()
 
+    def _end_sender(self) -> None:
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
+
     def _bound(self) -> socket.socket:
         opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
         try:
-            opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(self.filters))
+            opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(self._filters))
             opened.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, struct.pack("=I", WATCHED))
             self._enlarge(opened)
             opened.bind((self._settings.interface,))
@@ -157,16 +194,33 @@ class SocketCanLink:
                 self.title, got, self._settings.receive_buffer_bytes, got // FRAME_BUFFER_BYTES,
             )  # fmt: skip
 
-    def _read(self) -> None:
-        """One batch; what is left makes the loop call again."""
+    def _read(self) -> int:
+        """One batch, and how many frames it had; what is left makes the loop call again. -1 when the bus ended."""
         assert self._reader is not None
         try:
             frames = self._reader.read()
         except OSError as error:
             self._end(error)
-            return
+            return -1
         if frames:
             self._on_frames(frames)
+        return len(frames)
+
+    def _read_coalescing(self) -> None:
+        """A batch; when there is no more, look away for a while. A bus without frames is watched again."""
+        loop, opened = self._loop, self._socket
+        count = self._read()
+        if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed
+            return
+        if count and self._timer is None:
+            loop.remove_reader(opened.fileno())
+        if count >= BATCH_FRAMES // 2:  # some of the batch may be no data frames
+            self._timer = loop.call_later(0, self._read_coalescing)
+        elif count:
+            self._timer = loop.call_later(self._coalesce_s, self._read_coalescing)
+        elif self._timer is not None:
+            self._timer = None
+            loop.add_reader(opened.fileno(), self._read_coalescing)
 
     def _on_error_frame(self, classes: int, data: bytes) -> bool:
         state = self._state

@@ -17,9 +17,11 @@ from imud.clock import SampleClock
 from imud.config import DeviceConfig
 from imud.errors import BadArgument, CommandError, LinkError, LinkMissing
 from imud.event import Event, EventKind
+from imud.gpio import LINES
 from imud.kit.action import Action, Actions, Target
 from imud.kit.batch import Batch
 from imud.kit.driver import Driver, Identity
+from imud.kit.lines import LineMaker
 from imud.kit.link import Link
 from imud.kit.session import Conversation
 from imud.kit.settings import Settings
@@ -29,6 +31,8 @@ from imud.pipeline.meters import LatencyMeter, RateMeter
 from imud.pipeline.notices import Notices
 from imud.pipeline.path import SamplePath
 from imud.pipeline.talk import Talk
+from imud.pipeline.utc_keeper import Port, make_keeper
+from imud.pipeline.wires import Wires
 from imud.units import NS_PER_MS, NS_PER_S
 
 log = logging.getLogger(__name__)
@@ -59,6 +63,7 @@ class Device(ABC):
         publish: Callable[[Batch], None],
         tell: Callable[[Event], None],
         link: Link,
+        lines: LineMaker = LINES,
     ) -> None:
         self.config = config
         self.device_id = device_id
@@ -69,6 +74,11 @@ class Device(ABC):
         self._notices = Notices(config.name, self.ledger, tell)
         self.link = link
         self._talk = Talk(self.ledger, link.write, self._change_rate)
+        self._utc = make_keeper(config, Port(link.write, lambda: self._rate_bit_s, lambda: self._talk.busy))
+        self._wires: Wires | None = None
+        if config.lines is not None:
+            on_pulses = self._utc.pulses if self._utc is not None else None
+            self._wires = Wires(config.name, config.lines, lines, self._notices, on_pulses)
         self._driver: Driver | None = None
         self._clock: SampleClock | None = None
         self._path: SamplePath | None = None
@@ -81,22 +91,24 @@ class Device(ABC):
 
     async def run(self) -> None:
         """Keep the device alive until cancelled, or until a replay ends."""
-        while True:
-            try:
-                await self._wait_present()
-                await self._live()
-                self._set(DeviceState.FINISHED)
-                return
-            except LinkMissing as error:
-                self._down(DeviceState.MISSING, str(error))
-                await asyncio.sleep(GONE_S)
-            except LinkError as error:
-                self._down(DeviceState.FAILED, str(error))
-                await asyncio.sleep(RETRY_S)
+        try:
+            if self._utc is not None:
+                self._utc.start()
+            await self._live_again_and_again()
+            self._set(DeviceState.FINISHED)
+        finally:
+            if self._wires is not None:
+                self._wires.stop()
+            if self._utc is not None:
+                await self._utc.close()
 
     def tick(self, now_ns: int) -> None:
         """Ten times a second: states, idle line, events that gathered."""
         self._rate.mark(now_ns, self.ledger.samples)
+        if self._wires is not None:
+            self._wires.tick(now_ns)
+        if self._utc is not None:
+            self._utc.tick(now_ns, self._clock)
         path = self._path
         if path is None:
             return
@@ -151,6 +163,20 @@ class Device(ABC):
 
     # --- the link's life -----------------------------------------------------------------------------------------
 
+    async def _live_again_and_again(self) -> None:
+        """Live with the link, and again when it is back; returns at the regular end of a replay."""
+        while True:
+            try:
+                await self._wait_present()
+                await self._live()
+                return
+            except LinkMissing as error:
+                self._down(DeviceState.MISSING, str(error))
+                await asyncio.sleep(GONE_S)
+            except LinkError as error:
+                self._down(DeviceState.FAILED, str(error))
+                await asyncio.sleep(RETRY_S)
+
     async def _live(self) -> None:
         """From open to the end of the link; returns at the regular end of a replay. Raises LinkError."""
         self.link.open()
@@ -170,6 +196,8 @@ class Device(ABC):
             await asyncio.gather(working, return_exceptions=True)
             self._end_work()
             self.close()
+            if self._wires is not None:
+                self._wires.rest()
             if self._path is not None:
                 self._path.reset()
 
@@ -180,6 +208,7 @@ class Device(ABC):
             tick_modulus=driver.tick_modulus,
             byte_ns=byte_ns,
             hold_ns=hold_ns,
+            bits=driver.time_bits,
         )
         if self._clock is not None:
             clock.follow(self._clock)
@@ -329,6 +358,8 @@ class Device(ABC):
             temperature_c=newest.temperature_c if newest else None,
             status_bits=newest.status if newest else None,
             connects=self._connects,
+            lines=self._wires.status() if self._wires is not None else None,
+            utc=self._utc.status() if self._utc is not None else None,
         )
 
 

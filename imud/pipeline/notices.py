@@ -14,6 +14,8 @@ log = logging.getLogger(__name__)
 INTERVAL_NS = NS_PER_S
 """At most one loss and one bad-frame event a second and device."""
 RAW_SHOWN_BYTES = 32
+LEVELS = {EventKind.UP: logging.INFO, EventKind.MARK: logging.DEBUG}
+"""What is not worth a warning; marks come as often as a camera is triggered."""
 
 
 class Notices:
@@ -31,7 +33,7 @@ class Notices:
 
     def tell(self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None) -> None:
         """Send one event, and log it."""
-        log.log(logging.WARNING if kind is not EventKind.UP else logging.INFO, "%s: %s", self._device, message)
+        log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self._device, message)
         self._send(Event(now_ns, self._device, kind, message, detail))
 
     def bad_frame(self, frame: BadFrame) -> None:

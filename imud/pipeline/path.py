@@ -33,6 +33,8 @@ class SamplePath(ABC):
         overruns: Callable[[], int],
     ) -> None:
         self.clock = clock
+        self.drain: Callable[[], None] | None = None
+        """Called before what was read is fed: edges of lines come to the clock before the frames that follow them."""
         self.latency = LatencyMeter()
         self.newest: Sample | None = None
         self.begun_ns = 0
@@ -121,6 +123,8 @@ class StreamPath(SamplePath):
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Take bytes as read, with CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
+        if self.drain is not None:
+            self.drain()
         events = self.codec.feed(data)
         if events:
             self.take(events, t_rx_ns)
@@ -160,11 +164,14 @@ class CanPath(SamplePath):
         for can_id, extended, data, t_rx_ns, after_loss in frames:
             if after_loss:
                 self.codec.reset()
-            if not ledger.frames_pending:
+            pending = ledger.frames_pending
+            if not pending:
                 self._first_ns = t_rx_ns
             events = feed(can_id, extended, data, t_rx_ns)
             if events:
                 self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self.frame_ns)
+            if pending and ledger.frames_pending == 1:  # what waited is over, and this frame waits for others now
+                self._first_ns = t_rx_ns
         self.last_data_ns = t_rx_ns
         if samples:
             self._finish(samples, t_rx_ns)

@@ -1,4 +1,4 @@
-"""Where each device was last found: driver and baud rate, in one small JSON file that survives restarts.
+"""Where each device was last found: driver and baud rate or node, in one small JSON file that survives restarts.
 
 A missing or damaged file costs a few hundred milliseconds of detection, nothing else, so every error here is only
 reported.
@@ -21,6 +21,9 @@ class Found(msgspec.Struct, frozen=True):
 
     driver: str
     baud: int
+    """0 on a CAN bus, whose rate is the system's."""
+    node: int | None = None
+    """On a CAN bus: which device of the driver's kind."""
 
 
 class Remembered:

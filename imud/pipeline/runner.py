@@ -1,15 +1,18 @@
 """A device that sends bytes (UART, replay): finds out what it is and at which rate, asks who it is, and streams."""
 
 import asyncio
+import logging
 from collections.abc import Callable
 from time import monotonic_ns
 
 from imud.config import DeviceConfig
 from imud.devices import DRIVERS
-from imud.errors import NothingHeard
-from imud.event import Event
+from imud.errors import CommandError, NothingHeard
+from imud.event import Event, EventKind
+from imud.gpio import LINES
 from imud.kit.batch import Batch
 from imud.kit.driver import Identity, StreamDriver
+from imud.kit.lines import LineMaker
 from imud.kit.link import StreamLink
 from imud.kit.status import DeviceState
 from imud.links import LINKS
@@ -18,6 +21,8 @@ from imud.pipeline.path import SamplePath, StreamPath
 from imud.pipeline.remembered import Found, Remembered
 from imud.pipeline.search import Finder, Finding
 from imud.units import NS_PER_S, uart_byte_ns
+
+log = logging.getLogger(__name__)
 
 SILENT_SEARCH_NS = 15 * NS_PER_S
 """A silent line is searched anew after this: the device may have been exchanged or set to another rate."""
@@ -35,12 +40,15 @@ class DeviceRunner(Device):
         publish: Callable[[Batch], None],
         tell: Callable[[Event], None],
         remembered: Remembered,
+        lines: LineMaker = LINES,
     ) -> None:
-        super().__init__(config, device_id, publish, tell, LINKS[config.link].make(config.link_settings))
+        super().__init__(config, device_id, publish, tell, LINKS[config.link].make(config.link_settings), lines)
         self._remembered = remembered
         self._take: Callable[[bytes, int], None] = self._ignore
         self._finder: Finder | None = None
         self._search_again = asyncio.Event()
+        self._samples_before = 0
+        """Samples made before the link was opened."""
 
     def close(self) -> None:
         """Release the link; may be called twice."""
@@ -48,6 +56,7 @@ class DeviceRunner(Device):
         self._take = self._ignore
 
     def _start(self) -> None:
+        self._samples_before = self.ledger.samples
         self.link.start(self._receive, self._on_end)
         self._seek()
 
@@ -68,8 +77,29 @@ class DeviceRunner(Device):
                     self._seek()
             if self._may_ask and isinstance(self._driver, StreamDriver):
                 await self._identify(self._driver.identify, self._driver.read_settings, self._apply)
+                await self._wake(self._driver)
             await self._search_again.wait()
             self._seek()
+
+    async def _wake(self, driver: StreamDriver) -> None:
+        """Until its first sample since the link was opened: make a device stream that answers and sends none.
+
+        One that has streamed is left alone when it falls silent: it may have been told to.
+        """
+        told = False
+        while driver.wake is not None:
+            await asyncio.sleep(UNHEARD_NS / NS_PER_S)
+            if self.ledger.samples != self._samples_before or self._search_again.is_set():
+                return
+            try:
+                acknowledged = await self._talk.hold(driver.wake())
+            except CommandError as error:
+                log.debug("%s: not woken: %s", self.config.name, error)
+                continue
+            if not told:
+                told = True
+                message = "it answered and sent no samples: told to stream, which is not saved"
+                self._notices.tell(monotonic_ns(), EventKind.CONFIGURATION, message, acknowledged=acknowledged)
 
     def _seek(self) -> None:
         """Begin a search, or take what comes at once where driver and rate are given."""
@@ -103,6 +133,9 @@ class DeviceRunner(Device):
         if self._searchable:
             self._remembered.put(self.config.name, Found(driver.name, link.baud))
         self._path = path
+        if self._wires is not None:
+            self._wires.start(self._clock)
+            path.drain = self._wires.drain
         self._take = path.on_data
         for data, t_rx_ns in finding.chunks:
             path.on_data(data, t_rx_ns)

@@ -8,10 +8,19 @@ SIMULATORS: Table[Simulator] = Table(
     "simulator",
     {
         "hipnuc-uart": "imud.sim.hipnuc:SIMULATOR",
+        "hipnuc-modbus": "imud.sim.hipnuc_modbus:SIMULATOR",
         "imu61x-uart": "imud.sim.imu61x_uart:SIMULATOR",
     },
 )
 """Devices that stand behind a pseudo-terminal."""
 
-CAN_SIMULATORS: Table[CanSimulator] = Table("simulator on CAN", {"imu61x-can": "imud.sim.imu61x_can:SIMULATOR"})
+CAN_SIMULATORS: Table[CanSimulator] = Table(
+    "simulator on CAN",
+    {
+        "hipnuc-canopen": "imud.sim.hipnuc_canopen:SIMULATOR",
+        "hipnuc-j1939": "imud.sim.hipnuc_j1939:SIMULATOR",
+        "hipnuc-nmea2000": "imud.sim.hipnuc_nmea2000:SIMULATOR",
+        "imu61x-can": "imud.sim.imu61x_can:SIMULATOR",
+    },
+)
 """Devices that stand on a CAN interface."""

@@ -1,4 +1,4 @@
-"""`python -m imud.sim`: one simulated device behind a pseudo-terminal or on a CAN interface, as a process of its own.
+"""`python -m imud.sim`: a simulated device behind a pseudo-terminal, or one or more on a CAN interface, as a process.
 
 The first line on stdout is the path to open, or the name of the interface. It runs until stdin ends, or SIGTERM or
 SIGINT comes; its last line is what it counted, as JSON. Lines on stdin command it:
@@ -25,6 +25,7 @@ from typing import Final
 from imud.errors import LinkError
 from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.arrival import BARE_UART, USB_1MS, USB_16MS
+from imud.sim.can_modules import CanModules
 from imud.sim.can_port import CanPort, default_interface
 from imud.sim.faults import Faults, rates_from
 from imud.sim.motion import GRAVITY_M_S2, MOTIONS
@@ -33,6 +34,8 @@ from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_S
 
 ADAPTERS: Final = {profile.name: profile for profile in (BARE_UART, USB_1MS, USB_16MS)}
+DEVICE: Final = "hipnuc-uart"
+"""What is simulated where nothing is said."""
 COMMAND_BYTES_MAX: Final = 4096
 
 
@@ -45,10 +48,15 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # both end as KeyboardInterrupt
     now_ns = time.monotonic_ns()
-    if options.device in CAN_SIMULATORS:
-        return _run_on_can(options, now_ns)
+    devices: list[tuple[str, int]] = options.device or [(DEVICE, 0)]
+    if all(name in CAN_SIMULATORS for name, _ in devices):
+        return _run_on_can(options, devices, now_ns)
+    if len(devices) > 1:
+        print("imud.sim: expected one device behind a terminal, or one or more on a CAN bus", file=sys.stderr)
+        return 2
+    ((name, node),) = devices
     try:
-        module = SIMULATORS[options.device].make(_module_options(options), now_ns)
+        module = SIMULATORS[name].make(_module_options(options, node), now_ns)
         faults = Faults(options.seed, rates_from(options.faults)) if options.faults else None
     except ValueError as error:
         print(f"imud.sim: {error}", file=sys.stderr)
@@ -66,10 +74,12 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _run_on_can(options: argparse.Namespace, now_ns: int) -> int:
+def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now_ns: int) -> int:
     try:
-        module = CAN_SIMULATORS[options.device].make(_module_options(options), now_ns)
-        port = CanPort(module, options.interface or default_interface())
+        modules = [CAN_SIMULATORS[name].make(_module_options(options, node), now_ns) for name, node in devices]
+        port = CanPort(
+            CanModules(modules) if len(modules) > 1 else modules[0], options.interface or default_interface()
+        )
     except (ValueError, LinkError) as error:
         print(f"imud.sim: {error}", file=sys.stderr)
         return 2
@@ -142,7 +152,7 @@ def _duration_ns(text: str) -> int:
         raise BadCommand(f"unplug {text!r}: expected seconds") from None
 
 
-def _module_options(options: argparse.Namespace) -> SimulatorOptions:
+def _module_options(options: argparse.Namespace, node: int) -> SimulatorOptions:
     return SimulatorOptions(
         rate_hz=options.rate,
         baud=options.baud,
@@ -155,7 +165,18 @@ def _module_options(options: argparse.Namespace) -> SimulatorOptions:
         boot_ms=round(options.boot * 1e3),
         processing_ns=round(options.processing_us * 1e3),
         seed=options.seed,
+        node=node or options.node,
+        at_once=options.at_once,
     )
+
+
+def simulated(text: str) -> tuple[str, int]:
+    """Name and node of NAME or NAME:NODE, node 0 where none is given. Raises ArgumentTypeError."""
+    name, _, node = text.partition(":")
+    known = sorted([*SIMULATORS, *CAN_SIMULATORS])
+    if name not in known or (node and not node.isdecimal()):
+        raise argparse.ArgumentTypeError(f"expected one of {', '.join(known)}, with or without :NODE, got {text!r}")
+    return name, int(node or 0)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -164,10 +185,14 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add(
         "--device",
-        choices=sorted([*SIMULATORS, *CAN_SIMULATORS]),
-        default="hipnuc-uart",
-        help="what to simulate (%(default)s)",
+        action="append",
+        type=simulated,
+        metavar="NAME[:NODE]",
+        help=f"what to simulate ({DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
+        "several times for several devices on one CAN interface",
     )
+    add("--node", type=int, default=default.node, metavar="N", help="node, address or first identifier on a CAN bus")
+    add("--at-once", action="store_true", help="CAN frames of one instant leave together, not paced by the bit rate")
     add("--rate", type=float, default=default.rate_hz, metavar="HZ", help="samples per second (%(default)s)")
     add("--baud", type=int, default=0, help="rate of the port (the slowest common one that carries the samples)")
     add("--message", default="", help="message to send (the factory's)")

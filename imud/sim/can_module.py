@@ -72,8 +72,8 @@ class FrameWire:
     """One frame after the other at the rate of the bus; frames of one device never overlap."""
 
     def __init__(self, bitrate: int, free_ns: int) -> None:
-        """`free_ns`: nothing leaves before."""
-        self.frame_ns = FRAME_BITS * NS_PER_S // bitrate
+        """`bitrate` 0: frames take no time, so that those of one instant leave together. `free_ns`: nothing before."""
+        self.frame_ns = FRAME_BITS * NS_PER_S // bitrate if bitrate else 0
         self._free_ns = free_ns
         self._waiting: deque[SentFrame] = deque()
 

@@ -1,7 +1,8 @@
 """A simulated device on a CAN network interface: `vcan`, or a controller with a real bus.
 
-The simulator's frames leave when they would have crossed the wire of the simulated device. What the interface's queue
-does not take is lost and counted, as on a bus that is too full.
+The simulator's frames leave when they would have crossed the wire of the simulated device; all that is due goes out in
+one system call, so that a stall of the simulator's process falls between bursts and not into one. What the interface's
+queue does not take is lost and counted, as on a bus that is too full.
 """
 
 import os
@@ -10,6 +11,7 @@ from typing import Final
 
 from imud.errors import LinkError
 from imud.kit.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, pack_frame
+from imud.links.mmsg import send_all
 from imud.links.netlink import can_interfaces
 from imud.sim.can_module import CanModule
 
@@ -17,7 +19,7 @@ READ_BYTES: Final = 4096
 
 
 class CanPort:
-    """One module on one interface. Synchronization: one thread."""
+    """One module, or several as one (`CanModules`), on one interface. Synchronization: one thread."""
 
     is_open = True
     """Somebody may always listen."""
@@ -29,17 +31,7 @@ class CanPort:
         self._unplugged_until_ns = 0
         self.frames_refused = 0
         """Frames that the interface's queue did not take."""
-        try:
-            self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
-        except OSError as error:
-            raise LinkError(f"this kernel has no CAN sockets ({error.strerror}): load the module can_raw") from error
-        try:
-            self._socket.bind((interface,))
-            self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        except OSError as error:
-            self._socket.close()
-            hint = f"ip link add {interface} type vcan; ip link set {interface} up"
-            raise LinkError(f"{interface}: {error.strerror}: expected a CAN interface that is up ({hint})") from error
+        self._socket = _open(interface)
 
     def fileno(self) -> int:
         """The descriptor to wait on for frames of others."""
@@ -59,11 +51,9 @@ class CanPort:
         """Take what others sent, and send what is due."""
         if readable:
             self._receive(now_ns)
-        for frame in self.module.advance(now_ns) if now_ns >= self._unplugged_until_ns else ():
-            try:
-                self._socket.send(pack_frame(frame.can_id, frame.extended, frame.data))
-            except OSError:
-                self.frames_refused += 1
+        if now_ns >= self._unplugged_until_ns:
+            due = [pack_frame(frame.can_id, frame.extended, frame.data) for frame in self.module.advance(now_ns)]
+            self.frames_refused += len(send_all(self._socket.fileno(), due))
 
     def next_ns(self, now_ns: int) -> int:
         """When to call `step` next."""
@@ -71,8 +61,9 @@ class CanPort:
         return max(self._unplugged_until_ns, now_ns if due_ns is None else due_ns)
 
     def summary(self) -> dict[str, int]:
-        """What was counted so far."""
-        return {**self.module.counters(), "frames_refused": self.frames_refused}
+        """What was counted so far, and the zero of the motion, CLOCK_MONOTONIC."""
+        counters = {**self.module.counters(), "frames_refused": self.frames_refused}
+        return {**counters, "epoch_ns": self.module.epoch_ns}
 
     def close(self) -> None:
         """Leave the bus; may be called twice."""
@@ -89,6 +80,21 @@ class CanPort:
             can_id, size, data = RAW_FRAME.unpack(raw)
             if not can_id & (ERROR_FLAG | REMOTE_FLAG):
                 self.module.receive(can_id & EXTENDED_ID_MAX, can_id >= EXTENDED_FLAG, data[:size], now_ns)
+
+
+def _open(interface: str) -> socket.socket:
+    try:
+        opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+    except OSError as error:
+        raise LinkError(f"this kernel has no CAN sockets ({error.strerror}): load the module can_raw") from error
+    try:
+        opened.bind((interface,))
+        opened.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    except OSError as error:
+        opened.close()
+        hint = f"ip link add {interface} type vcan; ip link set {interface} up"
+        raise LinkError(f"{interface}: {error.strerror}: expected a CAN interface that is up ({hint})") from error
+    return opened
 
 
 def default_interface() -> str:

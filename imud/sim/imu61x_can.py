@@ -10,6 +10,7 @@ from typing import Final
 
 from imud.devices.imu61x.can import BASE_ID, SET_FRAMES, encode_set
 from imud.kit.attitude import euler_zyx_from_quat
+from imud.kit.can import STANDARD_ID_MAX
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
 from imud.sim.motion import MOTIONS, Motion, swing
 from imud.sim.noise import Noise
@@ -105,11 +106,14 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xCanModule:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {RATE_MAX_HZ:g}")
     if options.message:
         raise ValueError(f"message {options.message!r}: expected none, there is only one")
+    if not 0 <= options.node <= STANDARD_ID_MAX - SET_FRAMES + 1:
+        raise ValueError(f"node {options.node}: expected the identifier of the first frame, or 0 for {BASE_ID}")
     if options.motion not in MOTIONS:
         raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
     hardware = Imu61xCanHardware(
         rate_hz=options.rate_hz,
-        bitrate=options.baud or BITRATE,
+        base_id=options.node or BASE_ID,
+        bitrate=options.bitrate(BITRATE),
         motion=MOTIONS[options.motion](options.gravity_m_s2),
         noise=Noise(options.seed) if options.noise == "real" else None,
         skew_ppm=options.skew_ppm,

@@ -78,6 +78,15 @@ class SimulatorOptions:
     processing_ns: int = 125_000
     """Time from the instant of measurement to the first bit on the wire."""
     seed: int = 1
+    node: int = 0
+    """Which of several devices of a bus it is: node, address or first identifier, as its driver counts; 0 for the
+    factory's."""
+    at_once: bool = False
+    """Whether the frames of a CAN device leave without the pauses that a bit rate makes, as on a virtual bus."""
+
+    def bitrate(self, common: int) -> int:
+        """Bit rate of a CAN device, bit/s: `baud`, or the common one; 0 for frames that take no time."""
+        return 0 if self.at_once else self.baud or common
 
 
 @dataclass(frozen=True, slots=True)

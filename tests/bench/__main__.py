@@ -13,7 +13,10 @@ import msgspec
 
 from tests.bench.rows import Row
 
-PARTS = ("decode", "clock", "polling", "detect", "coalesce", "shm", "socket", "metrics", "end_to_end")
+PARTS = (
+    "decode", "clock", "clock_lines", "polling", "modbus", "can", "detect", "coalesce", "shm", "socket", "metrics",
+    "end_to_end",
+)  # fmt: skip
 OUTPUT = Path("build/bench.json")
 
 

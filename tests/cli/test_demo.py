@@ -4,6 +4,7 @@ import io
 import re
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from imud.cli import main
@@ -11,7 +12,9 @@ from imud.cli.demo_view import View
 from imud.sample import Sample, Sync
 
 
-@pytest.mark.parametrize(("device", "product"), [("hipnuc-uart", "HI14R3"), ("imu61x-uart", "IMU61x")])
+@pytest.mark.parametrize(
+    ("device", "product"), [("hipnuc-uart", "HI14R3"), ("imu61x-uart", "IMU61x"), ("hipnuc-modbus", "HI14R2N")]
+)
 def test_samples_flow_and_the_ledger_closes(device: str, product: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--device", device, "--duration", "1", "--rate", "200", "--plain"]) == 0
     out = capfd.readouterr().out
@@ -54,3 +57,17 @@ def test_live_view_draws_in_place() -> None:
 
 def test_account_without_samples() -> None:
     assert "no sample arrived" in View(io.StringIO(), live=False).account()
+
+
+def test_devices_that_cannot_be_together(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--device", "hipnuc-uart", "--device", "imu61x-can"]) == 2
+    assert "one or more on a CAN bus" in capsys.readouterr().err
+    assert main(["demo", "--device", "imu61x-can", "--device", "imu61x-can"]) == 2
+    assert "devices that differ" in capsys.readouterr().err
+
+
+def test_view_counts_what_is_missing_of_each_device() -> None:
+    view = View(io.StringIO(), live=False)
+    for name, seq in (("a", 1), ("b", 7), ("a", 2), ("b", 9)):
+        view.add(msgspec.structs.replace(sample(seq), device=name))
+    assert (view.samples, view.missed) == (4, 1)

@@ -8,6 +8,9 @@ from pathlib import Path
 from tests.lab.tool import tool
 
 BITRATE = 500_000
+FAULT = Path("/sys/module/imud_lab/parameters/can_fault")
+MODE_RESET = b"\x01"
+"""Mode register, the first of an SJA1000, with bit RM alone."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,27 @@ class CanInterface:
     def down(self) -> None:
         """Takes it out of operation: sockets on it get ENETDOWN."""
         tool("ip", "link", "set", self.name, "down")
+
+    def enter(self, state: str) -> None:
+        """Lets the controller's driver see an error state: `error-passive`, `bus-off`, `error-active`.
+
+        A controller that is bus-off takes no part in the bus until it is restarted, so it is put into reset mode, as
+        an SJA1000 puts itself (data sheet, 6.4.4: bit RM of the mode register is set).
+        """
+        if state == "bus-off":
+            with open(f"/sys/class/net/{self.name}/device/resource1", "r+b", buffering=0) as registers:
+                registers.write(MODE_RESET)
+        FAULT.write_text(f"{self.name} {state}", encoding="ascii")
+
+    def restart(self) -> None:
+        """Restarts a controller that is bus-off, as an administrator does."""
+        tool("ip", "link", "set", self.name, "type", "can", "restart")
+
+    def restart_by_itself(self, after_ms: int) -> None:
+        """Makes the kernel restart it after bus-off; 0 for never."""
+        self.down()
+        tool("ip", "link", "set", self.name, "type", "can", "restart-ms", str(after_ms))
+        self.up()
 
     def statistic(self, name: str) -> int:
         """A kernel counter, such as rx_packets or tx_packets."""

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from imud.links.port_owner import SERIAL_GROUP, group_of, holders_of, user_name
+from imud.kit.access import user_name
+from imud.links.port_owner import SERIAL_GROUP, group_of, holders_of
 
 
 def process(proc: Path, pid: int, name: str, *targets: str) -> None:

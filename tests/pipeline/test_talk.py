@@ -9,7 +9,7 @@ from imud.devices import DRIVERS
 from imud.errors import CommandError, LinkMissing, NoReply
 from imud.kit.codec import ReplyFrame
 from imud.kit.driver import StreamDriver
-from imud.kit.session import Conversation, Outcome, Reply, Request, Silence, of_text, pause
+from imud.kit.session import Conversation, Outcome, Reply, Request, Silence, of_text, pause, with_undo
 from imud.ledger import Ledger
 from imud.pipeline.talk import Talk
 
@@ -181,5 +181,44 @@ def test_a_frame_is_an_answer() -> None:
         await asyncio.sleep(0)
         talk.on_message(wanted, 0)
         assert await task == [Reply((wanted,))]
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_conversation_given_up_is_undone_if_the_link_is_there(is_there: bool) -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+
+        def write(data: bytes) -> None:
+            if not is_there and written:
+                raise LinkMissing("gone")
+            written.append(data)
+
+        talk = Talk(Ledger(), write)
+        task = asyncio.create_task(talk.hold(with_undo(ask(request("A"), request("B")), b"UNDO")))
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert written == [b"A\r\n", *[b"UNDO"] * is_there]
+
+    asyncio.run(story())
+
+
+def test_a_conversation_that_comes_to_its_end_is_not_undone() -> None:
+    """Whether it returns or raises: it had its turn to leave the device in order."""
+
+    def failing() -> Conversation[None]:
+        yield request("A", timeout_ns=1)
+        raise NoReply("no")
+
+    async def story() -> None:
+        written: list[bytes] = []
+        talk = Talk(Ledger(), written.append)
+        assert await talk.hold(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
+        with pytest.raises(NoReply):
+            await talk.hold(with_undo(failing(), b"UNDO"))
+        assert written == [b"A\r\n"] * 2
 
     asyncio.run(story())

@@ -45,6 +45,7 @@ from imud.kit.checksum import crc16_xmodem
 from imud.kit.codec import BadFrame, BadReason, CodecEvent, StreamCodec
 from imud.kit.driver import Identity, StreamDriver
 from imud.kit.settings import Settings
+from imud.kit.timing import TimeBits
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.units import NS_PER_MS, RAD_PER_DEG, T_PER_UT
@@ -56,6 +57,8 @@ FRAME_BYTES_MAX: Final = HEADER.size + PAYLOAD_BYTES_MAX
 
 STATUS_SINCE_APP_VER: Final = 169
 """Firmware 1.6.9 and newer sends MAIN_STATUS in bytes 1-2 of HI91; before, pps_sync_stamp as in the manual."""
+TIME_BITS: Final = TimeBits(sync_out=1 << 12, not_utc=1 << 11)
+"""What MAIN_STATUS says of time: the frame belongs to a pulse on SOUT; `system_time` is not synchronised to UTC."""
 
 _HI91_FRAME_BYTES: Final = HEADER.size + HI91.size
 _HI91_HEAD: Final = SYNC + HI91.size.to_bytes(2, "little")
@@ -356,6 +359,7 @@ DRIVER: Final = StreamDriver(
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
     navigation_frame="ENU",
     lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
+    time_bits=TIME_BITS,
     actions=ACTIONS,
     identify=identify,
     read_settings=read_settings,

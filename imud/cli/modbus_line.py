@@ -1,0 +1,144 @@
+"""Finding and numbering the modules of an RS-485 line: what `imud modbus` does, without words for people."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from time import sleep
+from typing import Final, TypeVar
+
+import msgspec
+
+from imud.devices.hipnuc.modbus import HipnucModbusSettings, probe
+from imud.devices.hipnuc.modbus_frames import check_id, randomise_ids, serial_bytes, set_id_by_serial
+from imud.devices.hipnuc.modbus_session import save, set_id
+from imud.errors import CommandError, DeviceRefused, TransferError
+from imud.kit.driver import Identity
+from imud.kit.modbus import BROADCAST
+from imud.kit.polling import Dialogue, Transfer, run_dialogue
+from imud.links.rs485 import Rs485Link, Rs485Settings
+
+T = TypeVar("T")
+
+TRIES: Final = 3
+SETTLE_S: Final = 0.3
+"""Time that modules get to take new addresses; the manual gives none."""
+
+
+class Found(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What answers at one address."""
+
+    baud: int
+    address: int
+    product: str = ""
+    serial_number: str = ""
+    firmware: str = ""
+    problem: str = ""
+    """What is wrong there; then nothing else is known."""
+
+
+@contextmanager
+def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
+    """A line of one's own. Raises LinkError."""
+    link = Rs485Link(Rs485Settings(line=port, baud=baud, reply_ms=reply_ms))
+    link.open()
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[Found]:
+    """Ask at every address who is there. Raises LinkError."""
+    found = (_look(link, baud, address) for address in addresses)
+    return [one for one in found if one is not None]
+
+
+def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int) -> Found:
+    """Have the module with this serial number take an address. Raises CommandError, LinkError."""
+    wanted = serial_bytes(serial_number).hex().upper()
+    order = set_id_by_serial(serial_number, new_id)
+    _check_free(link, new_id, wanted)
+    _to_all(link, order)
+    return _expect(link, baud, new_id, wanted)
+
+
+def assign_by_address(link: Rs485Link, baud: int, address: int, new_id: int) -> Found:
+    """Have the module at one address take another. Raises CommandError, LinkError."""
+    check_id("address", address)
+    dialogue = set_id(new_id)
+    before = _identity(link, address)
+    if before is None:
+        raise CommandError(f"nobody answers at address {address}")
+    _check_free(link, new_id, before.serial_number)
+    try:
+        _hold(link, address, dialogue)
+    except DeviceRefused as error:
+        raise CommandError(f"address {address}: {error}") from error
+    return _expect(link, baud, new_id, before.serial_number)
+
+
+def randomise(link: Rs485Link, lowest: int, highest: int) -> None:
+    """Have every module take a random address of a range. Raises BadArgument, LinkError."""
+    _to_all(link, randomise_ids(lowest, highest))
+
+
+def keep(link: Rs485Link, found: Found) -> None:
+    """Have a module save its settings. Raises CommandError, LinkError."""
+    try:
+        _hold(link, found.address, save())
+    except (TransferError, DeviceRefused) as error:
+        raise CommandError(f"address {found.address}: not saved: {error}") from error
+
+
+def _look(link: Rs485Link, baud: int, address: int) -> Found | None:
+    strange = link.heard.strange
+    try:
+        who = _hold(link, address, probe(HipnucModbusSettings()))
+    except DeviceRefused as error:
+        return Found(baud, address, problem=f"{error}; are there two modules with this address?")
+    except TransferError as error:
+        return Found(baud, address, problem=str(error)) if link.heard.strange > strange else None
+    return Found(baud, address, who.product, who.serial_number, who.firmware)
+
+
+def _identity(link: Rs485Link, address: int) -> Identity | None:
+    """Who is at an address; None for nobody. Raises CommandError for something that cannot be understood."""
+    problem: Exception | None = None
+    for _ in range(TRIES):
+        try:
+            return _hold(link, address, probe(HipnucModbusSettings()))
+        except TransferError:
+            continue
+        except DeviceRefused as error:
+            problem = error
+    if problem is not None:
+        raise CommandError(f"address {address}: {problem}; are there two modules with this address?")
+    return None
+
+
+def _check_free(link: Rs485Link, address: int, serial_number: str) -> None:
+    there = _identity(link, address)
+    if there is not None and there.serial_number != serial_number:
+        raise CommandError(f"address {address} is taken by {there.product}, serial number {there.serial_number}")
+
+
+def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> Found:
+    there = _identity(link, address)
+    if there is None:
+        raise CommandError(
+            f"nobody answers at address {address}: is a module with serial number {serial_number} on this line, at "
+            f"{baud} baud, and does its firmware know function 0x50?"
+        )
+    if there.serial_number != serial_number:
+        raise CommandError(f"expected serial number {serial_number} at address {address}, got {there.serial_number}")
+    return Found(baud, address, there.product, there.serial_number, there.firmware)
+
+
+def _to_all(link: Rs485Link, order: Transfer) -> None:
+    link.select(BROADCAST)
+    link.transfer(order)
+    sleep(SETTLE_S)
+
+
+def _hold(link: Rs485Link, address: int, dialogue: Dialogue[T]) -> T:
+    link.select(address)
+    return run_dialogue(dialogue, link.transfer)

@@ -1,0 +1,96 @@
+"""CAN interfaces for `imud probe`: everybody who is heard on a bus. Sends nothing but queries that were asked for."""
+
+import asyncio
+from collections.abc import Sequence
+from contextlib import suppress
+
+import msgspec
+
+from imud.cli.probe_report import Report
+from imud.detect import CanDevice, CanSearch
+from imud.devices import DRIVERS
+from imud.errors import CommandError, ImudError, NothingHeard
+from imud.kit.can import CanDriver, CanFrame
+from imud.kit.codec import message_of
+from imud.kit.driver import Identity, of_kind
+from imud.kit.link import CanLink
+from imud.ledger import Ledger
+from imud.links import LINKS
+from imud.links.can_state import ControllerState
+from imud.links.netlink import can_details
+from imud.pipeline.can_search import EVERYTHING, CanFinder
+from imud.pipeline.device import identity_words
+from imud.pipeline.talk import Talk
+
+
+async def examine_bus(interface: str, may_ask: bool) -> list[Report]:
+    """One report per device heard on an interface, or one that says why there is none."""
+    row = LINKS["socketcan"]
+    link = row.make_can(msgspec.convert({"interface": interface}, row.settings))
+    try:
+        if reason := link.absence():
+            return [Report(interface, problem=reason)]
+        link.filters = EVERYTHING
+        link.open()
+        devices, summary = await listen(link)
+        title = state_of(interface)
+        if not devices:
+            return [Report(interface, title, baud=link.bitrate, problem=summary)]
+        return [await _report(link, title, device, may_ask) for device in devices]
+    except ImudError as error:
+        return [Report(interface, problem=str(error))]
+    finally:
+        link.close()
+
+
+async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
+    """One round of detection: who is heard, and what is to be said if nobody is. Raises LinkError."""
+    search = CanSearch(of_kind(DRIVERS.values(), CanDriver), link.title)
+    finder = CanFinder(search, Ledger(), lambda device: None)
+    ended = asyncio.get_running_loop().create_future()
+    problems = [""]
+    link.start(finder.take, lambda news, problem: problems.append(problem), ended.set_result)
+    finder.start()
+    searching = asyncio.ensure_future(finder.finished())
+    await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
+    if ended.done():
+        searching.cancel()
+        raise ended.result() or ImudError(f"{link.title} ended")
+    with suppress(NothingHeard):
+        await searching
+    return search.survey.devices(), problems[-1] or search.summary()
+
+
+def state_of(interface: str) -> str:
+    """State of the controller, for people. Raises LinkError."""
+    details = can_details(interface)
+    if details.bitrate is None or details.state is None or details.state >= len(ControllerState):
+        return "bus without a bit rate" if details.bitrate is None else ""
+    return f"error-{ControllerState(details.state).name.lower()}".replace("error-bus_off", "bus-off")
+
+
+async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -> Report:
+    driver, node = device
+    identity = await ask(device, link) if may_ask else Identity()
+    words = identity_words(identity)
+    return Report(link.title, title, driver.name, driver.node_title(node), link.bitrate, words)
+
+
+async def ask(device: CanDevice, link: CanLink) -> Identity:
+    """Who it is; nothing when it does not answer."""
+    driver, settings = device.driver, device.driver.node_settings(device.node)
+    ledger = Ledger()
+    codec = driver.make_codec(ledger, settings)
+    talk = Talk(ledger, link.write)
+
+    def take(frames: Sequence[CanFrame]) -> None:
+        for frame in frames:
+            for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns):
+                if (message := message_of(event)) is not None:
+                    talk.on_message(message, frame.t_rx_ns)
+
+    link.filters = driver.filters(settings)
+    link.start(take, lambda news, problem: None, lambda error: None)
+    with suppress(CommandError):
+        return await talk.hold(driver.identify(settings))
+    return Identity()

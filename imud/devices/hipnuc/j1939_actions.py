@@ -1,0 +1,97 @@
+"""What a HiPNUC module on J1939 can be told by name: every row of the manual's section 6.2.2, and the one-shot."""
+
+from collections.abc import Callable
+from typing import Any, Final, Literal
+
+from imud.devices.hipnuc import j1939_session as session
+from imud.devices.hipnuc.j1939_session import Peer, Zero
+from imud.kit.action import Action, Actions
+from imud.kit.session import Conversation
+from imud.kit.settings import NoSettings, Settings
+
+MeasuredName = Literal["FF34", "FF37", "FF3A", "FF3D", "FF41", "FF43", "FF46", "FF4A"]
+"""A message that samples are made of, by the last four digits of its number."""
+PgnName = MeasuredName | Literal["FF2F"]
+"""Any message."""
+
+
+class IntervalParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How often a message is sent."""
+
+    pgn: PgnName
+    interval_ms: int
+    """5 … 1000."""
+
+
+class PgnParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A message."""
+
+    pgn: PgnName
+
+
+class BitrateParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A bit rate."""
+
+    bitrate: int
+
+
+class AddressParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An address."""
+
+    address: int
+
+
+class ZeroParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the angles are zero."""
+
+    zero: Literal["here", "cancel"]
+
+
+class DirectionParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The sign of an angle."""
+
+    axis: Literal["X", "Y"]
+    reversed: bool
+
+
+def _action(
+    words: str, begin: Callable[[Peer, Any], Conversation[None]], params: type[Settings] = NoSettings
+) -> Action:
+    return Action(words, lambda target, given: begin(target.settings.peer, given), params)
+
+
+def _direction(peer: Peer, params: DirectionParams) -> Conversation[None]:
+    return session.set_direction(peer, session.X_SIGN if params.axis == "X" else session.Y_SIGN, params.reversed)
+
+
+ACTIONS: Final[Actions] = {
+    "save": _action("write all settings to flash", lambda peer, _: session.save(peer)),
+    "restart": _action("restart it; what was not saved is lost", lambda peer, _: session.restart(peer)),
+    "factory_reset": _action(
+        "factory settings, address and bit rate included", lambda peer, _: session.factory_reset(peer)
+    ),
+    "interval": _action(
+        "how often a message is sent",
+        lambda peer, p: session.set_interval(peer, int(p.pgn, 16), p.interval_ms),
+        IntervalParams,
+    ),
+    "send_once": _action(
+        "send a message once, now", lambda peer, p: session.send_once(peer, int(p.pgn, 16)), PgnParams
+    ),
+    "bitrate": _action(
+        "set the bit rate of the bus; needs save and restart",
+        lambda peer, p: session.set_bitrate(peer, p.bitrate),
+        BitrateParams,
+    ),
+    "address": _action(
+        "set its address; needs save and restart, then `options.address`",
+        lambda peer, p: session.set_address(peer, p.address),
+        AddressParams,
+    ),
+    "zero": _action(
+        "make the present position zero, or cancel that",
+        lambda peer, p: session.zero(peer, Zero[p.zero.upper()]),
+        ZeroParams,
+    ),
+    "direction": _action("turn the sign of an angle", _direction, DirectionParams),
+}

@@ -1,0 +1,113 @@
+"""CPU per received CAN frame, our receive path against python-can's own `recv`, on the same bus in one run.
+
+It needs a virtual CAN bus and the right to make one. Where this kernel has none, the lab's measures (`make lab-deps`);
+there the CPU is emulated and the ratio alone means something. Run by itself: python -m tests.bench.can
+"""
+
+import shlex
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import process_time_ns
+
+import can
+import msgspec
+
+from imud.kit.can import pack_frame
+from imud.links.can_socket import BATCH_FRAMES, FrameReader
+from tests.bench.rows import Row, at_least
+
+BUS = "vcanbench"
+BATCHES = {"one at a time": 1, "ten waiting": 10, "a batch waiting": BATCH_FRAMES}
+"""Frames that wait when the program gets to read."""
+FRAMES = 6000
+RATIO_REACHED = 4.0
+ROOT = Path(__file__).parents[2]
+LAB_LIMIT_S = 600.0
+
+
+def measure(interface: str, waiting: int, frames: int) -> tuple[float, float]:
+    """CPU time per frame in µs, ours and python-can's, both of the same frames."""
+    with (
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW) as ours,
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as far,
+        can.Bus(interface, "socketcan") as bus,
+    ):
+        ours.bind((interface,))
+        far.bind((interface,))
+        reader = FrameReader(ours, lambda _classes, _data: False)
+        sent = [pack_frame(0x100 + number, False, bytes(8)) for number in range(waiting)]
+        taken_ns = [0, 0]
+        rounds = max(frames // waiting, 1)
+        for _ in range(rounds):
+            for frame in sent:
+                far.send(frame)
+            begin_ns = process_time_ns()
+            got = reader.read()
+            middle_ns = process_time_ns()
+            messages = [bus.recv(0) for _ in range(waiting)]
+            taken_ns[0] += middle_ns - begin_ns
+            taken_ns[1] += process_time_ns() - middle_ns
+            assert [frame.can_id for frame in got] == [message.arbitration_id for message in messages if message]
+    ours_us, theirs_us = (taken / rounds / waiting / 1e3 for taken in taken_ns)
+    return ours_us, theirs_us
+
+
+@contextmanager
+def virtual_bus() -> Iterator[str]:
+    """A virtual CAN interface of our own. Raises CalledProcessError where none can be made."""
+    _ip("link", "add", "dev", BUS, "type", "vcan")
+    try:
+        _ip("link", "set", BUS, "up")
+        yield BUS
+    finally:
+        _ip("link", "delete", BUS)
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+
+
+def here(*, quick: bool) -> list[Row]:
+    """The figures of this machine. Raises CalledProcessError or OSError without a virtual bus."""
+    found: list[Row] = []
+    with virtual_bus() as bus:
+        for words, waiting in BATCHES.items():
+            ours_us, theirs_us = measure(bus, waiting, FRAMES // 10 if quick else FRAMES)
+            found += [
+                Row(f"CAN receive, {words}: CPU per frame", ours_us, "us"),
+                Row(f"CAN receive, {words}: CPU per frame by python-can", theirs_us, "us"),
+                Row(f"CAN receive, {words}: python-can / imud", theirs_us / ours_us, "x"),
+            ]
+    last = found.pop()
+    return [*found, at_least(last.name, last.value, last.unit, RATIO_REACHED)]
+
+
+def in_lab(why: str, *, quick: bool) -> list[Row]:
+    """The figures of the lab's kernel; none, with a reason, where there is no lab."""
+    command = shlex.join([".venv/bin/python", "-m", "tests.bench.can", *(["--quick"] if quick else [])])
+    print(f"# no virtual CAN bus here ({why}): measured in the lab, on an emulated CPU", flush=True)
+    lab = [str(ROOT / "tests/lab/run"), "--exec", command]
+    done = subprocess.run(lab, cwd=ROOT, text=True, capture_output=True, timeout=LAB_LIMIT_S, check=False)
+    if done.returncode:
+        print(f"# the lab does not measure either: {done.stderr.strip().splitlines()[-1:]}")
+        return []
+    line = next(line for line in done.stdout.splitlines() if line.startswith("["))
+    return [row._replace(name=f"{row.name} (lab)") for row in msgspec.json.decode(line, type=list[Row])]
+
+
+def rows(*, quick: bool = False) -> list[Row]:
+    """The figures."""
+    try:
+        return here(quick=quick)
+    except subprocess.CalledProcessError as error:
+        return in_lab(error.stderr.decode().strip(), quick=quick)
+    except OSError as error:
+        return in_lab(str(error), quick=quick)
+
+
+if __name__ == "__main__":
+    print(msgspec.json.encode(here(quick="--quick" in sys.argv)).decode())

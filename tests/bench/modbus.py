@@ -1,0 +1,92 @@
+"""Eight Modbus modules on one RS-485 line at 115200 baud, read in turns by the daemon: how near to what a wire can.
+
+The limit is arithmetic: a request of 8 bytes and a reply of 57 (26 registers), 10 bits each, and a silence of 1.75 ms
+before each of the two, is 5.642 ms + 3.5 ms = 9.142 ms a sample, for modules that need no time to think; those of the
+simulator take 0.3 ms. The line is a process that hands over every byte when it is through, the daemon another.
+"""
+
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic, sleep
+from typing import NamedTuple
+
+import msgspec
+
+from imud.kit.modbus import frame_gap_ns
+from imud.units import NS_PER_S, uart_byte_ns
+from tests.bench.rig import START_LIMIT_S, Process, ask, cpu_ns, wait_for
+from tests.bench.rows import Row, at_least, at_most
+
+BAUD = 115200
+MODULES = 8
+REQUEST_BYTES, REPLY_BYTES = 8, 57
+LIMIT_HZ = NS_PER_S / ((REQUEST_BYTES + REPLY_BYTES) * uart_byte_ns(BAUD) + 2 * frame_gap_ns(BAUD))
+"""Samples per second of a whole line."""
+
+
+class Outcome(NamedTuple):
+    """What came of one run."""
+
+    rates_hz: list[float]
+    """Samples per second of each module that lives."""
+    cpu_us_per_sample: float
+    lost: int
+
+
+def measured(seconds: float, alive: int, configured: int) -> Outcome:
+    """Run the daemon on `configured` modules of which the first `alive` are there."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
+        folder = Path(name)
+        addresses = [str(address) for address in range(1, alive + 1)]
+        line = stack.enter_context(Process(set(range(64)), "-m", "tests.bench.modbus_line", str(BAUD), *addresses))
+        port = line.line()
+        devices = {
+            f"d{address}": {"driver": "hipnuc-modbus", "rs485": {"line": port, "baud": BAUD, "address": address}}
+            for address in range(1, configured + 1)
+        }
+        tree = {
+            "log_level": "error", "state_dir": name, "socket": {"path": str(folder / "s")},
+            "shm": {"directory": name}, "metrics": {"port": 0}, "devices": devices,
+        }  # fmt: skip
+        (folder / "imud.yaml").write_bytes(msgspec.json.encode(tree))
+        daemon = stack.enter_context(Process(set(range(64)), "-m", "imud", "run", "-c", str(folder / "imud.yaml")))
+        wait_for(folder / "s")
+        end = monotonic() + START_LIMIT_S
+        while sum(status.state == "running" for status in ask(folder / "s")) < alive:
+            if monotonic() > end:
+                raise TimeoutError("not all modules were found")
+            sleep(0.05)
+        sleep(1.0)
+        before, begun, cpu = ask(folder / "s"), monotonic(), cpu_ns(daemon.popen.pid)
+        sleep(seconds)
+        after, elapsed, cpu = ask(folder / "s"), monotonic() - begun, cpu_ns(daemon.popen.pid) - cpu
+        counts = [b.ledger["samples"] - a.ledger["samples"] for a, b in zip(before, after, strict=True)][:alive]
+        lost = sum(
+            b.ledger[key] - a.ledger[key]
+            for a, b in zip(before[:alive], after[:alive], strict=True)
+            for key in a.ledger
+            if key.startswith("lost_")
+        )
+    return Outcome([count / elapsed for count in counts], cpu / 1e3 / sum(counts), lost)
+
+
+def rows(*, quick: bool = False) -> list[Row]:
+    """The figures."""
+    seconds = 5.0 if quick else 20.0
+    all_eight = measured(seconds, MODULES, MODULES)
+    seven = measured(seconds, MODULES - 1, MODULES - 1)
+    one_dead = measured(seconds, MODULES - 1, MODULES)
+    share = min(all_eight.rates_hz) / (LIMIT_HZ / MODULES)
+    cost = 1 - sum(one_dead.rates_hz) / sum(seven.rates_hz)
+    return [
+        Row(f"Modbus, {MODULES} modules at {BAUD} baud: limit by arithmetic, each", LIMIT_HZ / MODULES, "Hz"),
+        Row("samples a second of the slowest", min(all_eight.rates_hz), "Hz"),
+        Row("samples a second of the quickest", max(all_eight.rates_hz), "Hz"),
+        at_least("the slowest, of the limit", share, "", 0.8),
+        Row("samples lost", all_eight.lost, ""),
+        Row("CPU of the daemon per sample", all_eight.cpu_us_per_sample, "us"),
+        Row("seven modules alone, each", sum(seven.rates_hz) / len(seven.rates_hz), "Hz"),
+        Row("the same seven beside one that is dead, each", sum(one_dead.rates_hz) / len(one_dead.rates_hz), "Hz"),
+        at_most("what the dead one costs the rest", 100 * cost, "%", 20),
+    ]

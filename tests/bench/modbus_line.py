@@ -1,0 +1,32 @@
+"""A simulated RS-485 line whose every byte comes when it is through, as a process: `… BAUD ADDRESS …`.
+
+The first line it prints is the port. It ends with its stdin.
+"""
+
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from imud.sim.__main__ import Control
+from imud.sim.arrival import BARE_UART
+from imud.sim.hipnuc_modbus import ModbusLine, slaves_at
+from imud.sim.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
+from imud.sim.simulator import SimulatorOptions
+
+
+def main() -> None:
+    """Play the line."""
+    baud, *addresses = map(int, sys.argv[1:])
+    now_ns = time.monotonic_ns()
+    line = ModbusLine(now_ns, slaves_at(addresses, SimulatorOptions(baud=baud)), chunk_bytes=1)
+    sharpen_timers()
+    with TemporaryDirectory(prefix="imud-bench-") as folder:
+        port = SimulatedPort(line, PtyNode(Path(folder) / "line"), Adapter(BARE_UART, now_ns))
+        print(port.node.path, flush=True)
+        Control(port).run()
+        port.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""`imud probe` on CAN interfaces: everybody who is heard, silence, and a query only where it is allowed."""
+
+import asyncio
+from collections.abc import Sequence
+from typing import ClassVar
+
+import pytest
+
+from imud.cli import probe, probe_can
+from imud.cli.probe_report import Report, row
+from imud.detect import can as detection
+from imud.devices import DRIVERS
+from imud.errors import LinkError
+from imud.kit.can import CanFrame
+from imud.kit.driver import Driver
+from imud.kit.link import LinkType, OnBusNews, OnEnd, OnFrames
+from imud.links.memory import MemoryCanLink, MemorySettings
+from imud.links.netlink import CanDetails
+from imud.links.socketcan import SocketCanSettings
+from imud.units import NS_PER_MS
+from tests.fake_can import fake_can_driver, fake_frame
+
+
+class Bus(MemoryCanLink):
+    """Says the same to everybody who begins to listen."""
+
+    frames: Sequence[CanFrame] = ()
+    problem = ""
+    down = False
+    made: ClassVar[list["Bus"]]
+
+    def __init__(self, settings: SocketCanSettings) -> None:
+        super().__init__(MemorySettings(name=settings.interface, baud=500_000))
+        self.made.append(self)
+
+    def absence(self) -> str:
+        return "can0 is down: set its bit rate" if self.down else ""
+
+    def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
+        super().start(on_frames, on_news, on_end)
+        if self.problem:
+            on_news(self.problem, self.problem)
+        self.feed(self.frames)
+
+
+@pytest.fixture
+def bus(monkeypatch: pytest.MonkeyPatch) -> type[Bus]:
+    class Own(Bus):
+        made: ClassVar[list[Bus]] = []
+
+    table: dict[str, Driver] = {**dict(DRIVERS), "fake-can": fake_can_driver()}
+    monkeypatch.setattr(probe_can, "DRIVERS", table)
+    monkeypatch.setattr(probe_can, "LINKS", {"socketcan": LinkType("socketcan", SocketCanSettings, make_can=Own)})
+    monkeypatch.setattr(probe_can, "can_details", lambda name: CanDetails(500_000, 0))
+    monkeypatch.setattr(detection, "LISTEN_NS", 5 * NS_PER_MS)
+    return Own
+
+
+def examined(*, ask: bool = False) -> list[Report]:
+    return asyncio.run(probe.examine_all(["can0"], {"can0"} if ask else set(), {}))
+
+
+def test_every_device_of_the_bus_is_listed(bus: type[Bus]) -> None:
+    bus.frames = [fake_frame(node, number) for number in (1, 2) for node in (8, 9)]
+    reports = examined()
+    assert [(r.port, r.driver, r.device, r.baud, r.title, r.identity) for r in reports] == [
+        ("can0", "fake-can", "node 8", 500_000, "error-active", {}),
+        ("can0", "fake-can", "node 9", 500_000, "error-active", {}),
+    ]
+    assert row(reports[0])[:3] == ("can0", "fake-can node 8", 500_000)
+    assert bus.made[0].written == []
+    assert not bus.made[0].is_open
+
+
+def test_a_query_where_it_is_allowed(bus: type[Bus]) -> None:
+    bus.frames = [fake_frame(8, number) for number in (1, 2)]
+    assert [report.identity for report in examined(ask=True)] == [{"product": "FAKE"}]
+
+
+def test_why_nobody_is_listed(bus: type[Bus]) -> None:
+    assert "nothing is heard on can0" in examined()[0].problem
+    bus.frames = [CanFrame(0x123, False, b"", 0)]
+    assert "that no driver knows (0x123)" in examined()[0].problem
+    bus.problem = "can0 is bus-off: x"
+    assert examined()[0].problem == "can0 is bus-off: x"
+    bus.down = True
+    assert examined() == [Report("can0", problem="can0 is down: set its bit rate")]
+
+
+def test_a_bus_that_ends_is_told(bus: type[Bus], monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(self: Bus, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
+        on_end(LinkError("can0 was taken down"))
+
+    monkeypatch.setattr(bus, "start", start)
+    assert examined()[0].problem == "can0 was taken down"
+
+
+@pytest.mark.parametrize(
+    ("details", "words"),
+    [
+        ((None, None), "bus without a bit rate"),
+        ((500_000, 3), "bus-off"),
+        ((500_000, 2), "error-passive"),
+        ((1, 9), ""),
+    ],
+)
+def test_the_state_in_words(
+    details: tuple[int | None, int | None], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe_can, "can_details", lambda name: CanDetails(*details))
+    assert probe_can.state_of("can0") == words

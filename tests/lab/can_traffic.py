@@ -1,0 +1,141 @@
+"""Simulated modules on one CAN bus in a process of their own, and the truth to hold samples against."""
+
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import sqrt
+from typing import Final
+
+import msgspec
+
+from imud.devices import DRIVERS
+from imud.kit.can import CanDriver
+from imud.sample import Sample, Vector3
+from imud.sim import CAN_SIMULATORS
+from imud.sim.motion import MOTIONS, Truth
+
+GYRO_RAD_S: Final = 0.004
+ACCEL_M_S2: Final = 0.02
+ANGLE_RAD: Final = 0.002
+"""Some counts of the coarsest protocol, and less than the motion `swing` changes between two samples at 100 Hz."""
+SEEK_S: Final = 0.0005
+SEEK_BACK_S: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Module:
+    """One simulated device and the name it gets in the configuration."""
+
+    driver: str
+    node: int
+
+    @property
+    def name(self) -> str:
+        """For example `imu61x-can-101`."""
+        return f"{self.driver}-{self.node}"
+
+    def config(self, interface: str) -> dict[str, object]:
+        """The device's keys."""
+        driver = DRIVERS[self.driver]
+        assert isinstance(driver, CanDriver)
+        options = msgspec.to_builtins(driver.node_settings(self.node))
+        return {
+            "driver": self.driver,
+            "options": options,
+            "identify": False,
+            "socketcan": {"interface": interface},
+        }
+
+
+def fleet() -> list[Module]:
+    """Four CANopen nodes, four J1939 nodes and one IMU61x; more IMU61x in place of what has no simulator."""
+    spare = iter(range(201, 2000, 100))
+    return [
+        Module(driver, node) if driver in CAN_SIMULATORS and driver in DRIVERS else Module("imu61x-can", next(spare))
+        for driver in ("hipnuc-canopen", "hipnuc-j1939")
+        for node in (8, 9, 10, 11)
+    ] + [Module("imu61x-can", 101)]
+
+
+class Traffic:
+    """The process that plays them."""
+
+    def __init__(self, process: "subprocess.Popen[str]") -> None:
+        self._process = process
+        self.pid = process.pid
+
+    def begin(self) -> int:
+        """Begin; return the zero of the motion, CLOCK_MONOTONIC."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("go\n")
+        self._process.stdin.flush()
+        return self._read()
+
+    def end(self) -> int:
+        """End; return how many frames the interface refused."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        return self._read()
+
+    def _read(self) -> int:
+        assert self._process.stdout is not None
+        return int(self._process.stdout.readline())
+
+
+@contextmanager
+def traffic(interface: str, modules: Sequence[Module], rate_hz: float, seconds: float) -> Iterator[Traffic]:
+    """All modules in one process that nothing of ours can stall: it has the priority of a real bus."""
+    argv = ["chrt", "-f", "10", sys.executable, "-m", "tests.lab.can_player", interface, str(rate_hz), str(seconds)]
+    argv += [f"{module.driver}:{module.node}" for module in modules]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(argv, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        try:
+            yield Traffic(process)
+        finally:
+            process.kill()
+
+
+class Against:
+    """Holds the samples of one device against the truth of its motion, each at its own instant."""
+
+    def __init__(self, first: Sample, rate_hz: float, epoch_ns: int) -> None:
+        """Finds the instant of the first sample: the one before its stamp where the truth is nearest."""
+        self._motion = MOTIONS["swing"](9.8)
+        self._period_s = 1 / rate_hz
+        self._seq = first.seq
+        stamp_s = (first.t_ns - epoch_ns) / 1e9
+        tries = [stamp_s + SEEK_S * n for n in range(round(-SEEK_BACK_S / SEEK_S), round(0.05 / SEEK_S))]
+        self._begin_s = min(tries, key=lambda t_s: self._worst(first, t_s))
+
+    def is_true(self, sample: Sample) -> bool:
+        """Whether every value of the sample is of the instant that its number says."""
+        return self._worst(sample, self._begin_s + (sample.seq - self._seq) * self._period_s) <= 1
+
+    def _worst(self, sample: Sample, t_s: float) -> float:
+        """The largest deviation from the truth at an instant, in units of what is allowed."""
+        truth = self._motion.at(t_s)
+        found = [
+            _distance(sample.gyro_rad_s, truth.gyro_rad_s) / GYRO_RAD_S,
+            _distance(sample.accel_m_s2, truth.accel_m_s2) / ACCEL_M_S2,
+            _turn(sample, truth) / ANGLE_RAD,
+        ]
+        return max(found)
+
+
+def _distance(a: Vector3 | None, b: Vector3) -> float:
+    assert a is not None
+    return max(abs(x - y) for x, y in zip(a, b, strict=True))
+
+
+def _turn(sample: Sample, truth: Truth) -> float:
+    """Angle between two attitudes, rad."""
+    assert sample.quat_wxyz is not None
+    near, far = (
+        sqrt(sum((x - sign * y) ** 2 for x, y in zip(sample.quat_wxyz, truth.quat_wxyz, strict=True)))
+        for sign in (1, -1)
+    )
+    return 2 * min(near, far)

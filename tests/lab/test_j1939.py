@@ -1,0 +1,234 @@
+"""The J1939 driver and its simulator against the kernel's own J1939 sockets, both ways, on a virtual bus."""
+
+import asyncio
+import math
+import socket
+import struct
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import closing, contextmanager
+from time import monotonic, monotonic_ns
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.devices.hipnuc import j1939_messages as messages
+from imud.devices.hipnuc import j1939_session as session
+from imud.devices.hipnuc.j1939 import HipnucJ1939Settings
+from imud.devices.hipnuc.nmea2000 import HipnucNmea2000Settings
+from imud.errors import NoReply
+from imud.kit.settings import Settings
+from imud.kit.status import DeviceState
+from imud.links.socketcan import SocketCanSettings
+from imud.pipeline.can_runner import CanRunner
+from imud.sample import Sample
+from imud.sim.can_modules import CanModules
+from imud.sim.can_port import CanPort
+from imud.sim.hipnuc_j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings
+from imud.sim.hipnuc_nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
+from tests.lab.can_interface import CanInterface
+
+LIMIT_S = 30.0
+LEVEL = 100 + socket.CAN_J1939
+"""SOL_CAN_J1939 of linux/can/j1939.h."""
+ALL = socket.J1939_NO_ADDR
+RAD_PER_COUNT = math.pi / 180_000
+
+
+@contextmanager
+def node(interface: str, address: int) -> Iterator[socket.socket]:
+    """A node of this address, run by the kernel."""
+    with socket.socket(socket.AF_CAN, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, socket.CAN_J1939) as end:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        end.setsockopt(LEVEL, socket.SO_J1939_SEND_PRIO, 3)
+        end.bind((interface, socket.J1939_NO_NAME, socket.J1939_NO_PGN, address))
+        yield end
+
+
+def say(end: socket.socket, interface: str, pgn: int, data: bytes, address: int = ALL) -> None:
+    end.sendto(data, (interface, socket.J1939_NO_NAME, pgn, address))
+
+
+class Rig:
+    """A device of the daemon on an interface."""
+
+    def __init__(self, interface: str, driver: str, options: Settings) -> None:
+        config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanSettings(interface=interface))
+        self.samples: list[Sample] = []
+        self.runner = CanRunner(config, 1, lambda batch: self.samples.extend(batch.samples), lambda _event: None)
+
+    async def until(self, condition: Callable[[], object], what: str, step: Callable[[], None] = lambda: None) -> None:
+        end = monotonic() + LIMIT_S
+        while not condition():
+            assert monotonic() < end, f"not within {LIMIT_S} s: {what}; {self.runner.status()}"
+            self.runner.tick(monotonic_ns())
+            step()
+            await asyncio.sleep(0.002)
+
+    def play(self, story: Callable[[], Awaitable[None]]) -> None:
+        """Run the device while the story is told."""
+
+        async def both() -> None:
+            task = asyncio.create_task(self.runner.run())
+            try:
+                await self.until(lambda: self.runner.state is not DeviceState.MISSING, "the bus is open")
+                await story()
+            finally:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+                self.runner.close()
+
+        asyncio.run(both())
+        assert self.runner.ledger.closes(), self.runner.ledger.snapshot()
+
+
+def burst(end: socket.socket, interface: str, number: int) -> None:
+    """One sample; its number is the roll in thousandths of a degree."""
+    say(end, interface, messages.ACCEL, messages.pack_accel((0.0, 0.0, 9.8)))
+    say(end, interface, messages.GYRO, messages.pack_gyro((0.1, 0.2, 0.3)))
+    say(end, interface, messages.ROLL_PITCH, messages.TWO_ANGLES.pack(number, 0))
+    say(end, interface, messages.HEADING, messages.pack_heading(1.0))
+
+
+def rolls(samples: list[Sample]) -> list[int]:
+    return [round(s.euler_rad[0] / RAD_PER_COUNT) for s in samples if s.euler_rad is not None]
+
+
+def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
+    """It sends samples and answers requests; another node's samples are on the bus, too."""
+    rig = Rig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings())
+    requests: list[tuple[int, bytes]] = []
+    intervals = {0x0137: 100, session.ADDRESS: 8}
+
+    def answer(end: socket.socket) -> None:
+        data, (_, _, pgn, source) = end.recvfrom(64)
+        if pgn != session.CONFIGURE:
+            return
+        requests.append((source, data))
+        register, command, _, value = session.LAYOUT.unpack(data)
+        if register in intervals:  # it has no other
+            intervals[register] = value if command == session.WRITE else intervals[register]
+            reply = session.LAYOUT.pack(register, command, 0, intervals[register])
+            say(end, vcan.name, session.CONFIGURE, reply, 0x55)
+
+    async def story() -> None:
+        loop = asyncio.get_running_loop()
+        with node(vcan.name, 8) as end, node(vcan.name, 9) as other:
+            loop.add_reader(end, answer, end)
+            try:
+                for number in range(40):
+                    burst(end, vcan.name, number)
+                    burst(other, vcan.name, 1000 + number)
+                    await asyncio.sleep(0.05)
+                await rig.until(lambda: rolls(rig.samples)[-1:] == [39], "the last sample")
+                await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
+                await rig.runner.act("interval", {"pgn": "FF37", "interval_ms": 50})
+                assert intervals[0x0137] == 50
+                with pytest.raises(NoReply):
+                    await rig.runner.act("zero", {"zero": "here"})
+            finally:
+                loop.remove_reader(end)
+
+    rig.play(story)
+    found = rolls(rig.samples)
+    assert found == list(range(40 - len(found), 40))
+    assert len(found) >= 30
+    assert rig.runner.ledger.lost() == 0
+    sample = rig.samples[-1]
+    assert sample.accel_m_s2 == pytest.approx((0, 0, 9.8), abs=0.0024)
+    assert sample.gyro_rad_s == pytest.approx((0.1, 0.2, 0.3), abs=0.00054)
+    assert sample.euler_rad is not None
+    assert sample.euler_rad[2] == pytest.approx(1.0, abs=9e-6)
+    assert {source for source, _ in requests} == {0x55}
+    assert bytes.fromhex("3701060032000000") in [data for _, data in requests]
+
+
+def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface) -> None:
+    module = HipnucJ1939Module(monotonic_ns(), J1939Settings(), J1939Hardware(bitrate=0, boot_ms=0))
+    port = CanPort(module, vcan.name)
+    heard: list[tuple[int, int, bytes]] = []
+
+    def hear(end: socket.socket) -> None:
+        while True:
+            try:
+                data, (_, _, pgn, source) = end.recvfrom(64)
+            except BlockingIOError:
+                return
+            heard.append((pgn, source, data))
+
+    def run_until(end: socket.socket, condition: Callable[[], object]) -> None:
+        limit = monotonic() + LIMIT_S
+        while not condition():
+            assert monotonic() < limit, heard[-8:]
+            port.step(monotonic_ns(), True)
+            hear(end)
+
+    with closing(port), node(vcan.name, 0x55) as end:
+        run_until(end, lambda: len(heard) >= 12)
+        assert [pgn for pgn, _, _ in heard[:8]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41] * 2
+        assert {source for _, source, _ in heard} == {8}
+        say(end, vcan.name, session.CONFIGURE, bytes.fromhex("3701060032000000"), 8)
+        run_until(end, lambda: heard[-1][0] == session.CONFIGURE)
+        assert heard[-1] == (session.CONFIGURE, 8, bytes.fromhex("3701060032000000"))
+        say(end, vcan.name, session.CONFIGURE, bytes.fromhex("3701030000000000"), 8)
+        run_until(end, lambda: heard[-1][2] == bytes.fromhex("3701030032000000"))
+    accel = struct.unpack("<3hH", next(data for pgn, _, data in heard if pgn == 0xFF34))
+    assert 1700 < sum(counts * counts for counts in accel[:3]) ** 0.5 < 2400  # 1 G and the swing
+
+
+def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterface) -> None:
+    """Two modules on the bus; one is set while both send, restarted, and sends as it was saved."""
+    fast = dict.fromkeys(messages.PGNS, 100)
+    quiet = J1939Hardware(bitrate=0, boot_ms=0)
+    module = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast), quiet)
+    other = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast, address=9), quiet)
+    port = CanPort(CanModules([module, other]), vcan.name)
+    rig = Rig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings())
+
+    def step() -> None:
+        port.step(monotonic_ns(), True)
+
+    async def told(name: str, **arguments: object) -> None:
+        task = asyncio.create_task(rig.runner.act(name, arguments))
+        await rig.until(task.done, name, step)
+        assert task.result() is None
+
+    async def story() -> None:
+        await rig.until(lambda: len(rig.samples) >= 20, "twenty samples", step)
+        assert rig.samples[-1].temperature_c is not None
+        assert rig.samples[-1].incli_rad is not None
+        assert rig.runner.ledger.lost() == 0
+        await told("direction", axis="X", reversed=True)
+        await told("zero", zero="here")
+        await told("bitrate", bitrate=250_000)
+        for pgn in ("FF34", "FF37"):
+            await told("interval", pgn=pgn, interval_ms=50)
+        await told("save")
+        await told("restart")
+        assert module.flash.x_reversed == 1
+        assert module.settings == module.flash
+        count = len(rig.samples)
+        await rig.until(lambda: len(rig.samples) >= count + 30, "faster samples", step)
+
+    with closing(port):
+        rig.play(story)
+    assert other.requests == 0
+    last = rig.samples[-20:]
+    assert {sample.accel_m_s2 is not None for sample in last} == {True}
+    assert {sample.mag_t is not None for sample in last} == {True, False}
+
+
+def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:
+    module = HipnucNmea2000Module(monotonic_ns(), Nmea2000Hardware(rate_hz=20, bitrate=0, boot_ms=0))
+    port = CanPort(module, vcan.name)
+    rig = Rig(vcan.name, "hipnuc-nmea2000", HipnucNmea2000Settings())
+
+    async def story() -> None:
+        await rig.until(lambda: len(rig.samples) >= 40, "forty samples", lambda: port.step(monotonic_ns(), True))
+
+    with closing(port):
+        rig.play(story)
+    assert rig.runner.ledger.lost() == 0
+    for sample in rig.samples:
+        assert sample.euler_rad is not None
+        truth = module.hardware.motion.at((sample.t_ns - module.epoch_ns) / 1e9)
+        assert sample.euler_rad == pytest.approx(truth.euler_rad, abs=0.1)
