@@ -30,6 +30,8 @@ PACKAGES = {
     "spi-tools": "independent peer of the tests",
     "can-utils": "independent peer of the tests",
     "gpiod": "independent peer of the tests",
+    "gpsd": "independent peer of the tests, also outside of the lab",
+    "chrony": "independent peer of the tests, also outside of the lab",
 }
 """Package name to what the lab does with it."""
 
