@@ -19,9 +19,11 @@ from imud.config import Config, DeviceConfig
 from imud.devices import DRIVERS
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
+from imud.gpio import LINES
 from imud.kit.action import ActionInfo, described
 from imud.kit.batch import Batch
 from imud.kit.can import CanDriver
+from imud.kit.lines import LineMaker
 from imud.kit.publisher import Publisher, PublisherContext, PublisherSettings
 from imud.kit.status import DeviceState, DeviceStatus
 from imud.links import LINKS
@@ -45,7 +47,8 @@ class Daemon:
     """Runs one configuration. Synchronization: all in the event loop's thread.
 
     `file` is read again on SIGHUP; `state_dir` is where found devices are remembered (None remembers nothing);
-    `extra` are publishers besides the configured ones; `until_finished` ends the run with the last replay.
+    `extra` are publishers besides the configured ones; `until_finished` ends the run with the last replay; `lines`
+    makes the devices' lines.
     """
 
     def __init__(
@@ -56,6 +59,7 @@ class Daemon:
         state_dir: Path | None = None,
         extra: Mapping[str, Publisher] | None = None,
         until_finished: bool = False,
+        lines: LineMaker = LINES,
     ) -> None:
         self.config = config
         self._file = file
@@ -63,6 +67,7 @@ class Daemon:
         self._context = PublisherContext(self.status, secrets.randbits(63) | 1, monotonic_ns, self.actions, self.act)
         self._extra = dict(extra or {})
         self._until_finished = until_finished
+        self._lines = lines
         self._publishers: dict[str, Publisher] = {}
         self._runners: dict[str, Device] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -202,7 +207,7 @@ class Daemon:
             return PolledRunner(device, device_id, publish, tell, self._buses)
         if link.frames_only or isinstance(DRIVERS.get(device.driver), CanDriver):
             return CanRunner(device, device_id, publish, tell, self._can_buses, self._remembered)
-        return DeviceRunner(device, device_id, publish, tell, self._remembered)
+        return DeviceRunner(device, device_id, publish, tell, self._remembered, self._lines)
 
     def _stop_device(self, name: str) -> None:
         self._tasks.pop(name).cancel()

@@ -82,7 +82,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     status: int | None = None
     pps_age_ms: int | None = None
     edge_seq: int | None = None
-    """Number of the SOUT or PPS edge that belongs to this sample."""
+    """Number of the rising edge on SOUT, or of the trigger on SIN, that belongs to this sample."""
 
 
 SAMPLE_FIELDS: tuple[str, ...] = Sample.__struct_fields__

@@ -5,6 +5,7 @@ from typing import Annotated, Final
 
 from msgspec import Meta
 
+from imud.kit.action import Action
 from imud.kit.can import STANDARD_ID_MAX, CanDriver, CanFilter, CanFrame, CyclicFrame
 from imud.kit.codec import CodecEvent
 from imud.kit.driver import SAMPLE_COUNTER, Identity
@@ -80,6 +81,7 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
         sample_frames=1,
         example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)],
         cyclic=_cyclic,
+        actions={"node": Action("its number", lambda target, _params: says_nothing(target.settings.node))},
     )
 
 

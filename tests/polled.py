@@ -10,7 +10,9 @@ import msgspec
 from imud.config import DeviceConfig
 from imud.devices import DRIVERS
 from imud.event import Event, EventKind
+from imud.gpio import LINES
 from imud.kit.batch import Batch
+from imud.kit.lines import LineMaker
 from imud.kit.status import DeviceState
 from imud.links import LINKS
 from imud.pipeline.bus import Buses
@@ -22,11 +24,11 @@ from tests.running import LIMIT_S
 class Rig:
     """One runner with what came out of it."""
 
-    def __init__(self, buses: Buses, config: DeviceConfig, device_id: int = 0) -> None:
+    def __init__(self, buses: Buses, config: DeviceConfig, device_id: int = 0, lines: LineMaker = LINES) -> None:
         self.samples: list[Sample] = []
         self.events: list[Event] = []
         self.now_ns = buses.now_ns
-        self.runner = PolledRunner(config, device_id, self._publish, self.events.append, buses)
+        self.runner = PolledRunner(config, device_id, self._publish, self.events.append, buses, lines)
 
     def _publish(self, batch: Batch) -> None:
         self.samples += batch.samples
@@ -66,12 +68,14 @@ def device_config(name: str, driver: str, link: str, settings: dict[str, Any], *
 
 
 @asynccontextmanager
-async def running(*configs: DeviceConfig, buses: Buses | None = None) -> AsyncIterator[list[Rig]]:
+async def running(
+    *configs: DeviceConfig, buses: Buses | None = None, lines: LineMaker = LINES
+) -> AsyncIterator[list[Rig]]:
     """Runners at work on their buses, with real threads unless others are given; all closed at the end."""
     mistakes: list[object] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: mistakes.append(context))
     buses = buses or Buses()
-    rigs = [Rig(buses, config, number) for number, config in enumerate(configs)]
+    rigs = [Rig(buses, config, number, lines) for number, config in enumerate(configs)]
     tasks = [asyncio.create_task(rig.runner.run()) for rig in rigs]
     try:
         yield rigs

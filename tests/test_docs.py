@@ -15,7 +15,7 @@ import pytest
 from imud import config
 from imud.cli import COMMANDS, build_parser
 from imud.devices import DRIVERS
-from tests import shm_reference
+from tests import actions_reference, shm_reference
 from tests.running import LIMIT_S, running_daemon
 from tests.test_daemon import cable, device
 
@@ -121,3 +121,12 @@ def test_layout_tables_are_those_of_the_code() -> None:
     text = shm_reference.PAGE.read_text()
     assert "| 0 | `uint64_t` | `seq` |" in text
     assert shm_reference.filled(text) == text, "run python -m tests.shm_reference"
+
+
+def test_tables_of_actions_are_those_of_the_drivers() -> None:
+    text = actions_reference.FILE.read_text()
+    assert text.count("\n### `") == len(DRIVERS)
+    for driver in DRIVERS.values():
+        for action in driver.actions:
+            assert f"\n| `{action}` | " in text, action
+    assert actions_reference.whole(text) == text, "run python -m tests.actions_reference"

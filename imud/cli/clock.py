@@ -78,8 +78,28 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
         f"  offset    {clock.offset_ns / NS_PER_S:+.9f} s (host - device), skew {clock.skew_ppm:+.3f} ppm, "
         f"{clock.resets} resets",
         f"  residual  {clock.residual_ns / NS_PER_US:.1f} µs (one sigma)",
+        *(f"  {name:<10}{words}" for name, words in aids(status)),
         f"  read after measurement, {len(behind_ns)} samples:",
         *histogram([late_ns / NS_PER_US for late_ns in behind_ns], "µs"),
         f"  verdict   {verdict(clock, behind_ns)}",
     ]
     return "\n".join(lines)
+
+
+def aids(status: DeviceStatus) -> Iterator[tuple[str, str]]:
+    """Name and words of what tells the time besides arrivals, where there is any."""
+    clock, lines, utc = status.clock, status.lines, status.utc
+    if lines is not None and "sout" in lines.edges:
+        yield (
+            "SOUT",
+            (
+                f"{clock.edges} pulses, {clock.edges_unpaired} belong to no sample;"
+                f" {clock.samples_unpaired} samples without theirs"
+            ),
+        )
+    if lines is not None and lines.sin:
+        yield "SIN", f"{lines.triggers} triggers, {clock.triggers_missed} not answered by a sample"
+    if utc is not None and (utc.pulses or utc.pulses_ignored):
+        yield "PPS", f"{utc.pulses} pulses, {utc.pulses_ignored} in step with none"
+    if clock.reference_error_ns:
+        yield "UTC", f"the host knows it to {clock.reference_error_ns / NS_PER_US:.1f} µs (one sigma)"

@@ -20,7 +20,7 @@ from imud.kit.link import StreamLink
 from imud.ledger import Ledger
 from imud.links import LINKS
 from imud.links.netlink import can_interfaces
-from imud.pipeline.device import identity_words
+from imud.pipeline.acquaintance import identity_words
 from imud.pipeline.search import Finder, Finding
 from imud.pipeline.talk import Talk
 from imud.ports import list_ports

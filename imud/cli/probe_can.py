@@ -18,8 +18,8 @@ from imud.ledger import Ledger
 from imud.links import LINKS
 from imud.links.can_state import ControllerState
 from imud.links.netlink import can_details
+from imud.pipeline.acquaintance import identity_words
 from imud.pipeline.can_search import EVERYTHING, CanFinder
-from imud.pipeline.device import identity_words
 from imud.pipeline.talk import Talk
 
 

@@ -1,11 +1,12 @@
 """`imud status`: state, rate, clock, losses and ledger of each device."""
 
 import argparse
+from collections.abc import Iterator
 
 import msgspec
 
 from imud.cli.connect import add_socket, connect, statuses
-from imud.kit.status import DeviceStatus, PollingStatus
+from imud.kit.status import DeviceStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.ledger import bytes_open, frames_open
 from imud.units import NS_PER_MS, NS_PER_US
 
@@ -47,9 +48,24 @@ def block(status: DeviceStatus) -> str:
         f" + {ledger['bytes_pending']} pending: {'closed' if closes(ledger) else 'DOES NOT CLOSE'}",
         f"  kernel    {status.kernel.overrun} overruns, {status.kernel.framing} framing, {status.kernel.parity} parity",
     ]
+    return "\n".join([*lines, *(f"  {name:<10}{words}" for name, words in parts(status))])
+
+
+def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
+    """Name and words of what only some devices have."""
     if status.polling is not None:
-        lines.append(f"  polling   {polling(status.polling)}")
-    return "\n".join(lines)
+        yield "polling", polling(status.polling)
+    if status.serial_line is not None:
+        yield "line", serial_line(status.serial_line)
+    if status.lines is not None:
+        for name, count in status.lines.edges.items():
+            yield name, watched(status.lines, name, count)
+        if status.lines.sin:
+            yield "sin", driven(status.lines)
+        others = status.lines.problems.keys() - status.lines.edges.keys() - {"sin"}
+        yield from ((name, status.lines.problems[name]) for name in sorted(others))
+    if status.utc is not None:
+        yield "utc", utc(status.utc)
 
 
 def polling(polls: PollingStatus) -> str:
@@ -59,6 +75,53 @@ def polling(polls: PollingStatus) -> str:
         f" {polls.late_mean_ns / NS_PER_US:.1f} µs after the deadline, {polls.late_worst_ns / NS_PER_US:.1f} at worst;"
         f" vanished {polls.vanished} times"
     )
+
+
+def serial_line(line: SerialLineCounters) -> str:
+    """What was heard on a shared serial line besides replies."""
+    return (
+        f"{line.timeouts} requests unanswered; {line.late_bytes} bytes unasked, {line.strange_bytes} strange;"
+        f" {line.echoes} echoes (all devices of the line)"
+    )
+
+
+def watched(lines: LinesStatus, name: str, edges: int) -> str:
+    """One input line."""
+    words = f"{edges} edges, {lines.edges_lost.get(name, 0)} lost"
+    if name == "alarm":
+        level = {True: "ACTIVE", False: "inactive", None: "level not known"}[lines.alarm]
+        words = f"{level}, raised {lines.alarms} times; {words}"
+    return words + problem_of(lines, name)
+
+
+def driven(lines: LinesStatus) -> str:
+    """SIN."""
+    return (
+        f"{lines.triggers} triggers, {lines.triggers_missed} missed;"
+        f" {lines.trigger_late_mean_ns / NS_PER_US:.1f} µs after the deadline,"
+        f" {lines.trigger_late_worst_ns / NS_PER_US:.1f} at worst{problem_of(lines, 'sin')}"
+    )
+
+
+def problem_of(lines: LinesStatus, name: str) -> str:
+    """Why a line is not watched or driven, in brackets; empty when it is."""
+    return f" ({lines.problems[name]})" if name in lines.problems else ""
+
+
+def utc(status: UtcStatus) -> str:
+    """How a device is told UTC, and what the host knows of it."""
+    words = []
+    if status.source:
+        refused = ", ".join(f"{cause} {count}" for cause, count in status.refused.items())
+        words.append(
+            f"{status.source}: {status.sentences} sentences, {status.sent} sent"
+            + (f", not sent: {refused}" if refused else "")
+        )
+    if status.pulses or status.pulses_ignored:
+        words.append(f"{status.pulses} pulses, {status.pulses_ignored} ignored")
+    if status.chrony_sent or status.chrony_refused:
+        words.append(f"chronyd took {status.chrony_sent}, refused {status.chrony_refused}")
+    return ("; ".join(words) or "nothing yet") + (f" ({status.problem})" if status.problem else "")
 
 
 def closes(ledger: dict[str, int]) -> bool:

@@ -122,21 +122,22 @@ class Aids:
 
     def steer(
         self, m: Measurement, x: int, y: int, fit_ns: int, fit_error_ns: float, fit_sync: Sync, period_ns: float,
-        slope: float, age_ns: int,
+        slope: float, slope_error: float, age_ns: int,
     ) -> int:  # fmt: skip
         """When the sample at device time `x` was taken, the fit saying `fit_ns`; leaves error, source and edge.
 
-        Its message began no later than `y`; samples are `period_ns` apart, a device ns is `slope` host ns, and the fit
-        has been going for `age_ns`.
+        Its message began no later than `y`; samples are `period_ns` apart, a device ns is `slope` host ns, one sigma
+        `slope_error`, and the fit has been going for `age_ns`.
         """
         elapsed_ns = x - self._x if self._x is not None else 0
         self._x = x
         before, fix_before = self._source, self._fix_ns
+        advanced = 2 * elapsed_ns > period_ns  # a slope over less than that is none
         source, paired = None, False
         for candidate in self._sources:
             pairing = candidate.pairing
             own = False
-            if elapsed_ns > 0 and not (candidate.mask and candidate.silent(m.status)):
+            if advanced and not (candidate.mask and candidate.silent(m.status)):
                 own = pairing.pair(x, y, fit_ns, fit_error_ns, period_ns, slope)
             else:
                 pairing.skip(x)
@@ -145,7 +146,7 @@ class Aids:
         if source is not None and source is before and self.pps is None and self.utc.reference is None:
             fix_ns, error_ns, by_pps = fix_before, fit_error_ns, False  # nothing else is asked
         else:
-            fix_ns, error_ns, by_pps = self._fix(m, x, y, fit_ns, fit_error_ns, slope)
+            fix_ns, error_ns, by_pps = self._fix(m, x, y, fit_ns, fit_error_ns, slope, slope_error)
         self._source, self._fix_ns = source, fix_ns
         if source is None:
             wanted = fit_ns + int(fix_ns)
@@ -165,13 +166,14 @@ class Aids:
         return wanted + int(left_ns)
 
     def _fix(
-        self, m: Measurement, x: int, y: int, fit_ns: int, fit_error_ns: float, slope: float
+        self, m: Measurement, x: int, y: int, fit_ns: int, fit_error_ns: float, slope: float, slope_error: float
     ) -> tuple[float, float, bool]:
         """(What is to be added to the fit, its error then, whether a pulse per second says so)."""
         fix_ns = 0.0
         for source in self._sources:
             if source.pairing.learned:
                 fix_ns = source.offset_ns - source.pairing.delay_ns
+                fit_error_ns = hypot(fit_error_ns, source.pairing.delay_error_ns)
                 break
         utc, pps, ticks = self.utc, self.pps, m.dev_ticks
         at_ns = fit_ns + int(fix_ns)
@@ -184,7 +186,7 @@ class Aids:
                 return fix_ns + more_ns, hypot(error_ns, utc.tick_error_ns), False
         if pps is not None:
             if m.pps_age_ms is not None:
-                pps.take(m.pps_age_ms, x, y, at_ns, fit_error_ns, slope)
+                pps.take(m.pps_age_ms, x, y, at_ns, fit_error_ns, slope, slope_error)
             if pps.helps(x, fit_error_ns):
                 more_ns, error_ns = pps.bounds.improved(x, at_ns, fit_error_ns, 0.0)
                 return fix_ns + more_ns, error_ns, True

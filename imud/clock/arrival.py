@@ -41,19 +41,6 @@ class LinkDelay:
             return self.hold_ns
         return min(self.hold_ns, max(period_ns - size_bytes * self.byte_ns, 0.0))
 
-    def hidden_ns(self, held_ns: float, wait_excess_ns: float, wait_band_ns: float) -> float:
-        """Bound of what a timer that beats with the samples hides from the envelope now.
-
-        Over a second, waits that sweep the timer's whole period are on average half of it longer than the luckiest.
-        Where n phases repeat (100 Hz on 16 ms: 8) they are (hold - hold / n) / 2 longer, so twice the excess leaves of
-        `hold` the step between phases, and the luckiest message of a second waited up to one step. As the two clocks
-        drift, that wait moves through the step; the band it has been seen to fill is not hidden any more.
-        """
-        if not held_ns:
-            return 0.0
-        step_ns = self.hold_ns - 2 * wait_excess_ns
-        return min(held_ns, max(step_ns - max(wait_band_ns, 0.0), 0.0))
-
 
 class ArrivalSpread:
     """Mean and spread of the steps between arrivals, for devices that send no time."""

@@ -42,7 +42,7 @@ class _Bin:
 class Bounds:
     """Lowest and highest time that a sample can have, by the intervals of the last half minute."""
 
-    __slots__ = ("_bins", "_middle", "_narrowest_ns", "_slope", "_x", "_y", "fresh_x", "known", "width_ns")
+    __slots__ = ("_bins", "_fan", "_middle", "_narrowest_ns", "_slope", "_width_ns", "_x", "_y", "fresh_x", "known")
 
     def __init__(self, narrowest_ns: int = NARROWEST_NS) -> None:
         self._narrowest_ns = narrowest_ns
@@ -50,12 +50,12 @@ class Bounds:
         self._x = self._y = 0
         self._middle = 0.0
         self._slope = 1.0
+        self._width_ns = self._fan = 0.0
+        """Of the corridor at `_x`, and how much it opens per device ns from there on."""
         self.fresh_x = 0
         """Device time of the newest interval."""
         self.known = False
         """Whether there is a corridor."""
-        self.width_ns = 0.0
-        """Of the corridor, at its newest end."""
 
     def clear(self) -> None:
         """Nothing is known any more."""
@@ -78,18 +78,24 @@ class Bounds:
             self._fit(x, slope)
         bins.append(_Bin(x, low, high))
 
+    def width_ns(self, x: int) -> float:
+        """Of the corridor at device time `x`, not before its newest end."""
+        return self._width_ns + self._fan * (x - self._x)
+
     def improved(self, x: int, fit_ns: int, error_ns: float, common_ns: float) -> tuple[float, float]:
         """(what to add to the fit for the sample at `x`, one-sigma error after it); `error_ns` is the fit's.
 
         `common_ns` is the error that all intervals share. Each weighs by its error, and the result lies within the
-        corridor. Both can be wrong by the same uneven ticks, so the error is that of the better.
+        corridor. Both can be wrong by the same uneven ticks, so the error is that of the better, and a fit that has to
+        be moved into the corridor is worse by that.
         """
+        width_ns = max(self.width_ns(x), self._narrowest_ns)
         middle = self._y - fit_ns + self._middle + self._slope * (x - self._x)
-        own_ns = hypot(SIGMA_OF_RANGE * max(self.width_ns, self._narrowest_ns), common_ns)
+        own_ns = hypot(SIGMA_OF_RANGE * width_ns, common_ns)
         wanted = middle * error_ns * error_ns / (error_ns * error_ns + own_ns * own_ns)
-        most = max(self.width_ns, self._narrowest_ns) / 2 + 2 * common_ns
+        most = width_ns / 2 + 2 * common_ns
         held = min(max(wanted, middle - most), middle + most)
-        return held, min(own_ns, error_ns) if held == wanted else own_ns
+        return held, min(own_ns, error_ns + abs(held - wanted))
 
     def _fit(self, x: int, slope: float) -> None:
         """Lay the corridor through all bins again; the oldest go where no line passes through all."""
@@ -110,7 +116,8 @@ class Bounds:
         self._x, self._y = x, y0
         self._middle = (found.lowest_ns + found.highest_ns) / 2 + slope * (x - x0)
         self._slope = slope + (0.0 if len(bins) == 1 else (found.slope_lowest + found.slope_highest) / 2)
-        self.width_ns = found.highest_ns - found.lowest_ns
+        self._width_ns = found.highest_ns - found.lowest_ns
+        self._fan = found.slope_highest - found.slope_lowest
 
 
 def _point(x: int, y: int, slope: float) -> Point:

@@ -1,33 +1,35 @@
-"""Time over a jump of the device's counter that is understood: it goes on from what was told, by the same crystal."""
+"""Time over a jump of the device's counter to UTC: from where the old fit ended, at the rate of UTC.
 
+What the old fit knew of the device's crystal does not hold any more: the counter is UTC now, whatever the crystal does.
+"""
+
+from math import hypot
 from typing import Final
 
-from imud.units import NS_PER_MS
-
-CRYSTAL: Final = 20e-6
-"""How well the slope is known at worst, of a fit that counts."""
+RATE: Final = 50e-6
+"""How far CLOCK_MONOTONIC is from the rate of UTC at most: a crystal's tolerance, where nothing steers it."""
+TICK_SHARE: Final = 0.5
+"""Where in its ticks the device measures is not known."""
 
 
 class Coast:
-    """A line from where the old fit ended, for as long as the new one does not count. Errors grow with time."""
+    """A line for as long as the new fit does not count. Errors grow with time."""
 
-    __slots__ = ("_error_ns", "_slope", "_t_ns", "_x")
+    __slots__ = ("_error_ns", "_t_ns", "_x")
 
-    def __init__(self, x: int, t_ns: int, slope: float, error_ns: float) -> None:
+    slope: Final = 1.0
+    """Host ns per device ns."""
+    slope_error: Final = RATE
+
+    def __init__(self, x: int, t_ns: int, error_ns: float, tick_ns: int) -> None:
         self._x = x
         self._t_ns = t_ns
-        self._slope = slope
-        self._error_ns = error_ns + NS_PER_MS / 4  # where in its tick the counter jumped is not known
+        self._error_ns = hypot(error_ns, TICK_SHARE * tick_ns)
 
     def at(self, x: int) -> int:
         """Host time at device time `x`."""
-        return self._t_ns + int(self._slope * (x - self._x))
+        return self._t_ns + x - self._x
 
     def error_ns(self, x: int) -> float:
         """One-sigma error of that."""
-        return self._error_ns + CRYSTAL * (x - self._x)
-
-    @property
-    def slope(self) -> float:
-        """Host ns per device ns."""
-        return self._slope
+        return self._error_ns + RATE * (x - self._x)

@@ -9,6 +9,8 @@ CONSISTENT_LONGER: Final = 12
 same hole four times in a row, and a period of two ticks for one would shift device time by a tick."""
 WHOLE_AFTER: Final = 64
 """After so many equal steps the period is whole: what differed in the beginning was a loss."""
+EVERY_TICK: Final = 1.5
+"""With a shorter period two samples can be in one tick; with a longer one it is the same sample."""
 MEMORY: Final = 4096
 """Steps in the mean of a period that is no whole number of ticks; then both sums are halved."""
 
@@ -24,7 +26,7 @@ class PeriodLearner:
         self._sum = 0.0
         self._count = 0.0
         self._even = 0
-        self._before = 0
+        self._before = -1
         self._candidate = 0
         self._run = 0
         self._run_sum = 0
@@ -35,6 +37,8 @@ class PeriodLearner:
         """Take the step to the newest sample; returns how many samples are missing in it."""
         period = self.period_ticks
         if ticks <= 0:
+            if 0 < period < EVERY_TICK:
+                self._refine(0)
             return 0
         if ticks == period:
             self._run = 0
@@ -45,16 +49,25 @@ class PeriodLearner:
             return 0
         if self._learn(ticks):
             return 0
-        return max(int(ticks / period + 0.5) - 1, 0) if period else 0
+        if not period:
+            return 0
+        steps = max(int(ticks / period + 0.5), 1)
+        if self.changes and abs(ticks - steps * period) <= 1:
+            self._add(ticks, steps)  # the mean of what is left, where one of ten is lost, is off by a thousandth
+        return steps - 1
+
+    def _add(self, ticks: int, steps: int) -> None:
+        """So many steps together are so many ticks."""
+        self._sum += ticks + int(self._even * self.period_ticks)
+        self._count += steps + self._even
+        self._even = 0
+        self.period_ticks = self._sum / self._count
 
     def _refine(self, ticks: int) -> None:
         self._run = 0
-        self._sum += ticks + int(self._even * self.period_ticks)
-        self._count += 1 + self._even
-        self._even = 0
+        self._add(ticks, 1)
         same, self._before = ticks == self._before, ticks
         self.changes += not same
-        self.period_ticks = self._sum / self._count
         if same and self.changes <= 1 and self._count >= WHOLE_AFTER:
             self.period_ticks, self._sum, self._count, self.changes = float(ticks), float(ticks), 1.0, 0
         while self._count >= MEMORY:
@@ -72,5 +85,6 @@ class PeriodLearner:
             return False
         self._sum, self._count = float(self._run_sum), float(self._run)
         self.period_ticks = self._sum / self._count
-        self._run = self._even = self.changes = self._before = 0
+        self._run = self._even = self.changes = 0
+        self._before = -1
         return True

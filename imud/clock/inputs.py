@@ -29,6 +29,8 @@ class LineInputs:
         self._sin_timing = sin or TriggerTiming()
         self._pulses = Pulses(int(self._sout_timing.width_us * NS_PER_US))
         self._aids: Aids | None = None
+        self.own_status: int | None = None
+        """Bits of the host's own that `sample` sets in the status from now on; None for none."""
 
     def edges(self, edges: Sequence[Edge]) -> None:
         """Edges of SOUT, rising and falling."""

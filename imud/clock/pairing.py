@@ -34,9 +34,11 @@ MISSES_MOST: Final = 8
 """After so many samples in a row without an event the line is given up."""
 WRONG: Final = 0.75
 WRONG_MOST: Final = 64
+"""The line is wrong when for so many samples in a row the fit is off by this share of a period."""
+SLOPE_OFF_MOST: Final = 0.12
+"""A line whose slope differs from the fit's by more went through the events of other samples: past two crystals."""
 LEARNED: Final = 16
 """So many pairs say how far the fit is behind the events."""
-"""The line is wrong when for so many samples in a row the fit is off by this share of a period."""
 QUEUE_MOST: Final = 4096
 """Events that wait for their message: 4 s at 1 kHz."""
 SMOOTHING: Final = 1 / 32
@@ -46,8 +48,8 @@ class Pairing:
     """The events of one line, and which sample each belongs to."""
 
     __slots__ = (
-        "_first", "_pairs", "_queue", "_tracker", "_wrong", "delay_ns", "due_ns", "events", "events_unpaired",
-        "lead_ns", "learned", "misses", "number", "samples_unpaired", "spread_ns", "stamp_ns",
+        "_first", "_pairs", "_queue", "_tracker", "_wrong", "delay_error_ns", "delay_ns", "due_ns", "events",
+        "events_unpaired", "lead_ns", "learned", "misses", "number", "samples_unpaired", "spread_ns", "stamp_ns",
     )  # fmt: skip
 
     def __init__(self, lead_ns: int) -> None:
@@ -60,6 +62,8 @@ class Pairing:
         self._wrong = 0
         self.delay_ns = float(lead_ns)
         """How much later than the events the fit of arrivals is."""
+        self.delay_error_ns = 0.0
+        """One-sigma error of the fit when it was compared last."""
         self.learned = False
         """Whether `delay_ns` comes from pairs."""
         self.due_ns = 0
@@ -123,7 +127,11 @@ class Pairing:
             if self.misses >= MISSES_MOST:
                 self._give_up()
             return False
+        if abs(tracker.slope - slope) > SLOPE_OFF_MOST:
+            self._give_up()
+            return False
         self.misses = 0
+        self.delay_error_ns = fit_error_ns
         return self._learn(fit_ns - self.due_ns, late=self.stamp_ns > y, most=WRONG * period_ns)
 
     def _learn(self, delay_ns: int, *, late: bool, most: float) -> bool:

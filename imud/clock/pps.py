@@ -38,10 +38,12 @@ class PpsAge:
         """Rising edges in their order, before the messages that follow them."""
         self._pulses.extend(pulses_ns)
 
-    def take(self, age_ms: int, x: int, y: int, fit_ns: int, fit_error_ns: float, slope: float) -> None:
+    def take(
+        self, age_ms: int, x: int, y: int, fit_ns: int, fit_error_ns: float, slope: float, slope_error: float
+    ) -> None:
         """A sample at device time `x`, by the fit at `fit_ns`, says that a pulse was `age_ms` before it.
 
-        Its message began no later than `y`.
+        Its message began no later than `y`. A device ns is `slope` host ns, one sigma `slope_error`.
         """
         if age_ms > AGE_MOST_MS:
             return
@@ -51,8 +53,8 @@ class PpsAge:
         for t_ns in reversed(self._pulses):
             above = t_ns + age
             if -tolerance - tick <= above <= tolerance:
-                low = fit_ns + int(above)
-                self.bounds.add(x, low - STAMP_NS, low + int(tick), y, slope)
+                low, doubt = fit_ns + int(above), int(SIGMAS * slope_error * age_ms * NS_PER_MS)
+                self.bounds.add(x, low - STAMP_NS - doubt, low + int(tick) + doubt, y, slope)
                 return
 
     def helps(self, x: int, fit_error_ns: float) -> bool:
@@ -60,6 +62,6 @@ class PpsAge:
         bounds = self.bounds
         if x - bounds.fresh_x > STALE_NS:
             bounds.clear()
-        own_ns = SIGMA_OF_RANGE * bounds.width_ns
+        own_ns = SIGMA_OF_RANGE * bounds.width_ns(x)
         self.trusted = bounds.known and own_ns < fit_error_ns * (2 if self.trusted else 1)
         return self.trusted

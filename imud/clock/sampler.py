@@ -19,6 +19,7 @@ from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
 from imud.clock.coast import Coast
 from imud.clock.envelope import SLOPE_HIGHEST, Envelope
 from imud.clock.inputs import LineInputs
+from imud.clock.jump import EARLY_NS, EARLY_SIGMAS, FIRST_EARLY_NS, LATE_NS, Jump
 from imud.clock.number import SampleNumber
 from imud.clock.slew import SETTLED_AFTER_NS, Slew
 from imud.clock.unwrap import DeviceTime
@@ -36,14 +37,6 @@ COAST_NS: Final = 16 * NS_PER_S
 YOUNG_NS: Final = 32 * NS_PER_S
 YOUNG_FACTOR: Final = 1.5
 """A corridor this short has not seen the timer's beat, and a stalled read in it weighs more."""
-EARLY_NS: Final = 5 * NS_PER_MS
-EARLY_SIGMAS: Final = 10
-"""A stamp that lies this far ahead of its own arrival says that the device's clock jumped."""
-FIRST_EARLY_NS: Final = NS_PER_S
-"""The same before a line counts: the first message may have waited that long in a buffer."""
-LATE_NS: Final = NS_PER_S // 2
-LATE_READS: Final = 3
-"""Messages may queue up while the host is busy; in so many reads over a second, it is the device's clock."""
 T_ERR_MOST: Final = 0xFFFF_FFFF
 """`t_err_ns` is 32 bits wide wherever it is published."""
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
@@ -95,8 +88,7 @@ class SampleClock(LineInputs):
         self._epoch_x = 0
         self._shift_ns = 0.0
         self._error_ns = 0.0
-        self._late_reads = 0
-        self._late_since_ns = 0
+        self._jump = Jump()
         self.missed = 0
         """Samples missing right before the newest one, by device time."""
 
@@ -119,7 +111,7 @@ class SampleClock(LineInputs):
         else:
             wanted = self._by_device(ticks, y, trailing_ns, t_rx_ns, size_bytes)
             t_dev_ns, sync = self._time.raw_ns, self._sync
-        edge_seq, aids, slew = None, self._aids, self._slew
+        edge_seq, aids, slew, own = None, self._aids, self._slew, self.own_status
         if aids is not None:
             if t_dev_ns is not None and (sync is not _ARRIVAL or self._coast is not None):
                 wanted, slew = self._steered(aids, m, wanted, y), aids.slew
@@ -142,26 +134,27 @@ class SampleClock(LineInputs):
         return Sample(
             self._device, seq, t_ns, t_err_ns, sync, t_rx_ns, t_ns + utc_offset_ns, t_dev_ns,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
-            m.incli_rad, m.status, m.pps_age_ms, edge_seq,
+            m.incli_rad, m.status if own is None else own | (m.status or 0), m.pps_age_ms, edge_seq,
         )  # fmt: skip
 
-    def sample_asked(self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int) -> Sample:
+    def sample_asked(
+        self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int, edge_seq: int | None = None
+    ) -> Sample:
         """A measurement that the host asked for, as the next sample of the device.
 
-        `t_ns` is CLOCK_MONOTONIC right before the asking, `t_err_ns` its one-sigma error, `t_rx_ns` right after the
-        answer. Where `t_ns` does not rise, it is lifted by nanoseconds.
+        `t_ns` is CLOCK_MONOTONIC right before the asking, or by the data-ready edge of number `edge_seq`; `t_err_ns` is
+        its one-sigma error, `t_rx_ns` right after the answer. A `t_ns` that does not rise is lifted, and the error too.
         """
-        self.missed = 0
+        self.missed, self._sync = 0, _ARRIVAL if edge_seq is None else Sync.EDGE
         self._spread.add(t_ns)
-        t_ns = max(t_ns, self._t_ns + 1)
-        t_rx_ns = max(t_rx_ns, self._t_rx_ns, t_ns)
-        self._t_ns, self._t_rx_ns = t_ns, t_rx_ns
-        self._seq = seq = self._seq + 1
-        self._t_err_ns = t_err_ns = min(t_err_ns, T_ERR_MOST)
+        t_err_ns = min(t_err_ns + max(0, self._t_ns + 1 - t_ns), T_ERR_MOST)
+        self._t_ns = t_ns = max(t_ns, self._t_ns + 1)
+        self._t_rx_ns = t_rx_ns = max(t_rx_ns, self._t_rx_ns, t_ns)
+        self._seq, self._t_err_ns = self._seq + 1, t_err_ns
         return Sample(
-            self._device, seq, t_ns, t_err_ns, _ARRIVAL, t_rx_ns, t_ns + utc_offset_ns, None,
+            self._device, self._seq, t_ns, t_err_ns, self._sync, t_rx_ns, t_ns + utc_offset_ns, None,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
-            m.incli_rad, m.status, m.pps_age_ms,
+            m.incli_rad, m.status, m.pps_age_ms, edge_seq,
         )  # fmt: skip
 
     @property
@@ -249,7 +242,8 @@ class SampleClock(LineInputs):
         x = time.even_ns
         line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
         height = y - line
-        if (height < -EARLY_NS or height > LATE_NS or self._late_reads) and self._jumped(height, x - x_before, t_rx_ns):
+        odd = height < -EARLY_NS or height > LATE_NS or self._jump.late_reads
+        if odd and self._jumped(height, x - x_before, t_rx_ns):
             told_ns = self._turned(ticks, y)
             if told_ns is not None:
                 return told_ns
@@ -295,23 +289,23 @@ class SampleClock(LineInputs):
 
     def _turned(self, ticks: int, y: int) -> int | None:
         """Time of a message whose counter jumped, if it jumped to UTC or within it; then time goes on over the jump."""
-        aids, envelope = self._aids, self._envelope
-        if aids is None or envelope is None:
+        aids = self._aids
+        if aids is None:
             return None
         above = aids.utc.above(ticks, y, FIRST_SPREAD_NS + self._delay.hold_ns)
         if above is None:
             return None
-        slope, period_ns, tick_ns = envelope.slope, self._period_ns() or 1.0, self._time.tick_ns
+        period_ns, tick_ns, error_ns = self._period_ns() or 1.0, self._time.tick_ns, float(self._t_err_ns)
         by_utc = y + above + tick_ns // 2
         t_ns = self._t_ns + int(max(round((by_utc - self._t_ns) / period_ns), 1) * period_ns)
-        if abs(t_ns - by_utc) > tick_ns + 2 * self._t_err_ns:  # the device began its samples anew
-            t_ns = max(by_utc, self._t_ns + 1)
-        error_ns = self._t_err_ns
+        unknown = self._sync is _ARRIVAL and self._coast is None
+        if unknown or abs(t_ns - by_utc) > tick_ns + 2 * error_ns:
+            t_ns, error_ns = max(by_utc, self._t_ns + 1), aids.utc.tick_error_ns  # or the device samples anew
         self.missed = 0
         self._time.begin(ticks)
         self._start(y)
         aids.utc.turned()
-        self._coast = coast = Coast(self._epoch_x, t_ns, slope, error_ns)
+        self._coast = coast = Coast(self._epoch_x, t_ns, error_ns, tick_ns)
         self._t_err = coast.error_ns(self._epoch_x)
         self._epoch_x -= SETTLED_AFTER_NS  # time went on: corrections stay slow
         return t_ns
@@ -320,9 +314,10 @@ class SampleClock(LineInputs):
         """What lines and UTC make of a time by the fit; leaves its error in `_t_err`."""
         x, coast, envelope = self._time.even_ns, self._coast, self._envelope
         assert envelope is not None
-        slope = coast.slope if coast else envelope.slope
-        age_ns = x - self._epoch_x
-        t_ns = aids.steer(m, x, y, wanted, self._t_err, self._sync, self._period_ns(), slope, age_ns)
+        line, age_ns = coast or envelope, x - self._epoch_x
+        t_ns = aids.steer(
+            m, x, y, wanted, self._t_err, self._sync, self._period_ns(), line.slope, line.slope_error, age_ns
+        )
         self._t_err = aids.error_ns
         return t_ns
 
@@ -335,7 +330,7 @@ class SampleClock(LineInputs):
     def _forget(self) -> None:
         self._envelope = self._coast = None
         self._sync = _ARRIVAL
-        self._late_reads = 0
+        self._jump.late_reads = 0
         self._slew.left_ns = 0.0
         if self._aids is not None:
             self._aids.restart()
@@ -345,17 +340,8 @@ class SampleClock(LineInputs):
         envelope = self._envelope
         assert envelope is not None
         if height < -EARLY_NS:
-            if self._sync is _ARRIVAL:
-                return height < -FIRST_EARLY_NS - (SLOPE_HIGHEST - 1) * (elapsed_ns + envelope.span_ns)
-            return height < -EARLY_SIGMAS * self._error_ns - EARLY_NS - 4 * envelope.slope_error * elapsed_ns
-        if height < LATE_NS + envelope.slope_error * elapsed_ns:
-            self._late_reads = 0
-            return False
-        if not self._late_reads:
-            self._late_since_ns = t_rx_ns
-        if t_rx_ns > self._t_rx_ns:
-            self._late_reads += 1
-        return self._late_reads >= LATE_READS and t_rx_ns - self._late_since_ns > NS_PER_S
+            return self._jump.early(envelope, height, elapsed_ns, None if self._sync is _ARRIVAL else self._error_ns)
+        return self._jump.late(envelope, height, elapsed_ns, t_rx_ns, new_read=t_rx_ns > self._t_rx_ns)
 
     def _refit(self, x: int, elapsed_ns: int, line_before: float, size_bytes: int) -> float:
         """Take over a line that changed, without a step; returns its value at `x`."""

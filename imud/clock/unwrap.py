@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from imud.clock.gaps import PeriodLearner
+from imud.clock.gaps import EVERY_TICK, PeriodLearner
 
 QUANTISED: Final = 0.29
 """One-sigma error of a truncated stamp, in ticks: 1 / √12."""
@@ -52,7 +52,7 @@ class DeviceTime:
         self.raw_ns += step * tick_ns
         period = self.period
         self.missed = period.step(step)
-        if step != period.period_ticks and step:
+        if step != period.period_ticks and (step or period.period_ticks < EVERY_TICK):
             off_ns = ((self.missed + 1) * period.period_ticks - step) * tick_ns
             self._phase_ns = min(max(self._phase_ns + off_ns, 0.0), float(tick_ns))
         self.even_ns = self.raw_ns + int(self._phase_ns)

@@ -5,9 +5,10 @@ time modulo 2³² or the time of day, no source says which. A counter that agree
 eight times in a second or more, or right after it jumped, is UTC. GPS time, which is 18 s ahead, never agrees.
 """
 
+from math import sqrt
 from typing import Final
 
-from imud.clock.bounds import SIGMA_OF_RANGE, Bounds
+from imud.clock.bounds import Bounds
 from imud.kit.timing import UtcReference
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -17,6 +18,9 @@ SLACK_NS: Final = 2 * NS_PER_MS
 TOLERANCE_MOST_NS: Final = NS_PER_S // 4
 AGREEMENTS: Final = 8
 DISAGREEMENTS: Final = 8
+TICK_ERROR: Final = 1 / sqrt(6)
+"""Half a tick with the corridor's own 1 / √12. Both errors can stand still at their bounds for a minute (20 ppm at 100
+Hz), a tick together, and twice the stated error covers that."""
 CHECK_EVERY_NS: Final = NS_PER_S // 8
 """A device that is not on UTC is looked at so often."""
 
@@ -39,8 +43,8 @@ class DeviceUtc:
 
     @property
     def tick_error_ns(self) -> float:
-        """Device time is as coarse as UTC now, and samples need not keep step with it."""
-        return SIGMA_OF_RANGE * self._tick_ns
+        """Device time is as coarse as UTC now, and samples need not keep step with it: so much besides the corridor."""
+        return TICK_ERROR * self._tick_ns
 
     def off(self) -> None:
         """The device is not on UTC, or nobody can tell any more."""

@@ -12,6 +12,8 @@ from imud.utc.source import RmcSettings
 LINK: Final = "uart"
 PULSE: Final = "pps"
 """What has this line takes its time from a pulse per second and from sentences."""
+TRIGGER: Final = "sin"
+"""The line by which imud drives the input that the pulse would come on."""
 
 
 def read_rmc(
@@ -28,6 +30,14 @@ def read_rmc(
         keys.problem(path, message, at_key=True)
     if driver == "auto":
         keys.problem(path, "expected rmc only beside a named driver, got it with driver auto", at_key=True)
+    lines = device.get("lines")
+    if isinstance(lines, dict) and TRIGGER in lines:
+        mark = keys.tree.key_mark((*path[:-1], "lines", TRIGGER))
+        message = (
+            "expected a receiver's pulse per second on SIN beside rmc, got imud as what drives it by lines.sin "
+            f"(line {mark.line}): leave one of them out"
+        )
+        keys.problem(path, message, at_key=True)
     return keys.part(RmcSettings, device["rmc"], path)
 
 

@@ -130,7 +130,7 @@ class CanSurvey:
             trial = self._trials.get((driver.name, node))
             if trial is None:
                 if len(self._trials) >= DEVICES_MAX:
-                    return
+                    continue
                 trial = self._begin(CanDevice(driver, node))
             trial.identifiers.add((frame.can_id, frame.extended))
 

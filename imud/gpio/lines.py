@@ -20,7 +20,7 @@ from imud.kit.line_events import EVENT, LineEvents
 from imud.kit.lines import InputSettings, LineSettings, OnEdges, OnLineEnd, OutputSettings
 
 KERNEL_EVENTS: Final = 1024
-"""Edges the kernel keeps for a line until they are read, its most: half a second of SOUT at 1 kHz."""
+"""Edges the kernel keeps for a line until they are read, its most: a second of SOUT at 1 kHz."""
 READ_EVENTS: Final = 64
 CONSUMER_CHARACTERS: Final = 31
 """Longest name of a user of a line that the kernel keeps (GPIO_MAX_NAME_SIZE - 1)."""
@@ -90,11 +90,12 @@ class GpioInput(_Line):
         os.set_blocking(self._fd, False)
         self._events.restart()
 
-    def start(self, on_edges: OnEdges, on_end: OnLineEnd) -> None:
-        """Deliver edges from now on, and those since `open`."""
+    def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
+        """Deliver edges from now on, and those since `open`; without `watch` only when `drain` is called."""
         self._on_edges, self._on_end = on_edges, on_end
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(self._fd, self.drain)
+        if watch:
+            self._loop.add_reader(self._fd, self.drain)
 
     def drain(self) -> None:
         """Deliver what the kernel has. Costs one system call where it has nothing."""

@@ -115,10 +115,10 @@ typedef struct imud_slot {
     int64_t t_rx_ns;  /* when the last byte was read, CLOCK_MONOTONIC */
     int64_t utc_ns;   /* t_ns on CLOCK_REALTIME */
     int64_t t_dev_ns; /* device time, unwrapped */
-    uint64_t edge_seq;
+    uint64_t edge_seq; /* number of the SOUT edge, or SIN trigger, that belongs to the sample */
     uint32_t t_err_ns; /* one-sigma error of t_ns */
     uint32_t present;  /* IMUD_HAS_... */
-    uint32_t status;   /* status bits as sent */
+    uint32_t status;   /* status bits as sent; bit 31 is imud's own: the ALARM line was active */
     uint16_t device_id;
     uint8_t sync; /* IMUD_SYNC_... */
     uint8_t reserved0;

@@ -28,8 +28,9 @@ ERROR_FLAG: Final = 0x2000_0000
 
 RAW_FRAME: Final = struct.Struct("=IB3x8s")
 """`struct can_frame` in the machine's byte order: identifier with flags, length, data."""
-FRAME_BITS: Final = 111
-"""Shortest time of a standard frame with eight data bytes on the wire, pause included, in bits (no stuff bits)."""
+STANDARD_OVERHEAD_BITS, EXTENDED_OVERHEAD_BITS = 47, 67
+"""Bits of a frame besides its data, the pause of three bits behind it included, stuff bits not (ISO 11898-1): with an
+identifier of 11 bits, and of 29."""
 
 
 class CanFrame(NamedTuple):
@@ -127,6 +128,11 @@ class CanDriver(Driver):
     cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
     """Frames that imud must send for a device with these settings, as long as the link is open; of a link that may not
     send, none are."""
+
+
+def frame_bits(extended: bool, data_bytes: int) -> int:
+    """Shortest time of a frame on the wire, pause included, in bits; stuff bits make it up to 22 % longer."""
+    return (EXTENDED_OVERHEAD_BITS if extended else STANDARD_OVERHEAD_BITS) + 8 * data_bytes
 
 
 def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:

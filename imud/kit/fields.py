@@ -40,8 +40,17 @@ FIELDS: Final = (
     FieldInfo("temperature_c", "number", "°C", "", "temperature of the sensor", False),
     FieldInfo("pressure_pa", "number", "Pa", "", "air pressure", False),
     FieldInfo("incli_rad", "number[2]", "rad", _SENSOR, "inclinometer X and Y", False),
-    FieldInfo("status", "integer", "", "", "status bits as sent", False),
-    FieldInfo("pps_age_ms", "integer", "ms", "device clock", "time since the last edge on the PPS/SIN input", False),
-    FieldInfo("edge_seq", "integer", "", "", "number of the SOUT or PPS edge that belongs to the sample", False),
-)
+    FieldInfo(
+        "status", "integer", "", "", "status bits as sent; bit 31 is imud's own: the ALARM line was active", False
+    ),
+    FieldInfo(
+        "pps_age_ms", "integer", "ms", "device clock",
+        "time from the last edge on the device's PPS/SIN input to the measurement, as sent", False,
+    ),
+    FieldInfo(
+        "edge_seq", "integer", "", "",
+        "number of the rising edge on SOUT, or of the trigger on SIN, that belongs to the sample; left out where its "
+        "own was not seen", False,
+    ),
+)  # fmt: skip
 """In the order of `imud.sample.SAMPLE_FIELDS`."""

@@ -10,9 +10,10 @@ PS is part of the number, and the message is for all. The parameter group number
 decides who goes first on the bus: on reception it means nothing.
 """
 
+from collections.abc import Container
 from typing import Final, NamedTuple
 
-from imud.kit.can import CanFilter
+from imud.kit.can import DATA_BYTES_MAX, CanFilter
 
 GLOBAL: Final = 0xFF
 """Destination of what is for all."""
@@ -57,6 +58,13 @@ def join(parts: J1939Id) -> int:
             f"no J1939 identifier: PGN {pgn:#x} {'ends in 00' if is_for_one else 'is for all'}, got {parts}"
         )
     return priority << 26 | (pgn | destination if is_for_one else pgn) << 8 | source
+
+
+def sender_of(can_id: int, extended: bool, data: bytes, pgns: Container[int]) -> int | None:
+    """The node that sent one of these messages of eight bytes, None for any other frame."""
+    parts = split(can_id)
+    is_one = extended and parts.pgn in pgns and len(data) == DATA_BYTES_MAX
+    return parts.source if is_one and parts.source <= ADDRESS_MAX else None
 
 
 def filter_of(pgn: int, source: int | None, destination: int = GLOBAL) -> CanFilter:

@@ -9,6 +9,10 @@ from msgspec.structs import fields
 
 from imud.errors import LinkError
 from imud.kit.settings import Settings
+from imud.kit.timing import SIN_DELAY_US, SOUT_WIDTH_US, SoutTiming, TriggerTiming
+
+Offset = Annotated[float, Meta(ge=-100_000, le=100_000)]
+Bias = Annotated[float, Meta(ge=0, le=100_000)]
 
 
 class Edge(NamedTuple):
@@ -45,6 +49,22 @@ class InputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     """Resistor inside the host's chip: a wire that nobody drives floats, and a floating wire makes edges."""
 
 
+class SoutSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SOUT."""
+
+    offset_us: Offset = 0.0
+    """Instant of measurement minus rising edge, µs; negative when the device measures before its pulse."""
+    bias_us: Bias = SIN_DELAY_US - SOUT_WIDTH_US
+    """How far the truth can be from that, µs; 0 when it was calibrated (`imud.kit.timing.SoutTiming`)."""
+    width_us: Bias = SOUT_WIDTH_US
+    """Length of the pulse, µs."""
+
+    @property
+    def timing(self) -> SoutTiming:
+        """Where on a pulse the measurement is."""
+        return SoutTiming(offset_us=self.offset_us, bias_us=self.bias_us, width_us=self.width_us)
+
+
 class DividedSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SOUT_DIV."""
 
@@ -65,6 +85,10 @@ class ReadySettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fie
 
     edge: Literal["rising", "falling"] = "rising"
     """The edge after which new data can be read; `rising` is from inactive to active."""
+    offset_us: Offset = 0.0
+    """Instant of measurement minus edge, µs; negative when the device measures before it tells so."""
+    bias_us: Bias = 100.0
+    """How far the truth can be from that, µs; 0 when it was calibrated. No manual says: 100 is an assumption."""
 
 
 class OutputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -79,6 +103,18 @@ class TriggerSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_
 
     rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 100.0
     """Rising edges per second; 0 for none but those that are asked for one by one."""
+    pulse_ms: Annotated[float, Meta(ge=0.01, le=500)] = 1.0
+    """How long a pulse is, or half a period where that is shorter, ms. The manual of HiPNUC names none for triggers; 1
+    ms passes any level shifter, a slow optocoupler needs more."""
+    offset_us: Offset = 0.0
+    """Instant of measurement minus trigger, µs."""
+    bias_us: Bias = SIN_DELAY_US
+    """How far the truth can be from that, µs; 0 when it was calibrated (`imud.kit.timing.TriggerTiming`)."""
+
+    @property
+    def timing(self) -> TriggerTiming:
+        """Where behind a trigger the measurement is."""
+        return TriggerTiming(offset_us=self.offset_us, bias_us=self.bias_us)
 
 
 class ResetSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -95,7 +131,7 @@ class ResetSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fi
 class DeviceLines(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The wires of one device besides its data."""
 
-    sout: InputSettings | None = None
+    sout: SoutSettings | None = None
     """SOUT of the device: a pulse before each frame."""
     sout_div: DividedSettings | None = None
     """SOUT_DIV of the device: a pulse for every so many samples."""
@@ -141,8 +177,8 @@ class InputLine(Protocol):
         """Request the line. Raises LinkMissing, LinkBusy (naming the holder), LinkDenied, LinkError."""
         ...
 
-    def start(self, on_edges: OnEdges, on_end: OnLineEnd) -> None:
-        """Deliver edges from now on. Needs a running loop and an open line."""
+    def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
+        """Deliver edges from now on; without `watch` only when `drain` is called. Needs a loop and an open line."""
         ...
 
     def drain(self) -> None:

@@ -9,7 +9,7 @@ from imud.kit.can import CanDriver, CanFilter, CanFrame, CyclicFrame
 from imud.kit.driver import Driver, StreamDriver
 from imud.kit.polling import PolledDriver, Transfer
 from imud.kit.settings import Settings
-from imud.kit.status import KernelCounters
+from imud.kit.status import KernelCounters, SerialLineCounters
 
 OnData = Callable[[bytes, int], None]
 """Called with bytes as read and CLOCK_MONOTONIC (ns) right after the read."""
@@ -122,6 +122,10 @@ class PolledLink(Link, Protocol):
 
     def transfer(self, transfer: Transfer) -> bytes:
         """Make a transfer and return all bytes read. Raises TransferError; LinkMissing and LinkError for the bus."""
+        ...
+
+    def serial_line(self) -> SerialLineCounters | None:
+        """What was heard besides replies since `open`; None for buses with a clock, where the host alone speaks."""
         ...
 
 

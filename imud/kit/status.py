@@ -89,6 +89,19 @@ class PollingStatus(msgspec.Struct, frozen=True):
     """All of them together."""
 
 
+class SerialLineCounters(msgspec.Struct, frozen=True):
+    """What was heard on a serial line that several devices share besides replies, since it was opened."""
+
+    timeouts: int = 0
+    """Requests without a reply."""
+    late_bytes: int = 0
+    """Bytes that came when nothing was asked."""
+    strange_bytes: int = 0
+    """Bytes that came before a reply, or instead of it."""
+    echoes: int = 0
+    """Requests that came back as an echo; no fault."""
+
+
 class LinesStatus(msgspec.Struct, frozen=True):
     """The wires of one device besides its data, since start."""
 
@@ -102,6 +115,8 @@ class LinesStatus(msgspec.Struct, frozen=True):
     """Whether the ALARM line is active; None without one, or while nobody knows."""
     alarms: int = 0
     """Times it became active."""
+    sin: bool = False
+    """Whether imud drives SIN, or is to; what follows is of it."""
     triggers: int = 0
     """Rising edges made on SIN."""
     triggers_missed: int = 0
@@ -110,6 +125,8 @@ class LinesStatus(msgspec.Struct, frozen=True):
     """From deadline to edge, mean over `triggers`."""
     trigger_late_worst_ns: int = 0
     """The longest."""
+    trigger_late_sum_ns: int = 0
+    """All of them together."""
 
 
 class UtcStatus(msgspec.Struct, frozen=True):
@@ -185,6 +202,8 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     """The frame that `quat_wxyz` turns into; empty while the driver is not known."""
     polling: PollingStatus | None = None
     """None for a device that sends by itself."""
+    serial_line: SerialLineCounters | None = None
+    """None for a device that shares no serial line; the same for all devices of one line."""
     lines: LinesStatus | None = None
     """None for a device without lines."""
     utc: UtcStatus | None = None

@@ -12,7 +12,7 @@ from imud.errors import LinkDenied, LinkError, LinkMissing
 from imud.kit.link import LinkType
 from imud.kit.polling import Transfer
 from imud.kit.settings import Settings
-from imud.kit.status import KernelCounters
+from imud.kit.status import KernelCounters, SerialLineCounters
 from imud.links.bus_node import node_present
 from imud.links.rs485_line import LINES, DirectionWish, Echo, Line, LineCounters, Lines
 from imud.units import NS_PER_MS
@@ -108,6 +108,11 @@ class Rs485Link:
     def kernel_counters(self) -> KernelCounters:
         """Errors the kernel counted on the line since it was opened."""
         return self._line.counted.read() if self._line else KernelCounters()
+
+    def serial_line(self) -> SerialLineCounters:
+        """What was heard on the line besides replies since it was opened, by any of its devices."""
+        heard = self.heard
+        return SerialLineCounters(heard.timeouts, heard.late, heard.strange, heard.echoed)
 
     def close(self) -> None:
         """Leave the line, whose last user closes the port; may be called twice."""

@@ -66,6 +66,8 @@ class Line:
     def __init__(self, path: str, baud: int, direction: DirectionWish, echo: Echo, sys: Path, proc: Path) -> None:
         """Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
         self.path, self.baud = path, baud
+        self.wishes = direction, echo
+        """As configured."""
         self.users = 1
         self.counters = LineCounters()
         self.echoes: bool | None = None if echo == "auto" else echo
@@ -133,7 +135,7 @@ class Line:
         wire_ns = (2 * len(frame) + reply_bytes) * self._byte_ns  # an echo comes with the request, not after it
         deadline_ns = time.monotonic_ns() + wire_ns + 2 * self._gap_ns + reply_ns + self._hold_ns
         reply = self._wait(finder, deadline_ns)
-        self._learn_echo(finder)
+        self._learn_echo(finder, reply)
         self.counters.strange += finder.strange
         if reply is None and finder.looks_damaged:
             reply = finder.rest()
@@ -157,10 +159,11 @@ class Line:
                 time.sleep(finder.missing * self._byte_ns * ASLEEP_SHARE / NS_PER_S)
         return finder.feed(self._read())  # this thread itself may have been late
 
-    def _learn_echo(self, finder: ReplyFinder) -> None:
+    def _learn_echo(self, finder: ReplyFinder, reply: bytes | None) -> None:
+        """An echo behind noise is not seen: only a reply with nothing before it shows that there is none."""
         if finder.echo_seen:
             self.counters.echoed += 1
-        if self.echoes is None:
+        if self.echoes is None and (finder.echo_seen or (reply is not None and not finder.strange)):
             self.echoes = finder.echo_seen
 
     def _no_reply(self, target: int, finder: ReplyFinder) -> TransferError:
@@ -238,6 +241,11 @@ class Lines:
                 return line
             if line.baud != baud:
                 raise LinkError(f"{path}: expected one baud rate for all its devices, got {line.baud} and {baud}")
+            if line.wishes != (direction, echo):
+                raise LinkError(
+                    f"{path}: expected the same `direction` and `echo` for all its devices, got {line.wishes[0]}, "
+                    f"{line.wishes[1]} and {direction}, {echo}"
+                )
             line.users += 1
             return line
 

@@ -125,6 +125,9 @@ class SpiLink:
         """The kernel counts none."""
         return KernelCounters()
 
+    def serial_line(self) -> None:
+        """It has a clock: nothing comes unasked."""
+
     def close(self) -> None:
         """Release the node; may be called twice."""
         fd, self._fd = self._fd, -1

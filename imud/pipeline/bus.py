@@ -21,7 +21,7 @@ from imud.kit.link import PolledLink
 from imud.kit.polling import Dialogue, Poll, Reading, Transfer
 from imud.pipeline.bus_thread import BusThread, StartWorker
 from imud.pipeline.round_robin import RoundRobin
-from imud.pipeline.schedule import Deadlines, Schedule
+from imud.pipeline.schedule import Deadlines, Schedule, Timetable
 from imud.units import NS_PER_S
 
 T = TypeVar("T")
@@ -42,7 +42,7 @@ class Member:
     def __init__(self, bus: "Bus", link: PolledLink, deadlines: Deadlines, take: TakeReadings) -> None:
         self.link = link
         self._deadlines = deadlines
-        self._schedule: Schedule | RoundRobin | None = None
+        self._schedule: Timetable | None = None
         self._bus = bus
         self._now_ns = bus.now_ns
         self._take = take
@@ -69,20 +69,24 @@ class Member:
         """Give its target free."""
         self._bus.release(self)
 
-    def start(self, polls: Sequence[Poll]) -> None:
-        """Read at deadlines from now on, or in turns where the link has no rate."""
+    def start(self, polls: Sequence[Poll], timetable: Timetable | None = None) -> None:
+        """Read from now on by the timetable; without one at deadlines, or in turns where the link has no rate."""
         rate_hz, begin_ns, counts = self.link.rate_hz, self._now_ns(), self._deadlines
-        schedule = Schedule(rate_hz, begin_ns, counts) if rate_hz else RoundRobin(begin_ns, counts)
+        schedule = timetable or (Schedule(rate_hz, begin_ns, counts) if rate_hz else RoundRobin(begin_ns, counts))
 
         def begin() -> None:
             self._polls, self._due_ns = polls, [0] * len(polls)
             self._schedule = schedule
 
-        self._bus.command(begin)
+        self.command(begin)
+
+    def command(self, command: Callable[[], None]) -> None:
+        """Have something done by the bus's thread between two transfers, at once where it sleeps."""
+        self._bus.command(command)
 
     def rest(self) -> None:
         """Read no more until `start`; what was read before still comes."""
-        self._bus.command(self._rest)
+        self.command(self._rest)
 
     def leave(self) -> None:
         """Leave the bus; the link is closed by its thread. Nothing is delivered any more. May be called twice."""
@@ -93,7 +97,7 @@ class Member:
     def _rest(self) -> None:
         self._schedule = None
 
-    def _poll(self, schedule: Schedule | RoundRobin) -> None:
+    def _poll(self, schedule: Timetable) -> None:
         """All that is due at the present deadline."""
         start_ns = self._now_ns()
         schedule.begun(start_ns)

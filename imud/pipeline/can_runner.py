@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Sequence
+from random import Random
 from time import monotonic_ns
 from typing import Any
 
@@ -10,8 +11,9 @@ from imud.detect import CanDevice, CanSearch
 from imud.devices import DRIVERS
 from imud.errors import LinkError, NothingHeard
 from imud.event import Event, EventKind
+from imud.kit.action import Target
 from imud.kit.batch import Batch
-from imud.kit.can import FRAME_BITS, CanCodec, CanDriver, CanFrame
+from imud.kit.can import CanCodec, CanDriver, CanFrame, frame_bits
 from imud.kit.driver import Identity, of_kind
 from imud.kit.link import CanLink
 from imud.kit.status import DeviceState
@@ -166,7 +168,8 @@ class CanRunner(Device):
         assert path is not None
         link.filters = driver.filters(self._options)
         clock.restart()
-        path.frame_ns = FRAME_BITS * NS_PER_S // link.bitrate if link.bitrate else 0
+        first = driver.example_frames(Random(0))[0]
+        path.frame_ns = frame_bits(first.extended, len(first.data)) * NS_PER_S // link.bitrate if link.bitrate else 0
         path.loss.link_opened()
         path.begin(monotonic_ns())
 
@@ -226,6 +229,16 @@ class CanRunner(Device):
         """Trouble of the bus stays shown while samples flow, and explains their absence."""
         streaming = state in (DeviceState.RUNNING, DeviceState.SILENT)
         super()._set(state, self._bus_problem or problem if streaming else problem)
+
+    @property
+    def _hears_replies(self) -> bool:
+        """A device whose driver is named is heard from the first moment: one that sends nothing can be told to."""
+        return super()._hears_replies or (self.state is DeviceState.SEARCHING and self._can_path is not None)
+
+    @property
+    def _target(self) -> Target:
+        """The device that is heard: one that was found has a number that the configuration does not name."""
+        return Target(self._options, self._rate_bit_s)
 
     @property
     def _searchable(self) -> bool:

@@ -27,9 +27,12 @@ from imud.kit.session import Conversation
 from imud.kit.settings import Settings
 from imud.kit.status import ClockStatus, DeviceState, DeviceStatus
 from imud.ledger import Ledger
+from imud.pipeline.acquaintance import Acquaintance, identity_words
+from imud.pipeline.line_actions import LineActions
 from imud.pipeline.meters import LatencyMeter, RateMeter
 from imud.pipeline.notices import Notices
 from imud.pipeline.path import SamplePath
+from imud.pipeline.reset import make_reset
 from imud.pipeline.talk import Talk
 from imud.pipeline.utc_keeper import Port, make_keeper
 from imud.pipeline.wires import Wires
@@ -79,11 +82,12 @@ class Device(ABC):
         if config.lines is not None:
             on_pulses = self._utc.pulses if self._utc is not None else None
             self._wires = Wires(config.name, config.lines, lines, self._notices, on_pulses)
+        self._reset = make_reset(config.name, config.lines, lines, self._notices, self._on_reset)
+        self._by_lines = LineActions(self._reset, self._wires)
         self._driver: Driver | None = None
         self._clock: SampleClock | None = None
         self._path: SamplePath | None = None
-        self._identity = Identity()
-        self._settings: Mapping[str, str] = {}
+        self._known = Acquaintance(self._notices)
         self._rate = RateMeter()
         self._connects = 0
         self._silent_since_ns = 0
@@ -92,6 +96,8 @@ class Device(ABC):
     async def run(self) -> None:
         """Keep the device alive until cancelled, or until a replay ends."""
         try:
+            if self._reset is not None:
+                self._reset.tick(monotonic_ns())
             if self._utc is not None:
                 self._utc.start()
             await self._live_again_and_again()
@@ -99,6 +105,8 @@ class Device(ABC):
         finally:
             if self._wires is not None:
                 self._wires.stop()
+            if self._reset is not None:
+                self._reset.close()
             if self._utc is not None:
                 await self._utc.close()
 
@@ -106,7 +114,9 @@ class Device(ABC):
         """Ten times a second: states, idle line, events that gathered."""
         self._rate.mark(now_ns, self.ledger.samples)
         if self._wires is not None:
-            self._wires.tick(now_ns)
+            self._wires.tick(now_ns, self._path.newest if self._path is not None else None)
+        if self._reset is not None:
+            self._reset.tick(now_ns)
         if self._utc is not None:
             self._utc.tick(now_ns, self._clock)
         path = self._path
@@ -158,6 +168,10 @@ class Device(ABC):
         """The link ends."""
         return
 
+    def _on_reset(self) -> None:
+        """The reset line is about to be pulsed."""
+        return
+
     async def _wait_present(self) -> None:
         await self.link.wait_present()
 
@@ -202,6 +216,7 @@ class Device(ABC):
                 self._path.reset()
 
     def _new_clock(self, driver: Driver, *, byte_ns: int = 0, hold_ns: int = 0) -> SampleClock:
+        lines = self.config.lines
         clock = SampleClock(
             self.config.name,
             tick_ns=driver.tick_ns,
@@ -209,6 +224,8 @@ class Device(ABC):
             byte_ns=byte_ns,
             hold_ns=hold_ns,
             bits=driver.time_bits,
+            sout=lines.sout.timing if lines is not None and lines.sout is not None else None,
+            sin=lines.sin.timing if lines is not None and lines.sin is not None else None,
         )
         if self._clock is not None:
             clock.follow(self._clock)
@@ -240,24 +257,16 @@ class Device(ABC):
                 log.info("%s: %s (try %d of %d)", self.config.name, error, attempt, IDENTIFY_TRIES)
 
     def _learn(self, identity: Identity, settings: Mapping[str, str]) -> None:
-        """Compare with what was known: a device that comes back may be another one, or set otherwise."""
-        now_ns = monotonic_ns()
-        before = self._identity
-        if before.serial_number and identity.serial_number != before.serial_number:
-            message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
-            self._notices.tell(now_ns, EventKind.CONFIGURATION, message, serial_number=identity.serial_number)
-        changed = {k: v for k, v in settings.items() if self._settings.get(k, v) != v}
-        if changed:
-            words = ", ".join(f"{name} is {value}, was {self._settings[name]}" for name, value in changed.items())
-            self._notices.tell(now_ns, EventKind.CONFIGURATION, f"settings of the device changed: {words}", **changed)
-        self._identity, self._settings = identity, settings
+        self._known.learn(monotonic_ns(), identity, settings)
+        if self._wires is not None:
+            self._wires.settings(settings)
 
     # --- what it can be told -----------------------------------------------------------------------------------------
 
     @property
     def actions(self) -> Actions:
-        """What it can be told to do, by name; none while its driver is not known."""
-        return self._driver.actions if self._driver is not None else {}
+        """What it can be told to do, by name; while its driver is not known, by its lines only."""
+        return {**(self._driver.actions if self._driver is not None else {}), **self._by_lines.rows}
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
         """Have it do something, and return the answer. Raises CommandError, TransferError, DeviceRefused, LinkError."""
@@ -265,11 +274,21 @@ class Device(ABC):
         if action is None:
             known = ", ".join(self.actions) or "none" + " while no device is found" * (self._driver is None)
             raise BadArgument(f"{self.config.name}: no action {name[:64]!r}; there are: {known}")
-        if self.state not in (DeviceState.RUNNING, DeviceState.SILENT):
+        if name in self._by_lines.rows:
+            return await self._by_lines.run(name, arguments)
+        if not self._hears_replies:
             raise CommandError(
                 f"{self.config.name} is {self.state}: {self._problem or 'it cannot be told anything now'}"
             )
-        return await self._do(action, action.arguments(arguments))
+        params = action.arguments(arguments)
+        if self._wires is not None:
+            self._wires.settings({})  # what was read back need not hold any more
+        return await self._do(action, params)
+
+    @property
+    def _hears_replies(self) -> bool:
+        """Whether what it says now goes to its codec."""
+        return self.state in (DeviceState.RUNNING, DeviceState.SILENT)
 
     async def _do(self, action: Action, params: Settings) -> object:
         """Run an action of the driver."""
@@ -288,7 +307,7 @@ class Device(ABC):
             self._ended.set_result(error)
 
     def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
-        quiet_ns = now_ns - path.last_sample_ns
+        quiet_ns = now_ns - max(path.last_sample_ns, path.begun_ns)
         if (self.state is DeviceState.SEARCHING and path.fresh) or (
             self.state is DeviceState.SILENT and quiet_ns < SILENCE_NS
         ):
@@ -305,6 +324,8 @@ class Device(ABC):
 
     def _up(self, now_ns: int, path: SamplePath) -> None:
         self._set(DeviceState.RUNNING)
+        if self._reset is not None:
+            self._reset.found()
         driver = self._driver.name if self._driver else ""
         self._notices.tell(now_ns, EventKind.UP, f"{driver} on {self._where}", driver=driver, baud=self._rate_bit_s)
 
@@ -345,8 +366,8 @@ class Device(ABC):
             link=self._where,
             state=self.state,
             problem=self._problem,
-            identity=identity_words(self._identity),
-            settings=dict(self._settings),
+            identity=identity_words(self._known.identity),
+            settings=dict(self._known.settings),
             rate_hz=self._rate.rate_hz(),
             expected_rate_hz=clock.expected_rate_hz if clock else 0.0,
             newest_seq=newest.seq if newest else 0,
@@ -358,17 +379,6 @@ class Device(ABC):
             temperature_c=newest.temperature_c if newest else None,
             status_bits=newest.status if newest else None,
             connects=self._connects,
-            lines=self._wires.status() if self._wires is not None else None,
+            lines=self._wires.status(self._reset) if self._wires is not None else None,
             utc=self._utc.status() if self._utc is not None else None,
         )
-
-
-def identity_words(identity: Identity) -> dict[str, str]:
-    """An identity as the flat mapping of `DeviceStatus`, empty members left out."""
-    words = {
-        "product": identity.product,
-        "serial_number": identity.serial_number,
-        "firmware": identity.firmware,
-        **(identity.details or {}),
-    }
-    return {name: value for name, value in words.items() if value}

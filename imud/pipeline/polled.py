@@ -17,15 +17,18 @@ from imud.config import DeviceConfig
 from imud.devices import DRIVERS
 from imud.errors import CommandError, DeviceRefused, LinkError, TransferError, Trouble
 from imud.event import Event
+from imud.gpio import LINES
 from imud.kit.action import Action
 from imud.kit.batch import Batch
 from imud.kit.driver import Identity, of_kind
+from imud.kit.lines import LineMaker
 from imud.kit.link import PolledLink
 from imud.kit.polling import PolledDriver, Reading
 from imud.kit.settings import Settings
 from imud.kit.status import DeviceState, DeviceStatus, PollingStatus
 from imud.links import LINKS
 from imud.pipeline.bus import Buses, Member
+from imud.pipeline.data_ready import DataReady
 from imud.pipeline.device import RETRY_S, SILENCE_NS, UNHEARD_NS, Device
 from imud.pipeline.path import SamplePath
 from imud.pipeline.polled_path import PolledPath
@@ -55,8 +58,13 @@ class PolledRunner(Device):
         publish: Callable[[Batch], None],
         tell: Callable[[Event], None],
         buses: Buses,
+        lines: LineMaker = LINES,
     ) -> None:
-        super().__init__(config, device_id, publish, tell, LINKS[config.link].make_polled(config.link_settings))
+        super().__init__(config, device_id, publish, tell, LINKS[config.link].make_polled(config.link_settings), lines)
+        self._ready: DataReady | None = None
+        if config.lines is not None and config.lines.data_ready is not None:
+            settings, rate_hz = config.lines.data_ready, self.link.rate_hz
+            self._ready = DataReady(config.name, settings, lines, rate_hz, self._notices)
         self._buses = buses
         self._member: Member | None = None
         self._deadlines = Deadlines()
@@ -67,9 +75,19 @@ class PolledRunner(Device):
         self._vanished = 0
         self._lost_counted = 0
 
+    async def run(self) -> None:
+        """Keep the device alive until cancelled."""
+        try:
+            await super().run()
+        finally:
+            if self._ready is not None:
+                self._ready.close()
+
     def tick(self, now_ns: int) -> None:
-        """Ten times a second: as every device, and deadlines that were not kept become lost samples."""
-        lost = self._deadlines.missed
+        """Ten times a second: as every device, and deadlines and edges without a read become lost samples."""
+        if self._ready is not None:
+            self._ready.tick(now_ns)
+        lost = self._missed
         self.ledger.lost_queue += lost - self._lost_counted
         self._lost_counted = lost
         super().tick(now_ns)
@@ -84,7 +102,13 @@ class PolledRunner(Device):
     def status(self) -> DeviceStatus:
         """Everything there is to say of the device now."""
         status = super().status()
-        return msgspec.structs.replace(status, expected_rate_hz=self.link.rate_hz, polling=self._polling_status())
+        return msgspec.structs.replace(
+            status,
+            expected_rate_hz=self._ready.expected_rate_hz if self._ready is not None else self.link.rate_hz,
+            polling=self._polling_status(),
+            serial_line=self.link.serial_line(),
+            lines=self._ready.told(status.lines) if self._ready is not None and status.lines else status.lines,
+        )
 
     # --- the bus's life ----------------------------------------------------------------------------------------------
 
@@ -98,11 +122,15 @@ class PolledRunner(Device):
         member = self._member
         assert member is not None
         while True:
+            if self._reset is not None:
+                await self._reset.settled()
             found = await self._find(member)
             if found is not None and await self._set_up(member, found):
                 await self._read(member, found)
-            else:
-                await asyncio.sleep(RETRY_S)
+                continue
+            await asyncio.sleep(RETRY_S)
+            if self._reset is not None:
+                await self._reset.not_found(self._buses.now_ns())
 
     async def _find(self, member: Member) -> Found | None:
         """One round of search; None when nothing is there."""
@@ -139,11 +167,16 @@ class PolledRunner(Device):
         """Read until the device is gone. Raises LinkError when its bus is."""
         gone = self._gone = asyncio.get_running_loop().create_future()
         path = self._begin(found)
-        member.start(path.codec.polls)
+        if self._ready is not None:
+            self._ready.start(member, path.codec.polls, self._deadlines, self._buses.now_ns())
+        else:
+            member.start(path.codec.polls)
         try:
             why = await gone
         finally:
             self._believed = False
+            if self._ready is not None:
+                self._ready.rest()
             member.rest()
             member.release()
         self._vanished += 1
@@ -157,6 +190,7 @@ class PolledRunner(Device):
             codec = found.driver.make_codec(self.ledger, found.options)
             period_ns, update_ns = self._period_ns, found.driver.update_ns(found.options)
             path = PolledPath(codec, period_ns, update_ns, self._buses.now_ns, *self._path_parts(self._clock))
+            path.edges = self._ready.edges if self._ready is not None else None
             self._path = self._polled = path
         self._clock.restart()
         self._found = found
@@ -188,6 +222,8 @@ class PolledRunner(Device):
     def _take(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
         """What the bus's thread hands over."""
         path = self._polled
+        if self._ready is not None:
+            self._ready.watched.drain()  # which edge a read belongs to is told by all that came before its end
         why = ""
         if path is not None and self._believed:
             why = path.on_readings(readings)
@@ -198,7 +234,16 @@ class PolledRunner(Device):
             self._believed = False
         if problem is not None:
             self._on_end(problem)
-        elif why and self._gone is not None and not self._gone.done():
+        elif why:
+            self._leave_it(why)
+
+    def _on_reset(self) -> None:
+        self._believed = False
+        self._leave_it("reset by its line")
+
+    def _leave_it(self, why: str) -> None:
+        """Read no more before it is identified again."""
+        if self._gone is not None and not self._gone.done():
             self._gone.set_result(why)
 
     def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
@@ -211,6 +256,11 @@ class PolledRunner(Device):
 
     def _silence_limit_ns(self) -> int:
         return max(SILENCE_NS, 5 * self._period_ns)
+
+    @property
+    def _missed(self) -> int:
+        """Deadlines and data-ready edges for which nothing was read."""
+        return self._deadlines.missed + (self._ready.edges.missed if self._ready is not None else 0)
 
     @property
     def _period_ns(self) -> int:
@@ -226,7 +276,7 @@ class PolledRunner(Device):
         return PollingStatus(
             polls=deadlines.polls,
             late=deadlines.late,
-            missed=deadlines.missed,
+            missed=self._missed,
             stale=path.codec.stale if path else 0,
             failed=path.failed if path else 0,
             vanished=self._vanished,

@@ -2,6 +2,7 @@
 
 The time of a sample is when its read began. What the device measured it has measured before: at most the time since
 the read before (had it been there then, this one would have repeated it), or one update of its registers, if known.
+With a data-ready line it is the edge that the read belongs to.
 Synchronization: the event loop's thread only.
 """
 
@@ -14,6 +15,7 @@ from imud.errors import Trouble
 from imud.kit.codec import BadFrame, BadReason
 from imud.kit.polling import PolledCodec, Reading, Vanished
 from imud.pipeline.path import SamplePath
+from imud.pipeline.ready_edges import ReadyEdges, Stamp
 from imud.sample import Measurement, Sample
 
 FAULTS_MAX: Final = 3
@@ -36,6 +38,8 @@ class PolledPath(SamplePath):
         self.codec = codec
         self.failed = 0
         """Transfers that failed."""
+        self.edges: ReadyEdges | None = None
+        """Those of the data-ready line, if there is one."""
         self._period_ns = period_ns
         self._update_ns = update_ns
         self._now_ns = now_ns
@@ -61,13 +65,16 @@ class PolledPath(SamplePath):
         utc_offset_ns = time_ns() - self._now_ns()
         samples: list[Sample] = []
         gone = ""
+        edges = self.edges
         for reading in readings:
             if gone:
                 self.disbelieve(reading)
-            elif reading.error is not None:
+                continue
+            stamp = edges.of(reading.start_ns, reading.end_ns) if edges is not None and reading.poll == 0 else None
+            if reading.error is not None:
                 gone = self._failed(reading)
             else:
-                gone = self._take(reading, utc_offset_ns, samples)
+                gone = self._take(reading, stamp, utc_offset_ns, samples)
         if samples:
             self._finish(samples, samples[-1].t_rx_ns)
         return gone
@@ -77,13 +84,13 @@ class PolledPath(SamplePath):
         self._ledger.bytes_in += len(reading.data)
         self._ledger.bytes_skipped += len(reading.data)
 
-    def _take(self, reading: Reading, utc_offset_ns: int, samples: list[Sample]) -> str:
+    def _take(self, reading: Reading, stamp: Stamp | None, utc_offset_ns: int, samples: list[Sample]) -> str:
         gone = ""
         for event in self.codec.take(reading.poll, reading.data):
             if type(event) is Measurement:
                 self._faults = 0
-                error_ns = self._error_ns(reading)
-                sample = self.clock.sample_asked(event, reading.start_ns, error_ns, reading.end_ns, utc_offset_ns)
+                t_ns, error_ns, edge_seq = stamp or (reading.start_ns, self._error_ns(reading), None)
+                sample = self.clock.sample_asked(event, t_ns, error_ns, reading.end_ns, utc_offset_ns, edge_seq)
                 samples.append(sample)
             elif type(event) is Vanished:
                 gone = event.why

@@ -74,12 +74,20 @@ class DeviceRunner(Device):
                     self._finder = None
                 except NothingHeard as error:
                     self._complain(str(error))
+                    await self._not_found()
                     self._seek()
             if self._may_ask and isinstance(self._driver, StreamDriver):
                 await self._identify(self._driver.identify, self._driver.read_settings, self._apply)
                 await self._wake(self._driver)
             await self._search_again.wait()
+            if not self._searchable:
+                await self._not_found()
             self._seek()
+
+    async def _not_found(self) -> None:
+        """Nothing is heard of it: its reset line may help."""
+        if self._reset is not None:
+            await self._reset.not_found(monotonic_ns())
 
     async def _wake(self, driver: StreamDriver) -> None:
         """Until its first sample since the link was opened: make a device stream that answers and sends none.
@@ -189,6 +197,8 @@ class DeviceRunner(Device):
             self._complain(f"bytes come on {self._where}, but no valid frame: wrong baud rate or device?")
         elif self.state is DeviceState.SEARCHING:
             self._complain(f"nothing is heard on {self._where}: is it powered, are TX and RX swapped?")
+            if self._reset is not None and path.last_data_ns <= path.begun_ns:
+                self._search_again.set()
         silent_long = self.state is DeviceState.SILENT and now_ns - self._silent_since_ns > SILENT_SEARCH_NS
         if self._searchable and (unheard or silent_long):
             self._search_again.set()

@@ -1,7 +1,9 @@
 """When a device is read: at absolute deadlines, so that nothing drifts; deadlines that were not kept are counted.
 
-A data-ready edge can take the place of the deadlines: whatever tells `due_ns` and is told `done` is a schedule.
+Turns (`round_robin`) or data-ready edges (`ready_schedule`) can take the place of deadlines: all are a `Timetable`.
 """
+
+from typing import Protocol
 
 from imud.units import NS_PER_S
 
@@ -24,6 +26,21 @@ class Deadlines:
         self.sum_late_ns = 0
         """Time from deadline to read, summed over `polls`."""
         self.worst_ns = 0
+
+
+class Timetable(Protocol):
+    """Says when a device is read next."""
+
+    due_ns: int
+    """CLOCK_MONOTONIC; the lowest on a bus comes first."""
+
+    def begun(self, start_ns: int, /) -> None:
+        """That read begins."""
+        ...
+
+    def done(self, now_ns: int, /) -> None:
+        """It is over: `due_ns` is that of the next."""
+        ...
 
 
 class Schedule:

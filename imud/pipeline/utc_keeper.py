@@ -61,6 +61,7 @@ class UtcKeeper:
         self._pps = PpsReference(self._on_second if chrony is not None else None)
         self._system = system
         self._reference: UtcReference | None = None
+        self._clock: SampleClock | None = None
         self._due_ns = 0
         self._feed: RmcFeed | None = None
         if port is not None:
@@ -81,12 +82,9 @@ class UtcKeeper:
 
     def tick(self, now_ns: int, clock: SampleClock | None) -> None:
         """Ten times a second: what is known of UTC now, for the clock."""
-        if now_ns < self._due_ns:
-            return
-        self._due_ns = now_ns + ASK_NS
-        self._reference = _better(self._pps.reference(now_ns), self._system())
-        if clock is not None:
-            clock.reference = self._reference
+        if clock is not self._clock or now_ns >= self._due_ns:
+            self._clock = clock
+            self._refer(now_ns)
 
     async def close(self) -> None:
         """Let go of everything; may be called twice."""
@@ -110,8 +108,18 @@ class UtcKeeper:
             chrony_refused=chrony.refused if chrony is not None else 0,
         )
 
+    def _refer(self, now_ns: int) -> None:
+        self._due_ns = now_ns + ASK_NS
+        self._reference = _better(self._pps.reference(now_ns), self._system())
+        if self._clock is not None:
+            self._clock.reference = self._reference
+
     def _on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
+        """The sentence that tells the device which second it is may tell the host so too: the clock has to know UTC
+        before the device's time turns into it, or it takes that for a jump."""
         self._pps.sentence(sentence, t_rx_ns)
+        if self._reference is None:
+            self._refer(t_rx_ns)
         if self._feed is not None:
             self._feed.on_sentence(sentence, t_rx_ns)
 

@@ -21,8 +21,13 @@ class WatchedLine:
         on_edges: OnEdges,
         on_level: Callable[[bool | None], None],
         complain: Callable[[str], None],
+        *,
+        watch: bool = True,
     ) -> None:
-        """`on_level` is told the level after each opening and after edges were lost, and None when it is gone."""
+        """`on_level` is told the level after each opening and after edges were lost, and None when it is gone.
+
+        Without `watch` the loop does not wake up for edges; they are taken by `drain`, and by `tick` when that is rare.
+        """
         self.line = line
         self.problem = ""
         """Why it is not watched now, one sentence; empty when it is."""
@@ -31,6 +36,7 @@ class WatchedLine:
         self._on_edges = on_edges
         self._on_level = on_level
         self._complain = complain
+        self._watch = watch
         self._is_open = False
         self._due_ns = 0
         self._lost = 0
@@ -40,7 +46,10 @@ class WatchedLine:
         if not self._is_open:
             if now_ns >= self._due_ns:
                 self._open(now_ns)
-        elif self.line.edges_lost != self._lost:
+            return
+        if not self._watch:
+            self.line.drain()
+        if self._is_open and self.line.edges_lost != self._lost:
             self._lost = self.line.edges_lost
             self._ask()
 
@@ -59,12 +68,15 @@ class WatchedLine:
     def _open(self, now_ns: int) -> None:
         try:
             self.line.open()
-            self.line.start(self._take, self._end)
+            self.line.start(self._take, self._end, self._watch)
         except LinkError as error:
             self.line.close()
             self._fail(error, now_ns)
             return
-        self._is_open, self.problem = True, ""
+        self._is_open = True
+        if self.problem:
+            self.problem = ""
+            self._complain("watched again")
         self._ask()
 
     def _take(self, edges: Sequence[Edge]) -> None:

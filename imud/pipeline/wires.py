@@ -4,7 +4,7 @@ Edges reach the clock before the frame that follows them: `drain` is called righ
 A line that fails costs the device nothing but what the line told; it is opened again when it can be.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from time import monotonic_ns
 from typing import Final
 
@@ -14,13 +14,18 @@ from imud.event import EventKind
 from imud.kit.lines import DeviceLines, Edge, LineMaker
 from imud.kit.status import LinesStatus
 from imud.kit.timing import Mark, TriggerStamp
-from imud.pipeline.alarm_line import AlarmLine
+from imud.pipeline.alarm_watch import AlarmWatch
 from imud.pipeline.notices import Notices
+from imud.pipeline.reset import ResetLine
 from imud.pipeline.trigger import Trigger
 from imud.pipeline.watched_line import RETRY_NS, WatchedLine
+from imud.sample import Sample
+from imud.units import NS_PER_MS
 
 ALARM_STATUS: Final = 1 << 31
 """Bit of `Sample.status` that is imud's own: the ALARM line was active. The devices' own bits are below 2¹⁶."""
+WITH_FRAMES: Final = ("sout", "sout_div")
+"""Lines whose edges are of use only together with frames: waking up for each would cost as much as for a frame."""
 OnPulses = Callable[[Sequence[Edge]], None]
 
 
@@ -34,30 +39,41 @@ class Wires:
         self._notices = notices
         self._on_pulses = on_pulses
         self._clock: SampleClock | None = None
-        self._alarm = AlarmLine(notices.tell)
+        self._alarm = AlarmWatch(notices.tell)
         self._watched: dict[str, WatchedLine] = {}
         for key, take in (
             ("sout", self._on_sout),
             ("sout_div", self._on_divided),
             ("pps", self._on_pps),
-            ("alarm", self._alarm.edges),
+            ("alarm", self._on_alarm),
         ):
             settings = getattr(lines, key)
             if settings is not None:
                 on_level = self._on_alarm_level if key == "alarm" else _ignore
                 line = maker.make_input(settings, f"{device} {key}", key != "alarm")
-                self._watched[key] = WatchedLine(line, take, on_level, self._complainer(key))
+                self._watched[key] = WatchedLine(
+                    line, take, on_level, self._complainer(key), watch=key not in WITH_FRAMES
+                )
         self._drained = [watched for key, watched in self._watched.items() if key != "alarm"]
         self._sin = maker.make_output(lines.sin, f"{device} sin") if lines.sin is not None else None
-        self._trigger = Trigger(self._sin, lines.sin.rate_hz) if self._sin is not None and lines.sin else None
+        self._trigger: Trigger | None = None
+        if self._sin is not None and lines.sin is not None:
+            pulse_ns = round(lines.sin.pulse_ms * NS_PER_MS)
+            self._trigger = Trigger(self._sin, lines.sin.rate_hz, pulse_ns=pulse_ns)
         self._triggering = False
         self._trigger_due_ns = 0
         self._trigger_problem = ""
+        self._stopped = False
 
     def start(self, clock: SampleClock) -> None:
         """The device is found: what the lines tell is for this clock, and SIN is driven."""
         self._clock = clock
+        self._show_alarm()
         self.tick(monotonic_ns())
+
+    def settings(self, settings: Mapping[str, str]) -> None:
+        """What the device is set to, as read back: what its ALARM line should say follows from that."""
+        self._alarm.settings(settings)
 
     def drain(self) -> None:
         """Give the clock all edges there are. Does not wait; one system call per line."""
@@ -66,11 +82,13 @@ class Wires:
         if self._trigger is not None:
             self._trigger.drain()
 
-    def tick(self, now_ns: int) -> None:
-        """Ten times a second: open what is to be opened, tell what has gathered."""
+    def tick(self, now_ns: int, newest: Sample | None = None) -> None:
+        """Ten times a second, with the device's newest sample: open what is to be opened, tell what has gathered."""
+        if self._stopped:
+            return
         for watched in self._watched.values():
             watched.tick(now_ns)
-        self._alarm.tick(now_ns)
+        self._alarm.tick(now_ns, newest)
         clock = self._clock
         if clock is None:
             return
@@ -89,7 +107,8 @@ class Wires:
             self._trigger_due_ns = 0
 
     def stop(self) -> None:
-        """Let go of all lines; may be called twice."""
+        """Let go of all lines for good; may be called twice."""
+        self._stopped = True
         self.rest()
         for watched in self._watched.values():
             watched.close()
@@ -108,22 +127,28 @@ class Wires:
         """Whether there is a line to SIN."""
         return self._trigger is not None
 
-    def status(self) -> LinesStatus:
-        """How the lines are doing."""
+    def status(self, reset: ResetLine | None = None) -> LinesStatus:
+        """How the lines are doing, that of reset included."""
         problems = {key: watched.problem for key, watched in self._watched.items() if watched.problem}
         if self._trigger_problem:
             problems["sin"] = self._trigger_problem
+        if reset is not None and reset.problem:
+            problems["reset"] = reset.problem
+        if self._alarm.problem:
+            problems.setdefault("alarm", self._alarm.problem)
         counts = self._trigger.counts if self._trigger is not None else None
         return LinesStatus(
             problems=problems,
             edges={key: watched.edges for key, watched in self._watched.items()},
             edges_lost={key: watched.line.edges_lost for key, watched in self._watched.items()},
-            alarm=self._alarm.active,
-            alarms=self._alarm.raised,
+            alarm=self._alarm.line.active,
+            alarms=self._alarm.line.raised,
+            sin=self._trigger is not None,
             triggers=counts.edges if counts else 0,
             triggers_missed=counts.missed if counts else 0,
             trigger_late_mean_ns=round(counts.mean_late_ns) if counts else 0,
             trigger_late_worst_ns=counts.worst_late_ns if counts else 0,
+            trigger_late_sum_ns=counts.sum_late_ns if counts else 0,
         )
 
     # --- what the lines tell -----------------------------------------------------------------------------------------
@@ -146,11 +171,18 @@ class Wires:
         if self._clock is not None:
             self._clock.triggers(stamps)
 
+    def _on_alarm(self, edges: Sequence[Edge]) -> None:
+        self._alarm.edges(edges)
+        self._show_alarm()
+
     def _on_alarm_level(self, active: bool | None) -> None:
-        if active is None:
-            self._alarm.unknown()
-        else:
-            self._alarm.level(monotonic_ns(), active)
+        self._alarm.level(monotonic_ns(), active)
+        self._show_alarm()
+
+    def _show_alarm(self) -> None:
+        """In the samples from now on."""
+        if self._clock is not None:
+            self._clock.own_status = ALARM_STATUS if self._alarm.line.active else None
 
     def _tell_mark(self, mark: Mark) -> None:
         words = f"sample {mark.seq}" if mark.seq is not None else "a sample that was lost"

@@ -6,7 +6,6 @@ event loop, so sums over them are exact: the ledger closes in every scrape.
 
 import platform
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from prometheus_client.core import (
@@ -18,59 +17,20 @@ from prometheus_client.core import (
 )
 
 import imud
-from imud.kit.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus, PollingStatus
+from imud.kit.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
 from imud.ledger import bytes_open, frames_open
+from imud.publishers.metric_family import Family, Labelled, one, seconds
+from imud.publishers.metric_lines import LINE_FAMILIES
+from imud.publishers.metric_polling import POLLING_FAMILIES
+from imud.publishers.metric_time import TIME_FAMILIES
 from imud.sample import Sync
 from imud.units import NS_PER_S
-
-Labelled = Iterable[tuple[tuple[str, ...], float]]
-"""Label values (besides `device`) and value."""
-
-
-@dataclass(frozen=True, slots=True)
-class Family:
-    """One metric of every device."""
-
-    name: str
-    """As it stands in the text, `_total` included."""
-    help: str
-    labels: tuple[str, ...]
-    """Labels besides `device`."""
-    read: Callable[[DeviceStatus], Labelled]
-
-    def metric(self, devices: Sequence[DeviceStatus]) -> Metric:
-        """The metric with its samples."""
-        make = CounterMetricFamily if self.name.endswith("_total") else GaugeMetricFamily
-        family = make(self.name, self.help, labels=("device", *self.labels))
-        for device in devices:
-            for labels, value in self.read(device):
-                family.add_metric((device.name, *labels), value)
-        return family
-
-
-def _one(read: Callable[[DeviceStatus], float | None]) -> Callable[[DeviceStatus], Labelled]:
-    """A value without labels; absent where the device has none, because absent is not zero."""
-
-    def labelled(device: DeviceStatus) -> Labelled:
-        value = read(device)
-        return () if value is None else (((), value),)
-
-    return labelled
-
-
-def _seconds(read: Callable[[DeviceStatus], int]) -> Callable[[DeviceStatus], Labelled]:
-    return _one(lambda device: read(device) / NS_PER_S)
 
 
 def _ledger(*fields: str) -> Callable[[DeviceStatus], Labelled]:
     """One counter, `bytes_in`; or several with a label, `crc=lost_crc`."""
     pairs = [(tuple(label for label in field.split("=")[:-1]), field.split("=")[-1]) for field in fields]
     return lambda device: ((labels, device.ledger[field]) for labels, field in pairs)
-
-
-def _polling(read: Callable[[PollingStatus], float]) -> Callable[[DeviceStatus], Labelled]:
-    """A value of devices that are asked; absent for those that send by themselves."""
-    return _one(lambda device: None if device.polling is None else read(device.polling))
 
 
 def _kernel(device: DeviceStatus) -> Labelled:
@@ -87,13 +47,13 @@ def _kernel(device: DeviceStatus) -> Labelled:
 
 DEVICE_FAMILIES: Final = (
     Family(
-        "imud_device_up", "1 while samples flow, else 0.", (), _one(lambda d: float(d.state is DeviceState.RUNNING))
+        "imud_device_up", "1 while samples flow, else 0.", (), one(lambda d: float(d.state is DeviceState.RUNNING))
     ),
     Family(
         "imud_device_state", "1 for the state the device is in, 0 for the others.", ("state",),
         lambda d: (((state.value,), float(d.state is state)) for state in DeviceState),
     ),
-    Family("imud_device_connects_total", "Times the link was opened.", (), _one(lambda d: d.connects)),
+    Family("imud_device_connects_total", "Times the link was opened.", (), one(lambda d: d.connects)),
     Family("imud_bytes_in_total", "Bytes that the link delivered.", (), _ledger("bytes_in")),
     Family(
         "imud_bytes_total", "Bytes by what became of them.", ("fate",),
@@ -117,11 +77,11 @@ DEVICE_FAMILIES: Final = (
     Family("imud_unknown_tags_total", "Sub-packets of good frames with an unknown tag.", (), _ledger("unknown_tags")),
     Family(
         "imud_ledger_unaccounted_bytes", "Bytes delivered less bytes accounted for; 0 unless imud has a bug.", (),
-        _one(lambda device: bytes_open(device.ledger)),
+        one(lambda device: bytes_open(device.ledger)),
     ),
     Family(
         "imud_ledger_unaccounted_frames", "Good frames less frames accounted for; 0 unless imud has a bug.", (),
-        _one(lambda device: frames_open(device.ledger)),
+        one(lambda device: frames_open(device.ledger)),
     ),
     Family("imud_samples_total", "Samples made.", (), _ledger("samples")),
     Family(
@@ -132,10 +92,10 @@ DEVICE_FAMILIES: Final = (
         "imud_replies_stray_total", "Lines of text from the device that answered no request in time.", ("kind",),
         _ledger("late=replies_late", "unsolicited=replies_unsolicited"),
     ),
-    Family("imud_sample_rate_hertz", "Samples per second over the last seconds.", (), _one(lambda d: d.rate_hz)),
+    Family("imud_sample_rate_hertz", "Samples per second over the last seconds.", (), one(lambda d: d.rate_hz)),
     Family(
         "imud_sample_rate_expected_hertz", "Rate by the device's own time stamps; absent while unknown.", (),
-        _one(lambda d: d.expected_rate_hz or None),
+        one(lambda d: d.expected_rate_hz or None),
     ),
     Family(
         "imud_clock_sync", "1 for the present source of time stamps, 0 for the others.", ("sync",),
@@ -143,47 +103,30 @@ DEVICE_FAMILIES: Final = (
     ),
     Family(
         "imud_clock_offset_seconds", "Host CLOCK_MONOTONIC minus device time, at the newest sample.", (),
-        _seconds(lambda d: d.clock.offset_ns),
+        seconds(lambda d: d.clock.offset_ns),
     ),
     Family(
         "imud_clock_skew_ratio", "How much faster than the host's the device's clock runs; 4e-05 is 40 ppm.", (),
-        _one(lambda d: d.clock.skew_ppm / 1e6),
+        one(lambda d: d.clock.skew_ppm / 1e6),
     ),
     Family(
         "imud_clock_residual_seconds", "One-sigma spread of arrival times around the fitted clock.", (),
-        _seconds(lambda d: d.clock.residual_ns),
+        seconds(lambda d: d.clock.residual_ns),
     ),
     Family(
         "imud_clock_error_seconds", "One-sigma error of the newest time stamp.", (),
-        _seconds(lambda d: d.clock.t_err_ns),
+        seconds(lambda d: d.clock.t_err_ns),
     ),
-    Family("imud_clock_resets_total", "Times the device's clock started anew.", (), _one(lambda d: d.clock.resets)),
-    Family("imud_temperature_celsius", "Temperature that the device sends.", (), _one(lambda d: d.temperature_c)),
-    Family("imud_status_bits", "Status word as the device sends it.", (), _one(lambda d: d.status_bits)),
+    Family("imud_clock_resets_total", "Times the device's clock started anew.", (), one(lambda d: d.clock.resets)),
+    Family("imud_temperature_celsius", "Temperature that the device sends.", (), one(lambda d: d.temperature_c)),
+    Family("imud_status_bits", "Status word of the newest sample.", (), one(lambda d: d.status_bits)),
     Family(
         "imud_kernel_errors_total", "Errors of the port that the kernel counted since the link was opened.", ("kind",),
         _kernel,
     ),
-    Family("imud_polls_total", "Deadlines at which the device was read.", (), _polling(lambda p: p.polls)),
-    Family(
-        "imud_polls_late_total", "Of these, begun more than a quarter of the period after the deadline.", (),
-        _polling(lambda p: p.late),
-    ),
-    Family("imud_polls_missed_total", "Deadlines that passed without a read.", (), _polling(lambda p: p.missed)),
-    Family("imud_polls_stale_total", "Reads that gave nothing new.", (), _polling(lambda p: p.stale)),
-    Family(
-        "imud_poll_delay_seconds_total", "Time from deadline to read, summed over all polls.", (),
-        _polling(lambda p: p.late_sum_ns / NS_PER_S),
-    ),
-    Family(
-        "imud_poll_delay_worst_seconds", "Longest time from deadline to read since start.", (),
-        _polling(lambda p: p.late_worst_ns / NS_PER_S),
-    ),
-    Family("imud_transfers_failed_total", "Transfers of polls that failed.", (), _polling(lambda p: p.failed)),
-    Family(
-        "imud_device_vanished_total", "Times a polled device had to be identified again.", (),
-        _polling(lambda p: p.vanished),
-    ),
+    *POLLING_FAMILIES,
+    *TIME_FAMILIES,
+    *LINE_FAMILIES,
 )  # fmt: skip
 """Metrics of a device with one value per label set, in the order they are shown."""
 

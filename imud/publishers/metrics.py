@@ -4,7 +4,7 @@
 
 The event loop gives a snapshot of plain records and goes on. Rendering holds Python's global lock, so the HTTP
 thread pauses for PAUSE_S before every metric and every SAMPLES_PER_TURN lines of it: measured with 16 devices
-(`python -m tests.bench.metrics`), a whole scrape without pauses keeps the loop waiting for 4 ms, one turn 0.4 ms.
+(`python -m tests.bench.metrics`), a whole scrape without pauses keeps the loop waiting for 7 ms, one turn 0.3 ms.
 """
 
 import asyncio

@@ -29,14 +29,18 @@ from imud.sim.can_modules import CanModules
 from imud.sim.can_port import CanPort, default_interface
 from imud.sim.faults import Faults, rates_from
 from imud.sim.motion import GRAVITY_M_S2, MOTIONS
+from imud.sim.pin import PinModule
+from imud.sim.pins import PinFaults, Pins, SinFile, pin_rates, pull_files
 from imud.sim.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
-from imud.sim.simulator import SimulatorOptions
-from imud.units import NS_PER_S
+from imud.sim.simulator import SimulatorOptions, StreamModule
+from imud.units import NS_PER_MS, NS_PER_S
 
 ADAPTERS: Final = {profile.name: profile for profile in (BARE_UART, USB_1MS, USB_16MS)}
 DEVICE: Final = "hipnuc-uart"
 """What is simulated where nothing is said."""
 COMMAND_BYTES_MAX: Final = 4096
+SIN_LOOK_NS: Final = 4 * NS_PER_MS
+"""How often SIN is looked at: a pulse has to be longer."""
 
 
 class BadCommand(ValueError):
@@ -58,19 +62,20 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         module = SIMULATORS[name].make(_module_options(options, node), now_ns)
         faults = Faults(options.seed, rates_from(options.faults)) if options.faults else None
-    except ValueError as error:
+        wires = Wires(options, module)
+    except (ValueError, OSError) as error:
         print(f"imud.sim: {error}", file=sys.stderr)
         return 2
     sharpen_timers()
-    with ExitStack() as stack:
+    with closing(wires), ExitStack() as stack:
         truth = stack.enter_context(options.truth.open("w")) if options.truth else None
         path = options.path or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-sim-"))) / "tty"
         port = SimulatedPort(module, PtyNode(path), Adapter(ADAPTERS[options.adapter], now_ns), faults, truth)
         stack.callback(port.close)
         with suppress(KeyboardInterrupt):
             print(path, flush=True)
-            Control(port).run()
-        print(json.dumps(port.summary()), flush=True)
+            Control(port, wires).run()
+        print(json.dumps(port.summary() | wires.summary()), flush=True)
     return 0
 
 
@@ -92,11 +97,52 @@ def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now
     return 0
 
 
+class Wires:
+    """The lines beside a device's data: its pins on the way out, SIN on the way in. Synchronization: one thread."""
+
+    def __init__(self, options: argparse.Namespace, module: StreamModule) -> None:
+        """Raises ValueError for pins that this device has not, OSError."""
+        self._files = pull_files(options.pins, options.pin_settle / 1e3)
+        self._truth = options.pin_truth.open("w") if options.pin_truth else None
+        self._pins: Pins | None = None
+        if self._files:
+            if not isinstance(module, PinModule):
+                raise ValueError("pins: this device has none that are simulated")
+            faults = PinFaults(options.seed, pin_rates(options.pin_faults)) if options.pin_faults else None
+            self._pins = Pins(module, self._files, faults, self._truth)
+        self._sin = SinFile(options.sin, module) if options.sin else None
+
+    def step(self, now_ns: int) -> None:
+        """Do all that is due, right before the port does. Raises OSError."""
+        if self._sin is not None:
+            self._sin.look(now_ns)
+        if self._pins is not None:
+            self._pins.step(now_ns)
+
+    def next_ns(self, now_ns: int) -> int:
+        """When `step` is to be called again at the latest."""
+        next_ns = self._pins.next_ns() if self._pins is not None else None
+        latest_ns = now_ns + (SIN_LOOK_NS if self._sin is not None else NS_PER_S)
+        return latest_ns if next_ns is None else min(next_ns, latest_ns)
+
+    def summary(self) -> dict[str, int]:
+        """Counters by name."""
+        return self._pins.summary() if self._pins is not None else {}
+
+    def close(self) -> None:
+        """Let go of the files; may be called twice."""
+        for file in self._files.values():
+            file.close()
+        if self._truth is not None:
+            self._truth.close()
+
+
 class Control:
     """Waits for time, bytes and commands, and moves the port along."""
 
-    def __init__(self, port: SimulatedPort | CanPort) -> None:
+    def __init__(self, port: SimulatedPort | CanPort, wires: Wires | None = None) -> None:
         self._port = port
+        self._wires = wires
         self._text = b""
         self._running = True
 
@@ -106,9 +152,13 @@ class Control:
         readable = True
         while self._running:
             now_ns = time.monotonic_ns()
+            next_ns = now_ns + NS_PER_S
+            if self._wires is not None:
+                self._wires.step(now_ns)
+                next_ns = self._wires.next_ns(now_ns)
             port.step(now_ns, readable)
             is_open = node.is_open
-            wait_ns = port.next_ns(now_ns) - time.monotonic_ns()
+            wait_ns = min(port.next_ns(now_ns), next_ns) - time.monotonic_ns()
             # select, because epoll and poll round up to milliseconds
             watched = [commands, node.fileno()] if is_open else [commands]
             ready = select.select(watched, [], [], max(wait_ns, 0) / NS_PER_S)[0]
@@ -136,7 +186,7 @@ class Control:
             case ["mark"]:
                 port.module.mark(now_ns)
             case ["stats"]:
-                print(json.dumps(port.summary()), flush=True)
+                print(json.dumps(port.summary() | (self._wires.summary() if self._wires else {})), flush=True)
             case ["quit"]:
                 self._running = False
             case []:
@@ -206,6 +256,13 @@ def _parser() -> argparse.ArgumentParser:
         help="time from sample to wire (%(default)s)")  # fmt: skip
     add("--adapter", choices=list(ADAPTERS), default=BARE_UART.name, help="how bytes are handed over (%(default)s)")
     add("--faults", default="", metavar="KIND=P,…", help="probability per burst: cut flip drop insert delay unplug …")
+    add("--pins", default="", metavar="NAME=PATH,…", help="pins by name (sout sout_div alarm), each on a `pull` file "
+        "of a gpio-sim line")  # fmt: skip
+    add("--pin-faults", default="", metavar="KIND=P,…", help="probability per pulse: lose_pulse lose_edge extra")
+    add("--pin-settle", type=float, default=0.0, metavar="MS", help="nothing else happens so long after a rising edge")
+    add("--pin-truth", type=Path, metavar="FILE", help="write edges, CSV: pin,level,due_ns,sample_ns,step_ns")
+    add("--sin", type=Path, metavar="PATH", help="SIN: the `value` file of a gpio-sim line, looked at every "
+        f"{SIN_LOOK_NS / NS_PER_MS:g} ms")  # fmt: skip
     add("--seed", type=int, default=default.seed, help="seed of noise and faults (%(default)s)")
     add("--interface", default="", metavar="NAME", help="CAN interface, for CAN devices (the first that is up)")
     add("--path", type=Path, help="node to make (a temporary one)")

@@ -5,11 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
+from imud.kit.can import DATA_BYTES_MAX, frame_bits
 from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_S
 
-FRAME_BITS: Final = 120
-"""A standard frame with eight data bytes on the wire, pause included: 111 bits and some stuff bits."""
+STUFF_BITS: Final = 9
+"""Of a frame with average data. Frames with fewer than eight bytes take as long here as those with eight."""
 BITRATE: Final = 500_000
 
 
@@ -73,13 +74,16 @@ class FrameWire:
 
     def __init__(self, bitrate: int, free_ns: int) -> None:
         """`bitrate` 0: frames take no time, so that those of one instant leave together. `free_ns`: nothing before."""
-        self.frame_ns = FRAME_BITS * NS_PER_S // bitrate if bitrate else 0
+        self.frame_ns, self.extended_ns = (
+            (frame_bits(extended, DATA_BYTES_MAX) + STUFF_BITS) * NS_PER_S // bitrate if bitrate else 0
+            for extended in (False, True)
+        )
         self._free_ns = free_ns
         self._waiting: deque[SentFrame] = deque()
 
     def send(self, ready_ns: int, can_id: int, extended: bool, data: bytes, sample_ns: int | None = None) -> None:
         """Queue a frame that is ready then."""
-        self._free_ns = max(ready_ns, self._free_ns) + self.frame_ns
+        self._free_ns = max(ready_ns, self._free_ns) + (self.extended_ns if extended else self.frame_ns)
         self._waiting.append(SentFrame(self._free_ns, can_id, extended, data, sample_ns))
 
     def sent(self, now_ns: int) -> list[SentFrame]:

@@ -115,7 +115,7 @@ class HipnucJ1939Module:
         waiting = self._leaving[0].due_ns if self._leaving else self._wire.next_ns()
         if waiting is not None or not self._next_ms:
             return waiting
-        return self._instant_ns(min(self._next_ms.values())) + self.hardware.processing_ns + self._wire.frame_ns
+        return self._instant_ns(min(self._next_ms.values())) + self.hardware.processing_ns + self._wire.extended_ns
 
     def counters(self) -> dict[str, int]:
         """Instants, frames and requests."""

@@ -83,7 +83,7 @@ class HipnucNmea2000Module:
         waiting = self._wire.next_ns()
         if waiting is not None:
             return waiting
-        return self._sample_ns() + self.hardware.processing_ns + self._wire.frame_ns
+        return self._sample_ns() + self.hardware.processing_ns + self._wire.extended_ns
 
     def counters(self) -> dict[str, int]:
         """Samples and frames sent."""

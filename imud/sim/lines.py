@@ -17,6 +17,7 @@ class MemoryInput:
         """What `open` raises."""
         self.is_open = False
         self._rising_only = rising_only
+        self._watch = True
         self._level = False
         self._lost = 0
         self._number = 0
@@ -38,7 +39,7 @@ class MemoryInput:
         if self.is_open and (rising or not self._rising_only):
             self._number += 1
             self._waiting.append(Edge(t_ns, rising, self._number))
-            if self._loop is not None and len(self._waiting) == 1:
+            if self._loop is not None and self._watch and len(self._waiting) == 1:
                 self._loop.call_soon(self.drain)
 
     def pulse(self, t_ns: int, width_ns: int) -> None:
@@ -66,11 +67,13 @@ class MemoryInput:
             raise self.open_error
         self.is_open = True
 
-    def start(self, on_edges: OnEdges, on_end: OnLineEnd) -> None:
-        """Deliver edges from now on, and those since `open`."""
+    def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
+        """Deliver edges from now on, and those since `open`; without `watch` only when `drain` is called."""
         self._on_edges, self._on_end = on_edges, on_end
         self._loop = asyncio.get_running_loop()
-        self._loop.call_soon(self.drain)
+        self._watch = watch
+        if watch:
+            self._loop.call_soon(self.drain)
 
     def drain(self) -> None:
         """Deliver what there is."""

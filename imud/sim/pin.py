@@ -1,7 +1,7 @@
 """Pins of a simulated device: what it does on single wires beside its data, without I/O."""
 
 from enum import StrEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 
 class Pin(StrEnum):
@@ -26,6 +26,7 @@ class PinEdge(NamedTuple):
     """CLOCK_MONOTONIC of the measurement whose frame follows; None where none does."""
 
 
+@runtime_checkable
 class PinModule(Protocol):
     """A simulated device with pins. Its inputs are methods (`mark`), times as in `StreamModule`."""
 

@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from random import Random
-from typing import Final, Protocol
+from time import sleep
+from typing import Final, Protocol, TextIO
 
 from imud.sim.pin import Pin, PinEdge, PinModule
 from imud.units import NS_PER_MS
@@ -26,8 +27,8 @@ LOST_MAX: Final = 100_000
 """Lost pulses kept in `PinFaults.lost`; the counts go on."""
 
 
-class MarkedModule(PinModule, Protocol):
-    """A device with pins and a sync input."""
+class MarkedModule(Protocol):
+    """A device with a sync input."""
 
     def mark(self, now_ns: int) -> None:
         """A rising edge on its sync input."""
@@ -91,11 +92,21 @@ class PinFaults:
 class Pins:
     """Hands the edges of a module's pins over when they are due. Synchronization: one thread."""
 
-    def __init__(self, module: PinModule, on_edge: Mapping[Pin, OnEdge], faults: PinFaults | None = None) -> None:
-        self._module, self._on_edge, self._faults = module, on_edge, faults
+    def __init__(
+        self,
+        module: PinModule,
+        on_edge: Mapping[Pin, OnEdge],
+        faults: PinFaults | None = None,
+        truth: TextIO | None = None,
+    ) -> None:
+        """`truth` gets one line per edge that is handed over: pin, level, due_ns, sample_ns (empty: of no sample), and
+        step_ns, the time of the step that did it."""
+        self._module, self._on_edge, self._faults, self._truth = module, on_edge, faults, truth
         self._held: list[PinEdge] = []
         self.edges = 0
         """Edges handed over."""
+        if truth:
+            truth.write("pin,level,due_ns,sample_ns,step_ns\n")
 
     def step(self, now_ns: int) -> None:
         """Do all that is due."""
@@ -107,6 +118,9 @@ class Pins:
         done, self._held = self._held[:due], self._held[due:]
         for edge in done:
             self._on_edge[edge.pin](edge.due_ns, edge.rising)
+            if self._truth:
+                sample = "" if edge.sample_ns is None else edge.sample_ns
+                self._truth.write(f"{edge.pin},{edge.rising:d},{edge.due_ns},{sample},{now_ns}\n")
         self.edges += len(done)
 
     def next_ns(self) -> int | None:
@@ -128,13 +142,17 @@ class PullFile:
     Interface: Documentation/admin-guide/gpio/gpio-sim.rst.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Raises OSError."""
+    def __init__(self, path: Path, settle_s: float = 0.0) -> None:
+        """For so long after a rising edge nothing else is done: an edge that comes before the kernel has told of the
+        last one is not seen, and a frame must not come before its edge. Raises OSError."""
         self._file = path.open("wb", buffering=0)
+        self._settle_s = settle_s
 
     def __call__(self, _due_ns: int, rising: bool) -> None:
         """Drive the line. Raises OSError."""
         self._file.write(b"pull-up" if rising else b"pull-down")
+        if rising and self._settle_s:
+            sleep(self._settle_s)
 
     def close(self) -> None:
         """Let go of the file; the level stays. May be called twice."""
@@ -159,15 +177,30 @@ class SinFile:
         self._level = level
 
 
-def pull_files(text: str) -> dict[Pin, PullFile]:
+def pull_files(text: str, settle_s: float = 0.0) -> dict[Pin, PullFile]:
     """Files by pin from `sout=PATH,alarm=PATH`. Raises ValueError, OSError."""
     files: dict[Pin, PullFile] = {}
     for part in filter(None, text.split(",")):
         name, _, path = part.partition("=")
         if name not in set(Pin) or not path:
             raise ValueError(f"pin {part!r}: expected NAME=PATH with one of {', '.join(Pin)}")
-        files[Pin(name)] = PullFile(Path(path))
+        files[Pin(name)] = PullFile(Path(path), settle_s)
     return files
+
+
+def pin_rates(text: str) -> PinFaultRates:
+    """Rates from `lose_pulse=0.1,extra=0.01`; names are those of `PinFaultRates`. Raises ValueError."""
+    known = [field.name for field in fields(PinFaultRates)]
+    values: dict[str, float] = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.partition("=")
+        if name not in known:
+            raise ValueError(f"fault {name!r} of pins: expected one of {', '.join(known)}")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise ValueError(f"fault {name} of pins: expected a number, got {value!r}") from None
+    return PinFaultRates(**values)
 
 
 def _due_ns(edge: PinEdge) -> int:

@@ -14,8 +14,8 @@ import msgspec
 from tests.bench.rows import Row
 
 PARTS = (
-    "decode", "clock", "clock_lines", "polling", "modbus", "can", "detect", "coalesce", "shm", "socket", "metrics",
-    "end_to_end",
+    "decode", "clock", "clock_lines", "lines", "polling", "modbus", "can", "can_devices", "detect", "coalesce", "shm",
+    "socket", "metrics", "end_to_end", "sout",
 )  # fmt: skip
 OUTPUT = Path("build/bench.json")
 

@@ -1,7 +1,7 @@
 """How right and how fast the clock is: `python -m tests.bench.clock` prints the table, truth known from simulation.
 
 A row is one profile of arrival, rate and crystal; figures are of all its seeds, after the fit has settled for 70 s.
-A second table is of lines and UTC (`clock_lines`). `--quick` takes one seed and fewer rows, `--lines` the second table.
+The second table, of lines and UTC, is `clock_lines`. `--quick` takes one seed and fewer rows.
 """
 
 import sys
@@ -172,11 +172,7 @@ def print_table(seeds: Sequence[int], rates: Sequence[int]) -> None:
 
 
 if __name__ == "__main__":
-    from tests.bench import clock_lines  # it needs this module
-
     if "--quick" in sys.argv:
         print_table((1,), (1, 100, 1000))
-    elif "--lines" not in sys.argv:
+    else:
         print_table((1, 2, 3), tuple(SECONDS))
-    print()
-    clock_lines.print_table()

@@ -1,4 +1,4 @@
-"""How right the clock is with lines and UTC: table two of `python -m tests.bench.clock`; how fast it is with SOUT."""
+"""How right the clock is with lines and UTC (as a program: the second table of docs/clock.md); its speed with SOUT."""
 
 from collections.abc import Callable, Iterator, Sequence
 from math import sqrt
@@ -166,3 +166,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         name = f"clock: with SOUT at {rate_hz} Hz, {profile.name}"
         yield at_most(f"{name}, sigma", sigma_ns([t.off_ns for t in after(told, 5)]) / 1000, "us", 5)
         yield at_least(f"{name}, share within 2 t_err", share_honest(told), "", 0.95)
+
+
+if __name__ == "__main__":
+    print_table()

@@ -97,14 +97,14 @@ def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) ->
 
 def run_utc(
     model: ArrivalModel, seconds: int, *, turn_ms: int, ahead_ns: int = 0, reference: UtcReference = REFERENCE,
-    back_at: float = 1.0,
+    turn_at: float = 0.25, back_at: float = 1.0,
 ) -> tuple[list[Told], SampleClock]:  # fmt: skip
-    """A device whose counter turns into UTC ms modulo `turn_ms` after a quarter, and to its own again at `back_at`."""
+    """A device whose counter turns into UTC ms modulo `turn_ms` at a share of the run, and back at another."""
     clock, told = clock_for(model), []
     clock.reference = reference
     count = int(model.rate_hz) * seconds
     for i, a in enumerate(model.run(count)):
-        utc = i >= count // 4 and i < back_at * count
+        utc = i >= turn_at * count and i < back_at * count
         ticks = (a.t_ns + UTC_OFFSET_NS + ahead_ns) // TICK_NS % turn_ms if utc else None
         told.append(Told(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a)))
     return told, clock

@@ -13,16 +13,16 @@ from threading import Event, Thread
 
 from imud.publishers.metrics import Renderer, Snapshot
 from tests.bench.rows import Row, at_most
-from tests.publishers.device_status import client, device
+from tests.publishers.device_status import client, equipped
 
 STALL_MS_MAX = 1.0
 """A sample every millisecond: a stall below this delays one wake-up and loses nothing."""
 
 
 def snapshot(devices: int) -> Snapshot:
-    """Devices and ten clients."""
+    """Devices with every part that a device can have, and ten clients."""
     return Snapshot(
-        tuple(device(f"imu{n}", n) for n in range(devices)), tuple(client(n, sent=5) for n in range(10)), (), 1
+        tuple(equipped(f"imu{n}", n) for n in range(devices)), tuple(client(n, sent=5) for n in range(10)), (), 1
     )
 
 

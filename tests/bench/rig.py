@@ -43,6 +43,8 @@ class Load:
     stuck: bool = False
     phases: int = 1
     shm: bool = True
+    sout: bool = False
+    """Whether the first device's SOUT is on a line."""
 
     @property
     def frames(self) -> int:
@@ -133,6 +135,8 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         }
         for i, port in enumerate(ports)
     }
+    if load.sout:
+        devices["d0"]["lines"] = {"sout": {"line": str(folder / "edges")[-31:]}}
     tree = {
         "log_level": "error",
         "state_dir": str(folder),
@@ -165,7 +169,8 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
         server.line()
         return server
     file = configuration(folder, ports, load)
-    server = stack.enter_context(Process(SERVER_CORE, "-m", "imud", "run", "-c", str(file)))
+    how = ["tests.bench.sout_daemon"] if load.sout else ["imud", "run", "-c"]
+    server = stack.enter_context(Process(SERVER_CORE, "-m", *how, str(file)))
     wait_for(path)
     end = monotonic() + START_LIMIT_S
     with Client(str(path)) as client:
@@ -192,10 +197,13 @@ def run(load: Load) -> Outcome:
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
         folder = Path(name)
         (folder / "times").write_bytes(bytes(8 * load.frames))
+        if load.sout:
+            os.mkfifo(folder / "edges")
         writer = stack.enter_context(
             Process(
                 REST_CORES, "-m", "tests.bench.writer", "--devices", str(load.devices), "--rate", str(load.rate_hz),
                 "--frames", str(load.frames), "--phases", str(load.phases), "--times", str(folder / "times"),
+                *(["--edges", str(folder / "edges")] if load.sout else []),
             )
         )  # fmt: skip
         ports = writer.line().split()

@@ -16,9 +16,14 @@ import time
 import tty
 
 from imud.devices.hipnuc.frames import encode_hi91
+from imud.kit.line_events import EVENT, RISING
+from imud.units import uart_byte_ns
 
 LATE_LIMIT_NS = 50_000_000
 """A writer this late has lost its deadlines: it counts them and starts anew."""
+
+PULSE_NS = 82 * uart_byte_ns(921_600) + 80_000
+"""From the rising edge of SOUT to the last byte of a frame: a pty has no wire, so the edge is set back by it."""
 
 
 def open_ptys(count: int) -> list[tuple[int, int]]:
@@ -47,8 +52,11 @@ def template() -> bytearray:
     return bytearray(frame)
 
 
-def play(masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap) -> int:
-    """Write `frames` frames to every master, in `phases` groups over each period; return how many were refused."""
+def play(masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, edges: int = -1) -> int:
+    """Write `frames` frames to every master, in `phases` groups over each period; return how many were refused.
+
+    With a descriptor for `edges`, the event of a pulse on SOUT goes there right before each frame.
+    """
     frame = template()
     crc, pack = binascii.crc_hqx, struct.pack_into
     head = crc(bytes(frame[:4]), 0)
@@ -69,6 +77,8 @@ def play(masters: list[int], rate_hz: float, frames: int, phases: int, times: mm
                 start_ns -= wait_ns
             if phase == 0:
                 pack("<q", times, 8 * i, time.monotonic_ns())
+                if edges >= 0:
+                    os.write(edges, EVENT.pack(time.monotonic_ns() - PULSE_NS, RISING, 0, i + 1, i + 1))
             for master in group:
                 try:
                     os.write(master, frame)
@@ -85,13 +95,15 @@ def main() -> None:
     parser.add_argument("--frames", type=int, required=True)
     parser.add_argument("--phases", type=int, default=1)
     parser.add_argument("--times", required=True)
+    parser.add_argument("--edges", help="FIFO that gets the events of SOUT")
     args = parser.parse_args()
     with open(args.times, "r+b") as file:
         times = mmap.mmap(file.fileno(), 8 * args.frames)
     pairs = open_ptys(args.devices)
     print(*(os.ttyname(slave) for _, slave in pairs), flush=True)
     sys.stdin.readline()
-    print(play([master for master, _ in pairs], args.rate, args.frames, args.phases, times), flush=True)
+    edges = os.open(args.edges, os.O_WRONLY) if args.edges else -1
+    print(play([master for master, _ in pairs], args.rate, args.frames, args.phases, times, edges), flush=True)
     sys.stdin.readline()
 
 

@@ -1,5 +1,6 @@
 """`imud clock` on a running daemon."""
 
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event, Thread
@@ -8,9 +9,11 @@ import msgspec
 import pytest
 
 from imud.cli import main
+from imud.cli.clock import aids, block
 from imud.kit.status import ClockStatus
 from tests.hi91 import hi91
 from tests.links.pty_port import PtyPort
+from tests.publishers.device_status import LINES, device, equipped
 from tests.running import RunningDaemon, running_daemon
 
 
@@ -59,3 +62,21 @@ def test_silence_ends_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     with running_daemon(tmp_path, {"bow": device}) as daemon:
         assert main(["clock", "--socket", str(daemon.socket), "--duration", "0.1"]) == 1
     assert "0 samples" in capsys.readouterr().out
+
+
+def test_what_tells_the_time_besides_arrivals_has_rows() -> None:
+    assert list(aids(device("plain"))) == []
+    assert list(aids(equipped("bow"))) == [
+        ("SOUT", "4998 pulses, 9 belong to no sample; 17 samples without theirs"),
+        ("SIN", "400 triggers, 21 not answered by a sample"),
+        ("PPS", "59 pulses, 1 in step with none"),
+        ("UTC", "the host knows it to 250.0 µs (one sigma)"),
+    ]
+    page = block(equipped("bow"), deque([9_000_000] * 100))
+    assert "\n  SOUT      4998 pulses" in page
+    assert "  verdict   limited by the kernel's stamps" in page
+
+
+def test_a_device_that_is_triggered_and_has_no_sout_shows_triggers_only() -> None:
+    lines = msgspec.structs.replace(LINES, edges={})
+    assert [name for name, _ in aids(equipped("bow", lines=lines, utc=None))] == ["SIN", "UTC"]

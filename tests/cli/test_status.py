@@ -1,18 +1,58 @@
 """What `imud status` prints of a device."""
 
 import msgspec
+import pytest
 
-from imud.cli.status import block
-from imud.kit.status import PollingStatus
-from tests.publishers.device_status import device
+from imud.cli.status import block, driven, parts, utc, watched
+from imud.kit.status import LinesStatus, UtcStatus
+from tests.publishers.device_status import LINES, POLLING, UTC, device, equipped
+
+
+def test_a_device_without_parts_has_no_rows_of_them() -> None:
+    assert list(parts(device("bow"))) == []
+    assert block(device("bow")).splitlines()[-1].startswith("  kernel ")
 
 
 def test_polling_is_shown_for_a_device_that_is_polled() -> None:
-    polling = PollingStatus(
-        polls=1000, late=20, missed=3, stale=4, failed=5, vanished=6, late_mean_ns=70_500, late_worst_ns=8_000_000
-    )
-    assert "polling" not in block(device("front"))
-    assert block(msgspec.structs.replace(device("front"), polling=polling)).splitlines()[-1] == (
-        "  polling   1000 reads, 20 late, 3 missed, 4 stale, 5 failed; 70.5 µs after the deadline, 8000.0 at worst;"
+    assert block(device("front", polling=POLLING)).splitlines()[-1] == (
+        "  polling   1000 reads, 20 late, 3 missed, 4 stale, 5 failed; 70.0 µs after the deadline, 8000.0 at worst;"
         " vanished 6 times"
     )
+
+
+def test_every_part_has_its_row() -> None:
+    assert block(equipped("bow")).splitlines()[-6:] == [
+        "  line      11 requests unanswered; 12 bytes unasked, 13 strange; 14 echoes (all devices of the line)",
+        "  sout      5000 edges, 7 lost",
+        "  alarm     ACTIVE, raised 3 times; 2 edges, 0 lost (/dev/gpiochip0 is not there)",
+        "  pps       60 edges, 0 lost",
+        "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, 900.0 at worst",
+        "  utc       gpsd at 127.0.0.1:2947: 100 sentences, 90 sent, not sent: stale 7, busy 3;"
+        " 59 pulses, 1 ignored; chronyd took 40, refused 19 (chronyd does not take samples)",
+    ]
+
+
+@pytest.mark.parametrize(("alarm", "words"), [(True, "ACTIVE"), (False, "inactive"), (None, "level not known")])
+def test_level_of_the_alarm_line(alarm: bool | None, words: str) -> None:
+    assert watched(msgspec.structs.replace(LINES, alarm=alarm), "alarm", 2).startswith(f"{words}, raised")
+
+
+def test_why_sin_is_not_driven() -> None:
+    lines = LinesStatus({"sin": "GPIO4 is in use by another program"}, {}, {}, sin=True)
+    assert driven(lines).endswith("(GPIO4 is in use by another program)")
+
+
+def test_sin_has_its_row_before_the_first_trigger() -> None:
+    assert [name for name, _ in parts(device("bow", lines=LinesStatus({}, {}, {}, sin=True)))] == ["sin"]
+
+
+def test_a_line_that_only_has_a_problem_has_its_row() -> None:
+    lines = LinesStatus({"reset": "GPIO5 is in use by another program"}, {}, {})
+    assert list(parts(device("bow", lines=lines))) == [("reset", "GPIO5 is in use by another program")]
+
+
+def test_utc_says_only_what_there_is() -> None:
+    assert utc(UtcStatus("", "")) == "nothing yet"
+    assert utc(UtcStatus("", "", pulses=3)) == "3 pulses, 0 ignored"
+    assert utc(msgspec.structs.replace(UTC, refused={}, pulses=0, pulses_ignored=0, chrony_refused=0, chrony_sent=0,
+                                       problem="")) == "gpsd at 127.0.0.1:2947: 100 sentences, 90 sent"  # fmt: skip

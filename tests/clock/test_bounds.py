@@ -22,7 +22,7 @@ def filled(ppm: float, seconds: int = 40) -> tuple[Bounds, int]:
 def test_lockstep_leaves_a_millisecond() -> None:
     bounds, x = filled(0.0)
     fix, error = bounds.improved(x, x, 1e9, 0.0)
-    assert bounds.width_ns == pytest.approx(MS, rel=0.2)
+    assert bounds.width_ns(x) == pytest.approx(MS, rel=0.2)
     assert abs(fix) < 150_000
     assert error == pytest.approx(289_000, rel=0.2)
 
@@ -42,11 +42,32 @@ def test_a_fit_that_knows_more_stays_within() -> None:
     assert error > 200_000
 
 
+def test_a_fit_beside_the_corridor_is_moved_and_doubted_by_that() -> None:
+    """One second of intervals says nothing of the slope, and the corridor is as wide as that."""
+    bounds = Bounds()
+    for x in (0, NS_PER_S // 2, NS_PER_S):
+        bounds.add(x, x, x + MS, FAR, 1.0)
+    assert bounds.width_ns(NS_PER_S) > 100 * MS
+    fix, error = bounds.improved(NS_PER_S, NS_PER_S, 1000.0, 0.0)
+    assert abs(fix) < 10
+    assert error == 1000.0
+    middle = bounds.improved(NS_PER_S, NS_PER_S, 1e12, 0.0)[0]
+    beside = NS_PER_S + int(middle + bounds.width_ns(NS_PER_S) / 2) + MS
+    fix, error = bounds.improved(NS_PER_S, beside, 1000.0, 0.0)
+    assert fix == pytest.approx(-MS, rel=0.01)
+    assert error == pytest.approx(MS, rel=0.01)
+
+
+def test_a_corridor_opens_with_time() -> None:
+    bounds, x = filled(50.0, 5)
+    assert bounds.width_ns(x + NS_PER_S) > bounds.width_ns(x) + 10_000
+
+
 def test_arrivals_bound_from_above() -> None:
     bounds = Bounds()
     for x in range(0, 5 * NS_PER_S, NS_PER_S):
         bounds.add(x, x, x + MS, x + 100_000, 1.0)
-    assert bounds.width_ns < 200_000
+    assert bounds.width_ns(4 * NS_PER_S) < 200_000
 
 
 def test_contradictions_drop_what_is_old() -> None:

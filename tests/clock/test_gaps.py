@@ -32,6 +32,29 @@ def test_uneven_ticks_are_no_loss() -> None:
     assert learner.step(8) == 2
 
 
+def test_losses_do_not_blur_an_uneven_rate() -> None:
+    """A mean of only what is left is off by a thousandth, and that drags device time through its tick."""
+    random = Random(3)
+    learner = PeriodLearner()
+    ticks, i, found = 0, 0, []
+    for _ in range(20_000):
+        i += 1
+        while random.random() < 0.1:
+            i += 1
+        ticks, before = i * 5 // 2, ticks
+        learner.step(ticks - before)
+        found.append(learner.period_ticks)
+    assert all(abs(period - 2.5) < 5e-4 for period in found[5000:])
+
+
+def test_at_a_tick_per_sample_two_may_share_one() -> None:
+    """1 kHz in milliseconds, 100 ppm fast: a stamp comes twice after 10 s."""
+    learner = PeriodLearner()
+    for i in range(10_100):
+        learner.step(int(i * 0.9999) - int((i - 1) * 0.9999))
+    assert learner.period_ticks == pytest.approx(0.9999, abs=3e-5)
+
+
 def test_a_slower_rate_is_adopted() -> None:
     learner = PeriodLearner()
     seen = [learner.step(step) for step in [10] * 20 + [20] * 20]

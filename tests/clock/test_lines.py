@@ -23,11 +23,24 @@ from imud.sim.arrival import (
 )
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE
-from tests.bench.line_model import LineFaults, heard, restarted
-from tests.bench.line_runs import after, run_sout, share_honest, sout_clock, steepest, syncs, with_sout
+from tests.bench.line_model import LineFaults, heard, measured_ns, restarted
+from tests.bench.line_runs import (
+    REFERENCE,
+    UTC_OFFSET_NS,
+    Told,
+    after,
+    measurement,
+    run_sout,
+    share_honest,
+    sout_clock,
+    steepest,
+    syncs,
+    with_sout,
+)  # fmt: skip
 from tests.clock.streams import BEGIN_NS, make_clock, message, rises
 
 SLEW = 550e-6
+UNIX = 1 << 32
 JITTER_STEP_NS = 60_000
 HALF_LOST = LineFaults(pulse_loss=0.1, edge_loss=0.02, frame_loss=0.1, extra=0.02, loaded=True)
 
@@ -36,14 +49,32 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: C
     return ArrivalModel(profile, rate_hz, seed, crystal or Crystal(50.0), BAUD_OF_RATE[rate_hz])
 
 
-@pytest.mark.parametrize("profile", [BARE_UART, USB_16MS, USB_16MS_PACKET, LOADED], ids=lambda p: p.name)
-@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 3)])
+@pytest.mark.parametrize("profile", [BARE_UART, USB_16MS, LOADED], ids=lambda p: p.name)
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 2)])
 def test_every_pair_is_right_under_loss_on_either_side(profile: ArrivalProfile, rate_hz: int, seconds: int) -> None:
     told = run_sout(model(profile, rate_hz, 3), seconds, HALF_LOST)
     paired = [t for t in told if t.sample.edge_seq is not None]
     assert len(paired) > 0.6 * len(told)
     assert all(t.sample.edge_seq == t.number for t in paired)
     assert rises(t.sample for t in told)
+    assert share_honest(told) >= 0.95
+
+
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 4)])
+def test_rising_edges_alone_are_enough(rate_hz: int, seconds: int) -> None:
+    """The kernel is asked for no others; they are numbered by themselves."""
+    m = model(USB_16MS, rate_hz, 5)
+    reads = [
+        read._replace(
+            edges=[Edge(e.t_ns, True, (e.number + 1) // 2) for e in read.edges if e.rising],
+            numbers=[(number + 1) // 2 for number in read.numbers],
+        )
+        for read in heard(m.run(rate_hz * seconds), 5, HALF_LOST)
+    ]
+    told = with_sout(sout_clock(m), reads)
+    paired = [t for t in told if t.sample.edge_seq is not None]
+    assert len(paired) > 0.6 * len(told)
+    assert all(t.sample.edge_seq == t.number for t in paired)
     assert share_honest(told) >= 0.95
 
 
@@ -81,6 +112,21 @@ def test_edges_that_stop_and_come_back_make_no_step(profile: ArrivalProfile) -> 
     assert share_honest(told) >= 0.95
 
 
+def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
+    """A device on UTC whose own crystal is 5 % slow: its milliseconds say little of which pulse is a sample's."""
+    m = model(LOADED, 1000, 3078, Crystal(-50_000.0))
+    clock, told = sout_clock(m), []
+    clock.reference = REFERENCE
+    for read in heard(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
+        clock.edges(read.edges)
+        for a in read.arrivals:
+            truth_ns = measured_ns(a)
+            ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
+            told.append(Told(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0))
+    assert max(abs(t.off_ns) for t in after(told, 1)) < 4 * NS_PER_MS
+    assert rises(t.sample for t in told)
+
+
 def test_the_fit_keeps_what_edges_taught_it() -> None:
     """Behind this adapter the fit alone is 1.5 ms off."""
     m = model(USB_16MS_PACKET, 100)
@@ -88,6 +134,15 @@ def test_the_fit_keeps_what_edges_taught_it() -> None:
     told = with_sout(sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
     assert abs(told[-1].off_ns) < 300_000
     assert told[-1].sample.sync is Sync.REGRESSION
+
+
+def test_what_edges_taught_a_young_fit_is_doubted() -> None:
+    """Pulses for 6 s only: the fit moves by a millisecond afterwards, and what was added to it does not know."""
+    m = model(USB_16MS, 100, 1048, Crystal(-50.0))
+    reads = heard(m.run(4500), 1048, LineFaults())
+    begin = next(i for i, read in enumerate(reads) if read.arrivals[0].t_ns > m.begin_ns + 6 * NS_PER_S)
+    told = with_sout(sout_clock(m), reads, silent=range(begin, len(reads)))
+    assert share_honest(told) >= 0.95
 
 
 def test_a_restarted_device_is_paired_again() -> None:
@@ -162,7 +217,7 @@ STEP = st.tuples(
 )
 
 
-@settings(derandomize=True, max_examples=100, deadline=None)
+@settings(derandomize=True, max_examples=60, deadline=None)
 @given(
     st.lists(STEP, max_size=80), st.sampled_from([0, 1_085, 86_805]), st.sampled_from([0, NS_PER_MS, 16 * NS_PER_MS])
 )

@@ -34,3 +34,19 @@ def test_another_clock_of_the_device_goes_on_where_it_ended() -> None:
     other.follow(one)
     sample = other.sample_asked(FRAME, 500, 1, 501, 0)
     assert (sample.seq, sample.t_ns) == (2, 1001)
+
+
+def test_by_an_edge() -> None:
+    one = clock()
+    samples = [one.sample_asked(FRAME, t_ns, 5, t_ns + 50, 0, edge) for t_ns, edge in ((100, 7), (200, None), (300, 8))]
+    assert [(sample.sync, sample.edge_seq, sample.t_ns) for sample in samples] == [
+        (Sync.EDGE, 7, 100), (Sync.ARRIVAL, None, 200), (Sync.EDGE, 8, 300),
+    ]  # fmt: skip
+    assert one.status().sync is Sync.EDGE
+
+
+def test_what_is_lifted_is_part_of_the_error() -> None:
+    one = clock()
+    one.sample_asked(FRAME, 1000, 5, 1001, 0)
+    sample = one.sample_asked(FRAME, 400, 5, 1002, 0)
+    assert (sample.t_ns, sample.t_err_ns) == (1001, 606)

@@ -19,7 +19,7 @@ def far(samples: Sequence[Sample], points: Sequence[Point]) -> int:
     return max(abs(s.t_ns - BEGIN_NS - ms * NS_PER_MS) for s, (_, ms) in zip(samples, points, strict=True))
 
 
-@settings(derandomize=True, max_examples=150, deadline=None)
+@settings(derandomize=True, max_examples=80, deadline=None)
 @given(
     st.lists(
         st.tuples(

@@ -37,6 +37,17 @@ def test_an_uneven_rate_becomes_even() -> None:
     assert 0 < time.error_ns < 50_000
 
 
+def test_two_samples_in_one_tick_are_told_apart() -> None:
+    """1 kHz in milliseconds, 100 ppm fast: after 5 s a stamp comes twice."""
+    time = DeviceTime(NS_PER_MS, 1 << 32)
+    time.begin(0)
+    even = []
+    for i in range(1, 14_000):
+        time.advance(int(i * 0.9999 + 0.5))
+        even.append(time.even_ns)
+    assert all(abs(b - a - NS_PER_MS) < 1000 for a, b in pairwise(even[100:]))
+
+
 def test_a_loss_is_counted_with_the_step() -> None:
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(0)

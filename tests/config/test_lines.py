@@ -16,6 +16,7 @@ from imud.kit.lines import (
     PpsSettings,
     ReadySettings,
     ResetSettings,
+    SoutSettings,
     TriggerSettings,
 )
 
@@ -49,7 +50,7 @@ def test_every_line() -> None:
         spi("reset: {line: R, hold_ms: 5, open_drain: true}, data_ready: {line: Y, edge: falling}"),
     )
     assert bow.lines == DeviceLines(
-        sout=InputSettings(line=17, chip="gpiochip0", bias="pull-down"),
+        sout=SoutSettings(line=17, chip="gpiochip0", bias="pull-down"),
         sout_div=DividedSettings(line="D", divisor=64),
         sin=TriggerSettings(line="S", rate_hz=0.0),
         alarm=InputSettings(line="A", active_low=True),
@@ -85,14 +86,14 @@ def test_none(keys: str) -> None:
         (hipnuc("sout: {line: 17}"), "2:59: devices.a.lines.sout: expected the key chip beside the number of a line, got none"),
         (hipnuc("sout: {chip: gpiochip0}"), "2:53: devices.a.lines.sout: expected the key line (a whole number from 0 to 1023, or text that is not empty), got none"),
         (hipnuc("sout: {line: -1, chip: c}"), "expected a whole number from 0 to 1023, or text that is not empty, got -1"),
-        (hipnuc("sout: {line: A, rate_hz: 5}"), 'devices.a.lines.sout.rate_hz: expected a key that imud knows, got "rate_hz"; known: active_low, bias, chip, line'),
+        (hipnuc("sout: {line: A, rate_hz: 5}"), 'devices.a.lines.sout.rate_hz: expected a key that imud knows, got "rate_hz"; known: active_low, bias, bias_us, chip, line, offset_us, width_us'),
         (hipnuc("sout: GPIO17"), '2:59: devices.a.lines.sout: expected keys and values, got "GPIO17"'),
         (hipnuc("sout: "), "devices.a.lines.sout: expected keys and values, got nothing"),
         (hipnuc("sout_div: {line: A, divisor: 65}"), "devices.a.lines.sout_div.divisor: expected a whole number from 1 to 64, got 65"),
         (hipnuc("sout_div: {line: A, divisor: 0}"), "expected a whole number from 1 to 64, got 0"),
         (hipnuc("sin: {line: A, rate_hz: 1001}"), "devices.a.lines.sin.rate_hz: expected a number from 0 to 1000, got 1001"),
         (hipnuc("sin: {line: A, rate_hz: .nan}"), "expected a finite number, got .nan"),
-        (hipnuc("sin: {line: A, bias: pull-up}"), 'got "bias"; known: active_low, chip, line, open_drain, rate_hz'),
+        (hipnuc("sin: {line: A, bias: pull-up}"), 'got "bias"; did you mean bias_us? known: active_low, bias_us, chip, line, offset_us, open_drain, pulse_ms, rate_hz'),
         (hipnuc("alarm: {line: A, bias: up}"), 'expected one of "as-is", "disabled", "pull-down", "pull-up", got "up"'),
         (spi("reset: {line: A, hold_ms: 0}"), "devices.a.lines.reset.hold_ms: expected a number from 0.01 to 10000, got 0"),
         (spi("data_ready: {line: A, edge: both}"), 'expected one of "falling", "rising", got "both"'),

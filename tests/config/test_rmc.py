@@ -61,6 +61,21 @@ def test_devices_that_take_no_sentences(keys: str) -> None:
     assert "expected rmc only beside" in errors(device("{source: gpsd}", keys))
 
 
+def test_a_device_that_imud_triggers_has_no_pulse_per_second() -> None:
+    text = """devices:
+  bow:
+    driver: hipnuc-uart
+    uart: {port: x}
+    lines:
+      sin: {line: GPIO17}
+    rmc: {source: gpsd}
+"""
+    told = errors(text)
+    assert "f:7:" in told
+    assert "by lines.sin (line 6): leave one of them out" in told
+    assert read(text.replace("sin:", "pps:")) == RmcSettings(source="gpsd")
+
+
 def test_every_source_has_its_row() -> None:
     assert set(RMC_SOURCES) == set(RmcSettings.__annotations__["source"].__args__)
     for name in RMC_SOURCES:

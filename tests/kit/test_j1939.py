@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imud.kit.can import EXTENDED_ID_MAX
-from imud.kit.j1939 import GLOBAL, J1939Id, filter_of, join, split
+from imud.kit.j1939 import GLOBAL, J1939Id, filter_of, join, sender_of, split
 
 KNOWN = [
     (0x0CFF3408, J1939Id(3, 0xFF34, 0x08)),
@@ -62,3 +62,12 @@ def test_filters_look_at_all_but_the_priority() -> None:
     reply = filter_of(0xEF00, 8, 0x55)
     assert reply.takes(0x18EF5508, True)
     assert not reply.takes(0x18EF0855, True)
+
+
+def test_sender_of_a_message() -> None:
+    pgns = (0xFF34,)
+    assert [sender_of(can_id, True, bytes(8), pgns) for can_id in (0x0CFF3400, 0x1CFF34FD)] == [0, 253]
+    assert sender_of(0x0CFF34FE, True, bytes(8), pgns) is None  # has no address
+    assert sender_of(0x0CFF3708, True, bytes(8), pgns) is None
+    assert sender_of(0x0CFF3408, False, bytes(8), pgns) is None
+    assert sender_of(0x0CFF3408, True, bytes(7), pgns) is None

@@ -1,43 +1,83 @@
 """Plays simulated modules from memory: python -m tests.lab.can_player INTERFACE RATE SECONDS NAME:NODE …
 
-The guest's one emulated CPU cannot simulate nine modules while a daemon serves them. So all frames are made first, in
-virtual time; then each burst is one system call. Prints `ready`, begins at the first line on stdin and prints the zero
-of the motion (CLOCK_MONOTONIC, ns), ends when the frames or stdin end, and prints how many frames were refused.
+The guest's one emulated CPU cannot simulate nine modules while a daemon serves them. So the frames of LOOP_S seconds
+are made first, in virtual time, each module with a motion of its own (`Phased`); then they are played again and again,
+each burst in one system call, INDEX of an IMU61x counting on. Prints `ready`, begins at the first line on stdin and
+prints the instant of the first sample (CLOCK_MONOTONIC, ns), ends after SECONDS or with stdin, and prints how many
+frames were refused.
 """
 
 import ctypes
 import gc
 import select
 import socket
+import struct
 import sys
 import time
+from dataclasses import dataclass, field
+from functools import partial
 
+from imud.devices.imu61x.can import INDEX_MODULUS, SET_FRAMES
 from imud.kit.can import RAW_FRAME, pack_frame
 from imud.links.mmsg import Message, Vector, libc
 from imud.sim import CAN_SIMULATORS
 from imud.sim.can_modules import CanModules
+from imud.sim.motion import MOTIONS
 from imud.sim.pty import sharpen_timers
 from imud.sim.simulator import SimulatorOptions
+from tests.lab.can_phase import LOOP_S, Phased
 
 BURST_NS = 2_000_000
 """Frames that leave within this time of each other leave together."""
 AHEAD_NS = 300_000_000
 FRAMES_MAX = 256
+BEGIN_NS = 1_000_000_000
+"""In the modules' own time: they have said by then what they say once."""
+LOOP_NS = round(LOOP_S * 1e9)
+INDEX = struct.Struct("<H")
+INDEX_AT = 8 + 6
+"""Where the frame that closes a set has INDEX: in the last two of its data, which begin at 8."""
 
 
-def bursts(names: list[str], rate_hz: float, seconds: float) -> list[tuple[int, bytes]]:
-    """Offset from the zero of the motion and frames of every burst."""
-    modules = []
-    for name in names:
+@dataclass
+class Played:
+    """Frames that leave together."""
+
+    offset_ns: int
+    """From the instant of the loop's first sample."""
+    frames: bytearray
+    indices: list[int] = field(default_factory=list)
+    """Where in them an INDEX is."""
+
+    def count_on(self, samples: int) -> None:
+        """So many samples later."""
+        for at in self.indices:
+            (index,) = INDEX.unpack_from(self.frames, at)
+            INDEX.pack_into(self.frames, at, (index + samples) % INDEX_MODULUS)
+
+
+def loop(names: list[str], rate_hz: float) -> list[Played]:
+    """The bursts of LOOP_S seconds."""
+    modules, closing = [], set()
+    for number, name in enumerate(names):
         driver, _, node = name.partition(":")
-        options = SimulatorOptions(rate_hz=rate_hz, node=int(node), boot_ms=0, noise="none", skew_ppm=0.0, at_once=True)
+        motion = f"swing {number}"
+        MOTIONS[motion] = partial(Phased, number)
+        options = SimulatorOptions(
+            rate_hz=rate_hz, node=int(node), boot_ms=0, noise="none", skew_ppm=0.0, at_once=True, motion=motion
+        )
         modules.append(CAN_SIMULATORS[driver].make(options, 0))
-    together, found, end_ns = CanModules(modules), list[tuple[int, bytes]](), round(seconds * 1e9)
-    while (due_ns := together.next_ns()) is not None and due_ns < end_ns:
-        due_ns += BURST_NS
-        frames = [pack_frame(frame.can_id, frame.extended, frame.data) for frame in together.advance(due_ns)]
-        assert len(frames) <= FRAMES_MAX
-        found.append((due_ns, b"".join(frames)))
+        if driver == "imu61x-can":
+            closing.add(int(node) + SET_FRAMES - 1)
+    together, found = CanModules(modules), list[Played]()
+    begin_ns = BEGIN_NS - round(0.5e9 / rate_hz)
+    while (due_ns := together.next_ns()) is not None and due_ns < begin_ns + LOOP_NS:
+        sent = together.advance(due_ns + BURST_NS)
+        assert len(sent) <= FRAMES_MAX
+        if due_ns >= begin_ns:
+            frames = bytearray().join(pack_frame(frame.can_id, frame.extended, frame.data) for frame in sent)
+            at = [n * RAW_FRAME.size + INDEX_AT for n, f in enumerate(sent) if f.can_id in closing and not f.extended]
+            found.append(Played(due_ns + BURST_NS - BEGIN_NS, frames, at))
     return found
 
 
@@ -49,36 +89,42 @@ class Sender:
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # hears nothing
         self._socket.bind((interface,))
-        self._frames = ctypes.create_string_buffer(FRAMES_MAX * RAW_FRAME.size)
+        self._frames = bytearray(FRAMES_MAX * RAW_FRAME.size)
+        frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))
         self._vectors, self._messages = (Vector * FRAMES_MAX)(), (Message * FRAMES_MAX)()
         for number, (vector, message) in enumerate(zip(self._vectors, self._messages, strict=True)):
-            vector.base, vector.bytes = ctypes.addressof(self._frames) + number * RAW_FRAME.size, RAW_FRAME.size
+            vector.base, vector.bytes = frames + number * RAW_FRAME.size, RAW_FRAME.size
             message.header.vector, message.header.vector_count = ctypes.addressof(vector), 1
 
-    def send(self, data: bytes) -> None:
+    def send(self, frames: bytearray) -> None:
         """All frames of a burst."""
-        count = len(data) // RAW_FRAME.size
-        ctypes.memmove(self._frames, data, len(data))
+        count = len(frames) // RAW_FRAME.size
+        self._frames[: len(frames)] = frames
         sent = libc.sendmmsg(self._socket.fileno(), self._messages, count, 0)
         self.refused += count - max(sent, 0)
 
 
 def main(interface: str, rate: str, seconds: str, *names: str) -> int:
     """Run."""
-    played = bursts(list(names), float(rate), float(seconds))
+    played, samples = loop(list(names), float(rate)), round(float(rate) * LOOP_S)
     sender = Sender(interface)
     gc.freeze()
     gc.disable()
     sharpen_timers()
     print("ready", flush=True)
     sys.stdin.readline()
-    epoch_ns = time.monotonic_ns() + AHEAD_NS
-    print(epoch_ns, flush=True)
-    for offset_ns, data in played:
-        wait_ns = epoch_ns + offset_ns - time.monotonic_ns()
-        if select.select([sys.stdin], [], [], max(wait_ns, 0) / 1e9)[0]:
-            break
-        sender.send(data)
+    begin_ns = time.monotonic_ns() + AHEAD_NS
+    end_ns = begin_ns + round(float(seconds) * 1e9)
+    print(begin_ns, flush=True)
+    ended = False
+    while not ended and begin_ns < end_ns:
+        for burst in played:
+            wait_ns = begin_ns + burst.offset_ns - time.monotonic_ns()
+            if ended := bool(select.select([sys.stdin], [], [], max(wait_ns, 0) / 1e9)[0]):
+                break
+            sender.send(burst.frames)
+            burst.count_on(samples)
+        begin_ns += LOOP_NS
     print(sender.refused, flush=True)
     return 0
 

@@ -14,14 +14,17 @@ from imud.devices import DRIVERS
 from imud.kit.can import CanDriver
 from imud.sample import Sample, Vector3
 from imud.sim import CAN_SIMULATORS
-from imud.sim.motion import MOTIONS, Truth
+from imud.sim.motion import Truth
+from tests.lab.can_phase import LOOP_S, Phased
 
 GYRO_RAD_S: Final = 0.004
 ACCEL_M_S2: Final = 0.02
 ANGLE_RAD: Final = 0.002
 """Some counts of the coarsest protocol, and less than the motion `swing` changes between two samples at 100 Hz."""
-SEEK_S: Final = 0.0005
-SEEK_BACK_S: Final = 0.5
+BEGIN_S: Final = 1.0
+"""Of the loop that is played, in the modules' own time."""
+LATE_SAMPLES: Final = 12
+"""So late may the first sample be, where the guest has stalled."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Module:
         """For example `imu61x-can-101`."""
         return f"{self.driver}-{self.node}"
 
-    def config(self, interface: str) -> dict[str, object]:
+    def config(self, interface: str, coalesce_ms: int) -> dict[str, object]:
         """The device's keys."""
         driver = DRIVERS[self.driver]
         assert isinstance(driver, CanDriver)
@@ -45,7 +48,7 @@ class Module:
             "driver": self.driver,
             "options": options,
             "identify": False,
-            "socketcan": {"interface": interface},
+            "socketcan": {"interface": interface, "coalesce_ms": coalesce_ms},
         }
 
 
@@ -67,7 +70,7 @@ class Traffic:
         self.pid = process.pid
 
     def begin(self) -> int:
-        """Begin; return the zero of the motion, CLOCK_MONOTONIC."""
+        """Begin; return the instant of the first sample, CLOCK_MONOTONIC."""
         assert self._process.stdin is not None
         self._process.stdin.write("go\n")
         self._process.stdin.flush()
@@ -102,18 +105,24 @@ def traffic(interface: str, modules: Sequence[Module], rate_hz: float, seconds: 
 class Against:
     """Holds the samples of one device against the truth of its motion, each at its own instant."""
 
-    def __init__(self, first: Sample, rate_hz: float, epoch_ns: int) -> None:
-        """Finds the instant of the first sample: the one before its stamp where the truth is nearest."""
-        self._motion = MOTIONS["swing"](9.8)
-        self._period_s = 1 / rate_hz
+    def __init__(self, number: int, first: Sample, rate_hz: float, begin_ns: int) -> None:
+        """`number` of the module; `begin_ns` of the play. Finds the instant of the first sample, at or before its
+        stamp, where the truth is nearest."""
+        self._motion = Phased(number)
+        self._rate_hz = rate_hz
         self._seq = first.seq
-        stamp_s = (first.t_ns - epoch_ns) / 1e9
-        tries = [stamp_s + SEEK_S * n for n in range(round(-SEEK_BACK_S / SEEK_S), round(0.05 / SEEK_S))]
-        self._begin_s = min(tries, key=lambda t_s: self._worst(first, t_s))
+        latest = int((first.t_ns - begin_ns) * rate_hz / 1e9)
+        self._first = min(
+            range(latest, latest - LATE_SAMPLES, -1), key=lambda n: self._worst(first, self._instant_s(n))
+        )
 
     def is_true(self, sample: Sample) -> bool:
         """Whether every value of the sample is of the instant that its number says."""
-        return self._worst(sample, self._begin_s + (sample.seq - self._seq) * self._period_s) <= 1
+        return self._worst(sample, self._instant_s(self._first + sample.seq - self._seq)) <= 1
+
+    def _instant_s(self, number: int) -> float:
+        """The instant of a sample since the play began, in the module's own time."""
+        return BEGIN_S + number / self._rate_hz % LOOP_S
 
     def _worst(self, sample: Sample, t_s: float) -> float:
         """The largest deviation from the truth at an instant, in units of what is allowed."""

@@ -33,6 +33,14 @@ class GpioChip:
         """The level of the line now, whoever drives it."""
         return self._attribute(line, "value").read_text(encoding="ascii").strip() == "1"
 
+    def pull(self, line: str) -> Path:
+        """The file that `drive` writes to, for another program."""
+        return self._attribute(line, "pull")
+
+    def value(self, line: str) -> Path:
+        """The file that `level` reads, for another program."""
+        return self._attribute(line, "value")
+
     def unplug(self) -> None:
         """Removes the chip, whoever uses its lines."""
         _set(self.device / "live", "0")

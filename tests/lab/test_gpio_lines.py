@@ -265,7 +265,7 @@ async def test_sin_has_its_period_and_its_stamps_are_true(gpio_chip: GpioChip) -
         if len(stamps) >= TRIGGERS:
             enough.set()
 
-    with _rising_edges(gpio_chip.path.name, gpio_chip.names.index("PPS")) as seen:
+    with rising_edges(gpio_chip.path.name, gpio_chip.names.index("PPS")) as seen:
         line.open()
         trigger = Trigger(line, TRIGGER_HZ)
         trigger.start(on_stamps, lambda error: pytest.fail(str(error)))
@@ -289,7 +289,7 @@ async def test_sin_has_its_period_and_its_stamps_are_true(gpio_chip: GpioChip) -
 
 
 @contextmanager
-def _rising_edges(chip: str, offset: int) -> Iterator[Iterator[int]]:
+def rising_edges(chip: str, offset: int) -> Iterator[Iterator[int]]:
     """Kernel stamps of rising edges as gpiomon prints them."""
     command = ("gpiomon", "--line-buffered", "--rising-edge", "--format=%s %n", chip, str(offset))
     with running(*command) as monitor:

@@ -1,5 +1,6 @@
 """The machine's command line."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from tests.lab.host.qemu import Machine
@@ -28,3 +29,10 @@ def test_processors_are_emulated_and_resets_end_it() -> None:
     assert arguments[arguments.index("-smp") + 1] == "3"
     assert "-no-reboot" in arguments
     assert "panic=-1" in arguments[arguments.index("-append") + 1]
+
+
+def test_a_steady_clock_is_asked_for() -> None:
+    machine = Machine(Path("/k/bzImage"), Path("/out"), Path("/out/console.log"), 512, 1, (7, 8))
+    assert "-icount" not in machine.command()
+    arguments = replace(machine, steady=True).command()
+    assert arguments[arguments.index("-icount") + 1] == "shift=0"

@@ -20,6 +20,7 @@ from imud.devices.hipnuc.modbus_frames import read_registers, set_id_by_serial, 
 from imud.errors import LinkBusy, LinkError, LinkMissing, TransferError, Trouble
 from imud.kit.modbus import framed, is_exception, is_whole
 from imud.kit.polling import Transfer
+from imud.kit.status import SerialLineCounters
 from imud.links.port_setup import open_port
 from imud.links.rs485 import Rs485Link, Rs485Settings
 from imud.links.rs485_direction import ENABLED, RTS_ON_SEND, TIOCGRS485, TIOCSRS485, Direction
@@ -96,7 +97,7 @@ def test_adapter_that_echoes(tmp_path: Path, setting: str | bool, chunk_bytes: i
             assert line.slaves[0].settings.heading_mode == 1
             assert link.transfer(SERIAL)[3:11] == serial_of(1)
             assert link.heard.strange == link.heard.late == 0
-            assert link.heard.echoed >= 2
+            assert link.serial_line().echoes == link.heard.echoed >= 2
         line.slaves[0].dead = True
         with opened(path, echo=setting, reply_ms=30) as link:
             link.select(2)
@@ -110,6 +111,40 @@ def test_echo_that_does_not_come_is_not_waited_for(tmp_path: Path) -> None:
     with wired(tmp_path, slave(1)) as (path, _), opened(path, echo="auto") as link:
         assert link.transfer(write_register(6, 1))[1] == 6
         assert link.heard.echoed == 0
+
+
+def test_noise_before_the_first_echo_does_not_hide_that_there_are_echoes(pty: PtyPort) -> None:
+    request, reply = framed(1, SERIAL.sends[0]), framed(1, b"\x03\x08" + serial_of(1))
+
+    def answer() -> None:
+        for noise in (b"\0", b""):
+            select.select([pty.master], [], [], 10)
+            assert pty.received() == request
+            pty.send(noise + request + reply)
+
+    far = threading.Thread(target=answer)
+    far.start()
+    try:
+        with opened(pty.path, reply_ms=1000) as link:
+            assert link.transfer(SERIAL) == reply
+            assert (link.heard.strange, link.heard.echoed) == (1 + len(request), 0)
+            assert link.transfer(SERIAL) == reply
+            assert (link.heard.strange, link.heard.echoed) == (1 + len(request), 1)
+    finally:
+        far.join(10)
+
+
+@pytest.mark.parametrize("more", [{"echo": True}, {"direction": "none"}])
+def test_devices_of_a_line_agree_on_it(pty: PtyPort, more: dict[str, object]) -> None:
+    lines = Lines()
+    with opened(pty.path, lines):
+        with (
+            pytest.raises(LinkError, match="expected the same `direction` and `echo` for all its devices"),
+            opened(pty.path, lines, 2, **more),
+        ):
+            pass
+        with opened(pty.path, lines, 2):
+            pass
 
 
 def test_exception_is_a_reply(tmp_path: Path) -> None:
@@ -176,7 +211,7 @@ def test_bytes_that_nobody_asked_for_are_thrown_away_and_counted(pty: PtyPort) -
         pty.send(framed(1, b"\x03\x08" + bytes(8)))
         with pytest.raises(TransferError):
             link.transfer(SERIAL)
-        assert link.heard.late == 13
+        assert link.serial_line() == SerialLineCounters(timeouts=1, late_bytes=13)
         assert pty.received() == framed(1, SERIAL.sends[0])
 
 
@@ -198,7 +233,7 @@ def test_garbage_instead_of_a_reply_is_told(pty: PtyPort) -> None:
         with opened(pty.path, reply_ms=1000) as link:
             with pytest.raises(TransferError, match=r"other bytes: 81 00 fe .* is the baud rate right"):
                 link.transfer(SERIAL)
-            assert link.heard.strange == 21
+            assert link.serial_line() == SerialLineCounters(timeouts=1, strange_bytes=21)
     finally:
         speaker.join(10)
 

@@ -14,6 +14,7 @@ from imud.links.i2c import I2cLink, I2cSettings
 from imud.links.spi import SpiLink, SpiSettings
 from imud.sim.imu61x_registers import Imu61xRegisters
 from imud.sim.in_process_bus import InProcessI2c, InProcessSpi
+from imud.sim.lines import MemoryLines
 from tests.polled import Rig, device_config, running
 from tests.virtual_time import VirtualClock, run_virtually, virtual_buses
 
@@ -37,6 +38,7 @@ class Stage:
         self.spi = InProcessSpi()
         """A device is put on it by `spi.device = …`."""
         self.i2c = InProcessI2c({})
+        self.lines = MemoryLines(self.clock.now_ns)
         if clock is not None:
             clock.stand_for_monotonic(monkeypatch, *UNTOLD)
         monkeypatch.setattr("imud.links.spi.LINK", LinkType("spi", SpiSettings, make_polled=self._make_spi))
@@ -48,7 +50,7 @@ class Stage:
 
     def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[Rig]]:
         """Runners at work."""
-        return running(*configs, buses=virtual_buses(self.clock))
+        return running(*configs, buses=virtual_buses(self.clock), lines=self.lines.maker)
 
     def run(self, body: Coroutine[Any, Any, None]) -> None:
         """The body of a test, to its end."""

@@ -39,6 +39,8 @@ class Wire:
     def kernel_counters(self) -> KernelCounters:
         return KernelCounters()
 
+    def serial_line(self) -> None: ...
+
     def place(self, target: int) -> str:
         return str(target)
 

@@ -2,16 +2,21 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine, Sequence
+from random import Random
 from time import monotonic_ns
 from typing import Any
 
 import pytest
 
 from imud.config import DeviceConfig
+from imud.devices import DRIVERS
+from imud.devices.hipnuc.canopen import HipnucCanopenSettings
+from imud.devices.hipnuc.j1939 import HipnucJ1939Settings
 from imud.devices.imu61x.can import Imu61xCanSettings, encode_set
 from imud.event import Event, EventKind
 from imud.kit.batch import Batch
-from imud.kit.can import CanFrame
+from imud.kit.can import CanDriver, CanFrame
+from imud.kit.settings import Settings
 from imud.kit.status import DeviceState, KernelCounters
 from imud.links.memory import MemoryCanLink, MemorySettings
 from imud.pipeline.can_runner import CanRunner
@@ -108,6 +113,38 @@ def test_samples_of_one_read_are_one_batch_with_their_own_times() -> None:
     assert bench.runner.status().link == "can0 at 500 kbit/s"
     assert bench.events[0].kind is EventKind.UP
     assert bench.link.written == []
+
+
+def delay_ns(name: str, settings: Settings, bitrate: int) -> int:
+    """From the time of a sample to its arrival; four frames, 0.3 ms apart, every 10 ms."""
+    bench = Bench()
+    config = DeviceConfig("mast", name, settings, True, "memory", MemorySettings(baud=bitrate, name="can0"))
+    bench.runner = CanRunner(config, 7, bench._publish, bench.events.append)
+    assert isinstance(bench.runner.link, MemoryCanLink)
+    bench.link = bench.runner.link
+    driver = DRIVERS[name]
+    assert isinstance(driver, CanDriver)
+    burst = driver.example_frames(Random(1))
+
+    async def story(bench: Bench) -> None:
+        begin_ns = monotonic_ns() - 300 * MS
+        for number in range(20):
+            t_ns = begin_ns + number * 10 * MS
+            assert bench.link.feed([f._replace(t_rx_ns=t_ns + place * 300_000) for place, f in enumerate(burst)])
+
+    play(bench, story)
+    assert len(bench.samples) > 10
+    return bench.samples[-1].t_rx_ns - bench.samples[-1].t_ns
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "bits"),
+    [("hipnuc-canopen", HipnucCanopenSettings(), 95), ("hipnuc-j1939", HipnucJ1939Settings(), 131)],
+)
+def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Settings, bits: int) -> None:
+    """TPDO1 has six bytes; a 29-bit identifier makes a frame 20 bits longer."""
+    taken_ns = delay_ns(name, settings, 500_000) - delay_ns(name, settings, 0)
+    assert taken_ns == pytest.approx(bits * 2000, abs=2000)
 
 
 def test_only_own_identifiers_pass() -> None:

@@ -108,6 +108,25 @@ def test_the_only_device_is_found_and_nothing_was_sent() -> None:
     play([Bench("mast", CanBuses())], story)
 
 
+def test_commands_go_to_the_device_that_was_found() -> None:
+    async def story(benches: list[Bench]) -> None:
+        (bench,) = benches
+        assert bench.runner.actions == {}
+        await bench.until(lambda: bench.runner.state is DeviceState.RUNNING, 8)
+        assert await bench.runner.act("node", {}) == 8
+
+    play([Bench("mast", CanBuses())], story)
+
+
+def test_commands_go_to_the_device_that_is_configured() -> None:
+    async def story(benches: list[Bench]) -> None:
+        (bench,) = benches
+        await bench.until(lambda: bench.runner.state is DeviceState.RUNNING, 5)
+        assert await bench.runner.act("node", {}) == 5
+
+    play([Bench("mast", CanBuses(), driver="fake-can", options=FakeCanSettings(node=5))], story)
+
+
 def test_several_are_named_and_the_search_goes_on() -> None:
     async def story(benches: list[Bench]) -> None:
         (bench,) = benches

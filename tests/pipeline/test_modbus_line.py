@@ -75,6 +75,10 @@ def test_a_dead_module_does_not_stall_the_others(tmp_path: Path) -> None:
                 await rigs[1].until(lambda: rigs[1].state is DeviceState.SEARCHING, "given up")
                 assert rigs[1].runner.status().problem.startswith("no reply from address 2")
                 assert rigs[1].runner.ledger.lost_gap_device == 3
+                line = rigs[0].runner.status().serial_line  # of all its devices, also those that answer
+                assert line is not None
+                assert line.timeouts >= 3
+                assert line.late_bytes == line.strange_bytes == line.echoes == 0
                 await rigs[0].until_samples(30)
                 await rigs[2].until_samples(30)
                 assert rigs[1].state is DeviceState.SEARCHING

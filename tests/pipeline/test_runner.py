@@ -299,6 +299,14 @@ def test_nothing_heard_says_what_to_look_at() -> None:
     play(Bench(), story)
 
 
+def test_a_device_that_has_just_been_opened_is_given_time() -> None:
+    async def story(bench: Bench) -> None:
+        bench.tick()
+        assert bench.runner.status().problem == ""
+
+    play(Bench(), story)
+
+
 def test_bytes_without_frames_say_so() -> None:
     async def story(bench: Bench) -> None:
         bench.now_ns = monotonic_ns() + 2500 * MS

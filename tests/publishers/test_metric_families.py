@@ -4,18 +4,24 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import pytest
 from prometheus_client.core import Metric
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families as parse_text
 
 import imud
-from imud.kit.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState, PollingStatus
+from imud.event import EventKind
+from imud.kit.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState
 from imud.ledger import LEDGER_FIELDS
+from imud.pipeline.rmc_feed import Refusal
 from imud.publishers.client_metrics import ClientTotals
+from imud.publishers.metric_lines import LINE_FAMILIES
+from imud.publishers.metric_polling import POLLING_FAMILIES
+from imud.publishers.metric_time import TIME_FAMILIES
 from imud.publishers.metrics import SAMPLES_PER_TURN, Renderer, Snapshot
 from imud.sample import Sync
-from tests.publishers.device_status import client, device
+from tests.publishers.device_status import LINES, UTC, client, device, equipped
 
 ROOT = Path(__file__).parent.parent.parent
 Key = tuple[str, frozenset[tuple[str, str]]]
@@ -126,25 +132,112 @@ def test_absent_is_not_zero() -> None:
         assert key(name, device="rear") not in shown
 
 
-def test_polling_is_shown_for_devices_that_are_polled_only() -> None:
-    polling = PollingStatus(
-        polls=1000, late=20, missed=3, stale=4, failed=5, vanished=6,
-        late_mean_ns=70_000, late_worst_ns=8_000_000, late_sum_ns=70_000_123,
-    )  # fmt: skip
-    shown = rendered(Snapshot((*DEVICES, device("polled", 2, polling=polling))))
-    expected = {
-        "imud_polls_total": 1000,
-        "imud_polls_late_total": 20,
-        "imud_polls_missed_total": 3,
-        "imud_polls_stale_total": 4,
-        "imud_transfers_failed_total": 5,
-        "imud_device_vanished_total": 6,
-        "imud_poll_delay_seconds_total": 0.070000123,
-        "imud_poll_delay_worst_seconds": 0.008,
+PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
+    ("imud_polls_total", ()): 1000,
+    ("imud_polls_late_total", ()): 20,
+    ("imud_polls_missed_total", ()): 3,
+    ("imud_polls_stale_total", ()): 4,
+    ("imud_transfers_failed_total", ()): 5,
+    ("imud_device_vanished_total", ()): 6,
+    ("imud_poll_delay_seconds_total", ()): 0.070000123,
+    ("imud_poll_delay_worst_seconds", ()): 0.008,
+    ("imud_serial_line_timeouts_total", ()): 11,
+    ("imud_serial_line_late_bytes_total", ()): 12,
+    ("imud_serial_line_strange_bytes_total", ()): 13,
+    ("imud_serial_line_echoes_total", ()): 14,
+    ("imud_clock_hold_seconds", ()): 0.016,
+    ("imud_clock_edges_total", ()): 4998,
+    ("imud_clock_edges_unpaired_total", ()): 9,
+    ("imud_clock_samples_unpaired_total", ()): 17,
+    ("imud_triggers_unanswered_total", ()): 21,
+    ("imud_clock_reference_error_seconds", ()): 0.00025,
+    ("imud_utc_problem", ()): 1,
+    ("imud_utc_sentences_total", ()): 100,
+    ("imud_utc_sentences_sent_total", ()): 90,
+    ("imud_utc_sentences_refused_total", (("cause", "stale"),)): 7,
+    ("imud_utc_sentences_refused_total", (("cause", "busy"),)): 3,
+    ("imud_pps_pulses_total", ()): 59,
+    ("imud_pps_pulses_ignored_total", ()): 1,
+    ("imud_chrony_samples_total", (("fate", "sent"),)): 40,
+    ("imud_chrony_samples_total", (("fate", "refused"),)): 19,
+    ("imud_line_problem", (("line", "sout"),)): 0,
+    ("imud_line_problem", (("line", "alarm"),)): 1,
+    ("imud_line_problem", (("line", "pps"),)): 0,
+    ("imud_line_problem", (("line", "sin"),)): 0,
+    ("imud_line_edges_total", (("line", "sout"),)): 5000,
+    ("imud_line_edges_total", (("line", "alarm"),)): 2,
+    ("imud_line_edges_total", (("line", "pps"),)): 60,
+    ("imud_line_edges_lost_total", (("line", "sout"),)): 7,
+    ("imud_line_edges_lost_total", (("line", "alarm"),)): 0,
+    ("imud_line_edges_lost_total", (("line", "pps"),)): 0,
+    ("imud_alarm_active", ()): 1,
+    ("imud_alarms_total", ()): 3,
+    ("imud_triggers_total", ()): 400,
+    ("imud_triggers_missed_total", ()): 8,
+    ("imud_trigger_delay_seconds_total", ()): 0.012000456,
+    ("imud_trigger_delay_worst_seconds", ()): 0.0009,
+}
+"""Every line of the parts that only some devices have."""
+
+
+def parts_of(name: str, shown: dict[Key, float]) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
+    """The lines of a device that are of such parts."""
+    names = {family.name for family in (*POLLING_FAMILIES, *TIME_FAMILIES, *LINE_FAMILIES)}
+    return {
+        (metric, tuple(pair for pair in labels if pair[0] != "device")): value
+        for (metric, labels), value in shown.items()
+        if metric in names and ("device", name) in labels
     }
-    for name, value in expected.items():
-        assert shown[key(name, device="polled")] == pytest.approx(value, rel=1e-12), name
-        assert key(name, device="front") not in shown
+
+
+def test_every_part_is_shown_in_base_units() -> None:
+    shown = parts_of("bow", rendered(Snapshot((*DEVICES, equipped("bow", 2)))))
+    assert shown.keys() == PARTS.keys()
+    for line, value in PARTS.items():
+        assert shown[line] == pytest.approx(value, rel=1e-12), line
+
+
+def test_parts_that_a_device_has_not_are_absent() -> None:
+    plain = device("plain", 2)
+    unsure = equipped(
+        "unsure", 3, polling=None, serial_line=None,
+        lines=msgspec.structs.replace(LINES, problems={}, edges={"sout": 1}, edges_lost={"sout": 0}, alarm=None,
+                                      sin=False),
+        utc=msgspec.structs.replace(UTC, source="", problem="", refused={}),
+    )  # fmt: skip
+    shown = rendered(Snapshot((plain, unsure)))
+    assert {metric for metric, _ in parts_of("plain", shown)} == {"imud_clock_hold_seconds"}
+    found = parts_of("unsure", shown)
+    assert {metric for metric, _ in found} == {
+        "imud_clock_hold_seconds", "imud_clock_edges_total", "imud_clock_edges_unpaired_total",
+        "imud_clock_samples_unpaired_total", "imud_clock_reference_error_seconds", "imud_utc_problem",
+        "imud_pps_pulses_total", "imud_pps_pulses_ignored_total", "imud_chrony_samples_total",
+        "imud_line_problem", "imud_line_edges_total", "imud_line_edges_lost_total",
+    }  # fmt: skip
+    assert found["imud_utc_problem", ()] == 0
+    assert found["imud_line_problem", (("line", "sout"),)] == 0
+    assert ("imud_line_problem", (("line", "sin"),)) not in found
+
+
+def test_a_problem_of_a_line_without_edges_is_shown() -> None:
+    lines = msgspec.structs.replace(LINES, problems={"reset": "in use", "sin": "in use"}, edges={"sout": 1})
+    found = parts_of("bow", rendered(Snapshot((equipped("bow", lines=lines),))))
+    problems = {labels[0][1]: value for (name, labels), value in found.items() if name == "imud_line_problem"}
+    assert problems == {"sout": 0, "sin": 1, "reset": 1}
+
+
+def test_every_number_of_the_parts_has_a_metric() -> None:
+    """A field that is added to a part and shown nowhere is noticed here: its change must change a scrape."""
+    means = {"late_mean_ns", "trigger_late_mean_ns"}  # sum over count
+    before = parts_of("bow", rendered(Snapshot((equipped("bow"),))))
+    for part in ("polling", "serial_line", "lines", "utc"):
+        status = equipped("bow")
+        value = getattr(status, part)
+        for field in msgspec.structs.fields(value):
+            if field.type is int and field.name not in means:
+                more = msgspec.structs.replace(value, **{field.name: getattr(value, field.name) + 1_000_000})
+                changed = parts_of("bow", rendered(Snapshot((equipped("bow", **{part: more}),))))
+                assert changed != before, f"{part}.{field.name}"
 
 
 def test_state_and_sync_are_one_hot() -> None:
@@ -228,7 +321,7 @@ def test_rendering_pauses_often() -> None:
         nonlocal pauses
         pauses += 1
 
-    devices = [device(f"d{n}", n, polling=PollingStatus()) for n in range(16)]
+    devices = [equipped(f"d{n}", n) for n in range(16)]
     body = Renderer(pause).render(Snapshot(devices), "").body
     lines = sum(line.startswith(b"imud_") for line in body.splitlines())
     assert lines > 900
@@ -249,6 +342,14 @@ def shown_names() -> set[str]:
 def test_every_metric_is_documented_and_nothing_else() -> None:
     documented = set(re.findall(r"^\| `([a-z_]+)`", (ROOT / "docs/metrics.md").read_text(), re.MULTILINE))
     assert documented == shown_names()
+
+
+def test_label_values_are_documented() -> None:
+    """Those of labels whose values are known ahead."""
+    text = (ROOT / "docs/metrics.md").read_text()
+    for values_of, kind in ((DeviceState, "state"), (Sync, "sync"), (EventKind, "kind"), (Refusal, "cause")):
+        rows = re.findall(rf"`{kind}`: ([a-z_, -]+)", text)
+        assert {value.value for value in values_of} in [set(row.strip().split(", ")) for row in rows], kind
 
 
 def test_names_follow_the_conventions() -> None:

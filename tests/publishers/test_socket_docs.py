@@ -9,6 +9,15 @@ from typing import Any
 
 from imud.event import Event, EventKind
 from imud.kit.jsonrpc import DEFAULT_PATH, LINE_MAX_BYTES, Code
+from imud.kit.status import (
+    ClockStatus,
+    DeviceStatus,
+    KernelCounters,
+    LinesStatus,
+    PollingStatus,
+    SerialLineCounters,
+    UtcStatus,
+)
 from imud.publishers.outbox import Limits
 from imud.publishers.rpc import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
 from imud.publishers.socket import SocketServer, SocketSettings
@@ -113,3 +122,19 @@ def test_numbers_and_codes_of_the_text() -> None:
     ):
         assert words in DOCUMENT, words
     assert os.path.isabs(settings.path)
+
+
+def test_every_member_of_status_is_explained() -> None:
+    """Members of a device, and of its parts."""
+    section = DOCUMENT.partition("\n## Status\n")[2].partition("\n## ")[0]
+    rows = [row.split(" | ")[0] for row in section.splitlines() if row.startswith("| `")]
+    first = {name for cell in rows for name in re.findall(r"`(\w+)`", cell)}
+    in_devices = {"name", "device_id", "driver", "link", "state", "problem", "identity", "rate_hz"}
+    assert first | in_devices == set(DeviceStatus.__struct_encode_fields__)
+    named = set(re.findall(r"`(\w+)`", section))
+    for part in (ClockStatus, KernelCounters, PollingStatus, SerialLineCounters, LinesStatus, UtcStatus):
+        assert set(part.__struct_encode_fields__) <= named, part.__name__
+
+
+def test_every_kind_of_event_is_named() -> None:
+    assert all(f"`{kind}`" in DOCUMENT for kind in EventKind)

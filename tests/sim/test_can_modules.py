@@ -77,6 +77,14 @@ def test_frames_of_one_instant_leave_together_where_there_is_no_bit_rate(bitrate
     assert len(wire.sent(1000 + 5 * 240_000)) == (0 if bitrate == 0 else 5)
 
 
+@pytest.mark.parametrize(("extended", "bits"), [(False, 120), (True, 140)])
+def test_a_frame_takes_its_time(extended: bool, bits: int) -> None:
+    """47 or 67 bits around the data, 64 of data, some stuff bits."""
+    wire = FrameWire(500_000, 0)
+    wire.send(1000, 1, extended, bytes(8))
+    assert wire.next_ns() == 1000 + bits * 2000
+
+
 def test_nodes_are_told_apart_and_sent_in_one_go(monkeypatch: pytest.MonkeyPatch) -> None:
     made = [
         CAN_SIMULATORS["imu61x-can"].make(SimulatorOptions(boot_ms=0, node=node, at_once=True), 0) for node in (0, 201)

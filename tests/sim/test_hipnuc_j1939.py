@@ -116,7 +116,7 @@ def test_four_modules_on_a_bus() -> None:
 def test_crystal_and_wire() -> None:
     module = made(baud=250_000, skew_ppm=1000.0)
     frames = module.advance(BEGIN_NS + SECOND_NS)
-    assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(frames[:4])] == [480_000] * 3
+    assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(frames[:4])] == [560_000] * 3  # 140 bits
     assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
     assert module.counters() == {"samples_sent": 101, "frames_sent": 404, "requests": 0}
 
@@ -193,7 +193,7 @@ def test_address_and_bit_rate_change_at_the_restart() -> None:
     bench.wait(100 * MS)
     frames = bench.wait(SECOND_NS)
     assert {split(f.can_id).source for f in frames} == {20}
-    assert frames[1].due_ns - frames[0].due_ns == 960_000
+    assert frames[1].due_ns - frames[0].due_ns == 1_120_000
     assert bench.talk(session.identify, address=20) is not None
 
 
@@ -202,7 +202,7 @@ def test_a_restart_is_answered_before_it_happens() -> None:
     module.receive(0x0CEF0855, True, bytes.fromhex("00000600FF000000"), BEGIN_NS)
     due_ns = module.next_ns()
     assert due_ns is not None
-    (reply, *_) = [f for f in module.advance(due_ns + MS) if split(f.can_id).pgn == 0xEF00]
+    (reply, *_) = [f for f in module.advance(due_ns + 2 * MS) if split(f.can_id).pgn == 0xEF00]
     assert reply.data == bytes.fromhex("00000600FF000000")
     assert reply.can_id == 0x0CEF5508
 

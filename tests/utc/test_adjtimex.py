@@ -28,6 +28,14 @@ def test_what_counts_as_synchronised(state: int, status: int, synchronised: bool
     assert kernel_clock(ask) == KernelClock(synchronised, 7, 99)
 
 
+def test_a_kernel_that_may_not_be_asked_vouches_for_nothing() -> None:
+    def ask(_timex: Timex) -> int:
+        raise PermissionError(1, "Operation not permitted")
+
+    assert not kernel_clock(ask).synchronised
+    assert system_reference(kernel_clock(ask), 42) is None
+
+
 def test_the_offset_joins_both_clocks() -> None:
     offset_ns = realtime_offset_ns()
     assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the machine may stall in between

@@ -187,7 +187,9 @@ def _mounting(_target: Target, params: MountingParams) -> Conversation[None]:
 ACTIONS: Final[Actions] = {
     "save": _simple(commands.save_config, "write all settings to flash"),
     "restart": Action("restart it and wait until it answers; what was not saved is lost", lambda _t, _p: restart()),
-    "factory_reset": _simple(commands.factory_reset, "factory settings, the baud rate included"),
+    "factory_reset": _simple(
+        commands.factory_reset, "factory settings, the baud rate included, which `baud: auto` finds"
+    ),
     "baud": Action("set the baud rate, save, restart and follow", lambda t, p: change_baud(p.baud, t.baud), BaudParams),
     "output": Action("send a message by itself at a rate, or not at all (0)", _output, OutputParams),
     "output_on_mark": Action(

@@ -5,7 +5,8 @@ PGN) has its own rate; the fastest kinds are in every burst, a slower one in eve
 never mixed.** The rule:
 
 - Which kinds there are, their order, the period and every m are learned by what is heard. Frames until then, four
-  periods of the fastest kind, and two of its own for each slower one, are ignored.
+  periods of the fastest kind, and two of its own for each slower one, are ignored. One that joins the fast ones later
+  is ignored for six.
 - A sample begins with the frame that begins a burst. It is whole, and made at once, when all kinds are held that are
   due in this burst: the fast ones, and those of which the last came m bursts ago (or 2 m, 3 m … where one was lost).
 - It ends when a kind comes that is already held (but an exact repetition right after itself is ignored), or a fast one
@@ -41,6 +42,9 @@ STRAY_WEIGHT: Final = 2
 a device that sends more of a kind than its beginning kind leaves one or more of them per sample."""
 AGREE_FIRST, AGREE_OTHER, AGREE_MULTIPLE = 2, 3, 4
 """Equal distances in a row that make an m: the first one; another one; one that losses could have made."""
+AGREE_FAST: Final = 6
+"""The same for a kind that is to be in every burst: bursts that are lost whole shorten the distance of a slower one,
+and once it counted as fast, its burst would be taken for the period."""
 
 
 class _Kind:
@@ -68,7 +72,10 @@ class _Kind:
         self.run = self.run + 1 if since == self.step else 1
         self.step = since
         every = self.every
-        needed = AGREE_FIRST if not every else AGREE_OTHER if since % every else AGREE_MULTIPLE
+        if since == 1:
+            needed = AGREE_FAST
+        else:
+            needed = AGREE_FIRST if not every else AGREE_OTHER if since % every else AGREE_MULTIPLE
         if since < 1 or since == every or self.run < needed:
             return False
         self.every = since

@@ -26,6 +26,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from imud.devices.hipnuc.assembly import Assembly
+from imud.devices.hipnuc.canopen_actions import ACTIONS, TpdoNumber
 from imud.devices.hipnuc.canopen_session import identify, read_settings
 from imud.devices.hipnuc.cob_ids import (
     EMERGENCY,
@@ -63,11 +64,9 @@ EULER_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
 QUAT_PER_LSB: Final = 0.0001
 INCLI_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
 
-SYNC_HZ_MAX: Final = 200.0
+SYNC_HZ_MIN, SYNC_HZ_MAX = 0.01, 200.0
 US_PER_S: Final = NS_PER_S // NS_PER_US
 EULER_CONVENTION: Final = "312 (Z-X-Y): pitch about X, roll about Y, yaw about Z counter-clockwise from above"
-
-TpdoNumber = Literal[1, 2, 3, 4, 6, 7]
 
 
 class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -79,6 +78,11 @@ class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_
     """TPDOs to make samples of, for example [1, 2, 3]; auto = all that are heard."""
     sync_hz: Annotated[float, Meta(ge=0, le=SYNC_HZ_MAX)] = 0.0
     """SYNC frames per second, for TPDOs of type 1; one device sends for all of a bus. 0 = none, the timers count."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a rate that is no rate."""
+        if 0 < self.sync_hz < SYNC_HZ_MIN:
+            raise ValueError(f"sync_hz: expected 0, or {SYNC_HZ_MIN} to {SYNC_HZ_MAX:g}, got {self.sync_hz}")
 
 
 class HipnucCanopenCodec:
@@ -251,6 +255,7 @@ DRIVER: Final = CanDriver(
     tick_modulus=2,
     euler_convention=EULER_CONVENTION,
     navigation_frame="ENU",
+    actions=ACTIONS,
     node_of=_node_of,
     node_settings=lambda node: HipnucCanopenSettings(node=node),
     node_title=lambda node: f"node {node}",

@@ -24,12 +24,11 @@ from imud.devices.hipnuc.j1939_session import CONFIGURE, HOST_ADDRESS, Peer
 from imud.kit.attitude import euler312_from_quat, quat_normalized
 from imud.kit.can import CanCodec, CanDriver, CanFilter, CanFrame
 from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.kit.driver import Identity
-from imud.kit.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, split
+from imud.kit.driver import SAMPLE_COUNTER, Identity
+from imud.kit.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
 from imud.kit.settings import Settings
 from imud.ledger import Ledger
 from imud.sample import Vector3
-from imud.units import NS_PER_MS
 
 FACTORY_ADDRESS: Final = 8
 Address = Annotated[int, Meta(ge=0, le=ADDRESS_MAX)]
@@ -135,9 +134,7 @@ def _filters(settings: HipnucJ1939Settings) -> list[CanFilter]:
 
 def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     """The sender of a message that samples are made of."""
-    parts = split(can_id)
-    is_ours = extended and parts.pgn in messages.MEASURED and len(data) == messages.MESSAGE_BYTES
-    return parts.source if is_ours and parts.source <= ADDRESS_MAX else None
+    return sender_of(can_id, extended, data, messages.MEASURED)
 
 
 def _apply_identity(_codec: CanCodec, _identity: Identity) -> None:
@@ -150,8 +147,8 @@ DRIVER: Final = CanDriver(
     settings=HipnucJ1939Settings,
     make_codec=HipnucJ1939Codec,
     filters=_filters,
-    tick_ns=NS_PER_MS,
-    tick_modulus=2**32,
+    tick_ns=SAMPLE_COUNTER,
+    tick_modulus=2,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above; "
     "NaN for an angle that the module does not send",
     navigation_frame="ENU",

@@ -19,6 +19,7 @@ class IntervalParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """How often a message is sent."""
 
     pgn: PgnName
+    """The last four digits of its number."""
     interval_ms: int
     """5 … 1000."""
 
@@ -33,12 +34,14 @@ class BitrateParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
     """A bit rate."""
 
     bitrate: int
+    """1000000, 800000, 500000, 250000 or 125000 bit/s."""
 
 
 class AddressParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An address."""
 
     address: int
+    """1 … 128, one that no other module of the bus has."""
 
 
 class ZeroParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -68,7 +71,9 @@ ACTIONS: Final[Actions] = {
     "save": _action("write all settings to flash", lambda peer, _: session.save(peer)),
     "restart": _action("restart it; what was not saved is lost", lambda peer, _: session.restart(peer)),
     "factory_reset": _action(
-        "factory settings, address and bit rate included", lambda peer, _: session.factory_reset(peer)
+        "factory settings, address 8 and its bit rate included: imud then hears it only where bus and "
+        "`options.address` are set to that",
+        lambda peer, _: session.factory_reset(peer),
     ),
     "interval": _action(
         "how often a message is sent",
@@ -79,12 +84,14 @@ ACTIONS: Final[Actions] = {
         "send a message once, now", lambda peer, p: session.send_once(peer, int(p.pgn, 16)), PgnParams
     ),
     "bitrate": _action(
-        "set the bit rate of the bus; needs save and restart",
+        "set the bit rate, in force after `save` and `restart`: the module is off the bus then, and disturbs it, until "
+        "interface and all others have the same",
         lambda peer, p: session.set_bitrate(peer, p.bitrate),
         BitrateParams,
     ),
     "address": _action(
-        "set its address; needs save and restart, then `options.address`",
+        "set its address, in force after `save` and `restart`: imud then hears nothing of it until `options.address` "
+        "says the new one; with `driver: auto` it looks again after 15 s",
         lambda peer, p: session.set_address(peer, p.address),
         AddressParams,
     ),

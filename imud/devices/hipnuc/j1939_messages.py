@@ -36,6 +36,7 @@ from imud.devices.hipnuc.modbus_registers import (
 )
 from imud.devices.hipnuc.packets import QUAT_PER_LSB
 from imud.kit.attitude import quat_from_euler312
+from imud.kit.counts import counts_of
 from imud.sample import Measurement, Quaternion, Vector3
 
 ACCEL, GYRO, ROLL_PITCH, HEADING, INCLINOMETER = 0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A
@@ -185,7 +186,7 @@ def pack_mag(mag_t: Vector3) -> bytes:
 
 def pack_roll_pitch(roll_rad: float, pitch_rad: float) -> bytes:
     """FF3D."""
-    return TWO_ANGLES.pack(_clip(roll_rad / EULER_RAD_PER_LSB, 32), _clip(pitch_rad / EULER_RAD_PER_LSB, 32))
+    return TWO_ANGLES.pack(counts_of(roll_rad / EULER_RAD_PER_LSB, 32), counts_of(pitch_rad / EULER_RAD_PER_LSB, 32))
 
 
 def pack_heading(yaw_rad: float, *, twice: bool = True) -> bytes:
@@ -203,12 +204,12 @@ def pack_inclinometer(x_rad: float, y_rad: float) -> bytes:
 def pack_temperature(temperature_c: float, pressure_pa: float) -> bytes:
     """FF43."""
     celsius, pressure = temperature_c / TEMPERATURE_C_PER_LSB, pressure_pa / PRESSURE_PA_PER_LSB
-    return TEMPERATURE_LAYOUT.pack(_clip(celsius, 16), 0, _clip(pressure, 32))
+    return TEMPERATURE_LAYOUT.pack(counts_of(celsius, 16), 0, counts_of(pressure, 32))
 
 
 def pack_quaternion(quat_wxyz: Quaternion) -> bytes:
     """FF46."""
-    return QUATERNION_LAYOUT.pack(*(_clip(q / QUAT_PER_LSB, 16) for q in quat_wxyz))
+    return QUATERNION_LAYOUT.pack(*(counts_of(q / QUAT_PER_LSB, 16) for q in quat_wxyz))
 
 
 def pack_utc(year: int, month: int, day: int, second_of_day: float) -> bytes:
@@ -219,9 +220,4 @@ def pack_utc(year: int, month: int, day: int, second_of_day: float) -> bytes:
 
 
 def _pack_vector(vector: Vector3, factor: float) -> bytes:
-    return VECTOR.pack(*(_clip(value / factor, 16) for value in vector), 0)
-
-
-def _clip(value: float, bits: int) -> int:
-    most = 1 << bits - 1
-    return max(-most, min(most - 1, round(value)))
+    return VECTOR.pack(*(counts_of(value / factor, 16) for value in vector), 0)

@@ -54,6 +54,7 @@ from imud.devices.hipnuc.modbus_registers import (
 from imud.errors import DeviceRefused
 from imud.kit.attitude import euler312_from_quat, quat_normalized
 from imud.kit.codec import BadFrame, BadReason
+from imud.kit.counts import counts_of
 from imud.kit.driver import Identity
 from imud.kit.modbus import (
     CRC_BYTES,
@@ -268,13 +269,13 @@ def pack_block(
 ) -> bytes:
     """Registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
     data = BLOCK.pack(
-        *(_clip(a / ACCEL_M_S2_PER_LSB) for a in accel_m_s2),
-        *(_clip(w / GYRO_RAD_S_PER_LSB) for w in gyro_rad_s),
-        *(_clip(b / MAG_T_PER_LSB) for b in mag_t),
-        *(_clip(angle / EULER_RAD_PER_LSB, 32) for angle in euler_rad),
-        _clip(temperature_c / TEMPERATURE_C_PER_LSB),
-        _clip(pressure_pa / PRESSURE_PA_PER_LSB, 32),
-        *(_clip(q / quat_per_lsb) for q in quat_wxyz),
+        *(counts_of(a / ACCEL_M_S2_PER_LSB, 16) for a in accel_m_s2),
+        *(counts_of(w / GYRO_RAD_S_PER_LSB, 16) for w in gyro_rad_s),
+        *(counts_of(b / MAG_T_PER_LSB, 16) for b in mag_t),
+        *(counts_of(angle / EULER_RAD_PER_LSB, 32) for angle in euler_rad),
+        counts_of(temperature_c / TEMPERATURE_C_PER_LSB, 16),
+        counts_of(pressure_pa / PRESSURE_PA_PER_LSB, 32),
+        *(counts_of(q / quat_per_lsb, 16) for q in quat_wxyz),
         *incli_counts,
     )
     return data if uptime_ms is None else data + UPTIME.pack(uptime_ms % 2**32)
@@ -284,11 +285,6 @@ def pack_identity(product: str, firmware: int, loader: int, serial: bytes) -> by
     """Registers 0x70 … 0x83."""
     head = product.encode("ascii")[:NAME_BYTES].ljust(NAME_BYTES, b"\0") + VERSIONS.pack(firmware, loader)
     return (head.ljust(SERIAL_AT, b"\0") + serial).ljust(2 * IDENTITY_REGISTERS, b"\0")
-
-
-def _clip(value: float, bits: int = 16) -> int:
-    most = 1 << bits - 1
-    return max(-most, min(most - 1, round(value)))
 
 
 def _example_reading(random: Random) -> bytes:

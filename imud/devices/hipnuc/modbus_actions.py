@@ -1,14 +1,16 @@
-"""What a HiPNUC module on RS-485 can be told by name: section 4.3 of the manual, but for its address and baud rate.
+"""What a HiPNUC module on RS-485 can be told by name: every command of section 4.3 of the manual.
 
-Those two are changed by `imud modbus`, which looks for the module where it has gone.
+After another address or baud rate imud does not follow; `imud modbus assign` looks for the module where it has gone.
 """
 
 from collections.abc import Callable
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
+
+from msgspec import Meta
 
 from imud.devices.hipnuc import modbus_session as session
 from imud.devices.hipnuc.commands import AttitudeMode, LevelReset
-from imud.devices.hipnuc.modbus_registers import BY_NAME, Access
+from imud.devices.hipnuc.modbus_registers import BY_NAME, ID_MAX, Access
 from imud.devices.hipnuc.modbus_session import LineMounting
 from imud.errors import BadArgument
 from imud.kit.action import Action, Actions
@@ -34,6 +36,20 @@ class MountingParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     mounting: Literal["level", "y_down", "y_up", "x_up", "x_down"]
 
 
+class AddressParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An address."""
+
+    address: Annotated[int, Meta(ge=1, le=ID_MAX)]
+    """One that no other module of the line has."""
+
+
+class BaudParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A rate."""
+
+    baud: int
+    """4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800 or 921600."""
+
+
 class RegisterParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A register by its name in the manual."""
 
@@ -56,7 +72,20 @@ ACTIONS: Final[Actions] = {
     "save": _action("write all settings to flash", lambda _: session.save()),
     "restart": _action("restart, as by power-on; what is not saved is lost", lambda _: session.restart()),
     "factory_reset": _action(
-        "back to factory settings, address 80 and 115200 baud included", lambda _: session.factory_reset()
+        "factory settings, address 80 and 115200 baud included: imud then hears it only where the line is set to that",
+        lambda _: session.factory_reset(),
+    ),
+    "address": _action(
+        "set its address, in force at once and not saved: imud then looks for it, and finds it only with "
+        "`address: auto`",
+        lambda given: session.set_id(given.address),
+        AddressParams,
+    ),
+    "baud": _action(
+        "set the baud rate, in force after `save` and `restart`: imud then hears nothing of it until the line and all "
+        "other modules have the same",
+        lambda given: session.set_baud(given.baud),
+        BaudParams,
     ),
     "attitude_mode": _action(
         "six axes, or nine with the magnetometer",

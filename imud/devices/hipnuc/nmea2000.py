@@ -27,12 +27,12 @@ from imud.devices.hipnuc.nmea2000_messages import Reference
 from imud.kit.attitude import euler312_from_quat, quat_normalized
 from imud.kit.can import CanCodec, CanDriver, CanFilter, CanFrame
 from imud.kit.codec import BadFrame, BadReason, CodecEvent
-from imud.kit.driver import Identity
-from imud.kit.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, split
+from imud.kit.driver import SAMPLE_COUNTER, Identity
+from imud.kit.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
 from imud.kit.session import says_nothing
 from imud.kit.settings import Settings
 from imud.ledger import Ledger
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.units import NS_PER_S
 
 SILENT_NS: Final = 3 * NS_PER_S
 """The slowest of the three messages comes once a second by the standard."""
@@ -178,9 +178,7 @@ def _filters(settings: HipnucNmea2000Settings) -> list[CanFilter]:
 
 def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     """The sender of one of the messages."""
-    parts = split(can_id)
-    is_ours = extended and parts.pgn in messages.PGNS and len(data) == messages.MESSAGE_BYTES
-    return parts.source if is_ours and parts.source <= ADDRESS_MAX else None
+    return sender_of(can_id, extended, data, messages.PGNS)
 
 
 def _apply_identity(_codec: CanCodec, _identity: Identity) -> None:
@@ -193,8 +191,8 @@ DRIVER: Final = CanDriver(
     settings=HipnucNmea2000Settings,
     make_codec=HipnucNmea2000Codec,
     filters=_filters,
-    tick_ns=NS_PER_MS,
-    tick_modulus=2**32,
+    tick_ns=SAMPLE_COUNTER,
+    tick_modulus=2,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above, "
     "0 with the bow to the north of the heading's reference; NaN for an angle that is not sent",
     navigation_frame="ENU",

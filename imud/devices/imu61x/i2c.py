@@ -24,6 +24,7 @@ from imud.devices.imu61x.common import (
     crc32,
     product_of,
 )
+from imud.devices.imu61x.register_actions import filter_actions
 from imud.devices.imu61x.registers import (
     FILTER_CTRL,
     I2C_BURST,
@@ -163,4 +164,5 @@ DRIVER: Final = PolledDriver(
     make_codec=Imu61xI2cCodec,
     update_ns=update_ns,
     example_reading=_example_reading,
+    actions=filter_actions(set_up),
 )

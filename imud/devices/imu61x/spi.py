@@ -30,6 +30,7 @@ from imud.devices.imu61x.common import (
     RAD_S_PER_DEG_S,
     crc32,
 )
+from imud.devices.imu61x.register_actions import filter_actions
 from imud.devices.imu61x.registers import (
     BURST,
     BURST_CTRL,
@@ -364,4 +365,5 @@ DRIVER: Final = PolledDriver(
     make_codec=Imu61xSpiCodec,
     update_ns=update_ns,
     example_reading=_example_reading,
+    actions=filter_actions(set_up),
 )

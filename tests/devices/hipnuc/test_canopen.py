@@ -176,9 +176,12 @@ def test_the_node_is_told_by_identifier_and_length(can_id: int, size: int, node:
 def test_sync_is_sent_at_its_rate() -> None:
     assert DRIVER.cyclic(HipnucCanopenSettings()) == []
     assert DRIVER.cyclic(HipnucCanopenSettings(sync_hz=150)) == [CyclicFrame(0x80, False, b"", 6_667_000)]
+    assert DRIVER.cyclic(HipnucCanopenSettings(sync_hz=0.01)) == [CyclicFrame(0x80, False, b"", 100_000_000_000)]
 
 
-@pytest.mark.parametrize("bad", [{"node": 0}, {"node": 128}, {"tpdos": [5]}, {"tpdos": "all"}, {"sync_hz": 201}])
+@pytest.mark.parametrize(
+    "bad", [{"node": 0}, {"node": 128}, {"tpdos": [5]}, {"tpdos": "all"}, {"sync_hz": 201}, {"sync_hz": 5e-324}]
+)
 def test_settings_that_it_cannot_have(bad: dict[str, object]) -> None:
     with pytest.raises(msgspec.ValidationError):
         make(**bad)

@@ -9,9 +9,8 @@ import pytest
 from imud.devices.hipnuc.canopen import HipnucCanopenCodec, HipnucCanopenSettings
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from tests.running import SHARED
+from tests.shared_data import shared
 
-DBC = SHARED / "data" / "hipnuc-canopen.dbc"
 SIZES = {0x188: 6, 0x288: 6, 0x388: 6, 0x488: 8, 0x688: 4, 0x788: 8}
 BURSTS = 300
 G_M_S2 = 9.8
@@ -21,9 +20,8 @@ def scaled(values: dict[str, float], names: str, factor: float) -> list[float]:
     return [values[name] * factor for name in names.split()]
 
 
-@pytest.mark.skipif(not DBC.exists(), reason=f"the signal definitions are not at {DBC}; set IMUD_SHARED")
 def test_random_payloads_decode_alike() -> None:
-    database = cantools.database.load_file(DBC)
+    database = cantools.database.load_file(shared("hipnuc-canopen.dbc"))
     assert isinstance(database, cantools.database.Database)
     assert {message.frame_id: message.length for message in database.messages} == SIZES
     codec, random = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings()), Random(7)

@@ -1,6 +1,7 @@
 """The canopen library on python-can's virtual bus: its client against the simulated module, and its LocalNode as the
 device under the codec and the conversations. Waits end with what they wait for; the limit is only for a failure."""
 
+import math
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ from canopen.objectdictionary import ODRecord, ODVariable, datatypes
 
 from imud.devices.hipnuc import canopen_session as session
 from imud.devices.hipnuc import sdo
-from imud.devices.hipnuc.canopen import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
+from imud.devices.hipnuc.canopen import HipnucCanopenCodec, HipnucCanopenSettings
 from imud.devices.hipnuc.canopen_session import Transmission
 from imud.devices.hipnuc.cob_ids import NmtCommand
 from imud.errors import NoReply
@@ -27,6 +28,8 @@ from tests.canopen_bench import converse, unpack
 
 LIMIT_S = 10.0
 NODE = 8
+ACCEL, GYRO = 0x2100, 0x2101
+"""Objects of their node that its TPDOs carry."""
 QUIET = dict.fromkeys((1, 2, 3, 4, 6, 7), 0)
 
 
@@ -59,10 +62,11 @@ def dictionary() -> canopen.ObjectDictionary:
         for sub in range(4):
             mapping.add_member(variable(f"mapped {sub}", 0x1A00 + place, sub, datatypes.UNSIGNED32))
         od.add_object(mapping)
-    accel = ODRecord("acceleration", 0x2100)
-    for sub in range(1, 4):
-        accel.add_member(variable(f"axis {sub}", 0x2100, sub, datatypes.INTEGER16))
-    od.add_object(accel)
+    for index, name in ((ACCEL, "acceleration"), (GYRO, "angular rate")):
+        vector = ODRecord(name, index)
+        for sub in range(1, 4):
+            vector.add_member(variable(f"axis {sub}", index, sub, datatypes.INTEGER16))
+        od.add_object(vector)
     return od
 
 
@@ -188,7 +192,7 @@ class Host:
         self.bus = can.Bus(channel, interface="virtual")
         self.codec = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings(node=NODE))
         self.session = Session(self.codec.ledger)
-        self.frames = 0
+        self.periods = 0
         self.timeout_factor = 20
         """Their node runs in a thread of a machine that has other things to do."""
 
@@ -198,10 +202,9 @@ class Host:
         if message is None:
             return []
         extended, data = message.is_extended_id, bytes(message.data)
-        t_ns = (
-            self.frames // 2 * 10_000_000 + self.frames % 2 * 250_000
-        )  # of a bus whose times the machine cannot spoil
-        self.frames += 1
+        self.periods += message.arbitration_id == 0x180 + NODE
+        # times of a bus that the machine cannot spoil: TPDO1 begins each period
+        t_ns = self.periods * 10_000_000 + (message.arbitration_id != 0x180 + NODE) * 250_000
         return list(self.codec.feed_frame(message.arbitration_id, extended, data, t_ns))
 
     def ask(self, request: Request) -> Outcome:
@@ -300,19 +303,24 @@ def test_their_node_obeys_our_nmt_and_its_heartbeat_is_heard(local: canopen.Loca
 
 
 def test_their_tpdos_are_our_samples(network: canopen.Network, local: canopen.LocalNode, host: Host) -> None:
-    """Two TPDOs per period."""
-    values = [(0.1 * n, 0.2, 9.8) for n in range(12)]
-    for accel in values:
-        frames = encode_tpdos(accel_m_s2=accel, gyro_rad_s=(0.0, 0.0, accel[0]))
-        local.network.send_message(0x180 + NODE, frames[1])
-        local.network.send_message(0x280 + NODE, frames[2])
+    """Two TPDOs per period, mapped, packed and sent by their node; all wait on the bus before the first is read."""
+    for number, index in ((1, ACCEL), (2, GYRO)):
+        tpdo = local.tpdo[number]
+        tpdo.cob_id = 0x080 + 0x100 * number + NODE
+        for sub in range(1, 4):
+            tpdo.add_variable(index, sub)
+    counts = [(100 * n, -200, 1000 - n) for n in range(12)]
+    for mg in counts:
+        for number in (1, 2):
+            for place, value in enumerate(mg):
+                local.tpdo[number][place].raw = value
+            local.tpdo[number].transmit()
     measured: list[Measurement] = []
-    limit_s = monotonic() + LIMIT_S
-    while host.codec.ledger.frames_good < 2 * len(values) and monotonic() < limit_s:
-        measured += [event for event in host.events(0.05) if isinstance(event, Measurement)]
+    for _ in range(2 * len(counts)):
+        measured += [event for event in host.events(LIMIT_S) if isinstance(event, Measurement)]
     assert network is local.network
-    assert len(measured) == len(values) - 5
-    for sample, accel in zip(measured[::-1], values[::-1], strict=False):
-        assert sample.accel_m_s2 == pytest.approx(accel, abs=0.005)
-        assert sample.gyro_rad_s is not None
-        assert sample.gyro_rad_s[2] == pytest.approx(accel[0], abs=0.0009)
+    assert host.codec.ledger.frames_good == 2 * len(counts)
+    assert len(measured) == len(counts) - 5
+    for sample, mg in zip(measured[::-1], counts[::-1], strict=False):
+        assert sample.accel_m_s2 == pytest.approx([value * 0.0098 for value in mg])
+        assert sample.gyro_rad_s == pytest.approx([math.radians(value * 0.1) for value in mg])

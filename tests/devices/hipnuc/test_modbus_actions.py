@@ -22,6 +22,10 @@ def act(wire: Wire, name: str, **given: object) -> object:
         ("save", {}, "0600000000"),
         ("factory_reset", {}, "0600000001"),
         ("restart", {}, "06000000ff"),
+        ("address", {"address": 1}, "0600050001"),
+        ("address", {"address": 128}, "0600050080"),
+        ("baud", {"baud": 4800}, "0600040000"),
+        ("baud", {"baud": 921600}, "0600040008"),
         ("attitude_mode", {"axes": 9}, "0600060001"),
         ("attitude_mode", {"axes": 6}, "0600060000"),
         ("level", {"level": "relative"}, "0600a50002"),
@@ -47,6 +51,16 @@ def test_registers_are_read_by_name() -> None:
     for name in ("CTRL", "nothing"):
         with pytest.raises(BadArgument, match="HEADING_MODE"):
             act(wire, "read", register=name)
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [("address", {"address": 129}), ("address", {}), ("baud", {"baud": 256000})]
+)
+def test_what_a_module_cannot_take_is_not_sent(name: str, given: dict[str, object]) -> None:
+    wire = Wire()
+    with pytest.raises(BadArgument):
+        act(wire, name, **given)
+    assert wire.asked == []
 
 
 def test_all_are_described() -> None:

@@ -44,6 +44,7 @@ def parser() -> Parser:
     options.add_argument("--output", type=Path, default=environment.ROOT / "build" / "lab", help="default: build/lab")
     options.add_argument("--memory", type=int, default=DEFAULT_MEMORY_MB, metavar="MB", help="default: %(default)s")
     options.add_argument("--processors", type=int, default=DEFAULT_PROCESSORS, metavar="N", help="default: %(default)s")
+    options.add_argument("--steady", action="store_true", help="the guest's clock counts instructions, 1 ns each")
     options.add_argument("--limit", type=float, default=guest.Limits.total_s, metavar="S", help="default: %(default)s")
     options.add_argument("arguments", nargs="*", metavar="-- PYTEST_ARGUMENT", help="such as: -- -k can -v")
     return options
@@ -57,7 +58,8 @@ def say(line: str) -> None:
 def boot(options: argparse.Namespace, python: environment.Python, built: Path) -> int:
     """One run of the guest: prepares its folder, runs it, keeps its results; returns its status."""
     command = ["sh", "-c", options.exec] if options.exec else environment.pytest_command(python, options.arguments)
-    limits = guest.Limits(total_s=options.limit)
+    silence_s = guest.STEADY_SILENCE_S if options.steady else guest.Limits.silence_s
+    limits = guest.Limits(total_s=options.limit, silence_s=silence_s)
     failed = True
     with results.run_folder(options.output) as folder:
         shutil.copy(built / kernel.MODULE, folder)
@@ -67,7 +69,8 @@ def boot(options: argparse.Namespace, python: environment.Python, built: Path) -
 
         def machine(uart_fds: tuple[int, int]) -> list[str]:
             image, console = built / kernel.IMAGE, folder / "console.log"
-            return Machine(image, folder, console, options.memory, options.processors, uart_fds).command()
+            memory_mb, processors, steady = options.memory, options.processors, options.steady
+            return Machine(image, folder, console, memory_mb, processors, uart_fds, steady).command()
 
         start_s = time.time()
         try:

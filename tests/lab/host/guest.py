@@ -20,6 +20,8 @@ from tests.lab.host.errors import LabError
 TICK_S = 0.5
 GOODBYE_S = 5.0  # from the status to the end of QEMU; it is about 0.1 s
 CHUNK_BYTES = 65536
+STEADY_SILENCE_S = 300.0
+"""Between two signs of life of a guest whose clock counts instructions: on a busy host its 5 s took more than 60."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ INIT = Path(__file__).resolve().parents[1] / "guest" / "init"
 SHARING = "security_model=none"
 ROOT_FLAGS = "trans=virtio,version=9p2000.L,msize=262144,cache=loose"
 """cache=loose: nobody writes through this mount, and without it each import asks the host again."""
+STEADY = ("-icount", "shift=0")
+"""An instruction takes 2^0 ns; a guest that waits, waits as long by the host's clock."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,8 @@ class Machine:
     processors: int
     uart_fds: tuple[int, int]
     """The two ends of a socket pair: the guest's extra UARTs, wired to each other."""
+    steady: bool = False
+    """Whether time in the guest is what its instructions make it, 1 ns each, and not the host's."""
 
     def command(self) -> list[str]:
         """QEMU's argument vector. The guest's live output is QEMU's standard output.
@@ -41,6 +45,7 @@ class Machine:
             *("-device", "virtio-serial-pci", "-device", "virtserialport,chardev=live"),
             *("-chardev", f"socket,id=uart1,fd={first_fd}", "-chardev", f"socket,id=uart2,fd={second_fd}"),
             *("-device", "pci-serial-2x,chardev1=uart1,chardev2=uart2"),
+            *(STEADY if self.steady else ()),
             *("-object", "can-bus,id=can", "-device", "kvaser_pci,canbus=can", "-device", "kvaser_pci,canbus=can"),
         ]
 

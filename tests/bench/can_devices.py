@@ -1,0 +1,124 @@
+"""CPU per sample of nine devices on one CAN bus, from the read to the published sample, and what of a CPU they need.
+
+Four CANopen nodes with six TPDOs, four J1939 nodes with four PGNs, one IMU61x, with the codecs, clocks and paths of the
+daemon; each has a socket of the loop device in place of the bus, and the system call that reads one reads those, too.
+Run by itself: python -m tests.bench.can_devices
+"""
+
+import socket
+from contextlib import ExitStack
+from time import monotonic_ns, process_time_ns
+
+from imud.clock import SampleClock
+from imud.devices import DRIVERS
+from imud.kit.batch import Batch
+from imud.kit.can import RAW_FRAME, CanDriver, CanFilter
+from imud.kit.slot import encode_slot
+from imud.ledger import Ledger
+from imud.links.can_socket import FrameReader
+from imud.pipeline.path import CanPath
+from tests.bench.rows import Row, at_most
+from tests.lab.can_player import loop
+from tests.lab.can_traffic import Module, fleet
+
+RATE_HZ = 100.0
+PERIOD_NS = round(1e9 / RATE_HZ)
+WAITING = {"read one by one": 1, "gathered for 50 ms": 5}
+"""Samples of a device that wait when it is read."""
+LEARNING = 40
+"""Samples until the assemblies have learned what belongs together."""
+CPU_SHARE_MOST = 0.5
+
+
+class Device:
+    """One device's way from a socket to a slot."""
+
+    def __init__(self, module: Module, stack: ExitStack) -> None:
+        driver = DRIVERS[module.driver]
+        assert isinstance(driver, CanDriver)
+        options = driver.node_settings(module.node)
+        self.filters: list[CanFilter] = list(driver.filters(options))
+        self.sender = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        receiver = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        self.sender.connect(receiver.getsockname())
+        self.reader = FrameReader(receiver, lambda _classes, _data: False)
+        self.ledger = Ledger()
+        clock = SampleClock(module.name, tick_ns=driver.tick_ns, tick_modulus=driver.tick_modulus, byte_ns=0, hold_ns=0)
+        codec = driver.make_codec(self.ledger, options)
+        self.path = CanPath(
+            codec, module.name, 1, clock, self.ledger, _publish, lambda *_: None, lambda _bad: None, lambda: 0
+        )
+
+    def take(self, times_ns: list[int]) -> int:
+        """Read and take what was sent, as if it had come at these times; return the CPU time, ns."""
+        begin_ns = process_time_ns()
+        frames = self.reader.read()
+        read_ns = process_time_ns()
+        frames = [frame._replace(t_rx_ns=t_ns) for frame, t_ns in zip(frames, times_ns, strict=True)]
+        taken_ns = process_time_ns()
+        self.path.on_frames(frames)
+        return process_time_ns() - taken_ns + read_ns - begin_ns
+
+    def wants(self, raw: bytes) -> bool:
+        """Whether the kernel's filters would pass the frame."""
+        can_id = RAW_FRAME.unpack(raw)[0] & 0x1FFF_FFFF
+        return any(can_id & f.mask == f.can_id & f.mask for f in self.filters)
+
+
+def _publish(batch: Batch) -> None:
+    """As the socket does it, but for the sending."""
+    for sample in batch.samples:
+        encode_slot(sample, batch.device_id)
+
+
+def measure(waiting: int, samples: int) -> float:
+    """CPU time per sample, µs."""
+    modules = fleet()
+    played = loop([f"{module.driver}:{module.node}" for module in modules], RATE_HZ)
+    with ExitStack() as stack:
+        devices = [Device(module, stack) for module in modules]
+        share = [
+            [
+                [raw for at in range(0, len(burst.frames), RAW_FRAME.size)
+                 if device.wants(raw := bytes(burst.frames[at : at + RAW_FRAME.size]))]
+                for device in devices
+            ]
+            for burst in played
+        ]  # fmt: skip
+        taken_ns, made, begun_ns = 0, 0, monotonic_ns()
+        for begin in range(0, LEARNING + samples, waiting):
+            before = sum(device.ledger.samples for device in devices)
+            turn = range(begin, begin + waiting)
+            for number in turn:
+                for device, frames in zip(devices, share[number % len(share)], strict=True):
+                    for raw in frames:
+                        device.sender.send(raw)
+            for device, each in zip(devices, zip(*(share[n % len(share)] for n in turn), strict=True), strict=True):
+                taken_ns += device.take(
+                    [begun_ns + n * PERIOD_NS for n, some in zip(turn, each, strict=True) for _ in some]
+                )
+            if begin < LEARNING:
+                taken_ns = 0
+            else:
+                made += sum(device.ledger.samples for device in devices) - before
+    assert made == samples * len(devices), made
+    return taken_ns / made / 1e3
+
+
+def rows(*, quick: bool = False) -> list[Row]:
+    """The figures."""
+    found: list[Row] = []
+    for words, waiting in WAITING.items():
+        each_us = measure(waiting, 200 if quick else 1000)
+        share = each_us * 1e-6 * RATE_HZ * len(fleet())
+        found.append(Row(f"nine CAN devices, {words}: CPU per sample", each_us, "us"))
+        found.append(at_most(f"nine CAN devices at {RATE_HZ:g} Hz, {words}: of a CPU", share, "", CPU_SHARE_MOST))
+    return found
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(row.name, round(row.value, 3), row.unit)

@@ -1,0 +1,87 @@
+"""A simulated module as a process: behind a pty, its pins on the lines of a gpio-sim chip."""
+
+import csv
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.lab.gpio_chip import GpioChip
+
+LIMIT_S = 150.0
+SETTLE_MS = 12.0
+"""The lab's kernel tells of simulated edges at its timer ticks, 4 ms apart."""
+
+
+class Pulse(NamedTuple):
+    """One pulse of a pin."""
+
+    sample_ns: int
+    """Instant of measurement of its sample."""
+    late_ns: int
+    """How much later than it should the module's process made it."""
+
+
+class Imu(NamedTuple):
+    """What a running module can be asked for."""
+
+    process: "subprocess.Popen[str]"
+    folder: Path
+
+    def truth(self) -> dict[int, int]:
+        """Instant of measurement by device time (ms), of the frames that went out whole. After its end only."""
+        with (self.folder / "truth.csv").open(encoding="ascii") as file:
+            rows = csv.DictReader(line for line in file if not line.startswith("#"))
+            return {int(row["device_ms"]): int(row["sample_ns"]) for row in rows}
+
+    def pulses(self, pin: str) -> list[Pulse]:
+        """Each pulse that a pin made, in order. After its end only."""
+        with (self.folder / "pins.csv").open(encoding="ascii") as file:
+            rows = [row for row in csv.DictReader(file) if row["pin"] == pin and row["level"] == "1"]
+        return [Pulse(int(row["sample_ns"]), int(row["step_ns"]) - int(row["due_ns"])) for row in rows]
+
+    def stop(self) -> None:
+        """End it; what it writes is complete then."""
+        self.process.communicate(timeout=LIMIT_S)
+
+
+def tty(folder: Path) -> Path:
+    """Where the module in that folder is, or will be."""
+    return folder / "imu"
+
+
+@contextmanager
+def running_imu(folder: Path, chip: GpioChip, pins: Mapping[str, str], *more: str) -> Iterator[Imu]:
+    """Start it; `pins` are names of the chip's lines by pin."""
+    lines = ",".join(f"{pin}={chip.pull(line)}" for pin, line in pins.items())
+    command = [
+        sys.executable, "-m", "imud.sim", "--boot", "0", "--path", str(tty(folder)), "--truth",
+        str(folder / "truth.csv"), "--pins", lines, "--pin-truth", str(folder / "pins.csv"),
+        "--pin-settle", str(SETTLE_MS), *more,
+    ]  # fmt: skip
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline().strip() == str(tty(folder))
+            yield Imu(process, folder)
+        finally:
+            if process.poll() is None:
+                process.communicate(timeout=LIMIT_S)
+
+
+def tell(folder: Path, *commands: str) -> None:
+    """Commands over the module's port, each answered with OK, while nobody else has it open."""
+    fd = os.open(tty(folder), os.O_RDWR | os.O_NOCTTY)
+    try:
+        for command in commands:
+            os.write(fd, command.encode() + b"\r\n")
+            heard = b""
+            while b"OK\r\n" not in heard:
+                assert select.select([fd], [], [], LIMIT_S)[0], f"{command}: no answer"
+                heard += os.read(fd, 4096)
+    finally:
+        os.close(fd)

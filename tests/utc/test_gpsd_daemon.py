@@ -1,0 +1,81 @@
+"""A real daemon that feeds a device what a real gpsd hears from a receiver on a pseudo-terminal."""
+
+import os
+import select
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from imud.kit.rmc import Rmc, parse
+from tests.running import running_daemon
+from tests.utc.test_gpsd_real import LIMIT_S, NO_GPSD, Receiver, free_port, gpsd, receiver
+
+__all__ = ["receiver"]
+WANTED = 3
+
+
+class Port:
+    """The far end of a serial port: a device that only listens."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        self._text = b""
+
+    def lines(self, wait_s: float) -> list[bytes]:
+        """What came and is complete."""
+        if select.select([self._master], [], [], wait_s)[0]:
+            self._text += os.read(self._master, 4096)
+        *whole, self._text = self._text.split(b"\n")
+        return [line + b"\n" for line in whole]
+
+    def close(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+
+
+@pytest.fixture
+def port() -> Iterator[Port]:
+    made = Port()
+    yield made
+    made.close()
+
+
+@pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
+def test_a_device_is_fed_what_gpsd_hears(receiver: Receiver, port: Port, tmp_path: Path) -> None:
+    tcp_port = free_port()
+    device = {
+        "driver": "hipnuc-uart",
+        "identify": False,
+        "uart": {"port": port.path, "baud": 115200},
+        "rmc": {"source": "gpsd", "tcp_port": tcp_port},
+    }
+    fed: list[tuple[Rmc, float]] = []
+    with (
+        gpsd(tcp_port, receiver.path, tmp_path),
+        running_daemon(tmp_path, {"bow": device}, limit_s=LIMIT_S) as daemon,
+    ):
+        receiver.second = 0
+        end = time.monotonic() + LIMIT_S
+        while len(fed) < WANTED:
+            assert time.monotonic() < end, daemon.statuses()["bow"].utc
+            now_s = time.time()
+            if int(now_s) > receiver.second and now_s % 1 < 0.5:  # a receiver tells each second early in it
+                receiver.second = int(now_s)
+                receiver.cycle()
+                receiver.second -= 1
+            for line in port.lines(0.1):
+                assert line.startswith(b"$GPRMC,")
+                rmc = parse(line)
+                assert isinstance(rmc, Rmc)
+                fed.append((rmc, time.time()))
+        utc = daemon.statuses()["bow"].utc
+    assert all(rmc.valid and rmc.fraction_ns == 0 for rmc, _ in fed)
+    assert all(0 <= heard_s - rmc.unix_s < 1.5 for rmc, heard_s in fed)
+    assert utc is not None
+    assert (utc.source, utc.problem) == (f"gpsd at 127.0.0.1:{tcp_port}", "")
+    assert utc.sentences >= utc.sent >= WANTED
