@@ -6,7 +6,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
-LAB_OPTIONS ?=
+LAB_OPTIONS ?= --steady
 
 .PHONY: all demo test lint check bench soak clean lab lab-deps
 

@@ -19,6 +19,7 @@ BINS: Final = 32
 """Half a minute: a crystal that drifts by 0.1 ppm/s leaves a straight line by 13 µs."""
 NARROWEST_NS: Final = 60 * NS_PER_US
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
+APART_SIGMAS: Final = 1
 
 
 class _Bin:
@@ -87,7 +88,8 @@ class Bounds:
 
         `common_ns` is the error that all intervals share. Each weighs by its error, and the result lies within the
         corridor. Both can be wrong by the same uneven ticks, so the error is that of the better, and a fit that has to
-        be moved into the corridor is worse by that.
+        be moved into the corridor is worse by that. Where the two contradict each other beyond their errors, one of
+        them is wrong, and nothing says which: a device that gets no pulse any more says for a while that it is on UTC.
         """
         width_ns = max(self.width_ns(x), self._narrowest_ns)
         middle = self._y - fit_ns + self._middle + self._slope * (x - self._x)
@@ -95,7 +97,10 @@ class Bounds:
         wanted = middle * error_ns * error_ns / (error_ns * error_ns + own_ns * own_ns)
         most = width_ns / 2 + 2 * common_ns
         held = min(max(wanted, middle - most), middle + most)
-        return held, min(own_ns, error_ns + abs(held - wanted))
+        error = min(own_ns, error_ns + abs(held - wanted))
+        if abs(middle) > most + APART_SIGMAS * error_ns:
+            error = max(error, (abs(held) + error_ns) / 2)
+        return held, error
 
     def _fit(self, x: int, slope: float) -> None:
         """Lay the corridor through all bins again; the oldest go where no line passes through all."""

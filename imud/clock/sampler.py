@@ -17,6 +17,7 @@ from typing import Final
 from imud.clock.aids import Aids
 from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
 from imud.clock.coast import Coast
+from imud.clock.correction import corrected
 from imud.clock.envelope import SLOPE_HIGHEST, Envelope
 from imud.clock.inputs import LineInputs
 from imud.clock.jump import EARLY_NS, EARLY_SIGMAS, FIRST_EARLY_NS, LATE_NS, Jump
@@ -242,6 +243,10 @@ class SampleClock(LineInputs):
         x = time.even_ns
         line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
         height = y - line
+        if time.watched and self._sync is not _ARRIVAL and corrected(time, envelope, x_before, y):
+            x = time.even_ns
+            line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
+            height = y - line
         odd = height < -EARLY_NS or height > LATE_NS or self._jump.late_reads
         if odd and self._jumped(height, x - x_before, t_rx_ns):
             told_ns = self._turned(ticks, y)
@@ -264,7 +269,7 @@ class SampleClock(LineInputs):
                 return self._coast.at(x)
             return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
         left = self._slew.over(x - x_before, x - self._epoch_x) if self._slew.left_ns else 0.0
-        error = self._error_ns + envelope.slope_error * (x - envelope.x_fit) + abs(left)
+        error = self._error_ns + envelope.slope_error * (x - envelope.x_fit) + abs(left) + time.doubt_ns
         self._t_err = error if height < LATE_NS else error + height
         return int(line - self._shift_ns + left)
 

@@ -77,3 +77,16 @@ def test_contradictions_drop_what_is_old() -> None:
     assert bounds.known
     at = x + 199 * NS_PER_S // 10
     assert bounds.improved(at, at, 1e9, 0.0)[0] == pytest.approx(20.5 * MS, abs=0.6 * MS)
+
+
+def test_a_fit_that_contradicts_a_narrow_corridor_is_covered() -> None:
+    """A device without pulses drifts away and still says UTC: its milliseconds agree with each other, not with it."""
+    bounds, x = Bounds(), 0
+    for _ in range(1000):
+        x += 10_037_000
+        low = x // MS * MS
+        bounds.add(x, low, low + MS, FAR, 1.0)
+    assert bounds.width_ns(x) < MS // 4
+    fix, error = bounds.improved(x, x + 3 * MS, 1000.0, 0.0)
+    assert fix == pytest.approx(-3 * MS, rel=0.1)
+    assert 2 * error >= abs(fix)

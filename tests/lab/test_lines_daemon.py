@@ -33,7 +33,7 @@ METRICS_PORT = 19321
 SAMPLES = 70
 FOLLOWS = 8
 """So many samples later, at 20 Hz, what the alarm line says has reached the samples."""
-ANSWERS = 25
+ANSWERS = 15
 LATE_NS = 25 * NS_PER_MS
 """A quarter of a period. Now and then the emulated processor stands still for longer: no pairing could be right."""
 
