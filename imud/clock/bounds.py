@@ -19,7 +19,8 @@ BINS: Final = 32
 """Half a minute: a crystal that drifts by 0.1 ppm/s leaves a straight line by 13 µs."""
 NARROWEST_NS: Final = 60 * NS_PER_US
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
-APART_SIGMAS: Final = 1
+APART_SIGMAS: Final = 1.75
+"""A constant delay that hides in the fit is anything up to √3 of its sigmas: within that nothing contradicts."""
 
 
 class _Bin:
