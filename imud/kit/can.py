@@ -119,8 +119,8 @@ class CanDriver(Driver):
     """Asks the device with these settings what it is, and leaves it as it was."""
     read_settings: Callable[[Any], Conversation[Mapping[str, str]]]
     """Reads back the own settings of the device with these settings, by its own names, and leaves it as it was."""
-    apply_identity: Callable[[CanCodec, Identity], None]
-    """Tells the codec what is known of the device."""
+    apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
+    """Tells the codec what is known of the device, where what it sends depends on that."""
     sample_frames: int
     """Frames that make one sample."""
     example_frames: Callable[[Random], Sequence[CanFrame]]

@@ -65,8 +65,8 @@ class StreamDriver(Driver):
     """Asks the device what it is, and leaves it as it was."""
     read_settings: Callable[[], Conversation[Mapping[str, str]]]
     """Reads back the device's own settings, by the device's own names, and leaves it as it was."""
-    apply_identity: Callable[[StreamCodec, Identity], None]
-    """Tells the codec what is known of the device (the meaning of a field can depend on the firmware)."""
+    apply_identity: Callable[[StreamCodec, Identity], None] = lambda _codec, _identity: None
+    """Tells the codec what is known of the device, where the meaning of a field depends on the firmware."""
     wake: Callable[[], Conversation[bool]] | None = None
     """Makes a device send samples that answers and sends none, and says whether it acknowledged; nothing is saved.
     Raises NoReply where nothing answers. None for devices that cannot be silent."""

@@ -43,9 +43,9 @@ from imud.devices.hipnuc.cob_ids import (
 from imud.devices.hipnuc.packets import M_S2_PER_G
 from imud.devices.hipnuc.sdo import SDO_BYTES
 from imud.kit.attitude import quat_from_euler312
-from imud.kit.can import STANDARD_ID_MAX, CanCodec, CanDriver, CanFilter, CanFrame, CyclicFrame
+from imud.kit.can import STANDARD_ID_MAX, CanDriver, CanFilter, CanFrame, CyclicFrame
 from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.kit.driver import SAMPLE_COUNTER, Identity
+from imud.kit.driver import SAMPLE_COUNTER
 from imud.kit.settings import Settings
 from imud.ledger import Ledger
 from imud.sample import Measurement, Pair, Quaternion, Vector3
@@ -241,10 +241,6 @@ def _cyclic(settings: HipnucCanopenSettings) -> list[CyclicFrame]:
     return [CyclicFrame(SYNC, False, b"", round(US_PER_S / settings.sync_hz) * NS_PER_US)] if settings.sync_hz else []
 
 
-def _apply_identity(_codec: CanCodec, _identity: Identity) -> None:
-    """Nothing in a TPDO depends on who sends it."""
-
-
 DRIVER: Final = CanDriver(
     name="hipnuc-canopen",
     title="HiPNUC CH0x0, CH10x, HI14 (CANopen)",
@@ -261,7 +257,6 @@ DRIVER: Final = CanDriver(
     node_title=lambda node: f"node {node}",
     identify=lambda settings: identify(settings.node),
     read_settings=lambda settings: read_settings(settings.node),
-    apply_identity=_apply_identity,
     sample_frames=4,
     example_frames=_example_frames,
     cyclic=_cyclic,

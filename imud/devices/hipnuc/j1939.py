@@ -22,9 +22,9 @@ from imud.devices.hipnuc.assembly import Assembly
 from imud.devices.hipnuc.j1939_actions import ACTIONS, MeasuredName
 from imud.devices.hipnuc.j1939_session import CONFIGURE, HOST_ADDRESS, Peer
 from imud.kit.attitude import euler312_from_quat, quat_normalized
-from imud.kit.can import CanCodec, CanDriver, CanFilter, CanFrame
+from imud.kit.can import CanDriver, CanFilter, CanFrame
 from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.kit.driver import SAMPLE_COUNTER, Identity
+from imud.kit.driver import SAMPLE_COUNTER
 from imud.kit.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
 from imud.kit.settings import Settings
 from imud.ledger import Ledger
@@ -137,10 +137,6 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     return sender_of(can_id, extended, data, messages.MEASURED)
 
 
-def _apply_identity(_codec: CanCodec, _identity: Identity) -> None:
-    """Nothing that it says of itself changes the meaning of what it sends."""
-
-
 DRIVER: Final = CanDriver(
     name="hipnuc-j1939",
     title="HiPNUC CH0x0, CH10x, HI14 (CAN, SAE J1939)",
@@ -158,7 +154,6 @@ DRIVER: Final = CanDriver(
     node_title=lambda address: f"address {address}",
     identify=lambda settings: session.identify(settings.peer),
     read_settings=lambda settings: session.read_settings(settings.peer),
-    apply_identity=_apply_identity,
     sample_frames=4,
     example_frames=_example_frames,
 )

@@ -25,7 +25,7 @@ from imud.devices.hipnuc import nmea2000_messages as messages
 from imud.devices.hipnuc.assembly import Assembly
 from imud.devices.hipnuc.nmea2000_messages import Reference
 from imud.kit.attitude import euler312_from_quat, quat_normalized
-from imud.kit.can import CanCodec, CanDriver, CanFilter, CanFrame
+from imud.kit.can import CanDriver, CanFilter, CanFrame
 from imud.kit.codec import BadFrame, BadReason, CodecEvent
 from imud.kit.driver import SAMPLE_COUNTER, Identity
 from imud.kit.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
@@ -181,10 +181,6 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     return sender_of(can_id, extended, data, messages.PGNS)
 
 
-def _apply_identity(_codec: CanCodec, _identity: Identity) -> None:
-    """It is not asked."""
-
-
 DRIVER: Final = CanDriver(
     name="hipnuc-nmea2000",
     title="HiPNUC CH0x0, CH10x, HI14, other heading and attitude sensors (CAN, NMEA 2000)",
@@ -201,7 +197,6 @@ DRIVER: Final = CanDriver(
     node_title=lambda source: f"source {source}",
     identify=lambda _settings: says_nothing(Identity()),
     read_settings=lambda _settings: says_nothing({}),
-    apply_identity=_apply_identity,
     sample_frames=len(messages.PGNS),
     example_frames=_example_frames,
 )

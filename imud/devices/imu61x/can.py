@@ -37,7 +37,7 @@ from msgspec import Meta
 
 from imud.devices.imu61x.common import EULER_CONVENTION, M_S2_PER_G, NAVIGATION_FRAME, RAD_S_PER_DEG_S
 from imud.kit.attitude import quat_from_euler_zyx
-from imud.kit.can import STANDARD_ID_MAX, CanCodec, CanDriver, CanFilter, CanFrame
+from imud.kit.can import STANDARD_ID_MAX, CanDriver, CanFilter, CanFrame
 from imud.kit.codec import BadFrame, BadReason, CodecEvent
 from imud.kit.driver import SAMPLE_COUNTER, Identity
 from imud.kit.session import says_nothing
@@ -274,10 +274,6 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     return BASE_ID if 0 <= slot < SET_FRAMES and not extended and len(data) == FRAME_BYTES else None
 
 
-def _apply_identity(_codec: CanCodec, _identity: Identity) -> None:
-    """The device says nothing of itself over CAN."""
-
-
 DRIVER: Final = CanDriver(
     name="imu61x-can",
     title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (CAN)",
@@ -293,7 +289,6 @@ DRIVER: Final = CanDriver(
     node_title=lambda base_id: f"base_id {base_id}",
     identify=lambda _settings: says_nothing(Identity()),
     read_settings=lambda _settings: says_nothing({}),
-    apply_identity=_apply_identity,
     sample_frames=SET_FRAMES,
     example_frames=_example_frames,
 )

@@ -30,8 +30,8 @@ from imud.devices.imu61x.replies import (
 )
 from imud.devices.imu61x.session import identify, read_settings, wake
 from imud.kit.attitude import quat_from_euler_zyx
-from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame, StreamCodec
-from imud.kit.driver import Identity, StreamDriver
+from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
+from imud.kit.driver import StreamDriver
 from imud.kit.settings import NoSettings
 from imud.ledger import Ledger
 from imud.sample import Measurement, Vector3
@@ -215,10 +215,6 @@ def _example_frame(random: Random) -> bytes:
     )
 
 
-def _apply_identity(_codec: StreamCodec, _identity: Identity) -> None:
-    """Nothing in the frames depends on model or firmware."""
-
-
 DRIVER: Final = StreamDriver(
     name="imu61x-uart",
     title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (UART)",
@@ -233,7 +229,6 @@ DRIVER: Final = StreamDriver(
     actions=ACTIONS,
     identify=identify,
     read_settings=read_settings,
-    apply_identity=_apply_identity,
     wake=wake,
     example_frame=_example_frame,
 )
