@@ -204,7 +204,7 @@ class Daemon:
         """The kind of runner that the device's link needs."""
         link, publish, tell = LINKS[device.link], self._publish, self._tell
         if link.polled:
-            return PolledRunner(device, device_id, publish, tell, self._buses)
+            return PolledRunner(device, device_id, publish, tell, self._buses, self._lines)
         if link.frames_only or isinstance(DRIVERS.get(device.driver), CanDriver):
             return CanRunner(device, device_id, publish, tell, self._can_buses, self._remembered)
         return DeviceRunner(device, device_id, publish, tell, self._remembered, self._lines)
