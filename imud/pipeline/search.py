@@ -1,9 +1,7 @@
 """Runs a detection (`imud.detect`, without I/O) on an open link: sets rates, sends queries, keeps its time."""
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import monotonic_ns
 
 from imud.config import DeviceConfig
 from imud.detect import Found, GaveUp, Listen, Search, Step
@@ -13,7 +11,7 @@ from imud.kit.driver import StreamDriver, of_kind
 from imud.kit.link import StreamLink
 from imud.ledger import Ledger
 from imud.pipeline import remembered
-from imud.units import NS_PER_S
+from imud.pipeline.search_round import SearchRound
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +23,7 @@ class Finding:
     """Bytes with CLOCK_MONOTONIC of their reads, taken out of the ledger again for the device's own codec to count."""
 
 
-class Finder:
+class Finder(SearchRound):
     """One round of detection. `on_found` is called inside the callback that completed it, so that the next bytes
     already go to the device's own codec. Synchronization: the event loop's thread only.
     """
@@ -40,6 +38,7 @@ class Finder:
         *,
         may_ask: bool,
     ) -> None:
+        super().__init__()
         self._link = link
         self._ledger = ledger
         self._on_found = on_found
@@ -52,26 +51,10 @@ class Finder:
             hold_ns=link.hold_ns,
             options=config.options if named else None,
         )
-        self._timer: asyncio.TimerHandle | None = None
-        self._done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def start(self) -> None:
         """Begin; from now on bytes go to `take`."""
-        self._follow(self._search.start(monotonic_ns()))
-
-    async def finished(self) -> None:
-        """Return when a device was found. Raises NothingHeard with what was heard instead, and LinkError."""
-        try:
-            await self._done
-        finally:
-            self.cancel()
-
-    def cancel(self) -> None:
-        """Stop searching; may be called twice."""
-        if self._timer is not None:
-            self._timer.cancel()
-        if not self._done.done():
-            self._done.cancel()
+        self._follow(self._search.start(self._now_ns()))
 
     def take(self, data: bytes, t_rx_ns: int) -> None:
         """Bytes from the link; they count as skipped until a device is found in them."""
@@ -80,14 +63,10 @@ class Finder:
         if not self._done.done():
             self._follow(self._search.on_data(data, t_rx_ns))
 
-    def _on_time(self) -> None:
-        """The loop's timer; it may fire a little early against CLOCK_MONOTONIC, then the search says nothing new."""
-        if not self._done.done():
-            step = self._search.on_time(monotonic_ns())
-            if step is None:
-                self._timer = asyncio.get_running_loop().call_later(0.001, self._on_time)
-            else:
-                self._follow(step)
+    def _at_time(self) -> bool:
+        step = self._search.on_time(self._now_ns())
+        self._follow(step)
+        return step is not None
 
     def _follow(self, step: Step | None) -> None:
         while isinstance(step, Listen):
@@ -105,19 +84,16 @@ class Finder:
         self._on_found(Finding(found.driver, found.chunks))
 
     def _listen(self, step: Listen) -> Step | None:
-        if self._timer is not None:
-            self._timer.cancel()
         if step.baud != self._link.baud:
             try:
                 self._link.set_baud(step.baud)
             except LinkError as error:
-                return self._search.refused(str(error), monotonic_ns())
+                return self._search.refused(str(error), self._now_ns())
         if step.send:
             try:
                 self._link.write(step.send)
             except LinkError as error:
                 self._done.set_exception(error)
                 return None
-        delay_s = max(0, step.until_ns - monotonic_ns()) / NS_PER_S
-        self._timer = asyncio.get_running_loop().call_later(delay_s, self._on_time)
+        self._wait_until(step.until_ns)
         return None

@@ -30,7 +30,7 @@ from tests.virtual_time import VirtualClock, run_virtually
 LINES = DeviceLines(reset=ResetSettings(line="R"))
 BOOT_S = 2.9
 """A little less than the manual says."""
-UNTOLD = tuple(f"imud.pipeline.{name}" for name in ("device", "path", "runner", "search", "talk"))
+UNTOLD = tuple(f"imud.pipeline.{name}" for name in ("device", "path", "runner", "search_round", "talk"))
 
 
 @pytest.fixture

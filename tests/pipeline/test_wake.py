@@ -23,7 +23,7 @@ from tests.virtual_time import VirtualClock, run_virtually
 
 STEP_S = 0.001
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
-UNTOLD = tuple(f"imud.pipeline.{name}" for name in ("device", "path", "runner", "search", "talk"))
+UNTOLD = tuple(f"imud.pipeline.{name}" for name in ("device", "path", "runner", "search_round", "talk"))
 
 
 class Line(MemoryLink):
