@@ -16,26 +16,26 @@ from typing import Any, cast
 
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
+from imud.contracts.action import ActionInfo, described
+from imud.contracts.batch import Batch
+from imud.contracts.can import CanDriver
+from imud.contracts.lines import LineFactory
+from imud.contracts.publisher import Publisher, PublisherContext, PublisherSettings
+from imud.contracts.status import DeviceState, DeviceStatus
 from imud.devices import DRIVERS
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
-from imud.gpio import LINES
-from imud.kit.action import ActionInfo, described
-from imud.kit.batch import Batch
-from imud.kit.can import CanDriver
-from imud.kit.lines import LineMaker
-from imud.kit.publisher import Publisher, PublisherContext, PublisherSettings
-from imud.kit.status import DeviceState, DeviceStatus
 from imud.links import LINKS
 from imud.notify import notify, watchdog_interval_s
-from imud.pipeline.bus import Buses
-from imud.pipeline.can_bus import CanBuses
-from imud.pipeline.can_runner import CanRunner
-from imud.pipeline.device import Device
-from imud.pipeline.polled import PolledRunner
-from imud.pipeline.remembered import Remembered
-from imud.pipeline.runner import DeviceRunner
 from imud.publishers import PUBLISHERS
+from imud.runtime.can.buses import CanBuses
+from imud.runtime.can.runner import CanRunner
+from imud.runtime.detection.remembered import Remembered
+from imud.runtime.device import Device
+from imud.runtime.polled.bus import Buses
+from imud.runtime.polled.runner import PolledRunner
+from imud.runtime.stream.runner import DeviceRunner
+from imud.signals.gpio import GPIO_LINES
 from imud.units import NS_PER_S
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class Daemon:
         state_dir: Path | None = None,
         extra: Mapping[str, Publisher] | None = None,
         until_finished: bool = False,
-        lines: LineMaker = LINES,
+        lines: LineFactory = GPIO_LINES,
     ) -> None:
         self.config = config
         self._file = file

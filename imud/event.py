@@ -1,6 +1,7 @@
 """What happens to a device besides samples: told to event subscribers and to the log."""
 
 from enum import StrEnum
+from typing import Protocol
 
 import msgspec
 
@@ -38,3 +39,11 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     message: str
     """One sentence for people."""
     detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
+
+
+class RaiseEvent(Protocol):
+    """Sends one event of one device, and logs it."""
+
+    def __call__(self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None) -> None:
+        """At `now_ns` (CLOCK_MONOTONIC): one sentence for people, and details by name."""
+        ...

@@ -10,14 +10,18 @@ PACKAGE = Path(__file__).parent.parent / "imud"
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud", "imud.units"),
     ("imud.sample", "imud.errors", "imud.ledger", "imud.event"),
-    ("imud.kit",),
-    ("imud.devices", "imud.clock", "imud.links", "imud.gpio", "imud.publishers", "imud.utc"),
-    ("imud.sim",),
-    ("imud.config", "imud.detect", "imud.ports", "imud.client", "imud.notify", "imud.pipeline"),
+    ("imud.attitude", "imud.permissions", "imud.worker", "imud.notify"),
+    ("imud.formats",),
+    ("imud.contracts",),
+    ("imud.devices", "imud.clock", "imud.links", "imud.publishers", "imud.utc"),
+    ("imud.sim", "imud.config", "imud.client"),
+    ("imud.signals",),
+    ("imud.runtime",),
     ("imud.daemon",),
     ("imud.cli", "imud.__main__"),
 )
-LEAVES = LAYERS[3]
+LEAVES_LAYER = next(number for number, names in enumerate(LAYERS) if "imud.devices" in names)
+LEAVES = LAYERS[LEAVES_LAYER]
 IO_MODULES = {
     "asyncio", "fcntl", "io", "os", "pathlib", "select", "serial", "socket", "subprocess", "termios", "threading",
     "time",
@@ -70,11 +74,11 @@ def test_imports_go_left(module: str) -> None:
             assert layer_of(target) <= mine, f"{module} imports {target}, which lies to its right"
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if layer_of(m) == 3])
+@pytest.mark.parametrize("module", [m for m in MODULES if layer_of(m) == LEAVES_LAYER])
 def test_leaves_do_not_import_each_other(module: str) -> None:
     family = next(leaf for leaf in LEAVES if module == leaf or module.startswith(leaf + "."))
     for target in imports(MODULES[module]):
-        if target in MODULES and layer_of(target) == 3:
+        if target in MODULES and layer_of(target) == LEAVES_LAYER:
             assert target == family or target.startswith(family + "."), f"{module} imports {target}"
 
 
@@ -100,4 +104,4 @@ def test_there_is_no_import_cycle() -> None:
 
 
 def test_only_one_module_imports_gpiod() -> None:
-    assert {m for m in MODULES if "gpiod" in imports(MODULES[m])} <= {"imud.gpio.chips"}
+    assert {m for m in MODULES if "gpiod" in imports(MODULES[m])} <= {"imud.signals.gpio_chips"}

@@ -18,8 +18,8 @@ import msgspec
 import pytest
 
 from imud.client import Ring
-from tests.hi91 import hi91
-from tests.running import RunningDaemon, running_daemon, wait_until, write_config
+from tests.support.hi91 import hi91
+from tests.support.running import RunningDaemon, running_daemon, wait_until, write_config
 
 
 class Cable:

@@ -15,8 +15,8 @@ import pytest
 from imud import config
 from imud.cli import COMMANDS, build_parser
 from imud.devices import DRIVERS
-from tests import actions_reference, shm_reference
-from tests.running import LIMIT_S, running_daemon
+from tests.support import actions_reference, shm_reference
+from tests.support.running import LIMIT_S, running_daemon
 from tests.test_daemon import cable, device
 
 ROOT = Path(__file__).parents[1]
@@ -120,7 +120,7 @@ def test_make_targets_of_the_readme_exist() -> None:
 def test_layout_tables_are_those_of_the_code() -> None:
     text = shm_reference.PAGE.read_text()
     assert "| 0 | `uint64_t` | `seq` |" in text
-    assert shm_reference.filled(text) == text, "run python -m tests.shm_reference"
+    assert shm_reference.filled(text) == text, "run python -m tests.support.shm_reference"
 
 
 def test_tables_of_actions_are_those_of_the_drivers() -> None:
@@ -129,4 +129,4 @@ def test_tables_of_actions_are_those_of_the_drivers() -> None:
     for driver in DRIVERS.values():
         for action in driver.actions:
             assert f"\n| `{action}` | " in text, action
-    assert actions_reference.whole(text) == text, "run python -m tests.actions_reference"
+    assert actions_reference.whole(text) == text, "run python -m tests.support.actions_reference"

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 from imud.client import Ring
-from imud.devices.hipnuc.frames import encode_hi91
+from imud.devices.hipnuc.uart.codec import encode_hi91
 from imud.sample import Sample
-from tests.running import SHARED, running_daemon, wait_until
+from tests.support.paths import SHARED
+from tests.support.running import running_daemon, wait_until
 
 RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
 G = 9.8

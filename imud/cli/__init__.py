@@ -15,7 +15,7 @@ from imud import __version__
 from imud.errors import ImudError
 
 
-class Command(NamedTuple):
+class Subcommand(NamedTuple):
     """A row of the table of commands."""
 
     module: str
@@ -23,19 +23,19 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "run": Command("imud.cli.run", "own the configured devices and serve their samples"),
-    "demo": Command("imud.cli.demo", "run the daemon on a simulated sensor and show what it does"),
-    "check": Command("imud.cli.check", "check a configuration file without opening any port"),
-    "probe": Command("imud.cli.probe", "list what is attached"),
-    "modbus": Command("imud.cli.modbus", "find modules on an RS-485 line and give them addresses"),
-    "decode": Command("imud.cli.decode", "raw capture in, one JSON object per message out"),
-    "replay": Command("imud.cli.replay", "run a capture through the daemon's whole path"),
-    "devices": Command("imud.cli.devices", "list the devices of the running daemon"),
-    "status": Command("imud.cli.status", "show state, rate, clock and ledger of each device"),
-    "watch": Command("imud.cli.watch", "print samples as they come"),
-    "clock": Command("imud.cli.clock", "show where time stamps come from, how good they are, and what limits them"),
-    "command": Command("imud.cli.command", "list what a device can be told to do, or tell it"),
-    "schema": Command("imud.cli.schema", "list the fields of a sample with units and frames"),
+    "run": Subcommand("imud.cli.run", "own the configured devices and serve their samples"),
+    "demo": Subcommand("imud.cli.demo", "run the daemon on a simulated sensor and show what it does"),
+    "check": Subcommand("imud.cli.check", "check a configuration file without opening any port"),
+    "probe": Subcommand("imud.cli.probe", "list what is attached"),
+    "modbus": Subcommand("imud.cli.modbus", "find modules on an RS-485 line and give them addresses"),
+    "decode": Subcommand("imud.cli.decode", "raw capture in, one JSON object per message out"),
+    "replay": Subcommand("imud.cli.replay", "run a capture through the daemon's whole path"),
+    "devices": Subcommand("imud.cli.devices", "list the devices of the running daemon"),
+    "status": Subcommand("imud.cli.status", "show state, rate, clock and ledger of each device"),
+    "watch": Subcommand("imud.cli.watch", "print samples as they come"),
+    "clock": Subcommand("imud.cli.clock", "show where time stamps come from, how good they are, and what limits them"),
+    "command": Subcommand("imud.cli.command", "list what a device can be told to do, or tell it"),
+    "schema": Subcommand("imud.cli.schema", "list the fields of a sample with units and frames"),
 }
 
 

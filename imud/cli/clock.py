@@ -14,7 +14,7 @@ from imud.cli.connect import add_socket, connect, statuses
 from imud.cli.histogram import histogram
 from imud.cli.verdict import verdict
 from imud.client import Client
-from imud.kit.status import DeviceStatus
+from imud.contracts.status import DeviceStatus
 from imud.units import NS_PER_S, NS_PER_US
 
 KEPT: Final = 2000

@@ -6,8 +6,8 @@ import msgspec
 
 from imud.cli.connect import add_socket
 from imud.client import Client
+from imud.contracts.action import ActionInfo
 from imud.errors import BadArgument
-from imud.kit.action import ActionInfo
 
 LIMIT_S = 180.0
 """The longest action, a calibration with its status asked again and again, ends within two minutes."""

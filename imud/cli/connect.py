@@ -6,8 +6,8 @@ import os
 import msgspec
 
 from imud.client import Client
-from imud.kit.jsonrpc import DEFAULT_PATH
-from imud.kit.status import DeviceStatus
+from imud.contracts.status import DeviceStatus
+from imud.formats.jsonrpc import DEFAULT_PATH
 
 
 def add_socket(parser: argparse.ArgumentParser) -> None:

@@ -14,14 +14,14 @@ from typing import BinaryIO
 import msgspec
 
 from imud.cli.options import add_option, driver_settings, given_options
+from imud.contracts.can import CanDriver
+from imud.contracts.codec import BadFrame, CodecEvent, ReplyFrame, TextLine
+from imud.contracts.driver import SAMPLE_COUNTER, Driver, StreamDriver
+from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
 from imud.errors import ImudError
-from imud.kit.can import CanDriver
-from imud.kit.candump import CandumpReader
-from imud.kit.capture import read_capture
-from imud.kit.codec import BadFrame, CodecEvent, ReplyFrame, TextLine
-from imud.kit.driver import SAMPLE_COUNTER, Driver, StreamDriver
-from imud.kit.settings import Settings
+from imud.formats.candump import CandumpReader
+from imud.formats.capture import read_capture
 from imud.ledger import Ledger
 from imud.sample import Measurement
 
@@ -63,7 +63,7 @@ def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | 
 
     Raises ImudError for a driver without captures, or a file that is none.
     """
-    times = DeviceTime(driver)
+    times = UnwrappedTime(driver)
     for event in events_in(file, driver, ledger, settings or driver.settings()):
         yield msgspec.json.encode(as_object(event, times)).decode() + "\n"
 
@@ -87,7 +87,7 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings
         raise ImudError(f"{driver.name} has no captures: a device on a polled bus sends nothing by itself")
 
 
-def as_object(event: CodecEvent, times: "DeviceTime") -> dict[str, object]:
+def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:
     """One codec event as the object that is printed."""
     if isinstance(event, TextLine):
         return {"text": event.text}
@@ -105,7 +105,7 @@ def as_object(event: CodecEvent, times: "DeviceTime") -> dict[str, object]:
     return shown
 
 
-class DeviceTime:
+class UnwrappedTime:
     """Unwraps device ticks without a host clock: a step back by more than half the range is a rollover."""
 
     def __init__(self, driver: Driver) -> None:

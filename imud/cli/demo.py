@@ -21,13 +21,13 @@ from imud.cli.connect import statuses
 from imud.cli.demo_view import View
 from imud.cli.status import block, closes
 from imud.client import Client
+from imud.contracts.can import CanDriver
+from imud.contracts.polling import PolledDriver
 from imud.devices import DRIVERS
 from imud.errors import ImudError, LinkMissing
-from imud.kit.can import CanDriver
-from imud.kit.polling import PolledDriver
 from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.__main__ import DEVICE, simulated
-from imud.sim.can_port import default_interface
+from imud.sim.ports.can_port import default_interface
 
 START_LIMIT_S = 10.0
 STOP_LIMIT_S = 5.0

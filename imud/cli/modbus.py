@@ -9,7 +9,7 @@ from functools import partial
 import msgspec
 
 from imud.cli.modbus_line import (
-    Found,
+    FoundModule,
     assign_by_address,
     assign_by_serial,
     keep,
@@ -18,10 +18,10 @@ from imud.cli.modbus_line import (
     scan,
 )
 from imud.cli.table import table
-from imud.devices.hipnuc.modbus_frames import FACTORY_ID
-from imud.devices.hipnuc.modbus_registers import BAUD_RATES, FACTORY_BAUD
+from imud.devices.hipnuc.common.registers import BAUD_RATES, FACTORY_BAUD
+from imud.devices.hipnuc.modbus.frames import FACTORY_ID
 from imud.errors import BadArgument
-from imud.kit.modbus import SLAVES
+from imud.formats.modbus import SLAVES
 
 HEAD = ("BAUD", "ADDRESS", "PRODUCT", "SERIAL NUMBER", "FIRMWARE", "")
 
@@ -77,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
     return 0 if found and not any(one.problem for one in found) else 1
 
 
-def _scan(args: argparse.Namespace) -> list[Found]:
-    found: list[Found] = []
+def _scan(args: argparse.Namespace) -> list[FoundModule]:
+    found: list[FoundModule] = []
     first = [address for address in (FACTORY_ID,) if address in args.addresses]
     order = list(dict.fromkeys([*first, *args.addresses]))
     for baud in BAUD_RATES if args.baud == "all" else (_baud(args.baud),):
@@ -87,7 +87,7 @@ def _scan(args: argparse.Namespace) -> list[Found]:
     return sorted(found, key=lambda one: (one.baud, one.address))
 
 
-def _assign(args: argparse.Namespace) -> list[Found]:
+def _assign(args: argparse.Namespace) -> list[FoundModule]:
     baud = _baud(str(args.baud))
     if (args.random is None) == (args.id is None):
         raise BadArgument("--id: expected the new address with --serial or --from, and none with --random")
@@ -115,7 +115,7 @@ def _baud(text: str) -> int:
     return int(text)
 
 
-def _show(found: list[Found], *, as_json: bool) -> None:
+def _show(found: list[FoundModule], *, as_json: bool) -> None:
     if as_json:
         for one in found:
             print(msgspec.json.encode(one).decode())

@@ -7,14 +7,14 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from imud.devices.hipnuc.modbus import HipnucModbusSettings, probe
-from imud.devices.hipnuc.modbus_frames import check_id, randomise_ids, serial_bytes, set_id_by_serial
-from imud.devices.hipnuc.modbus_session import save, set_id
+from imud.contracts.driver import Identity
+from imud.contracts.polling import Transfer, TransferScript, run_transfer_script
+from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings, probe
+from imud.devices.hipnuc.modbus.frames import check_id, randomise_ids, serial_bytes, set_id_by_serial
+from imud.devices.hipnuc.modbus.session import save, set_id
 from imud.errors import CommandError, DeviceRefused, TransferError
-from imud.kit.driver import Identity
-from imud.kit.modbus import BROADCAST
-from imud.kit.polling import Dialogue, Transfer, run_dialogue
-from imud.links.rs485 import Rs485Link, Rs485Settings
+from imud.formats.modbus import BROADCAST
+from imud.links.rs485.link import Rs485Link, Rs485Settings
 
 T = TypeVar("T")
 
@@ -23,7 +23,7 @@ SETTLE_S: Final = 0.3
 """Time that modules get to take new addresses; the manual gives none."""
 
 
-class Found(msgspec.Struct, frozen=True, omit_defaults=True):
+class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
     """What answers at one address."""
 
     baud: int
@@ -46,13 +46,13 @@ def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
         link.close()
 
 
-def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[Found]:
+def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[FoundModule]:
     """Ask at every address who is there. Raises LinkError."""
     found = (_look(link, baud, address) for address in addresses)
     return [one for one in found if one is not None]
 
 
-def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int) -> Found:
+def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int) -> FoundModule:
     """Have the module with this serial number take an address. Raises CommandError, LinkError."""
     wanted = serial_bytes(serial_number).hex().upper()
     order = set_id_by_serial(serial_number, new_id)
@@ -61,7 +61,7 @@ def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int
     return _expect(link, baud, new_id, wanted)
 
 
-def assign_by_address(link: Rs485Link, baud: int, address: int, new_id: int) -> Found:
+def assign_by_address(link: Rs485Link, baud: int, address: int, new_id: int) -> FoundModule:
     """Have the module at one address take another. Raises CommandError, LinkError."""
     check_id("address", address)
     dialogue = set_id(new_id)
@@ -81,7 +81,7 @@ def randomise(link: Rs485Link, lowest: int, highest: int) -> None:
     _to_all(link, randomise_ids(lowest, highest))
 
 
-def keep(link: Rs485Link, found: Found) -> None:
+def keep(link: Rs485Link, found: FoundModule) -> None:
     """Have a module save its settings. Raises CommandError, LinkError."""
     try:
         _hold(link, found.address, save())
@@ -89,15 +89,15 @@ def keep(link: Rs485Link, found: Found) -> None:
         raise CommandError(f"address {found.address}: not saved: {error}") from error
 
 
-def _look(link: Rs485Link, baud: int, address: int) -> Found | None:
+def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
     strange = link.heard.strange
     try:
         who = _hold(link, address, probe(HipnucModbusSettings()))
     except DeviceRefused as error:
-        return Found(baud, address, problem=f"{error}; are there two modules with this address?")
+        return FoundModule(baud, address, problem=f"{error}; are there two modules with this address?")
     except TransferError as error:
-        return Found(baud, address, problem=str(error)) if link.heard.strange > strange else None
-    return Found(baud, address, who.product, who.serial_number, who.firmware)
+        return FoundModule(baud, address, problem=str(error)) if link.heard.strange > strange else None
+    return FoundModule(baud, address, who.product, who.serial_number, who.firmware)
 
 
 def _identity(link: Rs485Link, address: int) -> Identity | None:
@@ -121,7 +121,7 @@ def _check_free(link: Rs485Link, address: int, serial_number: str) -> None:
         raise CommandError(f"address {address} is taken by {there.product}, serial number {there.serial_number}")
 
 
-def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> Found:
+def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> FoundModule:
     there = _identity(link, address)
     if there is None:
         raise CommandError(
@@ -130,7 +130,7 @@ def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> Fou
         )
     if there.serial_number != serial_number:
         raise CommandError(f"expected serial number {serial_number} at address {address}, got {there.serial_number}")
-    return Found(baud, address, there.product, there.serial_number, there.firmware)
+    return FoundModule(baud, address, there.product, there.serial_number, there.firmware)
 
 
 def _to_all(link: Rs485Link, order: Transfer) -> None:
@@ -139,6 +139,6 @@ def _to_all(link: Rs485Link, order: Transfer) -> None:
     sleep(SETTLE_S)
 
 
-def _hold(link: Rs485Link, address: int, dialogue: Dialogue[T]) -> T:
+def _hold(link: Rs485Link, address: int, dialogue: TransferScript[T]) -> T:
     link.select(address)
-    return run_dialogue(dialogue, link.transfer)
+    return run_transfer_script(dialogue, link.transfer)

@@ -7,10 +7,10 @@ import msgspec
 
 from imud.cli.command import argument
 from imud.config.keys import choose
+from imud.contracts.driver import Driver
+from imud.contracts.expected import expected, got
+from imud.contracts.settings import Settings
 from imud.errors import BadArgument
-from imud.kit.driver import Driver
-from imud.kit.expected import expected, got
-from imud.kit.settings import Settings
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:

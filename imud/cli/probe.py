@@ -10,20 +10,20 @@ import contextlib
 import msgspec
 
 from imud.cli.probe_can import examine_bus
-from imud.cli.probe_report import HEAD, Report, row
+from imud.cli.probe_report import HEAD, ProbeReport, row
 from imud.cli.table import table
 from imud.config import DeviceConfig
+from imud.contracts.codec import message_of
+from imud.contracts.driver import Identity
+from imud.contracts.link import StreamLink
 from imud.errors import CommandError, ImudError
-from imud.kit.codec import message_of
-from imud.kit.driver import Identity
-from imud.kit.link import StreamLink
 from imud.ledger import Ledger
 from imud.links import LINKS
-from imud.links.netlink import can_interfaces
-from imud.pipeline.acquaintance import identity_words
-from imud.pipeline.search import Finder, Finding
-from imud.pipeline.talk import Talk
-from imud.ports import list_ports
+from imud.links.can.netlink import can_interfaces
+from imud.links.uart.port_list import list_ports
+from imud.runtime.detection.stream_round import Finder, Finding
+from imud.runtime.exchange import Exchange
+from imud.runtime.known_identity import identity_words
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if any(report.driver for report in reports) else 1
 
 
-async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]) -> list[Report]:
+async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]) -> list[ProbeReport]:
     """All ports at the same time."""
     found = await asyncio.gather(
         *(
@@ -59,7 +59,7 @@ async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]
     return [report for reports in found for report in reports]
 
 
-async def examine(port: str, may_ask: bool, title: str) -> list[Report]:
+async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
     """Open a serial port, find what talks there, ask it who it is if that is allowed."""
     settings = msgspec.convert({"port": port, "baud": "auto"}, LINKS["uart"].settings)
     config = DeviceConfig("probe", "auto", None, may_ask, "uart", settings)
@@ -68,9 +68,9 @@ async def examine(port: str, may_ask: bool, title: str) -> list[Report]:
         link.open()
         found = await find(config, link)
         identity = await ask(found, link) if may_ask else Identity()
-        return [Report(port, title, found.driver.name, baud=link.baud, identity=identity_words(identity))]
+        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=identity_words(identity))]
     except ImudError as error:
-        return [Report(port, title, problem=str(error))]
+        return [ProbeReport(port, title, problem=str(error))]
     finally:
         link.close()
 
@@ -96,14 +96,14 @@ async def ask(found: Finding, link: StreamLink) -> Identity:
     """Who it is; nothing when it does not answer."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
-    talk = Talk(ledger, link.write, link.set_baud)
+    exchange = Exchange(ledger, link.write, link.set_baud)
 
     def take(data: bytes, t_rx_ns: int) -> None:
         for event in codec.feed(data):
             if (message := message_of(event)) is not None:
-                talk.on_message(message, t_rx_ns)
+                exchange.on_message(message, t_rx_ns)
 
     link.start(take, lambda error: None)
     with contextlib.suppress(CommandError):
-        return await talk.hold(found.driver.identify())
+        return await exchange.run(found.driver.identify())
     return Identity()

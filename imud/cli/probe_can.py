@@ -6,39 +6,40 @@ from contextlib import suppress
 
 import msgspec
 
-from imud.cli.probe_report import Report
-from imud.detect import CanDevice, CanSearch
+from imud.cli.probe_report import ProbeReport
+from imud.contracts.can import CanDriver
+from imud.contracts.codec import message_of
+from imud.contracts.driver import Identity, of_kind
+from imud.contracts.link import CanLink
 from imud.devices import DRIVERS
 from imud.errors import CommandError, ImudError, NothingHeard
-from imud.kit.can import CanDriver, CanFrame
-from imud.kit.codec import message_of
-from imud.kit.driver import Identity, of_kind
-from imud.kit.link import CanLink
+from imud.formats.can import CanFrame
 from imud.ledger import Ledger
 from imud.links import LINKS
-from imud.links.can_state import ControllerState
-from imud.links.netlink import can_details
-from imud.pipeline.acquaintance import identity_words
-from imud.pipeline.can_search import EVERYTHING, CanFinder
-from imud.pipeline.talk import Talk
+from imud.links.can.netlink import can_details
+from imud.links.can.state import ControllerState
+from imud.runtime.detection import CanDevice, CanSearch
+from imud.runtime.detection.can_round import EVERYTHING, CanFinder
+from imud.runtime.exchange import Exchange
+from imud.runtime.known_identity import identity_words
 
 
-async def examine_bus(interface: str, may_ask: bool) -> list[Report]:
+async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
     """One report per device heard on an interface, or one that says why there is none."""
     row = LINKS["socketcan"]
     link = row.make_can(msgspec.convert({"interface": interface}, row.settings))
     try:
         if reason := link.absence():
-            return [Report(interface, problem=reason)]
+            return [ProbeReport(interface, problem=reason)]
         link.filters = EVERYTHING
         link.open()
         devices, summary = await listen(link)
         title = state_of(interface)
         if not devices:
-            return [Report(interface, title, baud=link.bitrate, problem=summary)]
+            return [ProbeReport(interface, title, baud=link.bitrate, problem=summary)]
         return [await _report(link, title, device, may_ask) for device in devices]
     except ImudError as error:
-        return [Report(interface, problem=str(error))]
+        return [ProbeReport(interface, problem=str(error))]
     finally:
         link.close()
 
@@ -69,11 +70,11 @@ def state_of(interface: str) -> str:
     return f"error-{ControllerState(details.state).name.lower()}".replace("error-bus_off", "bus-off")
 
 
-async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -> Report:
+async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -> ProbeReport:
     driver, node = device
     identity = await ask(device, link) if may_ask else Identity()
     words = identity_words(identity)
-    return Report(link.title, title, driver.name, driver.node_title(node), link.bitrate, words)
+    return ProbeReport(link.title, title, driver.name, driver.node_title(node), link.bitrate, words)
 
 
 async def ask(device: CanDevice, link: CanLink) -> Identity:
@@ -81,16 +82,16 @@ async def ask(device: CanDevice, link: CanLink) -> Identity:
     driver, settings = device.driver, device.driver.node_settings(device.node)
     ledger = Ledger()
     codec = driver.make_codec(ledger, settings)
-    talk = Talk(ledger, link.write)
+    exchange = Exchange(ledger, link.write)
 
     def take(frames: Sequence[CanFrame]) -> None:
         for frame in frames:
             for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns):
                 if (message := message_of(event)) is not None:
-                    talk.on_message(message, frame.t_rx_ns)
+                    exchange.on_message(message, frame.t_rx_ns)
 
     link.filters = driver.filters(settings)
     link.start(take, lambda news, problem: None, lambda error: None)
     with suppress(CommandError):
-        return await talk.hold(driver.identify(settings))
+        return await exchange.run(driver.identify(settings))
     return Identity()

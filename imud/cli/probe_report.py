@@ -5,7 +5,7 @@ import msgspec
 HEAD = ("PORT", "DRIVER", "RATE", "PRODUCT", "SERIAL NUMBER", "")
 
 
-class Report(msgspec.Struct, frozen=True, omit_defaults=True):
+class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
     """What stands at one port, or is one of those on a bus."""
 
     port: str
@@ -20,7 +20,7 @@ class Report(msgspec.Struct, frozen=True, omit_defaults=True):
     problem: str = ""
 
 
-def row(report: Report) -> tuple[object, ...]:
+def row(report: ProbeReport) -> tuple[object, ...]:
     """A report as a line of the table."""
     identity = report.identity
     return (

@@ -11,12 +11,12 @@ from imud import config
 from imud.cli.options import add_option, driver_settings, given_options
 from imud.cli.run import start_log
 from imud.cli.status import block
+from imud.contracts.batch import Batch
+from imud.contracts.can import CanDriver
 from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ImudError
 from imud.event import Event
-from imud.kit.batch import Batch
-from imud.kit.can import CanDriver
 from imud.links import LINKS
 
 SPEEDS = ("recorded", "real", "maximum")

@@ -6,7 +6,7 @@ import msgspec
 
 from imud.cli.table import table
 from imud.devices import DRIVERS
-from imud.kit.fields import FIELDS
+from imud.formats.fields import FIELDS
 
 FIELD_HEAD = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
 DRIVER_HEAD = ("DRIVER", "NAVIGATION FRAME", "EULER ANGLES")

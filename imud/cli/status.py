@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import msgspec
 
 from imud.cli.connect import add_socket, connect, statuses
-from imud.kit.status import DeviceStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
+from imud.contracts.status import DeviceStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.ledger import bytes_open, frames_open
 from imud.units import NS_PER_MS, NS_PER_US
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Final
 
-from imud.kit.status import ClockStatus
+from imud.contracts.status import ClockStatus
 from imud.sample import Sync
 from imud.units import NS_PER_MS, NS_PER_US
 

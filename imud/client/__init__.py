@@ -3,6 +3,6 @@
 from imud.client.connection import Client, Hello
 from imud.client.ring import Ring, RingRead
 from imud.client.watch import EventStream, Watch
-from imud.kit.jsonrpc import RpcError
+from imud.formats.jsonrpc import RpcError
 
 __all__ = ["Client", "EventStream", "Hello", "Ring", "RingRead", "RpcError", "Watch"]

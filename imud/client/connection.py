@@ -22,7 +22,7 @@ import msgspec
 
 from imud.client.watch import EventStream, Watch, sample_of
 from imud.errors import LinkDenied, LinkError, LinkMissing, ServerError
-from imud.kit.jsonrpc import (
+from imud.formats.jsonrpc import (
     DEFAULT_PATH,
     FRAME_HEADER,
     FRAME_MAX_BYTES,
@@ -32,7 +32,7 @@ from imud.kit.jsonrpc import (
     line_of,
     parse_object,
 )
-from imud.kit.slot import SLOT_BYTES
+from imud.formats.slot import SLOT_BYTES
 from imud.sample import Sample
 
 RECV_BYTES: Final = 65536

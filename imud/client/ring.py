@@ -1,4 +1,4 @@
-"""Reads the shared-memory ring of one device (`imud.kit.shm_layout`): samples without a system call per sample.
+"""Reads the shared-memory ring of one device (`imud.formats.ring`): samples without a system call per sample.
 
     with Ring("imu0") as ring:
         while True:
@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from imud.errors import LinkMissing, ServerError
-from imud.kit.shm_layout import (
+from imud.formats.ring import (
     DIRECTORY,
     FILE_PREFIX,
     FIRST_WORD,
@@ -39,7 +39,7 @@ from imud.kit.shm_layout import (
     decode_ledger_block,
     ring_path,
 )
-from imud.kit.slot import SEQ_INVALID, SLOT_BYTES, decode_slot
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, decode_slot
 from imud.sample import Sample
 
 _ATTEMPTS = 3

@@ -8,7 +8,7 @@ import msgspec
 
 from imud.errors import ServerError
 from imud.event import Event, EventKind
-from imud.kit.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
+from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.sample import Sample
 
 _DEVICE_ID_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")

@@ -20,7 +20,7 @@ from imud.clock.pairing import Pairing
 from imud.clock.pps import PpsAge
 from imud.clock.slew import Slew
 from imud.clock.utc import DeviceUtc
-from imud.kit.timing import TimeBits, UtcReference
+from imud.contracts.timing import TimeBits, UtcReference
 from imud.sample import Measurement, Sync
 from imud.units import NS_PER_US
 
@@ -64,7 +64,7 @@ class EdgeSource:
         return self.bit_seen
 
 
-class Aids:
+class AidingSources:
     """All that can be known of a sample's time besides its arrival. Synchronization: none; one thread."""
 
     __slots__ = (

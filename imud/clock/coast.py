@@ -12,7 +12,7 @@ TICK_SHARE: Final = 0.5
 """Where in its ticks the device measures is not known."""
 
 
-class Coast:
+class Holdover:
     """A line for as long as the new fit does not count. Errors grow with time."""
 
     __slots__ = ("_error_ns", "_t_ns", "_x")

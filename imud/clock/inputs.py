@@ -3,13 +3,13 @@
 from collections.abc import Iterable, Sequence
 from math import sqrt
 
-from imud.clock.aids import Aids, EdgeSource
+from imud.clock.aids import AidingSources, EdgeSource
 from imud.clock.marks import Marks
 from imud.clock.pairing import Pairing
 from imud.clock.pps import PpsAge
 from imud.clock.pulses import Pulses, rising
-from imud.kit.lines import Edge
-from imud.kit.timing import SIN_DELAY_US, Mark, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
+from imud.contracts.lines import Edge
+from imud.contracts.timing import SIN_DELAY_US, Mark, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
 from imud.units import NS_PER_US
 
 
@@ -28,7 +28,7 @@ class LineInputs:
         self._sout_timing = sout or SoutTiming()
         self._sin_timing = sin or TriggerTiming()
         self._pulses = Pulses(int(self._sout_timing.width_us * NS_PER_US))
-        self._aids: Aids | None = None
+        self._aids: AidingSources | None = None
         self.own_status: int | None = None
         """Bits of the host's own that `sample` sets in the status from now on; None for none."""
 
@@ -96,7 +96,7 @@ class LineInputs:
         found.clear()
         return marks
 
-    def _with_aids(self) -> Aids:
+    def _with_aids(self) -> AidingSources:
         if self._aids is None:
-            self._aids = Aids(*self._ticks, self._bits)
+            self._aids = AidingSources(*self._ticks, self._bits)
         return self._aids

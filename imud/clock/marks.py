@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from imud.clock.pulses import Stamp
-from imud.kit.timing import Mark
+from imud.contracts.timing import Mark
 
 REACH: Final = 0.5
 """Share of a period; a sample further off is another one."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from imud.kit.lines import Edge
+from imud.contracts.lines import Edge
 
 Stamp = tuple[int, int]
 """(CLOCK_MONOTONIC of a rising edge, its number)."""

@@ -14,9 +14,9 @@ Synchronization: none; one thread.
 from math import hypot, sqrt
 from typing import Final
 
-from imud.clock.aids import Aids
+from imud.clock.aids import AidingSources
 from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
-from imud.clock.coast import Coast
+from imud.clock.coast import Holdover
 from imud.clock.correction import corrected
 from imud.clock.envelope import SLOPE_HIGHEST, Envelope
 from imud.clock.inputs import LineInputs
@@ -24,8 +24,8 @@ from imud.clock.jump import EARLY_NS, EARLY_SIGMAS, FIRST_EARLY_NS, LATE_NS, Jum
 from imud.clock.number import SampleNumber
 from imud.clock.slew import SETTLED_AFTER_NS, Slew
 from imud.clock.unwrap import DeviceTime
-from imud.kit.status import ClockStatus
-from imud.kit.timing import NO_TIME_BITS, SoutTiming, TimeBits, TriggerTiming
+from imud.contracts.status import ClockStatus
+from imud.contracts.timing import NO_TIME_BITS, SoutTiming, TimeBits, TriggerTiming
 from imud.sample import Measurement, Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -75,7 +75,7 @@ class SampleClock(LineInputs):
         self._spread = ArrivalSpread()
         self._slew = Slew()
         self._envelope: Envelope | None = None
-        self._coast: Coast | None = None
+        self._coast: Holdover | None = None
         self._sync = Sync.ARRIVAL
         """By the fit of arrivals."""
         self._told_sync = Sync.ARRIVAL
@@ -310,12 +310,12 @@ class SampleClock(LineInputs):
         self._time.begin(ticks)
         self._start(y)
         aids.utc.turned()
-        self._coast = coast = Coast(self._epoch_x, t_ns, error_ns, tick_ns)
+        self._coast = coast = Holdover(self._epoch_x, t_ns, error_ns, tick_ns)
         self._t_err = coast.error_ns(self._epoch_x)
         self._epoch_x -= SETTLED_AFTER_NS  # time went on: corrections stay slow
         return t_ns
 
-    def _steered(self, aids: Aids, m: Measurement, wanted: int, y: int) -> int:
+    def _steered(self, aids: AidingSources, m: Measurement, wanted: int, y: int) -> int:
         """What lines and UTC make of a time by the fit; leaves its error in `_t_err`."""
         x, coast, envelope = self._time.even_ns, self._coast, self._envelope
         assert envelope is not None

@@ -9,7 +9,7 @@ from math import sqrt
 from typing import Final
 
 from imud.clock.bounds import Bounds
-from imud.kit.timing import UtcReference
+from imud.contracts.timing import UtcReference
 from imud.units import NS_PER_MS, NS_PER_S
 
 DAY_NS: Final = 86_400 * NS_PER_S

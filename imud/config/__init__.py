@@ -5,7 +5,7 @@
     devices:
       NAME:
         driver, identify, enabled, options        (`DeviceGeneral`; options are the driver's settings)
-        lines                     wires besides the data (`imud.kit.lines.DeviceLines`), as far as the driver has them
+        lines                     GPIO lines (`imud.contracts.lines.DeviceLines`), as far as the driver has them
         rmc                       what tells the device UTC (`imud.utc.source.RmcSettings`), as far as it has SIN/PPS
         uart | replay | …         one key per row of LINKS, with that row's settings
 

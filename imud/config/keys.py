@@ -7,10 +7,10 @@ from typing import Any, TypeVar
 import msgspec
 
 from imud.config.tables import Row
-from imud.kit.expected import expected, got
-from imud.kit.settings import Settings
-from imud.kit.yaml_tree import Path as KeyPath
-from imud.kit.yaml_tree import Problem, YamlTree
+from imud.config.yaml_tree import Path as KeyPath
+from imud.config.yaml_tree import Problem, YamlTree
+from imud.contracts.expected import expected, got
+from imud.contracts.settings import Settings
 
 S = TypeVar("S", bound=Settings)
 

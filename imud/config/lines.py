@@ -7,9 +7,9 @@ from typing import Any
 from imud.config.keys import Keys
 from imud.config.model import DeviceConfig
 from imud.config.tables import DriverRow
-from imud.kit.expected import shown
-from imud.kit.lines import LINE_SCHEMAS, DeviceLines, LineSettings
-from imud.kit.yaml_tree import Path as KeyPath
+from imud.config.yaml_tree import Path as KeyPath
+from imud.contracts.expected import shown
+from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineSettings
 
 
 def read_lines(

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from imud.kit.lines import DeviceLines
-from imud.kit.settings import Settings
+from imud.contracts.lines import DeviceLines
+from imud.contracts.settings import Settings
 from imud.utc.source import RmcSettings
 
 

@@ -8,8 +8,8 @@ from imud.config.devices import DeviceReader
 from imud.config.keys import Keys
 from imud.config.model import Config, General
 from imud.config.tables import TABLES, Tables
+from imud.config.yaml_tree import FILE_BYTES_MAX, Problem, path_text, read_yaml
 from imud.errors import ConfigError
-from imud.kit.yaml_tree import FILE_BYTES_MAX, Problem, path_text, read_yaml
 
 PROBLEMS_SHOWN: Final = 20
 

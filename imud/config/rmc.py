@@ -5,8 +5,8 @@ from typing import Any, Final
 
 from imud.config.keys import Keys
 from imud.config.tables import DriverRow
-from imud.kit.expected import shown
-from imud.kit.yaml_tree import Path as KeyPath
+from imud.config.yaml_tree import Path as KeyPath
+from imud.contracts.expected import shown
 from imud.utc.source import RmcSettings
 
 LINK: Final = "uart"

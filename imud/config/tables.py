@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
+from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
-from imud.kit.settings import Settings
 from imud.links import LINKS
 from imud.publishers import PUBLISHERS
 

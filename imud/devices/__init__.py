@@ -1,19 +1,19 @@
 """Wire protocols, one file each: codecs without I/O, encoders, and the row that names them."""
 
-from imud.kit.driver import Driver
-from imud.kit.table import Table
+from imud.contracts.driver import Driver
+from imud.contracts.table import Table
 
 DRIVERS: Table[Driver] = Table(
     "driver",
     {
-        "hipnuc-uart": "imud.devices.hipnuc.frames:DRIVER",
-        "hipnuc-modbus": "imud.devices.hipnuc.modbus:DRIVER",
-        "hipnuc-canopen": "imud.devices.hipnuc.canopen:DRIVER",
-        "hipnuc-j1939": "imud.devices.hipnuc.j1939:DRIVER",
-        "hipnuc-nmea2000": "imud.devices.hipnuc.nmea2000:DRIVER",
-        "imu61x-uart": "imud.devices.imu61x.serial:DRIVER",
-        "imu61x-i2c": "imud.devices.imu61x.i2c:DRIVER",
-        "imu61x-spi": "imud.devices.imu61x.spi:DRIVER",
-        "imu61x-can": "imud.devices.imu61x.can:DRIVER",
+        "hipnuc-uart": "imud.devices.hipnuc.uart.codec:DRIVER",
+        "hipnuc-modbus": "imud.devices.hipnuc.modbus.codec:DRIVER",
+        "hipnuc-canopen": "imud.devices.hipnuc.canopen.codec:DRIVER",
+        "hipnuc-j1939": "imud.devices.hipnuc.j1939.codec:DRIVER",
+        "hipnuc-nmea2000": "imud.devices.hipnuc.nmea2000.codec:DRIVER",
+        "imu61x-uart": "imud.devices.imu61x.uart.codec:DRIVER",
+        "imu61x-i2c": "imud.devices.imu61x.i2c.codec:DRIVER",
+        "imu61x-spi": "imud.devices.imu61x.spi.codec:DRIVER",
+        "imu61x-can": "imud.devices.imu61x.can.codec:DRIVER",
     },
 )

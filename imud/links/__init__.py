@@ -1,17 +1,17 @@
 """Links: each owns one kind of port."""
 
-from imud.kit.link import LinkType
-from imud.kit.table import Table
+from imud.contracts.link import LinkType
+from imud.contracts.table import Table
 
 LINKS: Table[LinkType] = Table(
     "link",
     {
-        "uart": "imud.links.uart:LINK",
-        "socketcan": "imud.links.socketcan:LINK",
+        "uart": "imud.links.uart.link:LINK",
+        "socketcan": "imud.links.can.link:LINK",
         "i2c": "imud.links.i2c:LINK",
         "spi": "imud.links.spi:LINK",
-        "rs485": "imud.links.rs485:LINK",
-        "replay": "imud.links.replay:LINK",
+        "rs485": "imud.links.rs485.link:LINK",
+        "replay": "imud.links.replay.link:LINK",
         "memory": "imud.links.memory:LINK",
     },
 )

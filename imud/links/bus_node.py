@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
-from imud.kit.access import user_name
 from imud.links.inotify import wait_until
 from imud.links.port_owner import group_of
+from imud.permissions import user_name
 
 GONE: Final = frozenset({errno.ENOENT, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN, errno.EBADF})
 REFUSED: Final = frozenset({errno.EACCES, errno.EPERM})

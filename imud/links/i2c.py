@@ -12,11 +12,11 @@ from typing import Annotated, Final, Literal, Protocol
 from msgspec import Meta
 from smbus2 import I2cFunc, SMBus, i2c_msg
 
+from imud.contracts.link import LinkType
+from imud.contracts.polling import Transfer
+from imud.contracts.settings import Settings
+from imud.contracts.status import KernelCounters
 from imud.errors import LinkError
-from imud.kit.link import LinkType
-from imud.kit.polling import Transfer
-from imud.kit.settings import Settings
-from imud.kit.status import KernelCounters
 from imud.links.bus_node import node_present, open_problem, transfer_problem
 
 I2C_TIMEOUT: Final = 0x0702
@@ -38,7 +38,7 @@ class I2cSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """How often the device is read, per second."""
 
 
-class Bus(Protocol):
+class I2cBus(Protocol):
     """What is used of smbus2.SMBus."""
 
     @property
@@ -75,11 +75,11 @@ class I2cLink:
         self,
         settings: I2cSettings,
         *,
-        open_bus: Callable[[str], Bus] = SMBus,
+        open_bus: Callable[[str], I2cBus] = SMBus,
         ioctl: Callable[[int, int, int], object] = fcntl.ioctl,
     ) -> None:
         self._open_bus, self._ioctl = open_bus, ioctl
-        self._bus: Bus | None = None
+        self._bus: I2cBus | None = None
         self._denied = False
         self._address = 0
         self._place = ""
@@ -144,7 +144,7 @@ class I2cLink:
         if bus is not None:
             bus.close()
 
-    def _combined(self, bus: Bus, sent: bytes, read_bytes: int) -> bytes:
+    def _combined(self, bus: I2cBus, sent: bytes, read_bytes: int) -> bytes:
         write = i2c_msg.write(self._address, sent)
         if not read_bytes:
             bus.i2c_rdwr(write)
@@ -153,7 +153,7 @@ class I2cLink:
         bus.i2c_rdwr(write, read)
         return bytes(read)
 
-    def _block(self, bus: Bus, sent: bytes, read_bytes: int) -> bytes:
+    def _block(self, bus: I2cBus, sent: bytes, read_bytes: int) -> bytes:
         """The same by SMBus calls, for one register number and at most 32 bytes. Never a read of unknown length."""
         if not sent or len(sent) - 1 > BLOCK_BYTES_MAX or read_bytes > BLOCK_BYTES_MAX or (read_bytes and sent[1:]):
             raise LinkError(f"{self.title} is an SMBus controller and cannot make this transfer")

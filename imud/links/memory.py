@@ -13,11 +13,11 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from imud.contracts.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
+from imud.contracts.settings import Settings
+from imud.contracts.status import KernelCounters
 from imud.errors import LinkBusy, LinkError, LinkMissing
-from imud.kit.can import CanFilter, CanFrame, CyclicFrame
-from imud.kit.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
-from imud.kit.settings import Settings
-from imud.kit.status import KernelCounters
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 
 
 class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from imud.kit import access
+from imud import permissions
 
 SERIAL_GROUP: Final = "dialout"
 """Group of serial ports on Debian and its relatives; named where a port's own group is of no help."""
@@ -12,7 +12,7 @@ SERIAL_GROUP: Final = "dialout"
 
 def group_of(path: str) -> str:
     """Name of the group that may use the port, `dialout` where only root may or nothing is known."""
-    return access.group_of(path, SERIAL_GROUP)
+    return permissions.group_of(path, SERIAL_GROUP)
 
 
 def holders_of(path: str, proc: Path) -> str:

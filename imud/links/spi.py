@@ -17,11 +17,11 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
+from imud.contracts.link import LinkType
+from imud.contracts.polling import Transfer
+from imud.contracts.settings import Settings
+from imud.contracts.status import KernelCounters
 from imud.errors import LinkError
-from imud.kit.link import LinkType
-from imud.kit.polling import Transfer
-from imud.kit.settings import Settings
-from imud.kit.status import KernelCounters
 from imud.links.bus_node import node_present, open_problem, transfer_problem
 
 WR_MODE: Final = 0x40016B01

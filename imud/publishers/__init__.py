@@ -1,13 +1,13 @@
 """Outputs: each gives samples to readers and never makes the pipeline wait."""
 
-from imud.kit.publisher import PublisherType
-from imud.kit.table import Table
+from imud.contracts.publisher import PublisherType
+from imud.contracts.table import Table
 
 PUBLISHERS: Table[PublisherType] = Table(
     "publisher",
     {
-        "socket": "imud.publishers.socket:PUBLISHER",
-        "shm": "imud.publishers.shm:PUBLISHER",
-        "metrics": "imud.publishers.metrics:PUBLISHER",
+        "socket": "imud.publishers.socket.publisher:PUBLISHER",
+        "shm": "imud.publishers.shm.publisher:PUBLISHER",
+        "metrics": "imud.publishers.metrics.publisher:PUBLISHER",
     },
 )

@@ -24,14 +24,14 @@ from typing import Final
 
 from imud.errors import LinkError
 from imud.sim import CAN_SIMULATORS, SIMULATORS
-from imud.sim.arrival import BARE_UART, USB_1MS, USB_16MS
-from imud.sim.can_modules import CanModules
-from imud.sim.can_port import CanPort, default_interface
-from imud.sim.faults import Faults, rates_from
-from imud.sim.motion import GRAVITY_M_S2, MOTIONS
-from imud.sim.pin import PinModule
-from imud.sim.pins import PinFaults, Pins, SinFile, pin_rates, pull_files
-from imud.sim.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
+from imud.sim.physics.motion import GRAVITY_M_S2, MOTIONS
+from imud.sim.ports.arrival import BARE_UART, USB_1MS, USB_16MS
+from imud.sim.ports.can_modules import CanModules
+from imud.sim.ports.can_port import CanPort, default_interface
+from imud.sim.ports.faults import Faults, rates_from
+from imud.sim.ports.pin import PinModule
+from imud.sim.ports.pins import PinFaults, Pins, SinFile, pin_rates, pull_files
+from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
 from imud.sim.simulator import SimulatorOptions, StreamModule
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         module = SIMULATORS[name].make(_module_options(options, node), now_ns)
         faults = Faults(options.seed, rates_from(options.faults)) if options.faults else None
-        wires = Wires(options, module)
+        wires = SimulatedLines(options, module)
     except (ValueError, OSError) as error:
         print(f"imud.sim: {error}", file=sys.stderr)
         return 2
@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
         stack.callback(port.close)
         with suppress(KeyboardInterrupt):
             print(path, flush=True)
-            Control(port, wires).run()
+            StandardInputControl(port, wires).run()
         print(json.dumps(port.summary() | wires.summary()), flush=True)
     return 0
 
@@ -92,12 +92,12 @@ def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now
     with closing(port):
         with suppress(KeyboardInterrupt):
             print(port.interface, flush=True)
-            Control(port).run()
+            StandardInputControl(port).run()
         print(json.dumps(port.summary()), flush=True)
     return 0
 
 
-class Wires:
+class SimulatedLines:
     """The lines beside a device's data: its pins on the way out, SIN on the way in. Synchronization: one thread."""
 
     def __init__(self, options: argparse.Namespace, module: StreamModule) -> None:
@@ -137,10 +137,10 @@ class Wires:
             self._truth.close()
 
 
-class Control:
+class StandardInputControl:
     """Waits for time, bytes and commands, and moves the port along."""
 
-    def __init__(self, port: SimulatedPort | CanPort, wires: Wires | None = None) -> None:
+    def __init__(self, port: SimulatedPort | CanPort, wires: SimulatedLines | None = None) -> None:
         self._port = port
         self._wires = wires
         self._text = b""

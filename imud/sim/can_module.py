@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
-from imud.kit.can import DATA_BYTES_MAX, frame_bits
+from imud.formats.can import DATA_BYTES_MAX, frame_bits
 from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_S
 

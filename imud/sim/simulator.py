@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
-from imud.sim.motion import GRAVITY_M_S2
+from imud.sim.physics.motion import GRAVITY_M_S2
 
 
 class Burst(NamedTuple):
@@ -66,7 +66,7 @@ class SimulatorOptions:
     message: str = ""
     """Name of the message to send, empty for the factory's choice."""
     motion: str = "swing"
-    """A row of `imud.sim.motion.MOTIONS`."""
+    """A row of `imud.sim.physics.motion.MOTIONS`."""
     gravity_m_s2: float = GRAVITY_M_S2
     noise: Literal["real", "none"] = "real"
     skew_ppm: float = 20.0

@@ -1,6 +1,6 @@
 """UTC from outside: sources of RMC sentences, what the kernel and PPS edges say of UTC, the feed of chrony."""
 
-from imud.kit.table import Table
+from imud.contracts.table import Table
 from imud.utc.source import MakeSource
 
 RMC_SOURCES: Table[MakeSource] = Table(

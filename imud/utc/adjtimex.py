@@ -11,7 +11,7 @@ from math import sqrt
 from time import monotonic_ns, time_ns
 from typing import Final, NamedTuple
 
-from imud.kit.timing import UtcReference
+from imud.contracts.timing import UtcReference
 from imud.units import NS_PER_US
 
 STA_UNSYNC: Final = 0x40

@@ -2,8 +2,8 @@
 
 import asyncio
 
+from imud.contracts.link import StreamLink
 from imud.errors import LinkError
-from imud.kit.link import StreamLink
 from imud.utc.reconnecting import ReconnectingSource
 from imud.utc.retry import Retry
 from imud.utc.source import MakePort, RmcSettings

@@ -17,8 +17,8 @@ from math import hypot
 from statistics import median, quantiles
 from typing import Final
 
-from imud.kit.rmc import Rmc, parse
-from imud.kit.timing import UtcReference
+from imud.contracts.timing import UtcReference
+from imud.formats.rmc import Rmc, parse
 from imud.units import NS_PER_S, NS_PER_US
 
 STEP_TOLERANCE_NS: Final = 500 * NS_PER_US

@@ -5,8 +5,8 @@ from typing import Annotated, Literal, Protocol
 
 from msgspec import Meta
 
-from imud.kit.link import StreamLink
-from imud.kit.settings import Settings
+from imud.contracts.link import StreamLink
+from imud.contracts.settings import Settings
 
 OnSentence = Callable[[bytes, int], None]
 """Called with one RMC sentence, its line end included, and CLOCK_MONOTONIC (ns) right after it came."""

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from imud.kit.rmc import SENTENCE_BYTES_MAX
+from imud.formats.rmc import SENTENCE_BYTES_MAX
 
 LINE_BYTES_MAX: Final = 16384
 """Longer lines (gpsd writes JSON of some kilobytes) are passed over without being kept."""
@@ -16,7 +16,7 @@ class SentenceSplitter:
         self._skipping = False
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Sentences that are complete now, with CR LF; whether they are right is for `imud.kit.rmc` to say."""
+        """Sentences that are complete now, with CR LF; whether they are right is for `imud.formats.rmc` to say."""
         *lines, tail = (self._tail + data).split(b"\n")
         if lines and self._skipping:
             lines, self._skipping = lines[1:], False

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Final
 
-from imud.kit.rmc import build
+from imud.formats.rmc import build
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.adjtimex import KernelClock, kernel_clock, realtime_offset_ns
 from imud.utc.source import MakePort, OnSentence, RmcSettings

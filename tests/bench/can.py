@@ -16,8 +16,8 @@ from time import process_time_ns
 import can
 import msgspec
 
-from imud.kit.can import pack_frame
-from imud.links.can_socket import BATCH_FRAMES, FrameReader
+from imud.formats.can import pack_frame
+from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
 from tests.bench.rows import Row, at_least
 
 BUS = "vcanbench"

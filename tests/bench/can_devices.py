@@ -10,13 +10,14 @@ from contextlib import ExitStack
 from time import monotonic_ns, process_time_ns
 
 from imud.clock import SampleClock
+from imud.contracts.batch import Batch
+from imud.contracts.can import CanDriver
 from imud.devices import DRIVERS
-from imud.kit.batch import Batch
-from imud.kit.can import RAW_FRAME, CanDriver, CanFilter
-from imud.kit.slot import encode_slot
+from imud.formats.can import RAW_FRAME, CanFilter
+from imud.formats.slot import encode_slot
 from imud.ledger import Ledger
-from imud.links.can_socket import FrameReader
-from imud.pipeline.path import CanPath
+from imud.links.can.frame_reader import FrameReader
+from imud.runtime.path import CanPath
 from tests.bench.rows import Row, at_most
 from tests.lab.can_player import loop
 from tests.lab.can_traffic import Module, fleet

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from imud.clock import SampleClock
 from imud.sample import Measurement, Sync
-from imud.sim.arrival import BARE_UART, LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
+from imud.sim.ports.arrival import BARE_UART, LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.rows import Row, at_least, at_most
 

@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator, Sequence
 from math import sqrt
 from time import perf_counter_ns
 
-from imud.kit.timing import SoutTiming
+from imud.contracts.timing import SoutTiming
 from imud.sample import Measurement
-from imud.sim.arrival import (
+from imud.sim.ports.arrival import (
     BARE_UART,
     LOADED,
     USB_1MS,

@@ -10,9 +10,9 @@ import sys
 import time
 from collections.abc import Iterator
 
-from imud.links.uart import UartLink, UartSettings
+from imud.links.uart.link import UartLink, UartSettings
 from tests.bench.rows import Row
-from tests.links.pty_port import PtyPort
+from tests.support.pty_port import PtyPort
 
 PORTS = 16
 FRAME_BYTES = 82

@@ -14,10 +14,10 @@ from collections.abc import Callable
 from random import Random
 from time import perf_counter_ns
 
-from imud.devices.hipnuc.frames import HipnucCodec, HipnucSettings, encode_hi91
-from imud.devices.imu61x.serial import DRIVER as IMU61X
-from imud.devices.imu61x.serial import Imu61xCodec
-from imud.kit.codec import CodecEvent, StreamCodec
+from imud.contracts.codec import CodecEvent, StreamCodec
+from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings, encode_hi91
+from imud.devices.imu61x.uart.codec import DRIVER as IMU61X
+from imud.devices.imu61x.uart.codec import Imu61xCodec
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from tests.bench.rows import Row, at_most

@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from random import Random
 from statistics import quantiles
 
-from imud.detect import Found, Search
-from imud.devices.hipnuc.frames import DRIVER as HIPNUC
-from imud.devices.hipnuc.frames import encode_hi91
-from imud.devices.imu61x.commands import ask_status
-from imud.devices.imu61x.replies import Status
-from imud.devices.imu61x.serial import DRIVER as IMU61X
-from imud.devices.imu61x.serial import encode_status
-from imud.kit.driver import StreamDriver
+from imud.contracts.driver import StreamDriver
+from imud.devices.hipnuc.uart.codec import DRIVER as HIPNUC
+from imud.devices.hipnuc.uart.codec import encode_hi91
+from imud.devices.imu61x.uart.codec import DRIVER as IMU61X
+from imud.devices.imu61x.uart.codec import encode_status
+from imud.devices.imu61x.uart.commands import ask_status
+from imud.devices.imu61x.uart.replies import Status
+from imud.runtime.detection import Search, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.rows import Row, at_most
-from tests.uart_wire import FakeDevice, run_search
+from tests.support.uart_wire import FakeDevice, run_search
 
 COLD_S = 2.0
 REMEMBERED_S = 0.3
@@ -80,7 +80,7 @@ def measure(family: Family, baud: int, hold_ms: int, phases: int, *, remembered:
         search = Search(DRIVERS, remembered=memory, may_ask=True, hold_ns=hold_ms * NS_PER_MS)
         found, took_ns, _ = run_search(search, far, start_ns=10 * NS_PER_S + random.randrange(NS_PER_S))
         times_s.append(took_ns / NS_PER_S)
-        wrong += not isinstance(found, Found) or (found.driver, found.baud) != (driver, baud)
+        wrong += not isinstance(found, StreamFound) or (found.driver, found.baud) != (driver, baud)
     return times_s, wrong
 
 
@@ -96,7 +96,7 @@ def measure_rare(family: Family, rate_hz: float, phases: int) -> tuple[list[floa
         )  # fmt: skip
         found, took_ns, _ = run_search(Search(DRIVERS, may_ask=True), far, start_ns=10 * NS_PER_S)
         times_s.append(took_ns / NS_PER_S)
-        wrong += not isinstance(found, Found) or (found.driver, found.baud) != (driver, baud)
+        wrong += not isinstance(found, StreamFound) or (found.driver, found.baud) != (driver, baud)
     return times_s, wrong
 
 

@@ -5,10 +5,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from imud.clock import SampleClock
-from imud.kit.lines import Edge
-from imud.kit.timing import SoutTiming, UtcReference
+from imud.contracts.lines import Edge
+from imud.contracts.timing import SoutTiming, UtcReference
 from imud.sample import Measurement, Sample, Sync
-from imud.sim.arrival import Arrival, ArrivalModel
+from imud.sim.ports.arrival import Arrival, ArrivalModel
 from imud.units import NS_PER_S
 from tests.bench.clock import TICK_MODULUS, TICK_NS, clock_for
 from tests.bench.line_model import (

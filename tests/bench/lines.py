@@ -10,10 +10,10 @@ from statistics import mean
 
 from gpiod.edge_event import EdgeEvent
 
-from imud.gpio.lines import READ_EVENTS
-from imud.kit.line_events import EVENT, LineEvents
-from imud.kit.timing import TriggerStamp
-from imud.pipeline.trigger import Trigger
+from imud.contracts.timing import TriggerStamp
+from imud.signals.gpio_lines import READ_EVENTS
+from imud.signals.line_events import EVENT, LineEvents
+from imud.signals.trigger import Trigger
 from imud.units import NS_PER_S, NS_PER_US
 from tests.bench.rows import Row
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from threading import Event, Thread
 
-from imud.publishers.metrics import Renderer, Snapshot
+from imud.publishers.metrics.publisher import Renderer, Snapshot
 from tests.bench.rows import Row, at_most
-from tests.publishers.device_status import client, equipped
+from tests.support.device_status import client, equipped
 
 STALL_MS_MAX = 1.0
 """A sample every millisecond: a stall below this delays one wake-up and loses nothing."""

@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from imud.sim.__main__ import Control
-from imud.sim.arrival import BARE_UART
-from imud.sim.hipnuc_modbus import ModbusLine, slaves_at
-from imud.sim.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
+from imud.sim.__main__ import StandardInputControl
+from imud.sim.hipnuc.modbus.simulator import ModbusLine, slaves_at
+from imud.sim.ports.arrival import BARE_UART
+from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
 from imud.sim.simulator import SimulatorOptions
 
 
@@ -24,7 +24,7 @@ def main() -> None:
     with TemporaryDirectory(prefix="imud-bench-") as folder:
         port = SimulatedPort(line, PtyNode(Path(folder) / "line"), Adapter(BARE_UART, now_ns))
         print(port.node.path, flush=True)
-        Control(port).run()
+        StandardInputControl(port).run()
         port.close()
 
 

@@ -16,15 +16,15 @@ from tempfile import TemporaryDirectory
 
 import imud.links.spi as spi_link
 from imud.config import DeviceConfig
-from imud.devices.imu61x import spi
-from imud.kit.batch import Batch
-from imud.kit.lines import DeviceLines, LineMaker, ReadySettings
-from imud.kit.link import LinkType
+from imud.contracts.batch import Batch
+from imud.contracts.lines import DeviceLines, LineFactory, ReadySettings
+from imud.contracts.link import LinkType
+from imud.devices.imu61x.spi import codec as spi
 from imud.links.spi import SpiLink, SpiSettings
-from imud.pipeline.bus import Buses
-from imud.pipeline.polled import PolledRunner
-from imud.sim.imu61x_registers import Imu61xRegisters
-from imud.sim.lines import MemoryOutput
+from imud.runtime.polled.bus import Buses
+from imud.runtime.polled.runner import PolledRunner
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.ports.lines import MemoryOutput
 from tests.bench.ready_line import PipeInput
 from tests.bench.rows import Row, at_most
 
@@ -83,7 +83,7 @@ async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: boo
     lines = DeviceLines(data_ready=ReadySettings(line="Y")) if by_edges else None
     config = DeviceConfig("imu", "imu61x-spi", None, True, "spi", settings, lines=lines)
     buses = Buses()
-    maker = LineMaker(lambda *_: PipeInput(round(1e9 / RATE_HZ)), lambda *_: MemoryOutput())
+    maker = LineFactory(lambda *_: PipeInput(round(1e9 / RATE_HZ)), lambda *_: MemoryOutput())
     runner = PolledRunner(config, 0, publish, lambda _event: None, buses, maker)
     task = asyncio.create_task(runner.run())
     while samples < RATE_HZ / 4:

@@ -15,7 +15,7 @@ import time
 
 import msgspec
 
-from imud.kit.slot import SLOT_BYTES
+from imud.formats.slot import SLOT_BYTES
 
 LENGTH = struct.Struct("<I")
 SEQ_AND_PRESSURE = struct.Struct("<Q192xd")

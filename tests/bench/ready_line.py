@@ -6,7 +6,7 @@ import struct
 import subprocess
 import sys
 
-from imud.kit.lines import Edge, OnEdges, OnLineEnd
+from imud.contracts.lines import Edge, OnEdges, OnLineEnd
 
 STAMP = struct.Struct("q")
 MAKE_EDGES = """

@@ -15,7 +15,7 @@ import msgspec
 
 from imud.cli.connect import statuses
 from imud.client import Client
-from imud.kit.status import DeviceStatus
+from imud.contracts.status import DeviceStatus
 
 CORES = sorted(os.sched_getaffinity(0))
 SERVER_CORE = {CORES[-1]}

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from imud.client.ring import Ring
-from imud.kit.batch import Batch
-from imud.kit.publisher import PublisherContext
-from imud.publishers.shm import ShmPublisher, ShmSettings
+from imud.contracts.batch import Batch
+from imud.contracts.publisher import PublisherContext
+from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.sample import Sample, Sync
 from tests.bench.rows import Row
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
 
-from imud.kit.batch import Batch
-from imud.kit.jsonrpc import encode_request, line_of
-from imud.kit.publisher import PublisherContext
-from imud.publishers.socket import SocketServer, SocketSettings
+from imud.contracts.batch import Batch
+from imud.contracts.publisher import PublisherContext
+from imud.formats.jsonrpc import encode_request, line_of
+from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.sample import Sample, Sync
 from tests.bench.rows import Row, at_most
 

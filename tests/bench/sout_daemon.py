@@ -12,9 +12,9 @@ from typing import Any
 
 from imud import config
 from imud.cli.run import start_log
+from imud.contracts.lines import InputSettings, LineFactory
 from imud.daemon import Daemon
-from imud.gpio import GpioInput, GpioOutput
-from imud.kit.lines import InputSettings, LineMaker
+from imud.signals.gpio import GpioInput, GpioOutput
 
 
 class FifoInput(GpioInput):
@@ -45,7 +45,7 @@ def main() -> None:
     start_log(settings.log_level)
 
     async def serve() -> None:
-        daemon = Daemon(settings, lines=LineMaker(FifoInput, GpioOutput))
+        daemon = Daemon(settings, lines=LineFactory(FifoInput, GpioOutput))
         daemon.install_signals()
         await daemon.run()
 

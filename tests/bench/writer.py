@@ -15,8 +15,8 @@ import sys
 import time
 import tty
 
-from imud.devices.hipnuc.frames import encode_hi91
-from imud.kit.line_events import EVENT, RISING
+from imud.devices.hipnuc.uart.codec import encode_hi91
+from imud.signals.line_events import EVENT, RISING
 from imud.units import uart_byte_ns
 
 LATE_LIMIT_NS = 50_000_000

@@ -10,11 +10,11 @@ import pytest
 
 from imud.cli import main
 from imud.cli.clock import aids, block
-from imud.kit.status import ClockStatus
-from tests.hi91 import hi91
-from tests.links.pty_port import PtyPort
-from tests.publishers.device_status import LINES, device, equipped
-from tests.running import RunningDaemon, running_daemon
+from imud.contracts.status import ClockStatus
+from tests.support.device_status import LINES, device, equipped
+from tests.support.hi91 import hi91
+from tests.support.pty_port import PtyPort
+from tests.support.running import RunningDaemon, running_daemon
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ def test_samples_flow_and_the_ledger_closes(device: str, product: str, capfd: py
 
 
 def test_a_can_device_needs_an_interface(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("imud.sim.can_port.can_interfaces", list)
+    monkeypatch.setattr("imud.sim.ports.can_port.can_interfaces", list)
     assert main(["demo", "--device", "imu61x-can", "--duration", "1"]) == 2
     assert "ip link add vcan0 type vcan" in capsys.readouterr().err
 

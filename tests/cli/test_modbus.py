@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
-from imud.sim.hipnuc_modbus_slave import SlaveSettings
-from tests.modbus_wire import BAUD, serial_of, slave, wired
+from imud.sim.hipnuc.modbus.slave import SlaveSettings
+from tests.support.modbus_wire import BAUD, serial_of, slave, wired
 
 ON = ("--baud", str(BAUD), "--reply-ms", "30")
 PATIENT = ("--baud", str(BAUD), "--reply-ms", "400")

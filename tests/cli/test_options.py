@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
-from tests.can_logs import imu61x_log
 from tests.cli.test_decode import MANUAL_FRAME
+from tests.support.can_logs import imu61x_log
 
 
 @pytest.fixture

@@ -7,18 +7,18 @@ from typing import ClassVar
 import pytest
 
 from imud.cli import probe, probe_can
-from imud.cli.probe_report import Report, row
-from imud.detect import can as detection
+from imud.cli.probe_report import ProbeReport, row
+from imud.contracts.driver import Driver
+from imud.contracts.link import LinkType, OnBusNews, OnEnd, OnFrames
 from imud.devices import DRIVERS
 from imud.errors import LinkError
-from imud.kit.can import CanFrame
-from imud.kit.driver import Driver
-from imud.kit.link import LinkType, OnBusNews, OnEnd, OnFrames
+from imud.formats.can import CanFrame
+from imud.links.can.link import SocketCanSettings
+from imud.links.can.netlink import CanDetails
 from imud.links.memory import MemoryCanLink, MemorySettings
-from imud.links.netlink import CanDetails
-from imud.links.socketcan import SocketCanSettings
+from imud.runtime.detection import can as detection
 from imud.units import NS_PER_MS
-from tests.fake_can import fake_can_driver, fake_frame
+from tests.support.fake_can import fake_can_driver, fake_frame
 
 
 class Bus(MemoryCanLink):
@@ -56,7 +56,7 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> type[Bus]:
     return Own
 
 
-def examined(*, ask: bool = False) -> list[Report]:
+def examined(*, ask: bool = False) -> list[ProbeReport]:
     return asyncio.run(probe.examine_all(["can0"], {"can0"} if ask else set(), {}))
 
 
@@ -84,7 +84,7 @@ def test_why_nobody_is_listed(bus: type[Bus]) -> None:
     bus.problem = "can0 is bus-off: x"
     assert examined()[0].problem == "can0 is bus-off: x"
     bus.down = True
-    assert examined() == [Report("can0", problem="can0 is down: set its bit rate")]
+    assert examined() == [ProbeReport("can0", problem="can0 is down: set its bit rate")]
 
 
 def test_a_bus_that_ends_is_told(bus: type[Bus], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,12 +13,12 @@ from msgspec.structs import replace
 
 from imud.client import Client, RpcError
 from imud.client.watch import event_of
+from imud.contracts.batch import Batch
 from imud.errors import LinkDenied, LinkMissing, ServerError
 from imud.event import Event, EventKind
-from imud.kit.batch import Batch
-from imud.publishers.socket import SocketServer
-from tests.client.socket_daemon import Daemon, daemon
-from tests.publishers.socket_rig import DEVICES, EPOCH, NOW_NS, batch, sample
+from imud.publishers.socket.publisher import SocketServer
+from tests.support.socket_daemon import Daemon, daemon
+from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, batch, sample
 
 HELLO = b'{"jsonrpc":"2.0","method":"hello","params":{"protocol":1,"version":"9","epoch":7,"rights":["read"],"x":1}}\n'
 

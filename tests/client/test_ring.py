@@ -9,10 +9,10 @@ import pytest
 
 from imud.client.ring import Ring
 from imud.errors import LinkMissing, ServerError
-from imud.kit.shm_layout import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode_ledger_block
-from imud.kit.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, encode_slot
-from imud.publishers.waker import Waker
-from tests.publishers.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+from imud.formats.ring import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode_ledger_block
+from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, encode_slot
+from imud.publishers.socket.waker import Waker
+from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 
 
 @pytest.fixture(name="board")

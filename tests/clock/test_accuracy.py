@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from imud.sim.arrival import PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
+from imud.sim.ports.arrival import PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench.clock import BAUD_OF_RATE, accuracy, run
 
 CRYSTALS = {

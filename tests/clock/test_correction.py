@@ -8,8 +8,8 @@ import pytest
 from imud.clock.correction import corrected
 from imud.clock.envelope import Envelope
 from imud.clock.unwrap import DeviceTime
-from imud.kit.timing import UtcReference
-from imud.sim.arrival import BARE_UART, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
+from imud.contracts.timing import UtcReference
+from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE
 from tests.bench.line_model import LineFaults, heard, measured_ns
@@ -24,7 +24,7 @@ from tests.bench.line_runs import (
     sout_clock,
     steepest,
 )  # fmt: skip
-from tests.clock.streams import BEGIN_NS, feed, make_clock, rises, steady
+from tests.support.streams import BEGIN_NS, feed, make_clock, rises, steady
 
 UNIX = 1 << 32
 SECONDS = 14

@@ -1,7 +1,7 @@
 """Edges made into pulses."""
 
 from imud.clock.pulses import Pulses, rising
-from imud.kit.lines import Edge
+from imud.contracts.lines import Edge
 
 
 def test_a_pulse_is_its_rising_edge() -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from imud.sample import Measurement, Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.clock.streams import BEGIN_NS, MODULUS, Point, feed, make_clock, message, rises, steady
+from tests.support.streams import BEGIN_NS, MODULUS, Point, feed, make_clock, message, rises, steady
 
 NEAR_NS = 2 * NS_PER_MS
 """Messages are read 1 ms after they were measured and take 0.9 ms on the wire."""

@@ -4,9 +4,9 @@ import pytest
 
 from imud.clock import SampleClock
 from imud.clock.utc import DAY_NS
-from imud.kit.timing import TimeBits, UtcReference
+from imud.contracts.timing import TimeBits, UtcReference
 from imud.sample import Measurement, Sync
-from imud.sim.arrival import BARE_UART, LOADED, USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
+from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE, clock_for
 from tests.bench.line_runs import (
@@ -20,7 +20,7 @@ from tests.bench.line_runs import (
     steepest,
     syncs,
 )  # fmt: skip
-from tests.clock.streams import BEGIN_NS, rises
+from tests.support.streams import BEGIN_NS, rises
 
 UNIX = 1 << 32
 DAY = DAY_NS // NS_PER_MS

@@ -6,9 +6,7 @@ import pytest
 
 from imud import config
 from imud.config import DeviceConfig
-from imud.devices import DRIVERS
-from imud.errors import ConfigError
-from imud.kit.lines import (
+from imud.contracts.lines import (
     LINE_SCHEMAS,
     DeviceLines,
     DividedSettings,
@@ -19,6 +17,8 @@ from imud.kit.lines import (
     SoutSettings,
     TriggerSettings,
 )
+from imud.devices import DRIVERS
+from imud.errors import ConfigError
 
 
 def parse(*devices: str) -> tuple[DeviceConfig, ...]:
@@ -155,7 +155,7 @@ def test_drivers_have_lines_that_there_are() -> None:
 
 
 def test_the_shipped_examples_show_the_defaults() -> None:
-    from tests.test_config import SHIPPED, uncommented
+    from tests.config.test_config import SHIPPED, uncommented
 
     devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
     shown = {}

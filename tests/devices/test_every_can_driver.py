@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imud import devices
-from imud.kit.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanCodec, CanDriver, CanFrame, pack_frame
-from imud.kit.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.kit.driver import of_kind
+from imud.contracts.can import CanCodec, CanDriver
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
+from imud.contracts.driver import of_kind
+from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame, pack_frame
 from imud.ledger import Ledger
 from imud.sample import Measurement
 

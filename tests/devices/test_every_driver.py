@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imud import devices
-from imud.kit.codec import BadFrame, CodecEvent, ReplyFrame, StreamCodec, TextLine
-from imud.kit.driver import StreamDriver, of_kind
+from imud.contracts.codec import BadFrame, CodecEvent, ReplyFrame, StreamCodec, TextLine
+from imud.contracts.driver import StreamDriver, of_kind
 from imud.ledger import Ledger
 from imud.sample import Measurement
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imud.contracts.codec import BadFrame
+from imud.contracts.driver import of_kind
+from imud.contracts.polling import PolledCodec, PolledDriver, PolledEvent, Transfer, Vanished, run_transfer_script
 from imud.devices import DRIVERS
 from imud.errors import DeviceRefused, TransferError, Trouble
-from imud.kit.codec import BadFrame
-from imud.kit.driver import of_kind
-from imud.kit.polling import PolledCodec, PolledDriver, PolledEvent, Transfer, Vanished, run_dialogue
 from imud.ledger import Ledger
 from imud.links import LINKS
 from imud.sample import Measurement
@@ -144,7 +144,7 @@ def test_dialogues_end_whatever_is_answered(name: str, seed: int) -> None:
     for dialogue in (driver.probe(options), driver.set_up(options)):
         transfers = 0
         with suppress(TransferError, DeviceRefused):
-            run_dialogue(dialogue, transfer)
+            run_transfer_script(dialogue, transfer)
 
 
 @every_driver

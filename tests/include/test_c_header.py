@@ -11,8 +11,9 @@ from typing import Final, Self
 
 import pytest
 
-from imud.kit import shm_layout, slot
-from imud.kit.shm_layout import (
+from imud.formats import ring as shm_layout
+from imud.formats import slot
+from imud.formats.ring import (
     HEADER_BYTES,
     HEADER_FIELDS,
     LEDGER_BLOCK_OFFSET,
@@ -21,11 +22,11 @@ from imud.kit.shm_layout import (
     encode_header,
     encode_ledger_block,
 )
-from imud.kit.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES, encode_slot
+from imud.formats.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES, encode_slot
 from imud.ledger import LEDGER_FIELDS
-from imud.publishers.waker import Waker
+from imud.publishers.socket.waker import Waker
 from imud.sample import Sample
-from tests.publishers.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 
 INCLUDE = Path(__file__).parents[2] / "imud" / "include"
 READER = Path(__file__).with_name("reader.c")

@@ -17,13 +17,13 @@ import time
 from dataclasses import dataclass, field
 from functools import partial
 
-from imud.devices.imu61x.can import INDEX_MODULUS, SET_FRAMES
-from imud.kit.can import RAW_FRAME, pack_frame
-from imud.links.mmsg import Message, Vector, libc
+from imud.devices.imu61x.can.codec import INDEX_MODULUS, SET_FRAMES
+from imud.formats.can import RAW_FRAME, pack_frame
+from imud.links.can.mmsg import MessageBuffers, Vector, libc
 from imud.sim import CAN_SIMULATORS
-from imud.sim.can_modules import CanModules
-from imud.sim.motion import MOTIONS
-from imud.sim.pty import sharpen_timers
+from imud.sim.physics.motion import MOTIONS
+from imud.sim.ports.can_modules import CanModules
+from imud.sim.ports.pty import sharpen_timers
 from imud.sim.simulator import SimulatorOptions
 from tests.lab.can_phase import LOOP_S, Phased
 
@@ -91,7 +91,7 @@ class Sender:
         self._socket.bind((interface,))
         self._frames = bytearray(FRAMES_MAX * RAW_FRAME.size)
         frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))
-        self._vectors, self._messages = (Vector * FRAMES_MAX)(), (Message * FRAMES_MAX)()
+        self._vectors, self._messages = (Vector * FRAMES_MAX)(), (MessageBuffers * FRAMES_MAX)()
         for number, (vector, message) in enumerate(zip(self._vectors, self._messages, strict=True)):
             vector.base, vector.bytes = frames + number * RAW_FRAME.size, RAW_FRAME.size
             message.header.vector, message.header.vector_count = ctypes.addressof(vector), 1

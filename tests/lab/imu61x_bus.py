@@ -5,9 +5,9 @@ from math import dist
 from time import monotonic_ns
 
 from imud.event import EventKind
-from imud.sim.imu61x_registers import Imu61xRegisters
+from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.lab.wire import I2cTransfer, Refuse, SpiTransfer
-from tests.polled import Rig
+from tests.support.polled import Rig
 
 LIMIT_S = 40.0
 """The guest's processor is emulated."""

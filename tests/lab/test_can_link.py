@@ -9,18 +9,18 @@ from time import monotonic, monotonic_ns
 import pytest
 
 from imud.config import DeviceConfig
+from imud.contracts.status import DeviceState
 from imud.errors import LinkMissing
-from imud.kit.can import CanFilter, CanFrame, CyclicFrame, pack_frame
-from imud.kit.status import DeviceState
-from imud.links.can_cyclic import KernelSender, LoopSender
-from imud.links.can_socket import FrameReader
-from imud.links.socketcan import SocketCanLink, SocketCanSettings
-from imud.pipeline.can_bus import CanBuses
-from imud.pipeline.can_runner import CanRunner
-from imud.pipeline.can_search import EVERYTHING
-from imud.sim.can_modules import CanModules
-from imud.sim.can_port import CanPort
-from imud.sim.imu61x_can import Imu61xCanHardware, Imu61xCanModule
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
+from imud.links.can.cyclic import KernelSender, LoopSender
+from imud.links.can.frame_reader import FrameReader
+from imud.links.can.link import SocketCanLink, SocketCanSettings
+from imud.runtime.can.buses import CanBuses
+from imud.runtime.can.runner import CanRunner
+from imud.runtime.detection.can_round import EVERYTHING
+from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
+from imud.sim.ports.can_modules import CanModules
+from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
 
 LIMIT_S = 30.0
@@ -88,7 +88,7 @@ def test_a_kernel_without_the_manager_is_helped_by_the_loop(
     def without(interface: str, frames: object) -> KernelSender:
         raise OSError(93, "Protocol not supported")
 
-    monkeypatch.setattr("imud.links.socketcan.KernelSender", without)
+    monkeypatch.setattr("imud.links.can.link.KernelSender", without)
 
     async def story() -> None:
         link = SocketCanLink(SocketCanSettings(interface=vcan.name))

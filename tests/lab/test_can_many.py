@@ -8,12 +8,12 @@ import pytest
 
 from imud.client import Client
 from imud.client.watch import Watch
-from imud.kit.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
-from imud.kit.status import DeviceState, DeviceStatus
+from imud.contracts.status import DeviceState, DeviceStatus
+from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.sample import Sample
 from tests.lab.can_interface import CanInterface
 from tests.lab.can_traffic import Against, Module, fleet, traffic
-from tests.running import RunningDaemon, running_daemon
+from tests.support.running import RunningDaemon, running_daemon
 
 SECONDS = float(os.environ.get("IMUD_LAB_SECONDS", "6"))
 RATE_HZ = float(os.environ.get("IMUD_LAB_RATE_HZ", "20"))

@@ -11,18 +11,18 @@ from time import monotonic_ns
 
 import pytest
 
+from imud.contracts.lines import Edge, InputSettings, OutputSettings, ResetSettings
+from imud.contracts.timing import TriggerStamp
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
-from imud.gpio import GpioInput, GpioOutput
-from imud.gpio.lines import KERNEL_EVENTS
-from imud.kit.lines import Edge, InputSettings, OutputSettings, ResetSettings
-from imud.kit.timing import TriggerStamp
-from imud.pipeline.reset import reset
-from imud.pipeline.trigger import Trigger
+from imud.signals.gpio import GpioInput, GpioOutput
+from imud.signals.gpio_lines import KERNEL_EVENTS
+from imud.signals.reset import reset
+from imud.signals.trigger import Trigger
 from imud.units import NS_PER_S
-from tests.in_loop import in_loop
 from tests.lab.gpio_chip import GpioChip, simulated_chip
 from tests.lab.tool import running, tool
 from tests.lab.waiting import wait_until
+from tests.support.in_loop import in_loop
 
 INTERRUPTS = Path("/proc/interrupts")
 LIMIT_S = 30

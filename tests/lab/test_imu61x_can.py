@@ -14,16 +14,16 @@ import can
 import pytest
 
 from imud.config import DeviceConfig
-from imud.devices.imu61x.can import Imu61xCanSettings, encode_set
+from imud.contracts.status import DeviceState
+from imud.devices.imu61x.can.codec import Imu61xCanSettings, encode_set
 from imud.event import Event, EventKind
-from imud.kit.can import pack_frame
-from imud.kit.status import DeviceState
-from imud.links.can_socket import FrameReader
-from imud.links.socketcan import SocketCanSettings, pack_filters
-from imud.pipeline.can_runner import CanRunner
+from imud.formats.can import pack_frame
+from imud.links.can.frame_reader import FrameReader
+from imud.links.can.link import SocketCanSettings, pack_filters
+from imud.runtime.can.runner import CanRunner
 from imud.sample import Sample
-from imud.sim.can_port import CanPort
-from imud.sim.imu61x_can import Imu61xCanHardware, Imu61xCanModule
+from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
+from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
 from tests.lab.demo import demo
 from tests.lab.tool import tool

@@ -5,15 +5,15 @@ import errno
 
 import pytest
 
-from imud.devices.imu61x import i2c as device_i2c
-from imud.kit.polling import Poll
-from imud.kit.status import DeviceState
+from imud.contracts.polling import Poll
+from imud.contracts.status import DeviceState
+from imud.devices.imu61x.i2c import codec as device_i2c
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, physics_holds, registers, vanishes
 from tests.lab.register_device import RegisterDevice
 from tests.lab.wire import I2cTransfer
-from tests.polled import device_config, running
+from tests.support.polled import device_config, running
 
 RESOLUTION_M_S2 = 0.02
 ADDRESS = 0x1A

@@ -13,19 +13,19 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
+from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings, ReadySettings, ResetSettings
 from imud.event import EventKind
-from imud.gpio import GpioInput, GpioOutput
-from imud.kit.lines import DeviceLines, LineMaker, OutputSettings, ReadySettings, ResetSettings
 from imud.sample import Sample, Sync
-from imud.sim.imu61x_registers import Imu61xRegisters
+from imud.signals.gpio import GpioInput, GpioOutput
+from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.lab.bus import Bus
 from tests.lab.gpio_chip import GpioChip
 from tests.lab.imu61x_bus import LIMIT_S, on_i2c, on_spi, registers
 from tests.lab.tool import running as tool_running
 from tests.lab.waiting import wait_until
 from tests.lab.wire import I2cTransfer
-from tests.polled import Rig, device_config, running
-from tests.running import LIMIT_S as TASK_LIMIT_S
+from tests.support.polled import Rig, device_config, running
+from tests.support.running import LIMIT_S as TASK_LIMIT_S
 
 INTERRUPTS = Path("/proc/interrupts")
 HOLD_MS, WAIT_S = 50.0, 1.0
@@ -62,7 +62,7 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
         device.restart()
         device.faults = type(device.faults)()
 
-    maker = LineMaker(GpioInput, partial(WiredReset, gpio_chip, boot))
+    maker = LineFactory(GpioInput, partial(WiredReset, gpio_chip, boot))
 
     async def body(seen: Any) -> None:
         async with running(replace(config, lines=DeviceLines(reset=settings)), lines=maker) as (rig,):

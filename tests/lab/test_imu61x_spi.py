@@ -5,14 +5,14 @@ import errno
 
 import pytest
 
-from imud.devices.imu61x import spi
-from imud.kit.polling import Poll
-from imud.kit.status import DeviceState
+from imud.contracts.polling import Poll
+from imud.contracts.status import DeviceState
+from imud.devices.imu61x.spi import codec as spi
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes
 from tests.lab.wire import SpiTransfer
-from tests.polled import Rig, device_config, running
+from tests.support.polled import Rig, device_config, running
 
 RESOLUTION_M_S2 = 0.02
 PORTS = {"spi8": "/dev/spidev0.0", "spi16": "/dev/spidev1.0"}

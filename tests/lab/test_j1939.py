@@ -11,20 +11,19 @@ from time import monotonic, monotonic_ns
 import pytest
 
 from imud.config import DeviceConfig
-from imud.devices.hipnuc import j1939_messages as messages
-from imud.devices.hipnuc import j1939_session as session
-from imud.devices.hipnuc.j1939 import HipnucJ1939Settings
-from imud.devices.hipnuc.nmea2000 import HipnucNmea2000Settings
+from imud.contracts.settings import Settings
+from imud.contracts.status import DeviceState
+from imud.devices.hipnuc.j1939 import messages, session
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.devices.hipnuc.nmea2000.codec import HipnucNmea2000Settings
 from imud.errors import NoReply
-from imud.kit.settings import Settings
-from imud.kit.status import DeviceState
-from imud.links.socketcan import SocketCanSettings
-from imud.pipeline.can_runner import CanRunner
+from imud.links.can.link import SocketCanSettings
+from imud.runtime.can.runner import CanRunner
 from imud.sample import Sample
-from imud.sim.can_modules import CanModules
-from imud.sim.can_port import CanPort
-from imud.sim.hipnuc_j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings
-from imud.sim.hipnuc_nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
+from imud.sim.hipnuc.j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings
+from imud.sim.hipnuc.nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
+from imud.sim.ports.can_modules import CanModules
+from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
 
 LIMIT_S = 30.0

@@ -14,17 +14,17 @@ from urllib.request import urlopen
 
 import pytest
 
+from imud.contracts.status import DeviceStatus, LinesStatus
 from imud.event import EventKind
-from imud.kit.status import DeviceStatus, LinesStatus
-from imud.pipeline.wires import ALARM_STATUS
 from imud.sample import Sample, Sync
+from imud.signals.sync_signals import ALARM_STATUS
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.lab.gpio_chip import GpioChip
 from tests.lab.imu_process import Pulse, running_imu, tell, tty
 from tests.lab.test_gpio_lines import INTERRUPTS, rising_edges
 from tests.lab.tool import running, tool
 from tests.lab.waiting import wait_until
-from tests.running import RunningDaemon, running_daemon
+from tests.support.running import RunningDaemon, running_daemon
 
 pytestmark = pytest.mark.timeout(600)
 

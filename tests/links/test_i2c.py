@@ -5,12 +5,12 @@ import errno
 import pytest
 from smbus2 import I2cFunc
 
+from imud.contracts.polling import Transfer
 from imud.errors import LinkDenied, LinkError, LinkMissing, TransferError, Trouble
-from imud.kit.polling import Transfer
 from imud.links import LINKS
 from imud.links.i2c import I2C_TIMEOUT, I2cLink, I2cSettings
-from imud.sim.imu61x_registers import Imu61xRegisters
-from imud.sim.in_process_bus import InProcessI2c
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.ports.in_process_bus import InProcessI2c
 
 READ_ID = Transfer((b"\x6a",), 8)
 

@@ -5,9 +5,9 @@ import asyncio
 import msgspec
 import pytest
 
+from imud.contracts.link import StreamLink
+from imud.contracts.status import KernelCounters
 from imud.errors import LinkBusy, LinkError, LinkMissing
-from imud.kit.link import StreamLink
-from imud.kit.status import KernelCounters
 from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemorySettings
 

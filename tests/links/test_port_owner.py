@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from imud.kit.access import user_name
 from imud.links.port_owner import SERIAL_GROUP, group_of, holders_of
+from imud.permissions import user_name
 
 
 def process(proc: Path, pid: int, name: str, *targets: str) -> None:

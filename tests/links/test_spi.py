@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from imud.contracts.polling import Transfer
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
-from imud.kit.polling import Transfer
 from imud.links import LINKS
 from imud.links.spi import WR_MAX_SPEED_HZ, SpiLink, SpiSettings
-from imud.sim.in_process_bus import InProcessSpi
+from imud.sim.ports.in_process_bus import InProcessSpi
 
 
 def echo(selections: object, _mode: int) -> list[bytes]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.sim.pins import PinFaultRates, pin_rates
+from imud.sim.ports.pins import PinFaultRates, pin_rates
 from tests.sim.test_main import LIMIT_S, Start, command, path_of, read, start
 
 __all__ = ["start"]

@@ -5,12 +5,12 @@ import json
 import time
 from collections.abc import Awaitable, Callable
 
-from imud.kit.rmc import build
+from imud.formats.rmc import build
 from imud.units import NS_PER_S
 from imud.utc.gpsd import GpsdSource
 from imud.utc.retry import FIRST_S, Retry
 from imud.utc.source import RmcSettings
-from tests.utc.sentences import LIMIT_S, Sentences, soon
+from tests.support.sentences import LIMIT_S, Sentences, soon
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 VERSION = b'{"class":"VERSION","release":"3.22","rev":"3.22","proto_major":3,"proto_minor":14}\r\n'

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from imud.kit.rmc import Rmc, parse
-from tests.running import running_daemon
+from imud.formats.rmc import Rmc, parse
+from tests.support.running import running_daemon
 from tests.utc.test_gpsd_real import LIMIT_S, NO_GPSD, Receiver, free_port, gpsd, receiver
 
 __all__ = ["receiver"]

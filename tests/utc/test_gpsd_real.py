@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from imud.kit.rmc import Rmc, build, checksum, parse
+from imud.formats.rmc import Rmc, build, checksum, parse
 from imud.units import NS_PER_S
 from imud.utc.gpsd import GpsdSource
 from imud.utc.retry import Retry
 from imud.utc.source import RmcSettings
-from tests.utc.sentences import Sentences
+from tests.support.sentences import Sentences
 
 UTC_S = 1_795_000_000
 LIMIT_S = 30.0

@@ -2,15 +2,15 @@
 
 import asyncio
 
+from imud.contracts.link import OnData, OnEnd
+from imud.contracts.status import KernelCounters
 from imud.errors import LinkError, LinkMissing
-from imud.kit.link import OnData, OnEnd
-from imud.kit.rmc import build
-from imud.kit.status import KernelCounters
+from imud.formats.rmc import build
 from imud.units import NS_PER_S
 from imud.utc.nmea_port import NmeaPortSource, make
 from imud.utc.retry import Retry
 from imud.utc.source import RmcSettings
-from tests.utc.sentences import LIMIT_S, Sentences, soon
+from tests.support.sentences import LIMIT_S, Sentences, soon
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 

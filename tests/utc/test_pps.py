@@ -4,8 +4,8 @@ from random import Random
 
 import pytest
 
-from imud.kit.rmc import build
-from imud.kit.timing import UtcReference
+from imud.contracts.timing import UtcReference
+from imud.formats.rmc import build
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.pps import HOLD_NS, PULSES_NEEDED, PpsReference
 

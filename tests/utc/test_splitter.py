@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from imud.kit.rmc import build
+from imud.formats.rmc import build
 from imud.units import NS_PER_S
 from imud.utc.splitter import LINE_BYTES_MAX, SentenceSplitter
 

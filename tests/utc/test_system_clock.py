@@ -4,12 +4,12 @@ import asyncio
 
 import pytest
 
-from imud.kit.rmc import Rmc, parse
+from imud.formats.rmc import Rmc, parse
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.adjtimex import KernelClock
 from imud.utc.source import RmcSettings
 from imud.utc.system_clock import AFTER_NS, LATEST_NS, SystemClockSource
-from tests.utc.sentences import Sentences
+from tests.support.sentences import Sentences
 
 GOOD = KernelClock(True, 500, 1000)
 OFFSET_NS = 1_795_000_000 * NS_PER_S + 123_456_789

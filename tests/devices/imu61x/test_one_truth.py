@@ -11,19 +11,20 @@ from math import dist
 
 import pytest
 
-from imud.devices.imu61x import i2c, spi
-from imud.devices.imu61x.can import Imu61xCanCodec, Imu61xCanSettings
-from imud.devices.imu61x.registers import RegisterSettings
-from imud.devices.imu61x.serial import Imu61xCodec
-from imud.kit.codec import CodecEvent
-from imud.kit.polling import Dialogue, PolledCodec, PolledEvent, Transfer, run_dialogue
+from imud.contracts.codec import CodecEvent
+from imud.contracts.polling import PolledCodec, PolledEvent, Transfer, TransferScript, run_transfer_script
+from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings
+from imud.devices.imu61x.common.registers import RegisterSettings
+from imud.devices.imu61x.i2c import codec as i2c
+from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.uart.codec import Imu61xCodec
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.imu61x_can import Imu61xCanHardware, Imu61xCanModule
-from imud.sim.imu61x_registers import Imu61xRegisters
-from imud.sim.imu61x_settings import Imu61xSettings
-from imud.sim.imu61x_uart import Imu61xHardware, Imu61xModule
-from imud.sim.motion import Truth, swing
+from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.imu61x.settings import Imu61xSettings
+from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
+from imud.sim.physics.motion import Truth, swing
 
 EPOCH_NS = 5_000_000_000
 """Zero of the motion, the same for all devices."""
@@ -109,12 +110,12 @@ def by_spi(burst: str) -> Read:
     return by_polls(spi.DRIVER.set_up(settings), spi.Imu61xSpiCodec(Ledger(), settings), transfer)
 
 
-def by_polls(set_up: Dialogue[Mapping[str, str]], codec: PolledCodec, transfer: object) -> Read:
+def by_polls(set_up: TransferScript[Mapping[str, str]], codec: PolledCodec, transfer: object) -> Read:
     """Set the device up, then read it at each instant."""
     assert callable(transfer)
     now_ns = EPOCH_NS
     device = Imu61xRegisters(lambda: now_ns, motion=MOTION)
-    run_dialogue(set_up, lambda one: bytes(transfer(device, one)))
+    run_transfer_script(set_up, lambda one: bytes(transfer(device, one)))
     found: dict[int, Measurement] = {}
     for now_ns in INSTANTS:
         found[now_ns] = only(codec.take(0, transfer(device, codec.polls[0].transfer)))

@@ -1,0 +1,1 @@
+"""What a codec, link, driver, session, action and publisher promise."""

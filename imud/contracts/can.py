@@ -1,0 +1,69 @@
+"""What a driver for a CAN bus promises: the codec that takes its frames, and the row that its folder ends with."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import Any, Protocol
+
+from imud.contracts.codec import CodecEvent
+from imud.contracts.driver import Driver, Identity
+from imud.contracts.session import RequestScript
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame
+from imud.ledger import Ledger
+
+
+def nothing_cyclic(_settings: Any) -> Sequence[CyclicFrame]:
+    """The cyclic frames of a device that needs none."""
+    return ()
+
+
+class CanCodec(Protocol):
+    """Turns the frames of one device into events. Frames of others may be among them and change nothing.
+
+    The ledger counts data bytes: those of frames of other devices as skipped. Synchronization: one thread.
+    """
+
+    ledger: Ledger
+
+    def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
+        """Take one frame that arrived then (CLOCK_MONOTONIC); return what it completed. Never raises for any frame."""
+        ...
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """The bus is idle: return what need not wait any longer."""
+        ...
+
+    def reset(self) -> None:
+        """Frames are missing here (overrun, bus gone): frames that wait for the rest of their sample are given up."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanDriver(Driver):
+    """A device on a CAN bus, which it may share with others."""
+
+    make_codec: Callable[[Ledger, Any], CanCodec]
+    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    filters: Callable[[Any], Sequence[CanFilter]]
+    """The frames that a device with these settings sends, replies included."""
+    node_of: Callable[[int, bool, bytes], int | None]
+    """Which device of this protocol would send such a frame (identifier, 29 bits or not, data): its number, or None.
+
+    A frame that carries samples only; what this says is a guess that a codec must confirm."""
+    node_settings: Callable[[int], Any]
+    """Settings for the device of that number, the rest at its default."""
+    node_title: Callable[[int], str]
+    """The device of that number for people, for example `node 8`."""
+    identify: Callable[[Any], RequestScript[Identity]]
+    """Asks the device with these settings what it is, and leaves it as it was."""
+    read_settings: Callable[[Any], RequestScript[Mapping[str, str]]]
+    """Reads back the own settings of the device with these settings, by its own names, and leaves it as it was."""
+    apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
+    """Tells the codec what is known of the device, where what it sends depends on that."""
+    sample_frames: int
+    """Frames that make one sample."""
+    example_frames: Callable[[Random], Sequence[CanFrame]]
+    """Valid frames that make one sample, in the order they are sent, with random values and the default settings."""
+    cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
+    """Frames that imud must send for a device with these settings, as long as the link is open; of a link that may not
+    send, none are."""

@@ -1,0 +1,82 @@
+"""The row a device file ends with: everything the rest of imud needs to know about one wire protocol."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any, TypeVar
+
+from imud.contracts.action import Actions
+from imud.contracts.codec import StreamCodec
+from imud.contracts.session import RequestScript
+from imud.contracts.settings import Settings
+from imud.contracts.timing import NO_TIME_BITS, TimeBits
+from imud.ledger import Ledger
+
+SAMPLE_COUNTER = 0
+"""`tick_ns` of a device whose counter numbers its samples: a tick is one sample, its length is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a device says it is. Empty strings where it does not say."""
+
+    product: str = ""
+    serial_number: str = ""
+    firmware: str = ""
+    details: Mapping[str, str] | None = None
+    """Everything else it said, by the device's own names."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Driver:
+    """What the rows of all wire protocols have; the links that a driver can use follow from its kind."""
+
+    name: str
+    """Family and link, for example `hipnuc-uart`."""
+    title: str
+    """Vendor and products, for people."""
+    settings: type[Settings]
+    """What can be configured of the driver (`options` of a device)."""
+    tick_ns: int
+    """Length of one device tick in ns, or SAMPLE_COUNTER."""
+    tick_modulus: int
+    """Device time counts 0 … tick_modulus - 1."""
+    euler_convention: str
+    """Order, axes and signs of `euler_rad`, in words."""
+    navigation_frame: str
+    """The frame that `quat_wxyz` turns into, for example `ENU`."""
+    actions: Actions = field(default_factory=dict)
+    """What the device can be told to do, by name."""
+    lines: frozenset[str] = frozenset()
+    """Wires besides its data that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
+    time_bits: TimeBits = NO_TIME_BITS
+    """Bits of `Measurement.status` that speak of time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamDriver(Driver):
+    """A device that sends a byte stream by itself (UART, RS-232, USB serial)."""
+
+    baud_rates: tuple[int, ...]
+    """Rates the device knows, in bit/s, most likely first: detection tries them in this order."""
+    make_codec: Callable[[Ledger, Any], StreamCodec]
+    """Makes a codec that counts into the ledger, from an instance of `settings`."""
+    identify: Callable[[], RequestScript[Identity]]
+    """Asks the device what it is, and leaves it as it was."""
+    read_settings: Callable[[], RequestScript[Mapping[str, str]]]
+    """Reads back the device's own settings, by the device's own names, and leaves it as it was."""
+    apply_identity: Callable[[StreamCodec, Identity], None] = lambda _codec, _identity: None
+    """Tells the codec what is known of the device, where the meaning of a field depends on the firmware."""
+    wake: Callable[[], RequestScript[bool]] | None = None
+    """Makes a device send samples that answers and sends none, and says whether it acknowledged; nothing is saved.
+    Raises NoReply where nothing answers. None for devices that cannot be silent."""
+    example_frame: Callable[[Random], bytes]
+    """One valid frame with random values, for the shared property tests and for fault injection."""
+
+
+D = TypeVar("D", bound=Driver)
+
+
+def of_kind(drivers: Iterable[Driver], kind: type[D]) -> list[D]:
+    """The drivers of one kind, in their order."""
+    return [driver for driver in drivers if isinstance(driver, kind)]

@@ -1,0 +1,91 @@
+"""What a publisher is: an output that takes samples and events and never makes the pipeline wait."""
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from imud.contracts.action import ActionInfo
+from imud.contracts.batch import Batch
+from imud.contracts.settings import Settings
+from imud.contracts.status import ClientStatus, DeviceStatus
+from imud.errors import CommandError
+from imud.event import Event
+
+StatusSource = Callable[[], Sequence[DeviceStatus]]
+"""The state of every device now. To be called in the event loop's thread only."""
+
+
+class Publisher(Protocol):
+    """An output of samples. Every method returns at once and is called in the event loop's thread only."""
+
+    def start(self) -> None:
+        """Open what it needs (files, sockets, threads). Raises ServerError. Needs a running asyncio loop."""
+        ...
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """A device of the configuration appears: make room for it."""
+        ...
+
+    def remove_device(self, name: str) -> None:
+        """The device left the configuration."""
+        ...
+
+    def publish(self, batch: Batch) -> None:
+        """Give the samples to readers; drop for readers that are slow, and count that."""
+        ...
+
+    def event(self, event: Event) -> None:
+        """Tell readers of an event."""
+        ...
+
+    def tick(self, now_ns: int) -> None:
+        """Called ten times a second: heartbeats, ledgers, time-outs."""
+        ...
+
+    def close(self) -> None:
+        """Release everything; may be called twice."""
+        ...
+
+
+async def _nobody_acts(device: str, _name: str, _arguments: Mapping[str, Any]) -> object:
+    raise CommandError(f"{device}: nothing here can be told to do anything")
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherContext:
+    """What every publisher may know of the daemon."""
+
+    status: StatusSource
+    epoch: int
+    """Random number of this start of the daemon, 64 bits: readers see a restart by it."""
+    now_ns: Callable[[], int]
+    """CLOCK_MONOTONIC."""
+    actions: Callable[[str], Sequence[ActionInfo]] = lambda _device: ()
+    """What a device can be told to do."""
+    act: Callable[[str, str, Mapping[str, Any]], Awaitable[object]] = _nobody_acts
+    """Have a device do something: its name, the action's, arguments. Raises ImudError; the answer is JSON's values."""
+    client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
+    """Publishers that serve clients add a callable while they are open, so that another can show them."""
+
+    def clients(self) -> list[ClientStatus]:
+        """The clients of all publishers now. To be called in the event loop's thread only."""
+        return [client for source in self.client_sources for client in source()]
+
+
+class PublisherSettings(Protocol):
+    """What the settings of every publisher have; the daemon leaves out those that are not enabled."""
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the publisher runs."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherType:
+    """The row a publisher file ends with."""
+
+    name: str
+    """The top-level key in the configuration."""
+    settings: type[Settings]
+    make: Callable[[Any, PublisherContext], Publisher]

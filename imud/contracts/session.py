@@ -1,0 +1,216 @@
+"""Request and reply over a link that also carries samples, without I/O: messages in, outcomes out, time as an argument.
+
+A message is a line of text or a reply frame. A dialogue of several requests is a generator (`RequestScript`): it yields
+a `Request` and is sent the `Outcome`. The same generator is driven by the daemon's event loop, by a blocking probe, and
+by a test.
+"""
+
+from collections import deque
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from imud.contracts.codec import Message, ReplyFrame
+from imud.errors import CommandError
+from imud.ledger import Ledger
+from imud.units import NS_PER_S
+
+T = TypeVar("T")
+
+REPLY_MESSAGES_MAX = 256
+"""No reply of any manual has more than some dozens of messages; more means that its end was lost."""
+LATE_WINDOW_NS = 5 * NS_PER_S
+"""What comes up to this long after a time-out is taken for the late reply to the request that timed out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One command, ready to send, with what its reply looks like."""
+
+    payload: bytes
+    """Bytes for the link; empty sends nothing."""
+    name: str
+    """The command as people write it, for error messages."""
+    is_end: Callable[[Message], bool]
+    """Whether this message ends the reply well."""
+    is_rejection: Callable[[Message], bool]
+    """Whether this message ends the reply badly."""
+    is_part: Callable[[Message], bool]
+    """Whether this message can belong to the reply; others are of some other origin."""
+    timeout_ns: int = NS_PER_S // 2
+    silent: bool = False
+    """The device never answers this one (it reboots, say): it is done once sent."""
+    messages_min: int = 1
+    """Fewest messages of a good reply, its end included: an end that comes sooner is that of an earlier, late reply."""
+    baud: int = 0
+    """Rate in bit/s that the line must have from this request on; 0 for as it is. Serial lines only."""
+    undo: bytes = b""
+    """What is sent if the conversation is given up at this request (cancelled, its owner ends) while the link is still
+    there: a generator that is closed can send nothing by itself. Nothing waits for a reply to it."""
+
+
+def never(_message: Message) -> bool:
+    """Holds for no message."""
+    return False
+
+
+def of_text(holds: Callable[[str], bool]) -> Callable[[Message], bool]:
+    """What holds for a message that is text for which `holds` does."""
+    return lambda message: isinstance(message, str) and holds(message)
+
+
+def pause(duration_ns: int, *, baud: int = 0) -> Request:
+    """Wait before the next request, at another rate if `baud` is given; its outcome is `Silence`."""
+    return Request(b"", "pause", never, never, never, duration_ns, baud=baud)
+
+
+def with_undo(conversation: "RequestScript[T]", undo: bytes) -> "RequestScript[T]":
+    """The same conversation, of which every request has `undo`."""
+    try:
+        request = next(conversation)
+        while True:
+            request = conversation.send((yield replace(request, undo=undo)))
+    except StopIteration as end:
+        value: T = end.value
+        return value
+    finally:
+        conversation.close()
+
+
+@dataclass(frozen=True, slots=True)
+class _Messages:
+    messages: tuple[Message, ...]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The messages that are text."""
+        return tuple(message for message in self.messages if isinstance(message, str))
+
+    @property
+    def frames(self) -> tuple[ReplyFrame, ...]:
+        """The messages that are frames."""
+        return tuple(message for message in self.messages if isinstance(message, ReplyFrame))
+
+
+@dataclass(frozen=True, slots=True)
+class Reply(_Messages):
+    """The device answered: the messages, the one that ends the reply last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection(_Messages):
+    """The device refused: the messages, the refusing one last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Silence(_Messages):
+    """No complete reply came before the deadline; `messages` is the part that did."""
+
+
+Outcome = Reply | Rejection | Silence
+RequestScript = Generator[Request, Outcome, T]
+
+
+def says_nothing(value: T) -> RequestScript[T]:
+    """The conversation with a device that cannot be asked: no request, and `value` as its end."""
+    return value
+    yield  # makes it a generator
+
+
+class Session:
+    """One outstanding request at a time; late replies are told from fresh ones and counted.
+
+    Devices answer in the order they were asked. A message is late when it can belong to the request that timed out and
+    not to the outstanding one, or when it ends a reply whose messages were late. Two requests whose replies are the
+    same single message cannot be told apart: there the first one counts for the outstanding request.
+
+    Synchronization: one thread. The owner sends `start()`'s bytes, passes every message to `on_message()`, and calls
+    `on_time()` at `deadline_ns`.
+    """
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self._request: Request | None = None
+        self._messages: deque[Message] = deque(maxlen=REPLY_MESSAGES_MAX)
+        self._timed_out: Request | None = None
+        self._timed_out_ns = 0
+        self._late_messages = 0
+        """Messages of the late reply that is just arriving."""
+        self.deadline_ns: int | None = None
+        """When the outstanding request times out (CLOCK_MONOTONIC), or None."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request is outstanding."""
+        return self._request is not None
+
+    def start(self, request: Request, now_ns: int) -> bytes:
+        """Make `request` the outstanding one and return its bytes. Raises CommandError when one is outstanding."""
+        if self._request is not None:
+            raise CommandError(f"{request.name}: still waiting for the reply to {self._request.name}")
+        self._messages.clear()
+        if not request.silent:
+            self._request = request
+            self.deadline_ns = now_ns + request.timeout_ns
+        return request.payload
+
+    def on_message(self, message: Message, now_ns: int) -> Outcome | None:
+        """Take one message; return the outcome when it ends the outstanding request."""
+        request = self._request
+        if request is None or not self._belongs(request, message) or self._ends_late(request, message, now_ns):
+            self._count_stray(message, now_ns)
+            return None
+        self._late_messages = 0
+        self._messages.append(message)
+        if request.is_rejection(message):
+            return self._finish(Rejection)
+        if request.is_end(message):
+            return self._finish(Reply)
+        return None
+
+    def on_time(self, now_ns: int) -> Silence | None:
+        """Return `Silence` when the deadline has passed."""
+        if self._request is None or self.deadline_ns is None or now_ns < self.deadline_ns:
+            return None
+        if self._request.payload:  # nothing can come late that was never asked for
+            self._timed_out, self._timed_out_ns = self._request, now_ns
+            self._late_messages = len(self._messages)
+        self._request = self.deadline_ns = None
+        return Silence(tuple(self._messages))
+
+    def cancel(self) -> None:
+        """Forget the outstanding request: the link is gone."""
+        self._request = self.deadline_ns = None
+        self._messages.clear()
+
+    def _belongs(self, request: Request, message: Message) -> bool:
+        return _ends(request, message) or request.is_part(message)
+
+    def _ends_late(self, request: Request, message: Message, now_ns: int) -> bool:
+        """Whether `message` is an end, but not that of the outstanding request: its own messages have not come."""
+        if not _ends(request, message) or self._messages:
+            return False
+        late_is_arriving = self._late_messages > 0 and self._expects_late(now_ns)
+        return late_is_arriving or (request.is_end(message) and request.messages_min > 1)
+
+    def _expects_late(self, now_ns: int) -> bool:
+        return self._timed_out is not None and now_ns - self._timed_out_ns <= LATE_WINDOW_NS
+
+    def _finish(self, outcome: type[Reply] | type[Rejection]) -> Reply | Rejection:
+        self._request = self.deadline_ns = None
+        return outcome(tuple(self._messages))
+
+    def _count_stray(self, message: Message, now_ns: int) -> None:
+        late = self._timed_out
+        if late is None or not self._expects_late(now_ns) or not self._belongs(late, message):
+            self._ledger.replies_unsolicited += 1
+            return
+        self._late_messages += 1
+        if _ends(late, message):
+            self._ledger.replies_late += 1
+            self._timed_out = None
+            self._late_messages = 0
+
+
+def _ends(request: Request, message: Message) -> bool:
+    return request.is_end(message) or request.is_rejection(message)

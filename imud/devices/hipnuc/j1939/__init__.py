@@ -1,0 +1,1 @@
+"""HiPNUC modules over SAE J1939."""

@@ -1,0 +1,1 @@
+"""HiPNUC modules over Modbus RTU (manual B, chapter on Modbus)."""

@@ -1,0 +1,321 @@
+"""HiPNUC CH0x0/CH10x/HI14 on RS-485: one block of registers per sample. Manual "IMU配置手冊" V1.5.9, chapter 4.
+
+    50 03 00 34 00 1A crc  →  50 03 34 | accel 3 | gyro 3 | mag 3 | roll pitch yaw i32 | °C | Pa i32 | quaternion 4 |
+                                         inclinometer 2 | uptime ms u32 | crc      i16 where not said, high byte first
+
+Firmware that has no UPTIME answers with exception 2: from then on 24 registers are read. Nothing else than the first
+reading can decide it, because a codec alone keeps what was learned.
+
+Two scales differ between modules and are decided by the values, then kept:
+- the quaternion: the one of the two that gives unit length;
+- the inclinometer: two axes (±180°, ±90°, 180/32768 degrees a count) or one (0 … 360°, 360/32768). Y is reserved in
+  products with one, so a Y that is not zero, or a negative X, means two; a Y of zero while the module is pitched means
+  one. That the reserved register reads as zero is a guess. Until it is decided, and where both read as zero (a product
+  without inclinometer), there is no value.
+Likewise a guess, after the manual's own example: a pressure of zero, a field of zero, and a temperature of zero
+together with a pressure of zero, are sensors that the product does not have.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from math import atan2, cos, hypot, radians, sin
+from random import Random
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
+
+from imud.attitude import euler312_from_quat, quat_normalized
+from imud.contracts.codec import BadFrame, BadReason
+from imud.contracts.driver import Identity
+from imud.contracts.polling import Poll, PolledDriver, PolledEvent, TransferScript, Vanished
+from imud.contracts.settings import Settings
+from imud.devices.hipnuc.common.counts import counts_of
+from imud.devices.hipnuc.common.registers import (
+    ACCEL_M_S2_PER_LSB,
+    BAUD_RATES,
+    BLOCK_FIRST,
+    BLOCK_REGISTERS,
+    BY_NAME,
+    EULER_RAD_PER_LSB,
+    GYRO_RAD_S_PER_LSB,
+    IDENTITY_FIRST,
+    IDENTITY_REGISTERS,
+    INCLI_DUAL_RAD_PER_LSB,
+    INCLI_SINGLE_RAD_PER_LSB,
+    MAG_T_PER_LSB,
+    PRESSURE_PA_PER_LSB,
+    QUAT_NEW_PER_LSB,
+    QUAT_OLD_PER_LSB,
+    SHORT_BLOCK_REGISTERS,
+    TEMPERATURE_C_PER_LSB,
+)
+from imud.devices.hipnuc.modbus.actions import ACTIONS
+from imud.devices.hipnuc.modbus.frames import (
+    FACTORY_ID,
+    SERIAL_BYTES,
+    read_registers,
+    registers_of,
+    registers_reply,
+)
+from imud.devices.polled_frames import Measured, PolledFrameDecoder, absence
+from imud.errors import DeviceRefused
+from imud.formats.modbus import (
+    CRC_BYTES,
+    ILLEGAL_ADDRESS,
+    READ_HOLDING,
+    READ_OVERHEAD_BYTES,
+    SLAVES,
+    framed,
+    is_exception,
+    is_whole,
+)
+from imud.ledger import Ledger
+from imud.sample import Measurement, Pair, Quaternion, Vector3
+from imud.units import NS_PER_MS, NS_PER_S
+
+BLOCK: Final = struct.Struct(">3h3h3h3ihi4h2h")
+"""accel, gyro, mag, roll pitch yaw, temperature, pressure, quaternion wxyz, inclinometer: registers 0x34 … 0x4B."""
+UPTIME: Final = struct.Struct(">I")
+"""Registers 0x4C … 0x4D, ms."""
+DATA_AT: Final = 3
+NAME_BYTES: Final = 16
+VERSIONS: Final = struct.Struct(">HH")
+SERIAL_AT: Final = 2 * (BY_NAME["SN"].address - IDENTITY_FIRST)
+CHECK_NS: Final = 10 * NS_PER_S
+"""How often the serial number is read again: another module can take a place on the line unnoticed."""
+UNIT_TOLERANCE: Final = 0.02
+"""How far from 1 a quaternion may be: the two scales are a factor of 3.3 apart, rounding costs 1e-4."""
+PITCHED_RAD: Final = radians(1.0)
+"""A dual-axis inclinometer shows 182 counts here."""
+
+READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
+READ_SHORT_BLOCK: Final = read_registers(BLOCK_FIRST, SHORT_BLOCK_REGISTERS)
+READ_IDENTITY: Final = read_registers(IDENTITY_FIRST, IDENTITY_REGISTERS)
+READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
+READ_SETTINGS: Final = read_registers(BY_NAME["UART1_BAUD"].address, 3)
+_SAMPLE: Final = 0
+
+
+class HipnucModbusSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What can be configured of the codec."""
+
+    inclinometer: Literal["auto", "single", "dual"] = "auto"
+    """Axes of an inclinometer product: `single` has X from 0 to 360°, `dual` X ±180° and Y ±90°; `auto` decides by the
+    values, which takes a tilt of more than 1°."""
+    update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
+    """How often the device renews its registers, per second, for the error of time stamps; 0 for not known."""
+
+
+def update_ns(settings: HipnucModbusSettings) -> int:
+    """Longest time between two updates of the registers, 0 for not known."""
+    return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
+
+
+def probe(_settings: HipnucModbusSettings) -> TransferScript[Identity]:
+    """Name, versions and serial number. Raises DeviceRefused for what is no HiPNUC module."""
+    words = registers_of((yield READ_IDENTITY), IDENTITY_REGISTERS)
+    return identity_of(struct.pack(f">{len(words)}H", *words))
+
+
+def identity_of(data: bytes) -> Identity:
+    """What registers 0x70 … 0x83 say. Raises DeviceRefused where the name is no text."""
+    name = data[:NAME_BYTES].rstrip(b"\0 ")
+    if not name or any(byte not in range(0x20, 0x7F) for byte in name):
+        raise DeviceRefused(f"expected the name of a product at register 0x70, got {data[:NAME_BYTES].hex(' ')}")
+    firmware, loader = VERSIONS.unpack_from(data, NAME_BYTES)
+    serial = data[SERIAL_AT : SERIAL_AT + SERIAL_BYTES].hex().upper()
+    return Identity(name.decode("ascii"), serial, ".".join(str(firmware)), {"BL_VERSION": str(loader)})
+
+
+def set_up(_settings: HipnucModbusSettings) -> TransferScript[Mapping[str, str]]:
+    """Read baud rate, ID and heading mode; nothing is written. Raises DeviceRefused."""
+    baud, slave, heading = registers_of((yield READ_SETTINGS), 3)
+    return {
+        "baud": str(BAUD_RATES[baud]) if baud < len(BAUD_RATES) else f"code {baud}",
+        "id": str(slave),
+        "heading_mode": {0: "six axes", 1: "nine axes"}.get(heading, f"code {heading}"),
+    }
+
+
+class HipnucModbusCodec:
+    """Measurements out of blocks of registers. Synchronization: one thread.
+
+    What was learned of the firmware stays, after `reset` too; scales and serial number are learned anew.
+    """
+
+    def __init__(self, ledger: Ledger, settings: HipnucModbusSettings) -> None:
+        self.ledger = ledger
+        self.polls: Sequence[Poll] = _polls(short=False)
+        self._fixed_incli = _INCLI[settings.inclinometer]
+        self._size = READ_BLOCK.read_bytes
+        self._book = PolledFrameDecoder(ledger, self._size)
+        self._stale_before = 0
+        self.reset()
+
+    @property
+    def stale(self) -> int:
+        """Blocks that repeated the one before."""
+        return self._stale_before + self._book.stale
+
+    def take(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+        """Take one reply. Never raises."""
+        if poll != _SAMPLE:
+            return self._take_serial(data)
+        if is_exception(data):
+            return self._take_exception(data)
+        return self._book.take(data, self._bad, self._measure)
+
+    def reset(self) -> None:
+        """Another module may be there: nothing is known of its values."""
+        self._book.reset()
+        self._quat_scale = 0.0
+        self._incli_scale = self._fixed_incli
+        self._serial = b""
+
+    def _take_exception(self, data: bytes) -> Sequence[PolledEvent]:
+        if data[2] == ILLEGAL_ADDRESS and self._size == READ_BLOCK.read_bytes:
+            self._book.book_reply(data, good=True)
+            self.polls, self._size = _polls(short=True), READ_SHORT_BLOCK.read_bytes
+            self._stale_before, self._book = self.stale, PolledFrameDecoder(self.ledger, self._size)
+            return (Vanished("this firmware has no register 0x4C: reading without the device's time from now on"),)
+        self.ledger.bytes_in += len(data)
+        self.ledger.bytes_in_bad_frames += len(data)
+        self.ledger.frames_bad_content += 1
+        return (BadFrame(BadReason.CONTENT, data),)
+
+    def _take_serial(self, data: bytes) -> Sequence[PolledEvent]:
+        whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)
+        self._book.book_reply(data, good=whole or is_exception(data))
+        if not whole:  # damaged, or a firmware that does not like this read: nothing is known
+            return ()
+        serial, before = data[DATA_AT:-CRC_BYTES], self._serial
+        self._serial = serial
+        if not before or serial == before:
+            return ()
+        return (Vanished(f"serial number {serial.hex().upper()}, was {before.hex().upper()}: another module"),)
+
+    def _bad(self, data: bytes) -> BadReason | None:
+        if not is_whole(data):
+            return BadReason.CRC
+        good = data[1] == READ_HOLDING and data[2] == len(data) - READ_OVERHEAD_BYTES
+        return None if good else BadReason.CONTENT
+
+    def _measure(self, data: bytes) -> Measured:
+        (
+            ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, celsius, pressure, qw, qx, qy, qz, ix, iy,
+        ) = BLOCK.unpack_from(data, DATA_AT)  # fmt: skip
+        has_time = len(data) == READ_BLOCK.read_bytes
+        a, w, b, angle = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB
+        return Measurement(
+            len(data), 0, UPTIME.unpack_from(data, DATA_AT + BLOCK.size)[0] if has_time else None,
+            (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b) if mx or my or mz else None,
+            self._quaternion(qw, qx, qy, qz), (roll * angle, pitch * angle, yaw * angle),
+            celsius * TEMPERATURE_C_PER_LSB if celsius or pressure else None,
+            pressure * PRESSURE_PA_PER_LSB if pressure else None,
+            self._inclination(ix, iy, roll * angle, pitch * angle),
+        ), True  # fmt: skip
+
+    def _quaternion(self, w: int, x: int, y: int, z: int) -> Quaternion | None:
+        if not self._quat_scale:
+            length = hypot(w, x, y, z)
+            fitting = [k for k in (QUAT_OLD_PER_LSB, QUAT_NEW_PER_LSB) if abs(length * k - 1) < UNIT_TOLERANCE]
+            if not fitting:
+                return None
+            self._quat_scale = fitting[0]
+        k = self._quat_scale
+        return (w * k, x * k, y * k, z * k) if w or x or y or z else None
+
+    def _inclination(self, x: int, y: int, roll_rad: float, pitch_rad: float) -> Pair | None:
+        if not self._incli_scale:
+            if not x and not y:
+                return None
+            if y or x < 0:
+                self._incli_scale = INCLI_DUAL_RAD_PER_LSB
+            elif abs(_dual_y_rad(roll_rad, pitch_rad)) > PITCHED_RAD:
+                self._incli_scale = INCLI_SINGLE_RAD_PER_LSB
+            else:
+                return None
+        k = self._incli_scale
+        return x * k, y * k
+
+
+_INCLI: Final = {"auto": 0.0, "single": INCLI_SINGLE_RAD_PER_LSB, "dual": INCLI_DUAL_RAD_PER_LSB}
+
+
+def _dual_y_rad(roll_rad: float, pitch_rad: float) -> float:
+    """What the Y axis of a dual-axis inclinometer shows in this attitude: atan2(gy, gz) of the vertical in the body."""
+    return atan2(sin(pitch_rad), cos(pitch_rad) * cos(roll_rad))
+
+
+def _polls(*, short: bool) -> Sequence[Poll]:
+    return Poll(READ_SHORT_BLOCK if short else READ_BLOCK), Poll(READ_SERIAL, CHECK_NS)
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+
+def pack_block(
+    *,
+    accel_m_s2: Vector3,
+    gyro_rad_s: Vector3,
+    mag_t: Vector3,
+    euler_rad: Vector3,
+    quat_wxyz: Quaternion,
+    temperature_c: float,
+    pressure_pa: float,
+    uptime_ms: int | None,
+    incli_counts: tuple[int, int] = (0, 0),
+    quat_per_lsb: float = QUAT_NEW_PER_LSB,
+) -> bytes:
+    """Registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
+    data = BLOCK.pack(
+        *(counts_of(a / ACCEL_M_S2_PER_LSB, 16) for a in accel_m_s2),
+        *(counts_of(w / GYRO_RAD_S_PER_LSB, 16) for w in gyro_rad_s),
+        *(counts_of(b / MAG_T_PER_LSB, 16) for b in mag_t),
+        *(counts_of(angle / EULER_RAD_PER_LSB, 32) for angle in euler_rad),
+        counts_of(temperature_c / TEMPERATURE_C_PER_LSB, 16),
+        counts_of(pressure_pa / PRESSURE_PA_PER_LSB, 32),
+        *(counts_of(q / quat_per_lsb, 16) for q in quat_wxyz),
+        *incli_counts,
+    )
+    return data if uptime_ms is None else data + UPTIME.pack(uptime_ms % 2**32)
+
+
+def pack_identity(product: str, firmware: int, loader: int, serial: bytes) -> bytes:
+    """Registers 0x70 … 0x83."""
+    head = product.encode("ascii")[:NAME_BYTES].ljust(NAME_BYTES, b"\0") + VERSIONS.pack(firmware, loader)
+    return (head.ljust(SERIAL_AT, b"\0") + serial).ljust(2 * IDENTITY_REGISTERS, b"\0")
+
+
+def _example_reading(random: Random) -> bytes:
+    """A block with random values."""
+    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
+
+    def three(spread: float) -> Vector3:
+        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
+
+    data = pack_block(
+        accel_m_s2=three(9.8), gyro_rad_s=three(2), mag_t=three(5e-5), euler_rad=euler312_from_quat(quat),
+        quat_wxyz=quat, temperature_c=random.uniform(-40, 85), pressure_pa=random.uniform(80_000, 110_000),
+        uptime_ms=random.randrange(2**32),
+    )  # fmt: skip
+    return framed(FACTORY_ID, registers_reply(data))
+
+
+DRIVER: Final = PolledDriver(
+    name="hipnuc-modbus",
+    title="HiPNUC CH0x0, CH10x, HI14 (RS-485, Modbus RTU)",
+    settings=HipnucModbusSettings,
+    tick_ns=NS_PER_MS,
+    tick_modulus=2**32,
+    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
+    navigation_frame="ENU",
+    link="rs485",
+    targets=(FACTORY_ID, *(slave for slave in SLAVES if slave != FACTORY_ID)),
+    probe=probe,
+    set_up=set_up,
+    make_codec=HipnucModbusCodec,
+    update_ns=update_ns,
+    example_reading=_example_reading,
+    actions=ACTIONS,
+)

@@ -1,0 +1,99 @@
+"""Dialogues that change a HiPNUC module on RS-485: what is written is checked before, and read back where it can be.
+
+Manual "IMU配置手冊" V1.5.9, section 4.3. Settings are lost at power-off unless `save` follows. A new ID is in force at
+once: what comes next goes to the new address. When a new baud rate is in force the manual does not say; saved and
+restarted, it is. SET_LV and URFR cannot be read: their confirmation is all there is.
+"""
+
+from enum import Enum
+from typing import Final
+
+from imud.contracts.polling import TransferScript
+from imud.devices.arguments import listed, member
+from imud.devices.hipnuc.common.registers import BAUD_RATES, BY_NAME, ID_MAX, Register
+from imud.devices.hipnuc.modbus.frames import check_written, read_registers, registers_of, write_register
+from imud.devices.hipnuc.uart.commands import AttitudeMode, LevelReset
+from imud.errors import BadArgument, DeviceRefused, TransferError
+
+SAVE: Final = 0x0000
+FACTORY_RESET: Final = 0x0001
+RESTART: Final = 0x00FF
+
+
+class LineMounting(Enum):
+    """The five mountings that register URFR has."""
+
+    LEVEL = 0
+    Y_DOWN = 1
+    Y_UP = 2
+    X_UP = 3
+    X_DOWN = 4
+
+
+def save() -> TransferScript[None]:
+    """Write all settings to flash."""
+    return _write(BY_NAME["CTRL"], SAVE)
+
+
+def factory_reset() -> TransferScript[None]:
+    """Back to factory settings, ID and baud rate included; they are in force after a restart at the latest."""
+    return _write_unheard(BY_NAME["CTRL"], FACTORY_RESET)
+
+
+def restart() -> TransferScript[None]:
+    """Restart, as by power-on. Whether it is confirmed is not stated, so silence is not taken for a failure."""
+    return _write_unheard(BY_NAME["CTRL"], RESTART)
+
+
+def set_baud(baud: int) -> TransferScript[None]:
+    """Set the baud rate. Raises BadArgument, DeviceRefused, TransferError."""
+    if isinstance(baud, bool) or baud not in BAUD_RATES:
+        raise BadArgument(f"UART1_BAUD: expected one of {listed(BAUD_RATES)} baud, got {baud!r}")
+    return _write_unheard(BY_NAME["UART1_BAUD"], BAUD_RATES.index(baud))
+
+
+def set_id(new_id: int) -> TransferScript[None]:
+    """Take another address, 1 … 128. It may be confirmed from the old address, the new one, or not at all."""
+    if isinstance(new_id, bool) or new_id not in BY_NAME["MD_ID"].values:
+        raise BadArgument(f"MD_ID: expected 1 … {ID_MAX}, got {new_id!r}; higher ones go by serial number")
+    return _write_unheard(BY_NAME["MD_ID"], new_id)
+
+
+def set_heading_mode(mode: AttitudeMode) -> TransferScript[None]:
+    """Six or nine axes."""
+    return _write(BY_NAME["HEADING_MODE"], member("mode", mode, AttitudeMode).value)
+
+
+def set_mounting(mounting: LineMounting) -> TransferScript[None]:
+    """How the module is mounted."""
+    return _write(BY_NAME["URFR"], member("mounting", mounting, LineMounting).value)
+
+
+def auto_level(kind: LevelReset) -> TransferScript[None]:
+    """Make the present attitude level, or cancel that. The module must be at rest."""
+    return _write(BY_NAME["SET_LV"], member("kind", kind, LevelReset).value)
+
+
+def read(register: Register) -> TransferScript[tuple[int, ...]]:
+    """The words of one register. Raises DeviceRefused, TransferError."""
+    return registers_of((yield read_registers(register.address, register.count)), register.count)
+
+
+def _write(register: Register, value: int) -> TransferScript[None]:
+    """Write, and read back what can be read. Raises DeviceRefused, TransferError."""
+    request = write_register(register.address, value)
+    check_written((yield request), request)
+    if "R" in register.access:
+        (now,) = yield from read(register)
+        if now != value:
+            raise DeviceRefused(f"{register.name}: wrote {value}, the module has {now}")
+
+
+def _write_unheard(register: Register, value: int) -> TransferScript[None]:
+    """Write what may stop the module from being heard where it was. Raises DeviceRefused for an exception only."""
+    request = write_register(register.address, value)
+    try:
+        reply = yield request
+    except TransferError:
+        return
+    check_written(reply, request)

@@ -1,0 +1,1 @@
+"""HiPNUC modules over NMEA 2000."""

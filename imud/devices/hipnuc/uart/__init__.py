@@ -1,0 +1,1 @@
+"""HiPNUC modules over a UART: HI91, HI92, ASCII commands."""

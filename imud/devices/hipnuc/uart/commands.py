@@ -1,0 +1,309 @@
+r"""ASCII commands of HiPNUC modules (replies: `replies.py`). Manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
+
+    LOG HI91 ONTIME 0.01\r\n   →   OK\r\n        done
+                               →   ERR…\r\n      refused
+                               →   (nothing)     not understood: unknown commands get no reply at all
+    LOG VERSION\r\n            →   PNAME=HI14R3\r\n … OK\r\n
+
+Each function returns a `Request` and raises BadArgument for what the device would not take. Settings last until power
+is off unless `save_config` follows; `mounting`, `serial_config` take effect after `save_config` and `reboot`.
+"""
+
+from collections.abc import Callable
+from enum import Enum, StrEnum
+from typing import Final
+
+from imud.attitude import Matrix3, is_rotation
+from imud.contracts.session import Request, of_text
+from imud.devices.arguments import listed, member
+from imud.devices.hipnuc.uart.replies import is_end, is_rejection, is_setting_line, is_version_line
+from imud.errors import BadArgument
+from imud.units import NS_PER_S
+
+LINE_END: Final = "\r\n"
+BAUD_RATES: Final = (115200, 921600, 460800, 256000, 230400, 9600)
+"""Rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory default first."""
+REPLY_TIMEOUT_NS: Final = NS_PER_S // 2
+FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S  # erasing a flash page takes longer than a reply; the manual gives no time
+
+RATES_HZ: Final = (1, 2, 5, 10, 20, 50, 100, 200, 250, 500, 1000)
+"""Output rates: those of section 2.2.5 and of table 3.7. 5 Hz stands in neither; "and so on" is read to include it."""
+SOUT_DIVIDER_MAX: Final = 64
+PIN_MAX: Final = 9
+ROTATION_TOLERANCE: Final = 1e-3
+"""How far nine numbers typed with three decimals may be from a rotation."""
+
+
+class OutputMessage(StrEnum):
+    """Output messages."""
+
+    HI91 = "HI91"
+    """Floats, with device time. `IMU91` is its other name."""
+    HI92 = "HI92"
+    """Integers, without device time."""
+
+
+MAX_RATE_HZ: Final = {
+    OutputMessage.HI91: {9600: 10, 115200: 100, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
+    OutputMessage.HI92: {9600: 10, 115200: 200, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
+}
+"""Highest output rate by baud rate (table 3.7)."""
+
+
+class AttitudeMode(Enum):
+    """Whether the magnetometer aids the heading."""
+
+    SIX_AXIS = 0
+    """Heading is relative, 0 at power-on."""
+    NINE_AXIS = 1
+    """Heading is magnetic; needs one calibration and an undisturbed field."""
+
+
+class LevelReset(Enum):
+    """What to do with the level; the module must be at rest."""
+
+    RELATIVE = 2
+    """Pitch and roll are zero as the module stands now, whatever its tilt."""
+    AUTOMATIC = 3
+    """As RELATIVE and for the accelerometer too, but only within 5° of level or of upside down."""
+    CANCEL = 5
+    """Back to the factory's level."""
+
+
+class YawMode(Enum):
+    """How `yaw` takes its angle."""
+
+    RELATIVE = 0
+    """Added to the present yaw."""
+    ABSOLUTE = 1
+    """Replaces the present yaw."""
+
+
+class PinFunction(Enum):
+    """Functions of the multi-purpose pins (firmware 1.5.5 and newer), with the pin they have by default."""
+
+    SIN = 1
+    """Input of sync or PPS pulses; IO1."""
+    SOUT = 2
+    """High for 80 µs before each frame; IO2."""
+    LED = 3
+    """IO5."""
+    SOUT_DIV = 4
+    """Every n-th SOUT pulse, see `sout_divider`; IO6."""
+    ALARM = 5
+    """High while an angle is out of range, see `alarm`; IO9."""
+
+
+class AlarmAxis(StrEnum):
+    """The axis whose angle the alarm watches."""
+
+    X = "X"
+    Y = "Y"
+
+
+class Mounting(Enum):
+    """The nine mountings of section 2.2.4. The value is the URFR matrix, from new sensor axes to the old ones."""
+
+    LEVEL = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    """Z up: the default."""
+    X_MINUS_90 = ((1, 0, 0), (0, 0, 1), (0, -1, 0))
+    """Turned by -90° about X: Y down."""
+    X_PLUS_90 = ((1, 0, 0), (0, 0, -1), (0, 1, 0))
+    """Turned by 90° about X: Y up."""
+    X_180 = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+    """Turned by 180° about X."""
+    Y_PLUS_90 = ((0, 0, -1), (0, 1, 0), (1, 0, 0))
+    """Turned by 90° about Y: X up."""
+    Y_MINUS_90 = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))
+    """Turned by -90° about Y: X down."""
+    Y_180 = ((-1, 0, 0), (0, 1, 0), (0, 0, -1))
+    """Turned by 180° about Y."""
+    Z_PLUS_90 = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
+    """Turned by 90° about Z."""
+    Z_MINUS_90 = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+    """Turned by -90° about Z."""
+
+
+class Query(StrEnum):
+    """What can be asked; each reply is lines and then OK."""
+
+    VERSION = "VERSION"
+    USRCONFIG = "USRCONFIG"
+    COMCONFIG = "COMCONFIG"
+    MAGCONFIG = "MAGCONFIG"
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def reboot() -> Request:
+    """Restart, as by power-on. Not answered."""
+    return _command("REBOOT", silent=True)
+
+
+def save_config() -> Request:
+    """Write all settings to flash."""
+    return _command("SAVECONFIG", timeout_ns=FLASH_TIMEOUT_NS)
+
+
+def factory_reset() -> Request:
+    """Back to factory settings, the baud rate included."""
+    return _command("FRESET", timeout_ns=FLASH_TIMEOUT_NS)
+
+
+def unlog_all() -> Request:
+    """Set the rate of every timed message to 0."""
+    return _command("UNLOGALL")
+
+
+def serial_config(baud: int) -> Request:
+    """Set the baud rate. A module at a rate that the host does not expect is lost: keep contact or roll back."""
+    if baud not in BAUD_RATES:
+        raise BadArgument(f"SERIALCONFIG: expected one of {listed(sorted(BAUD_RATES))} baud, got {baud!r}")
+    return _command(f"SERIALCONFIG {int(baud)}")
+
+
+def attitude_mode(mode: AttitudeMode) -> Request:
+    """Choose 6-axis or 9-axis (AHRS) mode."""
+    return _command(f"CONFIG ATT MODE {member('mode', mode, AttitudeMode).value}")
+
+
+def level_reset(kind: LevelReset) -> Request:
+    """Set or cancel the level."""
+    return _command(f"CONFIG ATT RST {member('kind', kind, LevelReset).value}")
+
+
+def yaw(mode: YawMode, angle_deg: float) -> Request:
+    """Set yaw, -180° … 180°; lost at power-off."""
+    angle = _degrees("CONFIG YAW", "angle", angle_deg)
+    return _command(f"CONFIG YAW {member('mode', mode, YawMode).value} {angle}")
+
+
+def mounting(matrix: Mounting | Matrix3) -> Request:
+    """Set the rotation from new sensor axes to the old ones (URFR): a `Mounting` or any proper rotation."""
+    rows: Matrix3 = matrix.value if isinstance(matrix, Mounting) else matrix
+    if [len(row) for row in rows] != [3, 3, 3] or not is_rotation(rows, ROTATION_TOLERANCE):
+        raise BadArgument(
+            f"CONFIG IMU URFR: expected a rotation (three rows of three, orthonormal within {ROTATION_TOLERANCE:g}, "
+            f"determinant +1), got {rows}; a mirrored or scaled axis is not a mounting"
+        )
+    return _command("CONFIG IMU URFR " + ",".join(_text(value) for row in rows for value in row))
+
+
+def magnetic_calibration(enabled: bool) -> Request:
+    """Turn the calibration of the magnetometer in the background on (the default) or off (section 8.2)."""
+    return _command(f"CONFIG IMU EN_MCAL {_flag('enabled', enabled)}")
+
+
+def pin_function(function: PinFunction, pin: int) -> Request:
+    """Give `function` to pin IO1 … IO9. Not every product has every pin."""
+    number = _whole("CONFIG PMUX", "pin", pin, 1, PIN_MAX)
+    return _command(f"CONFIG PMUX{member('function', function, PinFunction).value} IO{number}")
+
+
+def alarm(axis: AlarmAxis, min_deg: float, max_deg: float, enabled: bool) -> Request:
+    """Watch the angle of an axis: the alarm pin is high outside `min_deg` … `max_deg`."""
+    name = "CONFIG PMUX5"
+    low, high = (_degrees(name, what, v) for what, v in (("minimum", min_deg), ("maximum", max_deg)))
+    if not min_deg < max_deg:
+        raise BadArgument(f"{name}: expected the minimum below the maximum, got {low}° and {high}°")
+    return _command(f"{name} {member('axis', axis, AlarmAxis)},{low},{high},0,{_flag('enabled', enabled)}")
+
+
+def sout_divider(divider: int) -> Request:
+    """Divide SOUT pulses by 1 … 64 for the SOUT_DIV pin."""
+    return _command(f"CONFIG PMUX4 DIV{_whole('CONFIG PMUX4', 'divider', divider, 1, SOUT_DIVIDER_MAX)}")
+
+
+def log_enable() -> Request:
+    """Send data frames (the default)."""
+    return _command("LOG ENABLE")
+
+
+def log_disable() -> Request:
+    """Send no data frames, whatever their rates."""
+    return _command("LOG DISABLE")
+
+
+def log_ontime(message: OutputMessage, rate_hz: int, baud: int | None = None) -> Request:
+    """Send `message` at one of RATES_HZ, or not at all (0). With `baud`, refuses what does not fit through the line."""
+    name = f"LOG {member('message', message, OutputMessage)} ONTIME"
+    if rate_hz != 0 and rate_hz not in RATES_HZ:
+        raise BadArgument(f"{name}: expected 0 (off) or one of {listed(RATES_HZ)} Hz, got {rate_hz!r}")
+    if baud is not None and rate_hz > max_rate_hz(message, baud):
+        raise BadArgument(
+            f"{name}: expected at most {max_rate_hz(message, baud)} Hz at {baud} baud, got {rate_hz} Hz; "
+            f"set a higher baud rate first"
+        )
+    return _command(f"{name} {_text(1 / rate_hz if rate_hz else 0)}")
+
+
+def log_onmark(message: OutputMessage) -> Request:
+    """Send `message` once for each pulse on SIN or `log_once`. Turn timed output off first (`unlog_all`)."""
+    return _command(f"LOG {member('message', message, OutputMessage)} ONMARK 1")
+
+
+def log_once(message: OutputMessage) -> Request:
+    """Send `message` once, as a pulse on SIN would. `log_onmark` comes first."""
+    return _command(f"LOG {member('message', message, OutputMessage)} ONMARK ONCE")
+
+
+def ask(query: Query) -> Request:
+    """Ask for one of the four reports."""
+    kind = member("query", query, Query)
+    is_part = is_version_line if kind is Query.VERSION else is_setting_line
+    return _command(f"LOG {kind}", is_part=is_part, messages_min=2)
+
+
+def max_rate_hz(message: OutputMessage, baud: int) -> int:
+    """Highest output rate of `message` at `baud` (table 3.7). Raises BadArgument for a rate the table does not have."""
+    rates = MAX_RATE_HZ[message]
+    if baud not in rates:
+        raise BadArgument(f"baud rate: expected one of {listed(sorted(rates))}, got {baud!r}")
+    return rates[baud]
+
+
+def _never(_line: str) -> bool:
+    return False
+
+
+def _command(
+    text: str,
+    *,
+    timeout_ns: int = REPLY_TIMEOUT_NS,
+    silent: bool = False,
+    is_part: Callable[[str], bool] = _never,
+    messages_min: int = 1,
+) -> Request:
+    payload = (text + LINE_END).encode("ascii")
+    return Request(
+        payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min
+    )
+
+
+# --- argument checks --------------------------------------------------------------------------------------------------
+
+
+def _flag(name: str, value: bool) -> int:
+    if not isinstance(value, bool):
+        raise BadArgument(f"{name}: expected true or false, got {value!r}")
+    return int(value)
+
+
+def _whole(command: str, name: str, value: int, low: int, high: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise BadArgument(f"{command}: expected a whole {name} of {low} … {high}, got {value!r}")
+    return value
+
+
+def _degrees(command: str, name: str, value: float) -> str:
+    """An angle in text. NaN and infinity are refused too."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -180 <= value <= 180:
+        raise BadArgument(f"{command}: expected a {name} of -180 … 180°, got {value!r}")
+    return _text(value)
+
+
+def _text(value: float) -> str:
+    """A number as the manual writes it: no exponent, no trailing zeros, no minus before zero."""
+    text = f"{value:.6f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text

@@ -1,0 +1,1 @@
+"""What the IMU61x protocols share: models, registers."""

@@ -1,0 +1,1 @@
+"""IMU61x over SPI."""

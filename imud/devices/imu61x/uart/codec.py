@@ -1,0 +1,234 @@
+"""Forsense IMU61x on a UART: AHRS frames and replies. Manual "IMU61X Interface Protocol and Instructions", chapter 1.
+
+    AHRS, id 0x0002, 44 bytes   timer µs u32 | pitch | roll | yaw ° | accel 3 g | gyro 3 °/s | temperature °C, all f32
+
+Framing stands in `framing.py`, the other frames in `replies.py`, what is sent to the device in `commands.py`. Pitch
+comes before roll. The quaternion is computed from the angles, whose convention is assumed (`common.EULER_CONVENTION`).
+
+The timer counts µs and wraps after 71.6 minutes.
+"""
+
+import struct
+from collections.abc import Sequence
+from math import cos, isfinite, sin
+from random import Random
+from typing import Any, Final
+
+from imud.attitude import quat_from_euler_zyx
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
+from imud.contracts.driver import StreamDriver
+from imud.contracts.settings import NoSettings
+from imud.devices.imu61x.common.family import EULER_CONVENTION, M_S2_PER_G, NAVIGATION_FRAME, RAD_S_PER_DEG_S, crc32
+from imud.devices.imu61x.uart.actions import ACTIONS
+from imud.devices.imu61x.uart.commands import AHRS_FRAME_BYTES, BAUD_RATES
+from imud.devices.imu61x.uart.framing import CRC_BYTES, DEVICE_SYNC, HEADER, Frame, FrameFinder, encode_frame
+from imud.devices.imu61x.uart.replies import (
+    PARAMETER_FRAME,
+    RESULT_DONE,
+    STATUS_FRAME,
+    Status,
+    is_reply,
+    pack_acknowledgement,
+    pack_parameters,
+    pack_status,
+)
+from imud.devices.imu61x.uart.session import identify, read_settings, wake
+from imud.ledger import Ledger
+from imud.sample import Measurement, Vector3
+from imud.units import NS_PER_US, RAD_PER_DEG
+
+AHRS: Final = struct.Struct("<I10f")
+"""timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)."""
+AHRS_FRAME: Final = 0x0002
+TIMER_MODULUS: Final = 2**32
+
+_HEAD: Final = HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS.size)
+_ONLY: Final = struct.Struct(f"<{HEADER.size}xI10fI")  # a whole frame: values and CRC
+
+
+class Imu61xCodec:
+    """Measurements and reply frames out of bytes in any split. Synchronization: one thread.
+
+    Frames of an unknown kind are counted (`frames_ignored`) and dropped. Frames of a known kind that are too short are
+    bad. A frame with NaN or infinity is delivered without the values concerned, after a `BadFrame` (not-finite) that
+    tells of it; its bytes and itself count as good.
+    """
+
+    def __init__(self, ledger: Ledger, _settings: NoSettings | None = None) -> None:
+        self.ledger = ledger
+        self._finder = FrameFinder(ledger, DEVICE_SYNC)
+
+    def feed(self, data: bytes) -> Sequence[CodecEvent]:
+        """Take bytes in the order they came; return what they completed. Never raises for any bytes."""
+        if len(data) == AHRS_FRAME_BYTES and data.startswith(_HEAD) and self._finder.idle:
+            only = self._take_only(data)
+            if only is not None:
+                return (only,)
+        return self._taken(self._finder.feed(data))
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """The line is idle: return whole frames that wait inside a longer frame that never came."""
+        return self._taken(self._finder.flush())
+
+    def reset(self) -> None:
+        """The stream broke: what is pending becomes skipped."""
+        self._finder.reset()
+
+    def _take_only(self, data: bytes) -> Measurement | None:
+        """A read that is one AHRS frame, all values finite, which is what a port gives as a rule."""
+        *values, crc = _ONLY.unpack(data)
+        if crc32(data[:-CRC_BYTES]) != crc or not isfinite(sum(values)):
+            return None
+        ledger = self.ledger
+        ledger.bytes_in += AHRS_FRAME_BYTES
+        ledger.bytes_in_good_frames += AHRS_FRAME_BYTES
+        ledger.frames_good += 1
+        ledger.frames_in_samples += 1
+        return _finite_measurement(values, AHRS_FRAME_BYTES, 0)
+
+    def _taken(self, found: Sequence[Frame | BadFrame]) -> list[CodecEvent]:
+        events: list[CodecEvent] = []
+        for frame in found:
+            if isinstance(frame, BadFrame):
+                events.append(frame)
+            else:
+                self._take(frame, events)
+        return events
+
+    def _take(self, frame: Frame, events: list[CodecEvent]) -> None:
+        """Book a frame whose CRC matches, and say what is in it."""
+        ledger, size = self.ledger, len(frame.raw)
+        reply = is_reply(frame.frame_id, frame.payload)
+        measured = frame.frame_id == AHRS_FRAME and not reply
+        if (measured and len(frame.payload) < AHRS.size) or (not reply and frame.frame_id in _REPLY_FRAMES):
+            ledger.frames_bad_content += 1
+            ledger.bytes_in_bad_frames += size
+            events.append(BadFrame(BadReason.CONTENT, frame.raw))
+            return
+        ledger.bytes_in_good_frames += size
+        ledger.frames_good += 1
+        if reply:
+            ledger.frames_in_replies += 1
+            events.append(ReplyFrame(frame.frame_id, frame.payload))
+        elif measured:
+            ledger.frames_in_samples += 1
+            self._measure(frame, events)
+        else:
+            ledger.frames_ignored += 1
+
+    def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
+        values = AHRS.unpack_from(frame.payload)
+        size, trailing = len(frame.raw), frame.trailing_bytes
+        if isfinite(sum(values)):  # 32-bit floats cannot add up to a 64-bit infinity
+            events.append(_finite_measurement(values, size, trailing))
+            return
+        self.ledger.frames_not_finite += 1
+        events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
+        events.append(_partial_measurement(values, size, trailing))
+
+
+_REPLY_FRAMES: Final = (STATUS_FRAME, PARAMETER_FRAME)
+
+
+def _finite_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
+    """An AHRS frame all of whose values are finite; the quaternion is `quat_from_euler_zyx`, spelt out for speed."""
+    us, pitch_deg, roll_deg, yaw_deg, ax, ay, az, gx, gy, gz, temperature_c = values
+    g, rad = M_S2_PER_G, RAD_S_PER_DEG_S
+    roll, pitch, yaw = roll_deg * RAD_PER_DEG, pitch_deg * RAD_PER_DEG, yaw_deg * RAD_PER_DEG
+    cr, sr, cp, sp, cy, sy = cos(roll / 2), sin(roll / 2), cos(pitch / 2), sin(pitch / 2), cos(yaw / 2), sin(yaw / 2)
+    cc, ss, cs, sc = cy * cp, sy * sp, cy * sp, sy * cp
+    return Measurement(
+        size, trailing, us,
+        (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), None,
+        (cc * cr + ss * sr, cc * sr - ss * cr, cs * cr + sc * sr, sc * cr - cs * sr),
+        (roll, pitch, yaw), temperature_c,
+    )  # fmt: skip
+
+
+def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
+    """The same without the groups of values of which one is NaN or infinite."""
+    us, pitch, roll, yaw = values[:4]
+    euler = _scaled3((roll, pitch, yaw), RAD_PER_DEG)
+    return Measurement(
+        size, trailing, us,
+        accel_m_s2=_scaled3(values[4:7], M_S2_PER_G),
+        gyro_rad_s=_scaled3(values[7:10], RAD_S_PER_DEG_S),
+        quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
+        euler_rad=euler,
+        temperature_c=values[10] if isfinite(values[10]) else None,
+    )  # fmt: skip
+
+
+def _scaled3(values: Sequence[float], factor: float) -> Vector3 | None:
+    x, y, z = values
+    return (x * factor, y * factor, z * factor) if isfinite(x) and isfinite(y) and isfinite(z) else None
+
+
+# --- the device's side ------------------------------------------------------------------------------------------------
+
+K1_FRAME: Final = 0x000C
+"""Id under which the simulator sends K1; no source has it, the codec takes any."""
+
+
+def encode_ahrs(
+    *, timer_us: int, accel_m_s2: Vector3, gyro_rad_s: Vector3, euler_rad: Vector3, temperature_c: float
+) -> bytes:
+    """A whole AHRS frame from SI values, `euler_rad` roll, pitch, yaw; time wraps. Raises OverflowError beyond f32."""
+    roll, pitch, yaw = euler_rad
+    payload = AHRS.pack(
+        timer_us % TIMER_MODULUS,
+        *(angle / RAD_PER_DEG for angle in (pitch, roll, yaw)),
+        *(a / M_S2_PER_G for a in accel_m_s2),
+        *(w / RAD_S_PER_DEG_S for w in gyro_rad_s),
+        temperature_c,
+    )
+    return encode_frame(DEVICE_SYNC, AHRS_FRAME, payload)
+
+
+def encode_status(status: Status) -> bytes:
+    """A whole S1 frame."""
+    return encode_frame(DEVICE_SYNC, STATUS_FRAME, pack_status(status))
+
+
+def encode_parameter(index: int, value: float) -> bytes:
+    """A whole P1 frame."""
+    return encode_frame(DEVICE_SYNC, PARAMETER_FRAME, pack_parameters(value, index))
+
+
+def encode_acknowledgement(command: int, result: int = RESULT_DONE, frame_id: int = K1_FRAME) -> bytes:
+    """A whole K1 frame."""
+    return encode_frame(DEVICE_SYNC, frame_id, pack_acknowledgement(command, result))
+
+
+def _example_frame(random: Random) -> bytes:
+    """An AHRS frame with random values."""
+
+    def three(spread: float) -> Vector3:
+        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
+
+    return encode_ahrs(
+        timer_us=random.randrange(TIMER_MODULUS),
+        accel_m_s2=three(9.8),
+        gyro_rad_s=three(2),
+        euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
+        temperature_c=random.uniform(-40, 85),
+    )
+
+
+DRIVER: Final = StreamDriver(
+    name="imu61x-uart",
+    title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (UART)",
+    baud_rates=BAUD_RATES,
+    settings=NoSettings,
+    make_codec=Imu61xCodec,
+    tick_ns=NS_PER_US,
+    tick_modulus=TIMER_MODULUS,
+    euler_convention=EULER_CONVENTION,
+    navigation_frame=NAVIGATION_FRAME,
+    lines=frozenset({"reset"}),
+    actions=ACTIONS,
+    identify=identify,
+    read_settings=read_settings,
+    wake=wake,
+    example_frame=_example_frame,
+)

@@ -1,0 +1,232 @@
+"""Commands to the Forsense IMU61x on a UART. Manual "IMU61X Interface Protocol", section 1.6, tables 10 to 12.
+
+    55 AA | command u16 | 24 u16 | param1 f32 | 0 f32 | param3 u32 | 0 u32 | 0 i32 | 0 i32 | CRC-32
+
+Each function returns a `Request` and raises BadArgument for what the device would not take: it would silently take a
+default instead. Settings last until power is off unless `save` follows. Whether the device obeys more than
+`output_mode` while it streams stands in no source; `session.py` does not depend on it.
+
+Commands that change something are acknowledged (K1). Its result is not judged here, because its codes stand in no
+source: any K1 for the command ends the reply.
+"""
+
+from collections.abc import Callable
+from enum import Enum
+from typing import Final
+
+from imud.contracts.codec import Message
+from imud.contracts.session import Request, never
+from imud.devices.arguments import member, one_of
+from imud.devices.imu61x.common.family import FILTERS, I2C_ADDRESSES, filter_control
+from imud.devices.imu61x.uart.framing import HOST_SYNC, OVERHEAD_BYTES, encode_frame
+from imud.devices.imu61x.uart.replies import (
+    Parameter,
+    pack_parameters,
+    parse_acknowledgement,
+    parse_parameter,
+    parse_status,
+)
+from imud.errors import BadArgument
+from imud.units import BITS_PER_UART_BYTE, NS_PER_MS, NS_PER_S
+
+BAUD_RATES: Final = (115200, 921600, 460800, 230400, 1500000)
+"""Rates of table 12, the factory default first, then those that people choose for 200 and 400 Hz."""
+RATES_HZ: Final = (1, 10, 50, 100, 200, 400)
+"""AHRS output rates of table 12."""
+AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + 44
+REPLY_TIMEOUT_NS: Final = 300 * NS_PER_MS
+"""A reply of 76 bytes takes 7 ms at 115200 baud, and a USB adapter holds it for 16 ms; the manual gives no time."""
+FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S  # erasing a flash page takes longer than a reply; the manual gives no time
+CALIBRATION_TIMEOUT_NS: Final = 10 * NS_PER_S
+"""Static calibration of the gyroscope until its acknowledgement; assumed."""
+
+
+class Command(Enum):
+    """Numbers of commands (table 12)."""
+
+    STATUS = 1
+    AHRS = 2
+    OUTPUT_MODE = 3
+    HEADING = 4
+    SAVE = 5
+    READ_PARAMETER = 6
+    CALIBRATE_INSTALLATION = 7
+    INSTALLATION_STATUS = 8
+    RESTART = 9
+    CALIBRATE_GYRO = 10
+    SET_PARAMETER = 14
+    FACTORY_RESET = 15
+
+
+class OutputMode(Enum):
+    """What the device does by itself."""
+
+    STREAM = 1
+    """Sends AHRS frames."""
+    COMMAND = 100
+    """Sends nothing but replies."""
+
+
+class BusMode(Enum):
+    """The bus besides the UART (parameter 27)."""
+
+    UART_ONLY = 0
+    SPI = 1
+    """As delivered."""
+    I2C = 2
+    BY_PIN = 3
+    """A pin decides: open or low is SPI, high is I2C."""
+
+
+# --- questions --------------------------------------------------------------------------------------------------------
+
+
+def ask_status() -> Request:
+    """Ask for S1: versions, model, serial number, status (CMD 1)."""
+    return _command(Command.STATUS, "status", is_end=lambda message: parse_status(message) is not None)
+
+
+def ask_ahrs() -> Request:
+    """Ask for one AHRS frame (CMD 2). It comes as a sample, so nothing is waited for."""
+    return _command(Command.AHRS, "AHRS once", silent=True)
+
+
+def read_parameter(parameter: Parameter) -> Request:
+    """Ask for a parameter (CMD 6)."""
+    member("parameter", parameter, Parameter)
+
+    def is_end(message: Message) -> bool:
+        value = parse_parameter(message)
+        return value is not None and value.index == parameter
+
+    return _command(Command.READ_PARAMETER, f"read parameter {parameter.name}", param3=parameter, is_end=is_end)
+
+
+def ask_installation_status() -> Request:
+    """Ask how the installation error calibration stands (CMD 8).
+
+    Whether K1 or S1 carries the answer stands in no source: both are taken.
+    """
+    command = Command.INSTALLATION_STATUS
+    acknowledged = _acknowledges(command)
+    return _command(
+        command,
+        "installation calibration status",
+        is_end=lambda message: acknowledged(message) or parse_status(message) is not None,
+    )
+
+
+# --- orders -----------------------------------------------------------------------------------------------------------
+
+
+def output_mode(mode: OutputMode, *, baud: int = 0) -> Request:
+    """Stream AHRS frames, or only answer (CMD 3). With `baud`, the line is set to that rate first."""
+    name = f"output mode {member('mode', mode, OutputMode).name}"
+    return _command(Command.OUTPUT_MODE, name, param1=mode.value, baud=baud)
+
+
+def reset_heading(heading_deg: float) -> Request:
+    """Make the heading of the AHRS 0° … 360° (CMD 4)."""
+    if isinstance(heading_deg, bool) or not isinstance(heading_deg, int | float) or not 0 <= heading_deg <= 360:
+        raise BadArgument(f"heading: expected 0 … 360°, got {heading_deg!r}")
+    return _command(Command.HEADING, "heading reset", param1=heading_deg)
+
+
+def save() -> Request:
+    """Write the present parameters to flash, the output mode included (CMD 5)."""
+    return _command(Command.SAVE, "save", timeout_ns=FLASH_TIMEOUT_NS)
+
+
+def start_installation_calibration() -> Request:
+    """Begin to measure the mounting error (CMD 7); `ask_installation_status` tells how far it is."""
+    return _command(Command.CALIBRATE_INSTALLATION, "installation calibration")
+
+
+def restart() -> Request:
+    """Start the device's software anew (CMD 9)."""
+    return _command(Command.RESTART, "restart")
+
+
+def calibrate_gyro() -> Request:
+    """Measure the zero bias of the gyroscope (CMD 10); the device must be at rest."""
+    return _command(Command.CALIBRATE_GYRO, "gyro calibration", timeout_ns=CALIBRATION_TIMEOUT_NS)
+
+
+def set_baud(baud: int) -> Request:
+    """Set the rate of the UART (CMD 14, parameter 3). `session.change_baud` does it without losing the device."""
+    return _set(Parameter.BAUD, one_of("baud rate", baud, BAUD_RATES))
+
+
+def set_rate(rate_hz: int, *, baud: int | None = None) -> Request:
+    """Set the AHRS output rate (CMD 14, parameter 21). With `baud`, refuses what does not fit through the line."""
+    one_of("AHRS rate in Hz", rate_hz, RATES_HZ)
+    if baud is not None and rate_hz > max_rate_hz(baud):
+        raise BadArgument(
+            f"AHRS rate: expected at most {max_rate_hz(baud)} Hz at {baud} baud, got {rate_hz} Hz; "
+            "set a higher baud rate first"
+        )
+    return _set(Parameter.AHRS_RATE, rate_hz)
+
+
+def set_bus_mode(mode: BusMode) -> Request:
+    """Choose the bus besides the UART (CMD 14, parameter 27)."""
+    return _set(Parameter.BUS_MODE, member("bus mode", mode, BusMode).value)
+
+
+def set_i2c_address(address: int) -> Request:
+    """Set the 7-bit I2C address, 0x18 … 0x1B (CMD 14, parameter 30)."""
+    return _set(Parameter.I2C_ADDRESS, one_of("I2C address", address, I2C_ADDRESSES))
+
+
+def set_filter(accel: int, gyro: int) -> Request:
+    """Set the low-pass filters by their codes, indices of `common.FILTERS` (CMD 14, parameter 31)."""
+    for name, code in (("accelerometer", accel), ("gyroscope", gyro)):
+        one_of(f"{name} filter code", code, range(len(FILTERS)))
+    return _set(Parameter.FILTER, filter_control(accel, gyro))
+
+
+def factory_reset() -> Request:
+    """Back to factory settings, the baud rate included (CMD 15). `session.factory_reset` does not lose the device."""
+    return _command(Command.FACTORY_RESET, "factory reset", timeout_ns=FLASH_TIMEOUT_NS)
+
+
+def max_rate_hz(baud: int) -> int:
+    """Highest output rate that fits through a line of `baud` (200 Hz at 115200, note 1 of table 3)."""
+    return max(rate_hz for rate_hz in RATES_HZ if rate_hz * AHRS_FRAME_BYTES * BITS_PER_UART_BYTE <= baud)
+
+
+# --- how they are made ------------------------------------------------------------------------------------------------
+
+
+def encode_command(command: Command, param1: float = 0.0, param3: int = 0) -> bytes:
+    """The frame of a command, without any check of its arguments."""
+    return encode_frame(HOST_SYNC, command.value, pack_parameters(param1, param3))
+
+
+def _set(parameter: Parameter, value: int) -> Request:
+    return _command(Command.SET_PARAMETER, f"set parameter {parameter.name} to {value}", param1=value, param3=parameter)
+
+
+def _command(
+    command: Command,
+    name: str,
+    *,
+    param1: float = 0.0,
+    param3: int = 0,
+    is_end: Callable[[Message], bool] | None = None,
+    timeout_ns: int = REPLY_TIMEOUT_NS,
+    silent: bool = False,
+    baud: int = 0,
+) -> Request:
+    acknowledged = _acknowledges(command)
+    payload = encode_command(command, param1, param3)
+    # an acknowledgement of a question is part of its reply but does not end it
+    return Request(payload, name, is_end or acknowledged, never, acknowledged, timeout_ns, silent, baud=baud)
+
+
+def _acknowledges(command: Command) -> Callable[[Message], bool]:
+    def holds(message: Message) -> bool:
+        reply = parse_acknowledgement(message)
+        return reply is not None and reply.command == command.value
+
+    return holds

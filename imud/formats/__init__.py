@@ -1,0 +1,1 @@
+"""Bytes without I/O that several parts share."""

@@ -1,0 +1,78 @@
+"""CAN frames (ISO 11898-1), filters, and the kernel's 16-byte `struct can_frame`.
+
+Frames travel between a link and a codec as `CanFrame`, and to a link as `struct can_frame`, so that a command is bytes
+on every kind of link.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+DATA_BYTES_MAX: Final = 8
+"""Data bytes of a classical CAN frame (ISO 11898-1)."""
+STANDARD_ID_MAX: Final = 0x7FF
+EXTENDED_ID_MAX: Final = 0x1FFF_FFFF
+EXTENDED_FLAG: Final = 0x8000_0000
+"""In the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)."""
+REMOTE_FLAG: Final = 0x4000_0000
+"""The same: a request without data (CAN_RTR_FLAG)."""
+ERROR_FLAG: Final = 0x2000_0000
+"""The same: news of the controller, no frame of the bus (CAN_ERR_FLAG)."""
+
+RAW_FRAME: Final = struct.Struct("=IB3x8s")
+"""`struct can_frame` in the machine's byte order: identifier with flags, length, data."""
+STANDARD_OVERHEAD_BITS, EXTENDED_OVERHEAD_BITS = 47, 67
+"""Bits of a frame besides its data, the pause of three bits behind it included, stuff bits not (ISO 11898-1): with an
+identifier of 11 bits, and of 29."""
+
+
+class CanFrame(NamedTuple):
+    """One data frame as received."""
+
+    can_id: int
+    """Identifier without flags."""
+    extended: bool
+    """Whether the identifier has 29 bits."""
+    data: bytes
+    t_rx_ns: int
+    """CLOCK_MONOTONIC of its arrival: when the kernel had it, where the kernel says so."""
+    after_loss: bool = False
+    """Whether frames are known to be missing right before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanFilter:
+    """Frames that a device needs: those whose identifier agrees with `can_id` in the bits of `mask`."""
+
+    can_id: int
+    mask: int
+    extended: bool
+
+    def takes(self, can_id: int, extended: bool) -> bool:
+        """Whether a frame passes."""
+        return extended == self.extended and not (can_id ^ self.can_id) & self.mask
+
+
+@dataclass(frozen=True, slots=True)
+class CyclicFrame:
+    """A frame that a bus must carry again and again for its devices to work (CANopen SYNC, say); imud sends it.
+
+    One device of a bus has it sent for all of them: a second one with a frame of the same identifier is refused."""
+
+    can_id: int
+    extended: bool
+    data: bytes
+    every_ns: int
+    """Its period, whole microseconds; the first one is sent at once."""
+
+
+def frame_bits(extended: bool, data_bytes: int) -> int:
+    """Shortest time of a frame on the wire, pause included, in bits; stuff bits make it up to 22 % longer."""
+    return (EXTENDED_OVERHEAD_BITS if extended else STANDARD_OVERHEAD_BITS) + 8 * data_bytes
+
+
+def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:
+    """A frame as `struct can_frame`. Raises ValueError for an identifier or a length that no frame can have."""
+    if not 0 <= can_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) or len(data) > DATA_BYTES_MAX:
+        raise ValueError(f"no CAN frame: identifier {can_id:#x}{' (29 bits)' * extended}, {len(data)} data bytes")
+    return RAW_FRAME.pack(can_id | EXTENDED_FLAG if extended else can_id, len(data), data)

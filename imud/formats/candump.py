@@ -1,0 +1,92 @@
+"""CAN logs as `candump -L` of can-utils writes them: one frame a line, stamped with the wall clock.
+
+    (1763717507.123456) can0 065#0000803F00000040
+     time s              bus  identifier, 3 hex digits (11 bits) or 8 (29 bits), # data
+
+What is no classical data frame is passed over and counted: remote frames (`#R`), CAN FD (`##`), error frames (bit 29 of
+the identifier). A direction mark (`R`, `T`) after the data and a raw length code (`_9`) after eight bytes are accepted.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from typing import BinaryIO, Final
+
+from imud.formats.can import DATA_BYTES_MAX, ERROR_FLAG, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
+from imud.units import NS_PER_S
+
+LINE_BYTES_MAX: Final = 512
+"""The longest line, CAN FD with 64 bytes and a long bus name, has some 190."""
+_FRAME: Final = re.compile(
+    rb"\((\d{1,18})\.(\d{1,9})\) +(\S+) +([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?"
+    rb"(?: [RT])?\s*"
+)
+_OTHER: Final = re.compile(
+    rb"\(\d{1,18}\.\d{1,9}\) +\S+ +[0-9A-Fa-f]{3,8}#(?:#[0-9A-Fa-f]+|R[\dA-Fa-f_]*)(?: [RT])?\s*"
+)
+_SEEMS: Final = re.compile(rb"\(\d{1,18}\.\d{1,9}\) +\S+ +[0-9A-Fa-f]{3,8}#")
+
+
+class CandumpReader:
+    """Reads a log from any binary stream. Iterate once: frames with the log's own times as `t_rx_ns`, never falling."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.passed_over = 0
+        """Valid lines that are no data frame."""
+        self.bad_lines = 0
+        self.first_bad = 0
+        """Number of the first line that is none of a log, from 1; 0 when there is none."""
+
+    @property
+    def problem(self) -> str:
+        """After iterating: what is wrong with the file, one sentence; empty when nothing is."""
+        if not self.bad_lines:
+            return ""
+        return f"{self.bad_lines} lines are none of a candump log (candump -L), the first is line {self.first_bad}"
+
+    def __iter__(self) -> Iterator[CanFrame]:
+        newest_ns, number = 0, 0
+        while line := self._file.readline(LINE_BYTES_MAX):
+            number += 1
+            match = _FRAME.fullmatch(line)
+            if match is None:
+                self._note(line, number)
+                continue
+            seconds, fraction, _, digits, data = match.groups()
+            can_id = int(digits, 16)
+            if can_id & ERROR_FLAG or can_id > EXTENDED_ID_MAX or (len(digits) == 3 and can_id > STANDARD_ID_MAX):
+                self._note(line if can_id & ERROR_FLAG else b"bad", number, passed=bool(can_id & ERROR_FLAG))
+                continue
+            newest_ns = max(newest_ns, int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")))
+            yield CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), newest_ns)
+
+    def _note(self, line: bytes, number: int, *, passed: bool = False) -> None:
+        if passed or _OTHER.fullmatch(line):
+            self.passed_over += 1
+        elif line.strip():
+            self.bad_lines += 1
+            self.first_bad = self.first_bad or number
+
+
+def is_candump(head: bytes) -> bool:
+    """Whether a file that begins so is such a log."""
+    return _SEEMS.match(head) is not None
+
+
+def candump_line(frame: CanFrame, bus: str = "can0") -> str:
+    """A frame as a line of a log, its `t_rx_ns` taken for the wall clock. Raises ValueError for no classical frame."""
+    most = EXTENDED_ID_MAX if frame.extended else STANDARD_ID_MAX
+    if not 0 <= frame.can_id <= most or len(frame.data) > DATA_BYTES_MAX or frame.t_rx_ns < 0:
+        raise ValueError(f"no classical CAN frame: {frame}")
+    seconds, ns = divmod(frame.t_rx_ns, NS_PER_S)
+    digits = 8 if frame.extended else 3
+    return f"({seconds:010d}.{ns // 1000:06d}) {bus} {frame.can_id:0{digits}X}#{frame.data.hex().upper()}\n"
+
+
+def write_candump(file: BinaryIO, frames: Iterable[CanFrame], bus: str = "can0") -> int:
+    """Append frames to a log; returns how many."""
+    count = 0
+    for frame in frames:
+        file.write(candump_line(frame, bus).encode("ascii"))
+        count += 1
+    return count

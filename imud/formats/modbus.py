@@ -1,0 +1,161 @@
+"""Modbus RTU frames as every master sees them: address, function, data, CRC; replies told from echoes and strangers.
+
+    request   address | function | data … | CRC low | CRC high
+    reply     address | function | data … | CRC low | CRC high        exception  address | function + 0x80 | code | CRC
+
+Source: "MODBUS over Serial Line" V1.02, chapter 2.5, and "MODBUS Application Protocol" V1.1b3, chapters 6 and 7. A
+frame has no sync word and no end mark: what it is follows from what was asked, and from the silence around it.
+"""
+
+from typing import Final
+
+from imud.formats.checksum import crc16_modbus
+from imud.units import NS_PER_US, uart_byte_ns
+
+READ_HOLDING: Final = 0x03
+WRITE_SINGLE: Final = 0x06
+EXCEPTION_BIT: Final = 0x80
+CRC_BYTES: Final = 2
+EXCEPTION_BYTES: Final = 5
+READ_OVERHEAD_BYTES: Final = 5
+"""Address, function, count of bytes, CRC around the registers of a reply to 0x03."""
+ADU_BYTES_MAX: Final = 256
+"""Longest frame on a serial line."""
+REGISTERS_MAX: Final = 125
+"""Most registers in one read: 250 bytes."""
+BROADCAST: Final = 0
+"""Address that all slaves obey and none answers."""
+SLAVES: Final = range(1, 248)
+"""Addresses of slaves."""
+
+FRAME_GAP_CHARACTERS: Final = 3.5
+FAST_GAP_NS: Final = 1_750 * NS_PER_US
+"""Silence between frames above 19200 baud, where 3.5 characters would be too short to see."""
+FAST_BAUD: Final = 19200
+
+ILLEGAL_ADDRESS: Final = 2
+EXCEPTIONS: Final = {
+    1: "the function is not known",
+    ILLEGAL_ADDRESS: "there is no such register",
+    3: "the value is not allowed",
+    4: "the device failed",
+    5: "accepted, and takes longer",
+    6: "the device is busy",
+    8: "its memory has a parity error",
+}
+"""What a slave says instead of a reply."""
+
+
+def framed(address: int, request: bytes) -> bytes:
+    """A whole frame of function and data."""
+    frame = bytes([address]) + request
+    return frame + crc16_modbus(frame).to_bytes(CRC_BYTES, "little")
+
+
+def is_whole(frame: bytes) -> bool:
+    """Whether the CRC at the end matches what comes before."""
+    return len(frame) > CRC_BYTES and crc16_modbus(frame) == 0
+
+
+def is_exception(frame: bytes) -> bool:
+    """Whether a frame says why there is no reply; its code is `frame[2]`."""
+    return len(frame) == EXCEPTION_BYTES and frame[1] & EXCEPTION_BIT != 0 and is_whole(frame)
+
+
+def exception_text(code: int) -> str:
+    """An exception in words."""
+    return f"exception {code}: {EXCEPTIONS.get(code, 'no meaning known')}"
+
+
+def frame_gap_ns(baud: int) -> int:
+    """Silence that ends a frame."""
+    return FAST_GAP_NS if baud > FAST_BAUD else round(FRAME_GAP_CHARACTERS * uart_byte_ns(baud))
+
+
+class ReplyFinder:
+    """Finds the reply to one request in what comes back, without I/O.
+
+    A frame that stands first and looks like the reply is it, damaged or not: who asked counts damage. After bytes that
+    belong to something else only a frame with a matching CRC is believed. `feed` all that is read; ask `rest` at the
+    end of waiting.
+    """
+
+    def __init__(self, request: bytes, reply_bytes: int, *, echoes: bool | None) -> None:
+        """`request` is the whole frame; `echoes`: whether the port hears what it sends, None for not known.
+
+        Where it is not known, the request must be no WRITE_SINGLE, whose reply is the same as an echo.
+        """
+        self.echo_seen: bool | None = None
+        """Whether the request came back; None while that is open."""
+        self.strange = 0
+        """Bytes that were neither echo nor reply."""
+        self._request = request
+        self._size = reply_bytes
+        self._expects_echo = echoes
+        self._data = b""
+
+    @property
+    def missing(self) -> int:
+        """How many bytes are still to come at least."""
+        may_be_echo = self.echo_seen is None and self._expects_echo is not False
+        may_be_short = may_be_echo or self._data[1:2] in (b"", self._error_function)
+        size = min(EXCEPTION_BYTES, self._size) if may_be_short else self._size
+        if may_be_echo and self._expects_echo:
+            size += len(self._request)
+        return max(1, size - len(self._data))
+
+    def feed(self, data: bytes) -> bytes | None:
+        """Take bytes; return the reply once it is there."""
+        self._data += data
+        if self.echo_seen is None and self._expects_echo is not False and not self._take_echo():
+            return None
+        return self._find()
+
+    def rest(self) -> bytes:
+        """What came and is no reply. If it has the size of one and is damaged, it may have been."""
+        return self._data
+
+    @property
+    def looks_damaged(self) -> bool:
+        """Whether `rest` is a reply whose first bytes were hit."""
+        return len(self._data) == self._size and not self.strange and not is_whole(self._data)
+
+    @property
+    def _error_function(self) -> bytes:
+        return bytes([self._request[1] | EXCEPTION_BIT])
+
+    def _take_echo(self) -> bool:
+        """Skip the echo; False while it may still be coming."""
+        request, data = self._request, self._data
+        if data.startswith(request):
+            self.echo_seen, self._data = True, data[len(request) :]
+        elif request.startswith(data):
+            return False
+        else:
+            self.echo_seen = False
+        return True
+
+    def _find(self) -> bytes | None:
+        data = self._data
+        for at in range(len(data)):
+            size = self._size_at(at)
+            if size and len(data) - at >= size and (at + self.strange == 0 or is_whole(data[at : at + size])):
+                self.strange += at
+                self._data = data[at + size :]
+                return data[at : at + size]
+            if size and at == 0 and len(data) < size:  # it begins well: wait for the rest of it
+                return None
+        kept = max(0, len(data) - ADU_BYTES_MAX)
+        self.strange, self._data = self.strange + kept, data[kept:]
+        return None
+
+    def _size_at(self, at: int) -> int:
+        """Size of the reply that begins at `at`, 0 if none does."""
+        data, request = self._data, self._request
+        head = data[at : at + 3]
+        if head[:1] != request[:1]:
+            return 0
+        if head[1:2] == self._error_function:
+            return EXCEPTION_BYTES
+        good = request[:2] + (bytes([self._size - READ_OVERHEAD_BYTES]) if request[1] == READ_HOLDING else request[2:3])
+        return self._size if good.startswith(head) else 0

@@ -1,0 +1,186 @@
+"""The shared-memory ring of one device: a header page, then slots of `imud.formats.slot`, all little-endian.
+
+The file is `/dev/shm/imud.<device>`. `HEADER_FIELDS` is the one table of the header; the writer, the Python reader
+and the check of the C header are made from it. Three cache lines hold what does not change (but for `state`), one what
+changes with every sample, and the block from 256 to 771 what changes at most ten times a second.
+
+       0         8       12       16     20     24     28       32      40    44     48                  64       128
+    +---------+-------+--------+------+------+------+--------+-------+-----+-------+-----------+------+----------+
+    | magic   |version|slot    |header|slot  |slot  |ledger  | epoch | pid | state | device_id | 0…   | device   |
+    |         |       |version |bytes |bytes |count |count   |       |     |       |           |      | (UTF-8)  |
+    +---------+-------+--------+------+------+------+--------+-------+-----+-------+-----------+------+----------+
+    | 192: newest_seq | 200: first_seq | 208: heartbeat_ns | 0…                                                  |
+    | 256: ledger_update | 264: driver | 296: ledger, 59×u64, the first ledger_count in use | 768: ledger_crc32    |
+    | 4096: slot (seq & (slot_count - 1)) of each sequence number …                                               |
+    +-------------------------------------------------------------------------------------------------------------+
+
+Rules for a reader, because the writer has no memory fence:
+- A slot is trusted only if its `seq` before the copy, its CRC-32, and its `seq` after the copy agree.
+- The ledger block likewise: `ledger_update` before and after the copy, and CRC-32 over bytes 256…767.
+- Samples `max(first_seq, newest_seq - slot_count + 1)` … `newest_seq` are in the ring; older ones are missed.
+- `newest_seq`, `first_seq`, `heartbeat_ns`, `state` and every `seq` are aligned and written by one store each.
+"""
+
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from imud.errors import ServerError
+from imud.formats.slot import SLOT_BYTES, SLOT_LAYOUT_VERSION, SlotField
+from imud.ledger import LEDGER_FIELDS
+
+DIRECTORY: Final = "/dev/shm"
+FILE_PREFIX: Final = "imud."
+
+MAGIC: Final = b"imudshm\0"
+RING_LAYOUT_VERSION: Final = 1
+HEADER_BYTES: Final = 4096
+"""One page, so that slots begin on a page."""
+LEDGER_ROOM: Final = 59
+"""Counters that fit into the block; new ones take free places and need no new layout version."""
+
+STATE_LIVE: Final = 1
+STATE_CLOSED: Final = 2
+"""The daemon ended the ring on purpose; nothing will be written to this file any more."""
+
+HEARTBEAT_LIMIT_NS: Final = 1_000_000_000
+"""The heartbeat comes ten times a second: a ring without one for this long has no daemon behind it."""
+
+HEADER_FIELDS: Final = (
+    SlotField("magic", "s", 8, 0),
+    SlotField("layout_version", "I", 1, 8),
+    SlotField("slot_layout_version", "I", 1, 12),
+    SlotField("header_bytes", "I", 1, 16),
+    SlotField("slot_bytes", "I", 1, 20),
+    SlotField("slot_count", "I", 1, 24),
+    SlotField("ledger_count", "I", 1, 28),
+    SlotField("epoch", "Q", 1, 32),
+    SlotField("pid", "I", 1, 40),
+    SlotField("state", "I", 1, 44),
+    SlotField("device_id", "I", 1, 48),
+    SlotField("reserved0", "B", 12, 52),
+    SlotField("device", "s", 64, 64),
+    SlotField("reserved1", "B", 64, 128),
+    SlotField("newest_seq", "Q", 1, 192),
+    SlotField("first_seq", "Q", 1, 200),
+    SlotField("heartbeat_ns", "q", 1, 208),
+    SlotField("reserved2", "B", 40, 216),
+    SlotField("ledger_update", "Q", 1, 256),
+    SlotField("driver", "s", 32, 264),
+    SlotField("ledger", "Q", LEDGER_ROOM, 296),
+    SlotField("ledger_crc32", "I", 1, 768),
+    SlotField("reserved3", "B", 3324, 772),
+)
+
+OFFSETS: Final = {field.name: field.offset for field in HEADER_FIELDS}
+
+NEWEST_WORD: Final = OFFSETS["newest_seq"] // 8
+FIRST_WORD: Final = OFFSETS["first_seq"] // 8
+HEARTBEAT_WORD: Final = OFFSETS["heartbeat_ns"] // 8
+LEDGER_UPDATE_WORD: Final = OFFSETS["ledger_update"] // 8
+STATE_HALF_WORD: Final = OFFSETS["state"] // 4
+"""Places in a memoryview of the ring that is cast to u64 (half words: to u32)."""
+
+LEDGER_BLOCK_OFFSET: Final = OFFSETS["ledger_update"]
+LEDGER_CRC_OFFSET: Final = OFFSETS["ledger_crc32"]
+LEDGER_BLOCK_BYTES: Final = LEDGER_CRC_OFFSET + 4 - LEDGER_BLOCK_OFFSET
+
+_CONSTANT = struct.Struct("<8s6IQ3I12x64s64x")  # magic … reserved1
+_LIVELY = struct.Struct("<QQq")  # newest_seq, first_seq, heartbeat_ns
+_BLOCK = struct.Struct(f"<Q32s{LEDGER_ROOM}Q")
+_CRC = struct.Struct("<I")
+_U64_MASK = 0xFFFF_FFFF_FFFF_FFFF
+
+
+@dataclass(frozen=True, slots=True)
+class RingHeader:
+    """The header at one moment, ledger block excluded."""
+
+    epoch: int
+    """Random number of the daemon's start that made the ring."""
+    pid: int
+    state: int
+    """STATE_LIVE or STATE_CLOSED."""
+    device: str
+    device_id: int
+    slot_count: int
+    """A power of two."""
+    newest_seq: int = 0
+    """0 before the first sample."""
+    first_seq: int = 1
+    """Older samples were never written to this ring."""
+    heartbeat_ns: int = 0
+    """CLOCK_MONOTONIC of the last sign of life."""
+    ledger_count: int = len(LEDGER_FIELDS)
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerBlock:
+    """The ledger as it stands in shared memory, with the driver that is in use."""
+
+    update: int
+    """Counts from 1, +1 for every change."""
+    driver: str
+    """Empty until the device is found."""
+    ledger: dict[str, int]
+
+
+def ring_path(directory: str, device: str) -> Path:
+    """The file of `device`. Raises ServerError for a name that would leave `directory` or does not fit the header."""
+    room = next(field.count for field in HEADER_FIELDS if field.name == "device") - 1  # readers in C need the final 0
+    if not device or "/" in device or "\0" in device or len(device.encode()) > room:
+        raise ServerError(f"device {device!r}: expected a name of 1 to {room} bytes without '/' for its shared memory")
+    return Path(directory, FILE_PREFIX + device)
+
+
+def encode_header(header: RingHeader) -> bytes:
+    """The first HEADER_BYTES of a ring, with an empty ledger block."""
+    constant = _CONSTANT.pack(
+        MAGIC, RING_LAYOUT_VERSION, SLOT_LAYOUT_VERSION, HEADER_BYTES, SLOT_BYTES, header.slot_count,
+        header.ledger_count, header.epoch & _U64_MASK, header.pid, header.state, header.device_id,
+        header.device.encode(),
+    )  # fmt: skip
+    lively = _LIVELY.pack(header.newest_seq, header.first_seq, header.heartbeat_ns)
+    return (constant + lively).ljust(HEADER_BYTES, b"\0")
+
+
+def decode_header(raw: bytes, where: str) -> RingHeader:
+    """The header in `raw`. Raises ServerError, naming `where`, for anything but a ring of this layout."""
+    if len(raw) < HEADER_BYTES or not raw.startswith(MAGIC):
+        raise ServerError(f"{where} is no ring of imud: expected {MAGIC!r} at its beginning, found {raw[:8]!r}")
+    _, version, slot_version, *sizes, epoch, pid, state, device_id, device = _CONSTANT.unpack_from(raw)
+    header_bytes, slot_bytes, slot_count, ledger_count = sizes
+    expected = (RING_LAYOUT_VERSION, SLOT_LAYOUT_VERSION, HEADER_BYTES, SLOT_BYTES)
+    found = (version, slot_version, header_bytes, slot_bytes)
+    if found != expected:
+        raise ServerError(
+            f"{where}: expected layout, slot layout, header bytes and slot bytes {expected}, found {found}:"
+            " daemon and reader are of different versions of imud"
+        )
+    if slot_count == 0 or slot_count & (slot_count - 1) or ledger_count > LEDGER_ROOM:
+        raise ServerError(f"{where}: {slot_count} slots and {ledger_count} counters cannot be: the header is damaged")
+    newest_seq, first_seq, heartbeat_ns = _LIVELY.unpack_from(raw, OFFSETS["newest_seq"])
+    name = device.rstrip(b"\0").decode("utf-8", "replace")
+    return RingHeader(
+        epoch, pid, state, name, device_id, slot_count, newest_seq, first_seq, heartbeat_ns, ledger_count
+    )  # fmt: skip
+
+
+def encode_ledger_block(update: int, driver: str, ledger: Mapping[str, int]) -> bytes:
+    """LEDGER_BLOCK_BYTES bytes; counters that `ledger` does not name are 0, and a driver's name is cut to 31 bytes."""
+    values = [ledger.get(name, 0) & _U64_MASK for name in LEDGER_FIELDS]
+    body = _BLOCK.pack(update, driver.encode()[:31], *values, *[0] * (LEDGER_ROOM - len(values)))
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def decode_ledger_block(block: bytes, ledger_count: int) -> LedgerBlock | None:
+    """The inverse; None for a block that is torn. Counters that the writer does not have are left out."""
+    body = block[:-4]
+    if len(block) != LEDGER_BLOCK_BYTES or zlib.crc32(body) != _CRC.unpack_from(block, len(body))[0]:
+        return None
+    update, driver, *values = _BLOCK.unpack(body)
+    ledger = dict(zip(LEDGER_FIELDS, values[:ledger_count], strict=False))  # either side may be the newer one
+    return LedgerBlock(update, driver.rstrip(b"\0").decode("utf-8", "replace"), ledger)

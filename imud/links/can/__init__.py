@@ -1,0 +1,1 @@
+"""CAN buses: native SocketCAN, and any other interface of python-can."""

@@ -1,0 +1,137 @@
+"""Reads CAN frames from a raw socket in batches, with the kernel's stamps and its count of what it dropped.
+
+Plan: one `recvmmsg` per wake-up takes all that is there, up to BATCH_FRAMES, into buffers made once; nothing is
+allocated but the frames. Python's own `recvmsg` costs two system calls per frame (it asks for the interface's name each
+time) and one more, with an exception, to find the queue empty.
+
+Kernel stamps are CLOCK_REALTIME. They are carried over to CLOCK_MONOTONIC with the offset of the two at the read, and
+held between the last time the queue was seen empty and now: a wall clock that was set between arrival and read cannot
+move a stamp out of that. The kernel begins to stamp some ms after the first socket of the machine asks for it; until
+then it fills in the time of the read.
+"""
+
+import ctypes
+import errno
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import Final
+
+from imud.formats.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, CanFrame
+from imud.links.can.mmsg import MessageBuffers, Vector, libc
+from imud.units import NS_PER_S, NS_PER_US
+
+BATCH_FRAMES: Final = 64
+"""Frames per read: 8 ms of a full bus at 1 Mbit/s. What is left is read at the next turn of the loop."""
+SO_TIMESTAMPNS_NEW: Final = 64
+"""Ask for arrival stamps, and the type they come under: two 64-bit integers, s and ns (Linux 5.1, asm-generic)."""
+SO_RXQ_OVFL: Final = 40
+"""Ask for the count of frames dropped because the receive buffer was full, and its type: u32."""
+STEADY_NS: Final = 20 * NS_PER_US
+"""Two clocks read further apart than this were interrupted: read again."""
+STEADY_TRIES: Final = 3
+_COUNT_MASK: Final = 0xFFFF_FFFF
+
+_WORD: Final = "Q" if struct.calcsize("P") == 8 else "I"
+_CONTROL_BYTES: Final = 64
+_CONTROL: Final = struct.Struct(f"={_WORD}iiqq{_WORD}iiI{_CONTROL_BYTES - struct.calcsize(f'={_WORD}iiqq{_WORD}iiI')}x")
+"""Two control messages as the kernel writes them: (length, level, type, s, ns) and (length, level, type, count)."""
+
+OnErrorFrame = Callable[[int, bytes], bool]
+"""Called with class bits and data of an error frame; returns whether frames are missing since."""
+
+
+class FrameReader:
+    """The receiving side of a socket whose messages are `struct can_frame`. The socket stays its owner's."""
+
+    def __init__(
+        self,
+        receiver: socket.socket,
+        on_error: OnErrorFrame,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Switches stamps and the drop count on."""
+        receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS_NEW, 1)
+        receiver.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        self.dropped = 0
+        """Frames that the kernel dropped because nobody read them in time."""
+        self._fd = receiver.fileno()
+        self._on_error = on_error
+        self._now_ns = now_ns
+        self._wall_ns = wall_ns
+        self._frames = bytearray(RAW_FRAME.size * BATCH_FRAMES)
+        self._control = bytearray(_CONTROL_BYTES * BATCH_FRAMES)
+        self._vectors = (Vector * BATCH_FRAMES)()
+        self._headers = bytearray(ctypes.sizeof(MessageBuffers) * BATCH_FRAMES)
+        self._messages = (MessageBuffers * BATCH_FRAMES).from_buffer(self._headers)
+        self._lay_out()
+        self._fresh_headers = bytes(self._headers)
+        self._empty_ns = now_ns()
+        self._newest_ns = self._empty_ns
+        self._lost = False
+
+    def read(self) -> list[CanFrame]:
+        """Data frames that are there, at most BATCH_FRAMES, oldest first. Raises OSError as the kernel names it."""
+        begun_ns = self._now_ns()
+        count = libc.recvmmsg(self._fd, self._messages, BATCH_FRAMES, socket.MSG_DONTWAIT, None)
+        if count < 0:
+            return self._failed(ctypes.get_errno(), begun_ns)
+        offset_ns, now_ns = self._clocks()
+        frames = self._taken(count, offset_ns, now_ns)
+        if count < BATCH_FRAMES:
+            self._empty_ns = begun_ns
+        header_size = count * ctypes.sizeof(MessageBuffers)
+        self._headers[:header_size] = self._fresh_headers[:header_size]
+        return frames
+
+    def _taken(self, count: int, offset_ns: int, now_ns: int) -> list[CanFrame]:
+        frames: list[CanFrame] = []
+        newest_ns = max(self._newest_ns, self._empty_ns)
+        raw = memoryview(self._frames)[: count * RAW_FRAME.size]
+        control = memoryview(self._control)[: count * _CONTROL_BYTES]
+        for (can_id, size, data), (_, _, kind, seconds, ns, _, _, drop_kind, drops) in zip(
+            RAW_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True
+        ):
+            if drop_kind == SO_RXQ_OVFL and drops != self.dropped & _COUNT_MASK:
+                self.dropped += (drops - self.dropped) & _COUNT_MASK
+                self._lost = True
+            if can_id & (ERROR_FLAG | REMOTE_FLAG):
+                if can_id & ERROR_FLAG:
+                    self._lost |= self._on_error(can_id ^ ERROR_FLAG, data)
+                continue
+            t_ns = seconds * NS_PER_S + ns - offset_ns if kind == SO_TIMESTAMPNS_NEW else now_ns
+            newest_ns = min(max(t_ns, newest_ns), now_ns)
+            extended = can_id >= EXTENDED_FLAG
+            frames.append(CanFrame(can_id & EXTENDED_ID_MAX, extended, data[:size], newest_ns, self._lost))
+            self._lost = False
+        self._newest_ns = newest_ns
+        return frames
+
+    def _clocks(self) -> tuple[int, int]:
+        """CLOCK_REALTIME less CLOCK_MONOTONIC, and CLOCK_MONOTONIC."""
+        for _ in range(STEADY_TRIES):
+            before_ns, wall_ns, now_ns = self._now_ns(), self._wall_ns(), self._now_ns()
+            if now_ns - before_ns <= STEADY_NS:
+                break
+        return wall_ns - (before_ns + now_ns) // 2, now_ns
+
+    def _failed(self, number: int, begun_ns: int) -> list[CanFrame]:
+        if number in (errno.EAGAIN, errno.EINTR):
+            self._empty_ns = begun_ns
+            return []
+        raise OSError(number, os.strerror(number))
+
+    def _lay_out(self) -> None:
+        """Each message gets one frame's bytes and its share of the control buffer."""
+        frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))
+        control = ctypes.addressof(ctypes.c_char.from_buffer(self._control))
+        vector = ctypes.addressof(self._vectors)
+        for i, message in enumerate(self._messages):
+            self._vectors[i].base = frames + i * RAW_FRAME.size
+            self._vectors[i].bytes = RAW_FRAME.size
+            header = message.header
+            header.vector, header.vector_count = vector + i * ctypes.sizeof(Vector), 1
+            header.control, header.control_bytes = control + i * _CONTROL_BYTES, _CONTROL_BYTES

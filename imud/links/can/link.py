@@ -1,0 +1,276 @@
+"""A CAN bus: a raw SocketCAN socket of our own, or any other interface that python-can knows.
+
+Every device opens its own socket with filters for its frames, so that several share a bus and none sees the others'.
+Bit rate and state of the interface belong to the system (docs/can.md): imud reads them and changes nothing. It needs no
+privilege, only the receive buffer may be larger than net.core.rmem_max with CAP_NET_ADMIN.
+"""
+
+import asyncio
+import errno
+import logging
+import os
+import socket
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final
+
+from msgspec import Meta
+
+from imud.contracts.link import CanLink, LinkType, OnBusNews, OnEnd, OnFrames
+from imud.contracts.settings import Settings
+from imud.contracts.status import KernelCounters
+from imud.errors import LinkDenied, LinkError, LinkMissing
+from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, REMOTE_FLAG, CanFilter, CyclicFrame
+from imud.links.can import netlink
+from imud.links.can.cyclic import NO_MANAGER, KernelSender, LoopSender, Sender
+from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
+from imud.links.can.state import WATCHED, BusState
+
+NATIVE: Final = "socketcan"
+FRAME_BUFFER_BYTES: Final = 960
+"""What the kernel charges a socket for one waiting frame, about (222 fit the usual 208 KiB)."""
+CAN_RAW_ERR_FILTER: Final = 2
+"""Option of SOL_CAN_RAW: classes of error frames to receive (linux/can/raw.h)."""
+SO_RCVBUFFORCE: Final = 33
+"""Receive buffer above net.core.rmem_max, with CAP_NET_ADMIN (asm-generic)."""
+
+log = logging.getLogger(__name__)
+
+
+class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a CAN bus."""
+
+    interface: Annotated[str, Meta(min_length=1, max_length=63)]
+    """Network interface, for example `can0` (`ip link` lists them); for another backend its channel."""
+    receive_buffer_bytes: Annotated[int, Meta(ge=4096, le=1 << 26)] = 1 << 20
+    """Kernel memory for frames that wait to be read, about 960 bytes each. The system may allow less."""
+    coalesce_ms: Annotated[int, Meta(ge=0, le=100)] = 0
+    """Let frames gather for so long before they are read: less CPU, more delay. Their time stamps stay the kernel's."""
+    backend: Annotated[str, Meta(min_length=1)] = NATIVE
+    """`socketcan`, or the name of another interface of python-can, for example `virtual` or `slcan`."""
+    bitrate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
+    """Bit rate that another backend is to set, bit/s; 0 leaves it alone. For a network interface the system sets it."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for keys that exclude each other."""
+        if self.bitrate and self.backend == NATIVE:
+            raise ValueError("bitrate: expected none with backend socketcan, the system sets it (docs/can.md)")
+
+
+class SocketCanLink:
+    """A CAN network interface as a `CanLink`. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: SocketCanSettings, *, sys: Path = netlink.SYS) -> None:
+        self._settings = settings
+        self._coalesce_s = settings.coalesce_ms / 1000
+        self._timer: asyncio.TimerHandle | None = None
+        self._sys = sys
+        self._socket: socket.socket | None = None
+        self._reader: FrameReader | None = None
+        self._state = BusState(settings.interface)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_frames: OnFrames = _nobody
+        self._on_news: OnBusNews = _nobody_hears
+        self._on_end: OnEnd = _nobody_ends
+        self._filters: Sequence[CanFilter] = ()
+        self._sender: Sender | None = None
+        self.title = self.bus = settings.interface
+        self.bitrate = 0
+        self.writable = True
+
+    @property
+    def filters(self) -> Sequence[CanFilter]:
+        """Frames to deliver."""
+        return self._filters
+
+    @filters.setter
+    def filters(self, filters: Sequence[CanFilter]) -> None:
+        self._filters = filters
+        if self._socket is not None:
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
+
+    def absence(self) -> str:
+        """Why the interface cannot be used now; empty when it can. Raises LinkError when it is no CAN interface."""
+        return netlink.absence(self._settings.interface, self._sys)
+
+    async def wait_present(self) -> None:
+        """Return when the interface is there and up."""
+        await netlink.wait_until(lambda: not self.absence())
+
+    def open(self) -> None:
+        """Open a socket on the interface. Raises LinkMissing, LinkDenied, LinkError."""
+        if reason := self.absence():
+            raise LinkMissing(reason)
+        details = netlink.can_details(self._settings.interface)
+        self.bitrate = details.bitrate or 0
+        self._state = BusState(self._settings.interface, details.state)
+        try:
+            self._socket = self._bound()
+        except OSError as error:
+            raise self._explained(error) from error
+        self._reader = FrameReader(self._socket, self._on_error_frame)
+
+    def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
+        """Deliver frames from now on; a bus that is in trouble already says so at once."""
+        assert self._socket is not None
+        self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._socket.fileno(), self._read_coalescing if self._coalesce_s else self._read)
+        if problem := self._state.problem:
+            on_news(problem, problem)
+
+    def write(self, data: bytes) -> None:
+        """Send frames (`struct can_frame`), one system call each. Raises LinkError."""
+        if self._socket is None:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        try:
+            for at in range(0, len(data), RAW_FRAME.size):
+                self._socket.send(data[at : at + RAW_FRAME.size])
+        except OSError as error:
+            if error.errno in (errno.ENOBUFS, errno.EAGAIN):
+                raise LinkError(f"{self.title} does not send, its queue is full: is it alone on the bus?") from error
+            raise self._explained(error) from error
+
+    def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
+        """Have the kernel send these; by the event loop, less exactly, where it cannot. Raises LinkError."""
+        self._end_sender()
+        try:
+            self._sender = KernelSender(self._settings.interface, frames)
+        except OSError as error:
+            if error.errno not in NO_MANAGER:
+                raise self._explained(error) from error
+            log.info("%s: this kernel has no CAN_BCM (module can_bcm): cyclic frames are less exact", self.title)
+            self._sender = LoopSender(self.write, self._on_end, frames)
+
+    def kernel_counters(self) -> KernelCounters:
+        """Frames that the kernel or the controller dropped, and states of the controller, since `open`."""
+        dropped = self._reader.dropped if self._reader else 0
+        state = self._state
+        return KernelCounters(dropped + state.overflows, error_passive=state.passive_count, bus_off=state.bus_off_count)
+
+    def close(self) -> None:
+        """Release the socket; may be called twice."""
+        self._end_sender()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._loop is not None and self._socket is not None:
+            self._loop.remove_reader(self._socket.fileno())
+        self._loop = None
+        self._reader = None
+        opened, self._socket = self._socket, None
+        if opened is not None:
+            opened.close()
+
+    def _end_sender(self) -> None:
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
+
+    def _bound(self) -> socket.socket:
+        opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+        try:
+            opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(self._filters))
+            opened.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, struct.pack("=I", WATCHED))
+            self._enlarge(opened)
+            opened.bind((self._settings.interface,))
+        except OSError:
+            opened.close()
+            raise
+        return opened
+
+    def _enlarge(self, opened: socket.socket) -> None:
+        """As much receive buffer as is wanted, or as the system gives; the kernel doubles and reports the double."""
+        wanted = self._settings.receive_buffer_bytes // 2
+        try:
+            opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted)
+        except PermissionError:
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
+        got = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        if got < self._settings.receive_buffer_bytes:
+            log.info(
+                "%s: receive buffer of %d bytes, wanted %d (sysctl net.core.rmem_max): room for about %d frames",
+                self.title, got, self._settings.receive_buffer_bytes, got // FRAME_BUFFER_BYTES,
+            )  # fmt: skip
+
+    def _read(self) -> int:
+        """One batch, and how many frames it had; what is left makes the loop call again. -1 when the bus ended."""
+        assert self._reader is not None
+        try:
+            frames = self._reader.read()
+        except OSError as error:
+            self._end(error)
+            return -1
+        if frames:
+            self._on_frames(frames)
+        return len(frames)
+
+    def _read_coalescing(self) -> None:
+        """A batch; when there is no more, look away for a while. A bus without frames is watched again."""
+        loop, opened = self._loop, self._socket
+        count = self._read()
+        if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed
+            return
+        if count and self._timer is None:
+            loop.remove_reader(opened.fileno())
+        if count >= BATCH_FRAMES // 2:  # some of the batch may be no data frames
+            self._timer = loop.call_later(0, self._read_coalescing)
+        elif count:
+            self._timer = loop.call_later(self._coalesce_s, self._read_coalescing)
+        elif self._timer is not None:
+            self._timer = None
+            loop.add_reader(opened.fileno(), self._read_coalescing)
+
+    def _on_error_frame(self, classes: int, data: bytes) -> bool:
+        state = self._state
+        overflows = state.overflows
+        if news := state.take(classes, data):
+            self._on_news(news, state.problem)
+        return state.overflows > overflows
+
+    def _end(self, error: OSError) -> None:
+        if self._loop is not None and self._socket is not None:
+            self._loop.remove_reader(self._socket.fileno())
+        self._on_end(self._explained(error))
+
+    def _explained(self, error: OSError) -> LinkError:
+        name = self.title
+        if error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
+            reason = "was taken down" if error.errno == errno.ENETDOWN else "is gone"
+            return LinkMissing(f"{name} {reason}: waiting for it to come up")
+        if error.errno == errno.EAFNOSUPPORT:
+            return LinkError(f"{name}: this kernel has no CAN (expected AF_CAN; is the module can_raw there?)")
+        if isinstance(error, PermissionError):
+            return LinkDenied(f"{name} may not be opened by this user")
+        return LinkError(f"{name}: {os.strerror(error.errno or 0)}")
+
+
+def pack_filters(filters: Sequence[CanFilter]) -> bytes:
+    """Filters as `struct can_filter`: data frames only, and only of the named length of identifier."""
+    flags = EXTENDED_FLAG | REMOTE_FLAG
+    return b"".join(struct.pack("=II", f.can_id | EXTENDED_FLAG * f.extended, f.mask | flags) for f in filters)
+
+
+def _nobody(_frames: object) -> None:
+    """Before `start` nobody listens."""
+
+
+def _nobody_hears(_news: str, _problem: str) -> None:
+    """Before `start` nobody listens."""
+
+
+def _nobody_ends(_error: LinkError | None) -> None:
+    """Before `start` nobody listens."""
+
+
+def make(settings: SocketCanSettings) -> CanLink:
+    """The link for the backend that the settings name."""
+    if settings.backend == NATIVE:
+        return SocketCanLink(settings)
+    from imud.links.can.python_can import PythonCanLink
+
+    return PythonCanLink(settings.backend, settings.interface, settings.bitrate)
+
+
+LINK = LinkType("socketcan", SocketCanSettings, make_can=make)

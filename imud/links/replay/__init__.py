@@ -1,0 +1,1 @@
+"""Captures instead of a port."""

@@ -1,0 +1,185 @@
+"""Plays a capture through the same path as a port.
+
+Speeds, and what `t_rx_ns` is (it never decreases and never lies in the future):
+
+- `recorded`: each read of a stamped capture comes as long after the first as it did then; `t_rx_ns` is that due time,
+  so the recorded arrival jitter is what the clock sees, not the jitter of this process.
+- `real`: bytes come as fast as the wire at `baud` carries them, PIECE_NS at a time; `t_rx_ns` is the due time.
+- `maximum`: as fast as the receiver takes it. Time is virtual: recorded stamps, or wire time at `baud` (all the same
+  instant where neither is known), shifted so that the end of the capture is the moment of the start. It can be negative
+  where the capture is longer than the machine is up.
+"""
+
+import asyncio
+import logging
+import os
+import time
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from imud.contracts.link import LinkType, OnData, OnEnd
+from imud.contracts.status import KernelCounters
+from imud.errors import ImudError, LinkError
+from imud.formats.capture import CaptureReader, read_capture
+from imud.links.inotify import wait_until
+from imud.links.replay.can import CanReplayLink
+from imud.links.replay.file import ReplaySettings, open_regular
+from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+
+PIECE_NS: Final = 2 * NS_PER_MS
+"""Wire time of one piece at speed `real`; a native UART hands over about as much at a time."""
+PIECE_BYTES_MAX: Final = 65536
+"""As much as a port is read at once."""
+TURN_BYTES: Final = 16384
+"""Delivered in one turn of the event loop, 0.5 ms of decoding: others get their turn between."""
+
+log = logging.getLogger(__name__)
+
+
+class ReplayLink:
+    """A capture as a `StreamLink`. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: ReplaySettings) -> None:
+        self._settings = settings
+        self._file: BinaryIO | None = None
+        self._handle: asyncio.Handle | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._player: Iterator[tuple[bytes, int]] = iter(())
+        self._span_ns = 0
+        self.title = settings.path
+        self.baud = settings.baud
+        self.auto_baud = False
+        self.writable = False
+        self.hold_ns = 0
+
+    async def wait_present(self) -> None:
+        """Return when the file is there."""
+        path = Path(self._settings.path)
+        await wait_until(path, path.exists)
+
+    def open(self) -> None:
+        """Open and check the capture. Raises LinkMissing, LinkDenied, LinkError."""
+        path, settings = self._settings.path, self._settings
+        self._file = file = open_regular(path)
+        try:
+            reader = self._reader()
+            self.baud = settings.baud or reader.baud
+            self.hold_ns = PIECE_NS if settings.speed == "real" else reader.hold_ns
+            if settings.speed == "recorded" and not reader.stamped:
+                raise LinkError(f"{path} is a raw capture without times: use speed real with a baud, or maximum")
+            if settings.speed == "real" and not self.baud:
+                raise LinkError(f"{path} does not say its baud rate: speed real needs `baud`")
+            self._span_ns = self._measure(reader) if settings.speed == "maximum" else 0
+        except LinkError:
+            file.close()
+            raise
+
+    def start(self, on_data: OnData, on_end: OnEnd) -> None:
+        """Play from the beginning."""
+        self._loop = asyncio.get_running_loop()
+        self._player = self._play(time.monotonic_ns() - self._span_ns)
+        self._handle = self._loop.call_soon(self._turn, on_data, on_end, None)
+
+    def write(self, data: bytes) -> None:
+        """Raises LinkError: there is nobody at the far end."""
+        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
+
+    def set_baud(self, baud: int) -> None:
+        """Raises LinkError: a recording has the rate it has."""
+        raise LinkError(f"{self.title} is a replay: its rate cannot be changed")
+
+    def kernel_counters(self) -> KernelCounters:
+        """A file has none."""
+        return KernelCounters()
+
+    def close(self) -> None:
+        """Release the file; may be called twice."""
+        if self._handle is not None:
+            self._handle.cancel()
+            self._handle = None
+        self._loop = None
+        self._player = iter(())
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
+
+    def _turn(self, on_data: OnData, on_end: OnEnd, waiting: tuple[bytes, int] | None) -> None:
+        """Deliver what is due, at most TURN_BYTES, then give way."""
+        loop, room, now_ns = self._loop, TURN_BYTES, time.monotonic_ns()
+        while loop is not None and self._loop is loop:
+            data, due_ns = item = waiting or next(self._player, (b"", 0))
+            waiting = None
+            if not data:
+                self.close()
+                on_end(None)
+                return
+            if due_ns > now_ns and due_ns > (now_ns := time.monotonic_ns()):
+                delay_s = (due_ns - now_ns) / NS_PER_S
+                self._handle = loop.call_later(delay_s, self._turn, on_data, on_end, item)
+                return
+            if room <= 0:
+                self._handle = loop.call_soon(self._turn, on_data, on_end, item)
+                return
+            room -= len(data)
+            on_data(data, due_ns)
+
+    def _play(self, origin_ns: int) -> Iterator[tuple[bytes, int]]:
+        """Pieces with the CLOCK_MONOTONIC at which each is due."""
+        while True:
+            offset_ns = pieces = 0
+            reader = self._reader()
+            for data, offset_ns in self._pieces(reader):
+                yield data, origin_ns + offset_ns
+                pieces += 1
+            if reader.problem:
+                log.warning("%s: %s", self.title, reader.problem)
+            if not self._settings.repeat or not pieces:
+                return
+            origin_ns += offset_ns + max(offset_ns // pieces, NS_PER_MS)
+
+    def _pieces(self, reader: CaptureReader) -> Iterator[tuple[bytes, int]]:
+        """Pieces of bounded size with the time each was complete, from 0."""
+        if reader.stamped and self._settings.speed != "real":
+            return self._stamped_pieces(reader)
+        return self._wire_pieces(reader)
+
+    def _stamped_pieces(self, reader: CaptureReader) -> Iterator[tuple[bytes, int]]:
+        chunks = iter(reader)
+        first = next(chunks, None)
+        if first is None:
+            return
+        for t_ns, data in chain((first,), chunks):
+            offset_ns = (t_ns or 0) - (first.t_ns or 0)
+            for start in range(0, len(data), PIECE_BYTES_MAX):
+                yield data[start : start + PIECE_BYTES_MAX], offset_ns
+
+    def _wire_pieces(self, reader: CaptureReader) -> Iterator[tuple[bytes, int]]:
+        byte_ns = uart_byte_ns(self.baud)
+        real = self._settings.speed == "real"
+        size = min(max(PIECE_NS // byte_ns, 1), PIECE_BYTES_MAX) if real and byte_ns else PIECE_BYTES_MAX
+        sent = 0
+        for _, data in reader:
+            for start in range(0, len(data), size):
+                piece = data[start : start + size]
+                sent += len(piece)
+                yield piece, sent * byte_ns
+
+    def _measure(self, reader: CaptureReader) -> int:
+        """How long the capture lasts in its own time, ns."""
+        if self._file is not None and not reader.stamped:
+            return os.fstat(self._file.fileno()).st_size * uart_byte_ns(self.baud)
+        return max((offset_ns for _, offset_ns in self._pieces(reader)), default=0)
+
+    def _reader(self) -> CaptureReader:
+        if self._file is None:
+            raise LinkError(f"{self.title} is not open")
+        self._file.seek(0)
+        try:
+            return read_capture(self._file)
+        except ImudError as error:
+            raise LinkError(f"{self.title}: {error}") from error
+
+
+LINK = LinkType("replay", ReplaySettings, ReplayLink, CanReplayLink)

@@ -1,0 +1,1 @@
+"""Serial lines that several devices share, half-duplex."""

@@ -1,0 +1,270 @@
+"""One RS-485 line: a serial port that is opened once for all devices on it, and what is asked and answered there.
+
+    silence ▸ request ▸ (echo) ▸ silence, thinking ▸ reply ▸ silence …
+
+One request is under way at a time. The silence between frames is kept, counted from when the last byte was read. A
+module that did not answer in time owes a reply: before it is asked anything else it is asked for one register, whose
+reply has another length than the one owed, so that an answer to the old question can never be taken for one to the new.
+"""
+
+import contextlib
+import os
+import select
+import termios
+import threading
+import time
+from pathlib import Path
+from typing import Final, Literal
+
+import serial
+
+from imud.errors import LinkError, LinkMissing, TransferError, Trouble
+from imud.formats.modbus import (
+    ADU_BYTES_MAX,
+    BROADCAST,
+    READ_HOLDING,
+    READ_OVERHEAD_BYTES,
+    ReplyFinder,
+    frame_gap_ns,
+    framed,
+)
+from imud.links.rs485.direction import Direction
+from imud.links.uart.low_latency import hold_ns, request_low_latency
+from imud.links.uart.port_setup import explain, open_port
+from imud.links.uart.tty_counters import TtyCounters
+from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+
+READ_BYTES: Final = 4096
+BROADCAST_NS: Final = 100 * NS_PER_MS
+"""Pause after a request to all: "MODBUS over Serial Line" 2.4.1 gives 100 to 200 ms."""
+ASLEEP_SHARE: Final = 0.9
+"""How much of the time that missing bytes need at least is slept through: fewer wake-ups, none late."""
+
+Echo = Literal["auto", True, False]
+DirectionWish = Literal["auto", "kernel", "none"]
+
+
+class LineCounters:
+    """What was heard on a line besides replies, in bytes unless said otherwise."""
+
+    __slots__ = ("echoed", "late", "strange", "timeouts")
+
+    def __init__(self) -> None:
+        self.echoed = 0
+        """Requests that came back as an echo."""
+        self.late = 0
+        """Came when nothing was asked."""
+        self.strange = 0
+        """Came before a reply, or instead of it."""
+        self.timeouts = 0
+        """Requests without a reply."""
+
+
+class Line:
+    """An open port. Transfers: the bus's thread; `share` and `release` in any, under the lock of `lines`."""
+
+    def __init__(self, path: str, baud: int, direction: DirectionWish, echo: Echo, sys: Path, proc: Path) -> None:
+        """Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        self.path, self.baud = path, baud
+        self.wishes = direction, echo
+        """As configured."""
+        self.users = 1
+        self.counters = LineCounters()
+        self.echoes: bool | None = None if echo == "auto" else echo
+        """Whether the port hears what it sends; None until it was seen."""
+        self._port: serial.Serial | None = open_port(path, baud, proc)
+        self._proc = proc
+        self._fd = self._port.fileno()
+        request_low_latency(self._port, path, sys)
+        self._tty = TtyCounters(self._fd)
+        self._hold_ns = hold_ns(path, sys)
+        self._byte_ns, self._gap_ns = uart_byte_ns(baud), frame_gap_ns(baud)
+        self._quiet_ns = time.monotonic_ns()
+        self._owing: dict[int, bytes] = {}
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+        try:
+            self._direction = None if direction == "none" else Direction(self._fd, path, required=direction == "kernel")
+        except LinkError:
+            self._port.close()
+            raise
+
+    @property
+    def counted(self) -> TtyCounters:
+        """Errors the kernel counts."""
+        return self._tty
+
+    def close(self) -> None:
+        """Release the port; may be called twice."""
+        port, self._port = self._port, None
+        if port is not None:
+            if self._direction is not None:
+                self._direction.restore()
+            self._tty.read()
+            with contextlib.suppress(OSError, termios.error):
+                port.close()
+
+    def transfer(self, target: int, request: bytes, reply_bytes: int, reply_ns: int) -> bytes:
+        """Ask and return the whole reply, damaged or not, or an exception. Raises TransferError, LinkError.
+
+        `reply_ns` is how long the module may think.
+        """
+        if self._port is None:
+            raise LinkError(f"{self.path} is not open")
+        if target == BROADCAST or not reply_bytes:
+            self._send(framed(target, request))
+            self._sleep_until(time.monotonic_ns() + (len(request) + 3) * self._byte_ns + BROADCAST_NS)
+            self._read()
+            return b""
+        owed = self._owing.get(target)
+        if owed is not None or (self.echoes is None and request[0] != READ_HOLDING):
+            self._settle(target, owed or request, reply_ns)
+        return self._ask(target, request, reply_bytes, reply_ns)
+
+    def _settle(self, target: int, owed: bytes, reply_ns: int) -> None:
+        """Ask for so few registers that the reply differs in length from the one owed; what came before is old."""
+        first, count = owed[1:3], owed[3:5]
+        few = 2 if owed[0] == READ_HOLDING and count == b"\0\1" else 1
+        request = bytes([READ_HOLDING]) + first + few.to_bytes(2, "big")
+        self._ask(target, request, READ_OVERHEAD_BYTES + 2 * few, reply_ns, owed=owed)
+
+    def _ask(self, target: int, request: bytes, reply_bytes: int, reply_ns: int, owed: bytes = b"") -> bytes:
+        frame = framed(target, request)
+        finder = ReplyFinder(frame, reply_bytes, echoes=self.echoes)
+        self._send(frame)
+        wire_ns = (2 * len(frame) + reply_bytes) * self._byte_ns  # an echo comes with the request, not after it
+        deadline_ns = time.monotonic_ns() + wire_ns + 2 * self._gap_ns + reply_ns + self._hold_ns
+        reply = self._wait(finder, deadline_ns)
+        self._learn_echo(finder, reply)
+        self.counters.strange += finder.strange
+        if reply is None and finder.looks_damaged:
+            reply = finder.rest()
+        if reply is None:
+            self._owing[target] = owed or request
+            self.counters.timeouts += 1
+            self.counters.strange += len(finder.rest())
+            raise self._no_reply(target, finder)
+        self._owing.pop(target, None)
+        return reply
+
+    def _wait(self, finder: ReplyFinder, deadline_ns: int) -> bytes | None:
+        """Read until the reply is there or the time is over."""
+        while (left_ns := deadline_ns - time.monotonic_ns()) > 0:
+            if not self._poll.poll(left_ns / NS_PER_MS):
+                break
+            reply = finder.feed(self._read())
+            if reply is not None:
+                return reply
+            if finder.missing > 1:
+                time.sleep(finder.missing * self._byte_ns * ASLEEP_SHARE / NS_PER_S)
+        return finder.feed(self._read())  # this thread itself may have been late
+
+    def _learn_echo(self, finder: ReplyFinder, reply: bytes | None) -> None:
+        """An echo behind noise is not seen: only a reply with nothing before it shows that there is none."""
+        if finder.echo_seen:
+            self.counters.echoed += 1
+        if self.echoes is None and (finder.echo_seen or (reply is not None and not finder.strange)):
+            self.echoes = finder.echo_seen
+
+    def _no_reply(self, target: int, finder: ReplyFinder) -> TransferError:
+        rest = finder.rest()
+        if rest or finder.strange:
+            message = f"no reply from address {target} on {self.path}, but other bytes: {rest[:16].hex(' ')}"
+            return TransferError(Trouble.DISTURBED, f"{message}; is the baud rate right, is an address given twice?")
+        # DISTURBED, not ABSENT: one request hit by noise is not answered either, and a module is given up after three
+        return TransferError(
+            Trouble.DISTURBED, f"no reply from address {target} on {self.path}: is it powered, are A and B not swapped?"
+        )
+
+    def _send(self, frame: bytes) -> None:
+        """Write a frame after the silence that must be before it. Raises TransferError, LinkError."""
+        self._hush()
+        try:
+            sent = os.write(self._fd, frame)
+        except BlockingIOError:
+            sent = 0
+        except OSError as error:
+            raise explain(error, self.path, self._proc) from error
+        if sent != len(frame):
+            raise TransferError(Trouble.STUCK, f"{self.path} does not send: is the port stuck?")
+        self._quiet_ns = time.monotonic_ns() + len(frame) * self._byte_ns
+
+    def _hush(self) -> None:
+        """Return when the line was silent for a gap; what came meanwhile belongs to nobody."""
+        limit_ns = time.monotonic_ns() + 2 * ADU_BYTES_MAX * self._byte_ns + self._gap_ns
+        while True:
+            late = len(self._read())
+            self.counters.late += late
+            now_ns = time.monotonic_ns()
+            if not late and now_ns >= self._quiet_ns + self._gap_ns:
+                return
+            if now_ns > limit_ns:
+                raise TransferError(Trouble.STUCK, f"{self.path} is never silent: does another master speak there?")
+            self._sleep_until(self._quiet_ns + self._gap_ns)
+
+    def _read(self) -> bytes:
+        """What is there now. Raises LinkMissing when the port is gone."""
+        try:
+            data = os.read(self._fd, READ_BYTES)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise self._gone(os.strerror(error.errno or 0)) from error
+        if not data:
+            raise self._gone("hung up")
+        self._quiet_ns = time.monotonic_ns()
+        return data
+
+    def _gone(self, why: str) -> LinkMissing:
+        return LinkMissing(f"{self.path} is gone ({why}): was the cable or the adapter pulled out?")
+
+    @staticmethod
+    def _sleep_until(deadline_ns: int) -> None:
+        left_ns = deadline_ns - time.monotonic_ns()
+        if left_ns > 0:
+            time.sleep(left_ns / NS_PER_S)
+
+
+class Lines:
+    """The lines that are open, by path. Synchronization: any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: dict[str, Line] = {}
+
+    def share(self, path: str, baud: int, direction: DirectionWish, echo: Echo, sys: Path, proc: Path) -> Line:
+        """The line of that path, opened if nobody has it open. Raises LinkError, also for another rate."""
+        with self._lock:
+            line = self._open.get(path)
+            if line is None:
+                line = self._open[path] = Line(path, baud, direction, echo, sys, proc)
+                return line
+            if line.baud != baud:
+                raise LinkError(f"{path}: expected one baud rate for all its devices, got {line.baud} and {baud}")
+            if line.wishes != (direction, echo):
+                raise LinkError(
+                    f"{path}: expected the same `direction` and `echo` for all its devices, got {line.wishes[0]}, "
+                    f"{line.wishes[1]} and {direction}, {echo}"
+                )
+            line.users += 1
+            return line
+
+    def lose(self, line: Line) -> None:
+        """The port is gone: who opens it next gets a new one."""
+        with self._lock:
+            if self._open.get(line.path) is line:
+                del self._open[line.path]
+
+    def release(self, line: Line) -> None:
+        """One user less; the last one closes the port."""
+        with self._lock:
+            line.users -= 1
+            if line.users:
+                return
+            if self._open.get(line.path) is line:
+                del self._open[line.path]
+            line.close()
+
+
+SHARED_PORTS: Final = Lines()
+"""Those of this process."""

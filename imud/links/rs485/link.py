@@ -1,0 +1,125 @@
+"""An RS-485 line with Modbus slaves, as one of its devices sees it. All devices of a line share its port and thread.
+
+A transfer's bytes are function and data; the line adds address and CRC (`imud.formats.modbus`) and returns whole
+replies.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from imud.contracts.link import LinkType
+from imud.contracts.polling import Transfer
+from imud.contracts.settings import Settings
+from imud.contracts.status import KernelCounters, SerialLineCounters
+from imud.errors import LinkDenied, LinkError, LinkMissing
+from imud.links.bus_node import node_present
+from imud.links.rs485.line import SHARED_PORTS, DirectionWish, Echo, Line, LineCounters, Lines
+from imud.units import NS_PER_MS
+
+
+class Rs485Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of an RS-485 line. All but `address`, `rate_hz` and `reply_ms` must be the same for all its devices."""
+
+    line: Annotated[str, Meta(min_length=1)]
+    """Path of the port. Several devices may have the same one."""
+    baud: Annotated[int, Meta(ge=300, le=4_000_000)] = 115200
+    """Rate in bit/s of the line."""
+    address: Annotated[int, Meta(ge=1, le=247)] | Literal["auto"] = "auto"
+    """Modbus address, or `auto`: ask at every address. Give it where a line has more than one device."""
+    rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 0.0
+    """How often the device is read, per second; 0 for as often as the line allows, in turns with the others."""
+    reply_ms: Annotated[int, Meta(ge=1, le=1000)] = 20
+    """How long the device may think before it answers. Time on the wire comes on top."""
+    direction: Literal["auto", "kernel", "none"] = "auto"
+    """Who switches between sending and receiving: `kernel` its driver (RTS), `none` the adapter, `auto` the driver if
+    it can."""
+    echo: Literal["auto"] | bool = "auto"
+    """Whether the adapter hears what it sends; `auto` finds out."""
+
+
+class Rs485Link:
+    """A `PolledLink` on a serial port that others may share."""
+
+    def __init__(
+        self,
+        settings: Rs485Settings,
+        *,
+        lines: Lines = SHARED_PORTS,
+        sys: Path = Path("/sys"),
+        proc: Path = Path("/proc"),
+    ) -> None:
+        self._settings = settings
+        self._lines, self._sys, self._proc = lines, sys, proc
+        self._line: Line | None = None
+        self._denied = False
+        self._address = 0
+        self._reply_ns = settings.reply_ms * NS_PER_MS
+        self.title = settings.line
+        self.writable = True
+        self.bus = settings.line
+        self.target: int | None = None if settings.address == "auto" else settings.address
+        self.shared = True
+        self.rate_hz = settings.rate_hz
+
+    @property
+    def heard(self) -> LineCounters:
+        """What was heard on the line besides replies since it was opened."""
+        return self._line.counters if self._line else LineCounters()
+
+    async def wait_present(self) -> None:
+        """Return when the port is there."""
+        await node_present(self.title, denied=self._denied)
+
+    def open(self) -> None:
+        """Open the port exclusively, or share it. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        settings, self._denied = self._settings, False
+        direction: DirectionWish = settings.direction
+        echo: Echo = settings.echo
+        try:
+            self._line = self._lines.share(self.title, settings.baud, direction, echo, self._sys, self._proc)
+        except LinkDenied:
+            self._denied = True
+            raise
+
+    def select(self, target: int) -> None:
+        """Speak to an address; 0 is all of them, and nobody answers."""
+        self._address = target
+
+    def place(self, target: int) -> str:
+        """An address for people, as the vendor's documents and programs write it."""
+        return f"address {target}"
+
+    def transfer(self, transfer: Transfer) -> bytes:
+        """Ask, and return the whole reply, an exception or a damaged reply. Raises TransferError, LinkError."""
+        line, (request,) = self._line, transfer.sends
+        if line is None:
+            raise LinkError(f"{self.title} is not open")
+        try:
+            return line.transfer(self._address, request, transfer.read_bytes, self._reply_ns)
+        except LinkMissing:
+            self._lines.lose(line)
+            raise
+
+    def write(self, data: bytes) -> None:
+        """Nothing is sent but in transfers. Raises LinkError."""
+        raise LinkError(f"{self.title} cannot send {len(data)} bytes outside of a transfer")
+
+    def kernel_counters(self) -> KernelCounters:
+        """Errors the kernel counted on the line since it was opened."""
+        return self._line.counted.read() if self._line else KernelCounters()
+
+    def serial_line(self) -> SerialLineCounters:
+        """What was heard on the line besides replies since it was opened, by any of its devices."""
+        heard = self.heard
+        return SerialLineCounters(heard.timeouts, heard.late, heard.strange, heard.echoed)
+
+    def close(self) -> None:
+        """Leave the line, whose last user closes the port; may be called twice."""
+        line, self._line = self._line, None
+        if line is not None:
+            self._lines.release(line)
+
+
+LINK = LinkType("rs485", Rs485Settings, make_polled=Rs485Link)

@@ -1,0 +1,212 @@
+"""A serial port: UART, RS-232, USB adapter or USB virtual port, read inside the event loop.
+
+What was measured to matter at 1 kHz is the number of wake-ups and system calls, so a wake-up is one read of whatever
+is there and one time stamp. With `coalesce_ms` the descriptor is not watched at all while data flows: a timer
+reads it, and only a read that finds nothing goes back to waiting for the descriptor.
+"""
+
+import asyncio
+import os
+import time
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import serial
+from msgspec import Meta
+
+from imud.contracts.link import LinkType, OnData, OnEnd
+from imud.contracts.settings import Settings
+from imud.contracts.status import KernelCounters
+from imud.errors import LinkDenied, LinkError, LinkMissing
+from imud.links.inotify import wait_until
+from imud.links.uart.low_latency import hold_ns, request_low_latency
+from imud.links.uart.port_setup import change_baud, explain, open_port
+from imud.links.uart.tty_counters import TtyCounters
+from imud.units import NS_PER_MS
+
+READ_BYTES: Final = 65536
+FULL_READ_BYTES: Final = 2048
+"""A read of this size leaves more behind (n_tty hands over at most 4095): read again without waiting."""
+WRITE_QUEUE_BYTES: Final = 4096
+"""Commands are some dozens of bytes; more waiting means that the port does not send."""
+DEFAULT_BAUD: Final = 115200
+"""Rate of a port that is opened for detection, until detection sets its own."""
+ACCESS_WAIT_S: Final = 1.0
+"""How long `wait_present` waits for access after a refusal: udev sets a node's group within some ms of its making."""
+
+
+class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a serial port."""
+
+    port: Annotated[str, Meta(min_length=1)]
+    """Path of the port. `/dev/serial/by-id/…` names the adapter and survives replugging; `/dev/ttyUSB0` does not."""
+    baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
+    """Rate in bit/s, or `auto`: listen at every rate the device knows."""
+    coalesce_ms: Annotated[int, Meta(ge=0, le=100)] = 0
+    """After a read wait so long before the next: fewer wake-ups and less CPU, as much more latency."""
+    low_latency: bool = True
+    """Ask driver and USB adapter to hand bytes over at once."""
+
+
+class UartLink:
+    """A serial port as a `StreamLink`. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: UartSettings, *, sys: Path = Path("/sys"), proc: Path = Path("/proc")) -> None:
+        self._settings = settings
+        self._sys = sys
+        self._proc = proc
+        self._port: serial.Serial | None = None
+        self._fd = -1
+        self._counters: TtyCounters | None = None
+        self._denied = False
+        self._on_data: OnData = _nobody
+        self._on_end: OnEnd = _nobody_ends
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._timer: asyncio.Handle | None = None
+        self._unsent = bytearray()
+        self._coalesce_s = settings.coalesce_ms / 1000
+        self.title = settings.port
+        self.auto_baud = settings.baud == "auto"
+        self.writable = True
+        self.baud: int = DEFAULT_BAUD if settings.baud == "auto" else settings.baud
+        self.hold_ns = 0
+
+    async def wait_present(self) -> None:
+        """Return when the port is there. After a refused `open`: when access is given, or after ACCESS_WAIT_S."""
+        path = Path(self._settings.port)
+        await wait_until(path, path.exists)
+        if not self._denied:
+            return
+        try:
+            async with asyncio.timeout(ACCESS_WAIT_S):
+                await wait_until(path, lambda: os.access(path, os.R_OK | os.W_OK, effective_ids=True))
+        except TimeoutError:
+            return
+
+    def open(self) -> None:
+        """Open the port exclusively, raw 8N1. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        path = self._settings.port
+        self._denied = False
+        try:
+            self._port = open_port(path, self.baud, self._proc)
+        except LinkDenied:
+            self._denied = True
+            raise
+        self._fd = self._port.fileno()
+        self._counters = TtyCounters(self._fd)
+        if self._settings.low_latency:
+            request_low_latency(self._port, path, self._sys)
+        self.hold_ns = hold_ns(path, self._sys) + self._settings.coalesce_ms * NS_PER_MS
+
+    def start(self, on_data: OnData, on_end: OnEnd) -> None:
+        """Deliver bytes from now on."""
+        self._on_data, self._on_end = on_data, on_end
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._fd, self._read_coalescing if self._coalesce_s else self._read)
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; what the port does not take at once is queued, up to WRITE_QUEUE_BYTES. Raises LinkError."""
+        if self._fd < 0:
+            raise LinkError(f"{self.title} is not open: nothing can be sent")
+        if len(self._unsent) + len(data) > WRITE_QUEUE_BYTES:
+            raise LinkError(f"{self.title} does not send: {len(self._unsent)} bytes wait; is the port stuck?")
+        if self._unsent:
+            self._unsent += data
+            return
+        rest = data[self._send(data) :]
+        if rest:
+            self._unsent += rest
+            self._loop = self._loop or asyncio.get_running_loop()
+            self._loop.add_writer(self._fd, self._write_more)
+
+    def set_baud(self, baud: int) -> None:
+        """Change the rate; bytes received at the old one are thrown away. Raises LinkError if the port cannot do it."""
+        if self._port is None:
+            raise LinkError(f"{self.title} is not open: its rate cannot be set")
+        change_baud(self._port, self._settings.port, baud, self._proc)
+        self.baud = baud
+
+    def kernel_counters(self) -> KernelCounters:
+        """Errors the kernel counted since `open`; zeros where the driver counts none."""
+        return self._counters.read() if self._counters else KernelCounters()
+
+    def close(self) -> None:
+        """Release the port; may be called twice."""
+        self._stop()
+        self._fd = -1
+        self._unsent.clear()
+        self._counters = None
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+    def _read(self) -> int:
+        """One read; returns its size, 0 for nothing there, -1 for the end."""
+        try:
+            data = os.read(self._fd, READ_BYTES)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            return self._end(error)
+        if not data:
+            return self._end(None)
+        self._on_data(data, time.monotonic_ns())
+        return len(data)
+
+    def _read_coalescing(self) -> None:
+        loop, fd = self._loop, self._fd
+        size = self._read()
+        if loop is None or fd < 0 or fd != self._fd or size < 0:  # ended, or closed by the receiver
+            return
+        if size and self._timer is None:
+            loop.remove_reader(fd)
+        if size >= FULL_READ_BYTES:
+            self._timer = loop.call_soon(self._read_coalescing)
+        elif size:
+            self._timer = loop.call_later(self._coalesce_s, self._read_coalescing)
+        elif self._timer is not None:
+            self._timer = None
+            loop.add_reader(fd, self._read_coalescing)
+
+    def _end(self, error: OSError | None) -> int:
+        self._stop()
+        reason = "hung up" if error is None else f"{os.strerror(error.errno or 0)}"
+        self._on_end(LinkMissing(f"{self.title} is gone ({reason}): was the cable or the adapter pulled out?"))
+        return -1
+
+    def _send(self, data: bytes | bytearray) -> int:
+        try:
+            return os.write(self._fd, data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise explain(error, self.title, self._proc) from error
+
+    def _write_more(self) -> None:
+        try:
+            sent = self._send(self._unsent)
+        except LinkError:  # the reader sees the same end, and tells
+            sent = len(self._unsent)
+        del self._unsent[:sent]
+        if not self._unsent and self._loop is not None:
+            self._loop.remove_writer(self._fd)
+
+    def _stop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._loop is not None and self._fd >= 0:
+            self._loop.remove_reader(self._fd)
+            self._loop.remove_writer(self._fd)
+        self._loop = None
+
+
+def _nobody(data: bytes, t_rx_ns: int) -> None:
+    """Before `start` nobody listens."""
+
+
+def _nobody_ends(error: LinkError | None) -> None:
+    """Before `start` nobody listens."""
+
+
+LINK = LinkType("uart", UartSettings, UartLink)

@@ -1,0 +1,211 @@
+"""The Prometheus endpoint: `http://ADDRESS:PORT/metrics`. Names and meanings: docs/metrics.md.
+
+    HTTP thread ──call_soon_threadsafe──▶ event loop: status, clients ──▶ HTTP thread: render, send
+
+The event loop gives a snapshot of plain records and goes on. Rendering holds Python's global lock, so the HTTP
+thread pauses for PAUSE_S before every metric and every SAMPLES_PER_TURN lines of it: measured with 16 devices
+(`python -m tests.bench.metrics`), a whole scrape without pauses keeps the loop waiting for 7 ms, one turn 0.3 ms.
+"""
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import msgspec
+from prometheus_client import CollectorRegistry, ProcessCollector
+from prometheus_client.core import Metric
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
+from prometheus_client.samples import Sample as Line
+
+from imud.contracts.batch import Batch
+from imud.contracts.publisher import PublisherContext, PublisherType
+from imud.contracts.settings import Settings
+from imud.contracts.status import ClientStatus, DeviceStatus
+from imud.event import Event
+from imud.publishers.metrics.clients import ClientTotals, client_metrics
+from imud.publishers.metrics.families import build_info, device_metrics, events, heartbeat
+from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
+
+log = logging.getLogger(__name__)
+
+SNAPSHOT_S: Final = 2.0
+"""An event loop that does not answer within this is stuck; the scrape then says so."""
+PAUSE_S: Final = 100e-6
+"""Long enough for the kernel to wake the loop's thread, which takes some ten microseconds."""
+
+SAMPLES_PER_TURN: Final = 64
+"""Lines rendered without a pause; one costs some 4 µs."""
+
+ABOUT: Final = b"imud: metrics for Prometheus are at /metrics\n"
+
+
+class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The Prometheus endpoint."""
+
+    enabled: bool = True
+    """Whether metrics are served at all."""
+    address: Annotated[str, msgspec.Meta(min_length=1)] = "127.0.0.1"
+    """IP address to listen on; `0.0.0.0` is every network of this machine. There is no password."""
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 9321
+    """TCP port; 0 takes any free one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What one scrape shows, all of one moment of the event loop."""
+
+    devices: Sequence[DeviceStatus] = ()
+    clients: Sequence[ClientStatus] = ()
+    events: Sequence[tuple[tuple[str, str], int]] = ()
+    """Events so far, by device and kind."""
+    heartbeat_age_ns: int = 0
+
+
+class DaemonCollector(Collector):
+    """Turns the newest snapshot into metrics. Synchronization: the HTTP thread."""
+
+    def __init__(self, pause: Callable[[], None]) -> None:
+        self.snapshot = Snapshot()
+        self._totals = ClientTotals()
+        self._pause = pause
+
+    def describe(self) -> list[Metric]:
+        """No names are claimed ahead: they would be rendered once for nothing."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics of the snapshot, which pause while they are rendered."""
+        for metric in self._metrics():
+            metric.samples = _Unhurried(metric.samples, self._pause)
+            yield metric
+
+    def _metrics(self) -> Iterator[Metric]:
+        snapshot = self.snapshot
+        self._totals.update(snapshot.clients)
+        yield build_info()
+        yield heartbeat(snapshot.heartbeat_age_ns)
+        yield from device_metrics(snapshot.devices)
+        yield from client_metrics(snapshot.clients, self._totals)
+        yield events(snapshot.events)
+
+
+class _Unhurried(list[Line]):
+    """The samples of a metric; whoever goes through them pauses now and then."""
+
+    def __init__(self, samples: Sequence[Line], pause: Callable[[], None]) -> None:
+        super().__init__(samples)
+        self._pause = pause
+
+    def __iter__(self) -> Iterator[Line]:
+        for begin in range(0, len(self), SAMPLES_PER_TURN):
+            self._pause()
+            yield from self[begin : begin + SAMPLES_PER_TURN]
+
+
+class Renderer:
+    """The registry of all metrics and the text made from it. Synchronization: the HTTP thread."""
+
+    def __init__(self, pause: Callable[[], None] = lambda: time.sleep(PAUSE_S)) -> None:
+        self._registry = CollectorRegistry()
+        self._collector = DaemonCollector(pause)
+        self._registry.register(self._collector)
+        ProcessCollector(registry=self._registry)
+
+    def render(self, snapshot: Snapshot, accept: str) -> HttpResponse:
+        """The metrics in the format that the Accept header asks for."""
+        self._collector.snapshot = snapshot
+        encode, content_type = choose_encoder(accept)
+        return HttpResponse("200 OK", encode(self._registry), content_type)
+
+
+class MetricsPublisher:
+    """Serves metrics. Synchronization: the event loop's thread; `_answer` runs in the HTTP thread."""
+
+    def __init__(self, settings: MetricsSettings, context: PublisherContext, *, snapshot_s: float = SNAPSHOT_S) -> None:
+        self._settings = settings
+        self._context = context
+        self._snapshot_s = snapshot_s
+        self._events: Counter[tuple[str, str]] = Counter()
+        self._tick_ns = context.now_ns()
+        self._renderer = Renderer()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._server: ScrapeServer | None = None
+
+    @property
+    def port(self) -> int:
+        """The bound port; 0 while nothing is served."""
+        return self._server.port if self._server else 0
+
+    def start(self) -> None:
+        """Listen, if enabled. Raises ServerError when address and port cannot be had."""
+        if not self._settings.enabled:
+            return
+        self._loop = asyncio.get_running_loop()
+        server = ScrapeServer(self._settings.address, self._settings.port, self._answer)
+        server.start()
+        self._server = server
+        log.info("metrics at http://%s:%d/metrics", self._settings.address, self.port)
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """Devices are found in the status at every scrape."""
+
+    def remove_device(self, name: str) -> None:
+        """Forget the device's events."""
+        for key in [key for key in self._events if key[0] == name]:
+            del self._events[key]
+
+    def publish(self, batch: Batch) -> None:
+        """Samples are counted by the pipeline already."""
+
+    def event(self, event: Event) -> None:
+        """Count it."""
+        self._events[event.device, event.kind.value] += 1
+
+    def tick(self, now_ns: int) -> None:
+        """Note that the event loop runs."""
+        self._tick_ns = now_ns
+
+    def close(self) -> None:
+        """End the HTTP thread; may be called twice."""
+        if self._server:
+            self._server.close()
+        self._server = None
+
+    async def _answer(self, request: HttpRequest) -> HttpResponse:
+        if request.method not in ("GET", "HEAD"):
+            return HttpResponse("405 Method Not Allowed", b"expected GET or HEAD\n")
+        if request.path == "/":
+            return HttpResponse("200 OK", ABOUT)
+        if request.path != "/metrics":
+            return HttpResponse("404 Not Found", b"there is only /metrics\n")
+        try:
+            snapshot = await self._ask_loop()
+        except TimeoutError:
+            seconds = f"{self._snapshot_s:g}"
+            return HttpResponse("503 Service Unavailable", f"the daemon gave no status within {seconds} s\n".encode())
+        return self._renderer.render(snapshot, request.accept)
+
+    async def _ask_loop(self) -> Snapshot:
+        """A snapshot made in the daemon's event loop. Raises TimeoutError when the loop is stuck or has ended."""
+        answer: Future[Snapshot] = Future()
+        if self._loop is None or self._loop.is_closed():
+            raise TimeoutError
+        self._loop.call_soon_threadsafe(self._give_snapshot, answer)
+        async with asyncio.timeout(self._snapshot_s):
+            return await asyncio.wrap_future(answer)
+
+    def _give_snapshot(self, answer: "Future[Snapshot]") -> None:
+        if answer.set_running_or_notify_cancel():
+            age_ns = self._context.now_ns() - self._tick_ns
+            answer.set_result(
+                Snapshot(self._context.status(), self._context.clients(), tuple(self._events.items()), age_ns)
+            )
+
+
+PUBLISHER = PublisherType("metrics", MetricsSettings, MetricsPublisher)

@@ -1,0 +1,213 @@
+"""A small HTTP/1.1 server for scrapes, in a thread with an event loop of its own.
+
+A connection is one request and one answer. A client that connects and says nothing, says it slowly, or does not read
+its answer holds one of CONNECTIONS_MAX places for CONNECTION_S at most, and nothing else; when all are taken, the
+oldest connection is ended for the new one, so that silent clients cannot lock out the one that asks.
+Synchronization: `start` and `close` in one thread; `answer` runs in the server's own.
+"""
+
+import asyncio
+import errno
+import socket
+import threading
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Final
+
+from imud.errors import ServerError
+
+CONNECTION_S: Final = 5.0
+"""From connection to the end of the answer. Prometheus itself gives up after 10 s."""
+CONNECTIONS_MAX: Final = 32
+"""A handful of scrapers and people is what is meant."""
+REQUEST_BYTES_MAX: Final = 8192
+"""Prometheus sends about 400 bytes of request and headers."""
+
+ACCEPT_PAUSE_S: Final = 1.0
+"""After the process ran out of descriptors."""
+
+TEXT: Final = "text/plain; charset=utf-8"
+
+
+@dataclass(frozen=True, slots=True)
+class HttpRequest:
+    """What is looked at of a request."""
+
+    method: str
+    path: str
+    """Without the query."""
+    accept: str
+    """The Accept header, empty if there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class HttpResponse:
+    """What goes back."""
+
+    status: str
+    """Code and reason, for example `200 OK`."""
+    body: bytes
+    content_type: str = TEXT
+
+
+class ScrapeServer:
+    """Serves `answer` over HTTP."""
+
+    def __init__(
+        self,
+        address: str,
+        port: int,
+        answer: Callable[[HttpRequest], Awaitable[HttpResponse]],
+        *,
+        connection_s: float = CONNECTION_S,
+        connections_max: int = CONNECTIONS_MAX,
+    ) -> None:
+        self.address = address
+        self.port = port
+        """The bound port once started, also where 0 was asked for."""
+        self._answer = answer
+        self._connection_s = connection_s
+        self._connections_max = connections_max
+        self._connections: dict[asyncio.Task[None], None] = {}
+        self._listener: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._stop: asyncio.Event | None = None
+
+    def start(self) -> None:
+        """Listen. Raises ServerError when address and port cannot be had."""
+        self._listener = _listen(self.address, self.port)
+        self.port = self._listener.getsockname()[1]
+        ready = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(self._listener, ready), name="scrape", daemon=True)
+        self._thread.start()
+        ready.wait()
+        if self._stop is None:
+            self._thread.join()
+            self._listener.close()
+            raise ServerError(f"metrics cannot be served at {self.address} port {self.port}: the thread did not start")
+
+    def close(self) -> None:
+        """End every connection and the thread; may be called twice."""
+        if self._thread and self._loop and self._stop:
+            self._loop.call_soon_threadsafe(self._stop.set)
+            self._thread.join()
+        if self._listener:
+            self._listener.close()
+        self._thread = self._listener = None
+
+    def _run(self, listener: socket.socket, ready: threading.Event) -> None:
+        try:
+            asyncio.run(self._serve(listener, ready))
+        finally:
+            ready.set()
+
+    async def _serve(self, listener: socket.socket, ready: threading.Event) -> None:
+        loop = self._loop = asyncio.get_running_loop()
+        self._stop = asyncio.Event()
+        loop.add_reader(listener, self._accept, loop, listener)
+        ready.set()
+        await self._stop.wait()
+        loop.remove_reader(listener)
+        connections = list(self._connections)
+        for connection in connections:
+            connection.cancel()
+        await asyncio.gather(*connections, return_exceptions=True)
+
+    def _accept(self, loop: asyncio.AbstractEventLoop, listener: socket.socket) -> None:
+        """Not `asyncio.start_server`: of a connection accepted just before the end it may never tell or close it."""
+        try:
+            client, _ = listener.accept()
+        except (BlockingIOError, ConnectionError):
+            return
+        except (
+            OSError
+        ):  # out of descriptors: the listener stays readable, and looking again at once would be a busy loop
+            loop.remove_reader(listener)
+            loop.call_later(ACCEPT_PAUSE_S, loop.add_reader, listener, self._accept, loop, listener)
+            return
+        if len(self._connections) >= self._connections_max:
+            oldest = next(iter(self._connections))
+            del self._connections[oldest]
+            oldest.cancel()
+        client.setblocking(False)
+        connection = loop.create_task(self._converse(loop, client))
+        self._connections[connection] = None
+        connection.add_done_callback(lambda done: self._ended(done, client))
+
+    def _ended(self, connection: asyncio.Task[None], client: socket.socket) -> None:
+        """Not in the conversation itself: one that is cancelled before its first step runs none of its own code."""
+        self._connections.pop(connection, None)
+        client.close()
+
+    async def _converse(self, loop: asyncio.AbstractEventLoop, client: socket.socket) -> None:
+        try:
+            async with asyncio.timeout(self._connection_s):
+                head = await _read_head(loop, client)
+                if head is not None:
+                    request = parse_request(head)
+                    answer = (
+                        await self._answer(request)
+                        if request
+                        else HttpResponse("400 Bad HttpRequest", b"expected HTTP/1.1\n")
+                    )
+                    with_body = request is None or request.method != "HEAD"
+                    await loop.sock_sendall(client, _response(answer, with_body=with_body))
+        except (TimeoutError, ConnectionError):
+            pass  # silent, slow, or gone: nothing is owed
+
+
+async def _read_head(loop: asyncio.AbstractEventLoop, client: socket.socket) -> bytes | None:
+    """Everything up to the empty line; None when the client ends first or says too much."""
+    data = b""
+    while b"\r\n\r\n" not in data:
+        part = await loop.sock_recv(client, REQUEST_BYTES_MAX)
+        data += part
+        if not part or len(data) > REQUEST_BYTES_MAX:
+            return None
+    return data[: data.index(b"\r\n\r\n")]
+
+
+def parse_request(head: bytes) -> HttpRequest | None:
+    """HttpRequest line and headers (RFC 9112, sections 3 and 5); None if they are no HTTP/1."""
+    line, *headers = head.decode("latin-1").split("\r\n")
+    words = line.split(" ")
+    if len(words) != 3 or not words[2].startswith("HTTP/1."):
+        return None
+    accepted = []
+    for header in headers:
+        name, _, value = header.partition(":")
+        if name.lower() == "accept":
+            accepted.append(value.strip())
+    return HttpRequest(words[0], words[1].partition("?")[0], ",".join(accepted))
+
+
+def _response(answer: HttpResponse, *, with_body: bool) -> bytes:
+    head = (
+        f"HTTP/1.1 {answer.status}\r\nContent-Type: {answer.content_type}\r\n"
+        f"Content-Length: {len(answer.body)}\r\nConnection: close\r\n\r\n"
+    )
+    return head.encode("latin-1") + (answer.body if with_body else b"")
+
+
+def _listen(address: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((address, port))
+        listener.listen()
+        listener.setblocking(False)
+    except OSError as error:
+        listener.close()
+        raise ServerError(_bind_message(address, port, error)) from error
+    return listener
+
+
+def _bind_message(address: str, port: int, error: OSError) -> str:
+    hint = "set metrics.address to an address of this machine, for example 127.0.0.1 or 0.0.0.0"
+    if error.errno == errno.EADDRINUSE:
+        hint = f"another program listens there, `ss -ltnp 'sport = {port}'` names it; or set metrics.port"
+    elif error.errno == errno.EACCES:
+        hint = "ports below 1024 need CAP_NET_BIND_SERVICE; set metrics.port to a higher one"
+    return f"metrics cannot be served at {address} port {port}: {error.strerror}; {hint}"

@@ -1,0 +1,92 @@
+"""Samples as socket messages: one encoding object per form, made once per batch for all clients that want that form."""
+
+from collections.abc import Callable, Mapping
+from operator import attrgetter
+from typing import Final, Protocol
+
+from imud.contracts.batch import Batch
+from imud.formats.jsonrpc import FRAME_HEADER, encode, encode_notification, frame_of, line_of
+from imud.formats.slot import SLOT_BYTES
+from imud.sample import Sample
+
+ALWAYS_FIELDS: Final = ("device", "seq", "t_ns")
+"""What a JSON sample has whatever was selected: without them it cannot be placed."""
+_HEAD: Final = b'{"jsonrpc":"2.0","method":"sample","params":'
+_TAIL: Final = b"}"
+_SLOT_HEADER: Final = FRAME_HEADER.pack(SLOT_BYTES)
+
+
+class Encoding(Protocol):
+    """Makes messages of samples. One message is one sample, so that a queue can drop by the sample."""
+
+    def encode(self, batch: Batch) -> list[bytes]:
+        """Every sample of the batch as a message."""
+        ...
+
+    def encode_one(self, batch: Batch, index: int) -> bytes:
+        """One sample of the batch as a message."""
+        ...
+
+    def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
+        """A message of `device` that also tells how many samples of which devices were dropped before it."""
+        ...
+
+
+class JsonEncoding:
+    """`sample` notifications, all members or the selected ones, as lines or as frames."""
+
+    def __init__(self, fields: tuple[str, ...] | None, framed: bool) -> None:
+        self._wrap = frame_of if framed else line_of
+        self._select = None if fields is None else selector(fields)
+
+    def encode(self, batch: Batch) -> list[bytes]:
+        """Every sample of the batch as a notification."""
+        return [self._message(sample) for sample in batch.samples]
+
+    def encode_one(self, batch: Batch, index: int) -> bytes:
+        """One sample of the batch as a notification."""
+        return self._message(batch.samples[index])
+
+    def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
+        """The device's own number becomes a member of the sample; the others come as notifications before it."""
+        notices = [_dropped_notice(name, count, self._wrap) for name, count in dropped.items() if name != device]
+        own = dropped.get(device)
+        if own is not None:
+            body = message[message.index(_HEAD) :].rstrip(b"\n")
+            message = self._wrap(b'%b,"dropped":%d}}' % (body[:-2], own))
+        return b"".join((*notices, message))
+
+    def _message(self, sample: Sample) -> bytes:
+        return self._wrap(_HEAD + encode(self._select(sample) if self._select else sample) + _TAIL)
+
+
+class BinaryEncoding:
+    """Frames of one slot each."""
+
+    def encode(self, batch: Batch) -> list[bytes]:
+        """Every sample of the batch as a frame."""
+        return [_SLOT_HEADER + slot for slot in batch.slots()]
+
+    def encode_one(self, batch: Batch, index: int) -> bytes:
+        """One sample of the batch as a frame."""
+        return _SLOT_HEADER + batch.slots()[index]
+
+    def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
+        """`dropped` notifications, then the slot."""
+        return b"".join((*(_dropped_notice(name, count, frame_of) for name, count in dropped.items()), message))
+
+
+def selector(fields: tuple[str, ...]) -> Callable[[Sample], dict[str, object]]:
+    """A function that takes the selected members of a sample, and those that are always there; absent ones stay out."""
+    names = tuple(dict.fromkeys((*ALWAYS_FIELDS, *fields)))
+    values = attrgetter(*names)
+
+    def select(sample: Sample) -> dict[str, object]:
+        pairs = zip(names, values(sample), strict=True)
+        return {name: value for name, value in pairs if value is not None}
+
+    return select
+
+
+def _dropped_notice(device: str, count: int, wrap: Callable[[bytes], bytes]) -> bytes:
+    return wrap(encode_notification("dropped", {"device": device, "dropped": count}))

@@ -1,0 +1,188 @@
+"""The UNIX socket publisher: JSON-RPC 2.0 for questions, samples as JSON lines or binary slots (docs/socket.md).
+
+    Listener ──accept──▶ Guard (rights) ──▶ Connection ──line──▶ rpc.handle_line ──▶ Hub
+    publish(batch) ──▶ Hub ──▶ Group per form ──the same bytes──▶ Outbox per client ──▶ send, or a bounded queue
+
+Readers and writers are descriptors in the event loop, no streams: measured elsewhere, asyncio streams cost three times
+as much per sample.
+"""
+
+import asyncio
+import logging
+import os
+import socket
+from pathlib import Path
+from typing import Annotated, Final
+
+import msgspec
+
+from imud.contracts.batch import Batch
+from imud.contracts.publisher import PublisherContext, PublisherType
+from imud.contracts.settings import Settings
+from imud.event import Event
+from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
+from imud.publishers.socket.connection import Connection, Owner
+from imud.publishers.socket.hub import Hub
+from imud.publishers.socket.listener import Listener
+from imud.publishers.socket.outbox import Limits
+from imud.publishers.socket.rights import Guard, Peer, Rights, gid_of, peer_of
+from imud.publishers.socket.rpc import handle_line, hello
+
+log = logging.getLogger(__name__)
+
+ACCEPTS_PER_TURN: Final = 16
+
+
+class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the UNIX socket."""
+
+    enabled: bool = True
+    """Whether imud serves the socket."""
+    path: Annotated[str, msgspec.Meta(pattern="^/.*[^/]$")] = DEFAULT_PATH
+    """Where the socket is, an absolute path."""
+    group: str = "imud"
+    """Members of this group may read; the socket file belongs to it."""
+    control_group: str = "imud-control"
+    """Members of this group may also change things."""
+    clients_max: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
+    """At most so many clients at a time; one more is told so and disconnected."""
+    queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
+    """At most so many samples wait for a client that does not read; 4096 are 4 s at 1 kHz. The oldest are dropped."""
+    queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
+    """At most so many bytes of samples wait for a client that does not read."""
+
+
+class SocketServer:
+    """Serves clients on a UNIX socket. Synchronization: the event loop's thread."""
+
+    def __init__(self, settings: SocketSettings, context: PublisherContext) -> None:
+        self._settings = settings
+        self._context = context
+        self.hub = Hub(settings.path, context)
+        self._owner = Owner(
+            self._on_line, self._on_close, self._on_evicted, Limits(settings.queue_samples, settings.queue_bytes)
+        )
+        self._listener: Listener | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._guard = Guard(os.geteuid(), None, None)
+        self._paused = False
+
+    def start(self) -> None:
+        """Listen. Raises ServerError and leaves nothing behind when that is not possible."""
+        settings = self._settings
+        self._loop = asyncio.get_running_loop()
+        self._guard = Guard(os.geteuid(), gid_of(settings.group), gid_of(settings.control_group))
+        self._listener = Listener(Path(settings.path), settings.group)
+        self._loop.add_reader(self._listener.sock, self._accept)
+        self._context.client_sources.append(self.hub.clients)
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """A device appears."""
+        self.hub.add_device(name, device_id)
+
+    def remove_device(self, name: str) -> None:
+        """A device leaves."""
+        self.hub.remove_device(name)
+
+    def publish(self, batch: Batch) -> None:
+        """Give the batch to the clients that want it."""
+        self.hub.publish(batch)
+
+    def event(self, event: Event) -> None:
+        """Tell clients of an event."""
+        self.hub.event(event)
+
+    def tick(self, now_ns: int) -> None:
+        """Close what lingered long enough; accept again after a pause."""
+        for connection in list(self.hub.connections.values()):
+            connection.tick()
+        if self._paused and self._listener is not None and self._loop is not None:
+            self._paused = False
+            self._loop.add_reader(self._listener.sock, self._accept)
+
+    def close(self) -> None:
+        """Stop listening, close every client, remove the socket file if it is ours; may be called twice."""
+        if self._listener is None:
+            return
+        if self._loop is not None:
+            self._loop.remove_reader(self._listener.sock)
+        self._listener.close()
+        self._listener = None
+        for connection in list(self.hub.connections.values()):
+            connection.close()
+        self.hub.end()
+        self._context.client_sources.remove(self.hub.clients)
+
+    # --- clients ----------------------------------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        for _ in range(ACCEPTS_PER_TURN):
+            if self._listener is None:
+                return
+            try:
+                sock, _address = self._listener.sock.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._pause(error)
+                return
+            sock.setblocking(False)
+            self._welcome(sock)
+
+    def _pause(self, error: OSError) -> None:
+        """Out of descriptors or memory: without a pause until the next tick, the loop would do nothing but fail."""
+        assert self._listener is not None
+        assert self._loop is not None
+        log.warning("cannot accept a client: %s", error.strerror)
+        self._loop.remove_reader(self._listener.sock)
+        self._paused = True
+
+    def _welcome(self, sock: socket.socket) -> None:
+        try:
+            peer = peer_of(sock)
+        except OSError:  # gone already
+            sock.close()
+            return
+        rights = self._guard.rights_of(peer)
+        refusal = self._refusal(peer, rights)
+        if refusal is not None:
+            self.hub.refused += 1
+            _refuse(sock, refusal)
+            return
+        self.hub.accepted += 1
+        number = self.hub.accepted
+        connection = Connection(number, sock, peer, rights, self._owner)
+        self.hub.connections[number] = connection
+        connection.post(hello(self.hub, connection))
+
+    def _refusal(self, peer: Peer, rights: Rights) -> RpcError | None:
+        settings = self._settings
+        if Rights.READ not in rights:
+            message = f"uid {peer.uid} may not read: expected root or a member of group {settings.group!r}"
+            return RpcError(Code.DENIED, message)
+        if len(self.hub.connections) >= settings.clients_max:
+            message = f"there are {settings.clients_max} clients already, as many as socket.clients_max allows"
+            return RpcError(Code.TOO_MANY_CLIENTS, message)
+        return None
+
+    def _on_line(self, connection: Connection, line: bytes) -> None:
+        handle_line(self.hub, connection, line)
+
+    def _on_close(self, connection: Connection) -> None:
+        self.hub.connections.pop(connection.number, None)
+        self.hub.changed()
+
+    def _on_evicted(self) -> None:
+        self.hub.evicted += 1
+
+
+def _refuse(sock: socket.socket, error: RpcError) -> None:
+    """Say why and close. The socket is new, so its buffer takes the line; if the peer is gone, so be it."""
+    try:
+        sock.send(line_of(encode_error(error)))
+    except OSError as problem:
+        log.debug("a refused client left first: %s", problem)
+    sock.close()
+
+
+PUBLISHER = PublisherType("socket", SocketSettings, SocketServer)

@@ -1,0 +1,329 @@
+"""The methods of the UNIX socket: a table of name → parameters and handler, and the way from a line to its reply."""
+
+from collections.abc import Callable, Collection, Coroutine, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
+
+import msgspec
+
+from imud import __version__
+from imud.errors import ImudError
+from imud.formats.fields import FIELDS
+from imud.formats.jsonrpc import (
+    PROTOCOL,
+    Code,
+    RpcError,
+    RpcRequest,
+    encode_error,
+    encode_notification,
+    encode_result,
+    parse_request,
+)
+from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
+from imud.publishers.socket.connection import Connection
+from imud.publishers.socket.encoding import selector
+from imud.publishers.socket.hub import Hub
+from imud.publishers.socket.outbox import NO_FD
+from imud.publishers.socket.rights import Rights
+from imud.publishers.socket.subscription import Form, Subscription
+from imud.sample import SAMPLE_FIELDS
+
+RATE_MIN_HZ: Final = 0.001
+"""Slower than one sample in 1,000 s is a mistake of units more likely than a wish; `poll` serves it."""
+RATE_MAX_HZ: Final = 1_000_000
+"""No sensor is as fast; far above, the count of periods would leave the range of a float."""
+
+P = TypeVar("P", bound=msgspec.Struct)
+
+
+class NoParams(msgspec.Struct):
+    """For methods without parameters."""
+
+
+class WatchParams(msgspec.Struct):
+    """Parameters of `watch`; what is left out or null means all, all, every sample, JSON."""
+
+    devices: list[str] | None = None
+    fields: list[str] | None = None
+    rate_hz: float | None = None
+    encoding: Form = Form.JSON
+
+
+class PollParams(msgspec.Struct):
+    """Parameters of `poll`."""
+
+    devices: list[str] | None = None
+    fields: list[str] | None = None
+
+
+class EventsParams(msgspec.Struct):
+    """Parameters of `events`."""
+
+    devices: list[str] | None = None
+    enable: bool = True
+
+
+class DeviceParams(msgspec.Struct):
+    """Parameters of methods about one device."""
+
+    device: str
+
+
+class CommandParams(msgspec.Struct):
+    """Parameters of `command`."""
+
+    device: str
+    name: str
+    arguments: dict[str, Any] = {}  # msgspec copies a mutable default
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a method answers."""
+
+    result: object
+    fd: int = NO_FD
+    """A descriptor whose copy goes with the reply."""
+    framed_from_here: bool = False
+    """Whether everything after this reply goes out as frames."""
+
+
+Later = Coroutine[Any, Any, object]
+"""A result that takes its time; other requests of the client are answered before it. May raise ImudError."""
+
+
+@dataclass(frozen=True, slots=True)
+class Method(Generic[P]):
+    """A row of the table."""
+
+    params: type[P]
+    run: Callable[[Hub, Connection, P], Answer | Later]
+    right: Rights = Rights.READ
+    """What the client must be allowed to do."""
+    acts: bool = False
+    """Whether it does something besides answering: only then is there a point in a request that wants no reply."""
+
+
+def hello(hub: Hub, connection: Connection) -> bytes:
+    """The notification that greets a client."""
+    rights = [right.name.lower() for right in Rights if right in connection.rights and right.name]
+    params = {"protocol": PROTOCOL, "version": __version__, "epoch": hub.context.epoch, "rights": rights}
+    return encode_notification("hello", params)
+
+
+def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
+    """Do what a line asks and send the reply. Whatever the line is, the connection lives on."""
+    try:
+        request = parse_request(line)
+    except RpcError as error:
+        connection.post(encode_error(error))
+        return
+    try:
+        answer = _call(hub, connection, request)
+    except RpcError as error:
+        if request.wants_reply:
+            error.request_id = request.request_id
+            connection.post(encode_error(error))
+        return
+    if answer is None:
+        return
+    if not isinstance(answer, Answer):
+        hub.do_later(connection, _answer_later(connection, request, answer))
+        return
+    if request.wants_reply:
+        connection.post(encode_result(request.request_id, answer.result), answer.fd)
+    if answer.framed_from_here and not connection.framed:
+        connection.framed = True
+
+
+async def _answer_later(connection: Connection, request: RpcRequest, later: Later) -> None:
+    """Wait for the result and send it."""
+    try:
+        result = await later
+    except ImudError as error:
+        body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
+    else:
+        body = encode_result(request.request_id, result)
+    if request.wants_reply:
+        connection.post(body)
+
+
+def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Later | None:
+    method = METHODS.get(request.method)
+    if method is None:
+        message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
+        raise RpcError(Code.METHOD_NOT_FOUND, message)
+    if method.right not in connection.rights:
+        raise RpcError(Code.DENIED, f"{request.method}: expected root or a member of the control group")
+    if not request.wants_reply and not method.acts:
+        return None
+    try:
+        params = msgspec.convert(request.params, method.params)
+    except msgspec.ValidationError as error:
+        raise RpcError(Code.INVALID_PARAMS, f"{request.method}: {error}") from None
+    return method.run(hub, connection, params)
+
+
+# --- what there is ------------------------------------------------------------------------------------------------
+
+
+def _devices(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
+    """What there is: one line's worth of each device."""
+    return Answer(
+        [
+            {
+                "name": device.name,
+                "device_id": device.device_id,
+                "driver": device.driver,
+                "link": device.link,
+                "state": device.state,
+                "problem": device.problem,
+                "identity": device.identity,
+                "rate_hz": device.rate_hz,
+                "sync": device.clock.sync,
+            }
+            for device in hub.context.status()
+        ]
+    )
+
+
+def _status(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
+    """Everything: each device with its clock and ledger, the socket with its clients."""
+    return Answer({"now_ns": hub.context.now_ns(), "devices": hub.context.status(), "socket": hub.status()})
+
+
+def _schema(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
+    """What the members of samples mean, per device where that differs, and how a slot is laid out."""
+    devices = {
+        device.name: {
+            "driver": device.driver,
+            "euler_convention": device.euler_convention,
+            "navigation_frame": device.navigation_frame,
+        }
+        for device in hub.context.status()
+    }
+    return Answer({"protocol": PROTOCOL, "fields": FIELDS, "devices": devices, "slot": SLOT_SCHEMA})
+
+
+SLOT_SCHEMA: Final = {
+    "bytes": SLOT_BYTES,
+    "layout_version": SLOT_LAYOUT_VERSION,
+    "byte_order": "little",
+    "fields": [{"name": f.name, "struct": f.code, "count": f.count, "offset": f.offset} for f in SLOT_FIELDS],
+    "present_bits": PRESENT_BITS,
+    "sync_codes": SYNC_CODES,
+}
+
+
+# --- samples --------------------------------------------------------------------------------------------------------
+
+
+def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
+    """Samples from now on; replaces what the client watched before."""
+    devices = _known_devices(hub, params.devices)
+    fields = _known_fields(params.fields)
+    rate_hz = _rate(params.rate_hz)
+    connection.subscription = Subscription(devices, fields, rate_hz, params.encoding)
+    hub.changed()
+    numbers = hub.devices if devices is None else {name: hub.devices[name] for name in devices}
+    result = {"encoding": params.encoding, "devices": numbers, "rate_hz": rate_hz}
+    return Answer(result, framed_from_here=params.encoding is Form.BINARY)
+
+
+def _unwatch(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
+    """No more samples; what already waits for the client is still sent."""
+    connection.subscription = None
+    hub.changed()
+    return Answer({})
+
+
+def _poll(hub: Hub, _connection: Connection, params: PollParams) -> Answer:
+    """The newest sample of each device that has one."""
+    names = _known_devices(hub, params.devices) or tuple(hub.devices)
+    fields = _known_fields(params.fields)
+    newest = [hub.newest[name] for name in names if name in hub.newest]
+    samples = newest if fields is None else list(map(selector(fields), newest))
+    return Answer({"now_ns": hub.context.now_ns(), "samples": samples})
+
+
+def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
+    """Events from now on, or none any more; replaces what was asked before."""
+    devices = _known_devices(hub, params.devices)
+    connection.event_devices = devices if params.enable else ()
+    return Answer({"enable": params.enable})
+
+
+def _notify(hub: Hub, connection: Connection, params: DeviceParams) -> Answer:
+    """A descriptor that becomes readable with each batch of one device; asked again, a new one in place of the old."""
+    _known_devices(hub, [params.device])
+    fd = connection.make_waker(params.device)
+    hub.changed()
+    return Answer({"device": params.device}, fd)
+
+
+# --- commands -------------------------------------------------------------------------------------------------------
+
+
+def _actions(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
+    """What a device can be told to do."""
+    _known_devices(hub, [params.device])
+    return Answer(hub.context.actions(params.device))
+
+
+def _command(hub: Hub, connection: Connection, params: CommandParams) -> Later:
+    """Have a device do something; the reply comes when it is done."""
+    _known_devices(hub, [params.device])
+    if hub.busy(connection):
+        raise RpcError(Code.UNAVAILABLE, "command: the one before is not done yet; wait for its reply")
+    return _done(hub, params)
+
+
+async def _done(hub: Hub, params: CommandParams) -> object:
+    return await hub.context.act(params.device, params.name, params.arguments)
+
+
+METHODS: Final[Mapping[str, Method[Any]]] = {
+    "devices": Method(NoParams, _devices),
+    "status": Method(NoParams, _status),
+    "schema": Method(NoParams, _schema),
+    "watch": Method(WatchParams, _watch, acts=True),
+    "unwatch": Method(NoParams, _unwatch, acts=True),
+    "poll": Method(PollParams, _poll),
+    "events": Method(EventsParams, _events, acts=True),
+    "notify": Method(DeviceParams, _notify),
+    "actions": Method(DeviceParams, _actions),
+    "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
+}
+
+
+# --- parameters -----------------------------------------------------------------------------------------------------
+
+
+def _known_devices(hub: Hub, names: list[str] | None) -> tuple[str, ...] | None:
+    """The names without repetition, None for all. Raises RpcError."""
+    return None if names is None else _known("device", names, hub.devices)
+
+
+def _known_fields(names: list[str] | None) -> tuple[str, ...] | None:
+    """The names without repetition, None for all. Raises RpcError."""
+    return None if names is None else _known("field", names, SAMPLE_FIELDS)
+
+
+def _known(kind: str, names: list[str], known: Collection[str]) -> tuple[str, ...]:
+    if not names:
+        raise RpcError(Code.INVALID_PARAMS, f"{kind}s: an empty list asks for nothing; leave it out for all")
+    for name in names:
+        if name not in known:
+            message = f"no {kind} named {name[:64]!r}; there are: {', '.join(known) or 'none'}"
+            raise RpcError(Code.INVALID_PARAMS, message)
+    return tuple(dict.fromkeys(names))
+
+
+def _rate(rate_hz: float | None) -> float:
+    """The rate, 0.0 for every sample. Raises RpcError."""
+    if not rate_hz:
+        return 0.0
+    if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:  # false for NaN, too
+        message = f"rate_hz: expected 0 (every sample) or {RATE_MIN_HZ} … {RATE_MAX_HZ}, got {rate_hz}"
+        raise RpcError(Code.INVALID_PARAMS, message)
+    return float(rate_hz)

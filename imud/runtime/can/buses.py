@@ -1,0 +1,56 @@
+"""What the devices of one CAN bus must know of each other: whose frames are whose, and who sends what cyclically."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from imud.formats.can import CanFilter, CyclicFrame
+
+
+class _Member(NamedTuple):
+    bus: str
+    filters: Sequence[CanFilter]
+    cyclic: Sequence[CyclicFrame]
+
+
+class CanBuses:
+    """Members of all buses by the name of the device. Synchronization: one thread."""
+
+    def __init__(self) -> None:
+        self._members: dict[str, _Member] = {}
+
+    def join(self, name: str, bus: str, filters: Sequence[CanFilter], cyclic: Sequence[CyclicFrame]) -> None:
+        """A device stands on a bus: the frames it hears, and those it wants to be sent."""
+        self._members[name] = _Member(bus, filters, cyclic)
+
+    def leave(self, name: str) -> None:
+        """It does no longer; nothing happens when it never did."""
+        self._members.pop(name, None)
+
+    def claimed(self, name: str, bus: str) -> Callable[[int, bool], bool]:
+        """Tells of an identifier (and 29 bits or not) whether another device of the bus hears such frames."""
+
+        def is_claimed(can_id: int, extended: bool) -> bool:
+            return any(
+                wanted.takes(can_id, extended)
+                for other, member in self._members.items()
+                if other != name and member.bus == bus
+                for wanted in member.filters
+            )
+
+        return is_claimed
+
+    def rivalry(self, name: str) -> str:
+        """Who has a frame sent already that this device wants to be sent, one sentence; empty when nobody has.
+
+        Of two, the one that joined first may.
+        """
+        mine = self._members.get(name)
+        wanted = {(frame.can_id, frame.extended) for frame in mine.cyclic} if mine else set()
+        for other, member in self._members.items():
+            if other == name or mine is None:
+                break
+            for frame in member.cyclic if member.bus == mine.bus else ():
+                if (frame.can_id, frame.extended) in wanted:
+                    frame_id = f"0x{frame.can_id:08X}" if frame.extended else f"0x{frame.can_id:03X}"
+                    return f"{other} and {name} would both send {frame_id} on {mine.bus}: let one of them do it"
+        return ""

@@ -1,0 +1,93 @@
+"""Drives conversations with one device: sends requests over the link, feeds it what comes back."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from time import monotonic_ns
+from typing import TypeVar
+
+from imud.contracts.codec import Message
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
+from imud.errors import CommandError, LinkError
+from imud.ledger import Ledger
+from imud.units import NS_PER_S
+
+T = TypeVar("T")
+
+
+class Exchange:
+    """One conversation at a time with one device. Synchronization: the event loop's thread only."""
+
+    def __init__(
+        self, ledger: Ledger, write: Callable[[bytes], None], set_baud: Callable[[int], None] | None = None
+    ) -> None:
+        """`set_baud` changes the rate of the link; None where it has none."""
+        self._session = Session(ledger)
+        self._write = write
+        self._set_baud = set_baud
+        self._lock = asyncio.Lock()
+        self._outcome: asyncio.Future[Outcome] | None = None
+
+    async def run(self, conversation: RequestScript[T]) -> T:
+        """Run `conversation` to its end and return its value. Raises what it raises, and LinkError when unplugged.
+
+        Given up in the middle, cancelled for example, it leaves the device as the request's `undo` makes it.
+        """
+        async with self._lock:
+            undo = b""
+            try:
+                request = next(conversation)
+                while True:
+                    undo = request.undo
+                    outcome = await self._ask(request)
+                    undo = b""
+                    request = conversation.send(outcome)
+            except StopIteration as end:
+                value: T = end.value
+                return value
+            finally:
+                conversation.close()
+                if undo:
+                    with suppress(LinkError):  # it is gone: there is nothing to leave in order
+                        self._write(undo)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a conversation is going on."""
+        return self._lock.locked()
+
+    def on_message(self, message: Message, t_rx_ns: int) -> None:
+        """Take one line of text or one reply frame from the codec."""
+        self._settle(self._session.on_message(message, t_rx_ns))
+
+    async def _ask(self, request: Request) -> Outcome:
+        if request.baud:
+            self._change_rate(request)
+        loop = asyncio.get_running_loop()
+        timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
+        try:
+            payload = self._session.start(request, monotonic_ns())
+            if payload:
+                self._write(payload)
+            if request.silent:
+                return Reply(())
+            self._outcome = loop.create_future()
+            return await self._outcome
+        finally:
+            timer.cancel()
+            self._outcome = None
+            self._session.cancel()
+
+    def _change_rate(self, request: Request) -> None:
+        if self._set_baud is None:
+            raise CommandError(f"{request.name}: expected a serial line to set to {request.baud} baud, got none")
+        self._set_baud(request.baud)
+
+    def _expire(self) -> None:
+        deadline_ns = self._session.deadline_ns
+        if deadline_ns is not None:  # the loop's timer may fire a little early against CLOCK_MONOTONIC
+            self._settle(self._session.on_time(max(monotonic_ns(), deadline_ns)))
+
+    def _settle(self, outcome: Outcome | None) -> None:
+        if outcome is not None and self._outcome is not None and not self._outcome.done():
+            self._outcome.set_result(outcome)

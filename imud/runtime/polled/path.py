@@ -1,0 +1,126 @@
+"""The hot path of one polled device: readings → codec → clock → batch → publishers.
+
+The time of a sample is when its read began. What the device measured it has measured before: at most the time since
+the read before (had it been there then, this one would have repeated it), or one update of its registers, if known.
+With a data-ready line it is the edge that the read belongs to.
+Synchronization: the event loop's thread only.
+"""
+
+from collections.abc import Callable, Sequence
+from math import sqrt
+from time import time_ns
+from typing import Any, Final
+
+from imud.contracts.codec import BadFrame, BadReason
+from imud.contracts.polling import PolledCodec, Reading, Vanished
+from imud.errors import Trouble
+from imud.runtime.path import SamplePath
+from imud.sample import Measurement, Sample
+from imud.signals.ready_edges import ReadyEdges, Stamp
+
+FAULTS_MAX: Final = 3
+"""So many damaged or failed reads in a row: it may be another device, or one that lost its settings."""
+SIGMA_OF_AGE: Final = 1 / sqrt(3)
+"""Root mean square of an age that is anything from 0 to its bound."""
+
+
+class PolledPath(SamplePath):
+    """The path of a device that is asked."""
+
+    def __init__(
+        self, codec: PolledCodec, period_ns: int, update_ns: int, now_ns: Callable[[], int], *parts: Any
+    ) -> None:
+        """`update_ns`: longest time between two updates of the device's registers, 0 for not known.
+
+        `now_ns` is CLOCK_MONOTONIC, `parts` are those of `SamplePath`.
+        """
+        super().__init__(*parts)
+        self.codec = codec
+        self.failed = 0
+        """Transfers that failed."""
+        self.edges: ReadyEdges | None = None
+        """Those of the data-ready line, if there is one."""
+        self._period_ns = period_ns
+        self._update_ns = update_ns
+        self._now_ns = now_ns
+        self._before_ns = 0
+        self._faults = 0
+
+    def begin(self, now_ns: int) -> None:
+        """The device was identified and set up: what comes from now on is its own."""
+        super().begin(now_ns)
+        self.reset()
+
+    def flush(self, now_ns: int) -> None:
+        """Nothing waits: what is asked for comes whole or not at all."""
+
+    def reset(self) -> None:
+        """What comes next is not compared with what came before."""
+        self.codec.reset()
+        self._before_ns = 0
+        self._faults = 0
+
+    def on_readings(self, readings: Sequence[Reading]) -> str:
+        """Take readings, oldest first; return why the device must be identified again, or an empty string."""
+        utc_offset_ns = time_ns() - self._now_ns()
+        samples: list[Sample] = []
+        gone = ""
+        edges = self.edges
+        for reading in readings:
+            if gone:
+                self.disbelieve(reading)
+                continue
+            stamp = edges.of(reading.start_ns, reading.end_ns) if edges is not None and reading.poll == 0 else None
+            if reading.error is not None:
+                gone = self._failed(reading)
+            else:
+                gone = self._take(reading, stamp, utc_offset_ns, samples)
+        if samples:
+            self._finish(samples, samples[-1].t_rx_ns)
+        return gone
+
+    def disbelieve(self, reading: Reading) -> None:
+        """Count bytes of a device that is not known to be the right one."""
+        self._ledger.bytes_in += len(reading.data)
+        self._ledger.bytes_skipped += len(reading.data)
+
+    def _take(self, reading: Reading, stamp: Stamp | None, utc_offset_ns: int, samples: list[Sample]) -> str:
+        gone = ""
+        for event in self.codec.take(reading.poll, reading.data):
+            if type(event) is Measurement:
+                self._faults = 0
+                t_ns, error_ns, edge_seq = stamp or (reading.start_ns, self._error_ns(reading), None)
+                sample = self.clock.sample_asked(event, t_ns, error_ns, reading.end_ns, utc_offset_ns, edge_seq)
+                samples.append(sample)
+            elif type(event) is Vanished:
+                gone = event.why
+            elif type(event) is BadFrame:
+                self._on_bad(event)
+                if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
+                    self._ledger.lost_crc += 1
+                    gone = gone or self._fault(f"{FAULTS_MAX} damaged frames in a row, the last by {event.reason}")
+        if reading.poll == 0:
+            self._before_ns = reading.start_ns
+        return gone
+
+    def _failed(self, reading: Reading) -> str:
+        error = reading.error
+        assert error is not None
+        self.failed += 1
+        self._before_ns = 0
+        if reading.poll == 0:
+            self._ledger.lost_gap_device += 1
+        if error.trouble is Trouble.DISTURBED:
+            return self._fault(str(error))
+        return str(error)
+
+    def _fault(self, why: str) -> str:
+        self._faults += 1
+        return why if self._faults >= FAULTS_MAX else ""
+
+    def _error_ns(self, reading: Reading) -> int:
+        """One-sigma error of `start_ns` as the time of measurement."""
+        age_ns = reading.start_ns - self._before_ns if self._before_ns else self._period_ns
+        if self._update_ns and self._update_ns < age_ns:
+            age_ns = self._update_ns
+        return int(SIGMA_OF_AGE * (age_ns + reading.end_ns - reading.start_ns)) + 1

@@ -1,0 +1,1 @@
+"""GPIO lines and what they mean: SOUT, SIN, PPS, ALARM, reset, data ready."""

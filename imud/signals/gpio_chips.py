@@ -1,0 +1,151 @@
+"""GPIO chips and where a line is on them. The only importer of gpiod; what goes wrong gets one clear error each."""
+
+import errno
+import os
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from imud.contracts.lines import LineSettings
+from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
+from imud.permissions import group_of, user_name
+
+DEVICES: Final = Path("/dev")
+GROUP: Final = "gpio"
+"""Group of GPIO chips on Raspberry Pi OS; named where a chip's own group is of no help."""
+GONE: Final = frozenset({errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EBADF})
+
+
+class Place(NamedTuple):
+    """Where a line is."""
+
+    path: str
+    """Node of its chip."""
+    offset: int
+    """Its number on the chip."""
+    name: str
+    """Its name, empty where it has none."""
+
+    def __str__(self) -> str:
+        named = f" ({self.name})" if self.name else ""
+        return f"{os.path.basename(self.path)} line {self.offset}{named}"
+
+
+def load_gpiod() -> Any:
+    """The module gpiod. Raises LinkError where there is none, or that of libgpiod 1."""
+    try:
+        import gpiod
+    except ImportError as error:
+        raise LinkError("GPIO lines need the Python package gpiod, got none: `pip install 'gpiod>=2.3'`") from error
+    if not hasattr(gpiod, "request_lines"):
+        raise LinkError(
+            f"GPIO lines need gpiod 2.3 or later, got that of libgpiod 1 ({gpiod.__file__}), which is Debian 12's "
+            "python3-libgpiod: `pip install 'gpiod>=2.3'` into the environment that imud runs in"
+        )
+    return gpiod
+
+
+def find_line(gpiod: Any, settings: LineSettings, devices: Path = DEVICES) -> Place:
+    """Where the line of some settings is. Raises LinkMissing, LinkDenied, and LinkError where it is in two places."""
+    chips, denied = _chips(gpiod, settings.chip, devices)
+    found = [
+        Place(chip.path, offset, name)
+        for chip in chips
+        for offset, name in enumerate(chip.names)
+        if settings.line in (offset, name)
+    ]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        places = " and ".join(map(str, found))
+        raise LinkError(f"expected the name {settings.line} on one line, got it on {places}: give chip and number")
+    raise denied or _no_line(settings.line, chips)
+
+
+def problem(error: OSError, path: str) -> LinkError:
+    """The LinkError for a chip that cannot be used."""
+    if error.errno in GONE:
+        return LinkMissing(f"{path} is gone, or is no GPIO chip: {os.strerror(error.errno or 0)}")
+    if error.errno in (errno.EACCES, errno.EPERM):
+        group, user = group_of(path, GROUP), user_name()
+        return LinkDenied(
+            f"{path} may not be opened by user {user}: it must belong to group {group}, readable and writable, and "
+            f"{user} to that group (`sudo usermod -aG {group} {user}` and a new login)"
+        )
+    return LinkError(f"{path} cannot be used as a GPIO chip: {os.strerror(error.errno or 0)}")
+
+
+def refusal(gpiod: Any, error: OSError, place: Place) -> LinkError:
+    """The LinkError for a line that the kernel does not give."""
+    if error.errno == errno.EBUSY:
+        holder = ""
+        with suppress(OSError), gpiod.Chip(place.path) as chip:  # a chip that goes away now is asked no more
+            holder = chip.get_line_info(place.offset).consumer or ""
+        return LinkBusy(f"{place} is in use by {holder or 'a nameless program'}: stop that, or choose another line")
+    if error.errno in (errno.ENODEV, errno.ENOENT, errno.EACCES, errno.EPERM):
+        return problem(error, place.path)
+    reason = os.strerror(error.errno or 0)
+    return LinkError(f"{place} cannot be requested: {reason}; an input needs a chip that makes interrupts")
+
+
+class _Chip(NamedTuple):
+    path: str
+    label: str
+    names: tuple[str, ...]
+    """Of its lines; empty for one that has none."""
+
+    def __str__(self) -> str:
+        return f"{os.path.basename(self.path)} ({self.label})"
+
+
+def _chips(gpiod: Any, wanted: str, devices: Path) -> tuple[Sequence[_Chip], LinkDenied | None]:
+    """The chips to look at, and why others could not be looked at."""
+    node = devices / wanted  # an absolute path stays as it is
+    if wanted and node.exists():
+        return [_read(gpiod, str(node))], None
+    chips: list[_Chip] = []
+    denied: LinkDenied | None = None
+    for path in _nodes(devices):
+        try:
+            chips.append(_read(gpiod, path))
+        except LinkDenied as error:
+            denied = error
+        except LinkMissing:
+            continue  # it went away in this moment
+    if not wanted:
+        return chips, denied
+    found = [chip for chip in chips if chip.label == wanted]
+    if len(found) > 1:
+        raise LinkError(f"expected the label {wanted} on one GPIO chip, got it on {' and '.join(map(str, found))}")
+    if not found:
+        there = ", ".join(map(str, chips)) or "none"
+        raise denied or LinkMissing(f"GPIO chip {wanted} is not there; there are: {there}")
+    return found, None
+
+
+def _nodes(devices: Path) -> list[str]:
+    """Nodes of all chips by number. A link is another name of one: /dev/gpiochip4 of a Raspberry Pi 5."""
+    nodes = [node for node in devices.glob("gpiochip*") if not node.is_symlink()]
+    return [str(node) for node in sorted(nodes, key=lambda node: int(re.sub(r"\D", "", node.name) or 0))]
+
+
+def _read(gpiod: Any, path: str) -> _Chip:
+    try:
+        with gpiod.Chip(path) as chip:
+            info = chip.get_info()
+            return _Chip(path, info.label, tuple(chip.get_line_info(n).name or "" for n in range(info.num_lines)))
+    except OSError as error:
+        raise problem(error, path) from error
+
+
+def _no_line(line: int | str, chips: Sequence[_Chip]) -> LinkMissing:
+    if isinstance(line, int):
+        return LinkMissing(f"{chips[0]} has no line {line}: its lines are 0 to {len(chips[0].names) - 1}")
+    names = [name for chip in chips for name in chip.names if name]
+    near = get_close_matches(line, names, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    where = ", ".join(map(str, chips)) or "any chip, as there is none"
+    return LinkMissing(f"no line has the name {line} on {where}{hint} (`gpioinfo` lists names)")

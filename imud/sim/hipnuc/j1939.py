@@ -1,0 +1,292 @@
+"""A HiPNUC module on SAE J1939: IMU configuration manual V1.5.9, chapter 6.
+
+Without I/O and without a clock of its own. It samples at whole milliseconds of its own crystal, which runs `skew_ppm`
+fast; messages due in the same millisecond are of one instant and leave back to back, lowest PGN first, `processing_ns`
+later. Requests on PGN EF00 are obeyed at once and answered to 0x55, whoever asked. Assumed, where the manual is silent:
+an unknown register is not answered, a value out of range is answered with the value that stays, an interval applies
+from the next whole multiple of it, the zero concerns the inclinometer only, and the direction is turned after it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from math import atan2, cos, pi, sin
+from typing import Final
+
+from imud.devices.hipnuc.j1939 import messages, session
+from imud.devices.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
+from imud.devices.hipnuc.j1939.session import LAYOUT, READ, WRITE
+from imud.formats.j1939 import J1939Id, join, split
+from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
+from imud.sim.physics.motion import MOTIONS, Motion, Truth, swing
+from imud.sim.physics.noise import Noise
+from imud.sim.simulator import SimulatorOptions
+from imud.units import NS_PER_MS, NS_PER_S
+
+INTERVAL_MS: Final = 100
+"""Factory's interval of every message."""
+REPLY_NS: Final = 200_000
+"""Time from a request to its reply (assumed)."""
+MESSAGES: Final = {
+    "": (messages.ACCEL, messages.GYRO, messages.ROLL_PITCH, messages.HEADING),
+    "all": messages.PGNS,
+    "inclinometer": (messages.INCLINOMETER,),
+}
+"""PGNs that are on, by the name of a message; `` is what every module has."""
+SLOW: Final = (messages.TEMPERATURE, messages.UTC)
+SLOW_MS: Final = 1000
+"""Interval of those in `all`."""
+YEAR: Final = 2025
+
+
+@dataclass(frozen=True, slots=True)
+class J1939Settings:
+    """What its flash holds."""
+
+    intervals_ms: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(MESSAGES[""], INTERVAL_MS))
+    """Of the messages that are on."""
+    bitrate_code: int = session.BITRATES.index(BITRATE)
+    address: int = FACTORY_ADDRESS
+    x_reversed: int = 0
+    y_reversed: int = 0
+    zero_rad: tuple[float, float] = (0.0, 0.0)
+    """Physical angles that read as zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class J1939Hardware:
+    """What a module is made of."""
+
+    bitrate: int | None = None
+    """Of the bus in bit/s, 0 for frames that take no time; None for what it is set to."""
+    motion: Motion = field(default_factory=swing)
+    noise: Noise | None = None
+    skew_ppm: float = 20.0
+    boot_ms: int = 500
+    processing_ns: int = 125_000
+    sends_heading_twice: bool = True
+    """As newer firmware does."""
+
+
+class HipnucJ1939Module:
+    """One module, powered on when it is made."""
+
+    def __init__(
+        self, now_ns: int, settings: J1939Settings | None = None, hardware: J1939Hardware | None = None
+    ) -> None:
+        """`settings` are what its flash holds; after a factory reset they are `J1939Settings()`."""
+        self.flash = self.settings = settings or J1939Settings()
+        self.hardware = hardware or J1939Hardware()
+        self.epoch_ns = now_ns
+        self.instants_sent = 0
+        self.frames_sent = 0
+        self.requests = 0
+        self._leaving: list[SentFrame] = []
+        """Frames that were on their way when it was told to restart, the reply to that too."""
+        self._ns_per_ms = NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6)
+        self._power_on(now_ns)
+
+    def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
+        """Take a frame that somebody else sent."""
+        parts = split(can_id)
+        is_request = extended and parts.pgn == session.CONFIGURE and parts.destination == self._address
+        if is_request and len(data) == LAYOUT.size and now_ns >= self._begin_ns:
+            self._sample(now_ns)
+            register, command, _, value = LAYOUT.unpack(data)
+            self._obey(register, command, value, now_ns)
+
+    def mark(self, now_ns: int) -> None:
+        """It has no sync input on this port."""
+
+    def reboot(self, now_ns: int) -> None:
+        """Power was lost and came back, or it was told to: what was not saved is gone."""
+        self.settings = self.flash
+        self._power_on(now_ns)
+
+    def advance(self, now_ns: int) -> list[SentFrame]:
+        """Return what has crossed the wire since the last call, in order."""
+        self._sample(now_ns)
+        left = [frame for frame in self._leaving if frame.due_ns <= now_ns]
+        self._leaving = self._leaving[len(left) :]
+        return left + self._wire.sent(now_ns)
+
+    def next_ns(self) -> int | None:
+        """When `advance` will have something next."""
+        waiting = self._leaving[0].due_ns if self._leaving else self._wire.next_ns()
+        if waiting is not None or not self._next_ms:
+            return waiting
+        return self._instant_ns(min(self._next_ms.values())) + self.hardware.processing_ns + self._wire.extended_ns
+
+    def counters(self) -> dict[str, int]:
+        """Instants, frames and requests."""
+        return {"samples_sent": self.instants_sent, "frames_sent": self.frames_sent, "requests": self.requests}
+
+    # --- messages ------------------------------------------------------------------------------------------------
+
+    def _power_on(self, now_ns: int) -> None:
+        hardware, settings = self.hardware, self.settings
+        self._begin_ns = now_ns + hardware.boot_ms * NS_PER_MS
+        self._address = settings.address
+        bitrate = session.BITRATES[settings.bitrate_code] if hardware.bitrate is None else hardware.bitrate
+        self._wire = FrameWire(bitrate, self._begin_ns)
+        self._next_ms = dict.fromkeys(settings.intervals_ms, 0)
+        self._leaving = []
+
+    def _instant_ns(self, device_ms: int) -> int:
+        return self._begin_ns + round(device_ms * self._ns_per_ms)
+
+    def _sample(self, now_ns: int) -> None:
+        """Queue the messages of all instants up to now."""
+        while self._next_ms:
+            device_ms = min(self._next_ms.values())
+            sample_ns = self._instant_ns(device_ms)
+            if sample_ns > now_ns:
+                return
+            due = sorted(pgn for pgn, next_ms in self._next_ms.items() if next_ms == device_ms)
+            reading = self._reading(sample_ns)
+            self.instants_sent += 1
+            for pgn in due:
+                self._next_ms[pgn] += self.settings.intervals_ms[pgn]
+                self._send(pgn, reading, sample_ns)
+
+    def _reading(self, sample_ns: int) -> Truth:
+        t_s = (sample_ns - self.epoch_ns) / NS_PER_S
+        truth = self.hardware.motion.at(t_s)
+        return self.hardware.noise.add(truth, t_s) if self.hardware.noise else truth
+
+    def _send(self, pgn: int, reading: Truth, sample_ns: int) -> None:
+        can_id, data = encode(pgn, self._packed(pgn, reading, sample_ns), self._address)
+        self._wire.send(sample_ns + self.hardware.processing_ns, can_id, True, data, sample_ns)
+        self.frames_sent += 1
+
+    def _packed(self, pgn: int, reading: Truth, sample_ns: int) -> bytes:
+        """The data of a message."""
+        roll, pitch, yaw = reading.euler_rad
+        rows: dict[int, Callable[[], bytes]] = {
+            messages.ACCEL: lambda: messages.pack_accel(reading.accel_m_s2),
+            messages.GYRO: lambda: messages.pack_gyro(reading.gyro_rad_s),
+            messages.MAG: lambda: messages.pack_mag(reading.mag_t),
+            messages.ROLL_PITCH: lambda: messages.pack_roll_pitch(roll, pitch),
+            messages.HEADING: lambda: messages.pack_heading(yaw, twice=self.hardware.sends_heading_twice),
+            messages.TEMPERATURE: lambda: messages.pack_temperature(reading.temperature_c, reading.pressure_pa),
+            messages.QUATERNION: lambda: messages.pack_quaternion(reading.quat_wxyz),
+            messages.INCLINOMETER: lambda: messages.pack_inclinometer(*self._inclination(reading)),
+            messages.UTC: lambda: messages.pack_utc(YEAR, 1, 1, (sample_ns - self.epoch_ns) / NS_PER_S % 86_400),
+        }
+        return rows[pgn]()
+
+    def _inclination(self, reading: Truth) -> tuple[float, float]:
+        """The angles that FF4A tells."""
+        settings = self.settings
+        (x, y), (zero_x, zero_y) = physical_inclination(reading), settings.zero_rad
+        return _within_pi(x - zero_x) * (-1) ** settings.x_reversed, _within_pi(y - zero_y) * (
+            -1
+        ) ** settings.y_reversed
+
+    # --- requests ------------------------------------------------------------------------------------------------
+
+    def _obey(self, register: int, command: int, value: int, now_ns: int) -> None:
+        self.requests += 1
+        if command == READ and (present := self._present(register)) is not None:
+            self._reply(register, command, present, now_ns)
+        elif command == WRITE and register == session.CONTROL:
+            self._control(value, now_ns)
+        elif command == WRITE and register == session.ONCE and value in session.INTERVALS:
+            self._reply(register, command, value, now_ns)
+            self._send(value, self._reading(now_ns), now_ns)
+        elif command == WRITE and (register == session.ZERO or self._present(register) is not None):
+            self._set(register, value, now_ns)
+            present = self._present(register)
+            self._reply(register, command, value if present is None else present, now_ns)
+
+    def _present(self, register: int) -> int | None:
+        """The value of a register that can be read."""
+        settings = self.settings
+        for pgn, interval_register in session.INTERVALS.items():
+            if register == interval_register:
+                return settings.intervals_ms.get(pgn, 0)
+        return {
+            session.BITRATE: settings.bitrate_code,
+            session.ADDRESS: settings.address,
+            session.X_SIGN: settings.x_reversed,
+            session.Y_SIGN: settings.y_reversed,
+        }.get(register)
+
+    def _set(self, register: int, value: int, now_ns: int) -> None:
+        """Take a value that is in range."""
+        settings = self.settings
+        pgn = next((pgn for pgn, address in session.INTERVALS.items() if address == register), None)
+        if pgn is not None and session.INTERVAL_MIN_MS <= value <= session.INTERVAL_MAX_MS:
+            self.settings = replace(settings, intervals_ms={**settings.intervals_ms, pgn: value})
+            device_ms = (now_ns - self._begin_ns) / self._ns_per_ms
+            self._next_ms[pgn] = (int(device_ms) // value + 1) * value
+        elif register == session.BITRATE and value < len(session.BITRATES):
+            self.settings = replace(settings, bitrate_code=value)
+        elif register == session.ADDRESS and value in session.ADDRESSES:
+            self.settings = replace(settings, address=value)
+        elif register == session.X_SIGN and value in (0, 1):
+            self.settings = replace(settings, x_reversed=value)
+        elif register == session.Y_SIGN and value in (0, 1):
+            self.settings = replace(settings, y_reversed=value)
+        elif register == session.ZERO and value == session.Zero.HERE.value:
+            self.settings = replace(settings, zero_rad=physical_inclination(self._reading(now_ns)))
+        elif register == session.ZERO and value == session.Zero.CANCEL.value:
+            self.settings = replace(settings, zero_rad=(0.0, 0.0))
+
+    def _control(self, value: int, now_ns: int) -> None:
+        if value not in (session.SAVE, session.FACTORY, session.RESTART):
+            return
+        self._reply(session.CONTROL, WRITE, value, now_ns)
+        if value == session.SAVE:
+            self.flash = self.settings
+        elif value == session.FACTORY:
+            self.flash = J1939Settings()
+        else:
+            leaving = self._wire.sent(now_ns + NS_PER_S)
+            self.reboot(now_ns)
+            self._leaving = leaving
+
+    def _reply(self, register: int, command: int, value: int, now_ns: int) -> None:
+        can_id = join(J1939Id(messages.PRIORITY, session.CONFIGURE, self._address, session.HOST_ADDRESS))
+        self._wire.send(now_ns + REPLY_NS, can_id, True, LAYOUT.pack(register, command, 0, value))
+        self.frames_sent += 1
+
+
+def physical_inclination(reading: Truth) -> tuple[float, float]:
+    """Tilt about the sensor's Y and X as a dual-axis inclinometer tells it: the vertical in the sensor frame."""
+    roll, pitch, _ = reading.euler_rad
+    up_x, up_y, up_z = -cos(pitch) * sin(roll), sin(pitch), cos(pitch) * cos(roll)
+    return atan2(-up_x, up_z), atan2(up_y, up_z)
+
+
+def _within_pi(angle: float) -> float:
+    return (angle + pi) % (2 * pi) - pi
+
+
+def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
+    """A module from the common options. Raises ValueError naming the option that it cannot have."""
+    interval_ms = round(1000 / options.rate_hz) if options.rate_hz > 0 else 0
+    if not session.INTERVAL_MIN_MS <= interval_ms <= session.INTERVAL_MAX_MS:
+        raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {1000 // session.INTERVAL_MIN_MS}")
+    if options.message not in MESSAGES:
+        raise ValueError(f"message {options.message!r}: expected {' or '.join(filter(None, MESSAGES))}, or none")
+    if options.node and options.node not in session.ADDRESSES:
+        raise ValueError(f"node {options.node}: expected an address 1 … 128, or 0 for {FACTORY_ADDRESS}")
+    if options.motion not in MOTIONS:
+        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
+    pgns = MESSAGES[options.message]
+    settings = J1939Settings(
+        intervals_ms={pgn: SLOW_MS - SLOW_MS % interval_ms if pgn in SLOW else interval_ms for pgn in pgns},
+        address=options.node or FACTORY_ADDRESS,
+    )
+    hardware = J1939Hardware(
+        bitrate=options.bitrate(BITRATE),
+        motion=MOTIONS[options.motion](options.gravity_m_s2),
+        noise=Noise(options.seed) if options.noise == "real" else None,
+        skew_ppm=options.skew_ppm,
+        boot_ms=options.boot_ms,
+        processing_ns=options.processing_ns,
+    )
+    return HipnucJ1939Module(now_ns, settings, hardware)
+
+
+SIMULATOR: Final = CanSimulator("hipnuc-j1939", "HiPNUC HI14 (CAN, SAE J1939)", make)

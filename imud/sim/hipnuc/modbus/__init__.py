@@ -1,0 +1,1 @@
+"""A simulated HiPNUC module on RS-485, Modbus RTU."""

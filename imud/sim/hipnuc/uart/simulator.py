@@ -1,0 +1,392 @@
+"""A HiPNUC module (CH0x0, CH10x, HI14) at the far end of a UART: IMU configuration manual V1.5.9, chapters 1-3, 8.
+
+Without I/O and without a clock of its own: the owner passes what the host sent to `receive` and collects what the
+module sent with `advance`. What it does as a real one does:
+
+- It samples at whole milliseconds of its own crystal, which runs `skew_ppm` fast; `system_time` counts from power-on.
+- A frame leaves `processing_ns` after its sample, when the wire is free; text goes between whole frames. What does not
+  fit the transmit buffer is never sent: at 115200 baud and 1 kHz six frames of seven are missing.
+- Commands are lines of ASCII, obeyed at once; a known one is answered with `OK` or `ERR`, an unknown one not at all.
+  URFR and SERIALCONFIG act after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved.
+- SOUT pulses before every frame, a rising edge on SIN sends messages set to ONMARK, the other pins and UTC are in
+  `hipnuc_pins.py` and `hipnuc_utc.py`; `pins` tells of edges as `advance` does of bytes.
+- LOG DISABLE silences frames, not replies, and is forgotten at a reboot (assumed; the manual calls ENABLE the default).
+
+Attitude is the truth in both modes; heading does not start at zero in six-axis mode, as it would in a real module.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import pi, radians
+from random import Random
+from typing import Final
+
+from imud.devices.hipnuc.uart.codec import encode_hi91, encode_hi92
+from imud.devices.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMessage
+from imud.sim.hipnuc.uart.hardware import HipnucHardware
+from imud.sim.hipnuc.uart.pins import ALARM_PERIOD_MS, SOUT_HIGH_NS, HipnucPins, is_alarming
+from imud.sim.hipnuc.uart.settings import CommandRefused, ModuleSettings, Output, changed, number, rows
+from imud.sim.hipnuc.uart.status import main_status
+from imud.sim.hipnuc.uart.utc import UtcTime
+from imud.sim.physics.motion import MOTIONS, Truth
+from imud.sim.physics.mounting import MountingRotation, frame_of, level_of
+from imud.sim.physics.noise import Noise
+from imud.sim.ports.pin import PinEdge
+from imud.sim.ports.transmitter import Transmitter
+from imud.sim.simulator import Burst, Simulator, SimulatorOptions
+from imud.units import NS_PER_MS, NS_PER_S, T_PER_UT
+
+FACTORY_BAUD: Final = ModuleSettings().baud
+MAIN_STATUS_FIRMWARE: Final = 169
+"""From here on HI91 bytes 1-2 are MAIN_STATUS instead of the PPS stamp."""
+TX_BUFFER_BYTES: Final = 512
+"""A frame that would make more than this wait for the wire is not sent."""
+COMMAND_BYTES_MAX: Final = 128
+"""Assumed; the longest command of the manual, URFR, has 123 with nine decimals."""
+REPLY_NS: Final = 200_000
+"""Time from the end of a command to its reply (assumed)."""
+PPS_MODULUS_MS: Final = 8192
+"""The PPS stamp free-runs 0 … 8191 without edges (recorded so)."""
+NEAR_LEVEL_RAD: Final = radians(5)
+"""ATT RST 3 acts within this of level."""
+_PRINTABLE = range(0x20, 0x7F)
+_FRAME_BYTES: Final = {OutputMessage.HI91: 82, OutputMessage.HI92: 54}
+
+
+class HipnucModule:
+    """One module, powered on when it is made."""
+
+    def __init__(
+        self, now_ns: int, settings: ModuleSettings | None = None, hardware: HipnucHardware | None = None
+    ) -> None:
+        """`settings` are what its flash holds."""
+        self.hardware = hardware or HipnucHardware()
+        self.flash = self.settings = settings or ModuleSettings()
+        self.epoch_ns = now_ns
+        self.frames_sent = 0
+        self.frames_dropped = 0
+        """Frames that did not fit the wire."""
+        self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
+        self._before_reboot: list[Burst] = []
+        self._pins = HipnucPins()
+        self._random = Random(self.hardware.mark_seed)
+        self._line = bytearray()
+        self._actions = self._make_actions()
+        self._power_on(now_ns, self.hardware.uptime_ms)
+
+    @property
+    def baud(self) -> int:
+        """Rate in bit/s in force; SERIALCONFIG changes it at the next reboot."""
+        return self._wire.baud
+
+    def reboot(self, now_ns: int) -> None:
+        """Power was lost and came back, or the device was told to: what was not saved is gone."""
+        self._sample(now_ns)
+        self._before_reboot += self._wire.stopped(now_ns)
+        self._pins.power_lost(now_ns)
+        self.settings = self.flash
+        self._power_on(now_ns, 0)
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Take bytes that the host sent, already as the module hears them."""
+        self._sample(now_ns)
+        if now_ns < self._ready_ns:  # still booting
+            return
+        for byte in data:
+            if byte == 0x0A:
+                line, self._line = self._line, bytearray()
+                if len(line) <= COMMAND_BYTES_MAX:
+                    self._obey(line.decode("ascii"), now_ns)
+                if now_ns < self._ready_ns:  # it told the module to reboot
+                    return
+            elif byte in _PRINTABLE:
+                if len(self._line) <= COMMAND_BYTES_MAX:
+                    self._line.append(byte)
+            elif byte != 0x0D:
+                self._line.clear()
+
+    def mark(self, now_ns: int) -> None:
+        """A rising edge on SIN/PPS: the PPS stamp starts anew, and messages set to ONMARK are sent."""
+        self._sample(now_ns)
+        if now_ns < self._ready_ns:  # still booting
+            return
+        self._pps_ns = self._device_ns(now_ns)
+        self._utc.pulse(self._pps_ns)
+        for message in self._outputs:
+            self._send_marked(message, now_ns)
+
+    def advance(self, now_ns: int) -> list[Burst]:
+        """Return what has left the wire since the last call, in order."""
+        self._sample(now_ns)
+        done, self._before_reboot = self._before_reboot, []
+        return done + self._wire.sent(now_ns)
+
+    def next_ns(self) -> int | None:
+        """When `advance` will have something next, or None while nothing is to come."""
+        if self._before_reboot:
+            return self._before_reboot[0].due_ns
+        if (due_ns := self._wire.next_ns()) is not None or not self._next_ms:
+            return due_ns
+        message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
+        ready_ns = self._instant_ns(device_ms) + self.hardware.processing_ns
+        return self._wire.due_ns(ready_ns, _FRAME_BYTES[message])
+
+    def pins(self, now_ns: int) -> list[PinEdge]:
+        """Return the edges on the output pins since the last call, in order."""
+        self._sample(now_ns)
+        return self._pins.take(now_ns)
+
+    def next_pin_ns(self) -> int | None:
+        """When `pins` may have something next, or None while nothing is to come."""
+        times = [] if (next_ns := self._pins.next_ns()) is None else [next_ns]
+        if self._next_ms:
+            times.append(self._instant_ns(min(self._next_ms.values())))
+        if self._alarm_ms is not None:
+            times.append(self._instant_ns(self._alarm_ms))
+        return min(times, default=None)
+
+    def counters(self) -> dict[str, int]:
+        """Frames by what became of them."""
+        return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
+
+    def _power_on(self, now_ns: int, uptime_ms: int) -> None:
+        hardware, settings = self.hardware, self.settings
+        self._frame = frame_of(rows(settings.urfr))
+        self._yaw_rad = 0.0
+        self._on_ns, self._on_ms = now_ns, uptime_ms
+        self._ready_ns = now_ns + hardware.boot_ms * NS_PER_MS
+        self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
+        self._pps_ns = 0
+        self._utc = UtcTime(hardware.utc_epoch)
+        self._enabled = True
+        self._line.clear()
+        self._settings_changed(self._ready_ns)
+
+    def _settings_changed(self, now_ns: int) -> None:
+        """Schedule the messages after `now_ns` and put the turns of the attitude in force."""
+        settings, device_ms = self.settings, self._device_ms(now_ns)
+        self._outputs = {OutputMessage.HI91: settings.hi91, OutputMessage.HI92: settings.hi92}
+        self._mounting = MountingRotation(self._frame, settings.level, settings.level_accel, self._yaw_rad)
+        watching = settings.alarm_x.enabled or settings.alarm_y.enabled
+        self._alarm_ms = (device_ms // ALARM_PERIOD_MS + 1) * ALARM_PERIOD_MS if watching else None
+        if not watching:
+            self._pins.alarm(now_ns, False)
+        self._next_ms: dict[OutputMessage, int] = {}
+        for message, output in self._outputs.items():
+            if output.period_ms and self._enabled:
+                self._next_ms[message] = (device_ms // output.period_ms + 1) * output.period_ms
+
+    def _device_ms(self, now_ns: int) -> int:
+        """Device time, not wrapped."""
+        return self._device_ns(now_ns) // NS_PER_MS
+
+    def _device_ns(self, now_ns: int) -> int:
+        return self._on_ms * NS_PER_MS + (now_ns - self._on_ns) * self._scale // NS_PER_S
+
+    def _instant_ns(self, device_ms: int) -> int:
+        """First host time at which the device's clock shows `device_ms`."""
+        return self._on_ns - (self._on_ms - device_ms) * NS_PER_MS * NS_PER_S // self._scale
+
+    def _sample(self, now_ns: int) -> None:
+        """Take all samples up to now and queue their frames; look at the angles as often as is due."""
+        self._watch_angles(now_ns)
+        while self._next_ms:
+            message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
+            sample_ns = self._instant_ns(device_ms)
+            if sample_ns > now_ns:
+                return
+            self._next_ms[message] = device_ms + self._outputs[message].period_ms
+            self._queue_frame(message, sample_ns, device_ms)
+
+    def _watch_angles(self, now_ns: int) -> None:
+        while self._alarm_ms is not None and (at_ns := self._instant_ns(self._alarm_ms)) <= now_ns:
+            self._alarm_ms += ALARM_PERIOD_MS
+            self._pins.alarm(at_ns, is_alarming(self.settings, self._truth(at_ns).euler_rad))
+
+    def _send_marked(self, message: OutputMessage, now_ns: int) -> None:
+        if self._enabled and self._outputs[message].on_mark and now_ns >= self._ready_ns:
+            spread_ns = self.hardware.mark_spread_ns
+            self._queue_frame(
+                message, now_ns, self._device_ms(now_ns), round(self._random.uniform(-spread_ns, spread_ns))
+            )
+
+    def _queue_frame(self, message: OutputMessage, sample_ns: int, device_ms: int, later_ns: int = 0) -> None:
+        """`later_ns`: how much longer than usual it takes to leave."""
+        processing_ns = max(self.hardware.processing_ns + later_ns, 0)
+        ready_ns, size = sample_ns + processing_ns, _FRAME_BYTES[message]
+        if not self._wire.fits(ready_ns, size):
+            self.frames_dropped += 1
+            return
+        self.frames_sent += 1
+        start_ns = self._wire.due_ns(ready_ns, size) - self._wire.wire_ns(size)
+        self._pins.frame(start_ns, min(SOUT_HIGH_NS, processing_ns), self.settings.sout_div, sample_ns)
+        self._wire.send(ready_ns, self._encode(message, sample_ns, device_ms), sample_ns, device_ms)
+
+    def _encode(self, message: OutputMessage, sample_ns: int, device_ms: int) -> bytes:
+        reading = self._reading(sample_ns)
+        accel, gyro, mag, euler, quat, temperature_c, pressure_pa = reading
+        device_ns = self._device_ns(sample_ns)
+        pps_ms = (device_ns - self._pps_ns) // NS_PER_MS % PPS_MODULUS_MS
+        has_status = self.hardware.firmware >= MAIN_STATUS_FIRMWARE
+        status = 0
+        if has_status:
+            uptime_ms, utc = device_ms - self._on_ms, self._utc.synchronised(device_ns)
+            status = main_status(reading, uptime_ms, nine_axis=self.settings.att_mode == 1, utc=utc)
+        if message is OutputMessage.HI92:
+            return encode_hi92(
+                pps_stamp_ms=pps_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat,
+                temperature_c=temperature_c, pressure_pa=pressure_pa, status=status,
+            )  # fmt: skip
+        return encode_hi91(
+            system_time_ms=self._utc.shown_ms(device_ns), accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler,
+            quat_wxyz=quat, temperature_c=temperature_c, pressure_pa=pressure_pa,
+            word_1_2=status if has_status else pps_ms,
+        )  # fmt: skip
+
+    def _reading(self, sample_ns: int) -> Truth:
+        """What the module measures at an instant, noise and mounting included."""
+        truth = self._truth(sample_ns)
+        return self.hardware.noise.add(truth, self._t_s(sample_ns)) if self.hardware.noise else truth
+
+    def _truth(self, at_ns: int) -> Truth:
+        """What a perfect module, mounted and levelled like this one, measures."""
+        truth = self.hardware.motion.at(self._t_s(at_ns))
+        return self._mounting.turned(truth) if self._mounting.active else truth
+
+    def _t_s(self, at_ns: int) -> float:
+        return (at_ns - self.epoch_ns) / NS_PER_S
+
+    def _obey(self, line: str, now_ns: int) -> None:
+        if line.startswith("$"):
+            self._utc.sentence(line.encode("ascii"), self._device_ns(now_ns))
+            return
+        try:
+            settings = changed(self.settings, line, self.hardware.firmware)
+            if settings is not None:
+                if settings.sout_div != self.settings.sout_div:
+                    self._pins.restart_divider()
+                self.settings = settings
+                reply: list[str] | None = []
+                self._settings_changed(now_ns)
+            else:
+                reply = self._act(line, now_ns)
+        except CommandRefused:
+            self._say(["ERR"], now_ns)
+            return
+        if reply is not None:
+            self._say([*reply, "OK"], now_ns)
+
+    def _say(self, lines: list[str], now_ns: int) -> None:
+        data = "".join(f"{line}\r\n" for line in lines).encode("ascii")
+        self._wire.send(now_ns + REPLY_NS, data)
+
+    def _make_actions(self) -> dict[str, Callable[[int], list[str] | None]]:
+        """Commands without a value that do more than change settings: reply lines before `OK`, None for no reply."""
+        hardware = self.hardware
+        version = [
+            f"PNAME={hardware.product}",
+            f"BUILD={hardware.build}",
+            f"UUID={hardware.uuid}",
+            f"APP_VER={hardware.firmware}",
+            f"BL_VER={hardware.bootloader}",
+        ]
+        bias = "MB=" + ", ".join(f"{value / T_PER_UT:.2f}" for value in hardware.mag_bias_t)
+        return {
+            "REBOOT": self.reboot,
+            "SAVECONFIG": self._save,
+            "FRESET": self._factory_reset,
+            "LOG ENABLE": lambda now_ns: self._enable(True, now_ns),
+            "LOG DISABLE": lambda now_ns: self._enable(False, now_ns),
+            "LOG VERSION": lambda _: version,
+            "LOG USRCONFIG": lambda _: self.settings.user_lines(),
+            "LOG COMCONFIG": lambda _: self.settings.port_lines(),
+            "LOG MAGCONFIG": lambda _: [bias],
+        }
+
+    def _act(self, line: str, now_ns: int) -> list[str] | None:
+        action = self._actions.get(line)
+        if action is not None:
+            return action(now_ns)
+        match line.split(" "):
+            case ["CONFIG", "ATT", "RST", kind]:
+                return self._level(kind, now_ns)
+            case ["CONFIG", "YAW", mode, value]:
+                return self._set_yaw(mode, value, now_ns)
+            case ["LOG", "IMU91" | "HI91" | "HI92" as message, "ONMARK", "ONCE"]:
+                self._send_marked(OutputMessage.HI92 if message == OutputMessage.HI92 else OutputMessage.HI91, now_ns)
+                return []
+        return None
+
+    def _save(self, _now_ns: int) -> list[str]:
+        self.flash = self.settings
+        return []
+
+    def _factory_reset(self, now_ns: int) -> list[str]:
+        self.flash = self.settings = ModuleSettings()
+        self._settings_changed(now_ns)
+        return []
+
+    def _enable(self, enabled: bool, now_ns: int) -> list[str]:
+        self._enabled = enabled
+        self._settings_changed(now_ns)
+        return []
+
+    def _attitude(self, now_ns: int) -> Truth:
+        """The attitude without levelling and without CONFIG YAW."""
+        return MountingRotation(self._frame).turned(self.hardware.motion.at(self._t_s(now_ns)))
+
+    def _level(self, kind: str, now_ns: int) -> list[str]:
+        """CONFIG ATT RST: 2 levels here, 3 only where nearly level (upside down allowed), 5 cancels."""
+        if kind not in ("2", "3", "5"):
+            raise CommandRefused(kind)
+        attitude = self._attitude(now_ns)
+        roll, pitch, _ = attitude.euler_rad
+        upside_down = kind == "3" and abs(roll) > pi / 2
+        if kind == "3" and max(abs(pitch), pi - abs(roll) if upside_down else abs(roll)) >= NEAR_LEVEL_RAD:
+            raise CommandRefused(kind)  # the manual says it gives up; that it answers ERR is assumed
+        level = ModuleSettings().level if kind == "5" else level_of(attitude.quat_wxyz, upside_down)
+        self.settings = replace(self.settings, level=level, level_accel=kind == "3")
+        self._settings_changed(now_ns)
+        return []
+
+    def _set_yaw(self, mode: str, value: str, now_ns: int) -> list[str]:
+        """CONFIG YAW: 0 adds to the heading, 1 makes it so."""
+        angle_rad = radians(number(value, -180.0, 180.0))
+        if mode not in ("0", "1"):
+            raise CommandRefused(mode)
+        if mode == "1":
+            angle_rad -= self._mounting.turned(self.hardware.motion.at(self._t_s(now_ns))).euler_rad[2]
+        self._yaw_rad += angle_rad
+        self._settings_changed(now_ns)
+        return []
+
+
+def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
+    """A module from the common options. Raises ValueError naming the option that it cannot have."""
+    period_ms = round(1000 / options.rate_hz) if options.rate_hz > 0 else 0
+    if not 1 <= period_ms <= 1000 or abs(period_ms * options.rate_hz - 1000) > 10:
+        raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … 1000 Hz, and 1000 divided by a whole number")
+    if options.message.upper() not in ("", *OutputMessage):
+        raise ValueError(f"message {options.message!r}: expected {' or '.join(OutputMessage)}")
+    message = OutputMessage(options.message.upper() or OutputMessage.HI91)
+    if options.motion not in MOTIONS:
+        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
+    fitting = (b for b, most_hz in MAX_RATE_HZ[message].items() if b >= FACTORY_BAUD and most_hz >= options.rate_hz)
+    baud = options.baud or next(fitting)
+    if baud not in BAUD_RATES:
+        raise ValueError(f"baud {baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
+    output, silent = Output(period_ms), Output()
+    hi91, hi92 = (output, silent) if message is OutputMessage.HI91 else (silent, output)
+    hardware = HipnucHardware(
+        firmware=options.firmware or HipnucHardware().firmware,
+        motion=MOTIONS[options.motion](options.gravity_m_s2),
+        noise=Noise(options.seed) if options.noise == "real" else None,
+        skew_ppm=options.skew_ppm,
+        boot_ms=options.boot_ms,
+        processing_ns=options.processing_ns,
+        mark_seed=options.seed,
+    )
+    return HipnucModule(now_ns, ModuleSettings(baud=baud, hi91=hi91, hi92=hi92), hardware)
+
+
+SIMULATOR = Simulator("hipnuc-uart", "HiPNUC HI14R3 (CH0x0, CH10x, HI14) on a UART", make)

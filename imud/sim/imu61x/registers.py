@@ -1,0 +1,229 @@
+"""A Forsense IMU61x at the far end of SPI or I2C: windows, the pipeline of SPI, latching, and faults on demand.
+
+Manual "IMU61X Interface Protocol and Instructions", chapters 2 and 3. Without I/O: the owner passes what crossed the
+wires of one transaction and gets what the device answers.
+
+- Registers are renewed every `update_ns` of the device; a transaction sees those of its beginning (latched).
+- SPI: the answer to a word comes with the second word after it, across selections too. A burst lasts as long as its
+  selection. In an SPI mode that it does not have, every bit is read one late.
+- A restart forgets window, filter and kind of burst (assumed: they are saved by a command of the UART only).
+"""
+
+import errno
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import Final
+
+from imud.attitude import euler_zyx_from_quat
+from imud.devices.imu61x.common import registers
+from imud.devices.imu61x.common.family import FILTER_DEFAULT, product_id_of
+from imud.devices.imu61x.i2c import codec as i2c
+from imud.devices.imu61x.spi import codec as spi
+from imud.sim.physics.motion import Motion, Truth, swing
+from imud.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
+
+UPDATE_NS: Final = NS_PER_MS
+"""Time between two renewals of the registers (assumed)."""
+_WINDOW_0, _WINDOW_1 = 0, 1
+
+
+@dataclass(slots=True)
+class RegisterFaults:
+    """What is wrong with the device or its wires; may be changed at any time."""
+
+    error: int = 0
+    """The errno that every transaction fails with: ENXIO not acknowledged, ETIMEDOUT bus stuck; 0 for none."""
+    line: int | None = None
+    """All bytes read are this: 0xFF or 0x00 for a data line that nobody drives."""
+    flips: int = 0
+    """So many transactions to come have one wrong bit in what is read."""
+    frozen: bool = False
+    """The registers are not renewed."""
+    product_id: bytes = b""
+    """What another device has in its place."""
+
+
+class Imu61xRegisters:
+    """One simulated device. Synchronization: one thread."""
+
+    def __init__(
+        self,
+        now_ns: Callable[[], int],
+        *,
+        motion: Motion | None = None,
+        product: str = "IMU614",
+        modes: frozenset[int] = frozenset({0, 3}),
+        update_ns: int = UPDATE_NS,
+        seed: int = 1,
+    ) -> None:
+        """`now_ns` is CLOCK_MONOTONIC; `modes` are the SPI modes that it understands."""
+        self.faults = RegisterFaults()
+        self.epoch_ns = now_ns()
+        """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
+        self.motion = motion or swing(STANDARD_GRAVITY_M_S2)
+        self.transactions = 0
+        self.filter = FILTER_DEFAULT
+        self.extended = 0
+        self.window = _WINDOW_0
+        self.latched_ns = self.epoch_ns
+        """Instant of measurement of the values that the newest transaction saw."""
+        self._now_ns = now_ns
+        self._product_id = product_id_of(product)
+        self._modes = modes
+        self._update_ns = update_ns
+        self._random = Random(seed)
+        self._pointer = 0
+        self._pipeline = deque((0, 0), maxlen=spi.PIPELINE_WORDS)
+        self._truth = self.motion.at(0.0)
+
+    def restart(self) -> None:
+        """Power was lost and came back."""
+        self.filter, self.extended, self.window = FILTER_DEFAULT, 0, _WINDOW_0
+        self._pipeline.extend((0, 0))
+
+    def truth_at(self, instant_ns: int) -> Truth:
+        """What an ideal sensor measures at CLOCK_MONOTONIC `instant_ns`."""
+        return self.motion.at((instant_ns - self.epoch_ns) / NS_PER_S)
+
+    # --- SPI ---------------------------------------------------------------------------------------------------------
+
+    def spi(self, selections: Sequence[bytes], mode: int = 0) -> list[bytes]:
+        """One transaction: MOSI of each assertion of chip select; returns MISO. Raises OSError by `faults.error`."""
+        self._begin()
+        answers = [self._selection(selection) for selection in selections]
+        if mode not in self._modes:
+            answers = [_one_bit_late(answer) for answer in answers]
+        return self._on_the_wire(answers)
+
+    def _selection(self, mosi: bytes) -> bytes:
+        burst: deque[int] = deque()
+        miso = bytearray()
+        for at in range(0, len(mosi) - 1, 2):
+            word = int.from_bytes(mosi[at : at + 2], "big")
+            miso += self._pipeline[0].to_bytes(2, "big")
+            if word == spi.write(registers.BURST, 0) and self.window == _WINDOW_0:
+                burst = deque(self._burst_words())
+            self._pipeline.append(burst.popleft() if burst and word in (0x8000, 0x0000) else self._answer(word))
+        return bytes(miso)
+
+    def _burst_words(self) -> list[int]:
+        truth = self._truth
+        if self.extended:
+            data = spi.encode_extended(
+                accel_m_s2=truth.accel_m_s2, gyro_rad_s=truth.gyro_rad_s, temperature_c=truth.temperature_c,
+                euler_rad=euler_zyx_from_quat(truth.quat_wxyz),
+            )  # fmt: skip
+        else:
+            data = spi.encode_standard(accel_m_s2=truth.accel_m_s2, gyro_rad_s=truth.gyro_rad_s)
+        return [int.from_bytes(data[at : at + 2], "big") for at in range(0, len(data), 2)]
+
+    def _answer(self, word: int) -> int:
+        """Do what a word says; the word that answers it."""
+        address = word >> 8 & 0x7F
+        if word & 0x8000:
+            self._write(address, word & 0xFF)
+            return 0
+        if address == registers.WIN_CTRL:
+            return self.window
+        return self._configuration(address) if self.window == _WINDOW_1 else self._value(address)
+
+    def _write(self, address: int, value: int) -> None:
+        if address == registers.WIN_CTRL:
+            self.window = value & 1
+        elif self.window == _WINDOW_1 and address == registers.FILTER_CTRL:
+            self.filter = value
+        elif self.window == _WINDOW_1 and address == registers.BURST_CTRL + 1:
+            self.extended = value & 1
+
+    def _configuration(self, address: int) -> int:
+        if address == registers.FILTER_CTRL:
+            return self.filter
+        if address == registers.BURST_CTRL:
+            return self.extended << 8
+        at = address - registers.PROD_ID
+        return int.from_bytes(self.product_id[at : at + 2], "big") if 0 <= at < 8 and not at % 2 else 0
+
+    def _value(self, address: int) -> int:
+        """One half of a value in window 0, high word first."""
+        index, low = divmod((address - registers.TEMP_HIGH) // 2, 2)
+        truth = self._truth
+        values = (
+            registers.temperature_counts(truth.temperature_c),
+            *(round(w / registers.RAD_S_PER_COUNT) for w in truth.gyro_rad_s),
+            *(round(a / registers.M_S2_PER_COUNT_REGISTER) for a in truth.accel_m_s2),
+        )
+        if not 0 <= index < len(values) or address % 2:
+            return 0
+        return values[index] >> (0 if low else 16) & 0xFFFF
+
+    # --- I2C ---------------------------------------------------------------------------------------------------------
+
+    def i2c(self, parts: Sequence[bytes | int]) -> bytes:
+        """One transaction between start and stop: bytes written, or how many are read; returns all that is read.
+
+        Raises OSError by `faults.error`.
+        """
+        self._begin()
+        return self._on_the_wire([self._read(part) for part in parts if not self._written(part)])[0]
+
+    def _written(self, part: bytes | int) -> bool:
+        if isinstance(part, int):
+            return False
+        if part:
+            self._pointer = part[0]
+        if part[1:] and self._pointer == registers.FILTER_CTRL:
+            self.filter = part[1]
+        return True
+
+    def _read(self, part: bytes | int) -> bytes:
+        truth = self._truth
+        burst = i2c.encode_burst(
+            accel_m_s2=truth.accel_m_s2, gyro_rad_s=truth.gyro_rad_s, temperature_c=truth.temperature_c
+        )
+        contents = {
+            registers.I2C_BURST: burst,
+            registers.FILTER_CTRL: bytes([self.filter]),
+            registers.PROD_ID: self.product_id,
+        }
+        size = part if isinstance(part, int) else 0
+        return contents.get(self._pointer, b"")[:size].ljust(size, b"\x00")
+
+    # --- both --------------------------------------------------------------------------------------------------------
+
+    @property
+    def product_id(self) -> bytes:
+        """The eight bytes of PROD_ID."""
+        return self.faults.product_id or self._product_id
+
+    def _begin(self) -> None:
+        """A transaction begins: latch the registers."""
+        self.transactions += 1
+        if self.faults.error:
+            raise OSError(self.faults.error, errno.errorcode.get(self.faults.error, "?"))
+        if not self.faults.frozen:
+            elapsed_ns = self._now_ns() - self.epoch_ns
+            self.latched_ns = self.epoch_ns + elapsed_ns // self._update_ns * self._update_ns
+            self._truth = self.truth_at(self.latched_ns)
+
+    def _on_the_wire(self, answers: list[bytes]) -> list[bytes]:
+        faults = self.faults
+        if faults.line is not None:
+            return [bytes([faults.line]) * len(answer) for answer in answers] or [b""]
+        if faults.flips and any(answers):
+            faults.flips -= 1
+            longest = max(range(len(answers)), key=lambda n: len(answers[n]))
+            answers[longest] = self._flipped(answers[longest])
+        return answers or [b""]
+
+    def _flipped(self, data: bytes) -> bytes:
+        """One bit wrong, not in the words of an SPI pipeline, which say nothing."""
+        first = spi.PIPELINE_BYTES if len(data) > spi.PIPELINE_BYTES else 0
+        at = self._random.randrange(first, len(data))
+        return data[:at] + bytes([data[at] ^ 1 << self._random.randrange(8)]) + data[at + 1 :]
+
+
+def _one_bit_late(data: bytes) -> bytes:
+    """What is read on the wrong edge."""
+    return (int.from_bytes(data, "big") >> 1).to_bytes(len(data), "big")

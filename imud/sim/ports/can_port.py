@@ -1,0 +1,108 @@
+"""A simulated device on a CAN network interface: `vcan`, or a controller with a real bus.
+
+The simulator's frames leave when they would have crossed the wire of the simulated device; all that is due goes out in
+one system call, so that a stall of the simulator's process falls between bursts and not into one. What the interface's
+queue does not take is lost and counted, as on a bus that is too full.
+"""
+
+import os
+import socket
+from typing import Final
+
+from imud.errors import LinkError
+from imud.formats.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, pack_frame
+from imud.links.can.mmsg import send_all
+from imud.links.can.netlink import can_interfaces
+from imud.sim.can_module import CanModule
+
+READ_BYTES: Final = 4096
+
+
+class CanPort:
+    """One module, or several as one (`CanModules`), on one interface. Synchronization: one thread."""
+
+    is_open = True
+    """Somebody may always listen."""
+
+    def __init__(self, module: CanModule, interface: str) -> None:
+        """Raises LinkError when there is no such CAN interface, or it is down."""
+        self.module = module
+        self.interface = interface
+        self._unplugged_until_ns = 0
+        self.frames_refused = 0
+        """Frames that the interface's queue did not take."""
+        self._socket = _open(interface)
+
+    def fileno(self) -> int:
+        """The descriptor to wait on for frames of others."""
+        return self._socket.fileno()
+
+    @property
+    def node(self) -> "CanPort":
+        """What is to be waited on."""
+        return self
+
+    def unplug(self, now_ns: int, duration_ns: int) -> None:
+        """The device leaves the bus and loses power."""
+        self._unplugged_until_ns = now_ns + duration_ns
+        self.module.reboot(self._unplugged_until_ns)
+
+    def step(self, now_ns: int, readable: bool) -> None:
+        """Take what others sent, and send what is due."""
+        if readable:
+            self._receive(now_ns)
+        if now_ns >= self._unplugged_until_ns:
+            due = [pack_frame(frame.can_id, frame.extended, frame.data) for frame in self.module.advance(now_ns)]
+            self.frames_refused += len(send_all(self._socket.fileno(), due))
+
+    def next_ns(self, now_ns: int) -> int:
+        """When to call `step` next."""
+        due_ns = self.module.next_ns()
+        return max(self._unplugged_until_ns, now_ns if due_ns is None else due_ns)
+
+    def summary(self) -> dict[str, int]:
+        """What was counted so far, and the zero of the motion, CLOCK_MONOTONIC."""
+        counters = {**self.module.counters(), "frames_refused": self.frames_refused}
+        return {**counters, "epoch_ns": self.module.epoch_ns}
+
+    def close(self) -> None:
+        """Leave the bus; may be called twice."""
+        self._socket.close()
+
+    def _receive(self, now_ns: int) -> None:
+        while True:
+            try:
+                raw = os.read(self._socket.fileno(), RAW_FRAME.size)
+            except BlockingIOError:
+                return
+            except OSError:  # the interface went down; it may come up again
+                return
+            can_id, size, data = RAW_FRAME.unpack(raw)
+            if not can_id & (ERROR_FLAG | REMOTE_FLAG):
+                self.module.receive(can_id & EXTENDED_ID_MAX, can_id >= EXTENDED_FLAG, data[:size], now_ns)
+
+
+def _open(interface: str) -> socket.socket:
+    try:
+        opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+    except OSError as error:
+        raise LinkError(f"this kernel has no CAN sockets ({error.strerror}): load the module can_raw") from error
+    try:
+        opened.bind((interface,))
+        opened.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    except OSError as error:
+        opened.close()
+        hint = f"ip link add {interface} type vcan; ip link set {interface} up"
+        raise LinkError(f"{interface}: {error.strerror}: expected a CAN interface that is up ({hint})") from error
+    return opened
+
+
+def default_interface() -> str:
+    """The first CAN interface that is up. Raises LinkError when there is none."""
+    found = can_interfaces()
+    if not found:
+        raise LinkError(
+            "expected a CAN interface that is up, found none; a virtual one: ip link add vcan0 type vcan; "
+            "ip link set vcan0 up"
+        )
+    return found[0]

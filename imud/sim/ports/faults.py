@@ -1,0 +1,173 @@
+"""Seeded faults on a stream of bursts: what happens to bytes on bad wires, each fault noted with its kind.
+
+Each burst (a frame or a reply) meets each kind of fault with its own probability, so that a test can say how many
+damaged frames, missing samples and skipped bytes the ledger at the other end must show.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from random import Random
+from typing import Final, NamedTuple
+
+from imud.sim.ports.wire import heard
+from imud.sim.simulator import Burst
+from imud.units import NS_PER_MS
+
+LOG_MAX: Final = 100_000
+"""Faults kept in `Faults.log`; the counts go on."""
+INSERT_BYTES_MAX: Final = 16
+WRONG_BAUDS: Final = (9600, 115_200, 230_400, 256_000, 460_800, 921_600)
+
+
+class FaultKind(StrEnum):
+    """What can happen to a burst."""
+
+    CUT = "cut"
+    """Its end is missing, at least one byte of it."""
+    FLIP = "flip"
+    """One bit is wrong."""
+    DROP = "drop"
+    """One byte is missing."""
+    INSERT = "insert"
+    """Up to 16 random bytes come before one of its bytes."""
+    DELAY = "delay"
+    """It is held back, and with it all that follows."""
+    UNPLUG = "unplug"
+    """The port disappears; this burst and those of the next `unplug_ns` are gone."""
+    WRONG_BAUD = "wrong_baud"
+    """It is sent at another rate."""
+    LOSE = "lose"
+    """Nothing of it arrives."""
+
+
+_Order = (
+    FaultKind.UNPLUG, FaultKind.WRONG_BAUD, FaultKind.CUT, FaultKind.FLIP, FaultKind.DROP, FaultKind.INSERT,
+    FaultKind.DELAY, FaultKind.LOSE,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FaultRates:
+    """Probability of each fault per burst, 0 … 1, and how long the lasting ones last."""
+
+    cut: float = 0.0
+    flip: float = 0.0
+    drop: float = 0.0
+    insert: float = 0.0
+    delay: float = 0.0
+    unplug: float = 0.0
+    wrong_baud: float = 0.0
+    lose: float = 0.0
+    delay_ns: int = 5 * NS_PER_MS
+    """Longest delay."""
+    unplug_ns: int = 300 * NS_PER_MS
+
+    def __post_init__(self) -> None:
+        for kind in FaultKind:
+            if not 0.0 <= getattr(self, kind.value) <= 1.0:
+                raise ValueError(f"fault {kind.value}: expected a probability 0 … 1, got {getattr(self, kind.value)}")
+
+    def any(self) -> bool:
+        """Whether there is any fault to expect."""
+        return any(getattr(self, kind.value) for kind in FaultKind)
+
+
+class Fault(NamedTuple):
+    """One fault that happened."""
+
+    kind: FaultKind
+    due_ns: int
+    """When the burst would have been through."""
+    burst: int
+    """Number of the burst, from 0."""
+    sample_ns: int | None
+    """Instant of measurement of the frame that was hit; None for text."""
+
+
+class Faults:
+    """Passes bursts on, damaged or not. Same seed, same bursts: same faults."""
+
+    def __init__(self, seed: int, rates: FaultRates, baud: int = 115_200) -> None:
+        self.rates = rates
+        self.baud = baud
+        """Rate at which the device sends; a wrong baud is any other."""
+        self.log: list[Fault] = []
+        self.counts: Counter[FaultKind] = Counter()
+        self.bursts = 0
+        self.bursts_hit = 0
+        """Bursts that did not arrive as they were sent (late ones do)."""
+        self.unplugged_until_ns = 0
+        self._random = Random(seed)
+        self._held_until_ns = 0
+
+    def pass_on(self, burst: Burst) -> Burst | None:
+        """The burst as it arrives, None if nothing of it does. Bursts never overtake each other."""
+        number, self.bursts = self.bursts, self.bursts + 1
+        kinds = self._strike()
+        if burst.due_ns < self.unplugged_until_ns:
+            self.bursts_hit += 1
+            return None
+        data, due_ns = burst.data, max(burst.due_ns, self._held_until_ns)
+        for kind in kinds:
+            self._note(Fault(kind, burst.due_ns, number, burst.sample_ns))
+            if kind is FaultKind.UNPLUG:
+                self.unplugged_until_ns = burst.due_ns + self.rates.unplug_ns
+                self.bursts_hit += 1
+                return None
+            if kind is FaultKind.DELAY:
+                due_ns += self._random.randint(1, self.rates.delay_ns)
+                self._held_until_ns = due_ns
+            else:
+                data = self._damaged(kind, data)
+        self.bursts_hit += data != burst.data
+        return burst._replace(due_ns=due_ns, data=data) if data else None
+
+    def _strike(self) -> list[FaultKind]:
+        """The faults of one burst, in the order they act. Draws the same number of times whatever happens.
+
+        For losses it draws only where there are any: seeds of older tests go on to mean the same.
+        """
+        rates, random = self.rates, self._random
+        kinds = _Order if rates.lose else _Order[:-1]
+        return [kind for kind in kinds if random.random() < getattr(rates, kind.value)]
+
+    def _note(self, fault: Fault) -> None:
+        self.counts[fault.kind] += 1
+        if len(self.log) < LOG_MAX:
+            self.log.append(fault)
+
+    def _damaged(self, kind: FaultKind, data: bytes) -> bytes:
+        random = self._random
+        if not data:
+            return data
+        at = random.randrange(len(data))
+        match kind:
+            case FaultKind.CUT:
+                data = data[:at]
+            case FaultKind.FLIP:
+                data = data[:at] + bytes([data[at] ^ 1 << random.randrange(8)]) + data[at + 1 :]
+            case FaultKind.DROP:
+                data = data[:at] + data[at + 1 :]
+            case FaultKind.INSERT:
+                data = data[:at] + random.randbytes(random.randint(1, INSERT_BYTES_MAX)) + data[at:]
+            case FaultKind.LOSE:
+                data = b""
+            case FaultKind.WRONG_BAUD:
+                data = heard(data, random.choice([baud for baud in WRONG_BAUDS if baud != self.baud]), self.baud)
+        return data
+
+
+def rates_from(text: str) -> FaultRates:
+    """Rates from `flip=0.01,drop=0.002`; names are those of `FaultRates`. Raises ValueError."""
+    known = {field.name: field.type for field in fields(FaultRates)}
+    values: dict[str, float] = {}
+    for part in filter(None, text.split(",")):
+        name, _, value = part.partition("=")
+        if name not in known:
+            raise ValueError(f"fault {name!r}: expected one of {', '.join(known)}")
+        try:
+            values[name] = int(value) if name.endswith("_ns") else float(value)
+        except ValueError:
+            raise ValueError(f"fault {name}: expected a number, got {value!r}") from None
+    return FaultRates(**values)  # type: ignore[arg-type]  # names and types checked above

@@ -1,0 +1,135 @@
+"""I2C and SPI inside the process: simulated devices behind what smbus2 and spidev's ioctl would be.
+
+For tests and measurements without the kernel's buses: `SpiLink(settings, ioctl=bus.ioctl, open_node=bus.open, …)` and
+`I2cLink(settings, open_bus=bus.open, ioctl=bus.ioctl)`.
+"""
+
+import ctypes
+import errno
+from collections.abc import Callable, Sequence
+
+from smbus2 import I2cFunc, i2c_msg
+
+from imud.links import spi
+from imud.sim.imu61x.registers import Imu61xRegisters
+
+I2C_M_RD = 0x0001
+"""Flag of a message that is read (<linux/i2c.h>)."""
+FD = 1_000_000
+"""Descriptors that no process has."""
+
+
+class InProcessI2c:
+    """An I2C bus with devices by address. It plays the parts of `SMBus` and of its opener."""
+
+    def __init__(self, devices: dict[int, Imu61xRegisters], funcs: int = I2cFunc.I2C) -> None:
+        self.devices = devices
+        self.funcs = funcs
+        self.fd: int | None = None
+        self.opened = 0
+        self.open_error = 0
+        """The errno that `open` fails with, 0 for none."""
+        self.calls: list[tuple[int, tuple[bytes | int, ...]]] = []
+        """Address and parts of every transaction."""
+
+    def open(self, _path: str) -> "InProcessI2c":
+        """As `SMBus(path)`."""
+        if self.open_error:
+            raise OSError(self.open_error, "by the test")
+        self.fd, self.opened = FD, self.opened + 1
+        return self
+
+    def ioctl(self, _fd: int, _request: int, _argument: int) -> int:
+        """Setting the time-out goes well."""
+        return 0
+
+    def i2c_rdwr(self, *messages: i2c_msg) -> None:
+        """One transaction."""
+        reads = [message for message in messages if message.flags & I2C_M_RD]
+        parts = [message.len if message in reads else bytes(message) for message in messages]
+        data = self._transact(messages[0].addr, parts)
+        for message in reads:
+            ctypes.memmove(message.buf, data, message.len)
+
+    def read_i2c_block_data(self, i2c_addr: int, register: int, length: int) -> list[int]:
+        """The SMBus way to read."""
+        return list(self._transact(i2c_addr, [bytes([register]), length]))
+
+    def write_i2c_block_data(self, i2c_addr: int, register: int, data: list[int]) -> None:
+        """The SMBus way to write."""
+        self._transact(i2c_addr, [bytes([register, *data])])
+
+    def close(self) -> None:
+        """Nothing is open any more."""
+        self.fd = None
+
+    def _transact(self, address: int, parts: Sequence[bytes | int]) -> bytes:
+        self.calls.append((address, tuple(parts)))
+        device = self.devices.get(address)
+        if device is None:
+            raise OSError(errno.ENXIO, "nobody acknowledges")
+        return device.i2c(parts)
+
+
+class InProcessSpi:
+    """One chip select of an SPI bus, seen through spidev's ioctl."""
+
+    def __init__(
+        self, device: Callable[[Sequence[bytes], int], Sequence[bytes]] | None = None, *, word_bits: int = 8
+    ) -> None:
+        """`device` as `Imu61xRegisters.spi`; without one, zeros are read. `word_bits` is the controller's most."""
+        self.device = device
+        self.mode = 0
+        self.opened: list[int] = []
+        self.open_error = 0
+        """The errno that `open` fails with, 0 for none."""
+        self.messages: list[tuple[tuple[bytes, ...], int, int]] = []
+        """MOSI of each selection, word size and speed of every message."""
+        self.keep_messages = True
+        self._word_bits = word_bits
+
+    def open(self, _path: str, _flags: int) -> int:
+        """As `os.open`."""
+        if self.open_error:
+            raise OSError(self.open_error, "by the test")
+        self.opened.append(FD + len(self.opened))
+        return self.opened[-1]
+
+    def close(self, fd: int) -> None:
+        """As `os.close`."""
+        self.opened.remove(fd)
+
+    def ioctl(self, _fd: int, request: int, argument: bytes) -> int:
+        """As `fcntl.ioctl` on spidev."""
+        if request == spi.WR_MODE:
+            self.mode = argument[0]
+        elif request == spi.WR_BITS_PER_WORD and argument[0] > self._word_bits:
+            raise OSError(errno.EINVAL, "words of that size are not supported")
+        elif request not in (spi.WR_BITS_PER_WORD, spi.WR_MAX_SPEED_HZ):
+            self._message(argument)
+        return 0
+
+    def _message(self, argument: bytes) -> None:
+        rows = list(spi.ROW.iter_unpack(argument))
+        if any(row[5] > self._word_bits for row in rows):
+            raise OSError(errno.EINVAL, "words of that size are not supported")
+        mosi = [_swapped(ctypes.string_at(tx, size), bits) for tx, _, size, _, _, bits, *_ in rows]
+        selections: list[bytes] = [b""]
+        for part, row in zip(mosi, rows, strict=True):
+            selections[-1] += part
+            if row[6]:
+                selections.append(b"")
+        if self.keep_messages:
+            self.messages.append((tuple(selections), rows[0][5], rows[0][3]))
+        answer = self.device(selections, self.mode) if self.device else [bytes(len(part)) for part in selections]
+        miso, at = b"".join(answer), 0
+        for _, rx, size, _, _, bits, *_ in rows:
+            ctypes.memmove(rx, _swapped(miso[at : at + size], bits), size)
+            at += size
+
+
+def _swapped(data: bytes, bits: int) -> bytes:
+    """Words of 16 bits between memory of a little-endian host and the wire."""
+    if bits <= 8:
+        return data
+    return b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))

@@ -1,0 +1,259 @@
+"""A simulated device behind a real pseudo-terminal: a node to open, a rate to set, a cable to pull.
+
+    module ──▶ faults ──▶ adapter ──▶ line (rate) ──▶ master │ slave ◀── the program under test, through a stable link
+    module ◀───────────── line (rate) ◀────────────── master │
+
+The program's rate is read from the terminal at every write: when it is not the module's, both sides hear garbage. A
+pty keeps nobody's bytes: with no reader, or with one that does not keep up, what does not fit is lost and counted.
+Unplugging closes the pseudo-terminal and removes the link; plugging makes a new one under the same name and powers the
+module on again.
+"""
+
+import fcntl
+import os
+import select
+import struct
+import termios
+import tty
+from collections import deque
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, TextIO
+
+from imud.sim.ports.arrival import ArrivalProfile
+from imud.sim.ports.faults import Faults
+from imud.sim.ports.wire import heard
+from imud.sim.simulator import Burst, StreamModule
+from imud.units import NS_PER_MS, NS_PER_S
+
+TCGETS2: Final = 0x802C542A
+TCSETS2: Final = 0x402C542B
+TERMIOS2: Final = struct.Struct("4I20s2I")
+"""c_iflag c_oflag c_cflag c_lflag, c_line with c_cc[19], c_ispeed c_ospeed (asm-generic/termbits.h)."""
+BOTHER: Final = 0o010000
+CBAUD: Final = 0o010017
+READ_BYTES: Final = 4096
+LOOK_NS: Final = 20 * NS_PER_MS
+"""How often to look whether somebody has opened a port that nobody had open: a pty tells of no such event."""
+
+
+@dataclass(slots=True)
+class PtyCounters:
+    """Where the module's bytes went."""
+
+    bytes_written: int = 0
+    bytes_unheard: int = 0
+    """Nobody had the port open."""
+    bytes_lost_full: int = 0
+    """The reader did not keep up."""
+    bursts_wrong_baud: int = 0
+    """Sent while the reader listened at another rate."""
+    unplugs: int = 0
+
+
+class PtyNode:
+    """One pseudo-terminal under a name that stays the same from plug to plug."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._master = -1
+        self._poll = select.poll()
+
+    def plug(self, baud: int) -> None:
+        """Make the terminal, raw and at `baud`, and its link. Raises OSError."""
+        self._master, slave = os.openpty()
+        try:
+            os.set_blocking(self._master, False)
+            self._poll = select.poll()
+            self._poll.register(self._master, 0)
+            tty.setraw(slave)
+            set_baud(slave, baud)
+            fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(os.ttyname(slave))
+            fresh.rename(self.path)
+        finally:
+            os.close(slave)  # from here on POLLHUP says that nobody has it open
+
+    def unplug(self) -> None:
+        """Make the terminal disappear; may be called twice."""
+        self.path.unlink(missing_ok=True)
+        if self._master >= 0:
+            os.close(self._master)
+            self._master = -1
+
+    def fileno(self) -> int:
+        """The master's descriptor, -1 while unplugged."""
+        return self._master
+
+    @property
+    def is_open(self) -> bool:
+        """Whether some program has the port open."""
+        if self._master < 0:
+            return False
+        return not self._poll.poll(0)  # POLLHUP while no slave is open
+
+    @property
+    def baud(self) -> int:
+        """The rate that the program set, in bit/s."""
+        return int(TERMIOS2.unpack(fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size)))[6])
+
+    def read(self) -> bytes:
+        """What the program sent."""
+        try:
+            return os.read(self._master, READ_BYTES)
+        except OSError:  # nothing there, or the program closed the port (EIO)
+            return b""
+
+    def write(self, data: bytes) -> int:
+        """Send, and return how many bytes fitted."""
+        try:
+            return os.write(self._master, data)
+        except OSError:  # full, or nobody there
+            return 0
+
+
+def set_baud(fd: int, baud: int) -> None:
+    """Set any rate on a terminal, standard or not."""
+    *flags, rest, _, _ = TERMIOS2.unpack(fcntl.ioctl(fd, TCGETS2, bytes(TERMIOS2.size)))
+    flags[2] = flags[2] & ~CBAUD | BOTHER
+    fcntl.ioctl(fd, TCSETS2, TERMIOS2.pack(*flags, rest, baud, baud))
+    termios.tcflush(fd, termios.TCIOFLUSH)
+
+
+class Adapter:
+    """When bytes that crossed the wire reach the terminal: at once, or when a USB adapter's latency timer fires."""
+
+    def __init__(self, profile: ArrivalProfile, begin_ns: int) -> None:
+        self._begin_ns = begin_ns
+        self._step_ns = round(profile.timer_ns / (1 + profile.timer_ppm * 1e-6))
+
+    def handed_over_ns(self, due_ns: int) -> int:
+        """When a burst whose last byte came at `due_ns` is handed over."""
+        step_ns = self._step_ns
+        return due_ns + step_ns - (due_ns - self._begin_ns) % step_ns if step_ns else due_ns
+
+
+class SimulatedPort:
+    """Moves bytes between a module and its terminal. Pure of clocks: the owner says what time it is and waits.
+
+    Synchronization: one thread.
+    """
+
+    def __init__(
+        self,
+        module: StreamModule,
+        node: PtyNode,
+        adapter: Adapter,
+        faults: Faults | None = None,
+        truth: TextIO | None = None,
+    ) -> None:
+        """`truth` gets one line per frame that went out whole: sample_ns, device_ms, written_ns."""
+        self.module, self.node = module, node
+        self.counters = PtyCounters()
+        self._adapter, self._faults, self._truth = adapter, faults, truth
+        self._held: deque[Burst] = deque()
+        self._replug_ns: int | None = None
+        node.plug(module.baud)
+        if truth:
+            truth.write(f"# epoch_ns={module.epoch_ns}\nsample_ns,device_ms,written_ns\n")
+
+    def step(self, now_ns: int, readable: bool = True) -> None:
+        """Do all that is due; with `readable`, look for bytes of the program as well."""
+        if self._replug_ns is not None and now_ns >= self._replug_ns:
+            self._plug(now_ns)
+        self._take(now_ns)
+        if readable and self.node.fileno() >= 0:
+            self._listen(now_ns)
+        self._hand_over(now_ns)
+
+    def next_ns(self, now_ns: int) -> int:
+        """When `step` is to be called again at the latest."""
+        times = [now_ns + NS_PER_S]
+        if self._held:
+            times.append(self._held[0].due_ns)
+        if (module_ns := self.module.next_ns()) is not None:
+            times.append(self._adapter.handed_over_ns(module_ns))
+        if self._replug_ns is not None:
+            times.append(self._replug_ns)
+        elif not self.node.is_open:
+            times.append(now_ns + LOOK_NS)
+        return min(times)
+
+    def unplug(self, now_ns: int, duration_ns: int) -> None:
+        """Pull the cable: the node vanishes, the module loses power; both come back after `duration_ns`."""
+        self.node.unplug()
+        self.counters.unplugs += 1
+        self.counters.bytes_unheard += sum(len(burst.data) for burst in self._held)
+        self._held.clear()
+        self._replug_ns = now_ns + duration_ns
+
+    def close(self) -> None:
+        """Remove the node; may be called twice."""
+        self.node.unplug()
+
+    def summary(self) -> dict[str, int]:
+        """Counters by name, faults included."""
+        faults = self._faults.counts if self._faults else {}
+        return (
+            self.module.counters()
+            | asdict(self.counters)
+            | {f"fault_{kind}": count for kind, count in sorted(faults.items())}
+        )
+
+    def _plug(self, now_ns: int) -> None:
+        self._replug_ns = None
+        self.module.reboot(now_ns)
+        self.node.plug(self.module.baud)
+
+    def _take(self, now_ns: int) -> None:
+        """Bring what left the module through faults and adapter."""
+        faults = self._faults
+        for burst in self.module.advance(now_ns):
+            arriving: Burst | None = burst
+            if faults and self._replug_ns is None:
+                faults.baud, until_ns = self.module.baud, faults.unplugged_until_ns
+                arriving = faults.pass_on(burst)
+                if faults.unplugged_until_ns != until_ns:
+                    self.unplug(now_ns, faults.rates.unplug_ns)
+            if arriving:
+                self._held.append(arriving._replace(due_ns=self._adapter.handed_over_ns(arriving.due_ns)))
+
+    def _listen(self, now_ns: int) -> None:
+        data = self.node.read()
+        if data:
+            self.module.receive(heard(data, self.node.baud, self.module.baud), now_ns)
+
+    def _hand_over(self, now_ns: int) -> None:
+        """Write what is due in one piece; nothing is kept for later."""
+        held, due = self._held, []
+        while held and held[0].due_ns <= now_ns:
+            due.append(held.popleft())
+        if not due:
+            return
+        data = b"".join(burst.data for burst in due)
+        if not self.node.is_open:
+            self.counters.bytes_unheard += len(data)
+            return
+        baud = self.node.baud
+        if baud != self.module.baud:
+            self.counters.bursts_wrong_baud += len(due)
+            data = heard(data, self.module.baud, baud)
+        written = self.node.write(data) if data else 0
+        self.counters.bytes_written += written
+        self.counters.bytes_lost_full += len(data) - written
+        if self._truth and written == len(data):
+            self._note(due, now_ns)
+
+    def _note(self, due: list[Burst], now_ns: int) -> None:
+        assert self._truth
+        for burst in due:
+            if burst.sample_ns is not None:
+                self._truth.write(f"{burst.sample_ns},{burst.device_ms},{now_ns}\n")
+
+
+def sharpen_timers() -> None:
+    """Ask the kernel to wake this process within 1 µs instead of 50 µs; without the right to, jitter stays."""
+    with suppress(OSError):
+        Path("/proc/self/timerslack_ns").write_text("1")

@@ -1,0 +1,90 @@
+"""A thread that sleeps from one deadline to the next: it serves a polled bus, or drives a trigger line.
+
+A worker calls a function that says how long it may sleep; tests call that function themselves, at times they choose
+(`tests/support/virtual_time.py`).
+"""
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+from imud.units import NS_PER_S
+
+END_LIMIT_S = 5.0
+"""A transfer on a bus that hangs ends with the controller's own time-out, of one second at most."""
+
+Round = Callable[[], int]
+"""Does what is due and returns how many ns may pass before it is called again; 0 for none."""
+
+
+class Worker(Protocol):
+    """Calls a `Round` again and again, one call at a time."""
+
+    def ring(self) -> None:
+        """There is something new to do: end the present sleep, or skip the next. From any thread."""
+        ...
+
+    def end(self) -> None:
+        """Call it no more. Returns when the present call is over."""
+        ...
+
+
+StartWorker = Callable[[str, Round, Callable[[BaseException], None]], Worker]
+"""Starts a worker: name, what it calls, and who is told of an exception, which ends it."""
+
+
+class WakeEvent:
+    """A wait that another thread can end. A lock's own wait is on CLOCK_MONOTONIC and costs a third of an Event's."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._lock.acquire()
+
+    def wait(self, seconds: float) -> None:
+        """Return after so much time, or when `ring` was called since the last wait."""
+        self._lock.acquire(timeout=seconds)
+
+    def ring(self) -> None:
+        """End the present wait, or the next. From any thread."""
+        with suppress(RuntimeError):  # it rings already
+            self._lock.release()
+
+
+class BusThread:
+    """A `Worker` that is a thread."""
+
+    def __init__(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
+        self._work, self._failed = work, failed
+        self._alarm = WakeEvent()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def ring(self) -> None:
+        """There is something new to do. From any thread."""
+        self._alarm.ring()
+
+    def end(self) -> None:
+        """Stop after the present transfer; may be called twice."""
+        self._ended = True
+        self._alarm.ring()
+        self._thread.join(END_LIMIT_S)
+
+    def _run(self) -> None:
+        _sharpen_timer()
+        work, wait = self._work, self._alarm.wait
+        try:
+            while not self._ended:
+                rest_ns = work()
+                if rest_ns > 0 and not self._ended:
+                    wait(rest_ns / NS_PER_S)
+        except BaseException as error:  # noqa: BLE001 - a mistake of ours must end the daemon, not just this thread
+            self._failed(error)
+
+
+def _sharpen_timer() -> None:
+    """Ask the kernel to wake this thread within 1 µs instead of 50 µs; without the right to, jitter stays."""
+    with suppress(OSError):
+        Path(f"/proc/{threading.get_native_id()}/timerslack_ns").write_text("1", encoding="ascii")

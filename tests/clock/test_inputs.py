@@ -1,0 +1,276 @@
+"""SOUT through the whole clock: every pair right, no step when edges come and go, honest all the time."""
+
+from itertools import pairwise
+from math import sqrt
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imud.clock import SampleClock
+from imud.contracts.lines import Edge
+from imud.contracts.timing import SoutTiming, TimeBits, TriggerStamp, UtcReference
+from imud.sample import Measurement, Sync
+from imud.sim.ports.arrival import (
+    BARE_UART,
+    LOADED,
+    USB_1MS,
+    USB_16MS,
+    USB_16MS_PACKET,
+    ArrivalModel,
+    ArrivalProfile,
+    Crystal,
+)
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.clock import BAUD_OF_RATE
+from tests.bench.line_model import LineFaults, heard, measured_ns, restarted
+from tests.bench.line_runs import (
+    REFERENCE,
+    UTC_OFFSET_NS,
+    Told,
+    after,
+    measurement,
+    run_sout,
+    share_honest,
+    sout_clock,
+    steepest,
+    syncs,
+    with_sout,
+)  # fmt: skip
+from tests.support.streams import BEGIN_NS, make_clock, message, rises
+
+SLEW = 550e-6
+UNIX = 1 << 32
+JITTER_STEP_NS = 60_000
+HALF_LOST = LineFaults(pulse_loss=0.1, edge_loss=0.02, frame_loss=0.1, extra=0.02, loaded=True)
+
+
+def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: Crystal | None = None) -> ArrivalModel:
+    return ArrivalModel(profile, rate_hz, seed, crystal or Crystal(50.0), BAUD_OF_RATE[rate_hz])
+
+
+@pytest.mark.parametrize("profile", [BARE_UART, USB_16MS, LOADED], ids=lambda p: p.name)
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 2)])
+def test_every_pair_is_right_under_loss_on_either_side(profile: ArrivalProfile, rate_hz: int, seconds: int) -> None:
+    told = run_sout(model(profile, rate_hz, 3), seconds, HALF_LOST)
+    paired = [t for t in told if t.sample.edge_seq is not None]
+    assert len(paired) > 0.6 * len(told)
+    assert all(t.sample.edge_seq == t.number for t in paired)
+    assert rises(t.sample for t in told)
+    assert share_honest(told) >= 0.95
+
+
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 4)])
+def test_rising_edges_alone_are_enough(rate_hz: int, seconds: int) -> None:
+    """The kernel is asked for no others; they are numbered by themselves."""
+    m = model(USB_16MS, rate_hz, 5)
+    reads = [
+        read._replace(
+            edges=[Edge(e.t_ns, True, (e.number + 1) // 2) for e in read.edges if e.rising],
+            numbers=[(number + 1) // 2 for number in read.numbers],
+        )
+        for read in heard(m.run(rate_hz * seconds), 5, HALF_LOST)
+    ]
+    told = with_sout(sout_clock(m), reads)
+    paired = [t for t in told if t.sample.edge_seq is not None]
+    assert len(paired) > 0.6 * len(told)
+    assert all(t.sample.edge_seq == t.number for t in paired)
+    assert share_honest(told) >= 0.95
+
+
+@pytest.mark.parametrize("crystal", [Crystal(-50_000.0), Crystal(50_000.0), Crystal(20.0, 0.1)], ids=str)
+def test_with_edges_only_their_own_jitter_is_left(crystal: Crystal) -> None:
+    """Simulated stamps are late by 3 µs and an exponential law of 4 µs."""
+    told = after(run_sout(model(USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5)
+    mean = sum(t.off_ns for t in told) / len(told)
+    assert sqrt(sum((t.off_ns - mean) ** 2 for t in told) / len(told)) < 5_000
+    assert syncs(told) == {Sync.EDGE}
+
+
+def test_the_error_is_honest_without_a_bias() -> None:
+    told = run_sout(model(BARE_UART), 30, HALF_LOST, SoutTiming(bias_us=0.0))
+    assert share_honest(told) >= 0.95
+    assert sum(t.sample.t_err_ns for t in after(told, 10)) / len(after(told, 10)) < 20_000
+
+
+@pytest.mark.parametrize("profile", [BARE_UART, USB_16MS_PACKET], ids=lambda p: p.name)
+def test_edges_that_stop_and_come_back_make_no_step(profile: ArrivalProfile) -> None:
+    m = model(profile, 100)
+    reads = heard(m.run(3600), 1, LineFaults())
+    silent = range(len(reads) // 3, 2 * len(reads) // 3)
+    told = with_sout(sout_clock(m), reads, silent=silent)
+    begin = sum(len(read.arrivals) for read in reads[: silent.start])
+    end = sum(len(read.arrivals) for read in reads[: silent.stop])
+    assert {t.sample.sync for t in told[begin - 300 : begin]} == {Sync.EDGE}
+    last = max(i for i, t in enumerate(told[:end]) if t.sample.edge_seq is not None)  # of a pulse seen before
+    assert last <= begin + 2
+    assert syncs(told[last + 3 : end]) == {Sync.REGRESSION}
+    assert syncs(told[end + 50 :]) == {Sync.EDGE}
+    # the jitter of the stamps themselves, beyond which only slewing is allowed
+    assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(told[1010:])) < JITTER_STEP_NS
+    assert steepest(told[begin + 3 : end]) < 2 * SLEW
+    assert share_honest(told) >= 0.95
+
+
+def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
+    """A device on UTC whose own crystal is 5 % slow: its milliseconds say little of which pulse is a sample's."""
+    m = model(LOADED, 1000, 3078, Crystal(-50_000.0))
+    clock, told = sout_clock(m), []
+    clock.reference = REFERENCE
+    for read in heard(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
+        clock.edges(read.edges)
+        for a in read.arrivals:
+            truth_ns = measured_ns(a)
+            ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
+            told.append(Told(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0))
+    assert max(abs(t.off_ns) for t in after(told, 1)) < 4 * NS_PER_MS
+    assert rises(t.sample for t in told)
+
+
+def test_the_fit_keeps_what_edges_taught_it() -> None:
+    """Behind this adapter the fit alone is 1.5 ms off."""
+    m = model(USB_16MS_PACKET, 100)
+    reads = heard(m.run(4000), 1, LineFaults())
+    told = with_sout(sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
+    assert abs(told[-1].off_ns) < 300_000
+    assert told[-1].sample.sync is Sync.REGRESSION
+
+
+def test_what_edges_taught_a_young_fit_is_doubted() -> None:
+    """Pulses for 6 s only: the fit moves by a millisecond afterwards, and what was added to it does not know."""
+    m = model(USB_16MS, 100, 1048, Crystal(-50.0))
+    reads = heard(m.run(4500), 1048, LineFaults())
+    begin = next(i for i, read in enumerate(reads) if read.arrivals[0].t_ns > m.begin_ns + 6 * NS_PER_S)
+    told = with_sout(sout_clock(m), reads, silent=range(begin, len(reads)))
+    assert share_honest(told) >= 0.95
+
+
+def test_a_restarted_device_is_paired_again() -> None:
+    m = model(USB_1MS, 100)
+    told = with_sout(clock := sout_clock(m), heard(restarted(m, 4000, 2 * NS_PER_S), 1, LineFaults(edge_loss=0.01)))
+    assert clock.status().resets == 1
+    assert syncs(told[-500:]) == {Sync.EDGE}
+    assert all(t.sample.edge_seq in (None, t.number) for t in told)
+    assert rises(t.sample for t in told)
+    assert share_honest(told) >= 0.95
+
+
+def test_a_lost_rising_edge_is_counted_back() -> None:
+    told = after(run_sout(model(BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
+    unpaired = sum(t.sample.edge_seq is None for t in told)
+    assert 0 < unpaired < 0.07 * len(told)  # both edges lost: 4 %
+    assert all(t.sample.edge_seq in (None, t.number) for t in told)
+
+
+def test_what_was_lost_is_counted() -> None:
+    m = model(BARE_UART)
+    reads = heard(m.run(3000), 1, LineFaults(pulse_loss=0.1, frame_loss=0.05))
+    told = with_sout(clock := sout_clock(m), reads)
+    status = clock.status()
+    seen = sum(edge.rising for read in reads for edge in read.edges)
+    assert status.edges == seen
+    paired = sum(t.sample.edge_seq is not None for t in told)
+    assert 0.03 * seen < status.edges_unpaired < 0.07 * seen
+    assert seen - paired - status.edges_unpaired < 100  # those of the beginning
+    assert 0 <= len(told) - paired - status.samples_unpaired < 100
+
+
+def test_the_offset_of_the_edge_is_configured() -> None:
+    here = run_sout(model(BARE_UART), 10, LineFaults())
+    there = run_sout(model(BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
+    assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
+
+
+def frames_with_bit(clock: SampleClock, *, every: int, knows: bool) -> list[int | None]:
+    """100 Hz, a pulse and bit 12 for each n-th frame only; the numbers of the pulses that samples got."""
+    numbers = []
+    for i in range(2000):
+        at = BEGIN_NS + 10 * i * NS_PER_MS
+        pulse = i % every == 0
+        if pulse:
+            clock.edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
+        m = Measurement(82, 0, 10 * i, status=0x1000 if pulse and knows else 0)
+        numbers.append(clock.sample(m, at + 2 * NS_PER_MS, 0).edge_seq)
+    return numbers
+
+
+def test_the_status_bit_says_which_frames_have_a_pulse() -> None:
+    bits = TimeBits(sync_out=0x1000)
+    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=10_850, hold_ns=0, bits=bits)
+    numbers = frames_with_bit(clock, every=5, knows=True)
+    assert numbers[1000::5] == list(range(2001, 4000, 10))
+    assert clock.status().samples_unpaired == 0
+
+
+def test_a_bit_that_is_never_set_says_nothing() -> None:
+    bits = TimeBits(sync_out=0x1000)
+    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=10_850, hold_ns=0, bits=bits)
+    assert frames_with_bit(clock, every=1, knows=False)[1000:] == list(range(2001, 4001, 2))
+
+
+STEP = st.tuples(
+    st.one_of(st.none(), st.integers(0, 999), st.integers(0, 20)),
+    st.one_of(st.integers(0, 3), st.integers(0, 50 * NS_PER_MS), st.integers(0, 100 * NS_PER_S)),
+    st.integers(0, 4096),
+    st.sampled_from(["", "edges", "pulses", "triggers", "divided", "reference", "nothing known", "regular"]),
+    st.integers(-20 * NS_PER_MS, 20 * NS_PER_MS),
+)
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(
+    st.lists(STEP, max_size=80), st.sampled_from([0, 1_085, 86_805]), st.sampled_from([0, NS_PER_MS, 16 * NS_PER_MS])
+)
+def test_any_input_gives_rising_stamps_before_arrival(
+    steps: list[tuple[int | None, int, int, str, int]], byte_ns: int, hold_ns: int
+) -> None:
+    clock = make_clock(tick_modulus=1000, byte_ns=byte_ns, hold_ns=hold_ns)
+    t_rx_ns, samples, tick = BEGIN_NS, [], 0
+    for number, (ticks, wait_ns, trailing, what, shift_ns) in enumerate(steps):
+        give(clock, what, t_rx_ns + shift_ns, number)
+        for _ in range(30 if what == "regular" else 1):
+            t_rx_ns += NS_PER_MS if what == "regular" else wait_ns
+            tick = tick + 1 if what == "regular" or ticks is None else ticks
+            if what == "regular":
+                give(clock, "edges", t_rx_ns + shift_ns // 16, 2 * tick)
+            m = Measurement(82, trailing, tick % 1000 if ticks is not None else None, pps_age_ms=abs(shift_ns) % 9000)
+            samples.append(clock.sample(m, t_rx_ns, 0))
+    assert rises(samples)
+    assert all(0 < s.t_err_ns < 1 << 32 for s in samples)
+    clock.status()
+
+
+def give(clock: SampleClock, what: str, t_ns: int, number: int) -> None:
+    """One thing that is no message."""
+    edges = [Edge(t_ns, True, 2 * number + 1), Edge(t_ns + 80_000, False, 2 * number + 2)]
+    if what == "edges":
+        clock.edges(edges)
+    elif what == "pulses":
+        clock.pulses(edges)
+    elif what == "divided":
+        clock.divided(edges)
+    elif what == "triggers":
+        clock.triggers([TriggerStamp(t_ns, 1000, number)])
+    elif what == "reference":
+        clock.reference = UtcReference(-t_ns % (1000 * NS_PER_MS), 1000)
+    elif what == "nothing known":
+        clock.reference = None
+
+
+def test_divided_pulses_find_their_samples() -> None:
+    clock = make_clock()
+    expected: list[tuple[int, int | None]] = []
+    for i in range(1000):
+        at = BEGIN_NS + 10 * i * NS_PER_MS
+        if i % 4 == 0:
+            clock.divided([Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
+        if i % 100 == 48:
+            expected.append((i + 1, None))  # its sample is lost
+            continue
+        s = clock.sample(message(10 * i), at + 2 * NS_PER_MS, 0)
+        if i % 4 == 0:
+            expected.append((i + 1, s.seq))
+    marks = clock.take_marks()
+    assert [(m.number, m.seq) for m in marks][10:] == expected[10:]
+    assert len(marks) == 250
+    assert clock.take_marks() == []

@@ -1,0 +1,421 @@
+"""Configuration: what is accepted, every error with its place, the shipped file, and what a change changes."""
+
+# ruff: noqa: E501 - a row of the table is a whole file and the whole message for it
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec import Meta
+
+from imud import config
+from imud.config import DEVICES_MAX, TABLES, Config, DeviceConfig, Tables
+from imud.contracts.expected import expected, got
+from imud.contracts.settings import NoSettings, Settings
+from imud.devices import DRIVERS
+from imud.errors import ConfigError
+from imud.links import LINKS
+from imud.publishers import PUBLISHERS
+from tests.support import config_reference
+from tests.support.paths import ROOT
+
+SHIPPED = ROOT / "etc/imud.yaml"
+
+
+class PortSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    port: Annotated[str, Meta(min_length=1)]
+    baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
+    wait_ms: Annotated[float, Meta(ge=0, le=100)] = 0.0
+
+
+class FileSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    path: str
+    speed: Literal["real", "maximum"] = "real"
+    repeat: bool = False
+
+    def __post_init__(self) -> None:
+        if self.repeat and self.speed == "maximum":
+            raise ValueError("repeat: expected false at speed maximum, got true")
+        if self.path == "/":
+            raise ValueError("this is no file")
+
+
+class OutSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    path: str = "/run/x"
+    ids: tuple[int, ...] = ()
+
+
+class DriverSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    range_g: Annotated[int, Meta(ge=2, le=16)] = 8
+
+
+@dataclass(frozen=True)
+class FakeRow:
+    settings: type[Settings]
+    searchable: bool = True
+    lines: frozenset[str] = frozenset()
+    refuses: type[Settings] | None = None
+    """Settings of a driver that does not fit this link."""
+
+    def fits(self, driver: "FakeRow") -> bool:
+        return driver.settings is not self.refuses
+
+
+class Broken(Mapping[str, FakeRow]):
+    """A table with a row whose library is not installed."""
+
+    def __getitem__(self, name: str) -> FakeRow:
+        raise ModuleNotFoundError(f"No module named {name!r}")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(["exotic"])
+
+    def __len__(self) -> int:
+        return 1
+
+
+FAKE = Tables(
+    drivers={"acme-uart": FakeRow(DriverSettings), "plain-uart": FakeRow(NoSettings)},
+    links={"port": FakeRow(PortSettings), "file": FakeRow(FileSettings)},
+    publishers={"out": FakeRow(OutSettings), "none": FakeRow(NoSettings)},
+)
+GOOD = """\
+log_level: debug
+out:
+  path: /tmp/out
+devices:
+  front:
+    driver: acme-uart
+    options: {range_g: 4}
+    port: {port: /dev/ttyUSB0, baud: 9600, wait_ms: 2}
+  rear:
+    identify: false
+    file: {path: a.bin}
+  spare:
+    enabled: false
+    port: {port: /dev/ttyUSB0}
+"""
+
+
+def parse(text: str, tables: Tables = FAKE) -> Config:
+    return config.parse(text, "f.yaml", tables)
+
+
+def errors(text: str, tables: Tables = FAKE) -> list[str]:
+    """The lines of the error that `text` gives."""
+    with pytest.raises(ConfigError) as caught:
+        parse(text, tables)
+    return str(caught.value).splitlines()
+
+
+def test_a_good_file() -> None:
+    assert parse(GOOD) == Config(
+        log_level="debug",
+        state_dir="/var/lib/imud",
+        publishers={"out": OutSettings(path="/tmp/out"), "none": NoSettings()},
+        devices=(
+            DeviceConfig(
+                "front", "acme-uart", DriverSettings(range_g=4), True, "port",
+                PortSettings(port="/dev/ttyUSB0", baud=9600, wait_ms=2.0), line=5,
+            ),
+            DeviceConfig("rear", "auto", None, False, "file", FileSettings(path="a.bin"), line=9),
+        ),
+        disabled=("spare",),
+    )  # fmt: skip
+
+
+def test_defaults() -> None:
+    made = parse("devices: {}")
+    assert (made.log_level, made.state_dir, made.devices) == ("info", "/var/lib/imud", ())
+    assert made.publishers == {"out": OutSettings(), "none": NoSettings()}
+    assert parse("out:\ndevices: {}").publishers["out"] == OutSettings()
+
+
+def test_options_of_a_named_driver_are_there_without_being_written() -> None:
+    (device,) = parse("devices: {a: {driver: acme-uart, port: {port: x}}}").devices
+    assert device.options == DriverSettings()
+
+
+def test_parse_takes_text_and_bytes() -> None:
+    assert config.parse(GOOD, "f", FAKE) == config.parse(GOOD.encode(), "f", FAKE)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("log_level: loud\ndevices: {}", '1:12: log_level: expected one of "debug", "error", "info", "warning", got "loud"'),
+        ("state_dir: 3\ndevices: {}", "1:12: state_dir: expected text that is not empty, got 3"),
+        ("devices:\n  a:\n    port: {port: x, baud: fast}", '3:27: devices.a.port.baud: expected a whole number from 50 to 4000000, or "auto", got "fast"'),
+        ("devices:\n  a:\n    port: {port: x, baud: 49}", '3:27: devices.a.port.baud: expected a whole number from 50 to 4000000, or "auto", got 49'),
+        ("devices:\n  a:\n    port: {port: x, baud: true}", '3:27: devices.a.port.baud: expected a whole number from 50 to 4000000, or "auto", got true'),
+        ("devices:\n  a:\n    port: {port: x, wait_ms: 101}", "3:30: devices.a.port.wait_ms: expected a number from 0 to 100, got 101"),
+        ("devices:\n  a:\n    port: {port: x, wait_ms: '5'}", '3:30: devices.a.port.wait_ms: expected a number from 0 to 100, got "5"'),
+        ("devices:\n  a:\n    port: {port: x, wait_ms: .nan}", "3:30: devices.a.port.wait_ms: expected a finite number, got .nan"),
+        ("devices:\n  a:\n    port: {port: }", "3:18: devices.a.port.port: expected text that is not empty, got nothing"),
+        ("devices:\n  a:\n    port:\n      baud: 9600", "3:5: devices.a.port: expected the key port (text that is not empty), got none"),
+        ("devices:\n  a:\n    port: /dev/ttyUSB0", '3:11: devices.a.port: expected keys and values, got "/dev/ttyUSB0"'),
+        ("devices:\n  a:\n    file: {path: x, repeat: no}", "3:29: devices.a.file.repeat: expected true or false, or text in quotes, got no"),
+        ("devices:\n  a:\n    file: {path: x, repeat: true, speed: maximum}", "3:29: devices.a.file.repeat: expected false at speed maximum, got true"),
+        ("devices:\n  a:\n    file: {path: /}", "3:11: devices.a.file: this is no file"),
+        ("devices:\n  a:\n    identify: 1\n    port: {port: x}", "3:15: devices.a.identify: expected true or false, got 1"),
+        ("devices:\n  a: {driver: auto}", "2:3: devices.a: expected exactly one link (port, file), got none"),
+        ("devices:\n  a:\n    port: {port: x}\n    file: {path: x}", "2:3: devices.a: expected exactly one link (port, file), got port and file"),
+        ("devices:\n  a: 5", "2:6: devices.a: expected keys and values, got 5"),
+        ("devices:\n  a:\n", "2:5: devices.a: expected keys and values, got nothing"),
+        ("devices:\n  a: {driver: acme-urat, port: {port: x}}", '2:15: devices.a.driver: expected a driver that imud knows, got "acme-urat"; did you mean acme-uart? known: acme-uart, auto, plain-uart'),
+        ("devices:\n  a: {driver: 5, port: {port: x}}", "2:15: devices.a.driver: expected text, got 5"),
+        ("devices:\n  a: {options: {range_g: 4}, port: {port: x}}", "2:7: devices.a.options: expected options only beside a named driver, got them with driver auto; drivers: acme-uart, plain-uart"),
+        ("devices:\n  a: {driver: plain-uart, options: {range_g: 4}, port: {port: x}}", '2:37: devices.a.options.range_g: expected a key that imud knows, got "range_g"; known: none'),
+        ("devices:\n  a: {driver: acme-uart, options: {range_g: 17}, port: {port: x}}", "2:45: devices.a.options.range_g: expected a whole number from 2 to 16, got 17"),
+        ("devices:\n  A: {port: {port: x}}", '2:3: devices.A: expected a device name of 1 to 32 of a-z, 0-9, _ and -, beginning with a letter or digit, got "A"'),
+        ("devices:\n  a: {port: {port: x}}\n  b: {port: {port: x}}", "3:20: devices.b.port.port: expected a port of its own, got x, which a (line 2) has"),
+        ("devices:\n  a: {port: {port: x}}\n  a: {port: {port: y}}", "3:3: devices.a: expected each key once, got a again: it stands in line 2 too"),
+        ("devices:\n", "1:9: devices: expected a name and keys for each device, got nothing; write {} for no device"),
+        ("devices: [a]", "1:10: devices: expected keys and values, got a list"),
+        ("log_level: info\n", "1:1: expected the key devices with a name and keys for each device, got none"),
+        ("just text", '1:1: expected keys and values, got "just text"'),
+        ("", "1:1: expected keys and values, got an empty file"),
+        ("divices: {}\ndevices: {}", '1:1: divices: expected a key that imud knows, got "divices"; did you mean devices? known: devices, log_level, none, out, state_dir'),
+        ("out: {ids: [1, x]}\ndevices: {}", "1:12: out.ids: expected a list, each of it a whole number, got a list (Expected `int`, got `str` - at `$[1]`)"),
+        ("logg: 1\nb: c: d\n", "2:5: expected YAML: mapping values are not allowed in this context"),
+        ("out: 5\ndevices: {}", "1:6: out: expected keys and values, got 5"),
+    ],
+)  # fmt: skip
+def test_error_with_its_place(text: str, line: str) -> None:
+    assert errors(text) == ["f.yaml:" + line]
+
+
+def test_all_errors_are_reported_in_the_order_of_the_file() -> None:
+    text = (
+        "log_levle: info\nout: {path: 1, ids: no}\ndevices:\n  a: {port: {prot: x, baud: 1}}\n  B: {file: {path: x}}\n"
+    )
+    places = [re.match(r"f\.yaml:(\d+:\d+): (\S+):", line) for line in errors(text)]
+    assert [place.groups() for place in places if place] == [
+        ("1:1", "log_levle"), ("2:13", "out.path"), ("2:21", "out.ids"), ("4:7", "devices.a.port"),
+        ("4:14", "devices.a.port.prot"), ("4:29", "devices.a.port.baud"), ("5:3", "devices.B"),
+    ]  # fmt: skip
+
+
+def test_very_many_errors_are_cut() -> None:
+    lines = errors("devices: {}\n" + "".join(f"x{n}: 1\n" for n in range(50)))
+    assert len(lines) == config.PROBLEMS_SHOWN + 1
+    assert lines[-1] == "… and 30 more problems"
+
+
+@pytest.mark.parametrize("name", ["0", "a-b_c", "a" * 32])
+def test_device_names(name: str) -> None:
+    assert [d.name for d in parse(f"devices: {{'{name}': {{file: {{path: x}}}}}}").devices] == [name]
+
+
+@pytest.mark.parametrize("name", ["a" * 33, "-a", "_a", "é", "a.b", "a b", "a/b", "../a", "", "a\\n"])
+def test_bad_device_names(name: str) -> None:
+    assert "device name" in errors(f'devices: {{"{name}": {{file: {{path: x}}}}}}')[0]
+
+
+def test_number_of_devices() -> None:
+    def text(count: int) -> str:
+        return "devices:\n" + "".join(f"  d{n}: {{file: {{path: x}}}}\n" for n in range(count))
+
+    assert len(parse(text(DEVICES_MAX)).devices) == DEVICES_MAX
+    assert "at most 256 devices, got 257" in errors(text(DEVICES_MAX + 1))[0]
+
+
+def test_a_part_that_is_not_installed() -> None:
+    tables = replace(FAKE, links=Broken())
+    assert errors("devices: {a: {exotic: {x: 1}}}", tables) == [
+        "f.yaml:1:15: devices.a.exotic: expected the parts of exotic to be installed, got: No module named 'exotic'"
+    ]
+
+
+def test_load(tmp_path: Path) -> None:
+    file = tmp_path / "imud.yaml"
+    file.write_text(GOOD)
+    assert config.load(file, FAKE) == parse(GOOD)
+    with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read: No such file or directory; .*--config"):
+        config.load(tmp_path / "none.yaml", FAKE)
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        config.load(tmp_path, FAKE)
+    file.write_bytes(b"# " + b"x" * (2 << 20))
+    with pytest.raises(ConfigError, match="at most 1048576 bytes"):
+        config.load(file, FAKE)
+
+
+def test_differences() -> None:
+    old = parse(GOOD)
+    assert str(config.differences(old, old)) == "nothing differs"
+    moved = parse("# one line more\n" + GOOD)
+    assert moved.devices != old.devices
+    assert str(config.differences(old, moved)) == "nothing differs"
+    new = parse(
+        GOOD.replace("  rear:", "  side:").replace("range_g: 4", "range_g: 2").replace("/tmp/out", "/tmp/o")
+        .replace("debug", "info")
+    )  # fmt: skip
+    found = config.differences(old, new)
+    assert found == config.Differences(("side",), ("rear",), ("front",), ("out",), ("log_level",))
+    assert str(found) == (
+        "devices added: side; devices removed: rear; devices changed: front; publishers changed: out; "
+        "keys changed: log_level"
+    )
+    disabled = parse(GOOD.replace("identify: false", "enabled: false"))
+    assert config.differences(old, disabled).devices_removed == ("rear",)
+    assert config.differences(disabled, old).devices_added == ("rear",)
+
+
+def refused(content: bytes) -> list[str]:
+    """Lines of the error, none if there is no error."""
+    try:
+        config.parse(content, "f", FAKE)
+    except ConfigError as error:
+        return str(error).splitlines()
+    return []
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.text("ab\n\x1b\u2028.", max_size=5) | st.sampled_from(["auto", "acme-uart", "x"]),
+        lambda inner: st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.text("a\n\u2028", max_size=3)
+            | st.sampled_from(["devices", "out", "a", "driver", "options", "port", "file", "path", "baud", "ids"]), inner,
+            max_size=4,
+        ),
+        max_leaves=10,
+    )
+)  # fmt: skip
+def test_any_tree_is_a_configuration_or_a_config_error(tree: Any) -> None:
+    text = msgspec.json.encode(tree)
+    for wrapped in (text, b'{"devices": {"a": ' + text + b"}}"):
+        for line in refused(wrapped):
+            assert line.startswith(("f:", "… and "))
+
+
+# --- words ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("field_type", "words"),
+    [
+        (bool, "true or false"), (int, "a whole number"), (float | None, "a number, or null"), (str, "text"),
+        (Annotated[float, Meta(gt=0, lt=2.5)], "a number above 0 below 2.5"), (Literal["a"], '"a"'),
+        (Annotated[str, Meta(pattern="^x")], "text matching ^x"), (dict[str, int], "keys, each with a whole number"),
+    ],
+)  # fmt: skip
+def test_expected(field_type: Any, words: str) -> None:
+    assert expected(field_type) == words
+
+
+def test_got() -> None:
+    assert [got(v) for v in (None, True, 1.5, "x", [1], {"a": 1})] == [
+        "nothing", "true", "1.5", '"x"', "a list", "keys and values",
+    ]  # fmt: skip
+    assert len(got("x" * 1000)) < 70
+
+
+# --- the shipped file, the documentation, the real tables --------------------
+
+
+def uncommented(text: str) -> str:
+    """The shipped file with all its examples active: a `#` right before a key or list goes away."""
+    return re.sub(r"^( *)#(?=( {2})*[a-z_0-9]+:)", r"\1", text, flags=re.MULTILINE)
+
+
+def test_shipped_file_loads() -> None:
+    made = config.load(SHIPPED)
+    assert [device.name for device in made.devices] == ["imu"]
+    assert set(made.publishers) == set(PUBLISHERS)
+
+
+def test_shipped_file_shows_the_defaults() -> None:
+    plain, full = config.load(SHIPPED), config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml")
+    assert full.publishers == plain.publishers
+    assert (full.log_level, full.state_dir) == (plain.log_level, plain.state_dir)
+    named = {device.name: device for device in full.devices}
+    assert replace(named["imu"], line=0) == replace(plain.devices[0], line=0)
+    for device in full.devices:
+        if device.options is not None:
+            assert device.options == DRIVERS[device.driver].settings()
+    assert named["recorded"].link_settings == msgspec.convert(
+        {"path": "/var/lib/imud/drive.cap"}, LINKS["replay"].settings
+    )
+    assert named["mast"].link_settings == msgspec.convert({"interface": "can0"}, LINKS["socketcan"].settings)
+    assert named["gimbal"].link_settings == msgspec.convert({"port": "/dev/spidev0.0"}, LINKS["spi"].settings)
+    for name, link in (("keel", "i2c"), ("nothing", "memory")):
+        assert named[name].link_settings == LINKS[link].settings()
+    assert {device.link for device in full.devices} == set(LINKS)
+
+
+def test_shipped_file_has_every_key() -> None:
+    from imud.config.yaml_tree import read_yaml
+
+    tree = read_yaml(uncommented(SHIPPED.read_text()).encode())
+    present = {tuple("NAME" if i == 1 and p[0] == "devices" else part for i, part in enumerate(p)) for p in tree.keys}
+    for _title, path, schema in config_reference.parts():
+        for field in schema.__struct_fields__:
+            assert (*path.split(".")[:-1], field) in present, f"{path}{field} is missing in etc/imud.yaml"
+
+
+def test_documentation_is_made_from_the_settings() -> None:
+    page = config_reference.FILE.read_text()
+    assert config_reference.whole(page) == page, "run python -m tests.support.config_reference"
+
+
+def test_every_row_is_configurable() -> None:
+    titles = {path for _title, path, _schema in config_reference.parts()}
+    assert {f"{name}." for name in PUBLISHERS} | {f"devices.NAME.{name}." for name in LINKS} <= titles
+    assert TABLES.drivers is DRIVERS
+
+
+def test_loading_opens_only_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    import builtins
+    import os
+
+    opened: list[object] = []
+    for module, name in ((builtins, "open"), (os, "open"), (os, "stat")):
+        original = getattr(module, name)
+
+        def watch(path: object, *args: Any, original: Any = original, **kwargs: Any) -> Any:
+            opened.append(path)
+            return original(path, *args, **kwargs)
+
+        monkeypatch.setattr(module, name, watch)
+    config.load(SHIPPED)
+    assert not [path for path in opened if str(path).startswith("/dev")]
+    assert SHIPPED in opened
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("{driver: hipnuc-uart, socketcan: {interface: can0}}", "expected a link that hipnuc-uart can use (uart, "),
+        ("{driver: imu61x-can, uart: {port: x}}", "expected a link that imu61x-can can use (socketcan, "),
+        ("{driver: imu61x-can, socketcan: {interface: c, bitrate: 500000}}", "expected none with backend socketcan"),
+    ],
+)
+def test_driver_and_link_must_go_together(device: str, message: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        config.parse(f"devices:\n  a: {device}\n", "x.yaml")
+    assert message in str(refused.value)
+
+
+def test_a_link_on_which_nothing_is_searched_needs_a_driver() -> None:
+    tables = Tables(FAKE.drivers, {"port": FakeRow(PortSettings, searchable=False)}, FAKE.publishers)
+    (line,) = errors("devices:\n  a: {port: {port: x}}", tables)
+    assert "expected a driver to be named for port (acme-uart, plain-uart), got auto" in line
+
+
+def test_what_talks_on_a_can_bus_is_searched() -> None:
+    (device,) = config.parse("devices:\n  a: {socketcan: {interface: can0}}\n", "x.yaml").devices
+    assert (device.driver, device.options) == ("auto", None)
+
+
+@pytest.mark.parametrize("link", ["socketcan: {interface: can0}", "replay: {path: a.log}", "memory: {}"])
+def test_a_can_driver_on_the_links_that_carry_frames(link: str) -> None:
+    (device,) = config.parse(f"devices:\n  a: {{driver: imu61x-can, {link}}}\n", "x.yaml").devices
+    assert device.driver == "imu61x-can"

@@ -1,0 +1,55 @@
+"""Actions: arguments checked and described; and every driver's actions by their rows."""
+
+import msgspec
+import pytest
+
+from imud.contracts.action import Action, described
+from imud.contracts.settings import Settings
+from imud.devices import DRIVERS
+from imud.errors import BadArgument
+
+ACTIONS = [(driver.name, name) for driver in DRIVERS.values() for name in driver.actions]
+
+
+class Params(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Arguments."""
+
+    angle_deg: float
+    relative: bool = False
+
+
+ACTION = Action("turn", lambda _target, params: params, Params)
+
+
+def test_arguments_become_an_instance() -> None:
+    assert ACTION.arguments({"angle_deg": 5}) == Params(angle_deg=5.0)
+
+
+@pytest.mark.parametrize("given", [{}, {"angle_deg": "x"}, {"angle_deg": 1, "turns": 2}])
+def test_bad_arguments_name_the_good_ones(given: dict[str, object]) -> None:
+    with pytest.raises(BadArgument, match=r"angle_deg \(a number\), relative \(true or false; default false\)"):
+        ACTION.arguments(given)
+
+
+def test_description_for_people() -> None:
+    (info,) = described({"yaw": ACTION})
+    assert msgspec.json.decode(msgspec.json.encode(info)) == {
+        "name": "yaw",
+        "help": "turn",
+        "parameters": [
+            {"name": "angle_deg", "values": "a number", "default": None},
+            {"name": "relative", "values": "true or false", "default": "false"},
+        ],
+    }
+
+
+@pytest.mark.parametrize(("driver", "name"), ACTIONS)
+def test_every_action_has_help_and_arguments_that_can_be_described(driver: str, name: str) -> None:
+    action = DRIVERS[driver].actions[name]
+    (info,) = described({name: action})
+    assert info.help
+    assert not info.help.endswith(".")
+    assert name == name.lower()
+    assert all(parameter.values != "keys and values" for parameter in info.parameters)
+    with pytest.raises(BadArgument):
+        action.arguments({"no_such_argument": 1})

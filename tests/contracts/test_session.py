@@ -1,0 +1,239 @@
+"""Request and reply: replies, refusals, silence, late replies, and text that answers nothing."""
+
+import pytest
+
+from imud.contracts.codec import ReplyFrame
+from imud.contracts.session import (
+    LATE_WINDOW_NS,
+    REPLY_MESSAGES_MAX,
+    Rejection,
+    Reply,
+    Request,
+    Session,
+    Silence,
+    never,
+    of_text,
+    pause,
+)
+from imud.errors import CommandError
+from imud.ledger import Ledger
+
+TIMEOUT_NS = 100
+
+
+def command(name: str, part: str = "", silent: bool = False) -> Request:
+    """A request whose reply is lines that begin with `part`, then OK; without `part`, OK alone."""
+    return Request(
+        payload=name.encode(),
+        name=name,
+        is_end=of_text(lambda line: line == "OK"),
+        is_rejection=of_text(lambda line: line == "ERR"),
+        is_part=of_text(lambda line: bool(part) and line.startswith(part)),
+        timeout_ns=TIMEOUT_NS,
+        silent=silent,
+        messages_min=2 if part else 1,
+    )
+
+
+@pytest.fixture
+def ledger() -> Ledger:
+    return Ledger()
+
+
+@pytest.fixture
+def session(ledger: Ledger) -> Session:
+    return Session(ledger)
+
+
+def strays(ledger: Ledger) -> tuple[int, int]:
+    return (ledger.replies_late, ledger.replies_unsolicited)
+
+
+def test_reply(session: Session, ledger: Ledger) -> None:
+    assert session.start(command("ask", "a"), 0) == b"ask"
+    assert session.busy
+    assert session.deadline_ns == TIMEOUT_NS
+    assert session.on_message("a=1", 5) is None
+    assert session.on_message("OK", 6) == Reply(("a=1", "OK"))
+    assert not session.busy
+    assert session.deadline_ns is None
+    assert session.on_time(1000) is None
+    assert strays(ledger) == (0, 0)
+
+
+def test_refusal_needs_no_lines(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    assert session.on_message("ERR", 5) == Rejection(("ERR",))
+
+
+def test_silence_at_the_deadline_and_not_before(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 5)
+    assert session.on_time(TIMEOUT_NS - 1) is None
+    assert session.on_time(TIMEOUT_NS) == Silence(("a=1",))
+    assert session.on_time(TIMEOUT_NS) is None
+    assert not session.busy
+
+
+def test_one_request_at_a_time(session: Session) -> None:
+    session.start(command("first"), 0)
+    with pytest.raises(CommandError, match="second: still waiting for the reply to first"):
+        session.start(command("second"), 1)
+    assert session.on_message("OK", 2) == Reply(("OK",))
+
+
+def test_silent_request_is_done_at_once(session: Session) -> None:
+    assert session.start(command("reboot", silent=True), 0) == b"reboot"
+    assert not session.busy
+    assert session.deadline_ns is None
+
+
+def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: Session, ledger: Ledger) -> None:
+    assert session.on_message("boot", 0) is None
+    session.start(command("ask", "a"), 0)
+    for line in ("noise", "a=1", "noise"):
+        assert session.on_message(line, 1) is None
+    assert session.on_message("OK", 2) == Reply(("a=1", "OK"))
+    assert strays(ledger) == (0, 3)
+
+
+def test_late_reply_with_nothing_outstanding(session: Session, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_time(TIMEOUT_NS)
+    for line in ("a=1", "OK"):
+        assert session.on_message(line, TIMEOUT_NS + 1) is None
+    assert strays(ledger) == (1, 0)
+    session.on_message("OK", TIMEOUT_NS + 2)
+    assert strays(ledger) == (1, 1)
+
+
+def test_late_refusal_is_late_too(session: Session, ledger: Ledger) -> None:
+    session.start(command("set"), 0)
+    session.on_time(TIMEOUT_NS)
+    session.on_message("ERR", TIMEOUT_NS + 1)
+    assert strays(ledger) == (1, 0)
+
+
+def test_after_the_window_nothing_is_late(session: Session, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_time(TIMEOUT_NS)
+    session.on_message("OK", TIMEOUT_NS + LATE_WINDOW_NS + 1)
+    assert strays(ledger) == (0, 1)
+
+
+def test_late_reply_does_not_answer_the_next_request(session: Session, ledger: Ledger) -> None:
+    """Not even where the next one is answered by OK alone: the lines before it say whose OK it is."""
+    session.start(command("ask", "a"), 0)
+    session.on_time(TIMEOUT_NS)
+    session.start(command("set"), TIMEOUT_NS)
+    assert [session.on_message(line, TIMEOUT_NS + 1) for line in ("a=1", "a=2", "OK")] == [None] * 3
+    assert strays(ledger) == (1, 0)
+    assert session.on_message("OK", TIMEOUT_NS + 2) == Reply(("OK",))
+
+
+def test_rest_of_a_reply_that_timed_out_in_the_middle(session: Session, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 5)
+    session.on_time(TIMEOUT_NS)
+    session.start(command("set"), TIMEOUT_NS)
+    assert session.on_message("OK", TIMEOUT_NS + 1) is None
+    assert strays(ledger) == (1, 0)
+    assert session.on_message("ERR", TIMEOUT_NS + 2) == Rejection(("ERR",))
+
+
+def test_a_report_does_not_end_before_its_lines(session: Session, ledger: Ledger) -> None:
+    """The OK of a command that timed out comes after the question."""
+    session.start(command("set"), 0)
+    session.on_time(TIMEOUT_NS)
+    session.start(command("ask", "a"), TIMEOUT_NS)
+    assert session.on_message("OK", TIMEOUT_NS + 1) is None
+    assert session.on_message("a=1", TIMEOUT_NS + 2) is None
+    assert session.on_message("OK", TIMEOUT_NS + 2) == Reply(("a=1", "OK"))
+    assert strays(ledger) == (1, 0)
+
+
+def test_lines_that_were_late_long_ago_do_not_cost_a_fresh_reply(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 5)
+    session.on_time(TIMEOUT_NS)
+    later = TIMEOUT_NS + LATE_WINDOW_NS + 1
+    session.start(command("set"), later)
+    assert session.on_message("OK", later + 1) == Reply(("OK",))
+
+
+def test_the_same_question_again_takes_the_late_reply(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_time(TIMEOUT_NS)
+    session.start(command("ask", "a"), TIMEOUT_NS)
+    session.on_message("a=1", TIMEOUT_NS + 1)
+    assert session.on_message("OK", TIMEOUT_NS + 1) == Reply(("a=1", "OK"))
+
+
+def test_cancel_forgets_the_request(session: Session, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 1)
+    session.cancel()
+    assert not session.busy
+    assert session.on_time(TIMEOUT_NS) is None
+    session.on_message("OK", 2)
+    assert strays(ledger) == (0, 1)
+    session.start(command("ask", "a"), 3)
+    session.on_message("a=2", 4)
+    assert session.on_message("OK", 4) == Reply(("a=2", "OK"))
+
+
+def test_endless_reply_is_bounded(session: Session) -> None:
+    session.start(command("ask", "a"), 0)
+    for number in range(REPLY_MESSAGES_MAX + 50):
+        session.on_message(f"a={number}", 1)
+    silence = session.on_time(TIMEOUT_NS)
+    assert silence is not None
+    assert len(silence.lines) == REPLY_MESSAGES_MAX
+
+
+def frame_command(frame_id: int) -> Request:
+    """A request that is answered by one frame."""
+    return Request(
+        payload=b"?",
+        name=f"frame {frame_id}",
+        is_end=lambda message: isinstance(message, ReplyFrame) and message.frame_id == frame_id,
+        is_rejection=never,
+        is_part=never,
+        timeout_ns=TIMEOUT_NS,
+    )
+
+
+def test_a_frame_answers_as_a_line_does(session: Session, ledger: Ledger) -> None:
+    session.start(frame_command(6), 0)
+    assert session.on_message("6", 1) is None
+    assert session.on_message(ReplyFrame(7, b""), 2) is None
+    reply = session.on_message(ReplyFrame(6, b"x"), 3)
+    assert reply == Reply((ReplyFrame(6, b"x"),))
+    assert reply.frames == (ReplyFrame(6, b"x"),)
+    assert reply.lines == ()
+    assert strays(ledger) == (0, 2)
+
+
+def test_a_late_frame_is_told_from_the_next_reply(session: Session, ledger: Ledger) -> None:
+    session.start(frame_command(6), 0)
+    session.on_time(TIMEOUT_NS)
+    session.start(frame_command(7), TIMEOUT_NS)
+    assert session.on_message(ReplyFrame(6, b""), TIMEOUT_NS + 1) is None
+    assert strays(ledger) == (1, 0)
+    assert session.on_message(ReplyFrame(7, b""), TIMEOUT_NS + 2) == Reply((ReplyFrame(7, b""),))
+
+
+def test_text_predicates_hold_for_no_frame() -> None:
+    assert of_text(lambda line: True)("x")
+    assert not of_text(lambda line: True)(ReplyFrame(1, b""))
+
+
+def test_a_pause_sends_nothing_and_late_replies_stay_late(session: Session, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_time(TIMEOUT_NS)
+    assert session.start(pause(50), TIMEOUT_NS) == b""
+    assert session.on_message("a=1", TIMEOUT_NS + 10) is None
+    assert session.on_time(TIMEOUT_NS + 49) is None
+    assert session.on_time(TIMEOUT_NS + 50) == Silence(())
+    session.on_message("OK", TIMEOUT_NS + 60)
+    assert strays(ledger) == (1, 0)

@@ -1,0 +1,101 @@
+"""Named actions of a CANopen module: what goes to the bus, and what the simulated module does."""
+
+from typing import Any
+
+import pytest
+
+from imud.contracts.action import Target
+from imud.contracts.session import RequestScript
+from imud.devices.hipnuc.canopen.codec import DRIVER, HipnucCanopenSettings
+from imud.errors import BadArgument
+from imud.sim.hipnuc.canopen.objects import NodeSettings
+from tests.support.canopen_bench import QUIET, Bench, unpack
+
+
+def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
+    """The conversation of an action with the node that the settings name."""
+    action = DRIVER.actions[name]
+    conversation: RequestScript[Any] = action.begin(
+        Target(HipnucCanopenSettings(node=at), 500_000), action.arguments(given)
+    )
+    return conversation
+
+
+ROWS: list[tuple[str, dict[str, object], str]] = [
+    ("save", {}, "23 00 20 00 00 00 00 00"),
+    ("restart", {}, "23 00 20 00 FF 00 00 00"),
+    ("factory_reset", {}, "23 00 20 00 01 00 00 00"),
+    ("node", {"node": 9}, "23 A0 20 00 09 00 00 00"),
+    ("bitrate", {"bitrate": 1_000_000}, "23 9A 20 00 00 00 00 00"),
+    ("bitrate", {"bitrate": 500_000}, "23 9A 20 00 02 00 00 00"),
+    ("bitrate", {"bitrate": 250_000}, "23 9A 20 00 03 00 00 00"),
+    ("bitrate", {"bitrate": 125_000}, "23 9A 20 00 04 00 00 00"),
+    ("interval", {"tpdo": 1, "interval_ms": 5}, "2B 00 18 05 05 00 00 00"),
+    ("interval", {"tpdo": 6, "interval_ms": 0}, "2B 04 18 05 00 00 00 00"),
+    ("interval", {"tpdo": 7, "interval_ms": 1000}, "2B 05 18 05 E8 03 00 00"),
+    ("transmission", {"tpdo": 1, "by": "sync"}, "2F 00 18 02 01 00 00 00"),
+    ("transmission", {"tpdo": 4, "by": "timer"}, "2F 03 18 02 FF 00 00 00"),
+    ("direction", {"x_reversed": True, "y_reversed": False}, "23 9E 20 00 01 00 00 00"),
+    ("zero", {"zero": "here"}, "23 A5 20 00 02 00 00 00"),
+    ("zero", {"zero": "cancel"}, "23 A5 20 00 05 00 00 00"),
+]
+
+
+@pytest.mark.parametrize(("name", "given", "data"), ROWS)
+@pytest.mark.parametrize("node", [8, 127])
+def test_commands_of_the_manual_go_to_the_node_of_the_settings(
+    name: str, given: dict[str, object], data: str, node: int
+) -> None:
+    assert unpack(next(begun(name, node, **given)).payload) == (0x600 + node, bytes.fromhex(data))
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [("start", 1), ("stop", 2), ("pre_operational", 0x80), ("reset_node", 0x81), ("reset_communication", 0x82)],
+)
+def test_network_management(command: str, code: int) -> None:
+    assert unpack(next(begun("nmt", 5, command=command)).payload) == (0, bytes([code, 5]))
+
+
+def test_every_action_is_tried_here() -> None:
+    assert {name for name, _, _ in ROWS} | {"nmt"} == set(DRIVER.actions)
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("node", {"node": 128}),
+        ("node", {"node": 0}),
+        ("bitrate", {"bitrate": 800_000}),
+        ("interval", {"tpdo": 5, "interval_ms": 10}),
+        ("interval", {"tpdo": 1, "interval_ms": 4}),
+        ("transmission", {"tpdo": 1, "by": "remote"}),
+        ("zero", {"zero": 2}),
+        ("nmt", {"command": "sleep"}),
+    ],
+)
+def test_arguments_that_cannot_be_send_nothing(name: str, given: dict[str, object]) -> None:
+    with pytest.raises(BadArgument):
+        next(begun(name, **given))
+
+
+def test_the_module_obeys() -> None:
+    bench = Bench(NodeSettings(periods_ms=QUIET.periods_ms))
+    bench.hold(begun("direction", x_reversed=False, y_reversed=True))
+    bench.hold(begun("interval", tpdo=2, interval_ms=20))
+    bench.run(100_000_000)
+    assert 0x288 in {can_id for can_id, _ in bench.heard}
+    assert bench.module.objects.settings.invert_y
+    assert not bench.module.objects.settings.invert_x
+    assert bench.hold(begun("nmt", command="reset_node")) is True  # the boot-up message came
+    assert not bench.module.objects.settings.invert_y  # nothing was saved
+
+
+def test_a_new_node_number_is_in_force_after_saving_and_restarting() -> None:
+    bench = Bench()
+    bench.hold(begun("node", node=9))
+    assert bench.module.node == 8
+    bench.hold(begun("save"))
+    bench.hold(begun("restart"))
+    bench.run(10_000_000)
+    assert bench.module.node == 9

@@ -1,0 +1,161 @@
+"""Every SDO command that the manual prints, and conversations with the simulated module."""
+
+from collections.abc import Callable
+
+import pytest
+
+from imud.contracts.codec import ReplyFrame
+from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript
+from imud.devices.hipnuc.canopen import sdo, session
+from imud.devices.hipnuc.canopen.cob_ids import NmtCommand
+from imud.devices.hipnuc.canopen.sdo import Aborted
+from imud.devices.hipnuc.canopen.session import InclinometerZero, Transmission
+from imud.errors import BadArgument, DeviceRefused, NoReply
+from imud.sim.hipnuc.canopen.objects import NodeSettings
+from tests.support.canopen_bench import QUIET, Bench, converse, unpack
+
+MANUAL: list[tuple[str, Callable[[], RequestScript[None]]]] = [
+    ("23 A0 20 00 09 00 00 00", lambda: session.set_node_id(8, 9)),
+    ("23 00 20 00 00 00 00 00", lambda: session.save(8)),
+    ("23 00 20 00 FF 00 00 00", lambda: session.restart(8)),
+    ("23 00 20 00 01 00 00 00", lambda: session.factory_reset(8)),
+    ("23 9A 20 00 00 00 00 00", lambda: session.set_bit_rate(8, 1_000_000)),
+    ("23 9A 20 00 02 00 00 00", lambda: session.set_bit_rate(8, 500_000)),
+    ("23 9A 20 00 03 00 00 00", lambda: session.set_bit_rate(8, 250_000)),
+    ("23 9A 20 00 04 00 00 00", lambda: session.set_bit_rate(8, 125_000)),
+    ("23 9E 20 00 00 00 00 00", lambda: session.set_inclinometer_signs(8, invert_x=False, invert_y=False)),
+    ("23 9E 20 00 01 00 00 00", lambda: session.set_inclinometer_signs(8, invert_x=True, invert_y=False)),
+    ("23 A5 20 00 02 00 00 00", lambda: session.set_inclinometer_zero(8, InclinometerZero.SET)),
+    ("23 A5 20 00 05 00 00 00", lambda: session.set_inclinometer_zero(8, InclinometerZero.CANCEL)),
+    ("2F 00 18 02 01 00 00 00", lambda: session.set_tpdo_type(8, 1, Transmission.SYNC)),
+    ("2F 00 18 02 FF 00 00 00", lambda: session.set_tpdo_type(8, 1, Transmission.TIMER)),
+]
+TPDO_OBJECTS = {1: "00", 2: "01", 3: "02", 4: "03", 6: "04", 7: "05"}
+PERIODS = {0: "00", 5: "05", 10: "0A", 20: "14", 50: "32", 100: "64"}
+
+
+@pytest.mark.parametrize(("text", "make"), MANUAL)
+def test_commands_of_the_manual(text: str, make: Callable[[], RequestScript[None]]) -> None:
+    assert unpack(next(make()).payload) == (0x608, bytes.fromhex(text))
+
+
+@pytest.mark.parametrize("tpdo", TPDO_OBJECTS)
+@pytest.mark.parametrize("period_ms", PERIODS)
+def test_rate_commands_of_the_manual(tpdo: int, period_ms: int) -> None:
+    text = f"2B {TPDO_OBJECTS[tpdo]} 18 05 {PERIODS[period_ms]} 00 00 00"
+    assert unpack(next(session.set_tpdo_period(8, tpdo, period_ms)).payload) == (0x608, bytes.fromhex(text))
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_the_sign_of_y_has_its_own_object(invert: bool) -> None:
+    bench = Bench()
+    bench.hold(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
+    assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: session.set_node_id(8, 0),
+        lambda: session.set_node_id(8, 128),
+        lambda: session.set_node_id(8, True),
+        lambda: session.set_bit_rate(8, 800_000),
+        lambda: session.set_tpdo_period(8, 5, 10),
+        lambda: session.set_tpdo_period(8, 1, 4),
+        lambda: session.set_tpdo_period(8, 1, 1001),
+        lambda: session.set_tpdo_period(8, 1, -1),
+        lambda: session.set_tpdo_type(8, 1, 1),  # type: ignore[arg-type]  # what is to be refused
+        lambda: session.set_inclinometer_signs(8, invert_x=1, invert_y=False),  # type: ignore[arg-type]  # the same
+        lambda: session.set_inclinometer_zero(8, 3),  # type: ignore[arg-type]  # the same
+        lambda: session.nmt(8, 1),  # type: ignore[arg-type]  # the same
+    ],
+)
+def test_arguments_that_cannot_be(make: Callable[[], RequestScript[None]]) -> None:
+    with pytest.raises(BadArgument, match="expected"):
+        next(make())
+
+
+def test_identify() -> None:
+    bench = Bench()
+    identity = bench.hold(session.identify(8))
+    assert (identity.product, identity.serial_number, identity.firmware) == ("HI14", "0x17080042", "0x0000009C")
+    assert identity.details is not None
+    assert identity.details["device type"] == "0x00000000"
+    assert "NMT state" not in identity.details
+    assert all(data[0] == 0x40 for _, data in bench.sent)
+
+
+def test_identify_tells_of_a_node_that_does_not_send() -> None:
+    bench = Bench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=200))
+    bench.hold(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
+    bench.run(1_000_000_000)
+    identity = bench.hold(session.identify(8))
+    assert identity.details is not None
+    assert identity.details["NMT state"] == "pre-operational"
+
+
+def test_read_settings() -> None:
+    settings = Bench(NodeSettings()).hold(session.read_settings(8))
+    assert settings["1800.2"] == "255"
+    assert settings["1804.5"] == "50"
+    assert settings["1805.5"] == "10"
+    assert settings["20A0.0"] == "8"
+    assert settings["209A.0"] == "2"
+    assert len(settings) == 17
+
+
+def test_what_a_node_does_not_know_is_left_out() -> None:
+    asked: list[tuple[int, int]] = []
+
+    def refuse(request: Request) -> Outcome:
+        can_id, data = unpack(request.payload)
+        asked.append((int.from_bytes(data[1:3], "little"), data[3]))
+        reply = ReplyFrame(can_id - 0x80, b"\x80" + data[1:4] + (0x0602_0000).to_bytes(4, "little"))
+        assert request.is_rejection(reply)
+        return Rejection((reply,))
+
+    identity = converse(session.identify(8), refuse)
+    assert (identity.product, identity.details) == ("", {})
+    assert asked[:6] == [(0x1000, 0), (0x1008, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4)]
+    assert converse(session.read_settings(8), refuse) == {}
+
+
+def test_a_node_that_is_not_there_does_not_answer() -> None:
+    with pytest.raises(NoReply, match="node 9"):
+        Bench().hold(session.identify(9))
+
+
+def test_settings_are_read_back() -> None:
+    bench = Bench()
+    bench.hold(session.set_tpdo_period(8, 7, 20))
+    assert bench.sent[-1] == (0x608, bytes.fromhex("40 05 18 05 00 00 00 00"))
+    assert bench.module.objects.settings.periods_ms[7] == 20
+
+
+def test_a_setting_that_reads_back_otherwise_is_refused() -> None:
+    def answer(request: Request) -> Outcome:
+        _, data = unpack(request.payload)
+        command = 0x4B if data[0] == 0x40 else 0x60
+        return Reply((ReplyFrame(0x588, bytes([command]) + data[1:4] + b"\7\0\0\0"),))
+
+    with pytest.raises(DeviceRefused, match=r"0x1800\.5 = 10, reads back 7"):
+        converse(session.set_tpdo_period(8, 1, 10), answer)
+
+
+def test_a_refused_write_says_why() -> None:
+    bench = Bench()
+    with pytest.raises(Aborted, match="invalid value"):
+        bench.hold(sdo.write(8, 0x20A0, 0, 200, 4))
+
+
+@pytest.mark.parametrize("command", NmtCommand)
+def test_nmt_commands(command: NmtCommand) -> None:
+    bench = Bench(boot_ms=100)
+    bench.run(200_000_000)
+    booted = bench.hold(session.nmt(8, command))
+    assert bench.sent[-1] == (0x000, bytes([command.value, 8]))
+    assert booted == command.name.startswith("RESET")
+
+
+def test_a_reset_without_boot_up_message() -> None:
+    assert Bench().hold(session.nmt(9, NmtCommand.RESET_NODE)) is False

@@ -1,0 +1,12 @@
+"""The layouts of the sub-packets are as long as the manual says."""
+
+from imud.devices.hipnuc.common.packets import HI91, HI92, PPS_STAMP_MODULUS_MS
+
+
+def test_sizes() -> None:
+    assert (HI91.size, HI92.size) == (76, 48)
+
+
+def test_the_pps_stamp_runs_free_as_the_recording_shows() -> None:
+    """10 ms after 8190 the recording has 8."""
+    assert (8190 + 10) % PPS_STAMP_MODULUS_MS == 8

@@ -1,0 +1,199 @@
+"""Every row of the manual's table 6.2.2 as it goes to the bus, replies and their matching, and what is refused."""
+
+from collections.abc import Callable
+
+import pytest
+
+from imud.contracts.action import Target
+from imud.contracts.codec import ReplyFrame
+from imud.contracts.driver import Identity
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session, Silence
+from imud.devices.hipnuc.j1939 import session
+from imud.devices.hipnuc.j1939.codec import DRIVER, HipnucJ1939Settings
+from imud.devices.hipnuc.j1939.session import HOST_ADDRESS, X_SIGN, Y_SIGN, J1939Node, Zero
+from imud.errors import BadArgument, NoReply, Rejected
+from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
+from imud.ledger import Ledger
+
+PEER = J1939Node(8)
+SET = Target(HipnucJ1939Settings(), 0)
+Frame = tuple[int, bytes]
+
+
+def sent(request: Request) -> Frame:
+    can_id, size, data = RAW_FRAME.unpack(request.payload)
+    assert can_id & EXTENDED_FLAG
+    return can_id & ~EXTENDED_FLAG, data[:size]
+
+
+def played(conversation: RequestScript[object], *outcomes: Outcome | bytes | None) -> tuple[list[Frame], object]:
+    """The frames that were sent, and what came out; each is answered with data from the module, None for silence."""
+    frames: list[Frame] = []
+    answers = iter(outcomes)
+    try:
+        request = next(conversation)
+        while True:
+            frames.append(sent(request))
+            answer = next(answers)
+            outcome = answer if isinstance(answer, Reply) else Silence(())
+            if isinstance(answer, bytes):
+                reply = ReplyFrame(0x0CEF5508, answer)
+                assert request.is_end(reply)
+                outcome = Reply((reply,))
+            request = conversation.send(outcome)
+    except StopIteration as end:
+        return frames, end.value
+
+
+def of_action(name: str, **arguments: object) -> RequestScript[object]:
+    action = DRIVER.actions[name]
+    conversation: RequestScript[object] = action.begin(SET, action.arguments(arguments))
+    return conversation
+
+
+ROWS: list[tuple[str, dict[str, object], str]] = [
+    ("interval", {"pgn": "FF34", "interval_ms": 5}, "34 01 06 00 05 00 00 00"),
+    ("interval", {"pgn": "FF37", "interval_ms": 100}, "37 01 06 00 64 00 00 00"),  # the manual's own example
+    ("interval", {"pgn": "FF3D", "interval_ms": 1000}, "3D 01 06 00 E8 03 00 00"),
+    ("interval", {"pgn": "FF41", "interval_ms": 20}, "41 01 06 00 14 00 00 00"),
+    ("interval", {"pgn": "FF4A", "interval_ms": 500}, "4A 01 06 00 F4 01 00 00"),  # printed 4A 01 60 00
+    ("interval", {"pgn": "FF3A", "interval_ms": 10}, "3A 01 06 00 0A 00 00 00"),
+    ("interval", {"pgn": "FF43", "interval_ms": 10}, "43 01 06 00 0A 00 00 00"),
+    ("interval", {"pgn": "FF46", "interval_ms": 10}, "46 01 06 00 0A 00 00 00"),
+    ("interval", {"pgn": "FF2F", "interval_ms": 1000}, "2F 01 06 00 E8 03 00 00"),
+    ("save", {}, "00 00 06 00 00 00 00 00"),
+    ("factory_reset", {}, "00 00 06 00 01 00 00 00"),
+    ("restart", {}, "00 00 06 00 FF 00 00 00"),
+    ("bitrate", {"bitrate": 1_000_000}, "9A 00 06 00 00 00 00 00"),
+    ("bitrate", {"bitrate": 800_000}, "9A 00 06 00 01 00 00 00"),
+    ("bitrate", {"bitrate": 500_000}, "9A 00 06 00 02 00 00 00"),
+    ("bitrate", {"bitrate": 250_000}, "9A 00 06 00 03 00 00 00"),
+    ("bitrate", {"bitrate": 125_000}, "9A 00 06 00 04 00 00 00"),
+    ("address", {"address": 1}, "9C 00 06 00 01 00 00 00"),
+    ("address", {"address": 128}, "9C 00 06 00 80 00 00 00"),
+    ("zero", {"zero": "here"}, "A5 00 06 00 02 00 00 00"),
+    ("zero", {"zero": "cancel"}, "A5 00 06 00 05 00 00 00"),
+    ("direction", {"axis": "X", "reversed": True}, "9E 00 06 00 01 00 00 00"),
+    ("direction", {"axis": "X", "reversed": False}, "9E 00 06 00 00 00 00 00"),
+    ("direction", {"axis": "Y", "reversed": True}, "9F 00 06 00 01 00 00 00"),
+    ("send_once", {"pgn": "FF34"}, "96 00 06 00 34 FF 00 00"),
+]
+READABLE = ("interval", "bitrate", "address", "direction")
+
+
+@pytest.mark.parametrize(("name", "arguments", "data"), ROWS, ids=[f"{name} {data}" for name, _, data in ROWS])
+def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: str) -> None:
+    written = bytes.fromhex(data)
+    read = written[:2] + b"\3\0" + bytes(4)
+    frames, value = played(of_action(name, **arguments), written, read[:4] + written[4:])
+    expected = [(0x0CEF0855, written)]
+    assert frames == ([*expected, (0x0CEF0855, read)] if name in READABLE else expected)
+    assert value is None
+
+
+def test_every_action_has_a_row() -> None:
+    assert {name for name, _, _ in ROWS} == set(DRIVER.actions)
+
+
+def test_a_value_that_did_not_take_is_told() -> None:
+    reply = bytes.fromhex("3701060064000000")
+    with pytest.raises(Rejected, match="wrote 50, the module has 100"):
+        played(session.set_interval(PEER, 0xFF37, 50), reply, bytes.fromhex("3701030064000000"))
+
+
+def test_silence_is_told_but_where_it_is_no_failure() -> None:
+    begins: list[Callable[[], RequestScript[None]]] = [
+        lambda: session.save(PEER),
+        lambda: session.zero(PEER, Zero.HERE),
+        lambda: session.send_once(PEER, 0xFF34),
+        lambda: session.set_interval(PEER, 0xFF34, 10),
+        lambda: session.set_address(PEER, 9),
+    ]
+    for begin in begins:
+        with pytest.raises(NoReply, match="address 8"):
+            played(begin(), None)
+    assert played(session.restart(PEER), None)[1] is None
+    assert played(session.factory_reset(PEER), None)[1] is None
+    with pytest.raises(NoReply, match="register 0x009c"):
+        played(session.identify(PEER), None)
+    with pytest.raises(NoReply, match="register 0x0134"):
+        played(session.set_interval(PEER, 0xFF34, 10), bytes.fromhex("340106000A000000"), None)
+
+
+@pytest.mark.parametrize(
+    "begin",
+    [
+        lambda: session.set_interval(PEER, 0xFF34, 4),
+        lambda: session.set_interval(PEER, 0xFF34, 1001),
+        lambda: session.set_interval(PEER, 0xFF34, True),
+        lambda: session.set_interval(PEER, 0xFF35, 10),
+        lambda: session.set_bitrate(PEER, 100_000),
+        lambda: session.set_address(PEER, 0),
+        lambda: session.set_address(PEER, 129),
+        lambda: session.set_direction(PEER, session.BITRATE, True),
+        lambda: session.zero(PEER, 2),  # type: ignore[arg-type]  # a bare number is the point
+        lambda: session.send_once(PEER, 0xFF35),
+        lambda: of_action("interval", pgn="FF35", interval_ms=10),
+        lambda: of_action("zero", zero="there"),
+    ],
+)
+def test_arguments_are_checked_before_anything_is_sent(begin: Callable[[], RequestScript[None]]) -> None:
+    with pytest.raises(BadArgument):
+        next(begin())
+
+
+@pytest.mark.parametrize(
+    ("can_id", "data", "is_reply"),
+    [
+        (0x0CEF5508, "3701030064000000", True),
+        (0x18EF5508, "3701030064000000", True),  # another priority
+        (0x0CEF2008, "3701030064000000", True),  # to the asking address
+        (0x0CEF5508, "3701035A64000000", True),  # status is reserved
+        (0x0CEF5509, "3701030064000000", False),  # another module
+        (0x0CEF2108, "3701030064000000", False),  # to somebody else
+        (0x0CEF5508, "3401030064000000", False),  # another register
+        (0x0CEF5508, "3701060064000000", False),  # another command
+        (0x0CEF5508, "37010300640000", False),
+    ],
+)
+def test_a_reply_is_matched_by_sender_register_and_command(can_id: int, data: str, is_reply: bool) -> None:
+    request = next(session.read(J1939Node(8, 0x20), 0x0137))
+    assert sent(request) == (0x0CEF0820, bytes.fromhex("3701030000000000"))
+    reply = ReplyFrame(can_id, bytes.fromhex(data))
+    assert request.is_end(reply) is request.is_part(reply) is is_reply
+    assert not request.is_rejection(reply)
+    assert not request.is_end("OK")
+
+
+def test_replies_to_other_requests_do_not_answer_this_one() -> None:
+    talk = Session(ledger := Ledger())
+    talk.start(next(session.read(PEER, X_SIGN)), 0)
+    assert talk.on_message(ReplyFrame(0x0CEF5508, bytes.fromhex("9F00030001000000")), 1) is None
+    outcome = talk.on_message(ReplyFrame(0x0CEF5508, bytes.fromhex("9E00030001000000")), 2)
+    assert isinstance(outcome, Reply)
+    assert ledger.replies_unsolicited == 1
+    talk.start(next(session.read(PEER, Y_SIGN)), 3)
+    assert talk.on_time(3 + session.REPLY_TIMEOUT_NS - 1) is None
+    assert isinstance(talk.on_time(3 + session.REPLY_TIMEOUT_NS), Silence)
+
+
+def test_all_that_can_be_read() -> None:
+    replies = [
+        "9C00030008000000", "9A00030002000000", "9E00030001000000", "9F00030000000000", None,  # FF2F: not known
+        "3401030064000000", "370103000A000000", None, "3D01030064000000", "4101030064000000", None, None, None,
+    ]  # fmt: skip
+    frames, settings = played(
+        session.read_settings(PEER), *(None if text is None else bytes.fromhex(text) for text in replies)
+    )
+    assert settings == {
+        "address": "8", "bitrate": "500000", "x_reversed": "1", "y_reversed": "0", "interval_ms_FF34": "100",
+        "interval_ms_FF37": "10", "interval_ms_FF3D": "100", "interval_ms_FF41": "100",
+    }  # fmt: skip
+    assert len(frames) == 13
+    assert all(data[2:] == b"\3\0\0\0\0\0" for _, data in frames)
+
+
+def test_identity_is_the_address() -> None:
+    _, identity = played(DRIVER.identify(HipnucJ1939Settings()), bytes.fromhex("9C00030008000000"))
+    assert identity == Identity(details={"address": "8"})
+    assert HOST_ADDRESS == 0x55

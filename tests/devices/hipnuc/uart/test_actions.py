@@ -1,0 +1,112 @@
+"""What a HiPNUC module can be told by name: what goes over the wire, and what the simulated module does."""
+
+from typing import Any
+
+import pytest
+
+from imud.contracts.action import Target
+from imud.contracts.session import Outcome, Rejection, Reply, Request, Silence
+from imud.devices.hipnuc.uart.actions import ACTIONS
+from imud.errors import BadArgument, NoReply, Rejected
+
+OK = Reply(("OK",))
+VERSION = Reply(("PNAME=HI14R3", "OK"))
+
+
+def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
+    """The requests of an action, answered in turn, and its value."""
+    action = ACTIONS[name]
+    conversation = action.begin(Target(None, 115200), action.arguments(arguments))
+    left = list(answers or [OK])
+    requests = []
+    try:
+        request = next(conversation)
+        while True:
+            requests.append(request)
+            request = conversation.send(left.pop(0))
+    except StopIteration as end:
+        assert not left
+        return requests, end.value
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "command"),
+    [
+        ("save", {}, "SAVECONFIG"),
+        ("factory_reset", {}, "FRESET"),
+        ("output_none", {}, "UNLOGALL"),
+        ("output", {"message": "HI91", "rate_hz": 100}, "LOG HI91 ONTIME 0.01"),
+        ("output", {"message": "HI92", "rate_hz": 0}, "LOG HI92 ONTIME 0"),
+        ("output_on_mark", {"message": "HI91"}, "LOG HI91 ONMARK 1"),
+        ("output_once", {"message": "HI91"}, "LOG HI91 ONMARK ONCE"),
+        ("output_enabled", {"enabled": False}, "LOG DISABLE"),
+        ("output_enabled", {"enabled": True}, "LOG ENABLE"),
+        ("mode", {"axes": 9}, "CONFIG ATT MODE 1"),
+        ("mode", {"axes": 6}, "CONFIG ATT MODE 0"),
+        ("level", {"level": "automatic"}, "CONFIG ATT RST 3"),
+        ("yaw", {"angle_deg": 16}, "CONFIG YAW 1 16"),
+        ("yaw", {"angle_deg": 1.5, "relative": True}, "CONFIG YAW 0 1.5"),
+        ("mounting", {"turned": "x-90"}, "CONFIG IMU URFR 1,0,0,0,0,1,0,-1,0"),
+        ("mounting", {"turned": [0, -1, 0, 1, 0, 0, 0, 0, 1]}, "CONFIG IMU URFR 0,-1,0,1,0,0,0,0,1"),
+        ("magnetic_calibration", {"enabled": True}, "CONFIG IMU EN_MCAL 1"),
+        ("pin", {"function": "sout_div", "pin": 9}, "CONFIG PMUX4 IO9"),
+        ("alarm", {"axis": "Y", "min_deg": -5, "max_deg": 5}, "CONFIG PMUX5 Y,-5,5,0,1"),
+        ("sout_divider", {"divisor": 4}, "CONFIG PMUX4 DIV4"),
+    ],
+)
+def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None:
+    (request,), value = sent(name, **arguments)
+    assert request.payload == f"{command}\r\n".encode()
+    assert value is None
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("output", {"message": "HI91", "rate_hz": 500}),  # more than 115200 baud carry
+        ("output", {"message": "HI93", "rate_hz": 1}),
+        ("mounting", {"turned": [1.0] * 8}),
+        ("mounting", {"turned": [2, 0, 0, 0, 1, 0, 0, 0, 1]}),
+        ("yaw", {"angle_deg": 181}),
+        ("pin", {"function": "sin", "pin": 10}),
+        ("sout_divider", {"divisor": 65}),
+        ("baud", {"baud": 1200}),
+    ],
+)
+def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any]) -> None:
+    with pytest.raises(BadArgument):
+        sent(name, [], **arguments)
+
+
+def test_refusal_and_silence() -> None:
+    with pytest.raises(Rejected, match="ERR 3"):
+        sent("save", [Rejection(("ERR 3",))])
+    with pytest.raises(NoReply, match="SAVECONFIG: expected OK, got nothing"):
+        sent("save", [Silence(())])
+
+
+def test_baud_is_followed() -> None:
+    requests, value = sent("baud", [OK, OK, Reply(()), Silence(()), VERSION], baud=921600)
+    assert [request.name for request in requests] == [
+        "SERIALCONFIG 921600", "SAVECONFIG", "REBOOT", "pause", "LOG VERSION",
+    ]  # fmt: skip
+    assert requests[3].baud == 921600
+    assert value == 921600
+
+
+def test_a_module_that_stays_at_its_rate_is_found_there() -> None:
+    silence = [Silence(())] * 6  # the pause and five questions
+    with pytest.raises(Rejected, match="stays at 115200"):
+        sent("baud", [OK, OK, Reply(()), *silence, Silence(()), Silence(()), VERSION], baud=921600)
+
+
+def test_a_module_that_is_lost_says_so() -> None:
+    silence = [Silence(())] * 6
+    with pytest.raises(NoReply):
+        sent("baud", [OK, OK, Reply(()), *silence, Silence(()), *silence], baud=921600)
+
+
+def test_restart_waits_until_it_answers() -> None:
+    requests, value = sent("restart", [Reply(()), Silence(()), Silence(()), VERSION])
+    assert requests[0].silent
+    assert getattr(value, "product", "") == "HI14R3"

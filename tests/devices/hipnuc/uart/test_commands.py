@@ -1,0 +1,131 @@
+"""HiPNUC commands: byte for byte as the manual prints them, and what is refused before it is sent."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from imud.contracts.session import Request
+from imud.devices.hipnuc.uart import commands as c
+from imud.errors import BadArgument
+
+H91, H92 = c.OutputMessage.HI91, c.OutputMessage.HI92
+
+PRINTED = [
+    (c.reboot(), "REBOOT"),
+    (c.save_config(), "SAVECONFIG"),
+    (c.factory_reset(), "FRESET"),
+    (c.unlog_all(), "UNLOGALL"),
+    (c.serial_config(115200), "SERIALCONFIG 115200"),
+    (c.attitude_mode(c.AttitudeMode.SIX_AXIS), "CONFIG ATT MODE 0"),
+    (c.attitude_mode(c.AttitudeMode.NINE_AXIS), "CONFIG ATT MODE 1"),
+    (c.level_reset(c.LevelReset.RELATIVE), "CONFIG ATT RST 2"),
+    (c.level_reset(c.LevelReset.AUTOMATIC), "CONFIG ATT RST 3"),
+    (c.level_reset(c.LevelReset.CANCEL), "CONFIG ATT RST 5"),
+    (c.yaw(c.YawMode.ABSOLUTE, 16), "CONFIG YAW 1 16"),
+    (c.yaw(c.YawMode.RELATIVE, 1.5), "CONFIG YAW 0 1.5"),
+    (c.yaw(c.YawMode.ABSOLUTE, -0.0), "CONFIG YAW 1 0"),
+    (c.yaw(c.YawMode.RELATIVE, 1e-5), "CONFIG YAW 0 0.00001"),
+    (c.mounting(c.Mounting.X_MINUS_90), "CONFIG IMU URFR 1,0,0,0,0,1,0,-1,0"),
+    (c.mounting(c.Mounting.X_PLUS_90), "CONFIG IMU URFR 1,0,0,0,0,-1,0,1,0"),
+    (c.mounting(c.Mounting.X_180), "CONFIG IMU URFR 1,0,0,0,-1,0,0,0,-1"),
+    (c.mounting(c.Mounting.Y_PLUS_90), "CONFIG IMU URFR 0,0,-1,0,1,0,1,0,0"),
+    (c.mounting(c.Mounting.Y_MINUS_90), "CONFIG IMU URFR 0,0,1,0,1,0,-1,0,0"),
+    (c.mounting(c.Mounting.Y_180), "CONFIG IMU URFR -1,0,0,0,1,0,0,0,-1"),
+    (c.mounting(c.Mounting.Z_PLUS_90), "CONFIG IMU URFR 0,-1,0,1,0,0,0,0,1"),
+    (c.mounting(c.Mounting.Z_MINUS_90), "CONFIG IMU URFR 0,1,0,-1,0,0,0,0,1"),
+    (c.mounting(c.Mounting.LEVEL), "CONFIG IMU URFR 1,0,0,0,1,0,0,0,1"),
+    (c.mounting(((0.8, -0.6, 0), (0.6, 0.8, 0), (0, 0, 1))), "CONFIG IMU URFR 0.8,-0.6,0,0.6,0.8,0,0,0,1"),
+    (c.magnetic_calibration(True), "CONFIG IMU EN_MCAL 1"),
+    (c.magnetic_calibration(False), "CONFIG IMU EN_MCAL 0"),
+    (c.pin_function(c.PinFunction.LED, 2), "CONFIG PMUX3 IO2"),
+    (c.pin_function(c.PinFunction.SOUT_DIV, 9), "CONFIG PMUX4 IO9"),
+    (c.alarm(c.AlarmAxis.Y, -5, 5, True), "CONFIG PMUX5 Y,-5,5,0,1"),
+    (c.alarm(c.AlarmAxis.X, -2.5, 10, False), "CONFIG PMUX5 X,-2.5,10,0,0"),
+    (c.sout_divider(4), "CONFIG PMUX4 DIV4"),
+    (c.log_enable(), "LOG ENABLE"),
+    (c.log_disable(), "LOG DISABLE"),
+    (c.log_ontime(H91, 100), "LOG HI91 ONTIME 0.01"),
+    (c.log_ontime(H92, 20), "LOG HI92 ONTIME 0.05"),
+    (c.log_ontime(H91, 0), "LOG HI91 ONTIME 0"),
+    (c.log_ontime(H91, 1), "LOG HI91 ONTIME 1"),
+    (c.log_ontime(H91, 500), "LOG HI91 ONTIME 0.002"),
+    (c.log_ontime(H91, 250), "LOG HI91 ONTIME 0.004"),
+    (c.log_ontime(H91, 1000, 921600), "LOG HI91 ONTIME 0.001"),
+    (c.log_onmark(H91), "LOG HI91 ONMARK 1"),
+    (c.log_once(H91), "LOG HI91 ONMARK ONCE"),
+    (c.ask(c.Query.VERSION), "LOG VERSION"),
+    (c.ask(c.Query.USRCONFIG), "LOG USRCONFIG"),
+    (c.ask(c.Query.COMCONFIG), "LOG COMCONFIG"),
+    (c.ask(c.Query.MAGCONFIG), "LOG MAGCONFIG"),
+]
+
+
+@pytest.mark.parametrize(("request_", "text"), PRINTED, ids=[text for _, text in PRINTED])
+def test_commands_are_as_printed(request_: Request, text: str) -> None:
+    assert request_.payload == text.encode() + b"\r\n"
+    assert request_.name == text
+
+
+IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+any_of: Any = None  # arguments of wrong types on purpose
+two_rows: Any = IDENTITY[:2]
+
+REFUSED: list[tuple[Callable[[], Request], str]] = [
+    (lambda: c.serial_config(57600), "one of 9600, 115200, 230400, 256000, 460800, 921600 baud, got 57600"),
+    (lambda: c.attitude_mode(any_of), "one of AttitudeMode.SIX_AXIS"),
+    (lambda: c.level_reset(any_of), "LevelReset.RELATIVE"),
+    (lambda: c.yaw(c.YawMode.ABSOLUTE, 180.1), "-180 … 180°, got 180.1"),
+    (lambda: c.yaw(c.YawMode.ABSOLUTE, math.nan), "got nan"),
+    (lambda: c.yaw(c.YawMode.ABSOLUTE, -math.inf), "got -inf"),
+    (lambda: c.yaw(c.YawMode.ABSOLUTE, True), "got True"),
+    (lambda: c.yaw(any_of, 5), "YawMode.RELATIVE"),
+    (lambda: c.mounting(((1, 0, 0), (0, 1, 0), (0, 0, -1))), "determinant"),
+    (lambda: c.mounting(((2, 0, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
+    (lambda: c.mounting(((1, 0.01, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
+    (lambda: c.mounting(((math.nan, 0, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
+    (lambda: c.mounting(two_rows), "three rows"),
+    (lambda: c.magnetic_calibration(any_of), "true or false, got None"),
+    (lambda: c.pin_function(c.PinFunction.LED, 0), "1 … 9, got 0"),
+    (lambda: c.pin_function(c.PinFunction.LED, 10), "1 … 9, got 10"),
+    (lambda: c.pin_function(any_of, 1), "PinFunction.SIN"),
+    (lambda: c.alarm(c.AlarmAxis.X, 5, -5, True), "minimum below the maximum"),
+    (lambda: c.alarm(c.AlarmAxis.X, 5, 5, True), "minimum below the maximum"),
+    (lambda: c.alarm(c.AlarmAxis.X, -5, math.inf, True), "a maximum of"),
+    (lambda: c.alarm(any_of, -5, 5, True), "AlarmAxis.X"),
+    (lambda: c.sout_divider(0), "1 … 64, got 0"),
+    (lambda: c.sout_divider(65), "1 … 64, got 65"),
+    (lambda: c.sout_divider(True), "got True"),
+    (lambda: c.log_ontime(H91, 300), "0 \\(off\\) or one of 1, 2, 5"),
+    (lambda: c.log_ontime(H91, -1), "got -1"),
+    (lambda: c.log_ontime(H91, 200, 115200), "at most 100 Hz at 115200 baud, got 200 Hz"),
+    (lambda: c.log_ontime(H91, 10, 4800), "one of 9600"),
+    (lambda: c.log_ontime(any_of, 10), "OutputMessage.HI91"),
+    (lambda: c.log_onmark(any_of), "OutputMessage.HI91"),
+    (lambda: c.log_once(any_of), "OutputMessage.HI91"),
+    (lambda: c.ask(any_of), "Query.VERSION"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), REFUSED)
+def test_bad_arguments_are_refused_with_what_was_expected(make: Callable[[], Request], message: str) -> None:
+    with pytest.raises(BadArgument, match=message) as caught:
+        make()
+    assert "expected" in str(caught.value)
+
+
+def test_reboot_is_silent_and_only_that() -> None:
+    assert [text for request, text in PRINTED if request.silent] == ["REBOOT"]
+
+
+@pytest.mark.parametrize("baud", c.BAUD_RATES)
+def test_every_rate_of_table_3_7_is_a_rate_and_fits_through_the_line(baud: int) -> None:
+    for message, frame_bytes in ((H91, 82), (H92, 54)):
+        rate = c.max_rate_hz(message, baud)
+        assert rate in c.RATES_HZ
+        assert rate * frame_bytes * 10 <= baud
+
+
+def test_table_3_7_distinguishes_the_messages() -> None:
+    assert (c.max_rate_hz(H91, 115200), c.max_rate_hz(H92, 115200)) == (100, 200)

@@ -1,0 +1,108 @@
+"""I2C bursts of the IMU61x: hand-computed bytes, identity, filter."""
+
+import struct
+from collections.abc import Callable
+
+import pytest
+
+from imud.contracts.codec import BadFrame, BadReason
+from imud.contracts.polling import Transfer, Vanished, run_transfer_script
+from imud.devices.imu61x.common.registers import RegisterSettings
+from imud.devices.imu61x.i2c import codec as i2c
+from imud.errors import DeviceRefused
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.imu61x.registers import Imu61xRegisters
+from tests.devices.imu61x.spi.test_codec import RAD_S, G, slow_crc
+
+VALUES = bytes.fromhex("00000000 0000003f 0000803f 0000803f 00000000 000080bf 0000c841".replace(" ", ""))
+"""Accel 0, 0.5, 1 g; gyro 1, 0, -1 °/s; 25 °C: f32, low byte first."""
+GOLDEN = VALUES + struct.pack("<I", slow_crc(VALUES))
+
+
+def codec(**settings: int) -> i2c.Imu61xI2cCodec:
+    return i2c.Imu61xI2cCodec(Ledger(), RegisterSettings(**settings))
+
+
+def wire(device: Imu61xRegisters, log: list[Transfer] | None = None) -> Callable[[Transfer], bytes]:
+    def transfer(one: Transfer) -> bytes:
+        if log is not None:
+            log.append(one)
+        return device.i2c([*one.sends, one.read_bytes] if one.read_bytes else [*one.sends])
+
+    return transfer
+
+
+def test_burst_in_si() -> None:
+    made = codec()
+    (m,) = made.take(0, GOLDEN)
+    assert isinstance(m, Measurement)
+    assert m.accel_m_s2 == pytest.approx((0, G / 2, G))
+    assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S))
+    assert m.temperature_c == 25.0
+    assert m.size_bytes == made.ledger.bytes_in_good_frames == 32
+
+
+def test_crc_covers_all_28_bytes() -> None:
+    for at in range(32):
+        damaged = GOLDEN[:at] + bytes([GOLDEN[at] ^ 0x80]) + GOLDEN[at + 1 :]
+        made = codec()
+        assert made.take(0, damaged) == (BadFrame(BadReason.CRC, damaged),)
+        assert made.ledger.closes()
+
+
+def test_infinite_value_is_left_out_and_told() -> None:
+    values = struct.pack("<7f", 0, 0, 1, float("inf"), 0, 0, 25)
+    bad, m = codec().take(0, values + struct.pack("<I", slow_crc(values)))
+    assert isinstance(bad, BadFrame)
+    assert bad.reason is BadReason.NOT_FINITE
+    assert isinstance(m, Measurement)
+    assert m.gyro_rad_s is None
+    assert m.accel_m_s2 == (0, 0, G)
+
+
+def test_stale_absent_and_short() -> None:
+    made = codec()
+    made.take(0, GOLDEN)
+    assert made.take(0, GOLDEN) == ()
+    assert made.stale == 1
+    for data in (b"\xff" * 32, b"\x00" * 32, b"", GOLDEN[:31]):
+        assert isinstance(made.take(0, data)[0], Vanished)
+    assert made.ledger.closes()
+
+
+def test_identity_and_filter_are_watched() -> None:
+    made = codec(gyro_filter=3)
+    assert made.take(1, b"\x00\x00IMU612") == ()
+    assert made.take(2, b"\xb3") == ()
+    assert made.ledger.frames_in_replies == 2
+    for poll, data in ((1, b"\x00\x00IMU61C"), (2, b"\xbb"), (1, b""), (2, b"")):
+        assert isinstance(made.take(poll, data)[0], Vanished)
+    assert made.ledger.closes()
+
+
+@pytest.mark.parametrize(
+    ("last", "product"), [("2", "IMU612"), ("4", "IMU614"), ("8", "IMU618"), ("A", "IMU6132A"), ("B", "IMU6132B")]
+)
+def test_probe_names_every_product(last: str, product: str) -> None:
+    dialogue = i2c.probe(RegisterSettings())
+    assert next(dialogue) == Transfer((b"\x6a",), 8)
+    with pytest.raises(StopIteration) as end:
+        dialogue.send(b"\x00\x00IMU61" + last.encode())
+    assert end.value.value.product == product
+
+
+def test_set_up_writes_reads_back_and_leaves_alone() -> None:
+    device, log = Imu61xRegisters(lambda: 0), list[Transfer]()
+    transfer = wire(device, log)
+    words = run_transfer_script(i2c.set_up(RegisterSettings(accel_filter=4)), transfer)
+    assert words == {"accel_filter": "10 Hz", "gyro_filter": "47 Hz"}
+    assert [(one.sends[0].hex(), one.read_bytes) for one in log] == [("06", 1), ("064b", 0), ("06", 1)]
+    log.clear()
+    run_transfer_script(i2c.set_up(RegisterSettings()), transfer)
+    assert len(log) == 1
+
+
+def test_filter_that_does_not_take_is_refused() -> None:
+    with pytest.raises(DeviceRefused, match="wrote 0x4b, read back 0xbb"):
+        run_transfer_script(i2c.set_up(RegisterSettings(accel_filter=4)), lambda one: b"\xbb" * one.read_bytes)

@@ -1,0 +1,249 @@
+"""SPI frames of the IMU61x: hand-computed words, every burst, every answer that is not a good one."""
+
+import struct
+from collections.abc import Sequence
+from math import nan
+
+import pytest
+
+from imud.contracts.codec import BadFrame, BadReason
+from imud.contracts.polling import PolledEvent, Transfer, Vanished, run_transfer_script
+from imud.devices.imu61x.common.registers import temperature_c
+from imud.devices.imu61x.spi import codec as spi
+from imud.errors import DeviceRefused, TransferError, Trouble
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.imu61x.registers import Imu61xRegisters
+
+PIPELINE = b"\xde\xad\xbe\xef"
+GOLDEN = bytes.fromhex("8000 003e 0000 0000 8000 ffc1  0000 0000 0000 fffb 0000 0005  ffff 0002".replace(" ", ""))
+"""Gyro 1, 0, -1 °/s: 4096000 = 0x003E8000, 0, 0xFFC18000. Accel 0, -1, 1 g: 0, 0xFFFB0000, 327680 = 0x00050000.
+
+Sum: 8000 + 003E + 8000 + FFC1 + FFFB + 0005 = 0x2FFFF.
+"""
+RAD_S = 0.017453292519943295
+G = 9.80665
+
+
+def codec(burst: str = "standard", **more: object) -> spi.Imu61xSpiCodec:
+    return spi.Imu61xSpiCodec(Ledger(), spi.SpiDeviceSettings(burst=burst, **more))  # type: ignore[arg-type]  # passed on as given
+
+
+def words(data: bytes) -> tuple[int, ...]:
+    return struct.unpack(f">{len(data) // 2}H", data)
+
+
+def with_sum(values: bytes, total: int | None = None) -> bytes:
+    total = sum(words(values)) if total is None else total
+    return values + struct.pack(">HH", total & 0xFFFF, total >> 16)
+
+
+def one(events: Sequence[PolledEvent]) -> Measurement:
+    (event,) = events
+    assert isinstance(event, Measurement)
+    return event
+
+
+def test_standard_burst_in_si() -> None:
+    made = codec()
+    m = one(made.take(0, PIPELINE + GOLDEN))
+    assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S), rel=1e-12)
+    assert m.accel_m_s2 == pytest.approx((0, -G, G), rel=1e-12)
+    assert m.temperature_c is None
+    assert made.ledger.snapshot() == Ledger().snapshot() | {
+        "bytes_in": 28, "bytes_in_good_frames": 28, "frames_good": 1, "frames_in_samples": 1
+    }  # fmt: skip
+
+
+def test_both_halves_of_the_checksum_count_unless_told_otherwise() -> None:
+    wrong_high, wrong_low = with_sum(GOLDEN[:24], 0x1FFFF), with_sum(GOLDEN[:24], 0x2FFFE)
+    assert codec().take(0, PIPELINE + wrong_high) == (BadFrame(BadReason.CRC, wrong_high),)
+    one(codec(checksum_bits=16).take(0, PIPELINE + wrong_high))
+    for made in (codec(), codec(checksum_bits=16)):
+        assert made.take(0, PIPELINE + wrong_low) == (BadFrame(BadReason.CRC, wrong_low),)
+        assert made.ledger.frames_bad_crc == 1
+        assert made.ledger.closes()
+
+
+def slow_crc(data: bytes) -> int:
+    """Bit by bit: reflected 0xEDB88320, start value 1, no final XOR."""
+    register = 1
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ 0xEDB88320 * (register & 1)
+    return register
+
+
+def extended(*values: float, status: int = 0x01020304) -> bytes:
+    memory = struct.pack("<10fI", *values, status)
+    memory += struct.pack("<I", slow_crc(memory))
+    return b"".join(memory[at : at + 2][::-1] for at in range(0, 48, 2))
+
+
+def test_extended_burst_in_si() -> None:
+    data = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
+    assert words(data)[:6] == (0x0000, 0x3F80, 0, 0, 0x0000, 0xBF80)  # 1.0 = 0x3F800000, low word first
+    m = one(codec("extended").take(0, PIPELINE + data))
+    assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S))
+    assert m.accel_m_s2 == pytest.approx((0, G / 2, G))
+    assert m.temperature_c == 25.0
+    assert m.euler_rad == pytest.approx((1.5707963267948966, 0, -0.7853981633974483))
+    assert m.status == 0x01020304
+    assert m.quat_wxyz == pytest.approx((0.65328148, 0.65328148, -0.27059805, -0.27059805))
+
+
+def test_extended_burst_with_nan_comes_without_the_values_concerned() -> None:
+    bad, m = codec("extended").take(0, PIPELINE + extended(1, nan, 0, 0, 0, 1, 25, 0, 0, 0))
+    assert isinstance(bad, BadFrame)
+    assert bad.reason is BadReason.NOT_FINITE
+    assert isinstance(m, Measurement)
+    assert m.gyro_rad_s is None
+    assert m.accel_m_s2 == pytest.approx((0, 0, G))
+
+
+def test_extended_crc_covers_44_bytes() -> None:
+    good = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
+    for at in range(48):
+        damaged = good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :]
+        assert codec("extended").take(0, PIPELINE + damaged) == (BadFrame(BadReason.CRC, damaged),)
+
+
+def test_single_registers_in_si() -> None:
+    """TEMP 2634 · 65536 is 25 °C; gyro high word 1 is 0.016 °/s; accel 327680000 = 0x13880000 is 1 g."""
+    data = bytes.fromhex("0a4a0000 00010000 00000000 ffff0000 00000000 ec780000 13880000".replace(" ", ""))
+    m = one(codec("registers").take(0, PIPELINE + data))
+    assert m.temperature_c == 25.0
+    assert m.gyro_rad_s == pytest.approx((0.016 * RAD_S, 0, -0.016 * RAD_S))
+    assert m.accel_m_s2 == pytest.approx((0, -G, G))
+
+
+@pytest.mark.parametrize(("counts", "celsius"), [(172621824, 25.0), (0, 35.0), (172621824 - 17262182, 26.0)])
+def test_temperature_of_counts(counts: int, celsius: float) -> None:
+    assert temperature_c(counts) == pytest.approx(celsius, abs=1e-6)
+
+
+def test_temperature_read_between_bursts_is_in_the_samples_after_it() -> None:
+    made = codec()
+    made.take(2, PIPELINE + bytes.fromhex("0a4a0000"))
+    assert one(made.take(0, PIPELINE + GOLDEN)).temperature_c == 25.0
+    made.take(2, PIPELINE + bytes.fromhex("fff00000"))  # above 35 °C counts are negative
+    other = with_sum(bytes.fromhex("0001") + GOLDEN[2:24])
+    assert one(made.take(0, PIPELINE + other)).temperature_c == pytest.approx(35 + 16 / 263.4)
+    made.take(2, PIPELINE + b"\xff" * 4)
+    assert one(made.take(0, PIPELINE + GOLDEN)).temperature_c is None
+    assert made.ledger.closes()
+
+
+def test_same_bytes_again_are_stale_until_reset() -> None:
+    made = codec()
+    one(made.take(0, PIPELINE + GOLDEN))
+    assert made.take(0, b"\0\0\0\0" + GOLDEN) == ()
+    assert (made.stale, made.ledger.frames_ignored, made.ledger.frames_good) == (1, 1, 2)
+    made.reset()
+    one(made.take(0, PIPELINE + GOLDEN))
+    assert made.stale == 1
+
+
+@pytest.mark.parametrize("data", [b"\xff" * 28, b"\x00" * 28, b"", GOLDEN[:-1]])
+def test_no_device_is_no_damage(data: bytes) -> None:
+    """Zeros would pass the checksum."""
+    made = codec()
+    (event,) = made.take(0, PIPELINE + data)
+    assert isinstance(event, Vanished)
+    assert made.ledger.bytes_skipped == made.ledger.bytes_in == len(data)
+
+
+def test_transfers_on_the_wire() -> None:
+    assert spi.READ_STANDARD.sends == (b"\x80\x00" + bytes(30),)
+    assert spi.READ_EXTENDED.sends == (b"\x80\x00" + bytes(50),)
+    assert [one.hex() for one in spi.READ_STATE.sends] == [
+        "fe01", "6a00", "6c00", "6e00", "7000", "0600", "0c00", "fe00", "7e00", "7e00", "7e00"
+    ]  # fmt: skip
+    assert [one.hex() for one in spi.READ_TEMPERATURE.sends] == ["0e00", "1000", "7e00", "7e00"]
+    assert [spi.READ_REGISTERS.sends[n].hex() for n in (0, 13)] == ["0e00", "2800"]
+
+
+# --- dialogues -------------------------------------------------------------------------------------------------------
+
+
+class Wire:
+    """A simulated device with a failure at one of its transfers."""
+
+    def __init__(self, *, fail_at: int = -1, deaf: bool = False) -> None:
+        self.device = Imu61xRegisters(lambda: 0)
+        self.sent: list[str] = []
+        self._fail_at = fail_at
+        self._deaf = deaf
+
+    def transfer(self, transfer: Transfer) -> bytes:
+        number = len(self.sent)
+        self.sent.append(" ".join(item.hex() for item in transfer.sends))
+        if number == self._fail_at:
+            self.device.spi(transfer.sends[:3])  # it breaks off in window 1
+            raise TransferError(Trouble.DISTURBED, "by the test")
+        data = b"".join(self.device.spi(transfer.sends))
+        if self._deaf:
+            self.device.filter, self.device.extended = 0xBB, 0
+        return data
+
+
+def test_probe_names_the_product_and_closes_the_window() -> None:
+    wire = Wire()
+    assert run_transfer_script(spi.probe(spi.SpiDeviceSettings()), wire.transfer).product == "IMU614"
+    assert wire.device.window == 0
+    assert len(wire.sent) == 1
+
+
+def test_set_up_writes_what_differs_only() -> None:
+    wire = Wire()
+    words = run_transfer_script(spi.set_up(spi.SpiDeviceSettings()), wire.transfer)
+    assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
+    assert len(wire.sent) == 1
+    settings = spi.SpiDeviceSettings(accel_filter=4, gyro_filter=4, burst="extended")
+    words = run_transfer_script(spi.set_up(settings), wire.transfer)
+    assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
+    assert wire.sent[2] == "fe01 8644 8d01 fe00 7e00 7e00"  # the manual's example of 10 Hz: 0x8644
+    assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
+
+
+@pytest.mark.parametrize("fail_at", [0, 1, 2])
+def test_window_is_closed_after_a_failure(fail_at: int) -> None:
+    wire = Wire(fail_at=fail_at)
+    with pytest.raises(TransferError):
+        run_transfer_script(spi.set_up(spi.SpiDeviceSettings(gyro_filter=1)), wire.transfer)
+    assert wire.sent[-1] == "fe00 7e00 7e00"
+    assert wire.device.window == 0
+
+
+def test_setting_that_does_not_take_is_refused() -> None:
+    with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xb1, read back 0xbb"):
+        run_transfer_script(spi.set_up(spi.SpiDeviceSettings(gyro_filter=1)), Wire(deaf=True).transfer)
+    with pytest.raises(DeviceRefused, match="BURST_CTRL is 0, expected 1"):
+        run_transfer_script(spi.set_up(spi.SpiDeviceSettings(burst="extended")), Wire(deaf=True).transfer)
+
+
+@pytest.mark.parametrize(
+    ("product_id", "why"), [(b"\xff" * 8, "only 0xFF"), (b"\x00" * 8, "only 0x00"), (b"\x00\x00IMU61C", "SPI mode")]
+)
+def test_another_id_is_refused(product_id: bytes, why: str) -> None:
+    wire = Wire()
+    wire.device.faults.product_id = product_id
+    with pytest.raises(DeviceRefused, match=why):
+        run_transfer_script(spi.probe(spi.SpiDeviceSettings()), wire.transfer)
+
+
+def take_state(**changes: int | bytes) -> list[PolledEvent]:
+    wire, made = Wire(), codec(gyro_filter=0xB)
+    for name, value in changes.items():
+        setattr(wire.device.faults if name == "product_id" else wire.device, name, value)
+    events = made.take(1, wire.transfer(spi.READ_STATE))
+    assert made.ledger.closes()
+    return list(events)
+
+
+def test_state_that_changed_by_itself_is_noticed() -> None:
+    assert take_state() == []
+    for (event,) in (take_state(filter=0xB0), take_state(extended=1), take_state(product_id=b"\x00\x00ICM206")):
+        assert isinstance(event, Vanished)
+    assert isinstance(codec().take(1, b"")[0], Vanished)

@@ -1,0 +1,139 @@
+"""Every command of table 12: golden bytes, argument checks, and which message ends its reply."""
+
+from collections.abc import Callable
+from math import inf, nan
+from typing import Any
+
+import pytest
+
+from imud.contracts.codec import ReplyFrame
+from imud.contracts.session import Request
+from imud.devices.imu61x.common.family import crc32
+from imud.devices.imu61x.uart import commands as c
+from imud.devices.imu61x.uart.replies import Parameter, pack_acknowledgement, pack_parameters
+from imud.errors import BadArgument
+
+STREAM_HEX = "55AA 0300 1800 0000803F" + 20 * "00" + "52D88EE8"
+"""A command frame that a device obeyed."""
+
+
+def test_golden_frame() -> None:
+    assert c.output_mode(c.OutputMode.STREAM).payload == bytes.fromhex(STREAM_HEX)
+
+
+@pytest.mark.parametrize(
+    ("request_", "command", "param1", "param3"),
+    [
+        (c.ask_status(), 1, "00000000", 0),
+        (c.ask_ahrs(), 2, "00000000", 0),
+        (c.output_mode(c.OutputMode.STREAM), 3, "0000803F", 0),
+        (c.output_mode(c.OutputMode.COMMAND), 3, "0000C842", 0),
+        (c.reset_heading(0), 4, "00000000", 0),
+        (c.reset_heading(360), 4, "0000B443", 0),
+        (c.reset_heading(22.5), 4, "0000B441", 0),
+        (c.save(), 5, "00000000", 0),
+        (c.read_parameter(Parameter.AHRS_RATE), 6, "00000000", 21),
+        (c.start_installation_calibration(), 7, "00000000", 0),
+        (c.ask_installation_status(), 8, "00000000", 0),
+        (c.restart(), 9, "00000000", 0),
+        (c.calibrate_gyro(), 10, "00000000", 0),
+        (c.set_baud(115200), 14, "0000E147", 3),
+        (c.set_baud(1500000), 14, "001BB749", 3),
+        (c.set_rate(400), 14, "0000C843", 21),
+        (c.set_bus_mode(c.BusMode.UART_ONLY), 14, "00000000", 27),
+        (c.set_bus_mode(c.BusMode.BY_PIN), 14, "00004040", 27),
+        (c.set_i2c_address(0x18), 14, "0000C041", 30),
+        (c.set_i2c_address(0x1B), 14, "0000D841", 30),
+        (c.set_filter(0xB, 0xB), 14, "00003B43", 31),
+        (c.set_filter(0, 4), 14, "00008040", 31),
+        (c.factory_reset(), 15, "00000000", 0),
+    ],
+)
+def test_bytes(request_: Request, command: int, param1: str, param3: int) -> None:
+    body = (
+        b"\x55\xaa" + command.to_bytes(2, "little") + b"\x18\x00"
+        + bytes.fromhex(param1) + bytes(4) + param3.to_bytes(4, "little") + bytes(12)
+    )  # fmt: skip
+    assert request_.payload == body + crc32(body).to_bytes(4, "little")
+    assert len(request_.payload) == 34
+
+
+def test_every_command_of_the_manual_is_there() -> None:
+    assert [command.value for command in c.Command] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 14, 15]
+
+
+@pytest.mark.parametrize("index", [3, 8, 9, 10, 16, 17, 18, 21, 27, 30, 31])
+def test_every_parameter_can_be_read(index: int) -> None:
+    request = c.read_parameter(Parameter(index))
+    assert request.is_end(ReplyFrame(6, pack_parameters(1.5, index)))
+    assert not request.is_end(ReplyFrame(6, pack_parameters(1.5, index + 1)))
+    acknowledged = ReplyFrame(99, pack_acknowledgement(6, 1))
+    assert not request.is_end(acknowledged)
+    assert request.is_part(acknowledged)
+
+
+def test_any_acknowledgement_of_the_command_ends_an_order() -> None:
+    request = c.save()
+    for result in (0, 1, 0xFFFF):
+        assert request.is_end(ReplyFrame(0x7777, pack_acknowledgement(5, result)))
+    assert not request.is_end(ReplyFrame(0x7777, pack_acknowledgement(6, 0)))
+    assert not request.is_end("OK")
+
+
+def test_status_and_installation_status_replies() -> None:
+    s1 = ReplyFrame(0xFF, bytes(22))
+    assert c.ask_status().is_end(s1)
+    assert not c.ask_status().is_end(ReplyFrame(5, pack_acknowledgement(1, 0)))
+    assert c.ask_installation_status().is_end(s1)
+    assert c.ask_installation_status().is_end(ReplyFrame(5, pack_acknowledgement(8, 0)))
+
+
+def test_one_ahrs_frame_comes_as_a_sample() -> None:
+    assert c.ask_ahrs().silent
+
+
+@pytest.mark.parametrize(
+    ("make", "value", "named"),
+    [
+        (c.set_baud, 9600, "115200, 230400, 460800, 921600, 1500000"),
+        (c.set_baud, True, "baud rate"),
+        (c.set_rate, 0, "1, 10, 50, 100, 200, 400"),
+        (c.set_rate, 100.5, "AHRS rate"),
+        (c.set_bus_mode, 1, "BusMode.SPI"),
+        (c.set_i2c_address, 0x1C, "I2C address"),
+        (c.set_i2c_address, "0x18", "I2C address"),
+        (c.output_mode, 1, "OutputMode.STREAM"),
+        (c.read_parameter, 21, "Parameter.AHRS_RATE"),
+        (c.reset_heading, -0.1, "0 … 360°"),
+        (c.reset_heading, 360.1, "0 … 360°"),
+        (c.reset_heading, nan, "0 … 360°"),
+        (c.reset_heading, inf, "0 … 360°"),
+        (c.reset_heading, True, "0 … 360°"),
+        (c.reset_heading, "90", "0 … 360°"),
+    ],
+)
+def test_what_the_device_would_not_take_is_refused(make: Callable[[Any], Request], value: object, named: str) -> None:
+    with pytest.raises(BadArgument, match=named):
+        make(value)
+
+
+@pytest.mark.parametrize("codes", [(16, 0), (0, 16), (-1, 0), (0, True)])
+def test_filter_codes(codes: tuple[int, int]) -> None:
+    with pytest.raises(BadArgument, match="filter code"):
+        c.set_filter(*codes)
+
+
+@pytest.mark.parametrize(("baud", "most_hz"), [(115200, 200), (230400, 400), (460800, 400), (1500000, 400)])
+def test_rates_that_fit_the_line(baud: int, most_hz: int) -> None:
+    assert c.max_rate_hz(baud) == most_hz
+    c.set_rate(most_hz, baud=baud)
+
+
+def test_a_rate_that_does_not_fit_the_line_is_refused() -> None:
+    with pytest.raises(BadArgument, match="at most 200 Hz at 115200 baud, got 400 Hz"):
+        c.set_rate(400, baud=115200)
+
+
+def test_the_line_can_change_with_a_request() -> None:
+    assert c.output_mode(c.OutputMode.COMMAND, baud=921600).baud == 921600
+    assert c.output_mode(c.OutputMode.COMMAND).baud == 0

@@ -1,0 +1,28 @@
+"""Length of frames on the wire, and frames as bytes."""
+
+import pytest
+
+from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, frame_bits, pack_frame
+
+
+@pytest.mark.parametrize(
+    ("extended", "data_bytes", "bits"),
+    # start 1, identifier 11, RTR, IDE, r0, DLC 4, data, CRC 15 + 1, ACK 2, end 7, pause 3; SRR, r1 and 18 bits more
+    [(False, 8, 111), (False, 6, 95), (False, 0, 47), (True, 8, 131), (True, 0, 67)],
+)
+def test_length_of_a_frame(extended: bool, data_bytes: int, bits: int) -> None:
+    assert frame_bits(extended, data_bytes) == bits
+
+
+def test_frames_as_the_kernel_has_them() -> None:
+    assert RAW_FRAME.unpack(pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
+    assert RAW_FRAME.unpack(pack_frame(0x1FFF_FFFF, True, b"")) == (0x1FFF_FFFF | EXTENDED_FLAG, 0, bytes(8))
+
+
+@pytest.mark.parametrize(
+    ("can_id", "extended", "data"),
+    [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9))],
+)
+def test_what_no_frame_can_be(can_id: int, extended: bool, data: bytes) -> None:
+    with pytest.raises(ValueError, match="no CAN frame"):
+        pack_frame(can_id, extended, data)

@@ -1,0 +1,144 @@
+"""Raw and stamped captures."""
+
+import io
+import struct
+from typing import BinaryIO, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.errors import ImudError
+from imud.formats.capture import MAGIC, RAW_CHUNK_BYTES, RECORD_BYTES_MAX, CaptureReader, CaptureWriter, read_capture
+
+GOLDEN = (
+    b"#imud-capture 1 driver=hipnuc-uart baud=115200\n"
+    b"\x02\x01\x00\x00\x00\x00\x00\x00\x03\x00\x00\x00abc"
+    b"\x03\x01\x00\x00\x00\x00\x00\x00\x01\x00\x00\x00d"
+)
+"""Two reads at 258 and 259 ns, written by hand from the format's description."""
+
+
+class Dripping(io.RawIOBase):
+    """A pipe that hands over one byte at a time and cannot seek."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = io.BytesIO(data)
+
+    def readable(self) -> bool:
+        return True
+
+    def read(self, size: int = -1) -> bytes:
+        return self._data.read(min(size, 1) if size > 0 else size)
+
+    def readline(self, size: int | None = -1) -> bytes:
+        return self._data.readline(-1 if size is None else size)
+
+
+def chunks(data: bytes) -> list[tuple[int | None, bytes]]:
+    return [(chunk.t_ns, chunk.data) for chunk in read_capture(io.BytesIO(data))]
+
+
+def written(**details: str | int) -> bytes:
+    file = io.BytesIO()
+    writer = CaptureWriter(file, driver="hipnuc-uart", baud=115200, details=details)
+    assert writer.write(b"abc", 258)
+    assert writer.write(b"d", 259)
+    return file.getvalue()
+
+
+def test_the_golden_capture_is_read_and_written() -> None:
+    reader = read_capture(io.BytesIO(GOLDEN))
+    assert (reader.stamped, reader.driver, reader.baud, reader.hold_ns) == (True, "hipnuc-uart", 115200, 0)
+    assert list(reader) == [(258, b"abc"), (259, b"d")]
+    assert reader.problem == ""
+    assert written() == GOLDEN
+
+
+def test_unknown_details_and_odd_characters_survive() -> None:
+    reader = read_capture(io.BytesIO(written(note="20 °C, 5 = five %\n", hold_ns=16_000_000)))
+    assert reader.details["note"] == "20 °C, 5 = five %\n"
+    assert reader.hold_ns == 16_000_000
+    assert list(reader) == [(258, b"abc"), (259, b"d")]
+
+
+@given(st.binary(max_size=3 * RAW_CHUNK_BYTES).filter(lambda data: not data.startswith(MAGIC)))
+def test_everything_else_is_raw(data: bytes) -> None:
+    reader = read_capture(io.BytesIO(data))
+    pieces = list(reader)
+    assert not reader.stamped
+    assert b"".join(piece for _, piece in pieces) == data
+    assert all(t_ns is None and 0 < len(piece) <= RAW_CHUNK_BYTES for t_ns, piece in pieces)
+
+
+@pytest.mark.parametrize("data", [GOLDEN, b"#imud", b"", b"#imud-capture", bytes(100)])
+def test_a_pipe_gives_the_same(data: bytes) -> None:
+    from_pipe = list(CaptureReader(cast(BinaryIO, Dripping(data))))
+    assert b"".join(piece for _, piece in from_pipe) == b"".join(piece for _, piece in chunks(data))
+
+
+def test_a_cut_at_any_byte_loses_only_the_cut_record() -> None:
+    records_at = GOLDEN.index(b"\n") + 1
+    ends = {records_at: 0, records_at + 15: 1, len(GOLDEN): 2}
+    for cut in range(records_at, len(GOLDEN) + 1):
+        reader = read_capture(io.BytesIO(GOLDEN[:cut]))
+        whole = [(258, b"abc"), (259, b"d")][: max(number for end, number in ends.items() if end <= cut)]
+        assert list(reader) == whole
+        assert ("cut short" in reader.problem) == (cut not in ends)
+
+
+def test_damage_is_named_with_its_place() -> None:
+    for record in (struct.pack("<qI", 300, RECORD_BYTES_MAX + 1), struct.pack("<qI", 100, 1) + b"x"):
+        reader = read_capture(io.BytesIO(GOLDEN + record + b"more"))
+        assert list(reader) == [(258, b"abc"), (259, b"d")]
+        assert reader.problem.startswith(f"damaged at byte {len(GOLDEN)}:")
+
+
+@pytest.mark.parametrize("line", [b"2 driver=x\n", b"1 driver=x", b"\n", b"\xff\xff\n"])
+def test_other_versions_and_broken_first_lines_are_refused(line: bytes) -> None:
+    with pytest.raises(ImudError, match="this imud reads version 1"):
+        read_capture(io.BytesIO(MAGIC + line))
+
+
+@pytest.mark.parametrize("baud", ["", "fast", "-1", "²", "9" * 30])
+def test_a_rate_that_is_no_number_is_unknown(baud: str) -> None:
+    file = io.BytesIO()
+    CaptureWriter(file, details={"note": baud})
+    header = file.getvalue().replace(b"note=", b"baud=")
+    assert read_capture(io.BytesIO(header)).baud == 0
+
+
+@given(st.lists(st.tuples(st.binary(max_size=50), st.integers(-(1 << 62), 1 << 62))))
+def test_what_is_written_is_read_with_times_that_never_run_back(reads: list[tuple[bytes, int]]) -> None:
+    file = io.BytesIO()
+    writer = CaptureWriter(file)
+    for data, t_ns in reads:
+        assert writer.write(data, t_ns)
+    back = chunks(file.getvalue())
+    assert [data for _, data in back] == [data for data, _ in reads if data]
+    times = [t_ns for t_ns, _ in back if t_ns is not None]
+    assert times == sorted(times)
+    if times:
+        assert times[-1] == max(t_ns for data, t_ns in reads if data)
+
+
+def test_a_long_read_is_split() -> None:
+    file = io.BytesIO()
+    CaptureWriter(file).write(bytes(RECORD_BYTES_MAX + 1), 1)
+    assert [(t_ns, len(data)) for t_ns, data in chunks(file.getvalue())] == [(1, RECORD_BYTES_MAX), (1, 1)]
+
+
+def test_the_bound_is_kept_and_the_rest_counted() -> None:
+    file = io.BytesIO()
+    writer = CaptureWriter(file, bytes_max=100)
+    taken = [writer.write(bytes(20), t_ns) for t_ns in range(5)]
+    assert taken == [True, True, False, False, False]
+    assert len(file.getvalue()) <= 100
+    assert writer.bytes_refused == 60
+    assert not writer.write(b"", 9)
+    assert not writer.write(b"a", 9)  # it would fit, but a capture has no holes
+
+
+def test_a_first_line_that_could_not_be_read_back_is_refused() -> None:
+    with pytest.raises(ValueError, match="can be read back"):
+        CaptureWriter(io.BytesIO(), details={"note": "x" * 5000})

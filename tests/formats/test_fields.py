@@ -1,0 +1,26 @@
+"""The table of a sample's members says what is in them."""
+
+from imud.formats.fields import FIELDS
+from imud.sample import SAMPLE_FIELDS, Sample
+from imud.signals.sync_signals import ALARM_STATUS
+
+BY_NAME = {field.name: field for field in FIELDS}
+
+
+def test_every_member_has_its_row_in_its_place() -> None:
+    assert tuple(BY_NAME) == SAMPLE_FIELDS
+    optional = SAMPLE_FIELDS[-len(Sample.__struct_defaults__) :]
+    assert [name for name, field in BY_NAME.items() if not field.always] == list(optional)
+
+
+def test_the_bit_of_the_alarm_line_is_the_one_that_is_told() -> None:
+    assert ALARM_STATUS == 1 << 31
+    assert "bit 31" in BY_NAME["status"].meaning
+
+
+def test_what_an_edge_is_the_number_of() -> None:
+    meaning = BY_NAME["edge_seq"].meaning
+    assert "rising edge on SOUT" in meaning
+    assert "trigger on SIN" in meaning
+    assert "PPS" not in meaning
+    assert (BY_NAME["pps_age_ms"].unit, BY_NAME["pps_age_ms"].frame) == ("ms", "device clock")

@@ -1,0 +1,73 @@
+"""29-bit identifiers of the manual and of the standard, split and joined."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imud.formats.can import EXTENDED_ID_MAX
+from imud.formats.j1939 import GLOBAL, J1939Id, filter_of, join, sender_of, split
+
+KNOWN = [
+    (0x0CFF3408, J1939Id(3, 0xFF34, 0x08)),
+    (0x0CEF0855, J1939Id(3, 0xEF00, 0x55, 0x08)),
+    (0x0CEF5508, J1939Id(3, 0xEF00, 0x08, 0x55)),
+    (0x09F11223, J1939Id(2, 127250, 0x23)),
+    (0x0DF119FE, J1939Id(3, 127257, 0xFE)),
+    (0x18EAFF00, J1939Id(6, 0xEA00, 0x00, GLOBAL)),  # a request to all
+    (0x1CEFFF01, J1939Id(7, 0xEF00, 0x01, 0xFF)),
+    (0x02F00400, J1939Id(0, 0x2F004, 0x00)),  # EDP set: J1939's upper half
+]
+
+
+@pytest.mark.parametrize(("can_id", "parts"), KNOWN, ids=[f"{can_id:08X}" for can_id, _ in KNOWN])
+def test_known_identifiers(can_id: int, parts: J1939Id) -> None:
+    assert split(can_id) == parts
+    assert join(parts) == can_id
+
+
+@settings(derandomize=True, deadline=None, database=None)
+@given(st.integers(0, EXTENDED_ID_MAX))
+def test_every_identifier_comes_back(can_id: int) -> None:
+    assert join(split(can_id)) == can_id
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        J1939Id(8, 0xFF34, 8),
+        J1939Id(3, 0x40000, 8),
+        J1939Id(3, 0xFF34, 256),
+        J1939Id(3, 0xEF00, 8, 256),
+        J1939Id(3, 0xEF01, 8, 5),  # a destination in the number
+        J1939Id(3, 0xFF34, 8, 5),  # a destination for what is for all
+        J1939Id(-1, 0xFF34, 8),
+    ],
+)
+def test_what_no_identifier_can_say(parts: J1939Id) -> None:
+    with pytest.raises(ValueError, match="J1939"):
+        join(parts)
+
+
+def test_filters_look_at_all_but_the_priority() -> None:
+    one = filter_of(0xFF34, 8)
+    assert all(one.takes(priority << 26 | 0xFF3408, True) for priority in range(8))
+    assert not one.takes(0x0CFF3409, True)
+    assert not one.takes(0x0CFF3508, True)
+    assert not one.takes(0x0DFF3408, True)  # another data page
+    assert not one.takes(0x0CFF3408 & 0x7FF, False)
+    any_source = filter_of(127250, None)
+    assert any_source.takes(0x09F11200, True)
+    assert any_source.takes(0x1DF112FD, True)
+    assert not any_source.takes(0x09F11300, True)
+    reply = filter_of(0xEF00, 8, 0x55)
+    assert reply.takes(0x18EF5508, True)
+    assert not reply.takes(0x18EF0855, True)
+
+
+def test_sender_of_a_message() -> None:
+    pgns = (0xFF34,)
+    assert [sender_of(can_id, True, bytes(8), pgns) for can_id in (0x0CFF3400, 0x1CFF34FD)] == [0, 253]
+    assert sender_of(0x0CFF34FE, True, bytes(8), pgns) is None  # has no address
+    assert sender_of(0x0CFF3708, True, bytes(8), pgns) is None
+    assert sender_of(0x0CFF3408, False, bytes(8), pgns) is None
+    assert sender_of(0x0CFF3408, True, bytes(7), pgns) is None

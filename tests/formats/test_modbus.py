@@ -1,0 +1,112 @@
+"""Frames of Modbus RTU, and the reply among all that can come back."""
+
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imud.formats.checksum import crc16_modbus
+from imud.formats.modbus import (
+    ReplyFinder,
+    exception_text,
+    frame_gap_ns,
+    framed,
+    is_exception,
+    is_whole,
+)
+
+REQUEST = framed(5, bytes.fromhex("03 0034 0002"))
+REPLY = framed(5, bytes.fromhex("03 04 11 22 33 44"))
+OTHER = framed(6, bytes.fromhex("03 04 55 66 77 88"))
+EXCEPTION = framed(5, b"\x83\x02")
+
+
+def finder(echoes: bool | None = False, request: bytes = REQUEST, size: int = len(REPLY)) -> ReplyFinder:
+    return ReplyFinder(request, size, echoes=echoes)
+
+
+def test_check_value_and_frames() -> None:
+    assert crc16_modbus(b"123456789") == 0x4B37
+    assert framed(0x50, bytes.fromhex("03 0034 0018")).hex() == "50030034001809" + "8f"
+    assert is_whole(REPLY)
+    assert not is_whole(REPLY[:-1])
+    assert not is_whole(b"")
+    assert is_exception(EXCEPTION)
+    assert not is_exception(EXCEPTION[:-1] + b"\x00")
+    assert not is_exception(framed(5, b"\x03\x02"))
+    assert exception_text(2) == "exception 2: there is no such register"
+    assert exception_text(77) == "exception 77: no meaning known"
+
+
+@pytest.mark.parametrize(("baud", "gap_ns"), [(9600, 3_645_831), (19200, 1_822_915), (38400, 1_750_000)])
+def test_silence_between_frames(baud: int, gap_ns: int) -> None:
+    """3.5 characters of 10 bits up to 19200 baud, 1.75 ms above."""
+    assert frame_gap_ns(baud) == pytest.approx(gap_ns, abs=2)
+
+
+@settings(max_examples=60, derandomize=True, deadline=None, database=None)
+@given(seed=st.integers(0, 2**32), echo=st.booleans(), known=st.booleans(), exception=st.booleans())
+def test_the_reply_is_found_in_any_split(seed: int, echo: bool, known: bool, exception: bool) -> None:
+    random, reply = Random(seed), EXCEPTION if exception else REPLY
+    stream = REQUEST * echo + reply
+    found = finder(echo if known else None)
+    while stream:
+        size = random.randint(1, len(stream))
+        assert found.missing <= len(stream)  # who sleeps for what is missing never sleeps too long
+        got, stream = found.feed(stream[:size]), stream[size:]
+        assert got == (None if stream else reply)
+    assert found.strange == 0
+    assert found.echo_seen is (echo if echo or not known else None)
+
+
+def test_what_belongs_to_others_is_skipped_and_counted() -> None:
+    found = finder()
+    assert found.feed(OTHER) is None
+    assert found.feed(b"\x05\x03" + REPLY[:4]) is None
+    assert found.feed(REPLY[4:]) == REPLY
+    assert found.strange == len(OTHER) + 2
+
+
+def test_reply_of_another_length_is_not_taken() -> None:
+    """What a module owes from before: it is asked for another number of registers now."""
+    old = framed(5, bytes.fromhex("03 06 11 22 33 44 55 66"))
+    found = finder()
+    assert found.feed(old) is None
+    assert found.feed(REPLY) == REPLY
+    assert found.strange == len(old)
+
+
+def test_damaged_reply_in_its_place_is_given_to_who_asked() -> None:
+    damaged = REPLY[:-1] + bytes([REPLY[-1] ^ 1])
+    assert finder().feed(damaged) == damaged
+    late = finder()
+    assert late.feed(OTHER + damaged) is None  # behind something strange only a whole one is believed
+    assert late.feed(REPLY) == REPLY
+    assert late.strange == len(OTHER) + len(damaged)
+
+
+def test_reply_with_a_damaged_head_may_have_been_one_but_another_module_may_not() -> None:
+    found = finder()
+    assert found.feed(b"\x45" + REPLY[1:]) is None
+    assert found.looks_damaged
+    assert found.rest() == b"\x45" + REPLY[1:]
+    found = finder()
+    assert found.feed(OTHER) is None
+    assert not found.looks_damaged
+
+
+def test_confirmation_is_told_from_the_echo() -> None:
+    write = framed(5, bytes.fromhex("06 0006 0001"))
+    found = finder(True, write, len(write))
+    assert found.feed(write) is None
+    assert found.feed(write) == write
+    assert finder(False, write, len(write)).feed(write) == write
+
+
+def test_port_that_never_falls_silent_does_not_fill_memory() -> None:
+    found = finder()
+    for _ in range(100):
+        assert found.feed(b"\xee" * 100) is None
+    assert len(found.rest()) <= 256
+    assert found.strange + len(found.rest()) == 10_000

@@ -1,0 +1,135 @@
+import struct
+import zlib
+
+import pytest
+
+from imud.errors import ServerError
+from imud.formats.ring import (
+    HEADER_BYTES,
+    HEADER_FIELDS,
+    LEDGER_BLOCK_BYTES,
+    LEDGER_ROOM,
+    OFFSETS,
+    STATE_LIVE,
+    RingHeader,
+    decode_header,
+    decode_ledger_block,
+    encode_header,
+    encode_ledger_block,
+    ring_path,
+)
+from imud.ledger import LEDGER_FIELDS
+from tests.support.layouts import check_layout
+
+HEADER = RingHeader(0x0102_0304_0506_0708, 4711, STATE_LIVE, "front-imu", 3, 4096, 10, 2, -5)
+LEDGER = {name: 100 + i for i, name in enumerate(LEDGER_FIELDS)}
+
+GOLDEN = (
+    b"imudshm\0"
+    + bytes.fromhex("01000000 01000000 00100000 00010000 00100000 16000000")  # 1, 1, 4096, 256, 4096, 22 counters
+    + bytes.fromhex("0807060504030201 67120000 01000000 03000000")
+    + bytes(12)
+    + b"front-imu".ljust(64, b"\0")
+    + bytes(64)
+    + bytes.fromhex("0a00000000000000 0200000000000000 fbffffffffffffff")
+)
+
+
+def test_table_covers_the_header_page() -> None:
+    check_layout(HEADER_FIELDS, HEADER_BYTES)
+
+
+def test_lively_words_have_a_cache_line_of_their_own() -> None:
+    lively = {"newest_seq", "first_seq", "heartbeat_ns"}
+    lines = {OFFSETS[name] // 64 for name in lively}
+    others = {f.offset // 64 for f in HEADER_FIELDS if f.name not in lively and not f.name.startswith("reserved")}
+    assert len(lines) == 1
+    assert not lines & others
+
+
+def test_golden_header() -> None:
+    raw = encode_header(HEADER)
+    assert len(raw) == HEADER_BYTES
+    assert raw[: len(GOLDEN)].hex(" ", 8) == GOLDEN.hex(" ", 8)
+    assert not any(raw[len(GOLDEN) :])
+
+
+def test_golden_header_decodes() -> None:
+    assert decode_header(GOLDEN.ljust(HEADER_BYTES, b"\0"), "x") == HEADER
+
+
+@pytest.mark.parametrize("raw", [b"", bytes(HEADER_BYTES), encode_header(HEADER)[:-1], b"x" * HEADER_BYTES])
+def test_no_ring_at_all(raw: bytes) -> None:
+    with pytest.raises(ServerError, match=r"/x is no ring"):
+        decode_header(raw, "/x")
+
+
+@pytest.mark.parametrize("name", ["layout_version", "slot_layout_version", "header_bytes", "slot_bytes"])
+def test_another_version_is_refused(name: str) -> None:
+    raw = bytearray(encode_header(HEADER))
+    raw[OFFSETS[name]] ^= 2
+    with pytest.raises(ServerError, match="different versions"):
+        decode_header(bytes(raw), "/x")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("slot_count", 0), ("slot_count", 4095), ("ledger_count", LEDGER_ROOM + 1)]
+)
+def test_impossible_counts_are_refused(name: str, value: int) -> None:
+    raw = bytearray(encode_header(HEADER))
+    struct.pack_into("<I", raw, OFFSETS[name], value)
+    with pytest.raises(ServerError, match="damaged"):
+        decode_header(bytes(raw), "/x")
+
+
+def test_ledger_block_by_hand() -> None:
+    body = struct.pack("<Q", 6) + b"hipnuc-uart".ljust(32, b"\0")
+    body += b"".join(struct.pack("<Q", 100 + i) for i in range(22)) + bytes(8 * (LEDGER_ROOM - 22))
+    expected = body + zlib.crc32(body).to_bytes(4, "little")
+    assert encode_ledger_block(6, "hipnuc-uart", LEDGER) == expected
+    assert len(expected) == LEDGER_BLOCK_BYTES
+
+
+def test_ledger_block_round_trip() -> None:
+    block = decode_ledger_block(encode_ledger_block(6, "hipnuc-uart", LEDGER), len(LEDGER_FIELDS))
+    assert block is not None
+    assert (block.update, block.driver, block.ledger) == (6, "hipnuc-uart", LEDGER)
+
+
+@pytest.mark.parametrize("at", [0, 8, 40, 300, LEDGER_BLOCK_BYTES - 1])
+def test_torn_ledger_block_is_refused(at: int) -> None:
+    raw = bytearray(encode_ledger_block(6, "hipnuc-uart", LEDGER))
+    raw[at] ^= 1
+    assert decode_ledger_block(bytes(raw), len(LEDGER_FIELDS)) is None
+
+
+def test_cut_ledger_block_is_refused() -> None:
+    assert decode_ledger_block(encode_ledger_block(1, "", LEDGER)[:-1], len(LEDGER_FIELDS)) is None
+
+
+def test_writer_with_fewer_counters() -> None:
+    block = decode_ledger_block(encode_ledger_block(1, "", LEDGER), 2)
+    assert block is not None
+    assert block.ledger == {"bytes_in": 100, "bytes_in_good_frames": 101}
+
+
+def test_writer_with_more_counters() -> None:
+    block = decode_ledger_block(encode_ledger_block(1, "", LEDGER), LEDGER_ROOM)
+    assert block is not None
+    assert block.ledger == LEDGER
+
+
+def test_ledger_values_that_do_not_fit() -> None:
+    block = decode_ledger_block(encode_ledger_block(1, "d" * 40, {"bytes_in": (1 << 64) + 5}), 1)
+    assert block is not None
+    assert (block.driver, block.ledger) == ("d" * 31, {"bytes_in": 5})
+
+
+def test_ring_path() -> None:
+    assert str(ring_path("/dev/shm", "imu0")) == "/dev/shm/imud.imu0"
+
+
+@pytest.mark.parametrize("device", ["", "a/b", "../x", "a\0b", "x" * 64, "ü" * 32])
+def test_names_that_cannot_be_files(device: str) -> None:
+    with pytest.raises(ServerError, match="expected a name"):
+        ring_path("/dev/shm", device)

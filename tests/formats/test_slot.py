@@ -1,0 +1,180 @@
+import struct
+import zlib
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.formats.slot import (
+    CRC_OFFSET,
+    PRESENT_BITS,
+    SLOT_BYTES,
+    SLOT_FIELDS,
+    SYNC_CODES,
+    decode_slot,
+    encode_slot,
+    slot_is_whole,
+)
+from imud.sample import Sample, Sync
+from tests.support.layouts import check_layout
+
+FULL = Sample(
+    "imu0", 258, 1_000_000_001, 250_000, Sync.EDGE, 1_000_400_000, 0x17A1_B2C3_D4E5_F607,
+    t_dev_ns=-2, accel_m_s2=(1.0, -2.0, 0.5), gyro_rad_s=(4.0, 8.0, 16.0), mag_t=(-1.0, 0.25, 0.125),
+    quat_wxyz=(1.0, 0.0, 0.0, -1.0), euler_rad=(2.0, 1.0, -0.5), temperature_c=32.0, pressure_pa=65536.0,
+    incli_rad=(-4.0, 0.0625), status=0x8001_0203, pps_age_ms=999, edge_seq=7,
+)  # fmt: skip
+BARE = Sample("imu0", 1, 2, 3, Sync.ARRIVAL, 4, 5)
+
+INTEGERS = ("t_dev_ns", "status", "pps_age_ms", "edge_seq")
+
+GOLDEN = (
+    "0201000000000000"  # seq 258 = 0x102
+    "01ca9a3b00000000"  # t_ns 1 000 000 001 = 0x3b9aca01
+    "80e4a03b00000000"  # t_rx_ns 1 000 400 000 = 0x3ba0e480
+    "07f6e5d4c3b2a117"  # utc_ns
+    "feffffffffffffff"  # t_dev_ns -2
+    "0700000000000000"  # edge_seq
+    "90d00300"  # t_err_ns 250 000 = 0x3d090
+    "ff0f0000"  # present: all twelve bits
+    "03020180"  # status
+    "3412"  # device_id 0x1234
+    "02"  # sync edge
+    "00"
+    "000000000000f03f" "00000000000000c0" "000000000000e03f"  # 1, -2, 0.5
+    "0000000000001040" "0000000000002040" "0000000000003040"  # 4, 8, 16
+    "000000000000f0bf" "000000000000d03f" "000000000000c03f"  # -1, 1/4, 1/8
+    "000000000000f03f" "0000000000000000" "0000000000000000" "000000000000f0bf"  # 1, 0, 0, -1
+    "0000000000000040" "000000000000f03f" "000000000000e0bf"  # 2, 1, -0.5
+    "0000000000004040"  # 32
+    "000000000000f040"  # 65536
+    "00000000000010c0" "000000000000b03f"  # -4, 1/16
+    "e7030000"  # 999
+    + "00" * 24
+)  # fmt: skip
+"""Written out by hand: a power of two 2**n as f64 has the exponent bits 1023 + n and no others."""
+
+
+def crc32_bit_by_bit(data: bytes) -> int:
+    crc = 0xFFFF_FFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ (0xEDB8_8320 if crc & 1 else 0)
+    return crc ^ 0xFFFF_FFFF
+
+
+def test_golden_bytes() -> None:
+    slot = encode_slot(FULL, 0x1234)
+    assert slot[:CRC_OFFSET].hex(" ", 8) == bytes.fromhex(GOLDEN).hex(" ", 8)
+    assert slot[CRC_OFFSET:] == crc32_bit_by_bit(bytes.fromhex(GOLDEN)).to_bytes(4, "little")
+
+
+def test_crc_check_value() -> None:
+    assert crc32_bit_by_bit(b"123456789") == 0xCBF4_3926  # the published check value of CRC-32
+
+
+def test_golden_decodes() -> None:
+    raw = bytes.fromhex(GOLDEN)
+    assert decode_slot(raw + zlib.crc32(raw).to_bytes(4, "little"), "imu0") == FULL
+
+
+def test_table_covers_the_slot() -> None:
+    check_layout(SLOT_FIELDS, SLOT_BYTES)
+
+
+@pytest.mark.parametrize("name", PRESENT_BITS)
+def test_presence_bit_of_each_field(name: str) -> None:
+    value = getattr(FULL, name)
+    slot = encode_slot(msgspec.structs.replace(BARE, **{name: value}), 0)
+    assert struct.unpack_from("<I", slot, 52)[0] == PRESENT_BITS[name]
+    decoded = decode_slot(slot, "imu0")
+    assert getattr(decoded, name) == value
+    assert all(getattr(decoded, other) is None for other in PRESENT_BITS if other != name)
+
+
+@pytest.mark.parametrize("name", PRESENT_BITS)
+def test_zero_is_not_absent(name: str) -> None:
+    full = getattr(FULL, name)
+    zero: Any = tuple(0.0 for _ in full) if isinstance(full, tuple) else 0
+    decoded = decode_slot(encode_slot(msgspec.structs.replace(BARE, **{name: zero}), 0), "imu0")
+    assert getattr(decoded, name) == zero
+
+
+def test_sync_codes_are_in_order_of_quality() -> None:
+    assert [SYNC_CODES[sync] for sync in (Sync.ARRIVAL, Sync.REGRESSION, Sync.EDGE, Sync.UTC)] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("sync", Sync)
+def test_sync_round_trip(sync: Sync) -> None:
+    assert decode_slot(encode_slot(msgspec.structs.replace(BARE, sync=sync), 0), "imu0").sync is sync
+
+
+@pytest.mark.parametrize("at", range(SLOT_BYTES))
+def test_any_flipped_bit_is_found(at: int) -> None:
+    slot = bytearray(encode_slot(FULL, 1))
+    slot[at] ^= 1 << at % 8
+    assert not slot_is_whole(bytes(slot))
+    with pytest.raises(ValueError, match="torn"):
+        decode_slot(bytes(slot), "imu0")
+
+
+@pytest.mark.parametrize("slot", [b"", bytes(SLOT_BYTES), bytes(SLOT_BYTES - 1), b"\xff" * SLOT_BYTES])
+def test_what_was_never_a_slot(slot: bytes) -> None:
+    assert not slot_is_whole(slot)
+
+
+def test_cut_slot() -> None:
+    assert not slot_is_whole(encode_slot(FULL, 1)[:-1])
+
+
+def test_sync_of_a_newer_layout() -> None:
+    raw = bytearray(encode_slot(FULL, 1)[:CRC_OFFSET])
+    raw[62] = 4
+    with pytest.raises(ValueError, match="sync 4"):
+        decode_slot(bytes(raw) + zlib.crc32(raw).to_bytes(4, "little"), "imu0")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "stored"),
+    [
+        ("t_err_ns", 1 << 32, 0xFFFF_FFFF),  # 4.3 s: "at least this bad" is the truth
+        ("t_err_ns", -1, 0),
+        ("status", 0x1_8000_0001, 0x8000_0001),
+        ("status", -1, 0xFFFF_FFFF),
+        ("pps_age_ms", 1 << 32, 0xFFFF_FFFF),
+        ("pps_age_ms", -5, 0),
+        ("edge_seq", -1, 0),
+        ("t_dev_ns", 1 << 63, (1 << 63) - 1),
+        ("t_dev_ns", -(1 << 63) - 1, -(1 << 63)),
+        ("t_ns", 1 << 63, (1 << 63) - 1),
+        ("t_rx_ns", 1 << 63, (1 << 63) - 1),
+        ("utc_ns", 1 << 63, (1 << 63) - 1),
+    ],
+)
+def test_values_that_do_not_fit_are_clipped_or_cut(field: str, value: int, stored: int) -> None:
+    expected = msgspec.structs.replace(FULL, **{field: stored})
+    assert decode_slot(encode_slot(msgspec.structs.replace(FULL, **{field: value}), 1), "imu0") == expected
+
+
+def test_device_id_that_does_not_fit() -> None:
+    assert encode_slot(FULL, 0x1_0002) == encode_slot(FULL, 2)
+
+
+def test_negative_device_time_is_kept() -> None:
+    assert decode_slot(encode_slot(msgspec.structs.replace(BARE, t_dev_ns=-5), 0), "imu0").t_dev_ns == -5
+
+
+_INTEGERS = st.integers(-(1 << 70), 1 << 70)
+_FLOATS = st.floats(allow_nan=False)
+
+
+@given(st.fixed_dictionaries(dict.fromkeys(("t_ns", "t_err_ns", "t_rx_ns", "utc_ns", *INTEGERS), _INTEGERS)),
+       st.tuples(_FLOATS, _FLOATS, _FLOATS))  # fmt: skip
+def test_no_sample_can_stop_the_daemon(values: dict[str, int], accel: tuple[float, float, float]) -> None:
+    sample = msgspec.structs.replace(BARE, accel_m_s2=accel, **values)
+    decoded = decode_slot(encode_slot(sample, 3), "imu0")
+    assert decoded.accel_m_s2 == accel
+    assert all(getattr(decoded, name) is not None for name in INTEGERS)

@@ -1,0 +1,94 @@
+"""Frames that are sent again and again: the kernel's message, and the event loop's own timer."""
+
+import asyncio
+import struct
+
+import pytest
+
+from imud.errors import LinkError
+from imud.formats.can import RAW_FRAME, CyclicFrame, pack_frame
+from imud.links.can.cyclic import LoopSender, setup
+
+MS = 1_000_000
+SYNC = CyclicFrame(0x80, False, b"\7", 10 * MS)
+LIMIT_S = 10.0
+
+
+def test_the_message_to_the_broadcast_manager() -> None:
+    """`struct bcm_msg_head` of linux/can/bcm.h on a 64-bit machine: 56 bytes, then the frame."""
+    if struct.calcsize("P") != 8:
+        pytest.skip("laid out otherwise")
+    message = setup(CyclicFrame(0x18FEE9AA, True, b"\1\2", 1_002_500_000))
+    assert len(message) == 56 + RAW_FRAME.size
+    head = struct.unpack("=IIIIqqqqII", message[:56])
+    assert head == (1, 3, 0, 0, 0, 0, 1, 2500, 0x98FEE9AA, 1)
+    assert message[56:] == pack_frame(0x18FEE9AA, True, b"\1\2")
+
+
+class Clock:
+    """Time that goes on when the loop's timer fires, late by what `late_ns` says."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def run(sent_at: list[int], late_ns: list[int], frames: list[CyclicFrame], *, fail_after: int = 1 << 30) -> list[str]:
+    """Send until `late_ns` is used up; the errors that were told."""
+    clock, errors = Clock(), list[str]()
+
+    async def story() -> None:
+        loop, done = asyncio.get_running_loop(), asyncio.Event()
+
+        def write(data: bytes) -> None:
+            if len(sent_at) >= fail_after:
+                raise LinkError("full")
+            assert data == pack_frame(0x80, False, b"\7")
+            sent_at.append(clock.now_ns)
+
+        def fail(error: LinkError) -> None:
+            errors.append(str(error))
+            done.set()
+
+        def call_later(delay_s: float, callback: object, *arguments: object) -> asyncio.TimerHandle:
+            if not late_ns:
+                done.set()
+                return loop_call_later(LIMIT_S, lambda: None)
+            clock.now_ns += round(delay_s * 1e9) + late_ns.pop(0)
+            return loop_call_later(0, callback, *arguments)  # type: ignore[arg-type]  # as it was given
+
+        loop_call_later = loop.call_later
+        loop.call_later = call_later  # type: ignore[assignment]  # the test's own time
+        sender = LoopSender(write, fail, frames, clock)
+        await done.wait()
+        sender.close()
+        sender.close()
+
+    asyncio.run(story())
+    return errors
+
+
+def test_deadlines_are_absolute() -> None:
+    sent: list[int] = []
+    run(sent, [3 * MS, 0, 9 * MS, 0], [SYNC])
+    assert sent == [0, 13 * MS, 20 * MS, 39 * MS, 40 * MS]
+
+
+def test_periods_that_were_slept_through_are_left_out() -> None:
+    sent: list[int] = []
+    run(sent, [35 * MS, 0], [SYNC])
+    assert sent == [0, 45 * MS, 50 * MS]
+
+
+def test_a_timer_that_fires_early_waits_on() -> None:
+    sent: list[int] = []
+    run(sent, [-MS, 0, 0], [SYNC])
+    assert sent == [0, 10 * MS, 20 * MS]
+
+
+def test_a_link_that_does_not_send_any_more_ends_it() -> None:
+    sent: list[int] = []
+    assert run(sent, [0] * 5, [SYNC], fail_after=2) == ["full"]
+    assert sent == [0, 10 * MS]

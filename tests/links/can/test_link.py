@@ -1,0 +1,230 @@
+"""How a CAN link lets frames gather, on a socket of another family: the same reads, stamps and loop."""
+
+import asyncio
+import errno
+import os
+import socket
+import time
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+
+import pytest
+
+from imud.errors import LinkError, LinkMissing
+from imud.formats.can import CanFrame, pack_frame
+from imud.links.can import netlink
+from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
+from imud.links.can.link import SocketCanLink, SocketCanSettings
+
+LIMIT_S = 10.0
+COALESCE_MS = 40
+
+
+class Bus:
+    """A link whose socket is one of the loop device, what it delivered, and when it meant to look again."""
+
+    def __init__(self, receiver: socket.socket, sender: socket.socket, coalesce_ms: int) -> None:
+        self.link = SocketCanLink(SocketCanSettings(interface="lo", coalesce_ms=coalesce_ms))
+        self.batches: list[list[CanFrame]] = []
+        self.delivered_ns: list[int] = []
+        self.ends: list[LinkError | None] = []
+        self.delays_s: list[float] = []
+        """Of the timers that were set."""
+        self.looks = 0
+        """How often a timer of the link ended."""
+        self.by_timer: list[bool] = []
+        """Of each batch, whether it was read when a timer ended."""
+        self.then: Callable[[], None] = lambda: None
+        """Done once, right after the next delivery."""
+        self._receiver = receiver
+        self._sender = sender
+        self._news = asyncio.Event()
+        self._looking = False
+        self._failures: list[dict[str, object]] = []
+
+    def send(self, *can_ids: int) -> None:
+        for can_id in can_ids:
+            self._sender.send(pack_frame(can_id, False, b"\1"))
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        """Wait for deliveries until it holds."""
+
+        async def wait() -> None:
+            while not condition():
+                self._news.clear()
+                await self._news.wait()
+
+        await asyncio.wait_for(wait(), LIMIT_S)
+
+    def run(self, monkeypatch: pytest.MonkeyPatch, story: Callable[["Bus"], Coroutine[None, None, None]]) -> None:
+        """Open, tell the story, close."""
+        monkeypatch.setattr(self.link, "absence", lambda: "")
+        monkeypatch.setattr(self.link, "_bound", self._receiver.dup)
+        monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
+
+        async def play() -> None:
+            loop = asyncio.get_running_loop()
+            call_later = loop.call_later
+
+            def noted(delay_s: float, call: Callable[..., object], *arguments: object) -> asyncio.TimerHandle:
+                if getattr(call, "__self__", None) is not self.link:
+                    return call_later(delay_s, call, *arguments)
+                self.delays_s.append(delay_s)
+                return call_later(delay_s, self._look, call)
+
+            loop.set_exception_handler(lambda _loop, context: self._failures.append(context))
+            monkeypatch.setattr(loop, "call_later", noted)
+            self.link.open()
+            self.link.start(self._take, lambda news, problem: None, self.ends.append)
+            await story(self)
+            self.link.close()
+
+        asyncio.run(play())
+        assert self._failures == []
+
+    def _look(self, call: Callable[[], object]) -> None:
+        self._looking = True
+        call()
+        self._looking = False
+        self.looks += 1
+        self._news.set()
+
+    def _take(self, frames: Sequence[CanFrame]) -> None:
+        self.delivered_ns.append(time.monotonic_ns())
+        self.batches.append(list(frames))
+        self.by_timer.append(self._looking)
+        then, self.then = self.then, lambda: None
+        then()
+        self._news.set()
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Two ends of a datagram path whose frames are stamped by the kernel, from the first one on."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setblocking(False)
+        sender.connect(receiver.getsockname())
+        reader = FrameReader(receiver, lambda classes, data: False)
+        end = time.monotonic() + LIMIT_S
+        stamped = False
+        while not stamped:  # the kernel begins to stamp some ms after the first socket asked for it
+            assert time.monotonic() < end, "no kernel stamps"
+            sender.send(pack_frame(0, False, b""))
+            sent_ns = time.monotonic_ns()
+            time.sleep(0.002)
+            stamped = any(frame.t_rx_ns < sent_ns + 1_000_000 for frame in reader.read())
+        yield receiver, sender
+
+
+def test_frames_gather_and_keep_their_time(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first is read at once; those that come next are read together, when the time is over."""
+    sent_ns: list[int] = []
+
+    async def story(bus: Bus) -> None:
+        def more() -> None:
+            bus.send(2, 3, 4)
+            sent_ns.append(time.monotonic_ns())
+
+        bus.then = more
+        bus.send(1)
+        await bus.until(lambda: len(bus.batches) == 2)
+
+    bus = Bus(*ends, COALESCE_MS)
+    bus.run(monkeypatch, story)
+    assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2, 3, 4]]
+    assert bus.delays_s == [COALESCE_MS / 1000] * 2
+    assert bus.delivered_ns[1] - bus.delivered_ns[0] > 0.9 * COALESCE_MS * 1e6
+    assert all(frame.t_rx_ns <= sent_ns[0] + 200_000 for frame in bus.batches[1])
+
+
+def test_what_is_more_than_a_batch_is_read_at_once(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story(bus: Bus) -> None:
+        bus.then = lambda: bus.send(*range(2 * BATCH_FRAMES + 5))
+        bus.send(0x700)
+        await bus.until(lambda: len(bus.batches) == 4)
+
+    bus = Bus(*ends, COALESCE_MS)
+    bus.run(monkeypatch, story)
+    assert [len(batch) for batch in bus.batches] == [1, BATCH_FRAMES, BATCH_FRAMES, 5]
+    assert bus.delays_s == [COALESCE_MS / 1000, 0, 0, COALESCE_MS / 1000]
+
+
+def test_a_bus_that_fell_silent_is_watched_again(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story(bus: Bus) -> None:
+        for number in range(1, 4):
+            bus.then = lambda: bus.send(0x100)
+            bus.send(number)
+            await bus.until(lambda: bus.looks == 2 * number)  # noqa: B023 - called before the number changes
+            assert len(bus.delays_s) == 2 * number  # no timer runs while nothing comes
+
+    bus = Bus(*ends, 1)
+    bus.run(monkeypatch, story)
+    assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [0x100], [2], [0x100], [3], [0x100]]
+    assert bus.by_timer == [False, True] * 3
+
+
+def test_without_it_every_frame_is_read_as_it_comes(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story(bus: Bus) -> None:
+        for number in range(3):
+            bus.send(number)
+            await bus.until(lambda: len(bus.batches) == number + 1)  # noqa: B023 - as above
+
+    bus = Bus(*ends, 0)
+    bus.run(monkeypatch, story)
+    assert [len(batch) for batch in bus.batches] == [1, 1, 1]
+    assert bus.delays_s == []
+
+
+@pytest.mark.parametrize("at", ["delivery", "pause"])
+def test_closed_while_frames_gather(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    """By the one who takes the frames, or later: nothing is delivered any more, and no timer is left."""
+
+    async def story(bus: Bus) -> None:
+        if at == "delivery":
+            bus.then = bus.link.close
+        bus.send(1)
+        await bus.until(lambda: bus.batches)
+        bus.send(2)
+        bus.link.close()
+        await asyncio.sleep(0.005)
+
+    bus = Bus(*ends, 1)
+    bus.run(monkeypatch, story)
+    assert [frame.can_id for batch in bus.batches for frame in batch] == [1]
+    assert bus.looks == 0
+    assert len(bus.delays_s) == (at == "pause")
+
+
+def test_a_bus_that_ends_in_the_pause_says_so_once(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def down() -> list[CanFrame]:
+        raise OSError(errno.ENETDOWN, os.strerror(errno.ENETDOWN))
+
+    async def story(bus: Bus) -> None:
+        bus.send(1)
+        await bus.until(lambda: bus.batches)
+        monkeypatch.setattr(bus.link._reader, "read", down)
+        bus.send(2)  # it must not be watched any more
+        await bus.until(lambda: bus.ends)
+        await asyncio.sleep(0.005)
+
+    bus = Bus(*ends, 1)
+    bus.run(monkeypatch, story)
+    (ended,) = bus.ends
+    assert isinstance(ended, LinkMissing)
+    assert bus.looks == 1
+    assert len(bus.delays_s) == 1

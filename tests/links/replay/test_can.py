@@ -1,0 +1,101 @@
+"""A candump log as a bus."""
+
+import asyncio
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from time import monotonic_ns
+
+import msgspec
+import pytest
+
+from imud.contracts.link import CanLink
+from imud.errors import LinkError, LinkMissing
+from imud.formats.can import CanFilter, CanFrame
+from imud.formats.candump import candump_line
+from imud.links import LINKS
+
+MS = 1_000_000
+BEGIN_NS = 1_763_717_507_000 * MS
+LIMIT_S = 5.0
+
+
+def write(path: Path, count: int, step_ms: int = 10) -> Path:
+    lines = [
+        candump_line(CanFrame(100 + n % 3, False, bytes([n % 256]), BEGIN_NS + n * step_ms * MS)) for n in range(count)
+    ]
+    path.write_text("".join(lines))
+    return path
+
+
+def make(path: Path, **keys: object) -> CanLink:
+    row = LINKS["replay"]
+    link = row.make_can(msgspec.convert({"path": str(path), **keys}, row.settings))
+    link.filters = [CanFilter(101, 0x7FF, False), CanFilter(102, 0x7FF, False)]
+    return link
+
+
+def play(link: CanLink, enough: int = 1 << 30) -> tuple[list[CanFrame], list[LinkError | None]]:
+    """Everything the link delivers until it ends, or has delivered enough."""
+
+    async def story() -> tuple[list[CanFrame], list[LinkError | None]]:
+        frames: list[CanFrame] = []
+        ends: list[LinkError | None] = []
+        done = asyncio.Event()
+
+        def take(some: Sequence[CanFrame]) -> None:
+            frames.extend(some)
+            if len(frames) >= enough:
+                link.close()
+                done.set()
+
+        def end(error: LinkError | None) -> None:
+            ends.append(error)
+            done.set()
+
+        await link.wait_present()
+        link.open()
+        link.start(take, lambda news, problem: None, end)
+        await asyncio.wait_for(done.wait(), LIMIT_S)
+        link.close()
+        return frames, ends
+
+    return asyncio.run(story())
+
+
+def test_maximum_speed_ends_now_and_keeps_the_recorded_steps(tmp_path: Path) -> None:
+    begun_ns = monotonic_ns()
+    frames, ends = play(make(write(tmp_path / "a.log", 1600), speed="maximum"))
+    assert ends == [None]
+    assert len(frames) == sum(n % 3 != 0 for n in range(1600))
+    assert {frame.can_id for frame in frames} == {101, 102}
+    assert frames[1].t_rx_ns - frames[0].t_rx_ns == 10 * MS
+    assert begun_ns - 10 * MS <= frames[-1].t_rx_ns <= monotonic_ns()
+
+
+def test_recorded_speed_takes_its_time(tmp_path: Path) -> None:
+    begun_ns = monotonic_ns()
+    frames, _ = play(make(write(tmp_path / "a.log", 9, step_ms=5)))
+    assert monotonic_ns() - begun_ns >= 40 * MS
+    assert [b.t_rx_ns - a.t_rx_ns for a, b in itertools.pairwise(frames)] == [5 * MS, 10 * MS] * 2 + [5 * MS]
+
+
+def test_it_can_repeat_and_be_closed_by_the_receiver(tmp_path: Path) -> None:
+    frames, ends = play(make(write(tmp_path / "a.log", 3, step_ms=1), repeat=True), enough=7)
+    assert [frame.can_id for frame in frames[:6]] == [101, 102] * 3
+    assert ends == []
+    times = [frame.t_rx_ns for frame in frames]
+    assert times == sorted(times)
+
+
+def test_what_cannot_be_played(tmp_path: Path) -> None:
+    bad = tmp_path / "bad"
+    bad.write_bytes(b"Z\xa5 no log\n")
+    with pytest.raises(LinkError, match="is no CAN log"):
+        make(bad).open()
+    missing = make(tmp_path / "missing")
+    assert "not there" in missing.absence()
+    with pytest.raises(LinkMissing):
+        missing.open()
+    with pytest.raises(LinkError, match="replay"):
+        missing.write(b"")

@@ -1,0 +1,228 @@
+"""Captures played through the link."""
+
+import asyncio
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from imud.contracts.link import StreamLink
+from imud.errors import LinkDenied, LinkError, LinkMissing
+from imud.formats.capture import CaptureWriter
+from imud.links import LINKS
+from imud.links.replay.file import ReplaySettings
+from imud.links.replay.link import PIECE_BYTES_MAX, PIECE_NS, ReplayLink
+from imud.units import NS_PER_MS, uart_byte_ns
+
+LIMIT_S = 5.0
+READS = [(b"a" * 82, 1_000_000_000), (b"b" * 41, 1_004_000_000), (b"c", 1_004_000_000), (b"d" * 82, 1_030_000_000)]
+
+
+@pytest.fixture
+def stamped(tmp_path: Path) -> Path:
+    path = tmp_path / "stamped"
+    with path.open("wb") as file:
+        writer = CaptureWriter(file, driver="hipnuc-uart", baud=115200, details={"hold_ns": 16_000_000})
+        for data, t_ns in READS:
+            writer.write(data, t_ns)
+    return path
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    path = tmp_path / "raw"
+    path.write_bytes(bytes(range(256)) * 2)
+    return path
+
+
+class Played:
+    """What came, and when it really did."""
+
+    def __init__(self) -> None:
+        self.chunks: list[tuple[bytes, int]] = []
+        self.real_ns: list[int] = []
+        self.started_ns = 0
+        self.ends: list[LinkError | None] = []
+
+    @property
+    def data(self) -> bytes:
+        return b"".join(data for data, _ in self.chunks)
+
+    @property
+    def offsets_ns(self) -> list[int]:
+        return [t_rx_ns - self.chunks[0][1] for _, t_rx_ns in self.chunks]
+
+
+def play(link: ReplayLink, pieces_max: int = 1 << 30) -> Played:
+    """Play to the end, or until so many pieces came."""
+
+    async def scene() -> Played:
+        played, done = Played(), asyncio.Event()
+
+        def on_data(data: bytes, t_rx_ns: int) -> None:
+            played.chunks.append((data, t_rx_ns))
+            played.real_ns.append(time.monotonic_ns())
+            if len(played.chunks) >= pieces_max:
+                link.close()
+                done.set()
+
+        def on_end(error: LinkError | None) -> None:
+            played.ends.append(error)
+            done.set()
+
+        await link.wait_present()
+        link.open()
+        played.started_ns = time.monotonic_ns()
+        link.start(on_data, on_end)
+        await asyncio.wait_for(done.wait(), LIMIT_S)
+        link.close()
+        return played
+
+    return asyncio.run(scene())
+
+
+def check_times(played: Played) -> None:
+    """True of every speed: never in the future, never back."""
+    times = [t_rx_ns for _, t_rx_ns in played.chunks]
+    assert times == sorted(times)
+    assert all(t_rx_ns <= real_ns for t_rx_ns, real_ns in zip(times, played.real_ns, strict=True))
+
+
+def test_recorded_speed_keeps_the_recorded_jitter(stamped: Path) -> None:
+    link = ReplayLink(ReplaySettings(path=str(stamped)))
+    played = play(link)
+    assert [data for data, _ in played.chunks] == [data for data, _ in READS]
+    assert played.offsets_ns == [t_ns - READS[0][1] for _, t_ns in READS]
+    assert played.real_ns[-1] - played.real_ns[0] >= 29 * NS_PER_MS
+    assert played.ends == [None]
+    assert (link.baud, link.hold_ns, link.writable) == (115200, 16_000_000, False)
+    check_times(played)
+
+
+def test_real_speed_is_the_wire_s(raw: Path) -> None:
+    link = ReplayLink(ReplaySettings(path=str(raw), speed="real", baud=115200))
+    played = play(link)
+    assert played.data == raw.read_bytes()
+    byte_ns = uart_byte_ns(115200)
+    assert max(len(data) for data, _ in played.chunks) == PIECE_NS // byte_ns
+    whole_ns = played.chunks[-1][1] - played.chunks[0][1] + len(played.chunks[0][0]) * byte_ns
+    assert whole_ns == len(played.data) * byte_ns
+    assert played.real_ns[-1] - played.started_ns >= whole_ns
+    assert link.hold_ns == PIECE_NS
+    check_times(played)
+
+
+def test_real_speed_of_a_stamped_capture_takes_its_rate(stamped: Path) -> None:
+    played = play(ReplayLink(ReplaySettings(path=str(stamped), speed="real")))
+    assert played.data == b"".join(data for data, _ in READS)
+    assert len(played.chunks) > len(READS)
+
+
+def test_maximum_speed_ends_at_the_start_in_virtual_time(stamped: Path) -> None:
+    played = play(ReplayLink(ReplaySettings(path=str(stamped), speed="maximum")))
+    assert played.offsets_ns == [t_ns - READS[0][1] for _, t_ns in READS]
+    assert played.real_ns[-1] - played.real_ns[0] < 20 * NS_PER_MS
+    assert 0 <= played.chunks[-1][1] - played.started_ns < 20 * NS_PER_MS
+    check_times(played)
+
+
+def test_maximum_speed_of_a_raw_capture_is_wire_time_or_one_instant(tmp_path: Path) -> None:
+    path = tmp_path / "long"
+    path.write_bytes(bytes(3 * PIECE_BYTES_MAX + 5))
+    played = play(ReplayLink(ReplaySettings(path=str(path), speed="maximum", baud=921600)))
+    assert len(played.data) == 3 * PIECE_BYTES_MAX + 5
+    byte_ns = uart_byte_ns(921600)
+    sizes = [len(data) for data, _ in played.chunks]
+    assert [b - a for a, b in pairwise(played.offsets_ns)] == [size * byte_ns for size in sizes[1:]]
+    check_times(played)
+    assert set(play(ReplayLink(ReplaySettings(path=str(path), speed="maximum"))).offsets_ns) == {0}
+
+
+def test_others_get_their_turn_at_maximum_speed(tmp_path: Path) -> None:
+    path = tmp_path / "long"
+    path.write_bytes(bytes(1 << 20))
+    link = ReplayLink(ReplaySettings(path=str(path), speed="maximum"))
+
+    async def scene() -> list[str]:
+        order: list[str] = []
+        done = asyncio.Event()
+        link.open()
+        link.start(lambda data, t_rx_ns: order.append("data"), lambda error: done.set())
+        while not done.is_set():
+            order.append("other")
+            await asyncio.sleep(0)
+        return order
+
+    order = asyncio.run(scene())
+    assert order.count("other") > order.count("data") / 16
+    assert order.count("data") == (1 << 20) // 4096
+
+
+def test_repeating_goes_on_in_time(stamped: Path) -> None:
+    played = play(ReplayLink(ReplaySettings(path=str(stamped), repeat=True)), pieces_max=2 * len(READS))
+    assert played.data == 2 * b"".join(data for data, _ in READS)
+    assert played.offsets_ns[len(READS)] > played.offsets_ns[len(READS) - 1]
+    assert played.ends == []
+    check_times(played)
+
+
+def test_an_empty_capture_ends_even_when_repeated(tmp_path: Path) -> None:
+    path = tmp_path / "empty"
+    with path.open("wb") as file:
+        CaptureWriter(file, driver="x")
+    assert play(ReplayLink(ReplaySettings(path=str(path), repeat=True))).ends == [None]
+
+
+def test_a_cut_capture_plays_what_is_whole_and_warns(stamped: Path, caplog: pytest.LogCaptureFixture) -> None:
+    stamped.write_bytes(stamped.read_bytes()[:-1])
+    played = play(ReplayLink(ReplaySettings(path=str(stamped), speed="maximum")))
+    assert played.data == b"".join(data for data, _ in READS[:-1])
+    assert played.ends == [None]
+    assert "cut short" in caplog.text
+
+
+def test_playing_again_starts_at_the_beginning(stamped: Path) -> None:
+    link = ReplayLink(ReplaySettings(path=str(stamped), speed="maximum"))
+    assert play(link).data == play(link).data
+
+
+def test_captures_that_do_not_fit_the_speed(raw: Path) -> None:
+    with pytest.raises(LinkError, match="raw capture without times"):
+        ReplayLink(ReplaySettings(path=str(raw))).open()
+    with pytest.raises(LinkError, match="needs `baud`"):
+        ReplayLink(ReplaySettings(path=str(raw), speed="real")).open()
+    raw.write_bytes(b"#imud-capture 9\n")
+    with pytest.raises(LinkError, match="version '9'"):
+        ReplayLink(ReplaySettings(path=str(raw))).open()
+
+
+def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(LinkMissing, match="expected a capture file"):
+        ReplayLink(ReplaySettings(path=str(tmp_path / "none"))).open()
+    with pytest.raises(LinkError, match="not a regular file"):
+        ReplayLink(ReplaySettings(path=str(tmp_path))).open()
+
+    def refuse(path: str) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr("imud.links.replay.file.os.stat", refuse)
+    with pytest.raises(LinkDenied):
+        ReplayLink(ReplaySettings(path=str(tmp_path))).open()
+
+
+def test_nothing_can_be_sent(stamped: Path) -> None:
+    link = ReplayLink(ReplaySettings(path=str(stamped)))
+    with pytest.raises(LinkError, match="nothing can be sent"):
+        link.write(b"x")
+    with pytest.raises(LinkError, match="cannot be changed"):
+        link.set_baud(9600)
+
+
+def test_the_row_and_its_settings() -> None:
+    row = LINKS["replay"]
+    link: StreamLink = row.make(msgspec.convert({"path": "a", "speed": "maximum"}, row.settings))
+    assert (link.title, link.auto_baud) == ("a", False)
+    with pytest.raises(msgspec.ValidationError, match="repeat needs speed"):
+        msgspec.convert({"path": "a", "speed": "maximum", "repeat": True}, row.settings)

@@ -1,0 +1,479 @@
+"""The serial link on real pseudo-terminals."""
+
+import asyncio
+import os
+import termios
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from imud.contracts.link import StreamLink
+from imud.contracts.status import KernelCounters
+from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
+from imud.links import LINKS
+from imud.links.uart.link import FULL_READ_BYTES, WRITE_QUEUE_BYTES, UartLink, UartSettings
+from imud.links.uart.port_setup import baud_of
+from imud.units import NS_PER_MS
+from tests.support.pty_port import PtyPort, unprivileged, waiting_bytes
+
+LIMIT_S = 5.0
+
+
+@pytest.fixture
+def pty() -> Iterator[PtyPort]:
+    port = PtyPort()
+    yield port
+    port.unplug()
+
+
+class Receiver:
+    """Keeps what a link tells."""
+
+    def __init__(self) -> None:
+        self.chunks: list[tuple[bytes, int]] = []
+        self.ends: list[LinkError | None] = []
+        self.told = asyncio.Event()
+
+    @property
+    def data(self) -> bytes:
+        return b"".join(data for data, _ in self.chunks)
+
+    def on_data(self, data: bytes, t_rx_ns: int) -> None:
+        self.chunks.append((data, t_rx_ns))
+        self.told.set()
+
+    def on_end(self, error: LinkError | None) -> None:
+        self.ends.append(error)
+        self.told.set()
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(LIMIT_S):
+            while not condition():
+                self.told.clear()
+                await self.told.wait()
+
+
+def play(link: UartLink, scene: Callable[[Receiver], Awaitable[None]]) -> Receiver:
+    """Run a scene on an open, started link."""
+
+    async def whole() -> Receiver:
+        receiver = Receiver()
+        link.open()
+        try:
+            link.start(receiver.on_data, receiver.on_end)
+            await scene(receiver)
+        finally:
+            link.close()
+        return receiver
+
+    return asyncio.run(whole())
+
+
+def descriptors() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_bytes_come_as_they_are_with_their_time(pty: PtyPort) -> None:
+    everything = bytes(range(256))
+
+    async def scene(receiver: Receiver) -> None:
+        pty.send(everything)
+        await receiver.until(lambda: len(receiver.data) == 256)
+
+    before_ns = time.monotonic_ns()
+    receiver = play(UartLink(UartSettings(port=pty.path, baud=115200)), scene)
+    assert receiver.data == everything
+    assert all(before_ns < t_rx_ns <= time.monotonic_ns() for _, t_rx_ns in receiver.chunks)
+    assert receiver.ends == []
+
+
+def test_bytes_are_sent_as_they_are(pty: PtyPort) -> None:
+    everything = bytes(range(256))
+    link = UartLink(UartSettings(port=pty.path))
+    link.open()
+    link.write(everything)
+    assert pty.received() == everything
+    link.close()
+
+
+def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort) -> None:
+    link = UartLink(UartSettings(port=pty.path))
+    blocks = [bytes([number % 251]) * 1000 for number in range(200)]
+    accepted = 0
+
+    async def scene(receiver: Receiver) -> None:
+        nonlocal accepted
+        refused = ""
+        for block in blocks:
+            try:
+                link.write(block)
+            except LinkError as error:
+                refused = str(error)
+                break
+            accepted += 1
+        assert "bytes wait" in refused
+        received = b""
+        drained = asyncio.Event()
+
+        def take() -> None:
+            nonlocal received
+            received += pty.received()
+            if len(received) >= accepted * 1000:
+                drained.set()
+
+        asyncio.get_running_loop().add_reader(pty.master, take)
+        await asyncio.wait_for(drained.wait(), LIMIT_S)
+        asyncio.get_running_loop().remove_reader(pty.master)
+        assert received == b"".join(blocks[:accepted])
+
+    play(link, scene)
+    assert accepted * 1000 > WRITE_QUEUE_BYTES
+
+
+def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
+    async def scene(receiver: Receiver) -> None:
+        sent = 0
+        while not link._unsent:
+            link.write(bytes(1000))
+            sent += 1000
+        received = b""
+        while len(received) < 2000:  # room again
+            received += pty.received()
+        link.write(b"last")
+        everything = asyncio.Event()
+
+        def take() -> None:
+            nonlocal received
+            received += pty.received()
+            if len(received) >= sent + 4:
+                everything.set()
+
+        asyncio.get_running_loop().add_reader(pty.master, take)
+        await asyncio.wait_for(everything.wait(), LIMIT_S)
+        asyncio.get_running_loop().remove_reader(pty.master)
+        assert received == bytes(sent) + b"last"
+
+    link = UartLink(UartSettings(port=pty.path))
+    play(link, scene)
+
+
+def test_unplugging_ends_the_link_once(pty: PtyPort) -> None:
+    async def scene(receiver: Receiver) -> None:
+        pty.unplug()
+        await receiver.until(lambda: bool(receiver.ends))
+        for _ in range(20):
+            await asyncio.sleep(0)
+
+    link = UartLink(UartSettings(port=pty.path))
+    receiver = play(link, scene)
+    assert len(receiver.ends) == 1
+    assert isinstance(receiver.ends[0], LinkMissing)
+    assert pty.path in str(receiver.ends[0])
+
+
+def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
+    async def scene(receiver: Receiver) -> None:
+        link._read()
+
+    link = UartLink(UartSettings(port=pty.path))
+    assert play(link, scene).ends == []
+
+
+def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
+    before = descriptors()
+    link = UartLink(UartSettings(port=pty.path))
+    for _ in range(3):
+        link.open()
+        link.close()
+        link.close()
+    assert descriptors() == before
+
+
+def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
+    link = UartLink(UartSettings(port=pty.path, coalesce_ms=1))
+
+    async def scene(receiver: Receiver) -> None:
+        got = asyncio.Event()
+
+        def on_data(data: bytes, t_rx_ns: int) -> None:
+            link.close()
+            got.set()
+
+        link.start(on_data, receiver.on_end)
+        pty.send(b"x")
+        await asyncio.wait_for(got.wait(), LIMIT_S)
+        assert link._timer is None
+
+    assert play(link, scene).ends == []
+
+
+def test_the_port_is_raw_8n1_at_the_rate(pty: PtyPort) -> None:
+    tty_settings = termios.tcgetattr(pty._slave)
+    tty_settings[0] |= termios.BRKINT | termios.IXON | termios.ICRNL | termios.ISTRIP
+    tty_settings[2] |= termios.HUPCL
+    tty_settings[3] |= termios.ICANON | termios.ECHO | termios.ISIG
+    termios.tcsetattr(pty._slave, termios.TCSANOW, tty_settings)
+    link = UartLink(UartSettings(port=pty.path, baud=921600))
+    link.open()
+    iflag, oflag, cflag, lflag, _, _, characters = termios.tcgetattr(pty._slave)
+    link.close()
+    assert not iflag & (termios.BRKINT | termios.IGNBRK | termios.IXON | termios.ICRNL | termios.ISTRIP | termios.INPCK)
+    assert not oflag & termios.OPOST
+    assert cflag & termios.CSIZE == termios.CS8
+    assert not cflag & (termios.CSTOPB | termios.PARENB | termios.HUPCL | termios.CRTSCTS)
+    assert not lflag & (termios.ICANON | termios.ECHO | termios.ISIG)
+    assert characters[termios.VMIN] in (1, b"\x01")
+
+
+@pytest.mark.parametrize("baud", [9600, 115200, 256000, 460800, 921600, 250_001])
+def test_every_rate_is_set_when_opening_and_later(pty: PtyPort, baud: int) -> None:
+    link = UartLink(UartSettings(port=pty.path, baud=baud))
+    link.open()
+    assert baud_of(pty._slave) == baud
+    link.set_baud(57600)
+    assert baud_of(pty._slave) == link.baud == 57600
+    link.set_baud(baud)
+    assert baud_of(pty._slave) == link.baud == baud
+    link.close()
+
+
+def test_a_change_of_rate_throws_old_bytes_away(pty: PtyPort) -> None:
+    link = UartLink(UartSettings(port=pty.path, baud=115200))
+    link.open()
+    pty.send(b"old bytes")
+    deadline_s = time.monotonic() + LIMIT_S
+    while waiting_bytes(pty._slave) < 9:  # the pty hands over in the kernel's own time
+        assert time.monotonic() < deadline_s
+    link.set_baud(9600)
+    assert waiting_bytes(pty._slave) == 0
+    link.close()
+
+
+def test_a_rate_that_the_driver_changes_is_refused(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = UartLink(UartSettings(port=pty.path, baud=115200))
+    link.open()
+    monkeypatch.setattr("imud.links.uart.port_setup.baud_of", lambda fd: 115200)
+    with pytest.raises(LinkError, match="cannot do 256000 baud: asked for it, its driver set 115200"):
+        link.set_baud(256000)
+    assert link.baud == 115200
+    link.close()
+    before = descriptors()
+    with pytest.raises(LinkError, match="cannot do 230400") as caught:
+        UartLink(UartSettings(port=pty.path, baud=230400)).open()
+    assert descriptors() == before
+    assert caught.value.__cause__ is None
+
+
+def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort) -> None:
+    first, second = (UartLink(UartSettings(port=pty.path)) for _ in range(2))
+    first.open()
+    with pytest.raises(LinkBusy, match=rf"\(pid {os.getpid()}\)"):
+        second.open()
+    first.close()
+    second.open()
+    second.close()
+
+
+def test_programs_that_do_not_lock_are_refused_too(pty: PtyPort) -> None:
+    os.chmod(pty.path, 0o666)
+    link = UartLink(UartSettings(port=pty.path))
+    link.open()
+    with unprivileged(), pytest.raises(OSError, match="busy"):
+        os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
+    link.close()
+
+
+def test_a_missing_port() -> None:
+    with pytest.raises(LinkMissing, match="/dev/no-such-port is not there"):
+        UartLink(UartSettings(port="/dev/no-such-port")).open()
+
+
+def test_a_port_of_others(pty: PtyPort) -> None:
+    os.chmod(pty.path, 0)
+    link = UartLink(UartSettings(port=pty.path))
+    with unprivileged(), pytest.raises(LinkDenied, match=r"user \w+: it belongs to group \w+; `sudo usermod -aG"):
+        link.open()
+
+
+def test_a_file_is_no_port(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.touch()
+    with pytest.raises(LinkError, match="is not a serial port"):
+        UartLink(UartSettings(port=str(path))).open()
+
+
+def test_a_port_that_is_unplugged_and_comes_back_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "by-id" / "usb-imu"
+    path.parent.mkdir()
+    first, second = PtyPort(), PtyPort()
+    path.symlink_to(first.path)
+    link = UartLink(UartSettings(port=str(path)))
+
+    async def life(port: PtyPort) -> float:
+        """Seconds until the first byte."""
+        started_s = asyncio.get_running_loop().time()
+        receiver = Receiver()
+        await asyncio.wait_for(link.wait_present(), LIMIT_S)
+        link.open()
+        link.start(receiver.on_data, receiver.on_end)
+        port.send(b"hello")
+        await receiver.until(lambda: receiver.data == b"hello")
+        took_s = asyncio.get_running_loop().time() - started_s
+        path.unlink()
+        port.unplug()
+        await receiver.until(lambda: bool(receiver.ends))
+        link.close()
+        return took_s
+
+    async def scene() -> float:
+        await life(first)
+        waiting = asyncio.create_task(life(second))
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert not waiting.done()
+        path.symlink_to(second.path)
+        return await waiting
+
+    assert asyncio.run(scene()) < 0.5
+
+
+def test_after_a_refusal_access_is_waited_for(pty: PtyPort) -> None:
+    os.chmod(pty.path, 0)
+    link = UartLink(UartSettings(port=pty.path))
+
+    async def scene() -> float:
+        with unprivileged():
+            with pytest.raises(LinkDenied):
+                link.open()
+            waiting = asyncio.create_task(link.wait_present())
+            for _ in range(20):
+                await asyncio.sleep(0)
+            assert not waiting.done()
+            if os.getuid() == 0:
+                os.seteuid(0)
+            os.chmod(pty.path, 0o666)
+            if os.getuid() == 0:
+                os.seteuid(65534)
+            started_s = asyncio.get_running_loop().time()
+            await asyncio.wait_for(waiting, LIMIT_S)
+            link.open()
+            link.close()
+            return asyncio.get_running_loop().time() - started_s
+
+    assert asyncio.run(scene()) < 0.5
+
+
+def test_after_a_refusal_the_wait_ends_anyway(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.links.uart.link.ACCESS_WAIT_S", 0.01)
+    os.chmod(pty.path, 0)
+    link = UartLink(UartSettings(port=pty.path))
+    with unprivileged():
+        with pytest.raises(LinkDenied):
+            link.open()
+        asyncio.run(asyncio.wait_for(link.wait_present(), LIMIT_S))
+
+
+def test_coalescing_gathers_what_comes_in_the_meantime(pty: PtyPort) -> None:
+    hold_s = 0.03
+
+    async def scene(receiver: Receiver) -> None:
+        pty.send(b"a")
+        await receiver.until(lambda: receiver.data == b"a")
+        for byte in b"bcdef":
+            pty.send(bytes([byte]))
+            for _ in range(5):
+                await asyncio.sleep(0)
+        await receiver.until(lambda: len(receiver.data) >= 6)
+
+    link = UartLink(UartSettings(port=pty.path, coalesce_ms=30))
+    receiver = play(link, scene)
+    assert [data for data, _ in receiver.chunks] == [b"a", b"bcdef"]
+    (_, first_ns), (_, second_ns) = receiver.chunks
+    assert second_ns - first_ns >= hold_s * 0.99e9
+    assert link.hold_ns == 30 * NS_PER_MS
+
+
+def test_coalescing_goes_back_to_waiting_and_sees_the_end(pty: PtyPort) -> None:
+    async def scene(receiver: Receiver) -> None:
+        for round_ in range(3):
+            pty.send(b"x")
+            await receiver.until(lambda wanted=round_ + 1: len(receiver.data) == wanted)  # type: ignore[misc]  # bound now
+            while link._timer is not None:  # until it waits for the descriptor again
+                await asyncio.sleep(0.001)
+        pty.unplug()
+        await receiver.until(lambda: bool(receiver.ends))
+
+    link = UartLink(UartSettings(port=pty.path, coalesce_ms=2))
+    assert len(play(link, scene).ends) == 1
+
+
+def test_coalescing_keeps_up_with_more_than_one_read_gives(pty: PtyPort) -> None:
+    size = 3 * FULL_READ_BYTES
+
+    async def scene(receiver: Receiver) -> None:
+        for _ in range(4):
+            pty.send(bytes(FULL_READ_BYTES))
+            while len(receiver.data) < FULL_READ_BYTES:
+                await asyncio.sleep(0)
+        await receiver.until(lambda: len(receiver.data) >= size)
+
+    link = UartLink(UartSettings(port=pty.path, coalesce_ms=100))
+    receiver = play(link, scene)
+    assert receiver.chunks[2][1] - receiver.chunks[0][1] < 90 * NS_PER_MS
+
+
+def test_the_latency_timer_is_lowered_and_what_remains_is_told(pty: PtyPort, tmp_path: Path) -> None:
+    timer = tmp_path / "class" / "tty" / os.path.basename(pty.path) / "device" / "latency_timer"
+    timer.parent.mkdir(parents=True)
+    for low_latency, left_ms in ((False, 16), (True, 1)):
+        timer.write_text("16\n")
+        link = UartLink(UartSettings(port=pty.path, low_latency=low_latency), sys=tmp_path)
+        link.open()
+        link.close()
+        assert link.hold_ns == left_ms * NS_PER_MS
+        assert int(timer.read_text()) == left_ms
+
+
+def test_a_pty_holds_nothing_back_and_counts_no_errors(pty: PtyPort) -> None:
+    link = UartLink(UartSettings(port=pty.path))
+    assert link.kernel_counters() == KernelCounters()
+    link.open()
+    assert link.hold_ns == 0
+    assert link.kernel_counters() == KernelCounters()
+    link.close()
+
+
+def test_a_closed_link_neither_writes_nor_sets_a_rate() -> None:
+    link = UartLink(UartSettings(port="/dev/null"))
+    with pytest.raises(LinkError, match="not open"):
+        link.write(b"x")
+    with pytest.raises(LinkError, match="not open"):
+        link.set_baud(9600)
+
+
+def test_the_row_and_its_settings() -> None:
+    row = LINKS["uart"]
+    settings = msgspec.convert({"port": "/dev/ttyUSB0", "baud": "auto"}, row.settings)
+    link: StreamLink = row.make(settings)
+    assert (link.title, link.auto_baud, link.baud, link.writable) == ("/dev/ttyUSB0", True, 115200, True)
+    assert not row.make(msgspec.convert({"port": "a", "baud": 9600}, row.settings)).auto_baud
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {},
+        {"port": ""},
+        {"port": "a", "baud": 0},
+        {"port": "a", "baud": "fast"},
+        {"port": "a", "coalesce_ms": 101},
+        {"port": "a", "coalesce_ms": -1},
+        {"port": "a", "speed": 9600},
+    ],
+)
+def test_wrong_settings_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert(wrong, UartSettings)

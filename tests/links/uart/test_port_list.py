@@ -1,0 +1,89 @@
+"""Listing ports, from made-up /dev and /sys trees."""
+
+from pathlib import Path
+
+import pytest
+
+from imud.links.uart.port_list import SerialPort, list_ports
+
+
+@pytest.fixture
+def dev(tmp_path: Path) -> Path:
+    path = tmp_path / "dev"
+    (path / "serial" / "by-id").mkdir(parents=True)
+    (path / "serial" / "by-path").mkdir()
+    return path
+
+
+@pytest.fixture
+def sys(tmp_path: Path) -> Path:
+    path = tmp_path / "sys"
+    (path / "class" / "tty").mkdir(parents=True)
+    return path
+
+
+def native(dev: Path, sys: Path, name: str, kind: str) -> None:
+    """A port of the 8250 or PL011 driver, with its `type`."""
+    (dev / name).touch()
+    (sys / "class" / "tty" / name).mkdir()
+    (sys / "class" / "tty" / name / "type").write_text(f"{kind}\n")
+
+
+def usb(dev: Path, sys: Path, name: str, **texts: str) -> None:
+    """A USB adapter as /sys shows it: the tty's device lies below the interface, which lies below the USB device."""
+    (dev / name).touch()
+    device = sys / "devices" / "usb1" / f"1-{name}"
+    port = device / "1.0" / name
+    port.mkdir(parents=True)
+    for key, text in texts.items():
+        (device / key).write_text(f"{text}\n")
+    (sys / "class" / "tty" / name).mkdir()
+    (sys / "class" / "tty" / name / "device").symlink_to(port)
+
+
+def test_an_adapter_is_listed_by_its_lasting_name(dev: Path, sys: Path) -> None:
+    usb(dev, sys, "ttyUSB0", manufacturer="FTDI", product="FT232R USB UART", serial="A1")
+    (dev / "serial" / "by-id" / "usb-FTDI").symlink_to("../../ttyUSB0")
+    (dev / "serial" / "by-path" / "pci-0").symlink_to("../../ttyUSB0")
+    assert list_ports(dev, sys) == [
+        SerialPort(f"{dev}/serial/by-id/usb-FTDI", f"{dev}/ttyUSB0", "FTDI FT232R USB UART A1"),
+    ]
+
+
+def test_without_by_id_the_path_and_then_the_node_is_the_name(dev: Path, sys: Path) -> None:
+    usb(dev, sys, "ttyUSB0", product="adapter")
+    usb(dev, sys, "ttyUSB1")
+    (dev / "serial" / "by-path" / "pci-0").symlink_to("../../ttyUSB0")
+    assert list_ports(dev, sys) == [
+        SerialPort(f"{dev}/serial/by-path/pci-0", f"{dev}/ttyUSB0", "adapter"),
+        SerialPort(f"{dev}/ttyUSB1", f"{dev}/ttyUSB1", ""),
+    ]
+
+
+def test_ports_without_hardware_and_other_terminals_are_left_out(dev: Path, sys: Path) -> None:
+    native(dev, sys, "ttyS0", "4")
+    native(dev, sys, "ttyS4", "0")
+    native(dev, sys, "ttyAMA0", "32")
+    for name in ("tty0", "tty63", "ttyprintk"):
+        native(dev, sys, name, "4")
+    assert [port.node for port in list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
+
+
+def test_a_port_whose_node_is_gone_is_left_out(dev: Path, sys: Path) -> None:
+    usb(dev, sys, "ttyUSB0")
+    (dev / "ttyUSB0").unlink()
+    assert list_ports(dev, sys) == []
+
+
+def test_the_order_is_the_natural_one(dev: Path, sys: Path) -> None:
+    for number in (10, 2, 1):
+        usb(dev, sys, f"ttyUSB{number}")
+    assert [port.node[-2:] for port in list_ports(dev, sys)] == ["B1", "B2", "10"]
+
+
+def test_a_machine_without_ports(tmp_path: Path) -> None:
+    assert list_ports(tmp_path / "dev", tmp_path / "sys") == []
+
+
+def test_this_machine_can_be_listed() -> None:
+    assert all(Path(port.node).exists() for port in list_ports())

@@ -1,0 +1,376 @@
+"""Metrics: every number is that of the status, in base units; documentation and alerts name what exists."""
+
+import re
+from collections.abc import Sequence
+
+import msgspec
+import pytest
+from prometheus_client.core import Metric
+from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
+from prometheus_client.parser import text_string_to_metric_families as parse_text
+
+import imud
+from imud.contracts.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState
+from imud.event import EventKind
+from imud.ledger import LEDGER_FIELDS
+from imud.publishers.metrics.clients import ClientTotals
+from imud.publishers.metrics.clock import TIME_FAMILIES
+from imud.publishers.metrics.lines import LINE_FAMILIES
+from imud.publishers.metrics.polling import POLLING_FAMILIES
+from imud.publishers.metrics.publisher import SAMPLES_PER_TURN, Renderer, Snapshot
+from imud.sample import Sync
+from imud.utc.rmc_feed import Refusal
+from tests.support.device_status import LINES, UTC, client, device, equipped
+from tests.support.paths import ROOT
+
+Key = tuple[str, frozenset[tuple[str, str]]]
+
+
+def values(metrics: Sequence[Metric]) -> dict[Key, float]:
+    """Every line by name and labels; a line that stands twice is an error."""
+    found: dict[Key, float] = {}
+    for metric in metrics:
+        for line in metric.samples:
+            key = (line.name, frozenset(line.labels.items()))
+            assert key not in found, key
+            found[key] = line.value
+    return found
+
+
+def rendered(snapshot: Snapshot) -> dict[Key, float]:
+    """The values of a snapshot after text and parser."""
+    body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
+    return values(list(parse_text(body)))
+
+
+def key(name: str, **labels: str) -> Key:
+    return name, frozenset(labels.items())
+
+
+DEVICES = (
+    device("front", 0),
+    device(
+        "rear", 1, state=DeviceState.MISSING, clock=ClockStatus(), temperature_c=None, status_bits=None,
+        expected_rate_hz=0.0, identity={},
+    ),
+)  # fmt: skip
+
+LEDGER_LINES = {
+    "bytes_in": ("imud_bytes_in_total", {}),
+    "bytes_in_good_frames": ("imud_bytes_total", {"fate": "good_frames"}),
+    "bytes_in_bad_frames": ("imud_bytes_total", {"fate": "bad_frames"}),
+    "bytes_skipped": ("imud_bytes_total", {"fate": "skipped"}),
+    "bytes_pending": ("imud_bytes_pending", {}),
+    "frames_good": ("imud_frames_good_total", {}),
+    "frames_in_samples": ("imud_frames_total", {"fate": "samples"}),
+    "frames_in_replies": ("imud_frames_total", {"fate": "replies"}),
+    "frames_ignored": ("imud_frames_total", {"fate": "ignored"}),
+    "frames_pending": ("imud_frames_pending", {}),
+    "frames_bad_crc": ("imud_frames_bad_total", {"reason": "crc"}),
+    "frames_bad_length": ("imud_frames_bad_total", {"reason": "length"}),
+    "frames_bad_content": ("imud_frames_bad_total", {"reason": "content"}),
+    "frames_not_finite": ("imud_frames_bad_total", {"reason": "not_finite"}),
+    "unknown_tags": ("imud_unknown_tags_total", {}),
+    "samples": ("imud_samples_total", {}),
+    "lost_gap_device": ("imud_samples_lost_total", {"cause": "gap_device"}),
+    "lost_crc": ("imud_samples_lost_total", {"cause": "crc"}),
+    "lost_overrun": ("imud_samples_lost_total", {"cause": "overrun"}),
+    "lost_queue": ("imud_samples_lost_total", {"cause": "queue"}),
+    "replies_late": ("imud_replies_stray_total", {"kind": "late"}),
+    "replies_unsolicited": ("imud_replies_stray_total", {"kind": "unsolicited"}),
+}
+
+
+def test_every_ledger_number_is_shown_as_it_is() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    assert set(LEDGER_LINES) == set(LEDGER_FIELDS)
+    for status in DEVICES:
+        for field, (name, labels) in LEDGER_LINES.items():
+            assert shown[key(name, device=status.name, **labels)] == status.ledger[field], field
+
+
+def test_ledger_closes_in_the_scrape_and_a_hole_shows() -> None:
+    ledger = dict(DEVICES[0].ledger)
+    ledger["bytes_in"] += 3
+    ledger["frames_in_replies"] += 2
+    shown = rendered(Snapshot((*DEVICES, device("leaky", 2, ledger=ledger))))
+    for name in ("front", "rear"):
+        assert shown[key("imud_ledger_unaccounted_bytes", device=name)] == 0
+        assert shown[key("imud_ledger_unaccounted_frames", device=name)] == 0
+    assert shown[key("imud_ledger_unaccounted_bytes", device="leaky")] == 3
+    assert shown[key("imud_ledger_unaccounted_frames", device="leaky")] == -2
+
+
+def test_values_in_base_units() -> None:
+    shown = rendered(Snapshot(DEVICES, heartbeat_age_ns=250_000_000))
+    front = {"device": "front"}
+    expected = {
+        "imud_clock_offset_seconds": 5.25,
+        "imud_clock_skew_ratio": -4e-05,
+        "imud_clock_residual_seconds": 3e-05,
+        "imud_clock_error_seconds": 4.5e-05,
+        "imud_clock_resets_total": 2,
+        "imud_sample_rate_hertz": 999.5,
+        "imud_sample_rate_expected_hertz": 1000.25,
+        "imud_temperature_celsius": 36.5,
+        "imud_status_bits": 4,
+        "imud_device_connects_total": 3,
+    }
+    for name, value in expected.items():
+        assert shown[key(name, **front)] == pytest.approx(value, rel=1e-12), name
+    kinds = {"overrun": 7, "framing": 8, "parity": 9, "break": 10}
+    for kind, count in kinds.items():
+        assert shown[key("imud_kernel_errors_total", kind=kind, **front)] == count
+    assert shown[key("imud_heartbeat_age_seconds")] == 0.25
+
+
+def test_absent_is_not_zero() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    for name in ("imud_temperature_celsius", "imud_status_bits", "imud_sample_rate_expected_hertz"):
+        assert key(name, device="front") in shown
+        assert key(name, device="rear") not in shown
+
+
+PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
+    ("imud_polls_total", ()): 1000,
+    ("imud_polls_late_total", ()): 20,
+    ("imud_polls_missed_total", ()): 3,
+    ("imud_polls_stale_total", ()): 4,
+    ("imud_transfers_failed_total", ()): 5,
+    ("imud_device_vanished_total", ()): 6,
+    ("imud_poll_delay_seconds_total", ()): 0.070000123,
+    ("imud_poll_delay_worst_seconds", ()): 0.008,
+    ("imud_serial_line_timeouts_total", ()): 11,
+    ("imud_serial_line_late_bytes_total", ()): 12,
+    ("imud_serial_line_strange_bytes_total", ()): 13,
+    ("imud_serial_line_echoes_total", ()): 14,
+    ("imud_clock_hold_seconds", ()): 0.016,
+    ("imud_clock_edges_total", ()): 4998,
+    ("imud_clock_edges_unpaired_total", ()): 9,
+    ("imud_clock_samples_unpaired_total", ()): 17,
+    ("imud_triggers_unanswered_total", ()): 21,
+    ("imud_clock_reference_error_seconds", ()): 0.00025,
+    ("imud_utc_problem", ()): 1,
+    ("imud_utc_sentences_total", ()): 100,
+    ("imud_utc_sentences_sent_total", ()): 90,
+    ("imud_utc_sentences_refused_total", (("cause", "stale"),)): 7,
+    ("imud_utc_sentences_refused_total", (("cause", "busy"),)): 3,
+    ("imud_pps_pulses_total", ()): 59,
+    ("imud_pps_pulses_ignored_total", ()): 1,
+    ("imud_chrony_samples_total", (("fate", "sent"),)): 40,
+    ("imud_chrony_samples_total", (("fate", "refused"),)): 19,
+    ("imud_line_problem", (("line", "sout"),)): 0,
+    ("imud_line_problem", (("line", "alarm"),)): 1,
+    ("imud_line_problem", (("line", "pps"),)): 0,
+    ("imud_line_problem", (("line", "sin"),)): 0,
+    ("imud_line_edges_total", (("line", "sout"),)): 5000,
+    ("imud_line_edges_total", (("line", "alarm"),)): 2,
+    ("imud_line_edges_total", (("line", "pps"),)): 60,
+    ("imud_line_edges_lost_total", (("line", "sout"),)): 7,
+    ("imud_line_edges_lost_total", (("line", "alarm"),)): 0,
+    ("imud_line_edges_lost_total", (("line", "pps"),)): 0,
+    ("imud_alarm_active", ()): 1,
+    ("imud_alarms_total", ()): 3,
+    ("imud_triggers_total", ()): 400,
+    ("imud_triggers_missed_total", ()): 8,
+    ("imud_trigger_delay_seconds_total", ()): 0.012000456,
+    ("imud_trigger_delay_worst_seconds", ()): 0.0009,
+}
+"""Every line of the parts that only some devices have."""
+
+
+def parts_of(name: str, shown: dict[Key, float]) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
+    """The lines of a device that are of such parts."""
+    names = {family.name for family in (*POLLING_FAMILIES, *TIME_FAMILIES, *LINE_FAMILIES)}
+    return {
+        (metric, tuple(pair for pair in labels if pair[0] != "device")): value
+        for (metric, labels), value in shown.items()
+        if metric in names and ("device", name) in labels
+    }
+
+
+def test_every_part_is_shown_in_base_units() -> None:
+    shown = parts_of("bow", rendered(Snapshot((*DEVICES, equipped("bow", 2)))))
+    assert shown.keys() == PARTS.keys()
+    for line, value in PARTS.items():
+        assert shown[line] == pytest.approx(value, rel=1e-12), line
+
+
+def test_parts_that_a_device_has_not_are_absent() -> None:
+    plain = device("plain", 2)
+    unsure = equipped(
+        "unsure", 3, polling=None, serial_line=None,
+        lines=msgspec.structs.replace(LINES, problems={}, edges={"sout": 1}, edges_lost={"sout": 0}, alarm=None,
+                                      sin=False),
+        utc=msgspec.structs.replace(UTC, source="", problem="", refused={}),
+    )  # fmt: skip
+    shown = rendered(Snapshot((plain, unsure)))
+    assert {metric for metric, _ in parts_of("plain", shown)} == {"imud_clock_hold_seconds"}
+    found = parts_of("unsure", shown)
+    assert {metric for metric, _ in found} == {
+        "imud_clock_hold_seconds", "imud_clock_edges_total", "imud_clock_edges_unpaired_total",
+        "imud_clock_samples_unpaired_total", "imud_clock_reference_error_seconds", "imud_utc_problem",
+        "imud_pps_pulses_total", "imud_pps_pulses_ignored_total", "imud_chrony_samples_total",
+        "imud_line_problem", "imud_line_edges_total", "imud_line_edges_lost_total",
+    }  # fmt: skip
+    assert found["imud_utc_problem", ()] == 0
+    assert found["imud_line_problem", (("line", "sout"),)] == 0
+    assert ("imud_line_problem", (("line", "sin"),)) not in found
+
+
+def test_a_problem_of_a_line_without_edges_is_shown() -> None:
+    lines = msgspec.structs.replace(LINES, problems={"reset": "in use", "sin": "in use"}, edges={"sout": 1})
+    found = parts_of("bow", rendered(Snapshot((equipped("bow", lines=lines),))))
+    problems = {labels[0][1]: value for (name, labels), value in found.items() if name == "imud_line_problem"}
+    assert problems == {"sout": 0, "sin": 1, "reset": 1}
+
+
+def test_every_number_of_the_parts_has_a_metric() -> None:
+    """A field that is added to a part and shown nowhere is noticed here: its change must change a scrape."""
+    means = {"late_mean_ns", "trigger_late_mean_ns"}  # sum over count
+    before = parts_of("bow", rendered(Snapshot((equipped("bow"),))))
+    for part in ("polling", "serial_line", "lines", "utc"):
+        status = equipped("bow")
+        value = getattr(status, part)
+        for field in msgspec.structs.fields(value):
+            if field.type is int and field.name not in means:
+                more = msgspec.structs.replace(value, **{field.name: getattr(value, field.name) + 1_000_000})
+                changed = parts_of("bow", rendered(Snapshot((equipped("bow", **{part: more}),))))
+                assert changed != before, f"{part}.{field.name}"
+
+
+def test_state_and_sync_are_one_hot() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
+        assert shown[key("imud_device_up", device=name)] == up
+        for other in DeviceState:
+            assert shown[key("imud_device_state", device=name, state=other.value)] == (other.value == state)
+    for sync in Sync:
+        assert shown[key("imud_clock_sync", device="front", sync=sync.value)] == (sync is Sync.REGRESSION)
+
+
+def test_latency_histogram_is_cumulative() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    bounds = [f"{bound / 1e9:.6g}" for bound in LATENCY_BOUNDS_NS]
+    counts = {
+        float(dict(labels)["le"]): value
+        for (name, labels), value in shown.items()
+        if name == "imud_sample_latency_seconds_bucket" and ("device", "front") in labels
+    }
+    assert [f"{bound:.6g}" for bound in sorted(counts)] == [*bounds, "inf"]
+    assert [counts[bound] for bound in sorted(counts)] == [1, 3, 6, 10, 15, 21, 28, 36, 45, 55, 66]
+    assert shown[key("imud_sample_latency_seconds_count", device="front")] == 66
+    assert shown[key("imud_sample_latency_seconds_sum", device="front")] == 2.5
+
+
+def test_identity_build_and_process() -> None:
+    shown = rendered(Snapshot(DEVICES))
+    identity = {"product": "HI13", "serial_number": "00000000", "firmware": "1.7.6"}
+    link = "/dev/ttyUSB0 at 115200 baud"
+    assert shown[key("imud_device_info", device="front", driver="hipnuc-uart", link=link, **identity)] == 1
+    (build,) = [dict(labels) for name, labels in shown if name == "imud_build_info"]
+    assert build["version"] == imud.__version__
+    assert shown[key("process_resident_memory_bytes")] > 1_000_000
+    assert key("process_cpu_seconds_total") in shown
+
+
+def test_identity_with_quotes_and_newlines_stays_one_label() -> None:
+    odd = 'a"b\\c\nd'
+    shown = rendered(Snapshot((device("x", identity={"product": odd}),)))
+    (labels,) = [dict(labels) for name, labels in shown if name == "imud_device_info"]
+    assert labels["product"] == odd
+
+
+def test_clients_are_summed_and_totals_never_fall() -> None:
+    totals = ClientTotals()
+    totals.update([client(1, sent=10, dropped=2), client(2, sent=5)])
+    totals.update([client(2, sent=6, dropped=1), client(3, sent=4)])  # 1 left
+    totals.update([])
+    assert (totals.sent, totals.dropped) == (10 + 6 + 4, 2 + 1)
+    clients: Sequence[ClientStatus] = [client(1, queue=7), client(2, "binary", queue=2), client(3, ""), client(4)]
+    shown = rendered(Snapshot(clients=clients))
+    assert {e: shown[key("imud_clients", encoding=e)] for e in ("json", "binary", "none")} == {
+        "json": 2, "binary": 1, "none": 1,
+    }  # fmt: skip
+    assert shown[key("imud_client_queue_samples")] == 9
+    assert shown[key("imud_client_queue_samples_max")] == 7
+    assert shown[key("imud_client_queue_bytes")] == 9 * 256
+
+
+def test_both_formats_say_the_same() -> None:
+    renderer = Renderer(pause=lambda: None)
+    plain = renderer.render(Snapshot(DEVICES), "text/html, */*;q=0.1")
+    rich = renderer.render(Snapshot(DEVICES), "application/openmetrics-text; version=1.0.0, text/plain;q=0.5")
+    assert plain.content_type == "text/plain; version=0.0.4; charset=utf-8"
+    assert rich.content_type.startswith("application/openmetrics-text; version=1.0.0")
+    assert rich.body.endswith(b"# EOF\n")
+    ours = re.compile("imud_")
+    from_plain, from_rich = (
+        {k: v for k, v in values(list(found)).items() if ours.match(k[0])}
+        for found in (parse_text(plain.body.decode()), parse_openmetrics(rich.body.decode()))  # type: ignore[no-untyped-call]  # the library's parser has no types
+    )
+    assert from_plain == from_rich
+
+
+def test_rendering_pauses_often() -> None:
+    """No stretch between two pauses renders more than SAMPLES_PER_TURN lines of ours."""
+    pauses = 0
+
+    def pause() -> None:
+        nonlocal pauses
+        pauses += 1
+
+    devices = [equipped(f"d{n}", n) for n in range(16)]
+    body = Renderer(pause).render(Snapshot(devices), "").body
+    lines = sum(line.startswith(b"imud_") for line in body.splitlines())
+    assert lines > 900
+    assert pauses >= lines / SAMPLES_PER_TURN
+    assert pauses >= sum(line.startswith(b"# HELP imud_") for line in body.splitlines()) - 1  # events: none yet
+
+
+# --- documentation and alerts ---------------------------------------------------------------------------------------
+
+
+def shown_names() -> set[str]:
+    """Names of all families as they stand after `# HELP`."""
+    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1)
+    body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
+    return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))
+
+
+def test_every_metric_is_documented_and_nothing_else() -> None:
+    documented = set(re.findall(r"^\| `([a-z_]+)`", (ROOT / "docs/metrics.md").read_text(), re.MULTILINE))
+    assert documented == shown_names()
+
+
+def test_label_values_are_documented() -> None:
+    """Those of labels whose values are known ahead."""
+    text = (ROOT / "docs/metrics.md").read_text()
+    for values_of, kind in ((DeviceState, "state"), (Sync, "sync"), (EventKind, "kind"), (Refusal, "cause")):
+        rows = re.findall(rf"`{kind}`: ([a-z_, -]+)", text)
+        assert {value.value for value in values_of} in [set(row.strip().split(", ")) for row in rows], kind
+
+
+def test_names_follow_the_conventions() -> None:
+    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1)
+    for metric in parse_text(Renderer(pause=lambda: None).render(snapshot, "").body.decode()):
+        assert metric.name.startswith(("imud_", "process_"))
+        assert metric.documentation.endswith(".")
+        for line in metric.samples:
+            assert (metric.type == "counter") == line.name.endswith("_total")
+
+
+def test_alerts_use_metrics_that_exist() -> None:
+    import yaml
+
+    rules = yaml.safe_load((ROOT / "etc/prometheus/imud.rules.yml").read_text())
+    alerts = [rule for group in rules["groups"] for rule in group["rules"]]
+    assert {alert["alert"] for alert in alerts} >= {
+        "ImudDown", "ImudDeviceDown", "ImudSamplesLost", "ImudSyncLost", "ImudLedgerOpen",
+    }  # fmt: skip
+    for alert in alerts:
+        used = set(re.findall(r"\bimud_\w+", alert["expr"]))
+        assert used <= shown_names(), alert["alert"]
+        assert used or "up{" in alert["expr"]
+        assert {"summary", "description"} <= set(alert["annotations"])
+        assert alert["labels"]["severity"] in ("warning", "critical")

@@ -1,0 +1,160 @@
+"""The Prometheus endpoint: a scrape asks the event loop, and starts, fails and ends cleanly."""
+
+import asyncio
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families as parse_text
+
+from imud.contracts.publisher import PublisherContext
+from imud.contracts.status import DeviceStatus
+from imud.errors import ServerError
+from imud.event import Event, EventKind
+from imud.publishers import PUBLISHERS
+from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
+from tests.support.device_status import device
+from tests.support.http_asking import LIMIT_S, ask, read_all
+
+DEVICES = (device("front", 0), device("rear", 1))
+
+
+def context(status: Callable[[], Sequence[DeviceStatus]] = lambda: DEVICES) -> PublisherContext:
+    return PublisherContext(status, 1, lambda: 5_000_000_000)
+
+
+@asynccontextmanager
+async def publisher(context: PublisherContext, **settings: object) -> AsyncIterator[MetricsPublisher]:
+    """A started publisher that leaves no thread behind."""
+    made = MetricsPublisher(MetricsSettings(**{"port": 0, **settings}), context, snapshot_s=0.05)  # type: ignore[arg-type]  # any key
+    made.start()
+    try:
+        yield made
+    finally:
+        made.close()
+        made.close()
+        assert "scrape" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
+    threads = []
+
+    def status() -> Sequence[DeviceStatus]:
+        threads.append(threading.get_ident())
+        return DEVICES
+
+    async def run() -> None:
+        async with publisher(context(status)) as served:
+            served.event(Event(1, "front", EventKind.LOSS, ""))
+            served.event(Event(1, "front", EventKind.LOSS, ""))
+            served.event(Event(1, "", EventKind.CONFIGURATION, ""))
+            served.tick(4_000_000_000)
+            line, head, body = await ask(served.port)
+            assert line == "HTTP/1.1 200 OK"
+            assert "Content-Type: text/plain; version=0.0.4" in head
+            assert f"Content-Length: {len(body.encode())}" in head
+            shown = {
+                (line.name, *line.labels.values()): line.value for found in parse_text(body) for line in found.samples
+            }
+            assert shown["imud_samples_total", "rear"] == DEVICES[1].ledger["samples"]
+            assert shown["imud_events_total", "front", "loss"] == 2
+            assert shown["imud_events_total", "", "configuration"] == 1
+            assert shown["imud_heartbeat_age_seconds",] == 1.0
+            served.remove_device("front")
+            assert 'imud_events_total{device="front"' not in (await ask(served.port))[2]
+            _, head, body = await ask(served.port, headers="Accept: application/openmetrics-text; version=1.0.0\r\n")
+            assert "application/openmetrics-text" in head
+            assert body.endswith("# EOF\n")
+
+    asyncio.run(run())
+    assert set(threads) == {threading.get_ident()}
+
+
+def test_paths_and_methods() -> None:
+    async def run() -> None:
+        async with publisher(context()) as served:
+            assert "/metrics" in (await ask(served.port, "/"))[2]
+            assert (await ask(served.port, "/metrics?x=1"))[0] == "HTTP/1.1 200 OK"
+            assert (await ask(served.port, "/other"))[0] == "HTTP/1.1 404 Not Found"
+            assert (await ask(served.port, method="POST"))[0] == "HTTP/1.1 405 Method Not Allowed"
+            line, head, body = await ask(served.port, method="HEAD")
+            assert line == "HTTP/1.1 200 OK"
+            assert int(head.partition("Content-Length: ")[2].split()[0]) > 1000
+            assert body == ""
+
+    asyncio.run(run())
+
+
+def test_a_loop_that_does_not_answer_gives_503() -> None:
+    async def run() -> None:
+        async with publisher(context()) as served:
+            stuck = await asyncio.to_thread(blocking_ask, served.port)  # answered while the loop is free: fine
+            assert b"200 OK" in stuck
+            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+                connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+                assert b"503 Service Unavailable" in read_all(connection)  # the loop is blocked by this very read
+
+    asyncio.run(run())
+
+
+def blocking_ask(port: int) -> bytes:
+    with socket.create_connection(("127.0.0.1", port), LIMIT_S) as connection:
+        connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+        return read_all(connection)
+
+
+def test_close_while_a_scrape_waits_for_the_loop_does_not_wait() -> None:
+    async def run() -> None:
+        served = MetricsPublisher(MetricsSettings(port=0), context(), snapshot_s=60)
+        served.start()
+        with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+            connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+            loop = asyncio.get_running_loop()
+            before = loop.time()
+            served.close()
+            assert loop.time() - before < LIMIT_S
+            assert b"200" not in read_all(connection)
+
+    asyncio.run(run())
+
+
+def test_disabled_opens_nothing_and_closes_twice() -> None:
+    async def run() -> None:
+        async with publisher(context(), enabled=False) as served:
+            assert served.port == 0
+
+    asyncio.run(run())
+
+
+def test_port_in_use_is_told() -> None:
+    async def run() -> None:
+        async with publisher(context()) as first:
+            second = MetricsPublisher(MetricsSettings(port=first.port), context())
+            with pytest.raises(
+                ServerError, match=rf"127\.0\.0\.1 port {first.port}: Address already in use; .*ss -ltnp"
+            ):
+                second.start()
+            second.close()
+            assert (await ask(first.port))[0] == "HTTP/1.1 200 OK"
+
+    asyncio.run(run())
+
+
+def test_port_is_free_after_close() -> None:
+    async def run() -> None:
+        async with publisher(context()) as first:
+            port = first.port
+            await ask(port)
+        async with publisher(context(), port=port) as second:
+            assert second.port == port
+
+    asyncio.run(run())
+
+
+def test_row() -> None:
+    row = PUBLISHERS["metrics"]
+    assert row.name == "metrics"
+    assert row.settings is MetricsSettings
+    assert MetricsSettings().port == 9321

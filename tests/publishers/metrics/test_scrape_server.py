@@ -1,0 +1,149 @@
+"""The server of scrapes: it answers, and silent, slow, deaf or wrong clients hold nothing up."""
+
+import asyncio
+import errno
+import socket
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from typing import Any, cast
+
+import pytest
+
+from imud.errors import ServerError
+from imud.publishers.metrics import scrape_server
+from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer, parse_request
+from tests.support.http_asking import LIMIT_S, ask, read_all
+
+
+@asynccontextmanager
+async def server(
+    answer: Callable[[HttpRequest], Awaitable[HttpResponse]], **limits: float
+) -> AsyncIterator[ScrapeServer]:
+    made = ScrapeServer("127.0.0.1", 0, answer, **limits)  # type: ignore[arg-type]  # limits by name
+    made.start()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+async def hello(_request: HttpRequest) -> HttpResponse:
+    return HttpResponse("200 OK", b"hello")
+
+
+@pytest.mark.parametrize("said", [b"", b"GET", b"GET /metrics HTTP/1.1\r\nHost: x\r\n"])
+def test_silent_or_half_requests_end_in_time(said: bytes) -> None:
+    async def run() -> None:
+        async with server(hello, connection_s=0.05) as served:
+            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as silent:
+                silent.sendall(said)
+                assert read_all(silent) == b""
+
+    asyncio.run(run())
+
+
+def test_silent_clients_cannot_lock_out_a_scraper() -> None:
+    async def run() -> None:
+        async with server(hello, connections_max=4, connection_s=60) as served:
+            silent = [socket.create_connection(("127.0.0.1", served.port), LIMIT_S) for _ in range(12)]
+            for _ in range(3):
+                assert (await ask(served.port))[2] == "hello"
+            ended = 0
+            for connection in silent[:8]:  # the oldest were ended for the newer ones
+                ended += read_all(connection) == b""
+            assert ended == 8
+            for connection in silent:
+                connection.close()
+
+    asyncio.run(run())
+
+
+def test_a_client_that_does_not_read_its_answer_is_ended() -> None:
+    async def much(_request: HttpRequest) -> HttpResponse:
+        return HttpResponse("200 OK", b"x" * 50_000_000)
+
+    async def run() -> None:
+        async with server(much, connection_s=0.2) as served:
+            ended = watch_end(served)
+            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as deaf:
+                deaf.sendall(b"GET / HTTP/1.1\r\n\r\n")
+                assert await asyncio.to_thread(ended.wait, LIMIT_S)
+                assert len(read_all(deaf)) < 50_000_000  # what the kernel had taken already
+
+    asyncio.run(run())
+
+
+def watch_end(served: ScrapeServer) -> threading.Event:
+    """An event that is set when a connection of `served` ends."""
+    ended = threading.Event()
+    forget = served._ended
+
+    def noted(connection: asyncio.Task[None], client: socket.socket) -> None:
+        forget(connection, client)
+        ended.set()
+
+    served._ended = noted  # type: ignore[method-assign]  # only to know when
+    return ended
+
+
+@pytest.mark.parametrize("head", [b"\x00\xff\r\n\r\n", b"GET /\r\n\r\n", b"GET / SPDY/3\r\n\r\n", b"\r\n\r\n"])
+def test_what_is_no_http_gets_400(head: bytes) -> None:
+    async def run() -> None:
+        async with server(hello) as served:
+            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+                connection.sendall(head)
+                assert await asyncio.to_thread(read_all, connection) == (
+                    b"HTTP/1.1 400 Bad HttpRequest\r\nContent-Type: text/plain; charset=utf-8\r\n"
+                    b"Content-Length: 18\r\nConnection: close\r\n\r\nexpected HTTP/1.1\n"
+                )
+
+    asyncio.run(run())
+
+
+def test_too_long_a_request_is_ended() -> None:
+    async def run() -> None:
+        async with server(hello) as served:
+            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+                connection.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * 4 * scrape_server.REQUEST_BYTES_MAX)
+                assert await asyncio.to_thread(read_all, connection) == b""
+
+    asyncio.run(run())
+
+
+class Exhausted:
+    """A listener in a process without a free descriptor."""
+
+    def accept(self) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+
+def test_without_descriptors_the_server_pauses_instead_of_turning_in_circles() -> None:
+    class Loop:
+        def __init__(self) -> None:
+            self.calls: list[str] = []
+
+        def remove_reader(self, _listener: object) -> None:
+            self.calls.append("remove_reader")
+
+        def add_reader(self, *_: object) -> None:
+            self.calls.append("add_reader")
+
+        def call_later(self, delay_s: float, callback: Callable[..., None], *args: object) -> None:
+            self.calls.append(f"after {delay_s} s")
+            callback(*args)
+
+    loop = Loop()
+    ScrapeServer("127.0.0.1", 0, hello)._accept(cast(Any, loop), cast(Any, Exhausted()))
+    assert loop.calls == ["remove_reader", "after 1.0 s", "add_reader"]
+
+
+def test_parse_request() -> None:
+    head = b"GET /a?b=c HTTP/1.1\r\naCCept: x/y\r\nAccept-Encoding: gzip\r\nAccept: z\r\n\r\n"
+    assert parse_request(head) == HttpRequest("GET", "/a", "x/y,z")
+
+
+@pytest.mark.parametrize("address", ["192.0.2.1", "not an address"])
+def test_address_that_is_not_here_is_told(address: str) -> None:
+    with pytest.raises(ServerError, match=f"{address} port 0: .*; set metrics.address"):
+        ScrapeServer(address, 0, hello).start()

@@ -1,0 +1,350 @@
+import errno
+import grp
+import logging
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.contracts.batch import Batch
+from imud.contracts.publisher import PublisherContext
+from imud.errors import ServerError
+from imud.event import Event, EventKind
+from imud.formats.ring import (
+    HEADER_BYTES,
+    LEDGER_BLOCK_BYTES,
+    LEDGER_BLOCK_OFFSET,
+    OFFSETS,
+    STATE_CLOSED,
+    STATE_LIVE,
+    RingHeader,
+    decode_header,
+    decode_ledger_block,
+    encode_header,
+)
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, encode_slot
+from imud.ledger import LEDGER_FIELDS
+from imud.publishers import PUBLISHERS
+from imud.publishers.shm.publisher import PUBLISHER, ShmPublisher, ShmSettings
+from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+
+
+@pytest.fixture(name="board")
+def _board(tmp_path: Path) -> Iterator[Board]:
+    board = Board(tmp_path)
+    yield board
+    board.publisher.close()
+
+
+def make(folder: Path, **settings: Any) -> ShmPublisher:
+    context = PublisherContext(list, 1, lambda: START_NS)
+    return ShmPublisher(ShmSettings(directory=str(folder), slots=SLOTS, **settings), context)
+
+
+def slot_at(seq: int) -> int:
+    return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
+
+
+def test_row() -> None:
+    assert PUBLISHERS["shm"] is PUBLISHER
+    assert PUBLISHER.name == "shm"
+    assert isinstance(PUBLISHER.make(PUBLISHER.settings(), PublisherContext(list, 1, lambda: 0)), ShmPublisher)
+
+
+def test_defaults() -> None:
+    settings = ShmSettings()
+    assert (settings.enabled, settings.directory, settings.slots) == (True, "/dev/shm", 4096)
+    assert (settings.group, settings.mode) == ("imud", 0o640)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"slots": 1000}, "power of two, found 1000; near it are 512 and 1024"),
+        ({"slots": 32}, ">= 64"),
+        ({"slots": 1 << 21}, "<= 1048576"),
+        ({"mode": 640}, "<= 511"),
+        ({"directory": "shm"}, "absolute path"),
+        ({"slotz": 64}, "slotz"),
+    ],
+)
+def test_settings_that_cannot_be(values: dict[str, object], message: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match=message):
+        msgspec.convert(values, ShmSettings)
+
+
+def test_header_of_a_new_ring(board: Board) -> None:
+    header = decode_header(board.path.read_bytes()[:HEADER_BYTES], "x")
+    assert header == RingHeader(77, os.getpid(), STATE_LIVE, DEVICE, 3, SLOTS, 0, 1, START_NS)
+
+
+def test_every_block_of_the_file_is_there(board: Board) -> None:
+    status = board.path.stat()
+    assert status.st_size == HEADER_BYTES + SLOTS * SLOT_BYTES
+    assert status.st_blocks * 512 >= status.st_size  # st_blocks counts 512-byte units
+
+
+def test_ring_is_whole_before_it_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[bool, RingHeader, int]] = []
+    rename = os.rename
+
+    def spy(source: Path, target: Path) -> None:
+        mode = stat.S_IMODE(source.stat().st_mode)
+        seen.append((target.exists(), decode_header(source.read_bytes()[:HEADER_BYTES], "x"), mode))
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", spy)
+    board = Board(tmp_path)
+    board.publisher.close()
+    [(existed, header, mode)] = seen
+    assert (existed, header.device, header.state, mode) == (False, DEVICE, STATE_LIVE, 0o640)
+
+
+def test_slots_lie_where_their_number_says(board: Board) -> None:
+    board.publish([1, 2])
+    board.publish([3])
+    raw = board.path.read_bytes()
+    for seq in (1, 2, 3):
+        assert raw[slot_at(seq) :][:SLOT_BYTES] == encode_slot(make_sample(seq), 3)
+    assert board.word("newest_seq") == 3
+    assert board.word("first_seq") == 1
+
+
+def test_ring_wraps(board: Board) -> None:
+    board.publish(range(1, SLOTS + 3))
+    raw = board.path.read_bytes()
+    for seq in range(3, SLOTS + 3):
+        assert raw[slot_at(seq) :][:SLOT_BYTES] == encode_slot(make_sample(seq), 3)
+    assert len(raw) == HEADER_BYTES + SLOTS * SLOT_BYTES
+
+
+def test_gap_in_the_numbers_moves_the_first(board: Board) -> None:
+    board.publish([1, 2])
+    board.publish([7, 8])
+    assert (board.word("first_seq"), board.word("newest_seq")) == (7, 8)
+
+
+class Spy:
+    """Stands before a memoryview and notes what is written where, in bytes."""
+
+    def __init__(self, target: memoryview, width: int, notes: list[tuple[int, int, object]]) -> None:
+        self.target, self.width, self.notes = target, width, notes
+
+    def __setitem__(self, at: int | slice, value: Any) -> None:
+        if isinstance(at, slice):
+            self.notes.append((at.start, at.stop - at.start, bytes(value)))
+        else:
+            self.notes.append((at * self.width, self.width, value))
+        self.target[at] = value
+
+    def release(self) -> None:
+        self.target.release()
+
+
+def test_order_of_writes(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+    notes: list[tuple[int, int, object]] = []
+    ring: Any = board.publisher._rings[DEVICE]
+    monkeypatch.setattr(ring, "_words", Spy(ring._words, 8, notes))
+    monkeypatch.setattr(ring, "_bytes", Spy(ring._bytes, 1, notes))
+    board.publish([1])
+    slot = encode_slot(make_sample(1), 3)
+    assert notes == [
+        (slot_at(1), 8, SEQ_INVALID),
+        (slot_at(1) + 8, SLOT_BYTES - 8, slot[8:]),
+        (slot_at(1), 8, 1),
+        (OFFSETS["newest_seq"], 8, 1),
+    ]
+    notes.clear()
+    board.tick()
+    update = OFFSETS["ledger_update"]
+    assert [note[:2] for note in notes[:3]] == [(update, 8), (update + 8, LEDGER_BLOCK_BYTES - 8), (update, 8)]
+    assert [notes[0][2], notes[2][2]] == [SEQ_INVALID, 1]
+    assert notes[3:] == [(OFFSETS["heartbeat_ns"], 8, board.now_ns)]
+
+
+def test_tick_shows_ledger_driver_and_heartbeat(board: Board) -> None:
+    for number, name in enumerate(LEDGER_FIELDS):
+        setattr(board.ledger, name, 1000 + number)
+    board.tick()
+    raw = board.path.read_bytes()[LEDGER_BLOCK_OFFSET:][:LEDGER_BLOCK_BYTES]
+    block = decode_ledger_block(raw, len(LEDGER_FIELDS))
+    assert block is not None
+    assert (block.update, block.driver, block.ledger) == (1, "hipnuc-uart", board.ledger.snapshot())
+    assert board.word("heartbeat_ns") == board.now_ns
+
+
+def test_ledger_is_written_only_when_it_changed(board: Board) -> None:
+    updates = []
+    for bytes_in, driver in ((0, ""), (0, ""), (5, ""), (5, ""), (5, "hipnuc-uart")):
+        board.ledger.bytes_in, board.driver = bytes_in, driver
+        board.tick()
+        updates.append(board.word("ledger_update"))
+    assert updates == [1, 1, 2, 2, 3]
+
+
+def test_close_tells_readers_and_removes_the_file(board: Board) -> None:
+    with board.path.open("rb") as file:
+        board.ledger.bytes_in, board.now_ns = 9, START_NS + 7
+        board.publisher.close()
+        raw = file.read()
+    header = decode_header(raw[:HEADER_BYTES], "x")
+    block = decode_ledger_block(raw[LEDGER_BLOCK_OFFSET:][:LEDGER_BLOCK_BYTES], 1)
+    assert (header.state, header.heartbeat_ns) == (STATE_CLOSED, START_NS + 7)
+    assert block is not None
+    assert block.ledger == {"bytes_in": 9}
+    assert not list(board.path.parent.iterdir())
+    board.publisher.close()
+
+
+def test_close_leaves_the_ring_of_a_successor(board: Board) -> None:
+    successor = board.path.with_name("other")
+    successor.write_bytes(b"new")
+    successor.rename(board.path)
+    board.publisher.close()
+    assert board.path.read_bytes() == b"new"
+
+
+def test_removed_device(board: Board) -> None:
+    board.publisher.remove_device(DEVICE)
+    assert not board.path.exists()
+    board.publish([1])  # a batch that was on its way
+    board.tick()
+    board.publisher.remove_device(DEVICE)
+
+
+def test_events_are_not_for_shared_memory(board: Board) -> None:
+    before = board.path.read_bytes()
+    board.publisher.event(Event(1, DEVICE, EventKind.UP, "found"))
+    assert board.path.read_bytes() == before
+
+
+def test_device_that_is_unknown(board: Board) -> None:
+    board.publisher.publish(Batch("another", 4, [make_sample(1, "another")]))
+    assert board.word("newest_seq") == 0
+
+
+def test_name_with_a_slash(board: Board) -> None:
+    with pytest.raises(ServerError, match="without '/'"):
+        board.publisher.add_device("../imu", 4)
+
+
+def test_leftovers_of_a_daemon_that_died_while_starting(tmp_path: Path) -> None:
+    (tmp_path / f".imud.{DEVICE}.new").write_bytes(b"half")
+    board = Board(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == [f"imud.{DEVICE}"]
+    board.publisher.close()
+
+
+def other_writer(path: Path, pid: int, *, heartbeat_ns: int = START_NS - 1, state: int = STATE_LIVE) -> None:
+    header = RingHeader(5, pid, state, DEVICE, 0, SLOTS, heartbeat_ns=heartbeat_ns)
+    path.write_bytes(encode_header(header))
+
+
+def test_second_daemon_is_refused(tmp_path: Path) -> None:
+    other_writer(tmp_path / f"imud.{DEVICE}", os.getppid())
+    with pytest.raises(ServerError, match=f"another imud, process {os.getppid()}"):
+        Board(tmp_path)
+
+
+def dead_pid() -> int:
+    with subprocess.Popen([sys.executable, "-S", "-c", ""]) as process:
+        process.wait()
+        return process.pid
+
+
+@pytest.mark.parametrize(
+    "leave",
+    [
+        lambda path: other_writer(path, dead_pid()),  # killed and restarted at once
+        lambda path: other_writer(path, os.getppid(), heartbeat_ns=START_NS - 1_000_000_000),  # number in use again
+        lambda path: other_writer(path, os.getppid(), state=STATE_CLOSED),
+        lambda path: path.write_bytes(b"of another version"),
+    ],
+)
+def test_file_of_an_earlier_daemon_is_replaced(tmp_path: Path, leave: Callable[[Path], object]) -> None:
+    path = tmp_path / f"imud.{DEVICE}"
+    leave(path)
+    with path.open("rb") as old:
+        before = old.read()
+        board = Board(tmp_path)
+        board.publish([1])
+        old.seek(0)
+        assert old.read() == before
+        assert board.word("epoch") == 77
+        board.publisher.close()
+
+
+def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with pytest.raises(ServerError, match=r"imud.imu0 cannot be made, 20480 bytes: No space left .* fewer `slots`"):
+        Board(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_directory_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(ServerError, match="expected a directory for shared memory"):
+        make(tmp_path / "none").start()
+
+
+def test_directory_that_is_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(ServerError, match="may not make files there"):
+        make(tmp_path).start()
+
+
+def test_file_that_cannot_be_made() -> None:
+    with pytest.raises(ServerError, match="may imud write to /proc"):
+        make(Path("/proc")).add_device(DEVICE, 0)
+
+
+def test_group_that_does_not_exist(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    publisher = make(tmp_path, group="no-such-group")
+    with caplog.at_level(logging.WARNING):
+        publisher.start()
+        publisher.add_device("a", 0)
+        publisher.add_device("b", 1)
+    assert [record.getMessage() for record in caplog.records] == [
+        "shm: group no-such-group does not exist; its members cannot read shared memory"
+    ]
+    assert (tmp_path / "imud.a").stat().st_gid == os.getegid()
+    publisher.close()
+
+
+def test_group_and_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "fchown", lambda _, user, group: given.append((user, group)))
+    publisher = make(tmp_path, group=grp.getgrgid(os.getegid()).gr_name, mode=0o604)
+    publisher.start()
+    publisher.add_device("a", 0)
+    assert given == [(-1, os.getegid())]
+    assert stat.S_IMODE((tmp_path / "imud.a").stat().st_mode) == 0o604
+    publisher.close()
+
+
+def test_group_that_cannot_be_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    another = next(group.gr_name for group in grp.getgrall() if group.gr_gid != os.getegid())
+    monkeypatch.setattr(os, "fchown", refuse)
+    publisher = make(tmp_path, group=another)
+    with caplog.at_level(logging.WARNING):
+        publisher.start()
+        publisher.add_device("a", 0)
+        publisher.add_device("b", 1)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"shm: group {another} cannot be given files by user {os.geteuid()}, who is not in it;"
+        " its members cannot read shared memory"
+    ]
+    publisher.close()

@@ -1,0 +1,93 @@
+"""`actions` and `command`: replies that come late, refusals, the right it needs, and clients that leave."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.publishers.socket.rights import Guard, Rights
+from tests.support import socket_rig
+from tests.support.socket_rig import Peer, run, serving, until
+
+
+@pytest.fixture(autouse=True)
+def not_done_yet() -> None:
+    socket_rig.done_late = asyncio.Event()
+
+
+def request(number: int, name: str, **arguments: Any) -> bytes:
+    params = {"device": "imu0", "name": name, "arguments": arguments}
+    return json.dumps({"jsonrpc": "2.0", "id": number, "method": "command", "params": params}).encode() + b"\n"
+
+
+def test_other_requests_are_answered_before_a_late_reply(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.send(request(70, "wait"))
+            assert len(await peer.result("devices")) == 2
+            await peer.send(request(71, "wait"))
+            refused = await peer.message()
+            assert (refused["id"], refused["error"]["code"]) == (71, -32004)
+            socket_rig.done_late.set()
+            assert await peer.message() == {"jsonrpc": "2.0", "id": 70, "result": {"waited": "imu0"}}
+            await peer.send(request(72, "output", rate_hz=5))
+            assert (await peer.message())["result"] is None
+            peer.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "words"),
+    [
+        ("explode", {}, "imu0 refuses explode"),
+        ("output", {}, "missing required field `rate_hz`; arguments: rate_hz (a whole number)"),
+        ("output", {"rate_hz": "x"}, "got `str`"),
+        ("output", {"rate_hz": 1, "speed": 2}, "unknown field `speed`"),
+    ],
+)
+def test_what_fails_says_why(tmp_path: Path, name: str, arguments: dict[str, Any], words: str) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.send(request(1, name, **arguments))
+            error = (await peer.message())["error"]
+            assert error["code"] == -32005
+            assert words in error["message"]
+            assert not server.hub.busy(next(iter(server.hub.connections.values())))
+            peer.close()
+
+    run(body)
+
+
+def test_reading_is_not_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
+
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            assert (await peer.result("actions", device="imu0"))[0]["name"] == "output"
+            code, message = await peer.error("command", device="imu0", name="output")
+            assert code == -32001
+            assert "control group" in message
+            peer.close()
+
+    run(body)
+
+
+def test_it_goes_on_when_the_client_leaves_and_ends_with_the_server(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.send(request(1, "wait"))
+            await until(lambda: any(map(server.hub.busy, server.hub.connections.values())))
+            (connection,) = server.hub.connections.values()
+            peer.close()
+            await until(lambda: not server.hub.connections)
+            assert server.hub.busy(connection)
+        await until(lambda: not server.hub.busy(connection))
+
+    run(body)

@@ -1,0 +1,141 @@
+"""Every example of docs/socket.md is played against the server."""
+
+import asyncio
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from imud.contracts.status import (
+    ClockStatus,
+    DeviceStatus,
+    KernelCounters,
+    LinesStatus,
+    PollingStatus,
+    SerialLineCounters,
+    UtcStatus,
+)
+from imud.event import Event, EventKind
+from imud.formats.jsonrpc import DEFAULT_PATH, LINE_MAX_BYTES, Code
+from imud.publishers.socket.outbox import Limits
+from imud.publishers.socket.publisher import SocketServer, SocketSettings
+from imud.publishers.socket.rpc import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
+from tests.support.paths import ROOT
+from tests.support.socket_daemon import daemon
+from tests.support.socket_rig import NOW_NS, Peer, batch, run, serving
+
+DOCUMENT = (ROOT / "docs" / "socket.md").read_text()
+ANYTHING = "…"
+
+
+def blocks(language: str) -> list[str]:
+    """The fenced examples in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
+
+
+def assert_like(found: Any, shown: Any) -> None:
+    """What came is what the example shows, apart from what it leaves out."""
+    if shown == ANYTHING:
+        return
+    if isinstance(shown, dict):
+        assert isinstance(found, dict)
+        names = shown.keys() - {ANYTHING}
+        assert found.keys() >= names if ANYTHING in shown else found.keys() == names
+        for name in names:
+            assert_like(found[name], shown[name])
+    elif isinstance(shown, list):
+        some = shown[:-1] if ANYTHING in shown else shown
+        assert len(found) >= len(some) if ANYTHING in shown else len(found) == len(some)
+        for item, expected in zip(found, some, strict=False):
+            assert_like(item, expected)
+    else:
+        assert found == shown
+
+
+def happen(server: SocketServer, shown: dict[str, Any], published: list[int]) -> None:
+    """Make the daemon do what the notification of the example tells."""
+    if shown.get("method") == "sample":
+        published.append(shown["params"]["seq"])
+        server.publish(batch("imu0", published[-1]))
+    if shown.get("method") == "event":
+        server.event(Event(NOW_NS, "imu0", EventKind.DOWN, "the adapter was pulled out", {"errno": 5}))
+
+
+def test_examples(tmp_path: Path) -> None:
+    lines = [line for block in blocks("json") for line in block.splitlines()]
+    published: list[int] = []
+
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.connect(server)
+            for line in lines:
+                arrow, text = line[0], line[2:]
+                if arrow == "→":
+                    if '"poll"' in text:
+                        server.publish(batch("imu0", 1))
+                    await peer.send(text.encode() + b"\n")
+                else:
+                    assert arrow == "←"
+                    happen(server, json.loads(text), published)
+                    assert_like(await peer.message(), json.loads(text))
+            peer.close()
+
+    run(body)
+    asked = {json.loads(line[2:])["method"] for line in lines if line.startswith("→ {")}
+    assert asked == set(METHODS)
+    assert published == [2]
+
+
+def test_python_example(tmp_path: Path, capsys: Any) -> None:
+    (code,) = blocks("python")
+    with daemon(tmp_path) as served:
+        # the example waits for a sample, so the server gives one to every watch
+        served.do(publish_on_watch)
+        exec(compile(code.replace(DEFAULT_PATH, served.path), "docs/socket.md", "exec"), {})
+    assert capsys.readouterr().out.splitlines()[1] == "80000001000000 (0.125, -0.5, 9.75)"
+
+
+def publish_on_watch(server: SocketServer) -> None:
+    """Give one sample right after a watch."""
+    changed = server.hub.changed
+
+    def after_change() -> None:
+        changed()
+        if any(connection.subscription for connection in server.hub.connections.values()):
+            asyncio.get_running_loop().call_soon(server.publish, batch("imu0"))
+
+    server.hub.changed = after_change  # type: ignore[method-assign]  # a hook for this test
+
+
+def test_numbers_and_codes_of_the_text() -> None:
+    settings = SocketSettings()
+    limits = Limits(settings.queue_samples, settings.queue_bytes)
+    for words in (
+        f"at most {LINE_MAX_BYTES:,} bytes",
+        f"at most {limits.samples:,} samples and {limits.sample_bytes >> 20} MiB",
+        f"more than {limits.replies:,} or {limits.reply_bytes >> 20} MiB",
+        f"{RATE_MIN_HZ} … {RATE_MAX_HZ}",
+        f"`{settings.group}`",
+        f"`{settings.control_group}`",
+        f"`{DEFAULT_PATH}`",
+        *(f"| {code.value} |" for code in Code if code is not Code.INTERNAL),
+    ):
+        assert words in DOCUMENT, words
+    assert os.path.isabs(settings.path)
+
+
+def test_every_member_of_status_is_explained() -> None:
+    """Members of a device, and of its parts."""
+    section = DOCUMENT.partition("\n## Status\n")[2].partition("\n## ")[0]
+    rows = [row.split(" | ")[0] for row in section.splitlines() if row.startswith("| `")]
+    first = {name for cell in rows for name in re.findall(r"`(\w+)`", cell)}
+    in_devices = {"name", "device_id", "driver", "link", "state", "problem", "identity", "rate_hz"}
+    assert first | in_devices == set(DeviceStatus.__struct_encode_fields__)
+    named = set(re.findall(r"`(\w+)`", section))
+    for part in (ClockStatus, KernelCounters, PollingStatus, SerialLineCounters, LinesStatus, UtcStatus):
+        assert set(part.__struct_encode_fields__) <= named, part.__name__
+
+
+def test_every_kind_of_event_is_named() -> None:
+    assert all(f"`{kind}`" in DOCUMENT for kind in EventKind)

@@ -1,0 +1,382 @@
+"""Slow clients: nobody waits for them, the oldest samples go first, and they are told how many."""
+
+import asyncio
+import json
+import os
+import random
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.formats.jsonrpc import encode_notification
+from imud.formats.slot import SLOT_BYTES, decode_slot
+from imud.publishers.socket.connection import Connection
+from imud.publishers.socket.encoding import JsonEncoding
+from imud.publishers.socket.outbox import NO_FD, Limits, Outbox
+from imud.publishers.socket.publisher import SocketServer
+from imud.publishers.socket.waker import BYTE
+from tests.support.socket_rig import Peer, batch, run, serving, until
+
+
+async def read_samples(peer: Peer, last: dict[str, int]) -> list[tuple[str, int, dict[str, int]]]:
+    """Device, seq and the drops told before it, until the last sample of every device has come."""
+    seen: list[tuple[str, int, dict[str, int]]] = []
+    told: dict[str, int] = {}
+    left = dict(last)
+    while left:
+        if peer.framed and len(body := await peer.body()) % SLOT_BYTES == 0:
+            device = ("imu0", "imu1")[body[60]]
+            seq = decode_slot(body, device).seq
+        else:
+            message = await peer.message() if not peer.framed else _json(body)
+            params = message["params"]
+            if "dropped" in params:
+                assert params["device"] not in told
+                told[params["device"]] = params["dropped"]
+            if message["method"] == "dropped":
+                continue
+            device, seq = params["device"], params["seq"]
+        seen.append((device, seq, told))
+        told = {}
+        if left.get(device) == seq:
+            del left[device]
+    return seen
+
+
+def _json(body: bytes) -> dict[str, Any]:
+    value = json.loads(body)
+    assert isinstance(value, dict)
+    return value
+
+
+def assert_accounted(seen: list[tuple[str, int, dict[str, int]]], devices: tuple[str, ...]) -> dict[str, int]:
+    """Every sample came in order or is among those told as dropped. Returns the drops by device."""
+    dropped = dict.fromkeys(devices, 0)
+    newest = dict.fromkeys(devices, 0)
+    for device, seq, told in seen:
+        for name, count in told.items():
+            dropped[name] += count
+        assert seq > newest[device]
+        newest[device] = seq
+    for device in devices:
+        came = sum(name == device for name, _, _ in seen)
+        assert came + dropped[device] == newest[device]
+    return dropped
+
+
+@pytest.mark.parametrize("encoding", ["json", "binary"])
+def test_a_client_that_does_not_read_loses_the_oldest_and_slows_nobody(tmp_path: Path, encoding: str) -> None:
+    total = 3000
+
+    async def body() -> None:
+        async with serving(tmp_path, queue_samples=100) as server:
+            slow, fast = await Peer.greeted(server), await Peer.greeted(server)
+            for peer in (slow, fast):
+                await peer.result("watch", encoding=encoding)
+                peer.framed = encoding == "binary"
+            for seq in range(1, total + 1, 2):
+                server.publish(batch("imu0", seq, 2))
+                server.publish(batch("imu1", seq, 2))
+                got = [await read_one(fast) for _ in range(4)]
+                assert got == [("imu0", seq), ("imu0", seq + 1), ("imu1", seq), ("imu1", seq + 1)]
+            first, second = sorted(server.hub.clients(), key=lambda client: client.number)
+            assert first.queue_samples == 100
+            assert first.queue_bytes < 200_000
+            assert first.dropped > total  # of 2 × total
+            assert (second.dropped, second.sent, second.queue_samples) == (0, 2 * total, 0)
+            seen = await read_samples(slow, {"imu0": total, "imu1": total})
+            dropped = assert_accounted(seen, ("imu0", "imu1"))
+            assert sum(dropped.values()) == first.dropped
+            assert sum(bool(told) for _, _, told in seen) == 1  # one loss, told at once
+            server.publish(batch("imu0", total + 1))  # the writer is gone again, the queue empty
+            assert [await read_one(peer) for peer in (slow, fast)] == [("imu0", total + 1)] * 2
+            slow.close()
+            fast.close()
+
+    run(body)
+
+
+async def read_one(peer: Peer) -> tuple[str, int]:
+    """Device and seq of the next message, a sample without drops."""
+    if peer.framed:
+        body = await peer.body()
+        assert len(body) == SLOT_BYTES
+        device = ("imu0", "imu1")[body[60]]
+        return device, decode_slot(body, device).seq
+    params = (await peer.message())["params"]
+    assert "dropped" not in params
+    return params["device"], params["seq"]
+
+
+def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path, queue_bytes=8192) as server:
+            peer = await Peer.greeted(server)
+            await peer.result("watch")
+            for seq in range(1, 2001):
+                server.publish(batch("imu0", seq))
+            (client,) = server.hub.clients()
+            assert 0 < client.queue_samples < 40
+            # a message that was sent in part is no part of the bound
+            assert client.queue_bytes <= 8192 + 1000
+            assert_accounted(await read_samples(peer, {"imu0": 2000}), ("imu0",))
+            peer.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_pattern_of_reading_accounts_for_every_sample(tmp_path: Path, seed: int) -> None:
+    """Publishing and reading a little, in any order: the order is kept, nothing is unaccounted for."""
+    rng = random.Random(seed)
+
+    async def body() -> None:
+        async with serving(tmp_path, queue_samples=50) as server:
+            peer = await Peer.greeted(server)
+            encoding = rng.choice(["json", "binary"])
+            await peer.result("watch", encoding=encoding)
+            peer.framed = encoding == "binary"
+            seq = 0
+            loop = asyncio.get_running_loop()
+            for _ in range(60):
+                count = rng.choice([1, 1, 2, 40])
+                server.publish(batch("imu0", seq + 1, count))
+                seq += count
+                if rng.random() < 0.3:
+                    peer.buffer += await loop.sock_recv(peer.sock, rng.choice([1, 100, 70_000]))
+                if rng.random() < 0.2:
+                    await asyncio.sleep(0)
+            assert_accounted(await read_samples(peer, {"imu0": seq}), ("imu0",))
+            assert len(await peer.result("devices")) == 2
+            peer.close()
+
+    run(body)
+
+
+def test_replies_keep_their_place_and_are_never_dropped(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path, queue_samples=5) as server:
+            peer = await Peer.greeted(server)
+            await peer.result("watch")
+            seq = 0
+            while (queue := server.hub.clients()[0].queue_samples) < 5:
+                seq += 1
+                server.publish(batch("imu0", seq))
+            assert queue == 5
+            for number in range(20):
+                await peer.send(b'{"jsonrpc":"2.0","id":%d,"method":"unheard-of"}\n' % number)
+            (connection,) = server.hub.connections.values()
+            await until(lambda: len(connection.outbox._replies) == 20)
+            for _ in range(20):
+                seq += 1
+                server.publish(batch("imu0", seq))
+            ids: list[int] = []
+            seqs: list[int] = []
+            dropped = 0
+            while not seqs or seqs[-1] != seq:
+                message = await peer.message()
+                if "id" in message:
+                    ids.append(message["id"])
+                else:
+                    seqs.append(message["params"]["seq"])
+                    dropped += message["params"].get("dropped", 0)
+            assert ids == list(range(20))
+            assert len(seqs) + dropped == seq
+            assert seqs[-5:] == list(range(seq - 4, seq + 1))
+            peer.close()
+
+    run(body)
+
+
+def test_who_asks_without_reading_is_disconnected(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            asking, other = await Peer.greeted(server), await Peer.greeted(server)
+            line = b'{"jsonrpc":"2.0","id":1,"method":"schema"}\n'
+
+            async def ask_on() -> None:
+                while True:
+                    await asking.send(line)
+                    await asyncio.sleep(0)
+
+            with pytest.raises((BrokenPipeError, ConnectionResetError)):
+                await ask_on()
+            assert server.hub.evicted == 1
+            assert len(await other.result("devices")) == 2
+            asking.close()
+            other.close()
+
+    run(body)
+
+
+def test_a_client_that_leaves_during_publish_harms_nobody(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peers = [await Peer.greeted(server) for _ in range(3)]
+            for peer in peers:
+                await peer.result("watch")
+            await peers[0].result("notify", device="imu0")
+            peers[0].close()
+            peers[1].close()
+            server.publish(batch("imu0", 1))  # the loop had no turn: the server learns of it here
+            server.publish(batch("imu0", 2))
+            assert len(server.hub.connections) == 1
+            assert [(await peers[2].message())["params"]["seq"] for _ in range(2)] == [1, 2]
+            peers[2].close()
+
+    run(body)
+
+
+def test_a_descriptor_waits_its_turn_behind_what_is_queued(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path, queue_samples=3) as server:
+            peer = await Peer.greeted(server)
+            await peer.result("watch")
+            fill(server)
+            (connection,) = server.hub.connections.values()
+            await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
+            await until(lambda: bool(connection.wakers))
+            server.publish(batch("imu1", 8000, 2))  # waits behind the reply
+            assert await descriptors(peer, connection) == 1
+            await until(lambda: not connection.outbox.waiting)
+            assert connection.wakers["imu0"].client_end == NO_FD  # sent, so the daemon has no copy left
+            data, fds, _flags, _address = socket.recv_fds(peer.sock, 65536, 4)
+            assert b'"seq":8001' in data
+            assert not fds
+            peer.close()
+
+    run(body)
+
+
+READ_BYTES = 64
+
+
+def fill(server: SocketServer) -> None:
+    """Publish until something is queued."""
+    seq = 0
+    while server.hub.clients()[0].queue_samples == 0:
+        seq += 1
+        server.publish(batch("imu0", seq))
+
+
+async def descriptors(peer: Peer, connection: Connection) -> int:
+    """Read until the reply with id 7; count the descriptors that came."""
+    found: list[int] = []
+    data = bytearray()
+    at = 0
+    while b'"id":7' not in data[-4096:]:
+        await asyncio.sleep(0)
+        try:
+            got, fds, _flags, _address = socket.recv_fds(peer.sock, READ_BYTES, 4)
+        except BlockingIOError:
+            continue
+        data += got
+        if fds:
+            at = len(data)
+            found += fds
+    assert at - READ_BYTES <= data.index(b'{"jsonrpc":"2.0","id":7,') < at  # with the first byte of its reply
+    assert connection.wake("imu0")
+    assert [os.read(fd, 64) for fd in found] == [BYTE]
+    for fd in found:
+        os.close(fd)
+    return len(found)
+
+
+def test_large_answers_reach_a_client_that_ended_its_side(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            (connection,) = server.hub.connections.values()
+            note = encode_notification("big", "x" * 500_000)
+            connection.post(note)
+            peer.sock.shutdown(1)
+            await until(lambda: connection._linger_ticks is not None)
+            assert await peer.body() == note
+            assert await peer.ended()
+            peer.close()
+
+    run(body)
+
+
+def test_who_lingers_without_reading_is_closed_by_ticks(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            (connection,) = server.hub.connections.values()
+            connection.post(encode_notification("big", "x" * 500_000))
+            connection.finish()
+            for _ in range(30):
+                server.tick(0)
+            assert connection.closed
+            peer.close()
+
+    run(body)
+
+
+class Trickle:
+    """A socket that takes as many bytes as it likes, and often none."""
+
+    def __init__(self, sock: socket.socket, rng: random.Random) -> None:
+        self.sock = sock
+        self.rng = rng
+
+    def fileno(self) -> int:
+        return self.sock.fileno()
+
+    def send(self, data: bytes) -> int:
+        if self.rng.random() < 0.3:
+            raise BlockingIOError
+        return self.sock.send(data[: self.rng.choice([1, 3, 10, 1000, 100_000])])
+
+
+def drained(sock: socket.socket) -> bytes:
+    """What there is to read."""
+    try:
+        return sock.recv(1 << 20)
+    except BlockingIOError:
+        return b""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
+    rng = random.Random(seed)
+
+    async def body() -> None:
+        ours, theirs = socket.socketpair()
+        ours.setblocking(False)
+        theirs.setblocking(False)
+        encoding = JsonEncoding(("sync",), framed=False)
+        outbox = Outbox(Trickle(ours, rng), Limits(20, 1 << 20), pytest.fail, pytest.fail, lambda: None)  # type: ignore[arg-type]  # all that Outbox uses
+        peer = Peer(theirs)
+        seq = 0
+        seen: list[tuple[str, int, dict[str, int]]] = []
+        for number in range(100):
+            part = batch("imu0", seq + 1, rng.choice([1, 2, 15]))
+            seq += len(part.samples)
+            Outbox.put_samples([outbox], encoding.encode(part), "imu0", encoding)
+            if number % 10 == 0:
+                outbox.put_reply(b'{"method":"other","params":{}}\n')
+            await asyncio.sleep(0)
+            peer.buffer += drained(theirs)
+        while outbox.waiting:
+            await asyncio.sleep(0)
+            peer.buffer += drained(theirs)
+        others = 0
+        while not seen or seen[-1][1] != seq:
+            message = await peer.message()
+            params = message["params"]
+            if message["method"] == "other":
+                others += 1
+            else:
+                dropped = params.get("dropped", 0)
+                seen.append((params["device"], params["seq"], {"imu0": dropped} if dropped else {}))
+        assert others == 10
+        assert assert_accounted(seen, ("imu0",)) == {"imu0": outbox.dropped}
+        assert outbox.sent == len(seen)
+        outbox.close()
+        ours.close()
+        theirs.close()
+
+    run(body)

@@ -1,0 +1,321 @@
+"""The socket server end to end: greeting, questions, samples in both encodings, events, limits."""
+
+import asyncio
+import os
+import socket
+import struct
+from pathlib import Path
+
+import pytest
+
+from imud import __version__
+from imud.event import Event, EventKind
+from imud.formats.slot import SLOT_BYTES, decode_slot
+from imud.publishers import PUBLISHERS
+from imud.publishers.socket.publisher import PUBLISHER, SocketServer, SocketSettings
+from imud.sample import SAMPLE_FIELDS
+from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, Peer, batch, context, run, sample, serving, until
+
+
+def test_row_is_the_table_s() -> None:
+    assert PUBLISHERS["socket"] is PUBLISHER
+    assert PUBLISHER.name == "socket"
+    assert PUBLISHER.settings() == SocketSettings()
+
+
+def test_hello_names_protocol_daemon_epoch_and_rights(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.connect(server)
+            assert await peer.message() == {
+                "jsonrpc": "2.0",
+                "method": "hello",
+                "params": {
+                    "protocol": 1,
+                    "version": __version__,
+                    "epoch": EPOCH,
+                    "rights": ["read", "control"] if os.getuid() == 0 else ["read"],
+                },
+            }
+            peer.close()
+
+    run(body)
+
+
+def test_devices_status_and_schema(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            devices = await peer.result("devices")
+            assert [(d["name"], d["device_id"], d["state"], d["sync"]) for d in devices] == [
+                ("imu0", 0, "running", "regression"),
+                ("imu1", 1, "running", "regression"),
+            ]
+            status = await peer.result("status")
+            assert status["now_ns"] == NOW_NS
+            assert status["devices"][1]["ledger"] == {"bytes_in": 82}
+            (client,) = status["socket"]["clients"]
+            assert (client["pid"], client["uid"], client["sent"]) == (os.getpid(), os.getuid(), 0)
+            schema = await peer.result("schema")
+            assert tuple(field["name"] for field in schema["fields"]) == SAMPLE_FIELDS
+            assert schema["devices"]["imu0"]["navigation_frame"] == "ENU"
+            assert schema["slot"]["bytes"] == SLOT_BYTES
+            peer.close()
+
+    run(body)
+
+
+def test_json_samples_have_the_names_of_the_design_and_no_absent_members(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            assert await peer.result("watch") == {"encoding": "json", "devices": DEVICES, "rate_hz": 0.0}
+            server.publish(batch("imu0", 7, 2))
+            server.publish(batch("imu1", 1))
+            first, second, other = await peer.messages(3)
+            assert first["method"] == "sample"
+            assert first["params"] == {
+                "device": "imu0",
+                "seq": 7,
+                "t_ns": 80_000_007_000_000,
+                "t_err_ns": 12_000,
+                "sync": "regression",
+                "t_rx_ns": 80_000_007_200_000,
+                "utc_ns": 1_790_000_000_007_000_000,
+                "t_dev_ns": 7_000_000,
+                "accel_m_s2": [0.125, -0.5, 9.75],
+                "gyro_rad_s": [0.25, 0.5, -0.75],
+                "temperature_c": 31.5,
+            }
+            assert (second["params"]["seq"], other["params"]["device"]) == (8, "imu1")
+            peer.close()
+
+    run(body)
+
+
+def test_fields_and_devices_select(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            reply = await peer.result("watch", devices=["imu1"], fields=["gyro_rad_s", "mag_t"])
+            assert reply["devices"] == {"imu1": 1}
+            server.publish(batch("imu0"))
+            server.publish(batch("imu1"))
+            params = (await peer.message())["params"]
+            assert params == {"device": "imu1", "seq": 1, "t_ns": 80_000_001_000_000, "gyro_rad_s": [0.25, 0.5, -0.75]}
+            peer.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize("seq", [1, 0x7B])  # 0x7B is `{`: a slot that begins like JSON
+def test_binary_frames_hold_one_slot_each(tmp_path: Path, seq: int) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            assert (await peer.result("watch", encoding="binary"))["devices"] == DEVICES
+            peer.framed = True
+            server.publish(batch("imu1", seq, 2))
+            for number in (seq, seq + 1):
+                slot = await peer.body()
+                assert len(slot) == SLOT_BYTES
+                assert decode_slot(slot, "imu1") == sample("imu1", number)
+            peer.close()
+
+    run(body)
+
+
+def test_after_a_binary_watch_everything_is_framed_for_good(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.result("watch", encoding="binary")
+            peer.framed = True
+            assert len(await peer.result("devices")) == 2
+            await peer.result("watch", encoding="json", fields=["sync"])
+            server.publish(batch())
+            assert (await peer.message())["params"]["sync"] == "regression"
+            assert (await peer.error("nonsense"))[0] == -32601
+            peer.close()
+
+    run(body)
+
+
+def test_framed_json_is_never_as_long_as_slots() -> None:
+    from imud.formats.jsonrpc import frame_of
+
+    for size in range(2, 1100):
+        frame = frame_of(b"{" + b" " * (size - 2) + b"}")
+        (length,) = struct.unpack_from("<I", frame)
+        assert length == len(frame) - 4
+        assert length % SLOT_BYTES
+
+
+def test_the_same_samples_as_lines_and_as_frames(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            lines, frames = await Peer.greeted(server), await Peer.greeted(server)
+            await frames.result("watch", encoding="binary")
+            frames.framed = True
+            for peer in (frames, lines):
+                await peer.result("watch")
+            server.publish(batch("imu0", 1, 2))
+            for seq in (1, 2):
+                assert (await lines.message())["params"]["seq"] == seq
+                assert (await frames.message())["params"]["seq"] == seq
+            lines.close()
+            frames.close()
+
+    run(body)
+
+
+def test_a_watch_replaces_the_one_before_and_unwatch_ends_it(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.result("watch", devices=["imu0"])
+            await peer.result("watch", devices=["imu1"])
+            server.publish(batch("imu0"))
+            server.publish(batch("imu1"))
+            assert (await peer.message())["params"]["device"] == "imu1"
+            await peer.result("unwatch")
+            server.publish(batch("imu1", 2))
+            await peer.send(b'{"jsonrpc":"2.0","id":"last","method":"poll"}\n')
+            assert (await peer.message())["id"] == "last"
+            peer.close()
+
+    run(body)
+
+
+def test_a_device_that_appears_later_matches_a_watch_of_all(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            all_of_them, one = await Peer.greeted(server), await Peer.greeted(server)
+            await all_of_them.result("watch")
+            await one.result("watch", devices=["imu0"])
+            server.add_device("imu9", 9)
+            server.publish(batch("imu9"))
+            server.publish(batch("imu0"))
+            told, first = await all_of_them.messages(2)
+            assert (told["method"], told["params"]) == ("device", {"device": "imu9", "device_id": 9})
+            assert first["params"]["device"] == "imu9"
+            assert (await one.message())["params"]["device"] == "imu0"
+            all_of_them.close()
+            one.close()
+
+    run(body)
+
+
+def test_poll_gives_the_newest_of_each_device(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            assert await peer.result("poll") == {"now_ns": NOW_NS, "samples": []}
+            server.publish(batch("imu0", 1, 3))
+            server.publish(batch("imu1", 5))
+            assert [s["seq"] for s in (await peer.result("poll"))["samples"]] == [3, 5]
+            chosen = await peer.result("poll", devices=["imu1"], fields=["t_ns", "sync"])
+            assert chosen["samples"] == [
+                {"device": "imu1", "seq": 5, "t_ns": 80_000_005_000_000, "sync": "regression"},
+            ]
+            server.remove_device("imu0")
+            server.add_device("imu0", 0)  # nothing of its former life is left
+            assert [s["seq"] for s in (await peer.result("poll"))["samples"]] == [5]
+            peer.close()
+
+    run(body)
+
+
+def test_events_go_to_those_who_want_them(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            everything, one, none = [await Peer.greeted(server) for _ in range(3)]
+            await everything.result("events")
+            await one.result("events", devices=["imu1"])
+            await none.result("devices")
+            for name in ("imu0", "imu1", ""):
+                server.event(Event(5, name, EventKind.DOWN, "gone", {"errno": 5}))
+            seen = [(await everything.message())["params"] for _ in range(3)]
+            assert [event["device"] for event in seen] == ["imu0", "imu1", ""]
+            assert seen[0] == {"t_ns": 5, "device": "imu0", "kind": "down", "message": "gone", "detail": {"errno": 5}}
+            assert [(await one.message())["params"]["device"] for _ in range(2)] == ["imu1", ""]
+            await everything.result("events", enable=False)
+            server.event(Event(6, "imu0", EventKind.UP, "back"))
+            assert len(await everything.result("devices")) == 2
+            assert len(await none.result("devices")) == 2
+            for peer in (everything, one, none):
+                peer.close()
+
+    run(body)
+
+
+def test_one_client_too_many_is_told_so(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path, clients_max=2) as server:
+            first, second, third = await Peer.greeted(server), await Peer.greeted(server), await Peer.connect(server)
+            assert (await third.message())["error"]["code"] == -32002
+            assert await third.ended()
+            assert server.hub.refused == 1
+            second.close()
+            await until(lambda: len(server.hub.connections) == 1)
+            fourth = await Peer.greeted(server)
+            for peer in (first, third, fourth):
+                peer.close()
+
+    run(body)
+
+
+def test_clients_are_seen_through_the_context(tmp_path: Path) -> None:
+    async def body() -> None:
+        known = context()
+        server = SocketServer(SocketSettings(path=str(tmp_path / "s")), known)
+        assert known.clients() == []
+        server.start()
+        peer = await Peer.greeted(server)
+        await peer.result("watch", encoding="binary")
+        server.publish(batch("imu0", 1, 3))
+        (client,) = known.clients()
+        assert (client.encoding, client.sent, client.dropped, client.queue_samples) == ("binary", 3, 0, 0)
+        server.close()
+        assert known.clients() == []
+        assert known.client_sources == []
+        peer.close()
+
+    run(body)
+
+
+def test_out_of_descriptors_pauses_accepting_until_the_next_tick(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Exhausted:
+        """A listening socket without descriptors to give."""
+
+        def __init__(self, sock: socket.socket) -> None:
+            self.sock = sock
+            self.calls = 0
+
+        def fileno(self) -> int:
+            return self.sock.fileno()
+
+        def accept(self) -> tuple[socket.socket, object]:
+            self.calls += 1
+            raise OSError(24, "Too many open files")
+
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            listener = server._listener
+            assert listener is not None
+            real, exhausted = listener.sock, Exhausted(listener.sock)
+            listener.sock = exhausted  # type: ignore[assignment]  # only these two methods are used
+            peer = await Peer.connect(server)
+            await until(lambda: exhausted.calls > 0)
+            for _ in range(20):
+                await asyncio.sleep(0)
+            assert exhausted.calls == 1  # no busy loop
+            listener.sock = real
+            server.tick(0)
+            assert (await peer.message())["method"] == "hello"
+            peer.close()
+
+    run(body)
+    assert "Too many open files" in caplog.text

@@ -1,0 +1,248 @@
+"""Whatever a client sends, it gets an error by the book, and server and other clients live on."""
+
+import asyncio
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from imud.contracts.batch import Batch
+from imud.formats.jsonrpc import LINE_MAX_BYTES, RpcError, parse_request
+from tests.support.socket_rig import LIMIT_S, Peer, batch, run, serving
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "request_id", "words"),
+    [
+        (b"{", -32700, None, "not JSON"),
+        (b"\xff\xfe", -32700, None, "not JSON"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"x\xff"}', -32700, None, "not JSON"),
+        (b"[" * 60_000, -32700, None, "nested too deeply"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":NaN}}', -32700, None, "not JSON"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":1e999}}', -32700, None, "not JSON"),
+        (b"7", -32600, None, "got a number"),
+        (b'[{"jsonrpc":"2.0","id":1,"method":"devices"}]', -32600, None, "one JSON object per line, got an array"),
+        (b"{}", -32600, None, '"2.0"'),
+        (b'{"jsonrpc":2.0,"id":1,"method":"devices"}', -32600, 1, '"2.0"'),
+        (b'{"jsonrpc":"2.0","id":"a"}', -32600, "a", "method: expected a string, got null"),
+        (b'{"jsonrpc":"2.0","id":1.5,"method":[]}', -32600, 1.5, "method: expected a string, got an array"),
+        (b'{"jsonrpc":"2.0","id":true,"method":"devices"}', -32600, None, "id: expected"),
+        (b'{"jsonrpc":"2.0","id":{},"method":"devices"}', -32600, None, "id: expected"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"devices","params":"x"}', -32600, 1, "params: expected an object"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"devices","params":[1]}', -32602, 1, "by name only"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"config.get"}', -32601, 1, "there are: devices, status"),
+        (b'{"jsonrpc":"2.0","id":null,"method":"x"}', -32601, None, "no method 'x'"),
+    ],
+)
+def test_bad_lines(tmp_path: Path, line: bytes, code: int, request_id: object, words: str) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.send(line + b"\n")
+            reply = await peer.message()
+            assert (reply["jsonrpc"], reply["id"], reply["error"]["code"]) == ("2.0", request_id, code)
+            assert words in reply["error"]["message"]
+            assert len(await peer.result("devices")) == 2
+            peer.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize(
+    ("method", "params", "words"),
+    [
+        ("watch", {"rate_hz": -1}, "0.001 … 1000000, got -1"),
+        ("watch", {"rate_hz": 1e-300}, "expected 0 (every sample) or 0.001"),
+        ("watch", {"rate_hz": 1e300}, "expected 0 (every sample) or 0.001"),
+        ("watch", {"rate_hz": True}, "got `bool`"),
+        ("watch", {"rate_hz": "fast"}, "got `str`"),
+        ("watch", {"devices": ["imu7"]}, "no device named 'imu7'; there are: imu0, imu1"),
+        ("watch", {"devices": []}, "empty list"),
+        ("watch", {"devices": "imu0"}, "got `str`"),
+        ("watch", {"devices": [1]}, "got `int`"),
+        ("watch", {"fields": ["accel"]}, "no field named 'accel'; there are: device, seq, t_ns"),
+        ("watch", {"encoding": "xml"}, "xml"),
+        ("poll", {"devices": ["imu7"]}, "there are: imu0, imu1"),
+        ("events", {"enable": "yes"}, "got `str`"),
+        ("notify", {}, "device"),
+        ("notify", {"device": "imu7"}, "there are: imu0, imu1"),
+    ],
+)
+def test_bad_parameters(tmp_path: Path, method: str, params: dict[str, Any], words: str) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            code, message = await peer.error(method, **params)
+            assert code == -32602
+            assert words in message
+            (connection,) = server.hub.connections.values()
+            assert connection.subscription is None
+            assert not connection.wakers
+            peer.close()
+
+    run(body)
+
+
+def test_unknown_members_are_ignored(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            line = b'{"later":1,"jsonrpc":"2.0","id":1,"method":"watch","params":{"later":[],"rate_hz":null}}\r\n'
+            await peer.send(line)
+            assert (await peer.message())["result"]["rate_hz"] == 0
+            peer.close()
+
+    run(body)
+
+
+def test_notifications_act_and_are_not_answered(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.send(b'{"jsonrpc":"2.0","method":"status"}\n')
+            await peer.send(b'{"jsonrpc":"2.0","method":"nonsense"}\n')
+            await peer.send(b'{"jsonrpc":"2.0","method":"notify","params":{"device":"imu0"}}\n')
+            await peer.send(b'{"jsonrpc":"2.0","method":"watch","params":{"devices":["imu1"]}}\n')
+            await peer.send(b'{"jsonrpc":"2.0","id":9,"method":"devices"}\n')
+            assert (await peer.message())["id"] == 9
+            (connection,) = server.hub.connections.values()
+            assert connection.subscription is not None
+            assert not connection.wakers
+            peer.close()
+
+    run(body)
+
+
+def test_half_lines_several_requests_and_blank_lines(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            lines = b"".join(b'{"jsonrpc":"2.0","id":%d,"method":"poll"}\n\r\n\n' % number for number in range(25))
+            await peer.send(lines)  # more than one turn's worth
+            assert [reply["id"] for reply in await peer.messages(25)] == list(range(25))
+            line = b'{"jsonrpc":"2.0","id":"cut","method":"poll"}\n'
+            for cut in range(1, len(line), 7):
+                await peer.send(line[:cut])
+                await asyncio.sleep(0)
+                await peer.send(line[cut:])
+                assert (await peer.message())["id"] == "cut"
+            peer.close()
+
+    run(body)
+
+
+def test_a_client_that_leaves_in_the_middle_of_a_line(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer, other = await Peer.greeted(server), await Peer.greeted(server)
+            await peer.send(b'{"jsonrpc":"2.0","id":1,"meth')
+            peer.close()
+            while len(server.hub.connections) > 1:
+                await asyncio.sleep(0)
+            assert len(await other.result("devices")) == 2
+            other.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize("newline", [b"", b"\n"])
+def test_a_line_over_the_limit_ends_the_connection(tmp_path: Path, newline: bytes) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer, other = await Peer.greeted(server), await Peer.greeted(server)
+            start = b'{"jsonrpc":"2.0","id":1,"method":"poll","x":"'
+            longest = start + b"x" * (LINE_MAX_BYTES - len(start) - 2) + b'"}'
+            await peer.send(longest + b"\n")
+            assert (await peer.message())["id"] == 1
+            await peer.send(b"x" * (LINE_MAX_BYTES + 1) + newline)
+            assert (await peer.message())["error"]["code"] == -32003
+            assert await peer.ended()
+            assert server.hub.evicted == 1
+            assert len(await other.result("devices")) == 2
+            peer.close()
+            other.close()
+
+    run(body)
+
+
+def test_one_client_s_flood_of_requests_leaves_turns_to_others(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            flood, other = await Peer.greeted(server), await Peer.greeted(server)
+            await flood.send(b'{"jsonrpc":"2.0","id":1,"method":"poll"}\n' * 1000)
+            await other.result("poll")
+            while b"\n" not in flood.buffer:
+                flood.buffer += await asyncio.get_running_loop().sock_recv(flood.sock, 1 << 20)
+            assert flood.buffer.count(b"\n") < 200  # of 1000, when the other was answered
+            flood.close()
+            other.close()
+
+    run(body)
+
+
+def test_nan_and_infinity_are_null(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            await peer.result("watch")
+            nan = batch()
+            values = (float("nan"), float("inf"), -float("inf"))
+            server.publish(Batch("imu0", 0, [replace(nan.samples[0], gyro_rad_s=values)]))
+            assert (await peer.message())["params"]["gyro_rad_s"] == [None, None, None]
+            peer.close()
+
+    run(body)
+
+
+REQUESTS = st.builds(
+    lambda method, params, rest: json.dumps({"jsonrpc": "2.0", "id": 1, "method": method, "params": params, **rest}),
+    st.sampled_from(["devices", "status", "schema", "watch", "unwatch", "poll", "events", "x"]),
+    st.dictionaries(
+        st.sampled_from(["devices", "fields", "rate_hz", "encoding", "enable"]),
+        st.none() | st.booleans() | st.floats() | st.text(max_size=5) | st.lists(st.sampled_from(["imu0", "t_ns", ""])),
+        max_size=3,
+    ),
+    st.dictionaries(st.sampled_from(["id", "jsonrpc", "x"]), st.none() | st.integers() | st.text(max_size=3)),
+).map(lambda text: text.encode() + b"\n")
+JUNK = (
+    st.binary(max_size=200)
+    | REQUESTS
+    | REQUESTS.flatmap(lambda line: st.integers(0, len(line)).map(lambda n: line[:n]))
+)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.lists(JUNK, max_size=12))
+def test_arbitrary_bytes_never_kill_the_server(tmp_path_factory: pytest.TempPathFactory, chunks: list[bytes]) -> None:
+    async def body() -> None:
+        async with serving(tmp_path_factory.mktemp("s")) as server:
+            noisy, calm = await Peer.greeted(server), await Peer.greeted(server)
+            await calm.result("watch")
+            for seq, chunk in enumerate(chunks, 1):
+                await noisy.send(chunk)
+                server.publish(batch("imu0", seq))
+                assert (await calm.message())["params"]["seq"] == seq
+            await noisy.send(b'\n{"jsonrpc":"2.0","id":"the end","method":"devices"}\n')
+            got = b""
+            async with asyncio.timeout(LIMIT_S):
+                while b'"the end"' not in got:
+                    got += await asyncio.get_running_loop().sock_recv(noisy.sock, 1 << 16)
+            noisy.close()
+            calm.close()
+
+    run(body)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.binary(max_size=100) | st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.sampled_from(["jsonrpc", "id", "method"]), inner),
+).map(lambda value: json.dumps(value).encode()))  # fmt: skip
+def test_a_line_is_a_request_or_a_known_error(line: bytes) -> None:
+    with suppress(RpcError):  # nothing else may come out
+        assert isinstance(parse_request(line).method, str)

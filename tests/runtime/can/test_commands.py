@@ -1,0 +1,107 @@
+"""A device on a CAN bus is told something: found by `driver: auto` or named, the command goes to its own node."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from time import monotonic_ns
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.settings import Settings
+from imud.contracts.status import DeviceState
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.errors import CommandError
+from imud.formats.can import RAW_FRAME, CanFrame
+from imud.links.memory import MemoryCanLink, MemorySettings
+from imud.runtime.can.runner import CanRunner
+from imud.runtime.detection import can as detection
+from imud.sim.hipnuc.canopen.objects import NodeSettings
+from imud.sim.hipnuc.canopen.simulator import HipnucCanopenHardware, HipnucCanopenModule
+from imud.units import NS_PER_MS
+
+LIMIT_S = 10.0
+NODE = 9
+
+
+class Bench:
+    """A runner, and a simulated module of node 9 at the other end of its bus."""
+
+    def __init__(self, driver: str, options: Settings | None) -> None:
+        config = DeviceConfig("bow", driver, options, False, "memory", MemorySettings(name="can0"))
+        self.runner = CanRunner(config, 1, lambda batch: None, lambda event: None)
+        assert isinstance(self.runner.link, MemoryCanLink)
+        self.link = self.runner.link
+        hardware = HipnucCanopenHardware(factory=NodeSettings(node=NODE), boot_ms=0, skew_ppm=0)
+        self.module = HipnucCanopenModule(monotonic_ns(), hardware)
+        self.deaf = False
+        """Whether what imud sends is lost."""
+        self._heard = 0
+
+    def exchange(self) -> None:
+        """What crossed the bus since the last call, both ways."""
+        now_ns = monotonic_ns()
+        for payload in self.link.written[self._heard :]:
+            self._heard += 1
+            if self.deaf:
+                continue
+            can_id, size, data = RAW_FRAME.unpack(payload)
+            self.module.receive(can_id, False, data[:size], now_ns)
+        frames = [CanFrame(f.can_id, f.extended, f.data, now_ns) for f in self.module.advance(now_ns)]
+        if frames:
+            self.link.feed(frames)
+        self.runner.tick(now_ns)
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        end = asyncio.get_running_loop().time() + LIMIT_S
+        while not condition():
+            assert asyncio.get_running_loop().time() < end, self.runner.status()
+            self.exchange()
+            await asyncio.sleep(0.001)
+
+    async def act(self, name: str, **arguments: object) -> object:
+        """Tell it, and keep the bus going until it answered."""
+        task = asyncio.create_task(self.runner.act(name, arguments))
+        await self.until(task.done)
+        return await task
+
+
+def play(bench: Bench, story: Coroutine[Any, Any, None]) -> None:
+    async def both() -> None:
+        task = asyncio.create_task(bench.runner.run())
+        try:
+            await bench.until(lambda: bench.link.listening)
+            await bench.until(lambda: bench.runner.state is DeviceState.RUNNING)
+            await story
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+            bench.runner.close()
+        assert bench.runner.ledger.closes()
+
+    asyncio.run(both())
+
+
+@pytest.mark.parametrize(("driver", "options"), [("auto", None), ("hipnuc-canopen", HipnucCanopenSettings(node=NODE))])
+def test_the_command_reaches_the_node(driver: str, options: Settings | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(detection, "LISTEN_NS", 100 * NS_PER_MS)
+    bench = Bench(driver, options)
+
+    async def story() -> None:
+        assert await bench.act("interval", tpdo=1, interval_ms=20) is None
+        assert bench.module.objects.settings.periods_ms[1] == 20
+        assert await bench.act("direction", x_reversed=True, y_reversed=False) is None
+        assert bench.module.objects.settings.invert_x == 1
+
+    play(bench, story())
+
+
+def test_a_node_that_does_not_answer_is_an_error() -> None:
+    bench = Bench("hipnuc-canopen", HipnucCanopenSettings(node=NODE))
+
+    async def story() -> None:
+        bench.deaf = True
+        with pytest.raises(CommandError, match="node 9"):
+            await bench.act("zero", zero="here")
+
+    play(bench, story())

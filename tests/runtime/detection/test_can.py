@@ -1,0 +1,175 @@
+"""Who talks on a CAN bus: one device, several, none, strangers, claimed and remembered ones."""
+
+from random import Random
+
+import pytest
+
+from imud.devices.imu61x.can.codec import DRIVER as IMU61X
+from imud.devices.imu61x.can.codec import encode_set
+from imud.formats.can import CanFrame
+from imud.runtime.detection import CanFound, CanGaveUp, CanListen, CanSearch, CanStep, CanSurvey
+from imud.runtime.detection.can import DEVICES_MAX, IDENTIFIERS_MAX, LISTEN_NS, PATIENCE_NS
+from tests.support.fake_can import BASE, fake_can_driver, fake_frame
+
+FAKE = fake_can_driver()
+DRIVERS = (FAKE, IMU61X)
+
+
+def imu61x(index: int, base_id: int = 101) -> list[CanFrame]:
+    """The frames of a sample."""
+    frames = encode_set(
+        index=index,
+        accel_m_s2=(0, 0, 9.8),
+        gyro_rad_s=(0, 0, 0),
+        euler_rad=(0, 0, 0),
+        temperature_c=20,
+        base_id=base_id,
+    )
+    return [CanFrame(can_id, False, data, 0) for can_id, data in frames]
+
+
+class Round:
+    """A search, and its time."""
+
+    def __init__(self, **more: object) -> None:
+        self.search = CanSearch(DRIVERS, "can0", **more)  # type: ignore[arg-type]  # as the search takes them
+        self.until_ns = self.search.start(0).until_ns
+        self.early: CanFound | None = None
+
+    def hear(self, *frames: CanFrame) -> "Round":
+        """Frames, one after the other."""
+        for frame in frames:
+            self.early = self.early or self.search.on_frames([frame])
+        return self
+
+    def end(self) -> CanStep:
+        """What is said at the end of the round."""
+        step = self.search.on_time(self.until_ns)
+        while isinstance(step, CanListen):
+            self.until_ns = step.until_ns
+            step = self.search.on_time(self.until_ns)
+        assert step is not None
+        return step
+
+    def found(self) -> str:
+        """The device that was found."""
+        step = self.end()
+        assert isinstance(step, CanFound), step
+        return step.device.title
+
+    def complaint(self) -> str:
+        """What is said when none was."""
+        step = self.end()
+        assert isinstance(step, CanGaveUp), step
+        return step.summary
+
+
+def test_one_device_is_found_at_the_end_of_the_round() -> None:
+    heard = Round().hear(fake_frame(8), fake_frame(8, 1))
+    assert heard.early is None
+    assert heard.search.on_time(LISTEN_NS - 1) is None
+    assert heard.found() == "fake-can node 8"
+    assert heard.until_ns == LISTEN_NS
+    assert Round().hear(*imu61x(1), *imu61x(2)).found() == "imu61x-can base_id 101"
+
+
+def test_strangers_beside_it_do_not_matter() -> None:
+    random = Random(7)
+    strangers = [CanFrame(0x400 + random.randrange(100), False, random.randbytes(3), 0) for _ in range(50)]
+    assert Round().hear(*strangers, fake_frame(8), *strangers, fake_frame(8, 1)).found() == "fake-can node 8"
+
+
+def test_of_several_every_one_is_named() -> None:
+    frames = [f for n in (1, 2) for f in (fake_frame(8, n), fake_frame(9, n), *imu61x(n))]
+    assert Round().hear(*frames).complaint() == (
+        "3 devices are heard on can0, fake-can node 8, fake-can node 9, imu61x-can base_id 101: name driver and options"
+    )
+
+
+def test_one_measurement_is_too_few_and_waited_for() -> None:
+    heard = Round().hear(*imu61x(1))
+    step = heard.search.on_time(heard.until_ns)
+    assert isinstance(step, CanListen)
+    heard.until_ns = step.until_ns
+    heard.hear(*imu61x(2))
+    assert heard.found() == "imu61x-can base_id 101"
+
+
+def test_frames_without_samples_are_waited_for_and_told() -> None:
+    heard = Round().hear(*imu61x(1)[:3], *imu61x(2)[:3])
+    assert heard.complaint() == (
+        "frames as of imu61x-can base_id 101 come on can0, but no whole sample: name driver and options"
+    )
+    assert PATIENCE_NS <= heard.until_ns < PATIENCE_NS + 2 * LISTEN_NS
+
+
+def test_unknown_frames_are_shown_by_their_identifiers() -> None:
+    frames = [CanFrame(0x18FEE9AA, True, bytes(8), 0), CanFrame(0x65, True, bytes(8), 0), CanFrame(0x7, False, b"", 0)]
+    assert Round().hear(*frames).complaint() == (
+        "frames come on can0 that no driver knows (0x007, 0x00000065, 0x18FEE9AA): name driver and options"
+    )
+    many = [CanFrame(number, False, b"", 0) for number in range(12)]
+    assert "0x007 and 4 more" in Round().hear(*many).complaint()
+
+
+def test_silence() -> None:
+    assert "nothing is heard on can0" in Round().complaint()
+
+
+def test_devices_of_others_are_left_to_them() -> None:
+    claimed = {BASE + 8}
+    heard = Round(claimed=lambda can_id, extended: can_id in claimed and not extended)
+    heard.hear(*(fake_frame(node, n) for n in (1, 2) for node in (8, 9)))
+    assert heard.found() == "fake-can node 9"
+    claimed.add(BASE + 9)  # another device found it meanwhile
+    assert "only frames of other configured devices" in heard.complaint()
+
+
+def test_the_remembered_device_is_taken_at_once() -> None:
+    heard = Round(remembered=("fake-can", 9))
+    heard.hear(fake_frame(8, 1), fake_frame(9, 1), fake_frame(8, 2))
+    assert heard.early is None
+    heard.hear(fake_frame(9, 2))
+    assert heard.early is not None
+    assert heard.early.device.title == "fake-can node 9"
+
+
+def test_a_remembered_device_that_another_one_has_is_not() -> None:
+    heard = Round(remembered=("fake-can", 9), claimed=lambda can_id, _: can_id == BASE + 9)
+    heard.hear(*(fake_frame(9, n) for n in range(5)))
+    assert heard.early is None
+
+
+def test_a_protocol_that_only_seems_so_does_not_delay_the_right_one() -> None:
+    """A second driver names the same frames as those of its own device, and gets no samples out of them."""
+    search = CanSearch([fake_can_driver("wrong", BASE - 1), FAKE], "can0")
+    search.start(0)
+    search.on_frames([fake_frame(8, 1), fake_frame(8, 2)])
+    step = search.on_time(LISTEN_NS)
+    assert isinstance(step, CanFound)
+    assert step.device.title == "fake-can node 8"
+
+
+def test_two_protocols_that_both_understand_are_both_named() -> None:
+    search = CanSearch([fake_can_driver("twin"), FAKE], "can0")
+    search.start(0)
+    search.on_frames([fake_frame(8, 1), fake_frame(8, 2)])
+    step = search.on_time(LISTEN_NS)
+    assert isinstance(step, CanGaveUp)
+    assert "twin node 8, fake-can node 8" in step.summary
+
+
+def test_frames_after_a_loss_are_not_joined_with_those_before() -> None:
+    first, second = imu61x(1), imu61x(2)
+    heard = Round().hear(*imu61x(0), *first[:2], second[2]._replace(after_loss=True), *second[3:])
+    assert [device.title for device in heard.search.survey.doubtful()] == ["imu61x-can base_id 101"]
+
+
+@pytest.mark.parametrize("extended", [False, True])
+def test_a_bus_full_of_noise_costs_bounded_memory(extended: bool) -> None:
+    survey, random = CanSurvey([fake_can_driver(base=0), FAKE]), Random(3)
+    most = 0x1FFF_FFFF if extended else 0x7FF
+    for _ in range(IDENTIFIERS_MAX + 500):
+        survey.take([CanFrame(random.randint(0, most), extended, random.randbytes(8), 0)])
+    assert len(survey.others()) <= IDENTIFIERS_MAX
+    assert len(survey.devices()) + len(survey.doubtful()) <= DEVICES_MAX

@@ -1,0 +1,322 @@
+"""Detection in virtual time, against a model of the line that shows what a wrong rate makes of the bits."""
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from imud.contracts.codec import CodecEvent
+from imud.devices.hipnuc.uart.codec import DRIVER as HIPNUC
+from imud.ledger import Ledger
+from imud.runtime.detection import ASK_TRIES, QUIET_NS, GaveUp, Listen, Search, Step, StreamFound
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.fake_driver import BAUD_RATES, FAKE_DRIVER, QUERY, REPLY, SYNC, fake_frame
+from tests.support.uart_wire import FakeDevice, received, run_search
+
+HIPNUC_REPLY = b"PNAME=HI14R3\r\nBUILD=Oct 15 2024\r\nUUID=043995698D6E1708\r\nAPP_VER=156\r\nBL_VER=109\r\nOK\r\n"
+
+
+def device(baud: int, rate_hz: float, phase_ns: int = 0, poll_ns: int = NS_PER_MS) -> FakeDevice:
+    return FakeDevice(FAKE_DRIVER, baud, rate_hz, phase_ns, poll_ns, REPLY, QUERY, random=Random(baud + phase_ns))
+
+
+def frames_in(found: StreamFound) -> int:
+    """Frames that the device's own codec makes of what was kept."""
+    ledger = Ledger()
+    codec = FAKE_DRIVER.make_codec(ledger, FAKE_DRIVER.settings())
+    for data, _ in found.chunks:
+        codec.feed(data)
+    return ledger.frames_in_samples
+
+
+def test_the_line_model_gives_the_bytes_at_the_right_rate_and_others_at_wrong_ones() -> None:
+    data = bytes(range(256))
+    assert bytes(value for _, value in received(data, 115200, 115200)) == data
+    # 0x00 at 9600 is one low of nine bits = 108 bits at 115200: one start edge only, sampled all low
+    assert [value for _, value in received(b"\x00", 9600, 115200)] == [0]
+    # 0x55 at half the rate: start low 2 bits, then pairs 11 00 11 00: sampled 0 11 00 11 0
+    assert received(b"\x55", 115200, 230400)[0][1] == 0b01100110
+
+
+@pytest.mark.parametrize("baud", BAUD_RATES)
+@pytest.mark.parametrize("poll_ms", [1, 16])
+def test_a_100_hz_device_is_found_cold_at_every_rate(baud: int, poll_ms: int) -> None:
+    random = Random(baud)
+    for _ in range(10):
+        search = Search([FAKE_DRIVER], hold_ns=poll_ms * NS_PER_MS if poll_ms > 1 else 0, may_ask=True)
+        far = device(baud, 100, random.randrange(NS_PER_S), poll_ms * NS_PER_MS)
+        found, took_ns, _ = run_search(search, far, start_ns=5 * NS_PER_S)
+        assert isinstance(found, StreamFound)
+        assert found.baud == baud
+        assert took_ns < 1.5 * NS_PER_S
+        assert frames_in(found) >= 2
+        assert far.sent_to == []
+
+
+@pytest.mark.parametrize("baud", BAUD_RATES)
+def test_the_remembered_rate_comes_first(baud: int) -> None:
+    search = Search([FAKE_DRIVER], remembered=("fake-uart", baud))
+    found, took_ns, listens = run_search(search, device(baud, 100, 1_234_567), start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert {listen.baud for listen in listens} == {baud}
+    assert took_ns < 0.3 * NS_PER_S
+    assert found.wasted_bytes == 0
+
+
+def test_a_remembered_rate_that_is_wrong_costs_little_and_its_bytes_are_reported() -> None:
+    search = Search([FAKE_DRIVER], remembered=("fake-uart", 9600))
+    found, took_ns, listens = run_search(search, device(921600, 100, 777), start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.baud == 921600
+    assert listens[0].baud == 9600
+    assert found.wasted_bytes > 0
+    assert took_ns < 0.8 * NS_PER_S  # garbage ends the long wait for silence
+
+
+def test_an_adapter_that_holds_bytes_back_gets_as_much_more_time() -> None:
+    until_ns = []
+    for hold_ns in (0, 16 * NS_PER_MS):
+        step = Search([FAKE_DRIVER], hold_ns=hold_ns).start(0)
+        assert isinstance(step, Listen)
+        until_ns.append(step.until_ns)
+    assert until_ns[1] - until_ns[0] == 16 * NS_PER_MS
+
+
+def test_a_remembered_driver_or_rate_that_no_longer_exists_is_ignored() -> None:
+    assert first_baud(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))) == BAUD_RATES[0]
+    assert first_baud(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))) == BAUD_RATES[0]
+    assert first_baud(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))) == 9600
+
+
+def first_baud(search: Search) -> int:
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    return step.baud
+
+
+@pytest.mark.parametrize(("baud", "rate_hz"), [(9600, 1.0), (115200, 1.0), (921600, 1.0), (230400, 5.0), (256000, 20)])
+def test_a_slow_device_is_found_in_a_later_pass(baud: int, rate_hz: float) -> None:
+    for phase_ns in range(0, NS_PER_S, NS_PER_S // 7):
+        far = device(baud, rate_hz, phase_ns)
+        found, took_ns, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=9 * NS_PER_S)
+        assert isinstance(found, StreamFound), found
+        assert found.baud == baud
+        assert took_ns < 15 * NS_PER_S
+        assert far.sent_to == []
+
+
+@pytest.mark.parametrize("baud", BAUD_RATES)
+def test_a_silent_device_is_asked_after_the_quiet_time_only(baud: int) -> None:
+    far = device(baud, 0)
+    found, took_ns, listens = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.baud == baud
+    first_question = next(index for index, listen in enumerate(listens) if listen.send)
+    assert listens[first_question - 1].until_ns - NS_PER_S >= QUIET_NS
+    assert took_ns < 4 * NS_PER_S
+    assert b"".join(data for data, _ in found.chunks) == REPLY
+
+
+def test_nothing_is_sent_without_leave() -> None:
+    far = device(115200, 0)
+    result, _, listens = run_search(Search([FAKE_DRIVER]), far)
+    assert isinstance(result, GaveUp)
+    assert far.sent_to == []
+    assert {listen.baud for listen in listens} == set(BAUD_RATES)
+    assert "heard nothing at 115200" in result.summary
+    assert "query" not in result.summary
+
+
+def test_each_rate_is_asked_as_often_as_said_and_the_error_says_so() -> None:
+    far = device(57600, 0)
+    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
+    assert isinstance(result, GaveUp)
+    assert far.sent_to == [(baud, QUERY) for baud in BAUD_RATES for _ in range(ASK_TRIES)]
+    assert "no answer to a query" in result.summary
+
+
+def test_another_kind_of_device_is_never_written_to_and_is_described() -> None:
+    far = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
+    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
+    assert isinstance(result, GaveUp)
+    assert far.sent_to == []
+    assert "115200: " in result.summary
+    assert "0 valid frames" in result.summary
+    assert result.wasted_bytes > 0
+
+
+def test_noise_stops_the_questions() -> None:
+    search = Search([FAKE_DRIVER], may_ask=True)
+    step: Step | None = search.start(0)
+    now_ns = 0
+    while isinstance(step, Listen) and not step.send:
+        now_ns = step.until_ns
+        step = search.on_time(now_ns)
+    assert isinstance(step, Listen)
+    assert step.send == QUERY
+    sent = 0
+    step = search.on_data(b"\xff", now_ns + 1) or step
+    while isinstance(step, Listen):
+        now_ns = step.until_ns
+        step = search.on_time(now_ns)
+        sent += isinstance(step, Listen) and bool(step.send)
+    assert isinstance(step, GaveUp)
+    assert sent == 0
+
+
+def test_an_end_line_alone_is_no_answer() -> None:
+    far = replace(device(115200, 0), reply=b"OK\r\n")
+    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
+    assert isinstance(result, GaveUp)
+
+
+def test_one_valid_frame_is_no_lock() -> None:
+    search = Search([FAKE_DRIVER], bauds=(115200,))
+    search.start(0)
+    step = search.on_data(fake_frame(b"x" * 76), 1)
+    assert isinstance(step, Listen)  # a longer stay
+    assert step.until_ns > NS_PER_S
+    assert isinstance(search.on_data(fake_frame(b"y" * 76), 2), StreamFound)
+
+
+def test_damaged_frames_must_be_fewer_unless_many_are_good() -> None:
+    bad = fake_frame(b"x" * 76)[:-1] + b"y"
+    good = fake_frame(b"z" * 76)
+    search = Search([FAKE_DRIVER], bauds=(115200,))
+    search.start(0)
+    for place, frame in enumerate([bad, bad, bad, bad, bad, good, good, good]):
+        assert not isinstance(search.on_data(frame, place), StreamFound)
+    assert isinstance(search.on_data(good, 9), StreamFound)
+
+
+def test_a_noisy_line_still_locks() -> None:
+    far = replace(device(460800, 100, 4_000_000), damage=0.4)
+    found, took_ns, _ = run_search(Search([FAKE_DRIVER]), far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert took_ns < 2 * NS_PER_S
+
+
+def test_a_frame_inside_a_false_long_one_counts_when_the_line_is_idle() -> None:
+    search = Search([FAKE_DRIVER], bauds=(115200,))
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    lie = b"\x5a\xa5\x00\x02\x00\x00"  # claims 512 bytes
+    assert search.on_data(lie + fake_frame(b"a" * 76) + fake_frame(b"b" * 76), 1) is None
+    assert isinstance(search.on_time(step.until_ns), StreamFound)
+
+
+def test_every_byte_is_in_the_chunks_or_wasted() -> None:
+    far = device(9600, 100, 5_000_000)
+    search = Search([FAKE_DRIVER])
+    heard = 0
+    take = search.on_data
+
+    def counting(data: bytes, t_rx_ns: int) -> object:
+        nonlocal heard
+        heard += len(data)
+        return take(data, t_rx_ns)
+
+    search.on_data = counting  # type: ignore[method-assign, assignment]  # a spy
+    found, _, _ = run_search(search, far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.wasted_bytes > 0
+    assert sum(len(data) for data, _ in found.chunks) + found.wasted_bytes == heard
+
+
+def test_a_rate_that_the_port_cannot_do_is_left_out_and_named() -> None:
+    search = Search([FAKE_DRIVER], bauds=(921600, 9600))
+    step: Step | None = search.start(0)
+    now_ns = 0
+    seen: list[int] = []
+    while isinstance(step, Listen):
+        seen.append(step.baud)
+        now_ns = step.until_ns
+        if step.baud == 921600:
+            step = search.refused("the port cannot do it", now_ns)
+        else:
+            search.on_data(b"\x01", now_ns - 1)
+            step = search.on_time(now_ns)
+    assert isinstance(step, GaveUp)
+    assert seen.count(921600) == 1
+    assert "921600: the port cannot do it" in step.summary
+
+
+def test_a_port_that_can_do_no_rate_is_given_up_at_once() -> None:
+    search = Search([FAKE_DRIVER], may_ask=True)
+    step = search.start(0)
+    for number in range(len(BAUD_RATES)):
+        assert isinstance(step, Listen)
+        step = search.refused("not to be had", number)
+    assert isinstance(step, GaveUp)
+    assert "9600: not to be had" in step.summary
+
+
+def test_early_time_is_no_step() -> None:
+    search = Search([FAKE_DRIVER])
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    assert search.on_time(step.until_ns - 1) is None
+
+
+def test_a_flood_ends_a_visit() -> None:
+    search = Search([FAKE_DRIVER])
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    change = None
+    for number in range(100):
+        change = search.on_data(bytes(4096), number)
+        if change is not None:
+            break
+    assert isinstance(change, Listen)
+    assert change.baud != step.baud
+
+
+def test_the_driver_is_told_apart_by_its_frames() -> None:
+    other = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
+    for drivers in ([other, FAKE_DRIVER], [FAKE_DRIVER, other]):
+        found, _, _ = run_search(Search(drivers), device(115200, 100), start_ns=NS_PER_S)
+        assert isinstance(found, StreamFound)
+        assert found.driver is FAKE_DRIVER
+
+
+class DeafCodec:
+    """Understands nothing."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+
+    def feed(self, data: bytes) -> list[CodecEvent]:
+        return []
+
+    def flush(self) -> list[CodecEvent]:
+        return []
+
+    def reset(self) -> None:
+        """Has nothing to forget."""
+
+
+def test_cut_frames_and_random_bytes_are_no_device() -> None:
+    random = Random(7)
+    for noise in (fake_frame(b"x" * 76)[:60], fake_frame(b"x" * 76)[:60] + SYNC, random.randbytes(82), SYNC * 40):
+        far = replace(device(115200, 100, 3_000_000), noise=noise)
+        result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
+        assert isinstance(result, GaveUp)
+        assert far.sent_to == []
+
+
+@pytest.mark.parametrize("baud", HIPNUC.baud_rates)
+def test_a_hipnuc_module_is_found_by_its_frames_and_when_silent_by_its_reply(baud: int) -> None:
+    far = FakeDevice(HIPNUC, baud, 100, 1_000_000, random=Random(baud))
+    found, _, _ = run_search(Search([HIPNUC], may_ask=True), far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert (found.driver.name, found.baud) == ("hipnuc-uart", baud)
+    far = replace(far, rate_hz=0, query=b"LOG VERSION\r\n", reply=HIPNUC_REPLY)
+    found, took_ns, _ = run_search(Search([HIPNUC], may_ask=True), far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.baud == baud
+    assert took_ns < 4 * NS_PER_S
+
+
+def test_a_search_needs_drivers() -> None:
+    with pytest.raises(ValueError, match="at least one driver"):
+        Search([])

@@ -1,0 +1,105 @@
+"""Several families of devices on one port, neither driver nor rate known: each is found, and told from the others."""
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from imud.contracts.driver import StreamDriver
+from imud.devices.hipnuc.uart.codec import DRIVER as HIPNUC
+from imud.devices.imu61x.uart.codec import DRIVER as IMU61X
+from imud.devices.imu61x.uart.codec import encode_acknowledgement, encode_status
+from imud.devices.imu61x.uart.commands import ask_status
+from imud.devices.imu61x.uart.replies import Status
+from imud.runtime.detection import ASK_TRIES, GaveUp, Search, StreamFound
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.uart_wire import FakeDevice, run_search
+
+FAMILIES = [HIPNUC, IMU61X]
+STATUS = encode_status(Status(10203, 2, 614, (1, 2, 3), 0, 0, 0, 0, 0, 0, 0, bytes(32)))
+ANSWERS = {
+    "hipnuc-uart": (b"LOG VERSION\r\n", b"PNAME=HI14R3\r\nAPP_VER=156\r\nOK\r\n"),
+    "imu61x-uart": (ask_status().payload, STATUS),
+}
+every_rate = pytest.mark.parametrize(
+    ("driver", "baud"), [(driver, baud) for driver in FAMILIES for baud in driver.baud_rates],
+    ids=lambda value: value.name if isinstance(value, StreamDriver) else None,
+)  # fmt: skip
+
+
+def device(driver: StreamDriver, baud: int, rate_hz: float, phase_ns: int = 0) -> FakeDevice:
+    query, reply = ANSWERS[driver.name]
+    return FakeDevice(driver, baud, rate_hz, phase_ns, reply=reply, query=query, random=Random(baud + phase_ns))
+
+
+@every_rate
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("hold_ms", [0, 16])
+def test_a_streaming_device_is_found_cold_among_all(driver: StreamDriver, baud: int, order: int, hold_ms: int) -> None:
+    random = Random(f"{driver.name} {baud}")
+    for _ in range(3):
+        far = replace(device(driver, baud, 100, random.randrange(NS_PER_S)), poll_ns=max(hold_ms, 1) * NS_PER_MS)
+        search = Search(FAMILIES[::order], may_ask=True, hold_ns=hold_ms * NS_PER_MS)
+        found, took_ns, _ = run_search(search, far, start_ns=5 * NS_PER_S)
+        assert isinstance(found, StreamFound), found
+        assert (found.driver.name, found.baud) == (driver.name, baud)
+        assert took_ns < 2 * NS_PER_S
+        assert far.sent_to == []
+
+
+@every_rate
+def test_a_remembered_device_is_found_at_once(driver: StreamDriver, baud: int) -> None:
+    search = Search(FAMILIES, remembered=(driver.name, baud))
+    found, took_ns, listens = run_search(search, device(driver, baud, 100, 1_234_567), start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.driver is driver
+    assert {listen.baud for listen in listens} == {baud}
+    assert took_ns < (0.3 if baud > 9600 else 0.4) * NS_PER_S  # two frames of 136 bytes take 283 ms at 9600 baud
+
+
+@pytest.mark.parametrize(("before", "now"), [(HIPNUC, IMU61X), (IMU61X, HIPNUC)])
+def test_a_device_of_the_other_family_in_its_place_is_found(before: StreamDriver, now: StreamDriver) -> None:
+    """Exchanged at the same rate: the remembered rate is heard first, with both codecs."""
+    search = Search(FAMILIES, remembered=(before.name, 115200))
+    found, took_ns, _ = run_search(search, device(now, 115200, 100, 4_000_000), start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert found.driver is now
+    assert took_ns < 0.3 * NS_PER_S
+
+
+@every_rate
+def test_a_silent_device_is_found_by_its_answer(driver: StreamDriver, baud: int) -> None:
+    far = device(driver, baud, 0)
+    found, took_ns, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=NS_PER_S)
+    assert isinstance(found, StreamFound)
+    assert (found.driver.name, found.baud) == (driver.name, baud)
+    assert took_ns < 8 * NS_PER_S
+
+
+@pytest.mark.parametrize("rate_hz", [1, 10])
+@pytest.mark.parametrize("driver", FAMILIES, ids=lambda driver: driver.name)
+def test_a_slow_device_is_found(driver: StreamDriver, rate_hz: int) -> None:
+    for phase_ns in range(0, NS_PER_S, NS_PER_S // 4):
+        far = device(driver, 115200, rate_hz, phase_ns)
+        found, took_ns, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=9 * NS_PER_S)
+        assert isinstance(found, StreamFound)
+        assert found.driver is driver
+        assert took_ns < 15 * NS_PER_S
+        assert far.sent_to == []
+
+
+def test_every_driver_is_asked_as_often_at_the_rates() -> None:
+    far = device(HIPNUC, 57600, 0)
+    result, _, _ = run_search(Search(FAMILIES, may_ask=True), far)
+    assert isinstance(result, GaveUp)
+    bauds = {baud for driver in FAMILIES for baud in driver.baud_rates}
+    for query, _ in ANSWERS.values():
+        asked = [baud for baud, sent in far.sent_to if sent == query]
+        assert set(asked) == bauds
+        assert len(asked) == len(bauds) * ASK_TRIES
+
+
+def test_an_acknowledgement_alone_is_no_answer() -> None:
+    far = replace(device(IMU61X, 115200, 0), reply=encode_acknowledgement(1))
+    result, _, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=NS_PER_S)
+    assert isinstance(result, GaveUp)

@@ -1,0 +1,211 @@
+"""The thread of a bus: dialogues get their turn, devices come and go, nothing is left behind."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from imud.contracts.polling import Poll, Reading, Transfer, TransferScript
+from imud.contracts.status import KernelCounters
+from imud.errors import DeviceRefused, LinkError, TransferError, Trouble
+from imud.runtime.polled.bus import Buses, Member
+from imud.runtime.polled.schedule import Deadlines
+from tests.support.virtual_time import VirtualClock, run_virtually, virtual_buses
+
+ASK = Transfer((b"\x01",), 1)
+
+
+class Wire:
+    """A link whose answers are the number of the transfer."""
+
+    title, writable, bus, shared, rate_hz = "wire", True, "wire", True, 2000.0
+
+    def __init__(self) -> None:
+        self.target: int | None = None
+        self.count = 0
+        self.fail: Exception | None = None
+        self.closed = 0
+        self.threads: set[str] = set()
+        self.takes_time: Callable[[], None] = lambda: None
+
+    async def wait_present(self) -> None: ...
+    def open(self) -> None: ...
+    def write(self, data: bytes) -> None: ...
+    def select(self, target: int) -> None: ...
+
+    def kernel_counters(self) -> KernelCounters:
+        return KernelCounters()
+
+    def serial_line(self) -> None: ...
+
+    def place(self, target: int) -> str:
+        return str(target)
+
+    def transfer(self, transfer: Transfer) -> bytes:
+        self.threads.add(threading.current_thread().name)
+        self.count += 1
+        self.takes_time()
+        if self.fail is not None:
+            raise self.fail
+        return bytes([self.count % 256]) * transfer.read_bytes
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class Sink:
+    """What the loop is given."""
+
+    def __init__(self) -> None:
+        self.readings: list[Reading] = []
+        self.problem: LinkError | None = None
+        self.calls = 0
+        self.enough = asyncio.Event()
+
+    def take(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
+        self.calls += 1
+        self.readings += readings
+        self.problem = problem or self.problem
+        if len(self.readings) > 20 or problem:
+            self.enough.set()
+
+
+def joined(buses: Buses, wire: Wire, sink: Sink) -> Member:
+    return buses.get(wire.bus).join(wire, Deadlines(), sink.take)
+
+
+def three() -> TransferScript[int]:
+    total = 0
+    for _ in range(3):
+        total += (yield ASK)[0]
+    return total
+
+
+def stubborn() -> TransferScript[str]:
+    try:
+        yield ASK
+    except TransferError as error:
+        return f"after {error.trouble}"
+    return "well"
+
+
+def refusing() -> TransferScript[None]:
+    yield ASK
+    raise DeviceRefused("no")
+
+
+def run(body: Any) -> None:
+    async def whole() -> None:
+        buses = Buses()
+        try:
+            await asyncio.wait_for(body(buses), 10)
+        finally:
+            buses.end()
+            buses.end()
+        assert [thread for thread in threading.enumerate() if thread.name == "wire"] == []
+
+    asyncio.run(whole())
+
+
+def test_dialogues_return_raise_and_catch() -> None:
+    async def body(buses: Buses) -> None:
+        wire = Wire()
+        member = joined(buses, wire, Sink())
+        assert await member.talk(three(), 1) == 1 + 2 + 3
+        with pytest.raises(DeviceRefused):
+            await member.talk(refusing(), 1)
+        wire.fail = TransferError(Trouble.ABSENT, "no")
+        assert await member.talk(stubborn(), 1) == "after absent"
+        with pytest.raises(TransferError):
+            await member.talk(three(), 1)
+        wire.fail = LinkError("gone")
+        with pytest.raises(LinkError):
+            await member.talk(stubborn(), 1)
+        assert wire.threads == {"wire"}
+
+    run(body)
+
+
+def test_readings_come_in_order_with_their_times() -> None:
+    """In virtual time: at 2 kHz, each 30 µs long, and every sixth time two of them."""
+    clock = VirtualClock()
+    buses = virtual_buses(clock)
+
+    async def body() -> None:
+        wire, sink = Wire(), Sink()
+        wire.takes_time = lambda: clock.advance(30_000)
+        member = joined(buses, wire, sink)
+        member.start((Poll(ASK), Poll(Transfer((b"\x02",), 2), 3_000_000)))
+        await sink.enough.wait()
+        buses.end()
+        readings = sink.readings
+        firsts = [reading.start_ns for reading in readings if reading.poll == 0]
+        steps = [after - before for before, after in pairwise(firsts)]
+        assert steps == pytest.approx([500_000] * len(steps), abs=2)
+        assert [r.poll for r in readings[:15]] == [0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
+        assert all(reading.end_ns - reading.start_ns == 30_000 for reading in readings)
+        assert all(before.end_ns <= after.start_ns for before, after in pairwise(readings))
+
+    run_virtually(clock, body())
+
+
+def test_dialogue_has_its_turn_on_a_bus_that_is_never_idle() -> None:
+    async def body(buses: Buses) -> None:
+        wire, sink = Wire(), Sink()
+        wire.rate_hz = 1e6
+        member = joined(buses, wire, sink)
+        member.start((Poll(ASK),))
+        await sink.enough.wait()
+        assert await member.talk(three(), 1) > 0
+
+    run(body)
+
+
+def test_end_of_the_bus_is_told_once_and_reading_stops() -> None:
+    async def body(buses: Buses) -> None:
+        wire, sink = Wire(), Sink()
+        member = joined(buses, wire, sink)
+        wire.fail = LinkError("gone")
+        member.start((Poll(ASK),))
+        await sink.enough.wait()
+        wire.fail = None
+        count = wire.count
+        assert await member.talk(three(), 1) == 3 * count + 6  # nothing else was transferred meanwhile
+        assert str(sink.problem) == "gone"
+        assert sink.calls == 1
+
+    run(body)
+
+
+def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread() -> None:
+    async def body(buses: Buses) -> None:
+        wire, sink, other = Wire(), Sink(), Wire()
+        member, stays = joined(buses, wire, sink), joined(buses, other, Sink())
+        member.start((Poll(ASK),))
+        await sink.enough.wait()
+        member.leave()
+        member.leave()
+        calls = sink.calls
+        await stays.talk(three(), 1)
+        assert sink.calls == calls
+        assert wire.closed == 1
+        assert other.closed == 0
+
+    run(body)
+
+
+def test_targets_are_taken_once() -> None:
+    async def body(buses: Buses) -> None:
+        a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
+        assert a.claim(0x18)
+        assert a.claim(0x18)
+        assert not b.claim(0x18)
+        a.release()
+        assert b.claim(0x18)
+        b.leave()
+        assert a.claim(0x18)
+
+    run(body)

@@ -1,0 +1,283 @@
+"""A polled device with a data-ready line: read at its edges, dated by them, and by deadlines while there are none."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from itertools import pairwise
+from math import dist
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.lines import DeviceLines, ReadySettings
+from imud.contracts.status import DeviceState
+from imud.errors import LinkMissing
+from imud.event import EventKind
+from imud.sample import Sample, Sync
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.ports.lines import MemoryInput
+from imud.units import NS_PER_S
+from tests.support.polled import Rig
+from tests.support.stage import Stage
+from tests.support.virtual_time import VirtualClock
+
+MS = 1_000_000
+EVERY_NS = 2 * MS
+"""500 Hz, while `rate_hz` says 100."""
+RATE_HZ = 100.0
+
+
+class Signal:
+    """The device's side of the line: an edge whenever its registers are renewed."""
+
+    def __init__(self, stage: Stage, device: Imu61xRegisters) -> None:
+        self.stamps: list[int] = []
+        """Of the edges since the line was opened."""
+        self.quiet = False
+        self._stage, self._device = stage, device
+
+    @property
+    def line(self) -> MemoryInput:
+        return self._stage.lines.inputs["imu data_ready"]
+
+    @property
+    def newest_ns(self) -> int:
+        """When the registers were renewed last."""
+        epoch_ns = self._device.epoch_ns
+        return epoch_ns + (self._stage.clock.now_ns() - epoch_ns) // EVERY_NS * EVERY_NS
+
+    def at_once(self, t_ns: int) -> None:
+        """An edge with that stamp, which the kernel has."""
+        self.line.edge(t_ns, True)
+        if self.line.is_open:
+            self.stamps.append(t_ns)
+
+    async def run(self) -> None:
+        clock = self._stage.clock
+        while True:
+            t_ns = self.newest_ns + EVERY_NS
+            await asyncio.sleep((t_ns - clock.now_ns()) / NS_PER_S)
+            if not self.quiet and clock.now_ns() >= t_ns and t_ns not in self.stamps[-20:]:
+                self.at_once(t_ns)
+
+
+class Scene:
+    """A device with its line, and its runner."""
+
+    def __init__(self, rig: Rig, signal: Signal, device: Imu61xRegisters, stage: Stage) -> None:
+        self.rig, self.signal, self.device, self.stage = rig, signal, device, stage
+
+    def told(self, words: str) -> Callable[[], bool]:
+        """Whether an event says so."""
+        return lambda: any(e.kind is EventKind.LINK and words in e.message for e in self.rig.events)
+
+    @property
+    def missed(self) -> int:
+        polling = self.rig.runner.status().polling
+        assert polling is not None
+        return polling.missed
+
+    def dated(self, sample: Sample) -> int:
+        """Index of the edge that a sample has, which has the right stamp and values."""
+        assert sample.edge_seq is not None
+        assert sample.sync is Sync.EDGE
+        stamp_ns = self.signal.stamps[sample.edge_seq - 1]
+        assert sample.t_ns == stamp_ns
+        assert sample.accel_m_s2 is not None
+        assert dist(sample.accel_m_s2, self.device.truth_at(stamp_ns).accel_m_s2) < 4e-5
+        return sample.edge_seq
+
+
+@pytest.fixture
+def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    return Stage(tmp_path, monkeypatch, VirtualClock())
+
+
+def with_line(stage: Stage, **more: Any) -> DeviceConfig:
+    return replace(
+        stage.on_spi(RATE_HZ, burst="standard"), lines=DeviceLines(data_ready=ReadySettings(line="Y", **more))
+    )
+
+
+@asynccontextmanager
+async def scene(stage: Stage, **more: Any) -> AsyncIterator[Scene]:
+    device = stage.registers(update_ns=EVERY_NS)
+    stage.spi.device = device.spi
+    signal = Signal(stage, device)
+    async with stage.running(with_line(stage, **more)) as (rig,):
+        task = asyncio.create_task(signal.run())
+        try:
+            yield Scene(rig, signal, device, stage)
+        finally:
+            task.cancel()
+
+
+def test_every_edge_is_a_sample_of_its_own_instant(stage: Stage) -> None:
+    async def body() -> None:
+        async with scene(stage) as it:
+            await it.rig.until_samples(200)
+            status = it.rig.runner.status()
+            assert status.expected_rate_hz == 500
+            assert status.clock.sync is Sync.EDGE
+            assert status.lines is not None
+            assert status.lines.edges["data_ready"] >= 199
+            assert status.lines.edges_lost == {"data_ready": 0}
+            numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
+            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+            assert all(sample.t_err_ns < 62_000 for sample in it.rig.samples[1:])  # 100 µs / √3 and 3 µs
+            assert it.missed == it.rig.runner.ledger.lost_queue == 0
+            assert EventKind.LINK not in it.rig.kinds
+
+    stage.run(body())
+
+
+def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(stage: Stage) -> None:
+    asked: list[Any] = []
+    make = stage.lines.input
+
+    def keep(settings: Any, purpose: str, rising_only: bool = False) -> MemoryInput:
+        asked.append((settings.edge, settings.active_low, rising_only))
+        return make(settings, purpose, rising_only)
+
+    stage.lines.maker = replace(stage.lines.maker, make_input=keep)
+
+    async def body() -> None:
+        for edge, active_low in (("falling", False), ("falling", True), ("rising", True)):
+            async with stage.running(with_line(stage, edge=edge, active_low=active_low)):
+                pass
+
+    stage.run(body())
+    assert asked == [("rising", True, True), ("rising", False, True), ("rising", True, True)]
+
+
+def test_the_edges_of_a_loop_that_stalls_are_missed(stage: Stage) -> None:
+    """The kernel has ten more edges when the loop comes back: one read, of the newest."""
+
+    async def body() -> None:
+        async with scene(stage) as it:
+            await it.rig.until_samples(20)
+            newest = len(it.signal.stamps)
+            for _ in range(10):
+                stage.clock.advance(EVERY_NS)
+                it.signal.at_once(it.signal.stamps[-1] + EVERY_NS)
+            await it.rig.until_samples(20)
+            numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
+            gaps = [b for a, b in pairwise(numbers) if b != a + 1]
+            assert gaps == [newest + 10]
+            lost = numbers[-1] - numbers[0] + 1 - len(numbers)
+            assert lost in (9, 10)
+            assert it.missed == it.rig.runner.ledger.lost_queue == lost
+            await it.rig.until(lambda: EventKind.LOSS in it.rig.kinds, "told")
+
+    stage.run(body())
+
+
+def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(stage: Stage) -> None:
+    """It is in the kernel when the read for the edge before begins; it is not read a second time."""
+
+    async def body() -> None:
+        async with scene(stage) as it:
+            await it.rig.until_samples(20)
+            it.signal.quiet = True
+            await asyncio.sleep(0.01)
+            before = it.rig.runner.status().polling
+            member = it.rig.runner._member
+            assert member is not None
+            stamp_ns = it.signal.newest_ns
+
+            def at_the_beginning_of_the_read() -> int:
+                member._now_ns = stage.clock.now_ns
+                stage.clock.advance(EVERY_NS)
+                it.signal.line._watch = False  # only who drains the line hears of it
+                it.signal.at_once(stamp_ns + EVERY_NS)
+                return stage.clock.now_ns()
+
+            member._now_ns = at_the_beginning_of_the_read
+            it.signal.at_once(stamp_ns)
+            await asyncio.sleep(0.01)
+            after = it.rig.runner.status().polling
+            assert before is not None
+            assert after is not None
+            assert it.dated(it.rig.samples[-1]) == len(it.signal.stamps)
+            assert (after.polls - before.polls, after.missed - before.missed) == (1, 1)
+            assert after.stale == before.stale
+
+    stage.run(body())
+
+
+def test_no_edges_any_more_and_edges_again(stage: Stage) -> None:
+    async def body() -> None:
+        async with scene(stage) as it:
+            await it.rig.until_samples(20)
+            it.signal.quiet = True
+            await it.rig.until(it.told("no edges: read at 100 Hz instead"), "told")
+            count = len(it.rig.samples)
+            await it.rig.until_samples(50)
+            assert it.rig.runner.status().expected_rate_hz == RATE_HZ
+            by_deadlines = it.rig.samples[count + 1 :]
+            assert {sample.sync for sample in by_deadlines} == {Sync.ARRIVAL}
+            assert {sample.edge_seq for sample in by_deadlines} == {None}
+            steps = [b.t_ns - a.t_ns for a, b in pairwise(by_deadlines)]
+            assert sum(steps) / len(steps) == pytest.approx(10 * MS, rel=0.01)
+            it.signal.quiet = False
+            await it.rig.until(it.told("edges are back"), "told")
+            count = len(it.rig.samples)
+            await it.rig.until_samples(50)
+            numbers = [it.dated(sample) for sample in it.rig.samples[count:]]
+            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+            assert it.rig.state is DeviceState.RUNNING
+            assert EventKind.DOWN not in it.rig.kinds
+            assert it.missed <= 1
+            stamps = [sample.t_ns for sample in it.rig.samples]
+            assert stamps == sorted(set(stamps))
+
+    stage.run(body())
+
+
+def test_without_the_line_deadlines_serve_until_it_comes(stage: Stage) -> None:
+    stage.lines.input(ReadySettings(line="Y"), "imu data_ready", True).open_error = LinkMissing("no such line")
+
+    async def body() -> None:
+        async with scene(stage) as it:
+            await it.rig.until(it.told("line data_ready: no such line"), "told")
+            await it.rig.until(it.told("no edges"), "told")
+            await it.rig.until_samples(20)
+            status = it.rig.runner.status()
+            assert status.lines is not None
+            assert status.lines.problems == {"data_ready": "no such line"}
+            it.signal.line.open_error = None
+            await it.rig.until(it.told("edges are back"), "told")
+            await it.rig.until_samples(20)
+            it.dated(it.rig.samples[-1])
+
+    stage.run(body())
+
+
+def test_what_came_while_the_device_was_not_believed_is_not_missed(stage: Stage) -> None:
+    async def body() -> None:
+        async with scene(stage) as it:
+            await it.rig.until_samples(20)
+            it.device.faults.line = 0xFF
+            await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
+            await asyncio.sleep(0.5)
+            it.device.faults.line = None
+            await it.rig.until_samples(20)
+            numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
+            assert max(b - a for a, b in pairwise(numbers)) > 200
+            assert it.missed == 0
+
+    stage.run(body())
+
+
+def test_the_line_is_let_go_of_at_the_end(stage: Stage) -> None:
+    async def body() -> None:
+        async with scene(stage) as it:
+            await it.rig.until_samples(3)
+            rig = it.rig
+        rig.runner.tick(stage.clock.now_ns())
+        assert not it.signal.line.is_open
+
+    stage.run(body())

@@ -1,0 +1,55 @@
+"""The daemon with a polled device: its bus has a thread and real time here."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from time import monotonic_ns
+from typing import Any
+
+import pytest
+
+from imud.config import Config
+from imud.daemon import Daemon
+from imud.sim.imu61x.registers import Imu61xRegisters
+from tests.support.stage import Stage
+
+
+@pytest.fixture
+def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    return Stage(tmp_path, monkeypatch)
+
+
+def wait_until_running(daemon: Daemon, then: Callable[[], None]) -> Coroutine[Any, Any, None]:
+    async def watch() -> None:
+        while sum(device.ledger["samples"] for device in daemon.status()) < 5:
+            await asyncio.sleep(0.005)
+        then()
+
+    return watch()
+
+
+def test_daemon_serves_a_polled_device(stage: Stage) -> None:
+    stage.spi.device = Imu61xRegisters(monotonic_ns).spi
+
+    async def body() -> None:
+        daemon = Daemon(Config("info", "", {}, (stage.on_spi(),)))
+        watching = asyncio.create_task(wait_until_running(daemon, daemon.stop))
+        await asyncio.wait_for(daemon.run(), 10)
+        await watching
+        assert daemon.status()[0].driver == "imu61x-spi"
+
+    asyncio.run(body())
+    assert not stage.spi.opened
+
+
+def test_mistake_in_the_bus_thread_ends_the_daemon(stage: Stage) -> None:
+    def mistake(_selections: Any, _mode: int) -> list[bytes]:
+        raise ZeroDivisionError("a mistake")
+
+    stage.spi.device = mistake
+
+    async def body() -> None:
+        await asyncio.wait_for(Daemon(Config("info", "", {}, (stage.on_spi(),))).run(), 10)
+
+    with pytest.raises(ZeroDivisionError, match="a mistake"):
+        asyncio.run(body())

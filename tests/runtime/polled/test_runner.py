@@ -1,0 +1,358 @@
+"""A polled device from its bus to the publishers: identified before it is believed, in time, back when it vanished."""
+
+import asyncio
+import errno
+from math import dist, sqrt
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from imud.contracts.polling import Reading
+from imud.contracts.status import DeviceState
+from imud.devices.imu61x.spi.codec import DRIVER
+from imud.event import EventKind
+from tests.support.polled import device_config
+from tests.support.stage import RATE_HZ, Stage, on_i2c
+from tests.support.virtual_time import VirtualClock
+
+
+@pytest.fixture
+def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    return Stage(tmp_path, monkeypatch, VirtualClock())
+
+
+@pytest.mark.parametrize(
+    ("burst", "resolution_m_s2", "temperature"),
+    [("standard", 4e-5, 2e-3), ("extended", 2e-6, 2e-3), ("registers", 4e-8, 1e-3)],
+)
+def test_spi_samples_are_the_truth_of_the_latched_instant(
+    stage: Stage, burst: str, resolution_m_s2: float, temperature: float
+) -> None:
+    """The resolution of a burst count is 0.2 / 65536 g = 3e-5 m/s², of a register's a thousandth, of f32 1e-6."""
+    device = stage.registers(modes=frozenset({3}), update_ns=970_000)  # not in step with the deadlines
+    latched: list[int] = []
+
+    def answer(selections: Any, mode: int) -> list[bytes]:
+        miso = device.spi(selections, mode)
+        is_reading = selections[0][0] in (0x80, 0x0E) and len(selections) != 4
+        if is_reading and latched[-1:] != [device.latched_ns]:  # read twice, it is stale and makes no sample
+            latched.append(device.latched_ns)
+        return miso
+
+    stage.spi.device = answer
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi(burst=burst, update_hz=1000)) as (rig,):
+            await rig.until_samples(60)
+            status = rig.runner.status()
+            assert status.identity == {"product": "IMU614"}
+            assert status.link == f"{stage.node}, mode 3"
+            assert status.settings["burst"] == ("extended" if burst == "extended" else "standard")
+            assert status.expected_rate_hz == RATE_HZ
+        errors = []
+        for sample, instant_ns in zip(rig.samples, latched, strict=False):
+            truth = device.truth_at(instant_ns)
+            assert sample.accel_m_s2 is not None
+            assert sample.gyro_rad_s is not None
+            assert dist(sample.accel_m_s2, truth.accel_m_s2) < resolution_m_s2
+            assert dist(sample.gyro_rad_s, truth.gyro_rad_s) < 1e-6
+            assert instant_ns <= sample.t_rx_ns
+            errors.append((sample.t_ns - instant_ns) / sample.t_err_ns)
+            if burst == "extended":
+                assert sample.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-6)
+        assert rig.samples[-1].temperature_c == pytest.approx(
+            device.truth_at(stage.clock.now_ns()).temperature_c, abs=0.05
+        )
+        assert rig.samples[-1].t_err_ns < 2_000_000
+        assert sqrt(sum(error**2 for error in errors) / len(errors)) < 1.1
+        assert max(errors) < sqrt(3) * 1.01
+
+    stage.run(body())
+    assert device.window == 0
+    assert not stage.spi.opened
+
+
+def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_read(stage: Stage) -> None:
+    stage.spi.device = stage.registers().spi
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            await rig.until_samples(20)
+        for before, sample in zip(rig.samples[5:], rig.samples[6:], strict=False):
+            asked_ns = sample.t_rx_ns - sample.t_ns
+            assert sample.t_err_ns == pytest.approx((sample.t_ns - before.t_ns + asked_ns) / sqrt(3), abs=10)
+            assert sample.t_ns > before.t_ns
+
+    stage.run(body())
+
+
+def test_one_burst_is_one_ioctl_in_one_selection(stage: Stage) -> None:
+    stage.spi.device = stage.registers().spi
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            await rig.until_samples(10)
+
+    stage.run(body())
+    bursts = [mosi for mosi, _, _ in stage.spi.messages if mosi[0][:1] == b"\x80"]
+    assert len(bursts) >= 10
+    assert {tuple(map(len, mosi)) for mosi in bursts} == {(32,)}
+
+
+SPI_FAULTS: list[tuple[dict[str, Any], str]] = [
+    ({"line": 0xFF}, "only 0xFF"),
+    ({"line": 0x00}, "only 0x00"),
+    ({"error": errno.EIO}, "transfer failed"),
+    ({"error": errno.ETIMEDOUT}, "held low"),
+    ({"flips": 10**6}, "damaged frames"),
+]
+
+
+@pytest.mark.parametrize(("fault", "why"), SPI_FAULTS, ids=[why for _, why in SPI_FAULTS])
+def test_vanished_device_is_not_believed_before_it_is_identified(stage: Stage, fault: dict[str, Any], why: str) -> None:
+    device = stage.registers()
+    stage.spi.device = device.spi
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            await rig.until_samples(3)
+            for name, value in {**fault, "product_id": b"\x00\x00ICM206"}.items():
+                setattr(device.faults, name, value)
+            await rig.until(lambda: EventKind.DOWN in rig.kinds, "reported")
+            down = next(event for event in rig.events if event.kind is EventKind.DOWN)
+            assert why in down.message
+            # another device takes its place, whose bursts look right
+            device.faults = type(device.faults)(product_id=b"\x00\x00ICM206")
+            count, asked = len(rig.samples), device.transactions
+            await rig.until(lambda: device.transactions > asked + 1, "asked again")
+            assert len(rig.samples) == count
+            assert rig.state is DeviceState.SEARCHING
+            device.faults = type(device.faults)()
+            await rig.until_samples(3)
+            assert rig.kinds.count(EventKind.UP) == rig.kinds.count(EventKind.DOWN) + 1
+            assert [sample.seq for sample in rig.samples] == list(range(1, len(rig.samples) + 1))
+
+    stage.run(body())
+
+
+def test_readings_on_their_way_when_it_vanished_are_not_believed(stage: Stage) -> None:
+    """The thread may have read more before it hears that the device is gone."""
+    device = stage.registers()
+    stage.spi.device = device.spi
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            await rig.until_samples(3)
+            now_ns = stage.clock.now_ns()
+            good = DRIVER.example_reading(Random(1))
+            gone = [Reading(0, b"\xff" * 32, None, now_ns, now_ns), Reading(0, good, None, now_ns, now_ns)]
+            before, count = rig.runner.ledger.bytes_skipped, len(rig.samples)
+            rig.runner._take(gone, None)
+            rig.runner._take(gone[1:], None)
+            assert len(rig.samples) == count
+            assert rig.runner.ledger.bytes_skipped == before + 28 + 32 + 32
+            await rig.until_samples(3)
+
+    stage.run(body())
+
+
+def test_single_damage_costs_its_sample_and_nothing_else(stage: Stage) -> None:
+    device = stage.registers()
+    stage.spi.device = device.spi
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            await rig.until_samples(5)
+            for number in (1, 2):
+                device.faults.flips = 1
+                await rig.until(lambda wanted=number: rig.runner.ledger.frames_bad_crc == wanted, "seen")  # type: ignore[misc]  # bound per round
+                await rig.until_samples(5)
+            assert rig.runner.ledger.lost_crc == 2
+            assert EventKind.DOWN not in rig.kinds
+            assert EventKind.BAD_FRAME in rig.kinds
+
+    stage.run(body())
+
+
+def test_restarted_device_is_set_up_again(stage: Stage) -> None:
+    """Its filter is read every ten seconds."""
+    device = stage.registers()
+    stage.i2c.devices[0x1A] = device
+    config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 1, "rate_hz": RATE_HZ}, gyro_filter=2)
+
+    async def body() -> None:
+        async with stage.running(config) as (rig,):
+            await rig.until_samples(3)
+            assert device.filter == 0xB2
+            device.restart()
+            await rig.until(lambda: device.filter == 0xB2, "set up again", 11)
+            await rig.until_samples(3)
+            assert rig.runner.status().polling.vanished == 1  # type: ignore[union-attr]  # a polled device has it
+            assert rig.runner.ledger.frames_in_replies > 2
+
+    stage.run(body())
+
+
+def test_setting_that_does_not_take_keeps_it_from_running(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = stage.registers()
+    stage.i2c.devices[0x18] = device
+
+    def deaf(part: bytes | int) -> bool:
+        return written(part if isinstance(part, int) else part[:1])
+
+    written = device._written
+    monkeypatch.setattr(device, "_written", deaf)
+    config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 1}, gyro_filter=2)
+
+    async def body() -> None:
+        async with stage.running(config) as (rig,):
+            await rig.until(lambda: "read back 0xbb" in rig.runner.status().problem, "told")
+            assert rig.state is DeviceState.SEARCHING
+            assert not rig.samples
+
+    stage.run(body())
+
+
+def test_auto_finds_driver_and_address_and_does_not_take_one_twice(stage: Stage) -> None:
+    stage.i2c.devices.update({0x19: stage.registers(product="IMU612"), 0x1B: stage.registers(product="IMU618")})
+
+    async def body() -> None:
+        async with stage.running(on_i2c("a", "auto"), on_i2c("b"), on_i2c("c")) as rigs:
+
+            def settled() -> bool:
+                for rig in rigs:
+                    rig.runner.tick(stage.clock.now_ns())
+                return all(rig.state is DeviceState.RUNNING or rig.runner.status().problem for rig in rigs)
+
+            await rigs[0].until(settled, "settled")
+            there = [rig for rig in rigs if rig.state is DeviceState.RUNNING]
+            assert {rig.runner.status().link for rig in there} == {
+                "/dev/i2c-1, address 0x19", "/dev/i2c-1, address 0x1b"
+            }  # fmt: skip
+            (left,) = (rig for rig in rigs if rig not in there)
+            await left.until(lambda: "another device of this configuration" in left.runner.status().problem, "told")
+            assert {rig.runner.status().identity["product"] for rig in there} == {"IMU612", "IMU618"}
+
+    stage.run(body())
+
+
+def test_vanished_device_does_not_hold_up_the_others(stage: Stage) -> None:
+    there, gone = stage.registers(), stage.registers()
+    stage.i2c.devices.update({0x18: there, 0x19: gone})
+    gone.faults.error = errno.ENXIO
+
+    async def body() -> None:
+        async with stage.running(on_i2c("there", address=0x18), on_i2c("gone", address=0x19)) as (good, bad):
+            await good.until_samples(100)
+            polling = good.runner.status().polling
+            assert polling is not None
+            assert (polling.missed, polling.late) == (0, 0)
+            assert bad.state is DeviceState.SEARCHING
+            assert "no acknowledgement at address 0x19" in bad.runner.status().problem
+            gone.faults.error = 0
+            await bad.until_samples(3)
+
+    stage.run(body())
+
+
+def test_repeated_values_are_stale_and_then_silence(stage: Stage) -> None:
+    device = stage.registers()
+    stage.i2c.devices[0x18] = device
+
+    async def body() -> None:
+        async with stage.running(on_i2c()) as (rig,):
+            await rig.until_samples(3)
+            device.faults.frozen = True
+            await rig.until(lambda: rig.state is DeviceState.SILENT, "silent")
+            polling, ledger = rig.runner.status().polling, rig.runner.ledger
+            assert polling is not None
+            assert polling.stale == ledger.frames_ignored > 10
+            assert ledger.lost() == 0
+            device.faults.frozen = False
+            await rig.until_samples(3)
+
+    stage.run(body())
+
+
+def test_device_slower_than_its_polls_gives_each_value_once(stage: Stage) -> None:
+    device = stage.registers(update_ns=10_000_000)
+    stage.spi.device = device.spi
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi(rate_hz=500)) as (rig,):
+            await rig.until_samples(20)
+        values = [sample.accel_m_s2 for sample in rig.samples]
+        assert len(set(values)) == len(values)
+        polling = rig.runner.status().polling
+        assert polling is not None
+        assert polling.stale > 2 * len(values)
+        steps = [b.t_ns - a.t_ns for a, b in zip(rig.samples[5:], rig.samples[6:], strict=False)]
+        assert sum(steps) / len(steps) == pytest.approx(1e7, rel=0.1)
+
+    stage.run(body())
+
+
+def test_missing_bus_is_waited_for_and_lost_again(stage: Stage) -> None:
+    stage.spi.device = stage.registers().spi
+    plug, unplug = stage.node.touch, stage.node.unlink
+    unplug()
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            await asyncio.sleep(0)
+            assert rig.state is DeviceState.MISSING
+            plug()
+            await rig.until_samples(3)
+            unplug()
+            device = stage.registers()
+            device.faults.error = errno.ENODEV
+            stage.spi.device = device.spi
+            await rig.until(lambda: rig.state is DeviceState.MISSING, "missing")
+            assert EventKind.DOWN in rig.kinds
+            device.faults.error = 0
+            plug()
+            await rig.until_samples(3)
+            assert rig.runner.status().connects == 2
+
+    stage.run(body())
+
+
+def test_bus_that_may_not_be_opened_fails_with_the_reason(stage: Stage) -> None:
+    stage.spi.open_error = errno.EBUSY
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            await rig.until(lambda: rig.state is DeviceState.FAILED, "failed")
+            assert "in use" in rig.runner.status().problem
+            stage.spi.open_error = 0
+            stage.spi.device = stage.registers().spi
+            await rig.until_samples(1)
+
+    stage.run(body())
+
+
+def test_slow_transfers_miss_deadlines_which_are_lost_samples(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
+    device = stage.registers()
+
+    def slow(selections: Any, mode: int) -> list[bytes]:
+        stage.clock.advance(5_000_000)
+        return device.spi(selections, mode)
+
+    stage.spi.device = slow
+
+    async def body() -> None:
+        async with stage.running(stage.on_spi(rate_hz=1000)) as (rig,):
+            await rig.until_samples(10)
+            await rig.until(lambda: EventKind.LOSS in rig.kinds, "told")
+            polling = rig.runner.status().polling
+            assert polling is not None
+            # a transfer takes 5.16 ms, the first read has three: as many deadlines as ms pass, kept or missed
+            assert polling.polls + polling.missed == pytest.approx(5.16 * (polling.polls + 2), abs=1.5)
+            assert polling.late > 0.5 * polling.polls
+            assert polling.late_sum_ns // polling.polls == polling.late_mean_ns > 0
+            assert "no value of it is new" not in caplog.text  # it was not asked for long enough to say so
+            assert rig.runner.ledger.lost_queue == polling.missed >= 30
+
+    stage.run(body())

@@ -1,0 +1,222 @@
+"""A simulated IMU61x on a line in virtual time: made to stream when it is silent, and never left silent."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.status import DeviceState
+from imud.devices.imu61x.uart.commands import OutputMode
+from imud.event import Event, EventKind
+from imud.links.memory import MemoryLink, MemorySettings
+from imud.runtime.detection.remembered import Remembered
+from imud.runtime.stream.runner import DeviceRunner
+from imud.sample import Sample
+from imud.sim.imu61x.settings import Imu61xSettings
+from imud.sim.imu61x.uart import Imu61xModule
+from imud.sim.ports.wire import heard
+from tests.support.imu61x_bench import STILL
+from tests.support.virtual_time import VirtualClock, run_virtually
+
+STEP_S = 0.001
+QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
+UNTOLD = (
+    "imud.runtime.device",
+    "imud.runtime.path",
+    "imud.runtime.stream.runner",
+    "imud.runtime.detection.round",
+    "imud.runtime.exchange",
+)
+
+
+class Line(MemoryLink):
+    """A line with a device at its far end."""
+
+    module: Imu61xModule
+    clock: VirtualClock
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
+
+    async def carry(self) -> None:
+        """What the device sends, as it leaves the wire."""
+        while True:
+            baud = self.module.baud
+            for burst in self.module.advance(self.clock.now_ns()):
+                self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
+            await asyncio.sleep(STEP_S)
+
+
+class Bench:
+    """One runner on the line."""
+
+    def __init__(self, clock: VirtualClock, settings: Imu61xSettings, hardware: dict[str, Any], **link: Any) -> None:
+        self.clock = clock
+        self.samples: list[Sample] = []
+        self.events: list[Event] = []
+        config = DeviceConfig(
+            "bow", link.pop("driver", "imu61x-uart"), None, link.pop("identify", True), "memory",
+            MemorySettings(**{"baud": 115200, **link}),
+        )  # fmt: skip
+        publish = lambda batch: self.samples.extend(batch.samples)  # noqa: E731  # one line of glue
+        self.runner = DeviceRunner(config, 0, publish, self.events.append, Remembered(None))
+        self.module = Imu61xModule(clock.now_ns(), settings, replace(STILL, **hardware))
+        self.line = Line(MemorySettings(**{"baud": 115200, **link}))
+        self.line.module, self.line.clock = self.module, clock
+        self.runner.link = self.line
+        self.runner._exchange._write = self.line.write
+
+    @property
+    def woken(self) -> list[str]:
+        """What was told of waking it."""
+        return [event.message for event in self.events if "told to stream" in event.message]
+
+    async def until(self, condition: Callable[[], object], limit_s: float = 30.0) -> None:
+        """Let time pass until it holds."""
+        end_ns = self.clock.now_ns() + int(limit_s * 1e9)
+        while not condition():
+            assert self.clock.now_ns() < end_ns, (self.runner.status(), self.line.written)
+            await asyncio.sleep(0.01)
+            self.runner.tick(self.clock.now_ns())
+
+
+Play = Callable[..., Bench]
+
+
+@pytest.fixture
+def play(monkeypatch: pytest.MonkeyPatch) -> Play:
+    """Runs a story with a runner at work, which is cancelled at its end."""
+
+    def run(
+        story: Callable[[Bench], Awaitable[None]],
+        settings: Imu61xSettings = QUIET,
+        hardware: dict[str, Any] | None = None,
+        **link: Any,
+    ) -> Bench:
+        clock = VirtualClock()
+        clock.stand_for_monotonic(monkeypatch, *UNTOLD)
+        benches: list[Bench] = []
+
+        async def both() -> None:
+            bench = Bench(clock, settings, hardware or {}, **link)
+            benches.append(bench)
+            carrying = asyncio.create_task(bench.line.carry())
+            running = asyncio.create_task(bench.runner.run())
+            try:
+                await story(bench)
+            finally:
+                running.cancel()
+                await asyncio.gather(running, return_exceptions=True)
+                bench.runner.close()
+                carrying.cancel()
+                await asyncio.gather(carrying, return_exceptions=True)
+            assert bench.runner.ledger.closes()
+
+        run_virtually(clock, both())
+        return benches[0]
+
+    return run
+
+
+@pytest.mark.parametrize("link", [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}], ids=str)
+def test_device_saved_in_command_mode_is_made_to_stream(play: Play, link: dict[str, Any]) -> None:
+    async def story(bench: Bench) -> None:
+        await bench.until(lambda: bench.woken and len(bench.samples) > 20)
+        assert bench.runner.state is DeviceState.RUNNING
+        assert bench.woken == ["it answered and sent no samples: told to stream, which is not saved"]
+        assert bench.runner.status().identity["serial_number"] == "003200473133510D33383736"
+
+    bench = play(story, hardware={"boot_ms": 0}, **link)
+    assert bench.module.flash.mode is OutputMode.COMMAND
+    assert [e.kind for e in bench.events if "told to stream" in e.message] == [EventKind.CONFIGURATION]
+
+
+def test_nothing_is_sent_where_it_may_not_be_asked(play: Play) -> None:
+    async def story(bench: Bench) -> None:
+        with pytest.raises(AssertionError):
+            await bench.until(lambda: bench.samples, 8)
+
+    bench = play(story, identify=False)
+    assert bench.line.written == []
+    assert bench.woken == []
+
+
+def test_device_that_streams_is_not_told_to(play: Play) -> None:
+    async def story(bench: Bench) -> None:
+        await bench.until(lambda: len(bench.samples) > 500)
+
+    bench = play(story, Imu61xSettings())
+    assert bench.woken == []
+
+
+def test_device_that_comes_later_is_woken_and_told_of_once(play: Play) -> None:
+    """It boots for 20 s, and does not say that it obeys."""
+
+    async def story(bench: Bench) -> None:
+        await bench.until(lambda: bench.woken and len(bench.samples) > 500, 60)
+        assert bench.woken == ["it answered and sent no samples: told to stream, which is not saved"]
+        assert [e.detail["acknowledged"] for e in bench.events if "acknowledged" in e.detail] == [False]
+
+    play(story, hardware={"boot_ms": 20_000, "acknowledges": False})
+
+
+def test_where_nothing_answers_nothing_is_told(play: Play) -> None:
+    async def story(bench: Bench) -> None:
+        with pytest.raises(AssertionError):
+            await bench.until(lambda: bench.samples, 20)
+
+    bench = play(story, hardware={"boot_ms": 10**6})
+    assert bench.woken == []
+    assert len(bench.line.written) > 10
+
+
+def test_device_that_acknowledges_and_stays_silent_is_told_of_once(play: Play) -> None:
+    async def story(bench: Bench) -> None:
+        bench.module._set_mode = lambda mode, now_ns: None  # type: ignore[method-assign]  # it only says so
+        with pytest.raises(AssertionError):
+            await bench.until(lambda: bench.samples, 10)
+        assert len(bench.woken) == 1
+
+    play(story, hardware={"boot_ms": 0})
+
+
+def test_device_that_was_told_to_be_silent_is_left_so(play: Play) -> None:
+    async def story(bench: Bench) -> None:
+        await bench.until(lambda: len(bench.samples) > 20 and bench.runner.status().settings)
+        await bench.runner.act("stop_streaming", {})
+        count = len(bench.samples)
+        with pytest.raises(AssertionError):
+            await bench.until(lambda: len(bench.samples) > count + 5, 10)
+        assert bench.runner.state is DeviceState.SILENT
+
+    bench = play(story, Imu61xSettings())
+    assert bench.woken == []
+
+
+@pytest.mark.parametrize("cut_at", range(1, 25, 3))
+def test_identification_cut_off_anywhere_leaves_it_streaming(play: Play, cut_at: int) -> None:
+    """The daemon stops in the middle of the questions; the device answers in command mode only."""
+
+    async def story(bench: Bench) -> None:
+        await bench.until(lambda: len(bench.line.written) >= cut_at)
+
+    bench = play(story, Imu61xSettings(), {"answers_while_streaming": False})
+    assert bench.module.settings.mode is OutputMode.STREAM
+
+
+def test_a_link_that_is_gone_needs_nothing(play: Play) -> None:
+    async def story(bench: Bench) -> None:
+        await bench.until(lambda: bench.module.settings.mode is OutputMode.COMMAND)
+        bench.line.disappear()
+        await bench.until(lambda: bench.runner.state is DeviceState.MISSING)
+        count = len(bench.line.written)
+        bench.line.appear()
+        await bench.until(lambda: len(bench.line.written) > count)
+        await bench.until(lambda: len(bench.samples) > 20)  # asked again, which begins with what it is in
+        assert bench.runner.state is DeviceState.RUNNING
+
+    play(story, Imu61xSettings(), {"answers_while_streaming": False})

@@ -1,0 +1,310 @@
+"""Devices with a reset line: reset when they are not found by other means, and when told to."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.lines import DeviceLines, ResetSettings, SoutSettings, TriggerSettings
+from imud.contracts.status import DeviceState
+from imud.contracts.timing import SoutTiming, TriggerTiming
+from imud.devices.imu61x.uart.codec import DRIVER, encode_ahrs
+from imud.errors import BadArgument, CommandError
+from imud.event import Event, EventKind
+from imud.links.memory import MemoryLink, MemorySettings
+from imud.runtime.detection.remembered import Remembered
+from imud.runtime.stream.runner import DeviceRunner
+from imud.sample import Sample
+from imud.sim.ports.lines import MemoryLines, MemoryOutput
+from tests.support.polled import Rig
+from tests.support.stage import Stage
+from tests.support.virtual_time import VirtualClock, run_virtually
+
+LINES = DeviceLines(reset=ResetSettings(line="R"))
+BOOT_S = 2.9
+"""A little less than the manual says."""
+UNTOLD = (
+    "imud.runtime.device",
+    "imud.runtime.path",
+    "imud.runtime.stream.runner",
+    "imud.runtime.detection.round",
+    "imud.runtime.exchange",
+)
+
+
+@pytest.fixture
+def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    return Stage(tmp_path, monkeypatch, VirtualClock())
+
+
+def on_release(line: MemoryOutput, boot: Callable[[], None]) -> None:
+    """Let the device boot after each pulse."""
+
+    def changed(_t_ns: int, active: bool) -> None:
+        if not active:
+            asyncio.get_running_loop().call_later(BOOT_S, boot)
+
+    line._on_change = changed
+
+
+class Scene:
+    """A polled device that hangs, and the line that helps."""
+
+    def __init__(self, rig: Rig, stage: Stage) -> None:
+        self.rig, self.stage = rig, stage
+        self.line = stage.lines.outputs["imu reset"]
+        self.device = stage.registers()
+        stage.spi.device = self.device.spi
+        on_release(self.line, self.boot)
+
+    def hang(self) -> None:
+        """It answers no more."""
+        self.device.faults.line = 0xFF
+
+    def boot(self) -> None:
+        """It works again, its settings forgotten."""
+        self.device.restart()
+        self.device.faults.line = None
+
+    @property
+    def pulses(self) -> int:
+        return sum(active for _, active in self.line.history)
+
+    @property
+    def told(self) -> list[str]:
+        """What was said of the line."""
+        return [event.message for event in self.rig.events if event.detail.get("line") == "reset"]
+
+
+@asynccontextmanager
+async def polled(stage: Stage, **more: Any) -> AsyncIterator[Scene]:
+    config = replace(
+        stage.on_spi(burst="extended", gyro_filter=2), lines=DeviceLines(reset=ResetSettings(line="R", **more))
+    )
+    async with stage.running(config) as (rig,):
+        yield Scene(rig, stage)
+
+
+def test_a_device_that_hangs_is_reset_and_set_up_again(stage: Stage) -> None:
+    async def body() -> None:
+        async with polled(stage) as it:
+            await it.rig.until_samples(5)
+            it.hang()
+            down_ns = stage.clock.now_ns()
+            await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
+            await it.rig.until_samples(5, 20)
+            assert it.pulses == 1
+            (up_ns, _), (released_ns, _) = it.line.history
+            assert 4.4e9 < up_ns - down_ns < 5.1e9
+            assert released_ns - up_ns == pytest.approx(10e6, abs=10)
+            assert it.told == ["not found for 4 s: reset by its line"]
+            assert it.rig.kinds.count(EventKind.UP) == 2
+            assert (it.device.extended, it.device.filter & 0x0F) == (1, 2)
+            assert stage.clock.now_ns() - up_ns < 4e9
+
+    stage.run(body())
+
+
+def test_a_device_that_comes_back_by_itself_is_not_reset(stage: Stage) -> None:
+    async def body() -> None:
+        async with polled(stage) as it:
+            for _ in range(5):
+                await it.rig.until_samples(5, 20)
+                it.hang()
+                await asyncio.sleep(3.5)
+                it.boot()
+            await it.rig.until_samples(5, 20)
+            assert it.pulses == 0
+            assert it.rig.kinds.count(EventKind.UP) == 6
+
+    stage.run(body())
+
+
+def test_a_device_that_is_not_there_is_reset_once_a_minute(stage: Stage) -> None:
+    async def body() -> None:
+        async with polled(stage) as it:
+            it.device.faults.line = 0
+            it.boot = lambda: None  # type: ignore[method-assign]  # it never does
+            on_release(it.line, it.boot)
+            await it.rig.until(lambda: it.pulses == 3, "three", 200)
+            times_ns = [t_ns for t_ns, active in it.line.history if active]
+            assert all(60e9 <= b - a < 61e9 for a, b in pairwise(times_ns))
+            assert "only 0x00" in it.rig.runner.status().problem
+
+    stage.run(body())
+
+
+def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(stage: Stage) -> None:
+    async def body() -> None:
+        async with polled(stage, hold_ms=500) as it:
+            await it.rig.until_samples(5)
+            begin_ns = stage.clock.now_ns()
+            task = asyncio.create_task(it.rig.runner.act("reset", {}))
+            await it.rig.until(lambda: it.line.active, "active")
+            await it.rig.until(lambda: it.rig.state is DeviceState.SEARCHING, "left")
+            asked = it.device.transactions
+            samples = len(it.rig.samples)
+            await it.rig.until(lambda: not it.line.active, "released")
+            await it.rig.until(task.done, "over")
+            assert it.device.transactions - asked <= 1  # the transfer that was under way
+            assert await task is None
+            assert stage.clock.now_ns() - begin_ns == pytest.approx(3.5e9, abs=10e6)
+            await it.rig.until_samples(5)
+            assert len(it.rig.samples) > samples
+            assert it.pulses == 1
+            assert [e.message for e in it.rig.events if e.kind is EventKind.DOWN] == ["reset by its line"]
+
+    stage.run(body())
+
+
+def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(stage: Stage) -> None:
+    async def body() -> None:
+        async with stage.running(stage.on_spi()) as (rig,):
+            assert "reset" not in rig.runner.actions
+            with pytest.raises(BadArgument, match="no action 'reset'"):
+                await rig.runner.act("reset", {})
+        async with polled(stage) as it:
+            it.hang()
+            await it.rig.until(lambda: "only 0xFF" in it.rig.runner.status().problem, "searching")
+            with pytest.raises(BadArgument, match="hard"):
+                await it.rig.runner.act("reset", {"hard": True})
+            await it.rig.until(lambda: it.line.is_open, "open")
+            assert await it.rig.runner.act("reset", {}) is None
+            assert it.pulses == 1
+            await it.rig.until_samples(5)
+            assert it.told == []
+
+    stage.run(body())
+
+
+def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_shown(stage: Stage) -> None:
+    async def body() -> None:
+        async with polled(stage) as it:
+            await it.rig.until_samples(1)
+            assert it.line.is_open
+            status = it.rig.runner.status()
+            assert status.lines is not None
+            assert status.lines.problems == {}
+        assert not it.line.is_open
+        it.rig.runner.tick(stage.clock.now_ns())
+        assert not it.line.is_open
+        assert it.line.history == []
+
+    stage.run(body())
+
+
+def frame(timer_us: int) -> bytes:
+    """One of a device at rest."""
+    zero = (0.0, 0.0, 0.0)
+    return encode_ahrs(timer_us=timer_us, accel_m_s2=(0, 0, 9.8), gyro_rad_s=zero, euler_rad=zero, temperature_c=25)
+
+
+class Uart:
+    """A runner on a line whose device sends nothing until it is reset."""
+
+    def __init__(self, clock: VirtualClock, lines: DeviceLines, **link: Any) -> None:
+        self.clock, self.wires = clock, MemoryLines(clock.now_ns)
+        self.samples: list[Sample] = []
+        self.events: list[Event] = []
+        config = DeviceConfig("imu", "imu61x-uart", None, False, "memory", MemorySettings(**link), lines=lines)
+        publish = lambda batch: self.samples.extend(batch.samples)  # noqa: E731  # one line of glue
+        self.runner = DeviceRunner(config, 0, publish, self.events.append, Remembered(None), self.wires.maker)
+        assert isinstance(self.runner.link, MemoryLink)
+        self.link = self.runner.link
+        self.streams = False
+
+    async def until(self, condition: Callable[[], object], limit_s: float = 100) -> None:
+        """Let time pass until it holds."""
+        end_ns = self.clock.now_ns() + round(limit_s * 1e9)
+        while not condition():
+            assert self.clock.now_ns() < end_ns, self.runner.status()
+            await asyncio.sleep(0.01)
+            if self.streams and self.link.baud == 115200:
+                self.link.feed(frame(self.clock.now_ns() // 1000), self.clock.now_ns())
+            self.runner.tick(self.clock.now_ns())
+
+    async def play(self, story: Callable[["Uart"], Any]) -> None:
+        """With the runner at work."""
+        running = asyncio.create_task(self.runner.run())
+        try:
+            await story(self)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+            self.runner.close()
+
+
+@pytest.mark.parametrize("baud", [115200, "auto"])
+def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(baud: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = VirtualClock()
+    clock.stand_for_monotonic(monkeypatch, *UNTOLD)
+
+    async def story(it: Uart) -> None:
+        on_release(it.wires.outputs["imu reset"], lambda: setattr(it, "streams", True))
+        await it.until(lambda: it.runner.state is DeviceState.RUNNING and it.clock.now_ns() > 1015e9)
+        assert [active for _, active in it.wires.outputs["imu reset"].history] == [True, False]
+        assert sum(e.message.endswith("reset by its line") for e in it.events) == 1
+        it.streams = False
+        await it.until(lambda: it.runner.state is DeviceState.SILENT)
+        it.streams = True
+        await it.until(lambda: it.runner.state is DeviceState.RUNNING)
+        assert len(it.wires.outputs["imu reset"].history) == 2
+
+    async def body() -> None:
+        await Uart(clock, LINES, baud=baud).play(story)
+
+    run_virtually(clock, body())
+
+
+def test_a_uart_on_which_something_is_heard_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = VirtualClock()
+    clock.stand_for_monotonic(monkeypatch, *UNTOLD)
+
+    async def story(it: Uart) -> None:
+        for _ in range(60):
+            next_ns = clock.now_ns() + 1_000_000_000
+            await it.until(partial(lambda until_ns: clock.now_ns() > until_ns, next_ns))
+            it.link.feed(b"noise", clock.now_ns())
+        assert it.wires.outputs["imu reset"].history == []
+
+    async def body() -> None:
+        await Uart(clock, LINES, baud=115200).play(story)
+
+    run_virtually(clock, body())
+
+
+def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = VirtualClock()
+    clock.stand_for_monotonic(monkeypatch, *UNTOLD)
+
+    async def body() -> None:
+        it = Uart(clock, DeviceLines(sin=TriggerSettings(line="S")), baud=115200)
+        assert list(it.runner.actions) == ["trigger"]
+        once: list[str] = []
+        wires = it.runner._wires
+        assert wires is not None
+        monkeypatch.setattr(type(wires), "trigger_once", lambda _self: once.append("edge"))
+        assert await it.runner.act("trigger", {}) is None
+        assert once == ["edge"]
+        monkeypatch.undo()
+        with pytest.raises(CommandError, match="trigger"):
+            await it.runner.act("trigger", {})
+
+    run_virtually(clock, body())
+
+
+def test_where_the_measurement_is_reaches_the_clock() -> None:
+    lines = DeviceLines(
+        sout=SoutSettings(line="O", offset_us=-7, bias_us=2, width_us=90), sin=TriggerSettings(line="I", offset_us=9)
+    )
+    runner = Uart(VirtualClock(), lines, baud=115200).runner
+    clock = runner._new_clock(DRIVER)
+    assert clock._sout_timing == SoutTiming(offset_us=-7, bias_us=2, width_us=90)
+    assert clock._sin_timing == TriggerTiming(offset_us=9)

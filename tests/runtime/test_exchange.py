@@ -1,0 +1,224 @@
+"""Conversations over a line that is also used by others: in order, one at a time, late and missing replies apart."""
+
+import asyncio
+from dataclasses import replace
+
+import pytest
+
+from imud.contracts.codec import ReplyFrame
+from imud.contracts.driver import StreamDriver
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Silence, of_text, pause, with_undo
+from imud.devices import DRIVERS
+from imud.errors import CommandError, LinkMissing, NoReply
+from imud.ledger import Ledger
+from imud.runtime.exchange import Exchange
+
+
+def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
+    return Request(
+        payload=name.encode() + b"\r\n",
+        name=name,
+        is_end=of_text(lambda text: text == "OK"),
+        is_rejection=of_text(lambda text: text.startswith("ERR")),
+        is_part=of_text(lambda text: text.startswith(name)),
+        timeout_ns=timeout_ns,
+        silent=silent,
+    )
+
+
+def ask(*requests: Request) -> RequestScript[list[Outcome]]:
+    outcomes = []
+    for one in requests:
+        outcomes.append((yield one))
+    return outcomes
+
+
+def test_requests_go_out_one_after_the_other() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        exchange = Exchange(Ledger(), written.append)
+        task = asyncio.create_task(exchange.run(ask(request("A"), request("B"))))
+        await asyncio.sleep(0)
+        assert written == [b"A\r\n"]
+        exchange.on_message("A=1", 0)
+        exchange.on_message("OK", 0)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert written == [b"A\r\n", b"B\r\n"]
+        exchange.on_message("ERR", 0)
+        outcomes = await task
+        assert outcomes[0] == Reply(("A=1", "OK"))
+        assert outcomes[1].lines == ("ERR",)
+
+    asyncio.run(story())
+
+
+def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
+    async def story() -> None:
+        ledger = Ledger()
+        exchange = Exchange(ledger, lambda data: None)
+        assert await exchange.run(ask(request("A", timeout_ns=1))) == [Silence(())]
+        exchange.on_message("A=1", 0)
+        exchange.on_message("OK", 0)
+        assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
+        exchange.on_message("OK", 0)
+        assert ledger.replies_unsolicited == 1
+
+    asyncio.run(story())
+
+
+def test_request_without_reply_is_done_once_sent() -> None:
+    async def story() -> None:
+        exchange = Exchange(Ledger(), lambda data: None)
+        assert await exchange.run(ask(request("REBOOT", silent=True))) == [Reply(())]
+
+    asyncio.run(story())
+
+
+def test_link_that_is_gone_ends_the_conversation_and_the_next_one_works() -> None:
+    async def story() -> None:
+        gone = True
+
+        def write(data: bytes) -> None:
+            if gone:
+                raise LinkMissing("pulled out")
+
+        exchange = Exchange(Ledger(), write)
+        with pytest.raises(LinkMissing):
+            await exchange.run(ask(request("A")))
+        gone = False
+        assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
+
+    asyncio.run(story())
+
+
+def test_second_conversation_waits_for_the_first() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        exchange = Exchange(Ledger(), written.append)
+        first = asyncio.create_task(exchange.run(ask(request("A"))))
+        second = asyncio.create_task(exchange.run(ask(request("B"))))
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert written == [b"A\r\n"]
+        exchange.on_message("OK", 0)
+        await first
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert written == [b"A\r\n", b"B\r\n"]
+        exchange.on_message("OK", 0)
+        await second
+
+    asyncio.run(story())
+
+
+def test_cancelled_conversation_leaves_the_line_free() -> None:
+    async def story() -> None:
+        exchange = Exchange(Ledger(), lambda data: None)
+        task = asyncio.create_task(exchange.run(ask(request("A"))))
+        await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        assert await exchange.run(ask(request("B", silent=True))) == [Reply(())]
+
+    asyncio.run(story())
+
+
+def test_device_that_never_answers_is_no_reply() -> None:
+    async def story() -> None:
+        exchange = Exchange(Ledger(), lambda data: None)
+        driver = DRIVERS["hipnuc-uart"]
+        assert isinstance(driver, StreamDriver)
+        conversation = driver.identify()
+        task = asyncio.create_task(exchange.run(conversation))
+        with pytest.raises(NoReply, match="LOG VERSION"):
+            await asyncio.wait_for(task, 5)
+
+    asyncio.run(story())
+
+
+def test_a_request_can_change_the_rate_before_it_goes_out() -> None:
+    async def story() -> None:
+        happened: list[object] = []
+        exchange = Exchange(Ledger(), happened.append, happened.append)
+        await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), baud=9600)))
+        assert happened == [b"A\r\n", 9600, b"B\r\n"]
+
+    asyncio.run(story())
+
+
+def test_a_rate_without_a_line_is_an_error() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        exchange = Exchange(Ledger(), written.append)
+        with pytest.raises(CommandError, match="9600 baud"):
+            await exchange.run(ask(replace(request("A"), baud=9600)))
+        assert written == []
+
+    asyncio.run(story())
+
+
+def test_a_pause_writes_nothing() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        assert await exchange_of(written).run(ask(pause(1_000_000))) == [Silence(())]
+        assert written == []
+
+    asyncio.run(story())
+
+
+def exchange_of(written: list[bytes]) -> Exchange:
+    return Exchange(Ledger(), written.append)
+
+
+def test_a_frame_is_an_answer() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        exchange = exchange_of(written)
+        wanted = ReplyFrame(5, b"x")
+        asking = replace(request("A"), is_end=lambda message: message == wanted)
+        task = asyncio.create_task(exchange.run(ask(asking)))
+        await asyncio.sleep(0)
+        exchange.on_message(wanted, 0)
+        assert await task == [Reply((wanted,))]
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_conversation_given_up_is_undone_if_the_link_is_there(is_there: bool) -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+
+        def write(data: bytes) -> None:
+            if not is_there and written:
+                raise LinkMissing("gone")
+            written.append(data)
+
+        exchange = Exchange(Ledger(), write)
+        task = asyncio.create_task(exchange.run(with_undo(ask(request("A"), request("B")), b"UNDO")))
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert written == [b"A\r\n", *[b"UNDO"] * is_there]
+
+    asyncio.run(story())
+
+
+def test_a_conversation_that_comes_to_its_end_is_not_undone() -> None:
+    """Whether it returns or raises: it had its turn to leave the device in order."""
+
+    def failing() -> RequestScript[None]:
+        yield request("A", timeout_ns=1)
+        raise NoReply("no")
+
+    async def story() -> None:
+        written: list[bytes] = []
+        exchange = Exchange(Ledger(), written.append)
+        assert await exchange.run(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
+        with pytest.raises(NoReply):
+            await exchange.run(with_undo(failing(), b"UNDO"))
+        assert written == [b"A\r\n"] * 2
+
+    asyncio.run(story())

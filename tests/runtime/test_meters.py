@@ -1,0 +1,50 @@
+"""Rates, latencies and the causes of loss, by hand."""
+
+from imud.contracts.status import LATENCY_BOUNDS_NS
+from imud.ledger import Ledger
+from imud.runtime.meters import LatencyMeter, LossMeter, RateMeter
+
+S = 1_000_000_000
+
+
+def test_rate_over_the_window() -> None:
+    meter = RateMeter()
+    assert meter.rate_hz() == 0.0
+    for tenth in range(31):  # 3 s at 100 Hz
+        meter.mark(tenth * S // 10, tenth * 10)
+    assert meter.rate_hz() == 100.0
+
+
+def test_rate_falls_to_zero_when_samples_stop() -> None:
+    meter = RateMeter()
+    for tenth in range(50):
+        meter.mark(tenth * S // 10, min(tenth, 10) * 10)
+    assert meter.rate_hz() == 0.0
+
+
+def test_latency_goes_into_the_bucket_whose_bound_it_does_not_exceed() -> None:
+    meter = LatencyMeter()
+    meter.add(50_000)
+    meter.add(50_001)
+    meter.add(10**12)
+    assert meter.buckets[0] == 1
+    assert meter.buckets[1] == 1
+    assert meter.buckets[len(LATENCY_BOUNDS_NS)] == 1
+    assert meter.sum_ns == 100_001 + 10**12
+
+
+def test_loss_is_explained_by_damage_first_then_overruns_then_the_device() -> None:
+    ledger = Ledger()
+    loss = LossMeter(ledger)
+    loss.bad_frames = 2
+    loss.missed(3, overruns=0)
+    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 0, 1)
+    loss.bad_frames = 0
+    loss.missed(4, overruns=7)
+    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 1)
+    loss.missed(1, overruns=7)  # no new overrun since
+    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 2)
+    loss.link_opened()
+    loss.missed(1, overruns=1)
+    assert ledger.lost_overrun == 5
+    assert ledger.lost() == 9

@@ -1,0 +1,39 @@
+"""Events of a line as the kernel writes them, by hand."""
+
+from imud.contracts.lines import Edge
+from imud.signals.line_events import LineEvents
+
+
+def event(t_ns: int, kind: int, seqno: int) -> bytes:
+    """`struct gpio_v2_line_event`, of line 5 in a request that counts otherwise."""
+    words = (kind, 5, 77, seqno)
+    return t_ns.to_bytes(8, "little") + b"".join(word.to_bytes(4, "little") for word in words) + bytes(24)
+
+
+def test_edges() -> None:
+    events = LineEvents()
+    data = event(0x0102030405060708, 1, 1) + event(2**63 - 1, 2, 2)
+    assert events.edges(data) == [Edge(0x0102030405060708, True, 1), Edge(2**63 - 1, False, 2)]
+    assert events.edges(b"") == []
+    assert events.lost == 0
+
+
+def test_a_jump_of_the_count_is_a_loss_and_numbers_go_on_over_it() -> None:
+    events = LineEvents()
+    assert [edge.number for edge in events.edges(event(1, 1, 2) + event(2, 2, 10) + event(3, 1, 11))] == [2, 10, 11]
+    assert events.lost == 1 + 7
+
+
+def test_the_count_of_the_kernel_wraps_and_the_number_does_not() -> None:
+    events = LineEvents()
+    events.edges(event(1, 1, 2**32 - 1))
+    assert [edge.number for edge in events.edges(event(2, 2, 0) + event(3, 1, 1))] == [2**32, 2**32 + 1]
+    assert events.lost == 2**32 - 2
+
+
+def test_numbers_go_on_after_a_restart() -> None:
+    events = LineEvents()
+    events.edges(event(1, 1, 1) + event(2, 2, 2))
+    events.restart()
+    assert [edge.number for edge in events.edges(event(3, 1, 1))] == [3]
+    assert events.lost == 0

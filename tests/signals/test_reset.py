@@ -1,0 +1,177 @@
+"""Reset: how long, how often, and what a cancellation leaves behind; and when a device is reset unasked."""
+
+import asyncio
+from itertools import pairwise
+
+import pytest
+
+from imud.contracts.lines import DeviceLines, LineFactory, ResetSettings
+from imud.errors import CommandError, LinkBusy, LinkMissing
+from imud.event import Event
+from imud.ledger import Ledger
+from imud.runtime.notices import Notices
+from imud.signals.reset import AGAIN_NS, ResetLine, make_reset, reset
+from imud.signals.watched_line import RETRY_NS
+from imud.sim.ports.lines import MemoryOutput
+from imud.units import NS_PER_S
+from tests.support.in_loop import in_loop
+from tests.support.virtual_time import VirtualClock, run_virtually
+
+SETTINGS = ResetSettings(line="RESET", hold_ms=20)
+
+
+@in_loop
+async def test_the_line_is_held_and_then_the_device_has_its_time() -> None:
+    story: list[object] = []
+    line = MemoryOutput(on_change=lambda _t_ns, active: story.append(active))
+    line.open()
+
+    async def sleep(seconds: float) -> None:
+        story.append(seconds)
+
+    await reset(line, SETTINGS, sleep)
+    assert story == [True, 0.02, False, 3.0]
+
+
+@in_loop
+async def test_cancelled_while_it_is_held() -> None:
+    line = MemoryOutput()
+    line.open()
+    held = asyncio.Event()
+
+    async def sleep(_seconds: float) -> None:
+        held.set()
+        await asyncio.Event().wait()
+
+    task = asyncio.create_task(reset(line, SETTINGS, sleep))
+    await asyncio.wait_for(held.wait(), 10)
+    assert line.active
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert [active for _, active in line.history] == [True, False]
+
+
+@in_loop
+async def test_a_line_that_is_gone() -> None:
+    line = MemoryOutput()
+    line.open()
+    line.set_error = LinkMissing("gone")
+    with pytest.raises(LinkMissing):
+        await reset(line, SETTINGS)
+
+
+class Scene:
+    """A reset line in virtual time."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.line = MemoryOutput(now_ns=self.clock.now_ns)
+        self.events: list[Event] = []
+        self.told = 0
+        maker = LineFactory(lambda *_: pytest.fail("an input"), lambda _settings, _purpose: self.line)
+        notices = Notices("imu", Ledger(), self.events.append)
+        made = make_reset("imu", DeviceLines(reset=SETTINGS), maker, notices.tell, self._on_pulse)
+        assert made is not None
+        self.reset: ResetLine = made
+
+    @property
+    def pulses_s(self) -> list[float]:
+        """When the line became active, s after the beginning."""
+        return [t_ns / NS_PER_S - 1000 for t_ns, active in self.line.history if active]
+
+    async def search(self, seconds: float, every_s: float = 0.5) -> None:
+        """Rounds that find nothing."""
+        end_ns = self.clock.now_ns() + seconds * NS_PER_S
+        while self.clock.now_ns() < end_ns:
+            await asyncio.sleep(every_s)
+            self.reset.tick(self.clock.now_ns())
+            await self.reset.not_found(self.clock.now_ns())
+
+    def _on_pulse(self) -> None:
+        assert not self.line.active
+        self.told += 1
+
+
+@pytest.mark.parametrize(("every_s", "first_s"), [(0.5, 4.5), (6.0, 18.0)])
+def test_after_three_rounds_and_the_time_a_device_needs_and_then_once_a_minute(every_s: float, first_s: float) -> None:
+    """A round every 0.5 s: the first ends at 0.5 s, and 4 s later the device should have been back."""
+    it = Scene()
+    run_virtually(it.clock, it.search(150, every_s))
+    assert it.pulses_s[0] == pytest.approx(first_s, abs=0.01)
+    assert all(AGAIN_NS / 1e9 <= b - a < AGAIN_NS / 1e9 + 2 * every_s for a, b in pairwise(it.pulses_s))
+    assert len(it.pulses_s) == it.told == 3
+    assert it.events[0].message == f"not found for {first_s - every_s:.0f} s: reset by its line"
+    assert [event.detail["line"] for event in it.events] == ["reset"] * 3
+    held = [b - a for (a, up), (b, _) in pairwise(it.line.history) if up]
+    assert held == pytest.approx([20e6] * 3, abs=10)
+
+
+def test_a_device_that_was_found_meanwhile_is_not_reset() -> None:
+    it = Scene()
+
+    async def body() -> None:
+        for _ in range(10):
+            await it.search(4)
+            it.reset.found()
+
+    run_virtually(it.clock, body())
+    assert it.pulses_s == []
+
+
+def test_asked_for_it_is_at_once_and_nobody_searches_before_it_is_over() -> None:
+    it = Scene()
+
+    async def body() -> None:
+        it.reset.tick(it.clock.now_ns())
+        begin_ns = it.clock.now_ns()
+        task = asyncio.create_task(it.reset.pulse())
+        await asyncio.sleep(0)
+        await it.reset.settled()
+        assert it.clock.now_ns() - begin_ns == pytest.approx(3.02e9, abs=1000)
+        await task
+        await it.search(3)  # not found since: it is not reset again at once
+
+    run_virtually(it.clock, body())
+    assert it.pulses_s == [0.0]
+
+
+def test_the_line_is_kept_inactive_and_left_so() -> None:
+    it = Scene()
+    it.reset.tick(0)
+    assert it.line.is_open
+    it.reset.close()
+    assert not it.line.is_open
+    it.reset.tick(10 * RETRY_NS)
+    assert not it.line.is_open
+    assert it.line.history == []
+
+
+@in_loop
+async def test_a_line_that_another_program_has_is_told_once_and_tried_again() -> None:
+    it = Scene()
+    it.line.open_error = LinkBusy("in use by gpioset")
+    for now_ns in range(0, 3 * RETRY_NS, RETRY_NS // 2):
+        it.reset.tick(now_ns)
+    assert [event.message for event in it.events] == ["line reset: in use by gpioset"]
+    assert it.reset.problem == "in use by gpioset"
+    with pytest.raises(CommandError, match="in use by gpioset"):
+        await it.reset.pulse()
+    it.line.open_error = None
+    it.reset.tick(4 * RETRY_NS)
+    assert it.line.is_open
+    assert not it.reset.problem
+
+
+@in_loop
+async def test_a_line_that_fails_when_it_is_driven() -> None:
+    it = Scene()
+    it.reset.tick(0)
+    it.line.set_error = LinkMissing("gone")
+    with pytest.raises(CommandError, match="gone"):
+        await it.reset.pulse()
+    assert it.reset.problem == "gone"
+    assert not it.line.is_open
+    it.line.set_error = None
+    it.reset.tick(RETRY_NS)
+    assert it.line.is_open

@@ -1,0 +1,197 @@
+"""The simulated CANopen module against its own truth and against the manual, decoded by the product's codec."""
+
+import itertools
+import math
+
+import pytest
+
+from imud.attitude import euler312_from_quat
+from imud.devices.hipnuc.canopen import sdo, session
+from imud.devices.hipnuc.canopen.cob_ids import NmtCommand
+from imud.devices.hipnuc.canopen.session import InclinometerZero, Transmission
+from imud.sim.can_module import SentFrame
+from imud.sim.hipnuc.canopen.objects import NodeSettings, ObjectDictionary
+from imud.sim.hipnuc.canopen.simulator import SIMULATOR, HipnucCanopenHardware, HipnucCanopenModule
+from imud.sim.simulator import SimulatorOptions
+from tests.support.canopen_bench import BEGIN_NS, MS, QUIET, Bench
+
+SECOND_NS = 1000 * MS
+
+
+def times_of(frames: list[SentFrame], can_id: int) -> list[int]:
+    return [frame.due_ns for frame in frames if frame.can_id == can_id]
+
+
+def test_values_are_the_truth_of_the_sample_instant() -> None:
+    module = HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(boot_ms=0, skew_ppm=0))
+    instants = [frame.sample_ns for frame in module.advance(BEGIN_NS + SECOND_NS) if frame.can_id == 0x188]
+    bench = Bench(NodeSettings())
+    bench.run(SECOND_NS)
+    assert len(bench.measured) == pytest.approx(95, abs=2)
+    for measured, t_ns in zip(bench.measured, instants[-len(bench.measured) :], strict=True):
+        assert t_ns is not None
+        truth = bench.module.hardware.motion.at((t_ns - bench.module.epoch_ns) / 1e9)
+        roll, pitch, _ = euler312_from_quat(truth.quat_wxyz)
+        assert measured.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=0.0050)
+        assert measured.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=0.00088)
+        assert measured.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=0.000051)
+        assert measured.euler_rad == pytest.approx(euler312_from_quat(truth.quat_wxyz), abs=0.000088)
+        assert measured.incli_rad == pytest.approx((pitch, roll), abs=0.000088)
+        if measured.pressure_pa is not None:
+            assert measured.pressure_pa == pytest.approx(truth.pressure_pa, abs=0.51)
+    assert sum(measured.pressure_pa is not None for measured in bench.measured) >= 15
+    assert bench.codec.ledger.lost() == 0
+
+
+def test_timers_and_wire() -> None:
+    settings = NodeSettings(periods_ms={1: 5, 2: 20, 3: 0, 4: 0, 6: 100, 7: 0}, bit_rate=250_000)
+    module = HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=settings, boot_ms=0, skew_ppm=1000))
+    frames = module.advance(BEGIN_NS + SECOND_NS + 2 * MS)
+    counts = [len(times_of(frames, can_id)) for can_id in (0x188, 0x288, 0x388, 0x488, 0x688, 0x788)]
+    assert counts == [200, 50, 0, 0, 10, 0]
+    first = times_of(frames, 0x188)[:3]
+    assert [b - a for a, b in itertools.pairwise(first)] == pytest.approx([4_995_005] * 2, abs=2)
+    together = [frame for frame in frames if frame.sample_ns == frames[-1].sample_ns]
+    assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(together)] == [480_000] * (len(together) - 1)
+
+
+def test_next_ns_is_when_something_is_sent() -> None:
+    module = HipnucCanopenModule(BEGIN_NS)
+    now_ns, seen = BEGIN_NS, 0
+    for _ in range(60):
+        due_ns = module.next_ns()
+        assert due_ns is not None
+        assert due_ns >= now_ns
+        now_ns = due_ns
+        seen += len(module.advance(now_ns))
+    assert seen == 60
+    silent = HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=QUIET, boot_ms=0))
+    silent.advance(BEGIN_NS + SECOND_NS)
+    assert silent.next_ns() is None
+
+
+def test_boot_up_and_heartbeat() -> None:
+    bench = Bench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=100), boot_ms=50)
+    bench.run(400 * MS)
+    assert bench.heard == [(0x708, b"\0"), *[(0x708, b"\5")] * 3]
+
+
+def test_sync_sends_what_is_of_type_1() -> None:
+    bench = Bench(NodeSettings(periods_ms={1: 10, 2: 10, 3: 0, 4: 0, 6: 0, 7: 0}))
+    bench.hold(session.set_tpdo_type(8, 1, Transmission.SYNC))
+    bench.hold(session.set_tpdo_type(8, 3, Transmission.SYNC))
+    bench.heard.clear()
+    bench.run(35 * MS)
+    assert {can_id for can_id, _ in bench.heard} == {0x288}
+    bench.heard.clear()
+    bench.send(0x080, b"")
+    bench.run(4 * MS)
+    assert [can_id for can_id, _ in bench.heard if can_id != 0x288] == [0x188, 0x388]
+    bench.hold(session.set_tpdo_type(8, 1, Transmission.TIMER))
+    bench.heard.clear()
+    bench.run(35 * MS)
+    assert sum(can_id == 0x188 for can_id, _ in bench.heard) >= 3
+
+
+def test_nmt_states() -> None:
+    bench = Bench(NodeSettings())
+    bench.hold(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
+    bench.run(20 * MS)
+    bench.heard.clear()
+    bench.run(50 * MS)
+    assert bench.heard == []
+    assert bench.hold(session.identify(8)).product == "HI14"  # SDO goes on
+    bench.send(0x000, b"\2\0")  # stop all
+    bench.heard.clear()
+    bench.send(0x608, sdo.read_frame(0x1000, 0))
+    bench.run(50 * MS)
+    assert bench.heard == []
+    bench.send(0x000, b"\1\0")
+    bench.run(50 * MS)
+    assert (0x188) in {can_id for can_id, _ in bench.heard}
+
+
+def test_what_applies_at_once_and_what_after_a_restart() -> None:
+    bench = Bench()
+    bench.hold(session.set_tpdo_period(8, 1, 50))
+    bench.hold(session.set_node_id(8, 20))
+    bench.hold(session.set_bit_rate(8, 250_000))
+    bench.heard.clear()
+    bench.run(120 * MS)
+    assert [can_id for can_id, _ in bench.heard] in ([0x188] * 2, [0x188] * 3)
+    assert bench.module.node == 8
+    bench.hold(session.restart(8))
+    assert bench.module.node == 8  # nothing was saved
+    assert bench.module.objects.settings == QUIET
+
+
+def test_saved_settings_survive_and_a_factory_reset_clears_them_at_power_on() -> None:
+    bench = Bench()
+    bench.hold(session.set_node_id(8, 20))
+    bench.hold(session.set_tpdo_period(8, 2, 100))
+    bench.hold(session.save(8))
+    bench.hold(session.restart(8))
+    assert bench.module.node == 20
+    assert bench.module.objects.settings.periods_ms[2] == 100
+    bench.send(0x614, sdo.write_frame(0x2000, 0, b"\1\0\0\0"))
+    assert bench.module.node == 20
+    bench.module.reboot(bench.now_ns)
+    assert bench.module.node == 8
+    assert bench.module.objects.settings == QUIET
+
+
+def test_inclinometer_signs_and_zero() -> None:
+    def incli() -> tuple[float, float]:
+        bench.run(20 * MS)
+        angles = bench.measured[-1].incli_rad
+        assert angles is not None
+        return angles
+
+    bench = Bench(NodeSettings(periods_ms={**QUIET.periods_ms, 7: 5}))
+    bench.run(700 * MS)
+    x, y = incli()
+    bench.hold(session.set_inclinometer_signs(8, invert_x=True, invert_y=False))
+    turned = incli()
+    assert math.copysign(1, turned[0]) == -math.copysign(1, x)
+    assert math.copysign(1, turned[1]) == math.copysign(1, y)
+    bench.hold(session.set_inclinometer_zero(8, InclinometerZero.SET))
+    bench.measured.clear()
+    assert incli() == pytest.approx((0, 0), abs=0.05)
+    bench.hold(session.set_inclinometer_zero(8, InclinometerZero.CANCEL))
+    assert incli() == pytest.approx(turned, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("request_hex", "code"),
+    [
+        ("40 34 12 00 00 00 00 00", 0x0602_0000),
+        ("40 00 18 07 00 00 00 00", 0x0609_0011),
+        ("40 00 20 00 00 00 00 00", 0x0601_0001),
+        ("23 00 10 00 00 00 00 00", 0x0601_0002),
+        ("23 00 18 05 0A 00 00 00", 0x0607_0010),
+        ("2B 00 18 05 04 00 00 00", 0x0609_0030),
+        ("A0 00 10 00 00 00 00 00", 0x0504_0001),
+    ],
+)
+def test_abort_codes(request_hex: str, code: int) -> None:
+    request = bytes.fromhex(request_hex)
+    reply, _ = ObjectDictionary(NodeSettings()).serve(request)
+    assert reply == b"\x80" + request[1:4] + code.to_bytes(4, "little")
+
+
+@pytest.mark.parametrize(
+    "options", [{"rate_hz": 0.5}, {"rate_hz": 150}, {"message": "x"}, {"motion": "none"}, {"node": 128}]
+)
+def test_options_that_it_cannot_have(options: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
+        SIMULATOR.make(SimulatorOptions(**options), BEGIN_NS)  # type: ignore[arg-type]  # a mapping of options
+
+
+@pytest.mark.parametrize("rate_hz", [1, 20, 100, 125, 200])
+def test_options_make_rates_that_divide(rate_hz: float) -> None:
+    module = SIMULATOR.make(SimulatorOptions(rate_hz=rate_hz, node=5, at_once=True), BEGIN_NS)
+    assert isinstance(module, HipnucCanopenModule)
+    assert module.node == 5
+    periods = module.objects.settings.periods_ms
+    assert periods[1] == 1000 / rate_hz
+    assert periods[6] % periods[1] == 0

@@ -1,0 +1,160 @@
+"""Simulated modules on one line: what a byte costs, who answers, what is kept. No clock, no waiting."""
+
+from math import dist
+from typing import Any
+
+import pytest
+
+from imud.devices.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings
+from imud.devices.hipnuc.modbus.frames import randomise_ids, read_registers, set_id_by_serial, write_register
+from imud.formats.modbus import framed, is_exception, is_whole
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.hipnuc.modbus.simulator import ModbusLine, make
+from imud.sim.hipnuc.modbus.slave import Slave
+from imud.sim.simulator import Burst, SimulatorOptions
+from imud.units import NS_PER_S
+from tests.support.modbus_wire import serial_of, slave
+
+BEGIN_NS = 5 * NS_PER_S
+BAUD = 115200
+BYTE_NS = 10 * NS_PER_S // BAUD
+GAP_NS = 1_750_000
+
+
+class Rig:
+    """A line, and a master that has all the time it needs."""
+
+    def __init__(self, *slaves: Slave, **more: bool | int) -> None:
+        self.line = ModbusLine(BEGIN_NS, slaves, **more)  # type: ignore[arg-type]  # passed on
+        self.now_ns = BEGIN_NS
+
+    def bursts(self, frame: bytes) -> list[Burst]:
+        self.line.receive(frame, self.now_ns)
+        found: list[Burst] = []
+        while (next_ns := self.line.next_ns()) is not None:
+            self.now_ns = max(next_ns, self.now_ns)
+            found += self.line.advance(self.now_ns)
+        self.now_ns += GAP_NS
+        return found
+
+    def ask(self, address: int, request: bytes) -> bytes:
+        return b"".join(burst.data for burst in self.bursts(framed(address, request)))
+
+
+READ_BLOCK = read_registers(0x34, 26).sends[0]
+
+
+def here(address: int, **more: Any) -> Slave:
+    return slave(address, baud=BAUD, **more)
+
+
+def test_every_byte_takes_its_time_in_both_directions() -> None:
+    rig = Rig(here(1, processing_ns=100_000))
+    (burst,) = rig.bursts(framed(1, READ_BLOCK))
+    assert burst.due_ns == BEGIN_NS + 8 * BYTE_NS + GAP_NS + 100_000 + 57 * BYTE_NS
+    assert burst.sample_ns == BEGIN_NS + 8 * BYTE_NS + GAP_NS + 100_000
+
+
+def test_reply_in_pieces_comes_no_sooner() -> None:
+    rig = Rig(here(1, processing_ns=0), chunk_bytes=1)
+    bursts = rig.bursts(framed(1, READ_BLOCK))
+    assert [len(burst.data) for burst in bursts] == [1] * 57
+    begin_ns = BEGIN_NS + 8 * BYTE_NS + GAP_NS
+    assert [burst.due_ns for burst in bursts] == [begin_ns + n * BYTE_NS for n in range(1, 58)]
+    assert is_whole(b"".join(burst.data for burst in bursts))
+
+
+def test_echo_comes_before_the_reply() -> None:
+    rig = Rig(here(1), echo=True)
+    frame = framed(1, READ_BLOCK)
+    echo, reply = rig.bursts(frame)
+    assert echo.data == frame
+    assert echo.due_ns == BEGIN_NS + 8 * BYTE_NS
+    assert is_whole(reply.data)
+
+
+def test_values_are_the_truth_of_that_instant() -> None:
+    for firmware, resolution in ((152, 2**-15), (169, 1e-4)):
+        rig = Rig(here(1, firmware=firmware, inclinometer="dual"))
+        codec = HipnucModbusCodec(Ledger(), HipnucModbusSettings())
+        request = READ_BLOCK if firmware == 169 else read_registers(0x34, 24).sends[0]
+        if firmware == 152:
+            assert is_exception(rig.ask(1, READ_BLOCK))
+            codec.take(0, rig.ask(1, READ_BLOCK))
+        (burst,) = rig.bursts(framed(1, request))
+        assert burst.sample_ns is not None
+        truth = rig.line.slaves[0].motion.at((burst.sample_ns - BEGIN_NS) / NS_PER_S)
+        (m,) = codec.take(0, burst.data)
+        assert isinstance(m, Measurement)
+        assert m.accel_m_s2 is not None
+        assert m.gyro_rad_s is not None
+        assert m.incli_rad is not None
+        assert dist(m.accel_m_s2, truth.accel_m_s2) < 0.005
+        assert dist(m.gyro_rad_s, truth.gyro_rad_s) < 0.001
+        assert m.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=resolution)
+        assert m.euler_rad == pytest.approx(truth.euler_rad, abs=1e-5)
+        assert m.incli_rad[0] == pytest.approx(truth.euler_rad[0], abs=1e-4)
+        assert (m.dev_ticks is None) == (firmware == 152)
+
+
+def test_only_who_is_meant_answers_and_only_to_whole_frames() -> None:
+    rig = Rig(here(1), here(2), here(3, dead=True))
+    assert rig.ask(2, READ_BLOCK)[0] == 2
+    assert rig.ask(3, READ_BLOCK) == rig.ask(4, READ_BLOCK) == rig.ask(0, READ_BLOCK) == b""
+    assert rig.bursts(framed(1, READ_BLOCK)[:-1] + b"\x00") == []
+    assert rig.line.counters() == {"requests": 4, "damaged": 1, "answered": 1}
+
+
+def test_two_of_the_same_address_spoil_each_other() -> None:
+    rig = Rig(slave(1, baud=BAUD, serial=0x0F), slave(1, baud=BAUD, serial=0xF0))
+    reply = rig.ask(1, read_registers(0x7F, 4).sends[0])
+    assert len(reply) == 13
+    assert not is_whole(reply)
+
+
+def test_ids_by_serial_number_and_by_chance() -> None:
+    rig = Rig(slave(80, baud=BAUD, serial=1), slave(80, baud=BAUD, serial=2))
+    assert rig.ask(0, set_id_by_serial(serial_of(2).hex(), 99).sends[0]) == b""
+    assert [one.settings.slave for one in rig.line.slaves] == [80, 99]
+    rig.ask(0, randomise_ids(10, 12).sends[0])
+    assert {one.settings.slave for one in rig.line.slaves} <= {10, 11, 12}
+    rig.line.reboot(rig.now_ns)
+    assert [one.settings.slave for one in rig.line.slaves] == [80, 80]
+
+
+def test_exceptions() -> None:
+    rig = Rig(here(1))
+    for request, code in (
+        (read_registers(0x34, 27).sends[0], 2),
+        (read_registers(0x33, 1).sends[0], 2),
+        (write_register(0x34, 0).sends[0], 2),
+        (write_register(6, 2).sends[0], 3),
+        (b"\x04\x00\x34\x00\x01", 1),
+    ):
+        reply = rig.ask(1, request)
+        assert reply == framed(1, bytes([request[0] | 0x80, code]))
+
+
+def test_wrong_crc_and_silence_on_demand() -> None:
+    rig = Rig(here(1, bad_crc=1, mute=1))
+    assert rig.ask(1, READ_BLOCK) == b""
+    assert not is_whole(rig.ask(1, READ_BLOCK))
+    assert is_whole(rig.ask(1, READ_BLOCK))
+
+
+def test_module_of_another_rate_is_not_understood() -> None:
+    rig = Rig(here(1), slave(2, baud=9600))
+    assert not is_whole(rig.ask(2, READ_BLOCK))
+    assert is_whole(rig.ask(1, READ_BLOCK))
+
+
+def test_line_from_the_common_options() -> None:
+    line = make(SimulatorOptions(message="1,22,247", baud=9600, noise="none"), BEGIN_NS)
+    assert [one.settings.slave for one in line.slaves] == [1, 22, 247]
+    assert len({one.serial for one in line.slaves}) == 3
+    assert line.baud == 9600
+    assert [one.settings.slave for one in make(SimulatorOptions(), BEGIN_NS).slaves] == [80]
+    for wrong in ({"message": "1,x"}, {"message": "0"}, {"message": "248"}, {"baud": 12345}, {"motion": "none"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            make(SimulatorOptions(**wrong), BEGIN_NS)

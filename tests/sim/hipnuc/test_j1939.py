@@ -1,0 +1,250 @@
+"""The simulated module on J1939 against its own truth and the manual's settings, decoded by the product's codec."""
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from imud.contracts.codec import ReplyFrame
+from imud.contracts.session import Reply, RequestScript, Silence
+from imud.devices.hipnuc.j1939 import messages, session
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings
+from imud.devices.hipnuc.j1939.session import J1939Node
+from imud.errors import NoReply, Rejected
+from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
+from imud.formats.j1939 import split
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.can_module import SentFrame
+from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings
+from imud.sim.physics.motion import Still
+from imud.sim.ports.can_modules import CanModules
+from imud.sim.simulator import SimulatorOptions
+
+BEGIN_NS = 5_000_000_000
+SECOND_NS = 1_000_000_000
+MS = 1_000_000
+
+
+def made(**options: object) -> HipnucJ1939Module:
+    given = {"rate_hz": 100.0, "noise": "none", "boot_ms": 0, **options}
+    module = SIMULATOR.make(SimulatorOptions(**given), BEGIN_NS)  # type: ignore[arg-type]  # a mapping of options
+    assert isinstance(module, HipnucJ1939Module)
+    return module
+
+
+def decoded(frames: Sequence[SentFrame], address: int = 8) -> list[tuple[Measurement, int]]:
+    """Measurements, each with its instant."""
+    codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Settings(address=address))
+    found: list[tuple[Measurement, int]] = []
+    for frame in frames:
+        for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
+            if isinstance(event, Measurement):
+                found.append((event, frame.sample_ns or 0))
+    assert codec.ledger.closes()
+    assert codec.ledger.lost() == 0
+    return found
+
+
+def pgns(frames: Sequence[SentFrame]) -> Counter[int]:
+    return Counter(split(frame.can_id).pgn for frame in frames)
+
+
+class Bench:
+    """A module and a host that talks to it."""
+
+    def __init__(self, module: HipnucJ1939Module, host: int = 0x55) -> None:
+        self.module = module
+        self.host = host
+        self.now_ns = BEGIN_NS
+        self.heard: list[SentFrame] = []
+
+    def wait(self, duration_ns: int) -> list[SentFrame]:
+        """What is heard meanwhile."""
+        self.now_ns += duration_ns
+        new = self.module.advance(self.now_ns)
+        self.heard += new
+        return new
+
+    def talk(self, begin: Callable[[J1939Node], RequestScript[object]], address: int = 8) -> object:
+        """Drive a conversation to its end."""
+        codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Settings(address=address, host_address=self.host))
+        conversation = begin(J1939Node(address, self.host))
+        try:
+            request = next(conversation)
+            while True:
+                can_id, size, data = RAW_FRAME.unpack(request.payload)
+                self.module.receive(can_id & EXTENDED_ID_MAX, True, data[:size], self.now_ns)
+                frames = self.wait(5 * MS)
+                events = [e for f in frames for e in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
+                ends = [e for e in events if isinstance(e, ReplyFrame) and request.is_end(e)]
+                request = conversation.send(Reply((ends[0],)) if ends else Silence(()))
+        except StopIteration as end:
+            return end.value
+
+
+def test_values_are_the_truth_of_the_sample_instant() -> None:
+    module = made(message="all")
+    found = decoded(module.advance(BEGIN_NS + 5 * SECOND_NS))
+    assert len(found) > 480
+    for measurement, sample_ns in found:
+        truth = module.hardware.motion.at((sample_ns - module.epoch_ns) / 1e9)
+        assert measurement.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=0.0024)
+        assert measurement.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=0.00054)
+        assert measurement.mag_t == pytest.approx(truth.mag_t, abs=1.6e-8)
+        assert measurement.euler_rad == pytest.approx(truth.euler_rad, abs=9e-6)
+        assert measurement.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=5.1e-5)
+    warm = [(m, t) for m, t in found if m.temperature_c is not None]
+    assert warm
+    for measurement, sample_ns in warm:
+        truth = module.hardware.motion.at((sample_ns - module.epoch_ns) / 1e9)
+        assert measurement.temperature_c == pytest.approx(truth.temperature_c, abs=0.0051)
+        assert measurement.pressure_pa == pytest.approx(truth.pressure_pa, abs=0.0051)
+
+
+def test_four_modules_on_a_bus() -> None:
+    modules = [made(node=node, rate_hz=100.0) for node in (1, 8, 9, 128)]
+    frames = CanModules(modules).advance(BEGIN_NS + SECOND_NS)
+    for module in modules:
+        found = decoded(frames, module.settings.address)
+        assert len(found) >= 94
+
+
+def test_crystal_and_wire() -> None:
+    module = made(baud=250_000, skew_ppm=1000.0)
+    frames = module.advance(BEGIN_NS + SECOND_NS)
+    assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(frames[:4])] == [560_000] * 3  # 140 bits
+    assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
+    assert module.counters() == {"samples_sent": 101, "frames_sent": 404, "requests": 0}
+
+
+def test_next_ns_is_when_something_is_sent() -> None:
+    module = made(message="all")
+    now_ns, seen = BEGIN_NS, 0
+    for _ in range(60):
+        due_ns = module.next_ns()
+        assert due_ns is not None
+        assert due_ns >= now_ns
+        now_ns = due_ns
+        seen += len(module.advance(now_ns))
+    assert seen >= 60
+
+
+def test_an_interval_is_set_and_read_back() -> None:
+    bench = Bench(made())
+    bench.talk(lambda peer: session.set_interval(peer, 0xFF37, 20))
+    bench.talk(lambda peer: session.set_interval(peer, 0xFF4A, 500))  # switched on by it
+    counts = pgns(bench.wait(SECOND_NS))
+    assert counts[0xFF34] == pytest.approx(100, abs=1)
+    assert counts[0xFF37] == pytest.approx(50, abs=1)
+    assert counts[0xFF4A] == 2
+    settings = bench.talk(session.read_settings)
+    assert isinstance(settings, dict)
+    assert settings["interval_ms_FF37"] == "20"
+    assert settings["address"] == "8"
+    assert settings["bitrate"] == "500000"
+
+
+def test_values_out_of_range_do_not_take() -> None:
+    bench = Bench(made())
+    for register, value in ((0x0134, 4), (0x009A, 5), (0x009C, 129), (0x009E, 2)):
+        with pytest.raises(Rejected):
+            bench.talk(lambda peer, r=register, v=value: session._write_checked(peer, r, v, "x"))  # type: ignore[misc]
+    assert bench.module.settings == bench.module.flash
+    with pytest.raises(NoReply):
+        bench.talk(lambda peer: session.read(peer, 0x0042))
+    with pytest.raises(NoReply):
+        bench.talk(lambda peer: session.read(peer, 0x009C), address=9)
+    before = bench.module.requests
+    bench.module.receive(0x0CEF0955, True, bytes.fromhex("3401060064000000"), bench.now_ns)
+    bench.module.receive(0x0CEF0855, True, bytes.fromhex("34010600640000"), bench.now_ns)
+    bench.module.receive(0x0CFF3408, True, bytes.fromhex("3401060064000000"), bench.now_ns)
+    assert bench.module.requests == before
+
+
+def test_what_is_not_saved_is_lost_at_a_restart() -> None:
+    bench = Bench(made(boot_ms=200))
+    bench.wait(300 * MS)
+    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
+    bench.talk(session.restart)
+    assert bench.module.settings.intervals_ms[0xFF34] == 10
+    assert pgns(bench.wait(190 * MS)) == {}
+    bench.wait(100 * MS)
+    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
+    bench.talk(session.save)
+    bench.talk(session.restart)
+    assert bench.module.settings.intervals_ms[0xFF34] == 50
+    bench.wait(300 * MS)
+    bench.talk(session.factory_reset)
+    bench.talk(session.restart)
+    assert bench.module.settings == J1939Settings()
+
+
+def test_address_and_bit_rate_change_at_the_restart() -> None:
+    bench = Bench(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
+    bench.talk(lambda peer: session.set_address(peer, 20))
+    bench.talk(lambda peer: session.set_bitrate(peer, 125_000))
+    assert {split(f.can_id).source for f in bench.wait(SECOND_NS)} == {8}
+    bench.talk(session.save)
+    bench.talk(session.restart)
+    bench.wait(100 * MS)
+    frames = bench.wait(SECOND_NS)
+    assert {split(f.can_id).source for f in frames} == {20}
+    assert frames[1].due_ns - frames[0].due_ns == 1_120_000
+    assert bench.talk(session.identify, address=20) is not None
+
+
+def test_a_restart_is_answered_before_it_happens() -> None:
+    module = made(boot_ms=0)
+    module.receive(0x0CEF0855, True, bytes.fromhex("00000600FF000000"), BEGIN_NS)
+    due_ns = module.next_ns()
+    assert due_ns is not None
+    (reply, *_) = [f for f in module.advance(due_ns + 2 * MS) if split(f.can_id).pgn == 0xEF00]
+    assert reply.data == bytes.fromhex("00000600FF000000")
+    assert reply.can_id == 0x0CEF5508
+
+
+def test_replies_go_to_the_one_address() -> None:
+    bench = Bench(made(), host=0x20)
+    assert bench.talk(lambda peer: session.read(peer, session.ADDRESS)) == 8
+    replies = [f for f in bench.heard if split(f.can_id).pgn == session.CONFIGURE]
+    assert {split(f.can_id).destination for f in replies} == {0x55}
+
+
+def test_a_message_is_sent_once() -> None:
+    bench = Bench(made())
+    bench.talk(lambda peer: session.send_once(peer, 0xFF46))
+    assert pgns(bench.heard)[0xFF46] == 1
+    assert pgns(bench.wait(SECOND_NS))[0xFF46] == 0
+
+
+def test_zero_and_directions_of_the_inclinometer() -> None:
+    still = Still(roll_rad=math.radians(10), pitch_rad=math.radians(20))
+    settings = J1939Settings(intervals_ms={messages.INCLINOMETER: 10})
+    bench = Bench(HipnucJ1939Module(BEGIN_NS, settings, J1939Hardware(boot_ms=0, motion=still)))
+
+    def shown() -> tuple[float, float]:
+        last = messages.measurement_of([(0xFF4A, bench.wait(50 * MS)[-1].data)]).incli_rad
+        assert last is not None
+        return round(math.degrees(last[0]), 2), round(math.degrees(last[1]), 2)
+
+    # X is the roll; Y = atan2(sin 20°, cos 20° · cos 10°) = atan2(0.342020, 0.925417) = 20.28°
+    assert shown() == (10.0, 20.28)
+    bench.talk(lambda peer: session.set_direction(peer, session.Y_SIGN, True))
+    assert shown() == (10.0, -20.28)
+    bench.talk(lambda peer: session.set_direction(peer, session.X_SIGN, True))
+    assert shown() == (-10.0, -20.28)
+    bench.talk(lambda peer: session.zero(peer, session.Zero.HERE))
+    assert shown() == (0.0, 0.0)
+    bench.talk(lambda peer: session.zero(peer, session.Zero.CANCEL))
+    assert shown() == (-10.0, -20.28)
+
+
+@pytest.mark.parametrize(
+    "options", [{"rate_hz": 0.5}, {"rate_hz": 500.0}, {"message": "x"}, {"motion": "none"}, {"node": 129}]
+)
+def test_options_that_it_cannot_have(options: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
+        made(**options)

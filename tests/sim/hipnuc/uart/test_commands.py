@@ -1,0 +1,212 @@
+"""The simulated module answers, remembers, forgets and turns its axes as manual chapters 2 and 8 say."""
+
+from math import radians
+
+import pytest
+
+from imud.attitude import matrix_from_quat
+from imud.devices.hipnuc.uart import commands
+from imud.sim.hipnuc.uart.hardware import HipnucHardware
+from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.physics.motion import Still
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.hipnuc_bench import FAST, STILL, Bench
+
+VERSION = ["PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK"]
+
+
+def test_the_vendors_probe_finds_it() -> None:
+    bench = Bench()
+    for _ in range(3):
+        assert bench.ask("LOG DISABLE") == ["OK"]
+    assert bench.wait(100.0) == []
+    assert bench.ask("LOG VERSION") == VERSION
+    assert bench.ask("LOG ENABLE") == ["OK"]
+    assert len(bench.frames(100.0)) == 10
+
+
+def test_replies_stand_between_whole_frames() -> None:
+    bench = Bench(FAST)
+    for _ in range(20):
+        bench.module.receive(b"LOG VERSION\r\n", bench.now_ns)
+        bench.now_ns += 3 * NS_PER_MS
+    bursts = bench.wait(40.0)
+    text = [burst.data for burst in bursts if burst.sample_ns is None]
+    assert text == ["".join(f"{line}\r\n" for line in VERSION).encode()] * 20
+    ends = [burst.due_ns - len(burst.data) * 10 * NS_PER_S // 921_600 for burst in bursts]
+    assert all(start >= before.due_ns - 1 for start, before in zip(ends[1:], bursts, strict=False))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "LOG VERSION\n",
+        "LOG VERSION\r\n",
+        "\xff\x80\x01LOG VERSION\r\n",
+        "\r\n\r\nLOG VERSION\n",
+        "LOG D\xffLOG VERSION\n",
+    ],
+)
+def test_line_ends_and_garbage_before_a_command(line: str) -> None:
+    bench = Bench()
+    bench.module.receive(line.encode("latin-1"), bench.now_ns)
+    assert bench.text(30.0) == VERSION
+
+
+@pytest.mark.parametrize(
+    "line", ["", "HELLO", "log version", "LOG", "LOG VERSIONS", "LOG HI93 ONTIME 1", "CONFIG ATT", "AT+RST", "X" * 5000]
+)
+def test_unknown_commands_get_no_reply(line: str) -> None:
+    bench = Bench()
+    assert bench.ask(line) == []
+    assert bench.ask("LOG VERSION") == VERSION
+    assert bench.module.settings == ModuleSettings()
+
+
+def test_a_line_above_128_bytes_is_no_command() -> None:
+    identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    fits, too_long = ("CONFIG IMU URFR " + ",".join(f"{n:.{digits}f}" for n in identity) for digits in (9, 10))
+    assert len(fits) <= 128 < len(too_long)
+    assert Bench().ask(fits) == ["OK"]
+    assert Bench().ask(too_long) == []
+
+
+def test_commands_split_anyhow_are_the_same() -> None:
+    bench = Bench()
+    for byte in b"LOG VERSION\r\n":
+        bench.module.receive(bytes([byte]), bench.now_ns)
+    assert bench.text(30.0) == VERSION
+
+
+def test_a_booting_module_hears_nothing() -> None:
+    bench = Bench()
+    bench.module.receive(b"REBOOT\r\nLOG VERSION\r\n", bench.now_ns)
+    assert bench.ask("LOG VERSION", 800.0) == []
+    bench.reboot()
+    assert bench.ask("LOG VERSION") == VERSION
+
+
+def test_reboot_forgets_what_was_not_saved_and_restarts_time() -> None:
+    bench = Bench()
+    assert bench.ask("LOG HI91 ONTIME 0.02") == ["OK"]
+    assert bench.ask("SAVECONFIG") == ["OK"]
+    assert bench.ask("LOG HI91 ONTIME 0.1") == ["OK"]
+    assert bench.ask("LOG DISABLE") == ["OK"]
+    assert bench.ask("REBOOT", 500.0) == []
+    frames = bench.frames(1000.0)
+    assert len(frames) == pytest.approx(50, abs=1)
+    assert frames[0].system_time_ms == 520
+
+
+def test_reboot_cuts_the_frame_on_the_wire() -> None:
+    bench = Bench(ModuleSettings(baud=9600, hi91=Output(100)), HipnucHardware(skew_ppm=0, processing_ns=0))
+    bench.wait(100.0 + 41.5 * 10 / 9.6)
+    bench.module.receive(b"REBOOT\r\n", bench.now_ns)
+    (burst,) = bench.wait(300.0)
+    assert len(burst.data) == 41
+    assert burst.sample_ns is None
+
+
+def test_baud_changes_after_save_and_reboot_only() -> None:
+    bench = Bench()
+    assert bench.ask("SERIALCONFIG 921600") == ["OK"]
+    assert bench.module.baud == 115_200
+    assert "BAUD: 921600" in bench.ask("LOG COMCONFIG")
+    bench.reboot()
+    assert bench.module.baud == 115_200
+    assert bench.ask("SERIALCONFIG 921600") == ["OK"]
+    assert bench.ask("SAVECONFIG") == ["OK"]
+    assert bench.module.baud == 115_200
+    bench.reboot()
+    assert bench.module.baud == 921_600
+
+
+def test_factory_reset_restores_everything() -> None:
+    bench = Bench(FAST)
+    assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
+    assert bench.ask("FRESET") == ["OK"]
+    assert bench.module.baud == 921_600
+    bench.reboot()
+    assert bench.module.settings == ModuleSettings()
+    assert bench.module.baud == 115_200
+    assert len(bench.frames(1000.0)) == pytest.approx(100, abs=1)
+
+
+def test_magconfig_and_usrconfig_have_the_manuals_form() -> None:
+    bench = Bench(hardware=HipnucHardware(mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
+    assert bench.ask("LOG MAGCONFIG") == ["MB=14.14, -2.08, -8.75", "OK"]
+    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 0"
+    assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
+    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 1"
+
+
+# --- attitude ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mounting", commands.Mounting)
+def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: commands.Mounting) -> None:
+    bench = Bench(hardware=STILL)
+    before = bench.frames(20.0)[-1]
+    assert bench.ask(commands.mounting(mounting).name) == ["OK"]
+    assert bench.frames(20.0)[-1].accel_g == before.accel_g
+    bench.ask("SAVECONFIG")
+    bench.reboot()
+    after = bench.frames(20.0)[-1]
+    for old, new in ((before.accel_g, after.accel_g), (before.mag_ut, after.mag_ut)):
+        back = [sum(c * value for c, value in zip(row, new, strict=True)) for row in mounting.value]  # B = C · U
+        assert back == pytest.approx(old, abs=1e-5)
+    up = matrix_from_quat((after.quat_wxyz[0], *after.quat_wxyz[1:]))[2]  # type: ignore[arg-type]  # four floats
+    assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude turned with the axes: force still points up
+
+
+def test_relative_level_zeroes_roll_and_pitch_and_can_be_cancelled() -> None:
+    bench = Bench(hardware=STILL)
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
+    assert bench.ask("CONFIG ATT RST 2") == ["OK"]
+    levelled = bench.frames(20.0)[-1]
+    assert levelled.euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
+    assert abs(levelled.accel_g[0]) > 0.01
+    assert bench.ask("CONFIG ATT RST 5") == ["OK"]
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
+
+
+def test_automatic_level_turns_the_accelerometer_too() -> None:
+    bench = Bench(hardware=STILL)
+    assert bench.ask("CONFIG ATT RST 3") == ["OK"]
+    frame = bench.frames(20.0)[-1]
+    assert frame.euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
+    assert frame.accel_g == pytest.approx((0.0, 0.0, 1.0), abs=1e-5)
+
+
+def test_automatic_level_upside_down_and_too_steep() -> None:
+    steep = Bench(hardware=HipnucHardware(motion=Still(radians(2), radians(6), 0.0)))
+    assert steep.ask("CONFIG ATT RST 3") == ["ERR"]
+    assert steep.frames(20.0)[-1].euler_deg[1] == pytest.approx(6.0, abs=1e-4)
+    turned = Bench(hardware=HipnucHardware(motion=Still(radians(-177), radians(1), 0.0)))
+    assert turned.ask("CONFIG ATT RST 3") == ["OK"]
+    roll, pitch, _ = turned.frames(20.0)[-1].euler_deg
+    assert abs(roll) == pytest.approx(180.0, abs=1e-4)
+    assert pitch == pytest.approx(0.0, abs=1e-4)
+
+
+def test_level_survives_a_reboot_if_saved() -> None:
+    bench = Bench(hardware=STILL)
+    bench.ask("CONFIG ATT RST 2")
+    bench.ask("SAVECONFIG")
+    bench.reboot()
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
+
+
+def test_yaw_absolute_and_relative_is_lost_at_reboot() -> None:
+    bench = Bench(hardware=STILL)
+    for command, yaw_deg in (("CONFIG YAW 1 16", 16.0), ("CONFIG YAW 0 1.5", 17.5), ("CONFIG YAW 1 -170", -170.0)):
+        assert bench.ask(command) == ["OK"]
+        assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, yaw_deg), abs=1e-4)
+    bench.ask("SAVECONFIG")
+    bench.reboot()
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("line", ["CONFIG ATT RST 4", "CONFIG YAW 2 0", "CONFIG YAW 1 181", "CONFIG YAW 1 nan"])
+def test_bad_values_are_refused(line: str) -> None:
+    assert Bench().ask(line) == ["ERR"]

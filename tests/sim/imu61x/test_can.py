@@ -1,0 +1,82 @@
+"""The simulated IMU61x on CAN against its own truth, decoded by the product's codec."""
+
+import itertools
+
+import pytest
+
+from imud.attitude import euler_zyx_from_quat
+from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.can_module import SentFrame
+from imud.sim.imu61x.can import SIMULATOR, Imu61xCanHardware, Imu61xCanModule
+from imud.sim.simulator import SimulatorOptions
+
+BEGIN_NS = 5_000_000_000
+SECOND_NS = 1_000_000_000
+
+
+def run(module: Imu61xCanModule, until_ns: int, step_ns: int = 700_000) -> list[SentFrame]:
+    frames: list[SentFrame] = []
+    for now_ns in range(BEGIN_NS, until_ns + 1, step_ns):
+        done = module.advance(now_ns)
+        assert all(frame.due_ns <= now_ns for frame in done)
+        frames += done
+    return frames
+
+
+def decoded(frames: list[SentFrame]) -> list[Measurement]:
+    codec = Imu61xCanCodec(Ledger(), Imu61xCanSettings())
+    events = [event for f in frames for event in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
+    return [event for event in events if isinstance(event, Measurement)]
+
+
+def test_values_are_the_truth_of_the_sample_instant() -> None:
+    module = Imu61xCanModule(BEGIN_NS, Imu61xCanHardware(boot_ms=0, index=65530))
+    frames = run(module, BEGIN_NS + SECOND_NS)
+    measured = decoded(frames)
+    assert len(measured) == pytest.approx(100, abs=1)
+    assert [m.dev_ticks for m in measured[:8]] == [65530, 65531, 65532, 65533, 65534, 65535, 0, 1]
+    for measurement, last in zip(measured, frames[4::5], strict=False):
+        assert last.sample_ns is not None
+        truth = module.hardware.motion.at((last.sample_ns - module.epoch_ns) / 1e9)
+        assert measurement.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=1e-6)
+        assert measurement.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-5)
+        assert measurement.euler_rad == pytest.approx(euler_zyx_from_quat(truth.quat_wxyz), abs=1e-6)
+        assert measurement.temperature_c == pytest.approx(truth.temperature_c, abs=0.005001)
+
+
+def test_frames_take_their_time_on_the_wire_and_the_crystal_runs_fast() -> None:
+    module = Imu61xCanModule(BEGIN_NS, Imu61xCanHardware(boot_ms=0, rate_hz=200, skew_ppm=1000, bitrate=250_000))
+    frames = run(module, BEGIN_NS + SECOND_NS)
+    one = frames[:5]
+    assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(one)] == [480_000] * 4
+    assert one[0].sample_ns is not None
+    assert one[0].due_ns - one[0].sample_ns == 125_000 + 480_000
+    assert module.counters() == {"samples_sent": 201, "frames_sent": 1005}
+
+
+def test_next_ns_is_when_something_is_sent() -> None:
+    module = Imu61xCanModule(BEGIN_NS)
+    now_ns, seen = BEGIN_NS, 0
+    for _ in range(50):
+        due_ns = module.next_ns()
+        assert due_ns is not None
+        assert due_ns >= now_ns
+        now_ns = due_ns
+        seen += len(module.advance(now_ns))
+    assert seen == 50
+
+
+def test_a_reboot_starts_the_index_anew() -> None:
+    module = Imu61xCanModule(BEGIN_NS, Imu61xCanHardware(boot_ms=0, index=500))
+    run(module, BEGIN_NS + SECOND_NS)
+    module.reboot(BEGIN_NS + SECOND_NS)
+    measured = decoded(module.advance(BEGIN_NS + SECOND_NS + SECOND_NS // 10))
+    assert measured[0].dev_ticks == 0
+
+
+@pytest.mark.parametrize("options", [{"rate_hz": 0.5}, {"rate_hz": 401}, {"message": "x"}, {"motion": "none"}])
+def test_options_that_it_cannot_have(options: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
+        SIMULATOR.make(SimulatorOptions(**options), BEGIN_NS)  # type: ignore[arg-type]  # a mapping of options

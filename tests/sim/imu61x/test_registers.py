@@ -1,0 +1,101 @@
+"""The simulated register file: pipeline, windows, latching, and that its faults are what they say."""
+
+import errno
+
+import pytest
+
+from imud.devices.imu61x.spi import codec as spi
+from imud.sim.imu61x.registers import Imu61xRegisters
+
+MS = 1_000_000
+
+
+class Clock:
+    """A clock that stands still until it is moved."""
+
+    def __init__(self) -> None:
+        self.now = 0
+
+    def __call__(self) -> int:
+        return self.now
+
+
+def device(**more: object) -> tuple[Imu61xRegisters, Clock]:
+    clock = Clock()
+    return Imu61xRegisters(clock, **more), clock  # type: ignore[arg-type]  # passed on as given
+
+
+def spoken(one: Imu61xRegisters, *words: int) -> list[int]:
+    """Each word in a selection of its own."""
+    return [int.from_bytes(miso, "big") for miso in one.spi([word.to_bytes(2, "big") for word in words])]
+
+
+def test_answer_comes_with_the_second_word_after_it_even_in_another_transaction() -> None:
+    one, _ = device(product="IMU618")
+    assert spoken(one, 0xFE01, 0x6A00, 0x6C00, 0x6E00, 0x7000)[3:] == [0x0000, 0x494D]
+    assert spoken(one, 0x7E00, 0x7E00) == [0x5536, 0x3138]
+    assert spoken(one, 0x7E00) == [1]
+
+
+def test_windows_hide_each_other() -> None:
+    one, _ = device()
+    assert spoken(one, 0x0600, 0x6C00, 0, 0)[2:] == [0, 0]  # configuration is not in window 0
+    assert spoken(one, 0xFE01, 0x0600, 0x0E00, 0, 0)[3:] == [0xBB, 0]  # values are not in window 1
+    one.spi([b"\xfe\x00"])
+    spoken(one, 0x8644, 0x8D01)
+    assert (one.filter, one.extended) == (0xBB, 0)  # writes to window 1 need it open
+
+
+def test_burst_ends_with_its_selection() -> None:
+    one, _ = device()
+    whole = one.spi(spi.READ_STANDARD.sends)[0]
+    assert len(whole) == 32
+    cut = b"".join(one.spi([spi.READ_STANDARD.sends[0][:8], bytes(24)]))
+    assert cut[:8] == whole[:8] or cut[4:8] == whole[4:8]
+    assert cut[12:] == bytes(len(cut) - 12)
+
+
+def test_registers_are_latched_and_renewed_in_steps() -> None:
+    one, clock = device(update_ns=10 * MS)
+    clock.now = 19 * MS
+    before = one.i2c([b"\x12", 32])
+    assert one.latched_ns == 10 * MS
+    clock.now = 19 * MS + 999_999
+    assert one.i2c([b"\x12", 32]) == before
+    clock.now = 20 * MS
+    assert one.i2c([b"\x12", 32]) != before
+    one.faults.frozen = True
+    clock.now = 90 * MS
+    one.i2c([b"\x12", 32])
+    assert one.latched_ns == 20 * MS
+
+
+def test_wrong_mode_shifts_the_bits() -> None:
+    one, _ = device(modes=frozenset({3}))
+    right = b"".join(one.spi(spi.READ_STATE.sends, 3))
+    wrong = b"".join(one.spi(spi.READ_STATE.sends, 0))
+    assert spi.State(right).product_id == b"\x00\x00IMU614"
+    assert spi.State(wrong).product_id != b"\x00\x00IMU614"
+
+
+def test_faults_are_what_they_say() -> None:
+    one, _ = device()
+    good = one.i2c([b"\x6a", 8])
+    one.faults.flips = 1
+    flipped = one.i2c([b"\x6a", 8])
+    assert sum((a ^ b).bit_count() for a, b in zip(good, flipped, strict=True)) == 1
+    assert one.i2c([b"\x6a", 8]) == good
+    one.faults.line = 0xFF
+    assert one.i2c([b"\x6a", 8]) == b"\xff" * 8
+    assert one.spi([b"\x00\x00"]) == [b"\xff\xff"]
+    one.faults.error = errno.ENXIO
+    with pytest.raises(OSError, match="ENXIO"):
+        one.i2c([b"\x6a", 8])
+
+
+def test_restart_forgets_what_was_set() -> None:
+    one, _ = device()
+    spoken(one, 0xFE01, 0x8644, 0x8D01)
+    assert (one.filter, one.extended, one.window) == (0x44, 1, 1)
+    one.restart()
+    assert (one.filter, one.extended, one.window) == (0xBB, 0, 0)

@@ -1,0 +1,286 @@
+"""The simulated IMU61x against the manual: modes, rates, RAM and flash, restart, calibration states, the wire."""
+
+import struct
+from dataclasses import replace
+from itertools import pairwise
+from math import pi
+
+import pytest
+
+from imud.attitude import matrix_from_quat
+from imud.contracts.codec import ReplyFrame
+from imud.contracts.session import Reply, Request
+from imud.devices.imu61x.uart import commands as c
+from imud.devices.imu61x.uart.replies import (
+    Acknowledgement,
+    Parameter,
+    ParameterValue,
+    parse_acknowledgement,
+    parse_parameter,
+    parse_status,
+)
+from imud.sim import SIMULATORS
+from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
+from imud.sim.imu61x.uart import Imu61xModule, make
+from imud.sim.physics.motion import swing
+from imud.sim.physics.noise import Noise
+from imud.sim.simulator import SimulatorOptions
+from imud.units import NS_PER_S
+from tests.support.imu61x_bench import BEGIN_NS, STILL, Bench, bench
+
+
+def acknowledged(far: Bench, request: Request) -> int:
+    """The result of an order."""
+    outcome = far.ask(request)
+    assert isinstance(outcome, Reply)
+    reply = parse_acknowledgement(outcome.messages[-1])
+    assert isinstance(reply, Acknowledgement)
+    return reply.result
+
+
+def parameter(far: Bench, which: Parameter) -> float:
+    outcome = far.ask(c.read_parameter(which))
+    assert isinstance(outcome, Reply)
+    value = parse_parameter(outcome.messages[-1])
+    assert isinstance(value, ParameterValue)
+    return value.value
+
+
+def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
+    """Taken apart without the codec: 312 roll 2° about Y, pitch -3° about X, yaw 40° at rest."""
+    module = Imu61xModule(BEGIN_NS, hardware=STILL)
+    (burst,) = module.advance(BEGIN_NS + 517_000_000)
+    data = burst.data
+    assert data[:6] == bytes.fromhex("AA5502002C00")
+    timer, pitch, roll, yaw, ax, ay, az, gx, gy, gz, temp = struct.unpack("<I10f", data[6:-4])
+    assert timer == 510_000
+    assert burst.device_ms == 510
+    assert (roll, pitch, yaw) == pytest.approx((-2.998, 2.003, 39.895), abs=0.01)
+    assert (ax**2 + ay**2 + az**2) ** 0.5 == pytest.approx(9.8 / 9.80665, abs=1e-6)
+    assert (gx, gy, gz) == (0, 0, 0)
+    assert 30 < temp < 40
+
+
+@pytest.mark.parametrize("rate_hz", c.RATES_HZ)
+def test_it_streams_at_every_rate_of_the_manual(rate_hz: int) -> None:
+    far = bench(Imu61xSettings(baud=230400, rate_hz=rate_hz))
+    far.wait(1000 - far.module.hardware.boot_ms)
+    samples = far.samples(2000)
+    assert len(samples) == pytest.approx(2 * rate_hz, abs=1)
+    ticks = [sample.dev_ticks for sample in samples]
+    assert {b - a for a, b in pairwise(ticks) if a is not None and b is not None} == {1_000_000 // rate_hz}
+    assert far.module.frames_dropped == 0
+
+
+def test_what_does_not_fit_the_wire_is_not_sent() -> None:
+    """Table 3 note 1: no more than 200 Hz at 115200; the wire carries 213."""
+    far = bench(Imu61xSettings(rate_hz=400))
+    assert len(far.samples(2000)) == pytest.approx(2 * 213, abs=4)
+    assert far.module.frames_dropped > 300
+
+
+def test_the_physics_of_the_truth_come_out() -> None:
+    """The rotation of the frame turns the specific force of the truth as the truth's own quaternion does."""
+    hardware = replace(STILL, motion=swing())
+    far = Bench(hardware=hardware)
+    assert far.samples(40)
+    for burst in far.module.advance(far.now_ns + 3 * NS_PER_S):
+        assert burst.sample_ns is not None
+        truth = swing().at((burst.sample_ns - BEGIN_NS) / NS_PER_S)
+        (sample,) = (event for event in far.codec.feed(burst.data) if not isinstance(event, ReplyFrame))
+        for name in ("accel_m_s2", "gyro_rad_s"):
+            assert getattr(sample, name) == pytest.approx(getattr(truth, name), abs=2e-6)
+        quat = getattr(sample, "quat_wxyz", None)
+        assert quat is not None
+        for row, wanted in zip(matrix_from_quat(quat), matrix_from_quat(truth.quat_wxyz), strict=True):
+            assert row == pytest.approx(wanted, abs=1e-6)
+
+
+def test_the_timer_runs_fast_and_wraps() -> None:
+    far = bench(skew_ppm=1000.0, uptime_us=2**32 - 600_000)
+    samples = far.samples(400)
+    ticks = [sample.dev_ticks or 0 for sample in samples]
+    assert any(b < a for a, b in pairwise(ticks))
+    begin_ns = far.now_ns
+    assert len(far.samples(10_000)) == pytest.approx(1001, abs=1)
+    assert far.now_ns - begin_ns == 10 * NS_PER_S
+
+
+def test_command_mode_is_silent_but_for_replies() -> None:
+    far = bench()
+    assert acknowledged(far, c.output_mode(c.OutputMode.COMMAND)) == 0
+    far.wait(20)
+    assert far.wait(2000) == []
+    outcome = far.ask(c.ask_status())
+    assert isinstance(outcome, Reply)
+    assert parse_status(outcome.messages[-1]) == far.module.hardware.status
+    assert parameter(far, Parameter.AHRS_RATE) == 100
+    far.ask(c.ask_ahrs())
+    assert len(far.samples(500)) == 1
+    assert acknowledged(far, c.output_mode(c.OutputMode.STREAM)) == 0
+    assert len(far.samples(1000)) == 100
+
+
+def test_a_device_that_listens_in_command_mode_only() -> None:
+    far = bench(answers_while_streaming=False)
+    far.send(c.ask_status().payload + c.factory_reset().payload)
+    assert not any(isinstance(event, ReplyFrame) for event in far.wait(500))
+
+
+def test_ram_is_lost_at_power_off_and_flash_is_not() -> None:
+    far = bench()
+    assert acknowledged(far, c.set_rate(50)) == 0
+    far.restart()
+    assert far.module.settings.rate_hz == 100
+    acknowledged(far, c.set_rate(50))
+    assert acknowledged(far, c.save()) == 0
+    far.restart()
+    assert parameter(far, Parameter.AHRS_RATE) == 50
+
+
+def test_the_mode_is_saved_too() -> None:
+    far = bench()
+    acknowledged(far, c.output_mode(c.OutputMode.COMMAND))
+    acknowledged(far, c.save())
+    far.restart()
+    assert far.samples(1000) == []
+
+
+def test_restart_is_acknowledged_and_then_silent_while_it_boots() -> None:
+    far = bench()
+    assert acknowledged(far, c.restart()) == 0
+    assert far.wait(far.module.hardware.boot_ms - 20) == []
+    samples = far.samples(200)
+    assert len(samples) >= 15
+    assert samples[0].dev_ticks is not None
+    assert samples[0].dev_ticks <= 520_000
+
+
+def test_values_that_it_does_not_have() -> None:
+    """Table 12 names the defaults for rate and baud; other values are refused."""
+    settings = Imu61xSettings(baud=921600, rate_hz=400)
+    assert changed(settings, 3, 9600.0).baud == 115200
+    assert changed(settings, 21, 77.0).rate_hz == 100
+    for index, value in ((27, 4.0), (30, 0x1C), (31, 256.0), (31, 0.5), (8, 0.0), (99, 1.0), (27, float("nan"))):
+        with pytest.raises(ParameterRefused):
+            changed(settings, index, value)
+
+
+def test_every_parameter_of_the_manual_can_be_asked_and_no_other() -> None:
+    for which in Parameter:
+        Imu61xSettings().value(which)
+    with pytest.raises(ParameterRefused):
+        Imu61xSettings().value(4)
+    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far.send(c.encode_command(c.Command.READ_PARAMETER, 0.0, 4))
+    (reply,) = far.wait(50)
+    assert isinstance(reply, ReplyFrame)
+    assert parse_acknowledgement(reply) == Acknowledgement(6, 1)
+
+
+@pytest.mark.parametrize("param1", [2.0, 0.0, float("nan")])
+def test_an_unknown_mode_is_refused(param1: float) -> None:
+    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far.send(c.encode_command(c.Command.OUTPUT_MODE, param1))
+    (reply,) = far.wait(50)
+    assert isinstance(reply, ReplyFrame)
+    assert parse_acknowledgement(reply) == Acknowledgement(3, 1)
+
+
+def test_the_acknowledgement_of_a_new_rate_comes_at_the_old_one() -> None:
+    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    assert acknowledged(far, c.set_baud(921600)) == 0
+    far.wait(10)
+    assert far.module.baud == 921600
+    far.line_baud = 921600
+    assert parameter(far, Parameter.BAUD) == 921600
+
+
+def test_what_is_sent_at_another_rate_is_not_understood() -> None:
+    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far.line_baud = 460800
+    far.send(c.factory_reset().payload)
+    far.line_baud = 115200
+    assert far.wait(100) == []
+
+
+def test_damaged_and_unknown_commands_are_not_answered() -> None:
+    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    damaged = bytearray(c.ask_status().payload)
+    damaged[12] ^= 1
+    far.send(bytes(damaged))
+    assert far.wait(100) == []
+    whole = c.ask_status().payload
+    far.send(whole[:10])
+    far.send(whole[10:])
+    assert len(far.wait(100)) == 1
+
+
+def test_installation_calibration_takes_its_time() -> None:
+    far = bench()
+    assert acknowledged(far, c.ask_installation_status()) == 0
+    assert acknowledged(far, c.start_installation_calibration()) == 0
+    assert acknowledged(far, c.ask_installation_status()) == 1
+    assert parameter(far, Parameter.INSTALL_X_OFF) == 0
+    far.wait(3000)
+    assert acknowledged(far, c.ask_installation_status()) == 0
+    assert parameter(far, Parameter.INSTALL_X_OFF) == pytest.approx(-2.998, abs=0.01)
+
+
+def test_heading_is_relative_and_wraps() -> None:
+    far = bench()
+    assert acknowledged(far, c.reset_heading(270)) == 0
+    euler = far.samples(50)[-1].euler_rad
+    assert euler is not None
+    assert euler[2] == pytest.approx(-pi / 2, abs=1e-5)
+    far.restart()
+    euler = far.samples(50)[-1].euler_rad
+    assert euler is not None
+    assert euler[2] == pytest.approx(0.6963, abs=1e-3)
+
+
+def test_power_off_cuts_the_frame_on_the_wire() -> None:
+    module = Imu61xModule(BEGIN_NS, hardware=STILL)
+    now_ns = BEGIN_NS + 512_000_000
+    assert module.advance(now_ns) == []
+    module.reboot(now_ns)
+    cut = b"".join(burst.data for burst in module.advance(now_ns))
+    assert 0 < len(cut) < 54
+    assert cut == bytes.fromhex("AA5502002C00")[: len(cut)] or cut.startswith(bytes.fromhex("AA5502002C00"))
+
+
+def test_next_ns_says_when_there_is_something() -> None:
+    module = Imu61xModule(BEGIN_NS, hardware=STILL)
+    now_ns = BEGIN_NS
+    for _ in range(20):
+        next_ns = module.next_ns()
+        assert next_ns is not None
+        assert module.advance(next_ns - 1) == []
+        assert len(module.advance(next_ns)) == 1
+        assert next_ns > now_ns
+        now_ns = next_ns
+
+
+def test_the_row_makes_it_from_common_options() -> None:
+    module = SIMULATORS["imu61x-uart"].make(SimulatorOptions(rate_hz=400, noise="none", firmware=7), BEGIN_NS)
+    assert module.baud == 230400
+    assert isinstance(module, Imu61xModule)
+    assert module.hardware.status.software_version == 7
+    noisy = make(SimulatorOptions(baud=1500000), BEGIN_NS)
+    assert noisy.baud == 1500000
+    assert isinstance(noisy.hardware.noise, Noise)
+    assert make(SimulatorOptions(rate_hz=200), BEGIN_NS).baud == 115200
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (SimulatorOptions(rate_hz=99), "rate 99 Hz: expected one of 1, 10"),
+        (SimulatorOptions(baud=9600), "baud 9600"),
+        (SimulatorOptions(message="HI91"), "expected AHRS"),
+        (SimulatorOptions(motion="fly"), "motion 'fly'"),
+    ],
+)
+def test_options_that_it_cannot_have(options: SimulatorOptions, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        make(options, BEGIN_NS)

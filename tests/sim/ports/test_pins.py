@@ -1,0 +1,182 @@
+"""Pins reach lines when they are due, lose what they are told to lose, and the same with the same seed."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from imud.sim.ports.faults import FaultKind, FaultRates, Faults
+from imud.sim.ports.lines import MemoryInput
+from imud.sim.ports.pin import Pin, PinEdge
+from imud.sim.ports.pins import PinFaultRates, PinFaults, Pins, PullFile, SinFile, pull_files
+from imud.units import NS_PER_MS
+from tests.support.hipnuc_bench import FAST, Bench
+
+
+class Line:
+    """Keeps what it is driven with."""
+
+    def __init__(self) -> None:
+        self.edges: list[tuple[int, bool]] = []
+
+    def __call__(self, t_ns: int, rising: bool) -> None:
+        self.edges.append((t_ns, rising))
+
+
+def run(faults: PinFaults | None, steps: int = 20_000, step_ns: int = 50_000) -> tuple[Line, Pins, Bench]:
+    bench, line = Bench(FAST), Line()
+    bench.module.pins(bench.now_ns)
+    pins = Pins(bench.module, {Pin.SOUT: line}, faults)
+    for _ in range(steps):
+        bench.now_ns += step_ns
+        pins.step(bench.now_ns)
+        assert not line.edges or line.edges[-1][0] <= bench.now_ns
+    return line, pins, bench
+
+
+def test_every_edge_comes_once_in_order() -> None:
+    line, pins, _ = run(None)
+    assert len(line.edges) == pytest.approx(2000, abs=3) == pins.edges
+    assert all(after[0] > before[0] and after[1] is not before[1] for before, after in pairwise(line.edges))
+    assert pins.summary() == {"pin_edges": pins.edges}
+
+
+def test_next_ns_names_the_next_edge_even_one_that_a_fault_made() -> None:
+    line, pins, bench = run(PinFaults(5, PinFaultRates(extra=1.0)), steps=1)
+    seen = 0
+    for _ in range(200):
+        next_ns = pins.next_ns()
+        assert next_ns is not None
+        assert next_ns > bench.now_ns
+        bench.now_ns = next_ns
+        pins.step(next_ns)
+        assert all(t_ns == next_ns for t_ns, _ in line.edges[seen:])
+        seen = len(line.edges)
+    assert seen > 100
+
+
+def test_lost_pulses_lose_both_edges_and_are_known() -> None:
+    faults = PinFaults(1, PinFaultRates(lose_pulse=0.1))
+    line, pins, bench = run(faults)
+    assert 70 <= faults.counts["lose_pulse"] <= 130
+    assert all(after[1] is not before[1] for before, after in pairwise(line.edges))
+    whole, _, _ = run(None)
+    missing = {t_ns for t_ns, rising in whole.edges if rising} - {t_ns for t_ns, rising in line.edges if rising}
+    assert len(missing) == faults.counts["lose_pulse"] == len(faults.lost)
+    processing_ns = bench.module.hardware.processing_ns - 80_000
+    assert {(sample_ns or 0) + processing_ns for _, sample_ns in faults.lost} == missing
+    assert pins.summary()["pin_fault_lose_pulse"] == faults.counts["lose_pulse"]
+
+
+def test_single_edges_can_be_lost() -> None:
+    faults = PinFaults(2, PinFaultRates(lose_edge=0.1))
+    line, _, _ = run(faults)
+    assert 150 <= faults.counts["lose_edge"] <= 250
+    assert len(line.edges) == pytest.approx(2000 - faults.counts["lose_edge"], abs=3)
+    assert any(after[1] is before[1] for before, after in pairwise(line.edges))
+
+
+def test_extra_pulses_stand_between_the_others() -> None:
+    faults = PinFaults(3, PinFaultRates(extra=0.1))
+    line, _, _ = run(faults)
+    assert 70 <= faults.counts["extra"] <= 130
+    assert len(line.edges) == pytest.approx(2000 + 2 * faults.counts["extra"], abs=4)
+    assert all(after[0] >= before[0] for before, after in pairwise(line.edges))
+
+
+def test_same_seed_same_faults() -> None:
+    rates = PinFaultRates(lose_pulse=0.1, lose_edge=0.05, extra=0.05)
+    assert run(PinFaults(7, rates))[0].edges == run(PinFaults(7, rates))[0].edges
+    assert run(PinFaults(7, rates))[0].edges != run(PinFaults(8, rates))[0].edges
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
+def test_probabilities_are_probabilities(value: float) -> None:
+    with pytest.raises(ValueError, match="expected a probability"):
+        PinFaultRates(lose_pulse=value)
+
+
+def test_frames_can_be_lost_whole() -> None:
+    faults = Faults(4, FaultRates(lose=0.1))
+    bursts = Bench(FAST).wait(1000.0)
+    arrived = [burst for burst in map(faults.pass_on, bursts) if burst]
+    assert 70 <= faults.counts[FaultKind.LOSE] <= 130
+    assert len(arrived) == len(bursts) - faults.counts[FaultKind.LOSE]
+    assert set(arrived) <= set(bursts)
+    assert faults.bursts_hit == faults.counts[FaultKind.LOSE]
+
+
+# --- files of gpio-sim ------------------------------------------------------------------------------------------------
+
+
+def test_pull_files_are_written_as_the_kernel_wants(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).write_bytes(b"")
+    files = pull_files(f"sout={tmp_path / 'a'},alarm={tmp_path / 'b'}")
+    assert set(files) == {Pin.SOUT, Pin.ALARM}
+    files[Pin.SOUT](0, True)
+    assert (tmp_path / "a").read_bytes() == b"pull-up"
+    files[Pin.SOUT](0, False)
+    assert (tmp_path / "a").read_bytes() == b"pull-uppull-down"
+    assert (tmp_path / "b").read_bytes() == b""
+    for file in files.values():
+        file.close()
+        file.close()
+
+
+@pytest.mark.parametrize("text", ["led=/tmp/x", "sout", "sout=", "=x"])
+def test_other_pins_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="expected NAME=PATH with one of sout, sout_div, alarm"):
+        pull_files(text)
+
+
+def test_a_file_that_is_missing_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        PullFile(tmp_path / "missing" / "pull")
+
+
+class Marked:
+    """Counts its marks."""
+
+    def __init__(self) -> None:
+        self.marks: list[int] = []
+
+    def mark(self, now_ns: int) -> None:
+        self.marks.append(now_ns)
+
+    def pins(self, now_ns: int) -> list[PinEdge]:
+        raise AssertionError(now_ns)
+
+    def next_pin_ns(self) -> int | None:
+        return None
+
+
+@pytest.fixture
+def value(tmp_path: Path) -> Callable[[int], Path]:
+    def write(level: int) -> Path:
+        (tmp_path / "value").write_text(f"{level}\n")
+        return tmp_path / "value"
+
+    return write
+
+
+def test_sin_marks_on_rising_edges_only(value: Callable[[int], Path]) -> None:
+    module = Marked()
+    sin = SinFile(value(1), module)
+    for number, level in enumerate([1, 0, 0, 1, 1, 0, 1]):
+        value(level)
+        sin.look(number * NS_PER_MS)
+    assert module.marks == [3 * NS_PER_MS, 6 * NS_PER_MS]
+
+
+def test_memory_lines_take_them_as_they_are() -> None:
+    line = MemoryInput()
+    line.open()
+    bench = Bench(FAST)
+    pins = Pins(bench.module, {Pin.SOUT: line.edge})
+    for _ in range(100):
+        bench.now_ns += NS_PER_MS
+        pins.step(bench.now_ns)
+    assert pins.edges == pytest.approx(200, abs=2)
+    assert not line.level()

@@ -1,0 +1,287 @@
+"""A module behind a real pseudo-terminal, stepped by hand: no clock, no waiting."""
+
+import fcntl
+import io
+import os
+import termios
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.hipnuc.uart.hardware import HipnucHardware
+from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalProfile
+from imud.sim.ports.faults import FaultRates, Faults
+from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, set_baud
+from imud.units import NS_PER_MS, NS_PER_S
+
+BEGIN_NS = 77 * NS_PER_S
+QUICK = HipnucHardware(skew_ppm=0, boot_ms=0)
+
+
+class Rig:
+    """A port, a program that may have it open, and the time."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        settings: ModuleSettings | None = None,
+        profile: ArrivalProfile = BARE_UART,
+        faults: Faults | None = None,
+    ) -> None:
+        self.now_ns = BEGIN_NS
+        self.path = path
+        self.truth = io.StringIO()
+        self.module = HipnucModule(BEGIN_NS, settings, QUICK)
+        self.port = SimulatedPort(self.module, PtyNode(path), Adapter(profile, BEGIN_NS), faults, self.truth)
+        self.fd = -1
+
+    def open(self, baud: int | None = None) -> None:
+        self.fd = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        if baud:
+            set_baud(self.fd, baud)
+
+    def close(self) -> None:
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
+
+    def run(self, duration_ms: float) -> bytes:
+        """Let time pass from deadline to deadline; return what the program read."""
+        end_ns, got = self.now_ns + round(duration_ms * NS_PER_MS), b""
+        while self.now_ns < end_ns:
+            self.now_ns = min(self.port.next_ns(self.now_ns), end_ns)
+            self.port.step(self.now_ns)
+            got += self.read()
+        return got
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self.fd, 65536) if self.fd >= 0 else b""
+        except OSError:  # nothing there, or the other end is gone
+            return b""
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig(tmp_path / "tty")
+    yield rig
+    rig.close()
+    rig.port.close()
+
+
+def frames_of(data: bytes) -> int:
+    ledger = Ledger()
+    codec = DRIVER.make_codec(ledger, DRIVER.settings())
+    return sum(isinstance(event, Measurement) for event in (*codec.feed(data), *codec.flush()))
+
+
+def test_a_program_reads_frames_and_gets_answers(rig: Rig) -> None:
+    rig.open(115_200)
+    assert frames_of(rig.run(1000)) == pytest.approx(99, abs=1)
+    os.write(rig.fd, b"LOG DISABLE\r\nLOG VERSION\r\n")
+    text = rig.run(50)
+    assert text.endswith(b"BL_VER=109\r\nOK\r\n")
+    assert b"OK\r\nPNAME=HI14R3\r\n" in text
+    assert rig.run(100) == b""
+
+
+def test_the_terminal_is_raw_and_does_not_echo_frames_into_the_module(rig: Rig) -> None:
+    rig.open()
+    flags = termios.tcgetattr(rig.fd)
+    assert not flags[3] & (termios.ECHO | termios.ICANON)
+    rig.run(200)
+    assert rig.port.node.read() == b""
+
+
+def test_the_wrong_rate_is_garbage_both_ways(rig: Rig) -> None:
+    rig.open(460_800)
+    garbage = rig.run(500)
+    assert len(garbage) > 1000
+    assert frames_of(garbage) == 0
+    os.write(rig.fd, b"LOG DISABLE\r\n")
+    rig.run(50)
+    assert rig.port.summary()["bursts_wrong_baud"] > 40
+    set_baud(rig.fd, 115_200)
+    assert frames_of(rig.run(200)) == pytest.approx(20, abs=1)  # and the command was not understood
+
+
+@pytest.mark.parametrize("baud", DRIVER.baud_rates)
+def test_every_rate_of_the_manual_can_be_set_and_seen(rig: Rig, baud: int) -> None:
+    rig.open(baud)
+    assert rig.port.node.baud == baud
+
+
+def test_baud_follows_save_and_reboot(rig: Rig) -> None:
+    rig.open(115_200)
+    os.write(rig.fd, b"SERIALCONFIG 921600\r\nSAVECONFIG\r\nREBOOT\r\n")
+    rig.run(50)
+    assert frames_of(rig.run(200)) == 0
+    set_baud(rig.fd, 921_600)
+    assert frames_of(rig.run(200)) >= 19
+
+
+def test_with_nobody_listening_bytes_are_lost_and_counted(rig: Rig) -> None:
+    assert rig.run(1000) == b""
+    counted = rig.port.summary()
+    assert counted["bytes_written"] == 0
+    assert counted["bytes_unheard"] == pytest.approx(99 * 82, abs=82)
+    rig.open(115_200)
+    assert frames_of(rig.run(100)) == pytest.approx(10, abs=1)  # nothing old
+    rig.close()
+    before = rig.port.summary()["bytes_written"]
+    rig.run(100)
+    assert rig.port.summary()["bytes_written"] == before
+
+
+def test_a_silent_module_notices_soon_that_somebody_opened_the_port(rig: Rig) -> None:
+    rig.module.receive(b"UNLOGALL\r\n", rig.now_ns)
+    rig.run(50)
+    assert rig.module.next_ns() is None
+    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + 20 * NS_PER_MS
+    rig.open()
+    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # from now on select tells of its bytes
+
+
+def test_faults_wait_while_the_cable_is_out(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "tty", faults=Faults(1, FaultRates(flip=0.5)))
+    rig.run(100)
+    assert rig.port.summary()["fault_flip"] > 0
+    rig.port.unplug(rig.now_ns, NS_PER_S)
+    before = rig.port.summary()["fault_flip"]
+    rig.run(900)
+    assert rig.port.summary()["fault_flip"] == before
+    rig.port.close()
+
+
+def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: Rig) -> None:
+    rig.open(115_200)
+    os.write(rig.fd, b"LOG DISABLE\r\n")
+    rig.close()
+    rig.run(50)
+    rig.open()
+    assert rig.run(100) == b""
+
+
+def test_a_reader_that_stops_blocks_nothing(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)))
+    rig.open(921_600)
+    rig.read = lambda: b""  # type: ignore[method-assign]  # a program that never reads
+    rig.run(2000)
+    counted = rig.port.summary()
+    assert counted["bytes_lost_full"] > 50_000
+    total = counted["bytes_lost_full"] + counted["bytes_written"] + counted["bytes_unheard"]
+    assert total == pytest.approx(2000 * 82, abs=5 * 82)
+    rig.close()
+    rig.port.close()
+
+
+def test_unplugging_takes_the_node_away_and_brings_it_back(rig: Rig) -> None:
+    rig.open(115_200)
+    rig.run(700)
+    assert rig.path.is_symlink()
+    rig.port.unplug(rig.now_ns, 300 * NS_PER_MS)
+    assert not rig.path.is_symlink()
+    with pytest.raises(OSError, match="Input/output error"):
+        os.write(rig.fd, b"anybody there?")
+    rig.run(299)
+    assert not rig.path.is_symlink()
+    rig.run(2)
+    assert rig.path.is_symlink()
+    rig.close()
+    rig.open(115_200)
+    codec = DRIVER.make_codec(Ledger(), DRIVER.settings())
+    (measurement, *_) = [event for event in codec.feed(rig.run(50)) if isinstance(event, Measurement)]
+    assert measurement.dev_ticks is not None
+    assert measurement.dev_ticks < 100  # the module lost power
+    counted = rig.port.summary()
+    assert counted["unplugs"] == 1
+    assert counted["bytes_written"] + counted["bytes_unheard"] == pytest.approx(counted["frames_sent"] * 82, abs=3 * 82)
+
+
+def test_an_exclusive_program_is_no_obstacle(rig: Rig) -> None:
+    rig.open(115_200)
+    fcntl.ioctl(rig.fd, termios.TIOCEXCL)
+    fcntl.flock(rig.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    assert frames_of(rig.run(100)) == pytest.approx(10, abs=1)
+
+
+def test_a_latency_timer_hands_over_in_batches(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
+    rig.open(921_600)
+    rig.run(500)
+    rows = [tuple(map(int, line.split(","))) for line in rig.truth.getvalue().splitlines()[2:]]
+    written = [row[2] for row in rows]
+    steps = {after - before for before, after in pairwise(written) if after > before}
+    assert len(set(written)) == pytest.approx(500 / 16, abs=2)
+    assert steps == {round(16 * NS_PER_MS / (1 - 30e-6))}
+    assert all(0 < row[2] - row[0] <= 17.1 * NS_PER_MS for row in rows)
+    rig.close()
+    rig.port.close()
+
+
+def test_what_the_adapter_held_is_lost_with_the_cable(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
+    rig.open(921_600)
+    rig.run(16 * 3 + 10)
+    rig.port.step(rig.now_ns)
+    rig.port.unplug(rig.now_ns, NS_PER_S)
+    assert rig.port.summary()["bytes_unheard"] == pytest.approx(10 * 82, abs=82)
+    rig.close()
+    rig.port.close()
+
+
+def test_the_truth_log_tells_when_each_frame_was_measured(rig: Rig) -> None:
+    rig.open(115_200)
+    rig.run(300)
+    head, names, *rows = rig.truth.getvalue().splitlines()
+    assert head == f"# epoch_ns={BEGIN_NS}"
+    assert names == "sample_ns,device_ms,written_ns"
+    for row in rows:
+        sample_ns, device_ms, written_ns = map(int, row.split(","))
+        assert sample_ns == BEGIN_NS + device_ms * NS_PER_MS
+        assert written_ns == sample_ns + 125_000 + 82 * 10 * NS_PER_S // 115_200
+    assert len(rows) == pytest.approx(29, abs=1)
+
+
+def test_faults_lie_between_module_and_reader(tmp_path: Path) -> None:
+    faults = Faults(4, FaultRates(flip=0.2))
+    rig = Rig(tmp_path / "tty", faults=faults)
+    rig.open(115_200)
+    ledger = Ledger()
+    codec = DRIVER.make_codec(ledger, DRIVER.settings())
+    codec.feed(rig.run(2000))
+    codec.flush()
+    assert ledger.frames_in_samples == faults.bursts - len({fault.burst for fault in faults.log})
+    assert rig.port.summary()["fault_flip"] == len(faults.log) > 20
+    rig.close()
+    rig.port.close()
+
+
+def test_a_fault_can_pull_the_cable(tmp_path: Path) -> None:
+    faults = Faults(4, FaultRates(unplug=0.05, unplug_ns=100 * NS_PER_MS))
+    rig = Rig(tmp_path / "tty", faults=faults)
+    seen = set()
+    for _ in range(200):
+        rig.run(10)
+        seen.add(rig.path.is_symlink())
+    assert seen == {True, False}
+    assert rig.port.summary()["unplugs"] == rig.port.summary()["fault_unplug"] > 1
+    rig.port.close()
+
+
+def test_closing_twice_is_allowed_and_leaves_nothing(tmp_path: Path) -> None:
+    before = set(os.listdir("/proc/self/fd"))
+    rig = Rig(tmp_path / "tty")
+    rig.run(20)
+    rig.port.close()
+    rig.port.close()
+    assert list(tmp_path.iterdir()) == []
+    assert set(os.listdir("/proc/self/fd")) == before

@@ -1,0 +1,82 @@
+"""Device and client records with made-up but consistent numbers, for tests and benchmarks of the metrics."""
+
+import msgspec
+
+from imud.contracts.status import (
+    LATENCY_BOUNDS_NS,
+    ClientStatus,
+    ClockStatus,
+    DeviceState,
+    DeviceStatus,
+    KernelCounters,
+    LinesStatus,
+    PollingStatus,
+    SerialLineCounters,
+    UtcStatus,
+)
+from imud.ledger import LEDGER_FIELDS
+from imud.sample import Sync
+
+
+def device(name: str, number: int = 0, **changes: object) -> DeviceStatus:
+    """A running device whose ledger closes and whose counters all differ from each other and between devices."""
+    ledger = {field: 1000 * (number + 1) + index for index, field in enumerate(LEDGER_FIELDS)}
+    ledger["bytes_in"] = sum(
+        ledger[key] for key in ("bytes_in_good_frames", "bytes_in_bad_frames", "bytes_skipped", "bytes_pending")
+    )
+    ledger["frames_good"] = sum(
+        ledger[key] for key in ("frames_in_samples", "frames_in_replies", "frames_ignored", "frames_pending")
+    )
+    status = DeviceStatus(
+        name=name,
+        device_id=number,
+        driver="hipnuc-uart",
+        link=f"/dev/ttyUSB{number} at 115200 baud",
+        state=DeviceState.RUNNING,
+        problem="",
+        identity={"product": "HI13", "serial_number": f"{number:08d}", "firmware": "1.7.6", "other": "x"},
+        settings={},
+        rate_hz=999.5 + number,
+        expected_rate_hz=1000.25,
+        newest_seq=123,
+        clock=ClockStatus(Sync.REGRESSION, 5_250_000_000, -40.0, 30_000, 45_000, 2),
+        ledger=ledger,
+        kernel=KernelCounters(7, 8, 9, 10),
+        latency_buckets=tuple(range(1, len(LATENCY_BOUNDS_NS) + 2)),
+        latency_sum_ns=2_500_000_000,
+        temperature_c=36.5,
+        status_bits=4,
+        connects=3,
+    )
+    return msgspec.structs.replace(status, **changes)
+
+
+POLLING = PollingStatus(
+    polls=1000, late=20, missed=3, stale=4, failed=5, vanished=6,
+    late_mean_ns=70_000, late_worst_ns=8_000_000, late_sum_ns=70_000_123,
+)  # fmt: skip
+SERIAL_LINE = SerialLineCounters(timeouts=11, late_bytes=12, strange_bytes=13, echoes=14)
+LINES = LinesStatus(
+    problems={"alarm": "/dev/gpiochip0 is not there"}, edges={"sout": 5000, "alarm": 2, "pps": 60},
+    edges_lost={"sout": 7, "alarm": 0, "pps": 0}, alarm=True, alarms=3, sin=True, triggers=400, triggers_missed=8,
+    trigger_late_mean_ns=30_000, trigger_late_worst_ns=900_000, trigger_late_sum_ns=12_000_456,
+)  # fmt: skip
+UTC = UtcStatus(
+    source="gpsd at 127.0.0.1:2947", problem="chronyd does not take samples", sentences=100, sent=90,
+    refused={"stale": 7, "busy": 3}, pulses=59, pulses_ignored=1, chrony_sent=40, chrony_refused=19,
+)  # fmt: skip
+EDGED = ClockStatus(
+    Sync.EDGE, 5_250_000_000, -40.0, 30_000, 4_500, 2, hold_ns=16_000_000, edges=4998, edges_unpaired=9,
+    samples_unpaired=17, triggers_missed=21, reference_error_ns=250_000,
+)  # fmt: skip
+
+
+def equipped(name: str, number: int = 0, **changes: object) -> DeviceStatus:
+    """A device that has every part that a device can have."""
+    parts = {"clock": EDGED, "polling": POLLING, "serial_line": SERIAL_LINE, "lines": LINES, "utc": UTC}
+    return device(name, number, **(parts | changes))
+
+
+def client(number: int, encoding: str = "json", sent: int = 0, dropped: int = 0, queue: int = 0) -> ClientStatus:
+    """A client that watches."""
+    return ClientStatus(number, 100 + number, 1000, False, encoding, sent, dropped, queue, queue * 256)

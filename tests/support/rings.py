@@ -1,0 +1,67 @@
+"""A shared-memory publisher on a folder of its own, with a clock and a ledger that the test moves."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from imud.contracts.batch import Batch
+from imud.contracts.publisher import PublisherContext
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
+from imud.formats.ring import OFFSETS
+from imud.ledger import Ledger
+from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
+from imud.sample import Sample, Sync
+
+DEVICE = "imu0"
+SLOTS = 64
+START_NS = 5_000_000_000
+
+
+def make_sample(seq: int, device: str = DEVICE) -> Sample:
+    """A sample whose every part says which one it is."""
+    value = float(seq)
+    return Sample(
+        device, seq, seq * 1_000_000, 1000 + seq % 1000, Sync.REGRESSION, seq * 1_000_000 + 500, 10**18 + seq,
+        accel_m_s2=(value, value + 0.25, value + 0.5), gyro_rad_s=(-value, 0.0, value), temperature_c=value / 8,
+    )  # fmt: skip
+
+
+class Board:
+    """A daemon's start as its shared memory sees it."""
+
+    def __init__(self, folder: Path, *, epoch: int = 77, slots: int = SLOTS, now_ns: int = START_NS) -> None:
+        self.path = folder / f"imud.{DEVICE}"
+        self.now_ns = now_ns
+        self.ledger = Ledger()
+        self.driver = "hipnuc-uart"
+        self.settings = ShmSettings(directory=str(folder), slots=slots, group="")
+        self.publisher = ShmPublisher(
+            self.settings, PublisherContext(lambda: [self.status()], epoch, lambda: self.now_ns)
+        )  # fmt: skip
+        self.publisher.start()
+        self.publisher.add_device(DEVICE, 3)
+
+    def status(self) -> DeviceStatus:
+        """What the pipeline would say of the device."""
+        return DeviceStatus(
+            DEVICE, 3, self.driver, "", DeviceState.RUNNING, "", {}, {}, 0.0, 0.0, 0, ClockStatus(),
+            self.ledger.snapshot(), KernelCounters(), (), 0, None, None, 1,
+        )  # fmt: skip
+
+    def publish(self, numbers: Iterable[int]) -> None:
+        """Publish the samples of these sequence numbers as one batch."""
+        self.publisher.publish(Batch(DEVICE, 3, [make_sample(seq) for seq in numbers]))
+
+    def tick(self, later_ns: int = 100_000_000) -> None:
+        """Let time pass, and tick."""
+        self.now_ns += later_ns
+        self.publisher.tick(self.now_ns)
+
+    def word(self, name: str, size_bytes: int = 8) -> int:
+        """A number of the header, as it is in the file."""
+        return int.from_bytes(self.path.read_bytes()[OFFSETS[name] :][:size_bytes], "little")
+
+    def poke(self, at: int, data: bytes) -> None:
+        """Overwrite bytes of the file, as a writer that was interrupted leaves them."""
+        with self.path.open("r+b") as file:
+            file.seek(at)
+            file.write(data)

@@ -1,0 +1,104 @@
+"""A real daemon in a process of its own, for tests that look at it from outside."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import msgspec
+
+from imud.client import Client
+from imud.contracts.status import DeviceStatus
+
+LIMIT_S = 10.0
+"""Recordings and manuals that are not in the repository."""
+
+
+def wait_until(condition: Callable[[], object], what: str, limit_s: float = LIMIT_S) -> None:
+    """Look again until the condition holds; for conditions in another process, which has no event to wait on."""
+    end = monotonic() + limit_s
+    while not condition():
+        assert monotonic() < end, f"not within {limit_s} s: {what}"
+        sleep(0.002)
+
+
+class RunningDaemon:
+    """`imud run` on a configuration in `folder`."""
+
+    def __init__(self, folder: Path, process: subprocess.Popen[str]) -> None:
+        self.folder = folder
+        self.process = process
+        self.socket = folder / "imud.sock"
+
+    def client(self) -> Client:
+        """A new connection."""
+        return Client(self.socket)
+
+    def statuses(self) -> dict[str, DeviceStatus]:
+        """Every device's state by name."""
+        with self.client() as client:
+            devices = msgspec.convert(client.status()["devices"], list[DeviceStatus])
+        return {device.name: device for device in devices}
+
+    def wait_for(self, device: str, state: str) -> DeviceStatus:
+        """Wait until a device is in a state."""
+        wait_until(lambda: self.statuses()[device].state == state, f"{device} is {state}")
+        return self.statuses()[device]
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self.process.send_signal(number)
+
+
+def write_config(folder: Path, devices: Mapping[str, Any], **more: Any) -> Path:
+    """A configuration with everything below `folder`."""
+    tree = {
+        "log_level": "debug",
+        "state_dir": str(folder),
+        "socket": {"path": str(folder / "imud.sock")},
+        "shm": {"directory": str(folder)},
+        "metrics": {"port": 0},
+        "devices": devices,
+        **more,
+    }
+    file = folder / "imud.yaml"
+    file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
+    return file
+
+
+@contextmanager
+def running_daemon(
+    folder: Path,
+    devices: Mapping[str, Any],
+    *,
+    limit_s: float = LIMIT_S,
+    python: Sequence[str] = ("-X", "dev", "-W", "error"),
+    **more: Any,
+) -> Iterator[RunningDaemon]:
+    """Start it, wait for its socket, stop it at the end and see that it ended well.
+
+    `python` are options of the interpreter; without them it is as fast as in life.
+    """
+    file = write_config(folder, devices, **more)
+    argv = [sys.executable, *python, "-m", "imud", "run", "--config", str(file)]
+    with (
+        (folder / "log").open("w") as log,
+        subprocess.Popen(argv, stderr=log, stdin=subprocess.DEVNULL, text=True) as process,
+    ):
+        daemon = RunningDaemon(folder, process)
+        try:
+            wait_until(lambda: daemon.socket.exists() or process.poll() is not None, "the daemon's socket", limit_s)
+            assert process.poll() is None, (folder / "log").read_text()
+            yield daemon
+        finally:
+            process.terminate()
+            status = process.wait(limit_s)
+    text = (folder / "log").read_text()
+    assert status == 0, text
+    assert "Traceback" not in text, text
+    assert "ResourceWarning" not in text, text
+    assert not daemon.socket.exists()

@@ -1,0 +1,245 @@
+"""A socket server with two devices, and a bare peer that speaks to it byte by byte, in one event loop."""
+
+import asyncio
+import grp
+import json
+import os
+import socket
+import struct
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from imud.contracts.action import Action, described
+from imud.contracts.batch import Batch
+from imud.contracts.publisher import PublisherContext
+from imud.contracts.settings import Settings
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
+from imud.errors import Rejected
+from imud.publishers.socket.publisher import SocketServer, SocketSettings
+from imud.sample import Sample, Sync
+
+T = TypeVar("T")
+
+EPOCH = 4886718345
+NOW_NS = 80_000_123_456_789
+LIMIT_S = 10.0
+DEVICES = {"imu0": 0, "imu1": 1}
+
+
+def sample(device: str = "imu0", seq: int = 1, period_ns: int = 1_000_000) -> Sample:
+    """Sample number `seq` of a device that sends every `period_ns`."""
+    t_ns = 80_000_000_000_000 + seq * period_ns
+    return Sample(
+        device=device,
+        seq=seq,
+        t_ns=t_ns,
+        t_err_ns=12_000,
+        sync=Sync.REGRESSION,
+        t_rx_ns=t_ns + 200_000,
+        utc_ns=1_790_000_000_000_000_000 + seq * period_ns,
+        t_dev_ns=seq * period_ns,
+        accel_m_s2=(0.125, -0.5, 9.75),
+        gyro_rad_s=(0.25, 0.5, -0.75),
+        temperature_c=31.5,
+    )
+
+
+def batch(device: str = "imu0", first: int = 1, count: int = 1, period_ns: int = 1_000_000) -> Batch:
+    """Samples number `first` and on."""
+    samples = [sample(device, seq, period_ns) for seq in range(first, first + count)]
+    return Batch(device, DEVICES.get(device, 9), samples)
+
+
+def device_status(name: str, device_id: int) -> DeviceStatus:
+    """A running device."""
+    return DeviceStatus(
+        name=name,
+        device_id=device_id,
+        driver="hipnuc-uart",
+        link="/dev/ttyUSB0 at 115200 baud",
+        state=DeviceState.RUNNING,
+        problem="",
+        identity={"product": "HI13"},
+        settings={},
+        rate_hz=1000.0,
+        expected_rate_hz=1000.0,
+        newest_seq=1,
+        clock=ClockStatus(sync=Sync.REGRESSION),
+        ledger={"bytes_in": 82},
+        kernel=KernelCounters(),
+        latency_buckets=(1, 0),
+        latency_sum_ns=200_000,
+        temperature_c=31.5,
+        status_bits=0,
+        connects=1,
+        euler_convention="roll, pitch, yaw; 312 order",
+        navigation_frame="ENU",
+    )
+
+
+def context() -> PublisherContext:
+    """A daemon with the devices of `DEVICES` whose clock stands still."""
+    statuses = [device_status(*item) for item in DEVICES.items()]
+    return PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, lambda _device: described(ACTIONS), act)
+
+
+class OutputParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Arguments of an action."""
+
+    rate_hz: int
+
+
+ACTIONS = {"output": Action("send at a rate", lambda _target, _params: None, OutputParams)}
+done_late = asyncio.Event()
+"""`wait` is done when this is set."""
+
+
+async def act(device: str, name: str, arguments: Mapping[str, Any]) -> object:
+    """A device that obeys `output`, waits on `wait`, and refuses everything else."""
+    if name == "wait":
+        await done_late.wait()
+        return {"waited": device}
+    if name != "output":
+        raise Rejected(f"{device} refuses {name}")
+    ACTIONS[name].arguments(arguments)
+    return None
+
+
+def run(body: Callable[[], Awaitable[T]]) -> T:
+    """Run a test's coroutine in a new loop, for a limited time."""
+
+    strays: list[dict[str, Any]] = []
+
+    async def limited() -> T:
+        asyncio.get_running_loop().set_exception_handler(lambda _loop, stray: strays.append(stray))
+        async with asyncio.timeout(LIMIT_S):
+            return await body()
+
+    result = asyncio.run(limited())
+    assert not strays
+    return result
+
+
+@asynccontextmanager
+async def serving(directory: Path, **settings: Any) -> AsyncIterator[SocketServer]:
+    """A started server with two devices; closed at the end, and then nothing of it is left."""
+    path = directory / "imud.sock"
+    own_group = grp.getgrgid(os.getgid()).gr_name
+    server = SocketServer(SocketSettings(**{"path": str(path), "group": own_group, **settings}), context())
+    server.start()
+    for name, number in DEVICES.items():
+        server.add_device(name, number)
+    try:
+        yield server
+    finally:
+        server.close()
+        assert not path.exists()
+        assert not server.hub.connections
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Let the loop run until something is so; `run` limits the time."""
+    while not condition():
+        await asyncio.sleep(0)
+
+
+class Peer:
+    """One bare client. Messages come out as JSON objects or as slots."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.sock = sock
+        self.framed = False
+        self.buffer = b""
+        self.ids = 0
+
+    @classmethod
+    async def connect(cls, server: SocketServer) -> Self:
+        """Connect; the hello is still to come."""
+        sock = socket.socket(socket.AF_UNIX)
+        sock.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(sock, server.hub.path)
+        return cls(sock)
+
+    @classmethod
+    async def greeted(cls, server: SocketServer) -> Self:
+        """Connect and read the hello."""
+        peer = await cls.connect(server)
+        assert (await peer.message())["method"] == "hello"
+        return peer
+
+    async def send(self, data: bytes) -> None:
+        """Send bytes as they are."""
+        await asyncio.get_running_loop().sock_sendall(self.sock, data)
+
+    async def ask(self, method: str, **params: object) -> dict[str, Any]:
+        """Send a request and return the reply, which must be the next message but for notifications."""
+        self.ids += 1
+        request = {"jsonrpc": "2.0", "id": self.ids, "method": method, "params": params}
+        await self.send(json.dumps(request).encode() + b"\n")
+        while "id" not in (reply := await self.message()):
+            pass
+        assert reply["id"] == self.ids
+        return reply
+
+    async def result(self, method: str, **params: object) -> Any:
+        """Send a request that must go well."""
+        reply = await self.ask(method, **params)
+        assert "error" not in reply, reply
+        return reply["result"]
+
+    async def error(self, method: str, **params: object) -> tuple[int, str]:
+        """Send a request that must fail; code and message."""
+        error = (await self.ask(method, **params))["error"]
+        return error["code"], error["message"]
+
+    async def message(self) -> dict[str, Any]:
+        """The next JSON object."""
+        body = await self.body()
+        value = json.loads(body, parse_constant=_refuse)
+        assert isinstance(value, dict)
+        return value
+
+    async def messages(self, count: int) -> Sequence[dict[str, Any]]:
+        """The next JSON objects."""
+        return [await self.message() for _ in range(count)]
+
+    async def body(self) -> bytes:
+        """The next line or frame body. Raises EOFError at the end."""
+        while (body := self._take()) is None:
+            data = await asyncio.get_running_loop().sock_recv(self.sock, 1 << 16)
+            if not data:
+                raise EOFError
+            self.buffer += data
+        return body
+
+    async def ended(self) -> bool:
+        """Whether the server closed, with nothing more to read."""
+        try:
+            return not self.buffer and await asyncio.get_running_loop().sock_recv(self.sock, 1) == b""
+        except ConnectionResetError:
+            return True
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.sock.close()
+
+    def _take(self) -> bytes | None:
+        if not self.framed:
+            line, newline, rest = self.buffer.partition(b"\n")
+            if not newline:
+                return None
+            self.buffer = rest
+            return line
+        if len(self.buffer) < 4:
+            return None
+        (length,) = struct.unpack_from("<I", self.buffer)
+        if len(self.buffer) < 4 + length:
+            return None
+        body, self.buffer = self.buffer[4 : 4 + length], self.buffer[4 + length :]
+        return body
+
+
+def _refuse(word: str) -> None:
+    raise AssertionError(f"{word} is not JSON")

@@ -1,0 +1,91 @@
+"""Polled devices on buses inside the process, in virtual time: what is read when follows from the deadlines alone."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.link import LinkType
+from imud.links.i2c import I2cLink, I2cSettings
+from imud.links.spi import SpiLink, SpiSettings
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.ports.in_process_bus import InProcessI2c, InProcessSpi
+from imud.sim.ports.lines import MemoryLines
+from tests.support.polled import Rig, device_config, running
+from tests.support.virtual_time import VirtualClock, run_virtually, virtual_buses
+
+RATE_HZ = 250.0
+TRANSFER_NS = 160_000
+"""What every transfer takes: 32 bytes at 1.6 Mbit/s."""
+UNTOLD = ("imud.runtime.device", "imud.runtime.path")
+"""Modules that take the time themselves."""
+
+
+class Stage:
+    """An SPI bus and an I2C bus, which the links of the configuration open, and the time."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, clock: VirtualClock | None = None) -> None:
+        """Without `clock` time is the real one."""
+        self.clock = clock or VirtualClock()
+        self.is_virtual = clock is not None
+        self.node = folder / "spidev0.0"
+        """What stands for the node of the SPI bus in /dev."""
+        self.node.touch()
+        self.spi = InProcessSpi()
+        """A device is put on it by `spi.device = …`."""
+        self.i2c = InProcessI2c({})
+        self.lines = MemoryLines(self.clock.now_ns)
+        if clock is not None:
+            clock.stand_for_monotonic(monkeypatch, *UNTOLD)
+        monkeypatch.setattr("imud.links.spi.LINK", LinkType("spi", SpiSettings, make_polled=self._make_spi))
+        monkeypatch.setattr("imud.links.i2c.LINK", LinkType("i2c", I2cSettings, make_polled=self._make_i2c))
+
+    def registers(self, **more: Any) -> Imu61xRegisters:
+        """A device in the time of the stage."""
+        return Imu61xRegisters(self.clock.now_ns, **more)
+
+    def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[Rig]]:
+        """Runners at work."""
+        return running(*configs, buses=virtual_buses(self.clock), lines=self.lines.maker)
+
+    def run(self, body: Coroutine[Any, Any, None]) -> None:
+        """The body of a test, to its end."""
+        run_virtually(self.clock, body)
+
+    def on_spi(self, rate_hz: float = RATE_HZ, **options: Any) -> DeviceConfig:
+        """A device on the SPI bus, as configured."""
+        return device_config("imu", "imu61x-spi", "spi", {"port": str(self.node), "rate_hz": rate_hz}, **options)
+
+    def _make_spi(self, settings: SpiSettings) -> SpiLink:
+        bus = self.spi
+        return SpiLink(settings, ioctl=self._taking_time(bus.ioctl), open_node=bus.open, close_node=bus.close)
+
+    def _make_i2c(self, settings: I2cSettings) -> I2cLink:
+        self.i2c.i2c_rdwr = self._taking_time(InProcessI2c.i2c_rdwr.__get__(self.i2c))  # type: ignore[method-assign]  # the wire takes time
+        return _ReadyI2c(settings, open_bus=self.i2c.open, ioctl=self.i2c.ioctl)
+
+    def _taking_time(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any) -> Any:
+            result = call(*args)
+            if self.is_virtual:
+                self.clock.advance(TRANSFER_NS)
+            return result
+
+        return timed
+
+
+class _ReadyI2c(I2cLink):
+    """Its node need not be waited for."""
+
+    async def wait_present(self) -> None:
+        """It is there."""
+        await asyncio.sleep(0)
+
+
+def on_i2c(name: str = "imu", driver: str = "imu61x-i2c", **more: Any) -> DeviceConfig:
+    """A device on the I2C bus, as configured."""
+    return device_config(name, driver, "i2c", {"bus": 1, "rate_hz": RATE_HZ, **more})

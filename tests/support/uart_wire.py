@@ -1,0 +1,152 @@
+"""A device on a serial line in virtual time, seen by a UART at any baud rate: what a wrong rate makes of the bits.
+
+The line is modelled bit by bit: 8N1 at the device's rate, sampled as a UART does at the host's rate (start edge, half
+a bit later still low, then the middle of each bit). A byte with a wrong stop bit is delivered as sampled, as Linux does
+without INPCK.
+"""
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import count
+from random import Random
+from typing import Final
+
+from imud.contracts.driver import StreamDriver
+from imud.runtime.detection import GaveUp, Listen, Search, Step, StreamFound
+from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+
+SET_BAUD_NS: Final = 3 * NS_PER_MS
+"""What setting a rate costs on a USB adapter; bytes that begin before are lost."""
+REPLY_DELAY_NS: Final = 20 * NS_PER_MS
+TimedByte = tuple[int, int]
+"""End of the byte on the wire, ns; its value."""
+
+
+def levels(data: bytes) -> list[int]:
+    """The bits on the line, start and stop bits included, least significant first."""
+    return [bit for byte in data for bit in (0, *((byte >> place) & 1 for place in range(8)), 1)]
+
+
+@lru_cache(maxsize=4096)
+def received(data: bytes, device_baud: int, host_baud: int) -> tuple[TimedByte, ...]:
+    """What a UART at `host_baud` makes of `data` sent at `device_baud` from time 0 on."""
+    if device_baud == host_baud:
+        byte_ns = uart_byte_ns(host_baud)
+        return tuple(((index + 1) * byte_ns, byte) for index, byte in enumerate(data))
+    bits = levels(data)
+    device_ns, host_ns = NS_PER_S / device_baud, NS_PER_S / host_baud
+    falling = [i * device_ns for i, bit in enumerate(bits) if bit == 0 and (i == 0 or bits[i - 1] == 1)]
+
+    def level(t_ns: float) -> int:
+        index = int(t_ns / device_ns)
+        return bits[index] if index < len(bits) else 1
+
+    result: list[TimedByte] = []
+    t_ns = 0.0
+    while (at := bisect_left(falling, t_ns)) < len(falling):
+        start_ns = falling[at]
+        if level(start_ns + host_ns / 2):  # a glitch, no start bit
+            t_ns = start_ns + host_ns / 2
+            continue
+        value = sum(level(start_ns + (1.5 + place) * host_ns) << place for place in range(8))
+        t_ns = start_ns + 9.5 * host_ns
+        result.append((round(start_ns + 10 * host_ns), value))
+    return tuple(result)
+
+
+@dataclass
+class FakeDevice:
+    """Sends frames at `rate_hz` (0: only answers), as far as the line has room."""
+
+    driver: StreamDriver
+    baud: int
+    rate_hz: float
+    phase_ns: int = 0
+    poll_ns: int = NS_PER_MS
+    """The host sees bytes at multiples of this: 1 ms of a scheduler, 16 ms of a USB adapter."""
+    reply: bytes = b""
+    query: bytes = b""
+    make_frame: Callable[[Random], bytes] | None = None
+    """What it sends; the driver's example frames by default."""
+    noise: bytes = b""
+    """Sent in place of frames."""
+    damage: float = 0.0
+    """Share of frames with one bit flipped."""
+    random: Random = field(default_factory=lambda: Random(1))
+    sent_to: list[tuple[int, bytes]] = field(default_factory=list)
+    """Every write: rate of the host, bytes."""
+
+    def __post_init__(self) -> None:
+        make = self.make_frame or self.driver.example_frame
+        self.frames = [self.noise or self._maybe_damaged(make(self.random)) for _ in range(16)]
+
+    def _maybe_damaged(self, frame: bytes) -> bytes:
+        if self.random.random() >= self.damage:
+            return frame
+        place = self.random.randrange(8, len(frame))
+        return frame[:place] + bytes([frame[place] ^ 1]) + frame[place + 1 :]
+
+    def stream(self, host_baud: int, from_ns: int) -> Iterator[TimedByte]:
+        """Bytes that the host receives from `from_ns` on, without end (nothing for a silent device)."""
+        if not self.rate_hz:
+            return
+        wire_ns = max(map(len, self.frames)) * uart_byte_ns(self.baud)
+        period_ns = max(round(NS_PER_S / self.rate_hz), wire_ns)
+        host_byte_ns = uart_byte_ns(host_baud)
+        for number in count(max((from_ns - self.phase_ns) // period_ns - 1, 0)):
+            start_ns = self.phase_ns + number * period_ns
+            for offset_ns, value in received(self.frames[number % len(self.frames)], self.baud, host_baud):
+                if start_ns + offset_ns - host_byte_ns >= from_ns:
+                    yield start_ns + offset_ns, value
+
+    def visit(self, step: Listen, now_ns: int) -> Iterator[tuple[int, bytes]]:
+        """Reads of the host during one visit: time and bytes, without end."""
+        source = self.stream(step.baud, now_ns + SET_BAUD_NS)
+        if step.send:
+            self.sent_to.append((step.baud, step.send))
+            if step.send == self.query and step.baud == self.baud:
+                source = iter(self._answer(now_ns))
+        polled_ns, gathered = 0, bytearray()
+        for t_ns, value in source:
+            due_ns = -(-t_ns // self.poll_ns) * self.poll_ns
+            if gathered and due_ns > polled_ns:
+                yield polled_ns, bytes(gathered)
+                gathered.clear()
+            polled_ns = due_ns
+            gathered.append(value)
+        if gathered:
+            yield polled_ns, bytes(gathered)
+
+    def _answer(self, now_ns: int) -> Sequence[TimedByte]:
+        start_ns = now_ns + SET_BAUD_NS + len(self.query) * uart_byte_ns(self.baud) + REPLY_DELAY_NS
+        return [(start_ns + offset_ns, value) for offset_ns, value in received(self.reply, self.baud, self.baud)]
+
+
+def run_search(search: Search, device: FakeDevice, start_ns: int = 0) -> tuple[StreamFound | GaveUp, int, list[Listen]]:
+    """Run a search to its end in virtual time. Returns the result, how long it took (ns), and every Listen."""
+    now_ns, visits = start_ns, []
+    step: Step | None = search.start(now_ns)
+    while isinstance(step, Listen):
+        visits.append(step)
+        reads = device.visit(step, now_ns)
+        step, now_ns = _stay(search, reads, step)
+    assert step is not None
+    return step, now_ns - start_ns, visits
+
+
+def _stay(search: Search, reads: Iterator[tuple[int, bytes]], listen: Listen) -> tuple[Step, int]:
+    """One stay at one rate, prolonged as the search wants; returns the step that ends it and when it came."""
+    until_ns = listen.until_ns
+    t_ns, data = next(reads, (1 << 62, b""))
+    while True:
+        if t_ns <= until_ns:
+            now_ns, step = t_ns, search.on_data(data, t_ns)
+            t_ns, data = next(reads, (1 << 62, b""))
+        else:
+            now_ns, step = until_ns, search.on_time(until_ns)
+        if isinstance(step, Listen) and step.baud == listen.baud and not step.send and step.until_ns != until_ns:
+            until_ns = step.until_ns
+        elif step is not None:
+            return step, now_ns

@@ -1,0 +1,114 @@
+"""Time that passes only when the event loop has nothing to do: hours in milliseconds, and every run the same.
+
+    loop would sleep until t ──▶ the clock jumps to t ──▶ what is due then runs
+
+The rounds of a polled bus run in the loop as well (`LoopWorker`), where a thread runs them in life, so that nothing at
+all depends on how busy the machine is.
+"""
+
+import asyncio
+import selectors
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from imud.runtime.polled.bus import Buses
+from imud.units import NS_PER_S
+from imud.worker import Round
+
+DESCRIPTOR_LIMIT_S = 10.0
+"""How long, in real time, a loop that waits for nothing but descriptors may wait."""
+
+
+class VirtualClock:
+    """CLOCK_MONOTONIC of a test. Synchronization: one thread."""
+
+    def __init__(self, begin_ns: int = 1000 * NS_PER_S) -> None:
+        self._now_ns = begin_ns
+
+    def now_ns(self) -> int:
+        """As `time.monotonic_ns`."""
+        return self._now_ns
+
+    def advance(self, duration_ns: int) -> None:
+        """So much time passes: something took it."""
+        assert duration_ns >= 0
+        self._now_ns += duration_ns
+
+    def stand_for_monotonic(self, monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
+        """Take the place of `monotonic_ns` in modules that are not given a clock."""
+        for module in modules:
+            monkeypatch.setattr(f"{module}.monotonic_ns", self.now_ns)
+
+
+class _JumpingSelector(selectors.DefaultSelector):
+    """Where it would wait for time to pass, time passes at once."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        super().__init__()
+        self._clock = clock
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0)
+        if ready or timeout == 0:
+            return ready
+        if timeout is None:
+            ready = super().select(DESCRIPTOR_LIMIT_S)
+            assert ready, "nothing will ever happen any more"
+            return ready
+        self._clock.advance(round(timeout * NS_PER_S) + 1)
+        return []
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """An event loop on a `VirtualClock`."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        super().__init__(_JumpingSelector(clock))
+        self._clock = clock
+
+    def time(self) -> float:
+        """As the clock says."""
+        return self._clock.now_ns() / NS_PER_S
+
+
+class LoopWorker:
+    """A `Worker` of a bus that is no thread: its rounds are callbacks of the loop."""
+
+    def __init__(self, _name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
+        self._work, self._failed = work, failed
+        self._loop = asyncio.get_running_loop()
+        self._next: asyncio.Handle | None = self._loop.call_soon(self._run)
+
+    def ring(self) -> None:
+        """There is something new to do."""
+        if self._next is not None:
+            self._next.cancel()
+            self._next = self._loop.call_soon(self._run)
+
+    def end(self) -> None:
+        """No more; may be called twice."""
+        if self._next is not None:
+            self._next.cancel()
+            self._next = None
+
+    def _run(self) -> None:
+        try:
+            rest_ns = self._work()
+        except Exception as error:  # noqa: BLE001 - as in the thread
+            self._next = None
+            self._failed(error)
+            return
+        self._next = self._loop.call_later(rest_ns / NS_PER_S, self._run)
+
+
+def virtual_buses(clock: VirtualClock) -> Buses:
+    """Buses without threads, in virtual time."""
+    return Buses(clock.now_ns, LoopWorker)
+
+
+def run_virtually(clock: VirtualClock, body: Coroutine[Any, Any, None]) -> None:
+    """Run to its end; nothing is left behind."""
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(clock)) as runner:
+        runner.run(body)

@@ -1,0 +1,238 @@
+"""A simulated HiPNUC module with pins, wired to a runner, in virtual time: bytes and edges come in step."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.batch import Batch
+from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings
+from imud.event import Event, EventKind
+from imud.formats.rmc import build
+from imud.links.memory import MemoryLink, MemorySettings
+from imud.runtime import utc_keeper
+from imud.runtime.detection.remembered import Remembered
+from imud.runtime.stream.runner import DeviceRunner
+from imud.sample import Sample
+from imud.signals import sync_signals as wires_module
+from imud.signals.trigger import Trigger
+from imud.sim.hipnuc.uart.hardware import HipnucHardware
+from imud.sim.hipnuc.uart.settings import ModuleSettings
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.ports.faults import Faults
+from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
+from imud.sim.ports.pin import Pin
+from imud.sim.ports.pins import OnEdge, PinFaults, Pins
+from imud.units import NS_PER_MS, NS_PER_S
+from imud.utc.adjtimex import KernelClock
+from imud.utc.rmc_feed import RmcFeed
+from imud.utc.source import OnSentence, RmcSettings
+from tests.support.virtual_time import LoopWorker, VirtualClock, run_virtually
+
+BEGIN_NS = 1000 * NS_PER_S + 123_456_789
+BAUD = 115_200
+TICK_S = 0.1
+WAKE_NS = 30_000
+"""From the last byte to the program that reads it."""
+EDGE_LATE_NS = 45_000
+"""From the measurement to the rising edge: 125 µs to the frame, of which 80 µs are the pulse."""
+CLOCKED = (
+    "imud.runtime.device",
+    "imud.runtime.stream.runner",
+    "imud.runtime.path",
+    "imud.runtime.exchange",
+    "imud.signals.watched_line",
+    "imud.signals.sync_signals",
+)
+
+
+class FakeSource:
+    """An RMC source whose sentences are the test's."""
+
+    title = "test"
+    problem = ""
+
+    def __init__(self) -> None:
+        self.sentences = 0
+        self.give: OnSentence = lambda _sentence, _t_rx_ns: None
+        self.closed = False
+
+    def start(self, on_sentence: OnSentence) -> None:
+        self.give = on_sentence
+
+    async def close(self) -> None:
+        self.closed = True
+
+
+class Wired:
+    """The module, the runner, and the wires between them."""
+
+    def __init__(
+        self,
+        lines: DeviceLines,
+        settings: ModuleSettings | None = None,
+        hardware: HipnucHardware | None = None,
+        *,
+        frame_faults: Faults | None = None,
+        pin_faults: PinFaults | None = None,
+        identify: bool = False,
+        rmc: RmcSettings | None = None,
+    ) -> None:
+        self.clock = VirtualClock(BEGIN_NS)
+        self.source = FakeSource()
+        self.memory = MemoryLines(self.clock.now_ns)
+        self.cut: set[Pin] = set()
+        """Pins whose wire is cut now."""
+        self.samples: list[Sample] = []
+        self.events: list[Event] = []
+        self.instants: dict[int, int] = {}
+        """Instant of measurement by device time (ms) of the frames that arrived."""
+        self.frames: list[int] = []
+        """Instant of measurement of each frame that arrived, in order."""
+        self._config = DeviceConfig(
+            "bow", "hipnuc-uart", None, identify, "memory", MemorySettings(baud=BAUD), lines=lines, rmc=rmc
+        )
+        self._settings, self._hardware = settings, hardware
+        self._frame_faults, self._pin_faults = frame_faults, pin_faults
+        self._pulses: dict[Pin, dict[int, int]] = {pin: {} for pin in Pin}
+        self._timer: asyncio.Handle | None = None
+        self._heard = 0
+
+    def play(self, monkeypatch: pytest.MonkeyPatch, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the device while the story is told; at the end the ledger closes and the lines are released."""
+        clock = self.clock
+        clock.stand_for_monotonic(monkeypatch, *CLOCKED)
+        monkeypatch.setattr(wires_module, "Trigger", partial(Trigger, now_ns=clock.now_ns, start_worker=LoopWorker))
+        monkeypatch.setattr(utc_keeper, "RmcFeed", partial(RmcFeed, now_ns=clock.now_ns))
+        monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _make_port: self.source})
+        monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 0, 0))
+        run_virtually(clock, self._play(story))
+
+    async def _play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        maker = LineFactory(self.memory.input, self._output)
+        self.runner = DeviceRunner(self._config, 7, self._publish, self.events.append, Remembered(None), lines=maker)
+        assert isinstance(self.runner.link, MemoryLink)
+        self.link = self.runner.link
+        self.power_on()
+        tasks = [asyncio.create_task(self.runner.run()), asyncio.create_task(self._tick())]
+        try:
+            await asyncio.sleep(0.3)
+            self.run_module()
+            await story()
+        finally:
+            if self._timer is not None:
+                self._timer.cancel()
+            for task in tasks:
+                task.cancel()
+            ends = await asyncio.gather(*tasks, return_exceptions=True)
+            self.runner.close()
+        for end in ends:
+            if not isinstance(end, asyncio.CancelledError):
+                raise AssertionError(end) from end
+        assert self.runner.ledger.closes()
+        wires: Sequence[MemoryInput | MemoryOutput] = [*self.memory.inputs.values(), *self.memory.outputs.values()]
+        assert not any(wire.is_open for wire in wires)
+
+    # --- what a story may do -----------------------------------------------------------------------------------------
+
+    async def wait(self, seconds: float) -> list[Sample]:
+        """Let time pass; returns the samples that came."""
+        before = len(self.samples)
+        await asyncio.sleep(seconds)
+        return self.samples[before:]
+
+    def power_on(self) -> None:
+        """A module that begins anew on the same wires."""
+        self.module = HipnucModule(self.clock.now_ns(), self._settings, self._hardware)
+        on_edge: Mapping[Pin, OnEdge] = {pin: partial(self._on_edge, pin) for pin in Pin}
+        self.pins = Pins(self.module, on_edge, self._pin_faults)
+
+    def tell(self, command: str) -> None:
+        """A command that the module gets by another way than imud's."""
+        self.module.receive(command.encode() + b"\r\n", self.clock.now_ns())
+
+    def line(self, key: str) -> MemoryInput:
+        """The host's end of a wire."""
+        return self.memory.inputs[f"bow {key}"]
+
+    def pulse_per_second(self, t_ns: int) -> None:
+        """A receiver's pulse, at the module and at the host."""
+        self.module.mark(t_ns)
+        self.line("pps").pulse(t_ns, 5 * NS_PER_MS)
+
+    def sentence(self, unix_s: int) -> None:
+        """The receiver says which second it was."""
+        self.source.sentences += 1
+        self.source.give(build(unix_s * NS_PER_S), self.clock.now_ns())
+
+    # --- what is known of the truth ----------------------------------------------------------------------------------
+
+    def instant(self, sample: Sample) -> int:
+        """When it was measured, while the module's time runs from its power-on."""
+        assert sample.t_dev_ns is not None
+        return self.instants[sample.t_dev_ns // NS_PER_MS]
+
+    def pulses(self, pin: Pin) -> dict[int, int]:
+        """Instant of measurement by the number of the pulse, of those that the host saw."""
+        return self._pulses[pin]
+
+    def of_kind(self, kind: EventKind) -> list[Event]:
+        """Events so far."""
+        return [event for event in self.events if event.kind is kind]
+
+    # --- the machinery -----------------------------------------------------------------------------------------------
+
+    def run_module(self) -> None:
+        """Move bytes and edges that are due; again when there are more."""
+        if self._timer is not None:
+            self._timer.cancel()
+        now_ns, module = self.clock.now_ns(), self.module
+        for data in self.link.written[self._heard :]:
+            module.receive(data, now_ns)
+        self._heard = len(self.link.written)
+        self.pins.step(now_ns)
+        for burst in module.advance(now_ns - WAKE_NS):
+            passed = self._frame_faults.pass_on(burst) if self._frame_faults else burst
+            if passed is None:
+                continue
+            if burst.sample_ns is not None and burst.device_ms is not None:
+                self.instants[burst.device_ms] = burst.sample_ns
+                self.frames.append(burst.sample_ns)
+            self.link.feed(passed.data, now_ns)
+        times = [now_ns + NS_PER_MS * 20]
+        if (next_ns := module.next_ns()) is not None:
+            times.append(next_ns + WAKE_NS)
+        if (next_ns := self.pins.next_ns()) is not None:
+            times.append(next_ns)
+        rest_s = max(min(times) - now_ns, 0) / NS_PER_S
+        self._timer = asyncio.get_running_loop().call_later(rest_s, self.run_module)
+
+    def _on_edge(self, pin: Pin, t_ns: int, rising: bool) -> None:
+        line = self.memory.inputs.get(f"bow {pin}")
+        if line is None or pin in self.cut or not line.is_open:
+            return
+        line.edge(t_ns, rising)
+        if rising:
+            pulses = self._pulses[pin]
+            pulses[len(pulses) + 1] = t_ns - EDGE_LATE_NS
+
+    def _output(self, _settings: OutputSettings, purpose: str) -> MemoryOutput:
+        return self.memory.outputs.setdefault(
+            purpose, MemoryOutput(purpose, now_ns=self.clock.now_ns, on_change=self._on_sin)
+        )
+
+    def _on_sin(self, now_ns: int, active: bool) -> None:
+        if active:
+            self.module.mark(now_ns)
+            self.run_module()
+
+    def _publish(self, batch: Batch) -> None:
+        self.samples += batch.samples
+
+    async def _tick(self) -> None:
+        while True:
+            self.runner.tick(self.clock.now_ns())
+            await asyncio.sleep(TICK_S)

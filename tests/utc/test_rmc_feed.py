@@ -1,0 +1,166 @@
+"""What the feed sends, when, and what it refuses and why; and that a module fed by it shows UTC."""
+
+from itertools import pairwise
+
+import pytest
+
+from imud.contracts.timing import UtcReference
+from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.errors import LinkError
+from imud.formats.rmc import as_gprmc, build, checksum
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.hipnuc.uart.hardware import HipnucHardware
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.units import NS_PER_MS, NS_PER_S
+from imud.utc.rmc_feed import Refusal, RmcFeed
+
+UTC_S = 1_795_000_000
+BEGIN_NS = 1000 * NS_PER_S
+"""CLOCK_MONOTONIC at UTC_S."""
+OFFSET_NS = UTC_S * NS_PER_S - BEGIN_NS
+WIRE_115200_NS = 70 * 10 * NS_PER_S // 115_200
+GOOD = UtcReference(OFFSET_NS, NS_PER_MS)
+
+
+class Bench:
+    """A feed whose port and clock are the test's."""
+
+    def __init__(self, rate_hz: int = 1, reference: UtcReference | None = GOOD, baud: int = 115_200) -> None:
+        self.now_ns = BEGIN_NS
+        self.sent: list[bytes] = []
+        self.busy = False
+        self.broken = False
+        self.reference = reference
+        self.feed = RmcFeed(
+            self._write, lambda: baud, lambda: self.busy, rate_hz, lambda: self.reference, lambda: self.now_ns
+        )
+
+    def _write(self, data: bytes) -> None:
+        if self.broken:
+            raise LinkError("the port is gone")
+        self.sent.append(data)
+
+    def give(self, named_s: float, at_s: float, sentence: bytes | None = None, *, waited_s: float = 0.0) -> str:
+        """A sentence that names `named_s` after UTC_S comes at `at_s`; returns why it was refused, or nothing."""
+        before = dict(self.feed.refused)
+        t_rx_ns = BEGIN_NS + round(at_s * NS_PER_S)
+        self.now_ns = t_rx_ns + round(waited_s * NS_PER_S)
+        self.feed.on_sentence(sentence or build(UTC_S * NS_PER_S + round(named_s * NS_PER_S)), t_rx_ns)
+        return next((kind for kind, count in self.feed.refused.items() if count != before.get(kind, 0)), "")
+
+
+def test_a_sentence_is_passed_on_at_once() -> None:
+    bench = Bench()
+    assert bench.give(0, 0.1) == ""
+    assert bench.sent == [build(UTC_S * NS_PER_S)]
+    status = bench.feed.status()
+    assert (status.sent, status.refused, status.last_sent_ns) == (1, {}, BEGIN_NS + NS_PER_S // 10)
+
+
+def test_another_talker_is_made_gp() -> None:
+    bench = Bench()
+    body = build(UTC_S * NS_PER_S)[1:-5].replace(b"GP", b"GN")
+    assert bench.give(0, 0.1, b"$%b*%02X\r\n" % (body, checksum(body))) == ""
+    assert bench.sent[0].startswith(b"$GPRMC,")
+    assert bench.sent[0] == as_gprmc(bench.sent[0])
+
+
+@pytest.mark.parametrize(
+    ("sentence", "refusal"),
+    [
+        (b"noise", Refusal.DAMAGED),
+        (build(UTC_S * NS_PER_S)[:-4] + b"00\r\n", Refusal.DAMAGED),
+        (b"", Refusal.DAMAGED),
+        (build(UTC_S * NS_PER_S, valid=False), Refusal.NOT_VALID),
+        (b"$GPRMC,,V,,,,,,,,,,N*53\r\n", Refusal.NOT_VALID),
+    ],
+)
+def test_bad_sentences_are_refused(sentence: bytes, refusal: Refusal) -> None:
+    bench = Bench()
+    assert bench.give(0, 0.1, sentence or b"\x00") == refusal
+    assert bench.sent == []
+    assert bench.feed.status().refused == {refusal.value: 1}
+
+
+REFERENCES = [GOOD, UtcReference(OFFSET_NS, 0), None]
+
+
+@pytest.mark.parametrize("reference", REFERENCES, ids=["reference", "exact reference", "pulse line"])
+@pytest.mark.parametrize(
+    ("named_s", "at_s", "refusal"),
+    [
+        (0, 0.001, ""),
+        (0, 0.9, ""),
+        (0, 0.9745, Refusal.STALE),  # 6 ms on the wire and 20 ms of guard
+        (0.5, 0.45, Refusal.AHEAD),
+        (0.5, 0.55, ""),
+    ],
+)
+def test_it_has_to_be_through_before_the_next_second(
+    reference: UtcReference | None, named_s: float, at_s: float, refusal: str
+) -> None:
+    bench = Bench(reference=reference)
+    if reference is None:
+        bench.feed.pulse(BEGIN_NS)
+        refusal = Refusal.STALE if refusal is Refusal.AHEAD else refusal  # by pulses alone, of the second before
+    assert bench.give(named_s, at_s) == refusal
+
+
+@pytest.mark.parametrize("at_s", [1.05, 1.5, 3.2, -0.02])
+def test_a_reference_finds_sentences_of_another_second(at_s: float) -> None:
+    assert Bench().give(0, at_s) == (Refusal.AHEAD if at_s < 0 else Refusal.STALE)
+
+
+def test_a_slow_port_leaves_less_time() -> None:
+    assert Bench(baud=9600).give(0, 0.9) == ""
+    assert Bench(baud=9600).give(0, 0.92) == Refusal.STALE  # 73 ms on the wire
+
+
+def test_a_sentence_that_waited_is_judged_by_the_time_it_is_sent() -> None:
+    assert Bench().give(0, 0.1, waited_s=0.8) == ""
+    assert Bench().give(0, 0.1, waited_s=0.9) == Refusal.STALE
+    assert Bench(reference=None).give(0, 0.1, waited_s=1.0) == Refusal.STALE
+
+
+def test_a_poor_reference_and_an_old_pulse_are_not_asked() -> None:
+    assert Bench(reference=UtcReference(OFFSET_NS, 90 * NS_PER_MS)).give(0, 1.5) == ""
+    bench = Bench(reference=None)
+    bench.feed.pulse(BEGIN_NS)
+    assert bench.give(1, 1.99) == ""
+
+
+def test_no_more_than_the_device_is_to_have() -> None:
+    bench = Bench(rate_hz=2)
+    refusals = [bench.give(tenth / 10, tenth / 10 + 0.05) for tenth in range(30)]
+    assert [n for n, refusal in enumerate(refusals) if not refusal] == [0, 5, 10, 15, 20, 25]
+    assert set(refusals) == {"", Refusal.TOO_MANY}
+
+
+def test_no_conversation_is_interrupted_and_a_refused_one_is_not_counted_as_sent() -> None:
+    bench = Bench()
+    bench.busy = True
+    assert bench.give(0, 0.1) == Refusal.BUSY
+    bench.busy, bench.broken = False, True
+    assert bench.give(0, 0.2) == Refusal.LINK
+    bench.broken = False
+    assert bench.give(0, 0.3) == ""
+    assert len(bench.sent) == 1
+
+
+def test_a_module_that_is_fed_shows_utc() -> None:
+    module = HipnucModule(BEGIN_NS - 3 * NS_PER_S, hardware=HipnucHardware(skew_ppm=30.0))
+    bench = Bench()
+    codec = DRIVER.make_codec(Ledger(), DRIVER.settings())
+    told: list[int] = []
+    for second in range(8):
+        module.mark(BEGIN_NS + second * NS_PER_S)
+        assert bench.give(second, second + 0.2) == ""
+        module.receive(bench.sent[-1], bench.now_ns + WIRE_115200_NS)
+        for burst in module.advance(BEGIN_NS + second * NS_PER_S + 999 * NS_PER_MS):
+            for event in codec.feed(burst.data):
+                assert isinstance(event, Measurement)
+                assert event.dev_ticks is not None
+                told.append(event.dev_ticks)
+    assert 980 <= told[-1] - (UTC_S + 7) * 1000 % 2**32 < 1000
+    assert sum(after - before != pytest.approx(10, abs=1) for before, after in pairwise(told)) == 1
