@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from inspect import signature
+from typing import Any, cast, get_type_hints
 
 import msgspec
 
@@ -23,25 +25,56 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """A row of a driver's actions."""
+    """A row of a driver's actions.
+
+    An action's arguments are described once: by the keyword-only parameters of `begin`. Their annotations give type
+    and bounds (`msgspec.Meta`), their names the unit, their defaults what may be left out.
+    """
 
     help: str
     """What it does, one sentence."""
-    begin: Callable[[Target, Any], Any]
-    """Makes the conversation (polled drivers: the dialogue) from the target and an instance of `params`.
+    begin: Callable[..., Any]
+    """`begin(target, *, name: type = default, …)` makes the request script, or a polled driver's transfer script.
 
-    Its value is the answer, something that JSON can carry. Raises BadArgument, like the conversation itself.
+    Its value is the answer, something that JSON can carry. Raises BadArgument, like the script itself.
     """
     params: type[Settings] = NoSettings
-    """Its arguments, with units in their names."""
+    """Its arguments, where `begin` takes an instance of a struct as its second parameter."""
+
+    @property
+    def parameters(self) -> type[Settings]:
+        """The arguments as a struct type."""
+        return _parameters(self.begin) if _takes_names(self.begin) else self.params
 
     def arguments(self, given: Mapping[str, Any]) -> Settings:
         """The arguments checked. Raises BadArgument naming what was expected and what came."""
         try:
-            return msgspec.convert(dict(given), self.params)
+            return msgspec.convert(dict(given), self.parameters)
         except msgspec.ValidationError as error:
             known = ", ".join(str(parameter) for parameter in parameters_of(self)) or "none"
             raise BadArgument(f"{error}; arguments: {known}") from None
+
+    def script(self, target: Target, arguments: Settings) -> Any:
+        """The script that carries out the action, with arguments that `arguments` returned."""
+        if _takes_names(self.begin):
+            return self.begin(target, **msgspec.structs.asdict(arguments))
+        return self.begin(target, arguments)
+
+
+@cache
+def _takes_names(begin: Callable[..., Any]) -> bool:
+    return sum(p.kind is not p.KEYWORD_ONLY for p in signature(begin).parameters.values()) == 1
+
+
+@cache
+def _parameters(begin: Callable[..., Any]) -> type[Settings]:
+    hints = get_type_hints(begin, include_extras=True)
+    given = [p for p in signature(begin).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    fields = [(p.name, hints[p.name]) if p.default is p.empty else (p.name, hints[p.name], p.default) for p in given]
+    made = msgspec.defstruct(
+        "Parameters", fields, bases=(Settings,), frozen=True, kw_only=True, forbid_unknown_fields=True
+    )
+    return cast(type[Settings], made)
 
 
 Actions = Mapping[str, Action]
@@ -73,7 +106,7 @@ def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
     """The arguments that an action takes."""
     return tuple(
         ActionParameter(field.name, expected(field.type), None if field.required else shown(field.default))
-        for field in msgspec.structs.fields(action.params)
+        for field in msgspec.structs.fields(action.parameters)
     )
 
 

@@ -292,7 +292,7 @@ class Device(ABC):
 
     async def _do(self, action: Action, params: Settings) -> object:
         """Run an action of the driver."""
-        return await self._exchange.run(action.begin(self._target, params))
+        return await self._exchange.run(action.script(self._target, params))
 
     @property
     def _target(self) -> Target:

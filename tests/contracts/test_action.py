@@ -1,9 +1,12 @@
 """Actions: arguments checked and described; and every driver's actions by their rows."""
 
+from typing import Annotated
+
 import msgspec
 import pytest
+from msgspec import Meta
 
-from imud.contracts.action import Action, described
+from imud.contracts.action import Action, Target, described, parameters_of
 from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
 from imud.errors import BadArgument
@@ -53,3 +56,20 @@ def test_every_action_has_help_and_arguments_that_can_be_described(driver: str, 
     assert all(parameter.values != "keys and values" for parameter in info.parameters)
     with pytest.raises(BadArgument):
         action.arguments({"no_such_argument": 1})
+
+
+def _turn(target: Target, *, angle_deg: Annotated[float, Meta(ge=-180, le=180)], relative: bool = False) -> str:
+    return f"{target.baud} {angle_deg} {relative}"
+
+
+def test_arguments_are_described_by_the_parameters_of_begin() -> None:
+    action = Action("turn it", _turn)
+    assert [str(parameter) for parameter in parameters_of(action)] == [
+        "angle_deg (a number from -180 to 180)",
+        "relative (true or false; default false)",
+    ]
+    assert action.script(Target(None, 9600), action.arguments({"angle_deg": 12})) == "9600 12.0 False"
+    with pytest.raises(BadArgument, match=r"Expected `float` <= 180.0 - at `\$.angle_deg`; arguments: angle_deg \("):
+        action.arguments({"angle_deg": 181})
+    with pytest.raises(BadArgument, match="angle"):
+        action.arguments({"angle": 1})

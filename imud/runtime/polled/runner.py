@@ -215,7 +215,7 @@ class PolledRunner(Device):
         member, found = self._member, self._found
         if member is None or found is None:
             raise CommandError(f"{self.config.name} is not there")
-        return await member.talk(action.begin(self._target, params), found.target)
+        return await member.talk(action.script(self._target, params), found.target)
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from tests.support.canopen_bench import QUIET, Bench, unpack
 def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
     """The conversation of an action with the node that the settings name."""
     action = DRIVER.actions[name]
-    conversation: RequestScript[Any] = action.begin(
+    conversation: RequestScript[Any] = action.script(
         Target(HipnucCanopenSettings(node=at), 500_000), action.arguments(given)
     )
     return conversation

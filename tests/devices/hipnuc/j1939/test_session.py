@@ -47,7 +47,7 @@ def played(conversation: RequestScript[object], *outcomes: Outcome | bytes | Non
 
 def of_action(name: str, **arguments: object) -> RequestScript[object]:
     action = DRIVER.actions[name]
-    conversation: RequestScript[object] = action.begin(SET, action.arguments(arguments))
+    conversation: RequestScript[object] = action.script(SET, action.arguments(arguments))
     return conversation
 
 

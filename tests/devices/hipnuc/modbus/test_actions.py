@@ -13,7 +13,7 @@ TARGET = Target(HipnucModbusSettings(), 0)
 
 def act(wire: Wire, name: str, **given: object) -> object:
     action = DRIVER.actions[name]
-    return run_transfer_script(action.begin(TARGET, action.arguments(given)), wire.transfer)
+    return run_transfer_script(action.script(TARGET, action.arguments(given)), wire.transfer)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ VERSION = Reply(("PNAME=HI14R3", "OK"))
 def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
     """The requests of an action, answered in turn, and its value."""
     action = ACTIONS[name]
-    conversation = action.begin(Target(None, 115200), action.arguments(arguments))
+    conversation = action.script(Target(None, 115200), action.arguments(arguments))
     left = list(answers or [OK])
     requests = []
     try:

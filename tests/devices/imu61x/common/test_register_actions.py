@@ -26,7 +26,7 @@ class Wires:
     def act(self, driver: PolledDriver, settings: RegisterSettings, **given: object) -> object:
         action = driver.actions["filter"]
         transfer: Callable[[Transfer], bytes] = self._i2c if driver is I2C else self._spi
-        return run_transfer_script(action.begin(Target(settings, 0), action.arguments(given)), transfer)
+        return run_transfer_script(action.script(Target(settings, 0), action.arguments(given)), transfer)
 
     def _i2c(self, one: Transfer) -> bytes:
         self.transfers += 1

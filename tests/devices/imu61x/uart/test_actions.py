@@ -14,7 +14,7 @@ from tests.support.imu61x_bench import Bench, bench
 def tell(far: Bench, name: str, **arguments: Any) -> object:
     """Have the device do it."""
     action = ACTIONS[name]
-    return far.hold(action.begin(Target(None, far.line_baud), action.arguments(arguments)))
+    return far.hold(action.script(Target(None, far.line_baud), action.arguments(arguments)))
 
 
 def test_stop_and_start() -> None:
