@@ -104,4 +104,4 @@ def test_there_is_no_import_cycle() -> None:
 
 
 def test_only_one_module_imports_gpiod() -> None:
-    assert {m for m in MODULES if "gpiod" in imports(MODULES[m])} <= {"imud.signals.gpio_chips"}
+    assert {m for m in MODULES if "gpiod" in imports(MODULES[m])} <= {"imud.signals.gpio.chips"}

@@ -11,8 +11,8 @@ from statistics import mean
 from gpiod.edge_event import EdgeEvent
 
 from imud.contracts.timing import TriggerStamp
-from imud.signals.gpio_lines import READ_EVENTS
-from imud.signals.line_events import EVENT, LineEvents
+from imud.signals.gpio.kernel_interface import EVENT, LineEventDecoder
+from imud.signals.gpio.line_request import READ_EVENTS
 from imud.signals.trigger import Trigger
 from imud.units import NS_PER_S, NS_PER_US
 from tests.bench.rows import Row
@@ -55,14 +55,14 @@ def _per_edge_us(read: Callable[[], object], edges: int, times: int) -> float:
 
 def _reading(quick: bool) -> list[Row]:
     near, far = os.pipe()
-    events, times = LineEvents(), 200 if quick else 2000
+    events, times = LineEventDecoder(), 200 if quick else 2000
     found = []
     for count in (2, READ_EVENTS):
         data = b"".join(EVENT.pack(n, 1, 0, n, n) for n in range(1, count + 1))
 
         def read(data: bytes = data) -> None:
             os.write(far, data)
-            events.edges(os.read(near, READ_EVENTS * EVENT.size))
+            events.decode(os.read(near, READ_EVENTS * EVENT.size))
 
         found.append(
             Row(f"edges read {count} at a time, CPU per edge (with the write)", _per_edge_us(read, count, times), "us")

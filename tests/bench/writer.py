@@ -16,7 +16,7 @@ import time
 import tty
 
 from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.signals.line_events import EVENT, RISING
+from imud.signals.gpio.kernel_interface import EVENT, RISING
 from imud.units import uart_byte_ns
 
 LATE_LIMIT_NS = 50_000_000

@@ -15,7 +15,7 @@ from imud.contracts.lines import Edge, InputSettings, OutputSettings, ResetSetti
 from imud.contracts.timing import TriggerStamp
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.signals.gpio import GpioInput, GpioOutput
-from imud.signals.gpio_lines import KERNEL_EVENTS
+from imud.signals.gpio.line_request import KERNEL_EVENTS
 from imud.signals.reset import reset
 from imud.signals.trigger import Trigger
 from imud.units import NS_PER_S

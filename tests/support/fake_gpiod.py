@@ -8,7 +8,7 @@ from typing import Any
 
 import gpiod as real
 
-from imud.signals.line_events import EVENT
+from imud.signals.gpio.kernel_interface import EVENT
 
 
 class FakeRequest:

@@ -11,7 +11,7 @@ import pytest
 
 from imud.contracts.lines import LineSettings
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
-from imud.signals.gpio_chips import Place, find_line, load_gpiod, refusal
+from imud.signals.gpio.chips import LineLocation, find_line, load_gpiod, request_error
 from tests.support.fake_gpiod import FakeGpiod
 
 
@@ -19,7 +19,7 @@ from tests.support.fake_gpiod import FakeGpiod
 @pytest.mark.parametrize(("line", "offset", "name"), [(0, 0, "SOUT"), (1, 1, ""), ("SOUT", 0, "SOUT")])
 def test_by_chip(gpiod: FakeGpiod, tmp_path: Path, chip: str, line: int | str, offset: int, name: str) -> None:
     place = find_line(gpiod, LineSettings(line=line, chip=chip), tmp_path)
-    assert place == Place(str(tmp_path / "gpiochip0"), offset, name)
+    assert place == LineLocation(str(tmp_path / "gpiochip0"), offset, name)
 
 
 def test_by_path(gpiod: FakeGpiod, tmp_path: Path) -> None:
@@ -106,16 +106,16 @@ def test_a_line_that_is_not_given(
     gpiod: FakeGpiod, tmp_path: Path, number: int, kind: type[LinkError], message: str
 ) -> None:
     gpiod.holder = "gpiomon"
-    error = refusal(gpiod, OSError(number, "by the test"), Place(str(tmp_path / "gpiochip0"), 0, "SOUT"))
+    error = request_error(gpiod, OSError(number, "by the test"), LineLocation(str(tmp_path / "gpiochip0"), 0, "SOUT"))
     assert type(error) is kind
     assert message in str(error)
 
 
 def test_a_holder_without_a_name(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    place = Place(str(tmp_path / "gpiochip0"), 0, "SOUT")
-    assert "in use by a nameless program" in str(refusal(gpiod, OSError(errno.EBUSY, ""), place))
+    place = LineLocation(str(tmp_path / "gpiochip0"), 0, "SOUT")
+    assert "in use by a nameless program" in str(request_error(gpiod, OSError(errno.EBUSY, ""), place))
     gpiod.errors["gpiochip0"] = errno.ENODEV
-    assert isinstance(refusal(gpiod, OSError(errno.EBUSY, ""), place), LinkBusy)
+    assert isinstance(request_error(gpiod, OSError(errno.EBUSY, ""), place), LinkBusy)
 
 
 def test_gpiod_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

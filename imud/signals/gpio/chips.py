@@ -1,4 +1,7 @@
-"""GPIO chips and where a line is on them. The only importer of gpiod; what goes wrong gets one clear error each."""
+"""GPIO chips: finds the chip and offset of a configured line. The only importer of gpiod.
+
+Each way in which this can fail has its own error message, which names what to change.
+"""
 
 import errno
 import os
@@ -15,19 +18,20 @@ from imud.permissions import group_of, user_name
 
 DEVICES: Final = Path("/dev")
 GROUP: Final = "gpio"
-"""Group of GPIO chips on Raspberry Pi OS; named where a chip's own group is of no help."""
+"""Group of GPIO chips on Raspberry Pi OS; named in messages where the chip belongs to root alone."""
 GONE: Final = frozenset({errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EBADF})
+"""Errors of a chip that was removed."""
 
 
-class Place(NamedTuple):
-    """Where a line is."""
+class LineLocation(NamedTuple):
+    """Chip and offset of a line."""
 
     path: str
-    """Node of its chip."""
+    """Device node of the chip."""
     offset: int
-    """Its number on the chip."""
+    """Offset of the line on the chip."""
     name: str
-    """Its name, empty where it has none."""
+    """Name of the line, empty if it has none."""
 
     def __str__(self) -> str:
         named = f" ({self.name})" if self.name else ""
@@ -35,7 +39,7 @@ class Place(NamedTuple):
 
 
 def load_gpiod() -> Any:
-    """The module gpiod. Raises LinkError where there is none, or that of libgpiod 1."""
+    """Import gpiod. Raises LinkError if it is missing, or is the module of libgpiod 1."""
     try:
         import gpiod
     except ImportError as error:
@@ -48,11 +52,11 @@ def load_gpiod() -> Any:
     return gpiod
 
 
-def find_line(gpiod: Any, settings: LineSettings, devices: Path = DEVICES) -> Place:
-    """Where the line of some settings is. Raises LinkMissing, LinkDenied, and LinkError where it is in two places."""
+def find_line(gpiod: Any, settings: LineSettings, devices: Path = DEVICES) -> LineLocation:
+    """Find the configured line. Raises LinkMissing, LinkDenied, and LinkError if two lines match."""
     chips, denied = _chips(gpiod, settings.chip, devices)
     found = [
-        Place(chip.path, offset, name)
+        LineLocation(chip.path, offset, name)
         for chip in chips
         for offset, name in enumerate(chip.names)
         if settings.line in (offset, name)
@@ -60,13 +64,13 @@ def find_line(gpiod: Any, settings: LineSettings, devices: Path = DEVICES) -> Pl
     if len(found) == 1:
         return found[0]
     if found:
-        places = " and ".join(map(str, found))
-        raise LinkError(f"expected the name {settings.line} on one line, got it on {places}: give chip and number")
+        matches = " and ".join(map(str, found))
+        raise LinkError(f"expected the name {settings.line} on one line, got it on {matches}: give chip and number")
     raise denied or _no_line(settings.line, chips)
 
 
-def problem(error: OSError, path: str) -> LinkError:
-    """The LinkError for a chip that cannot be used."""
+def chip_error(error: OSError, path: str) -> LinkError:
+    """Return the LinkError for a chip that cannot be used."""
     if error.errno in GONE:
         return LinkMissing(f"{path} is gone, or is no GPIO chip: {os.strerror(error.errno or 0)}")
     if error.errno in (errno.EACCES, errno.EPERM):
@@ -78,31 +82,31 @@ def problem(error: OSError, path: str) -> LinkError:
     return LinkError(f"{path} cannot be used as a GPIO chip: {os.strerror(error.errno or 0)}")
 
 
-def refusal(gpiod: Any, error: OSError, place: Place) -> LinkError:
-    """The LinkError for a line that the kernel does not give."""
+def request_error(gpiod: Any, error: OSError, location: LineLocation) -> LinkError:
+    """Return the LinkError for a line whose request the kernel refused."""
     if error.errno == errno.EBUSY:
         holder = ""
-        with suppress(OSError), gpiod.Chip(place.path) as chip:  # a chip that goes away now is asked no more
-            holder = chip.get_line_info(place.offset).consumer or ""
-        return LinkBusy(f"{place} is in use by {holder or 'a nameless program'}: stop that, or choose another line")
+        with suppress(OSError), gpiod.Chip(location.path) as chip:  # it may have been removed meanwhile
+            holder = chip.get_line_info(location.offset).consumer or ""
+        return LinkBusy(f"{location} is in use by {holder or 'a nameless program'}: stop that, or choose another line")
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.EACCES, errno.EPERM):
-        return problem(error, place.path)
+        return chip_error(error, location.path)
     reason = os.strerror(error.errno or 0)
-    return LinkError(f"{place} cannot be requested: {reason}; an input needs a chip that makes interrupts")
+    return LinkError(f"{location} cannot be requested: {reason}; an input needs a chip that makes interrupts")
 
 
 class _Chip(NamedTuple):
     path: str
     label: str
     names: tuple[str, ...]
-    """Of its lines; empty for one that has none."""
+    """Names of the lines by offset; empty for a line without a name."""
 
     def __str__(self) -> str:
         return f"{os.path.basename(self.path)} ({self.label})"
 
 
 def _chips(gpiod: Any, wanted: str, devices: Path) -> tuple[Sequence[_Chip], LinkDenied | None]:
-    """The chips to look at, and why others could not be looked at."""
+    """Return the chips to search, and the error of a chip that may not be opened."""
     node = devices / wanted  # an absolute path stays as it is
     if wanted and node.exists():
         return [_read(gpiod, str(node))], None
@@ -114,7 +118,7 @@ def _chips(gpiod: Any, wanted: str, devices: Path) -> tuple[Sequence[_Chip], Lin
         except LinkDenied as error:
             denied = error
         except LinkMissing:
-            continue  # it went away in this moment
+            continue  # removed since the folder was listed
     if not wanted:
         return chips, denied
     found = [chip for chip in chips if chip.label == wanted]
@@ -127,7 +131,7 @@ def _chips(gpiod: Any, wanted: str, devices: Path) -> tuple[Sequence[_Chip], Lin
 
 
 def _nodes(devices: Path) -> list[str]:
-    """Nodes of all chips by number. A link is another name of one: /dev/gpiochip4 of a Raspberry Pi 5."""
+    """Return the nodes of all chips by number, without symbolic links (/dev/gpiochip4 of a Raspberry Pi 5 is one)."""
     nodes = [node for node in devices.glob("gpiochip*") if not node.is_symlink()]
     return [str(node) for node in sorted(nodes, key=lambda node: int(re.sub(r"\D", "", node.name) or 0))]
 
@@ -138,7 +142,7 @@ def _read(gpiod: Any, path: str) -> _Chip:
             info = chip.get_info()
             return _Chip(path, info.label, tuple(chip.get_line_info(n).name or "" for n in range(info.num_lines)))
     except OSError as error:
-        raise problem(error, path) from error
+        raise chip_error(error, path) from error
 
 
 def _no_line(line: int | str, chips: Sequence[_Chip]) -> LinkMissing:

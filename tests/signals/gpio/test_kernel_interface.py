@@ -1,7 +1,7 @@
 """Events of a line as the kernel writes them, by hand."""
 
 from imud.contracts.lines import Edge
-from imud.signals.line_events import LineEvents
+from imud.signals.gpio.kernel_interface import LineEventDecoder
 
 
 def event(t_ns: int, kind: int, seqno: int) -> bytes:
@@ -11,29 +11,29 @@ def event(t_ns: int, kind: int, seqno: int) -> bytes:
 
 
 def test_edges() -> None:
-    events = LineEvents()
+    events = LineEventDecoder()
     data = event(0x0102030405060708, 1, 1) + event(2**63 - 1, 2, 2)
-    assert events.edges(data) == [Edge(0x0102030405060708, True, 1), Edge(2**63 - 1, False, 2)]
-    assert events.edges(b"") == []
+    assert events.decode(data) == [Edge(0x0102030405060708, True, 1), Edge(2**63 - 1, False, 2)]
+    assert events.decode(b"") == []
     assert events.lost == 0
 
 
 def test_a_jump_of_the_count_is_a_loss_and_numbers_go_on_over_it() -> None:
-    events = LineEvents()
-    assert [edge.number for edge in events.edges(event(1, 1, 2) + event(2, 2, 10) + event(3, 1, 11))] == [2, 10, 11]
+    events = LineEventDecoder()
+    assert [edge.number for edge in events.decode(event(1, 1, 2) + event(2, 2, 10) + event(3, 1, 11))] == [2, 10, 11]
     assert events.lost == 1 + 7
 
 
 def test_the_count_of_the_kernel_wraps_and_the_number_does_not() -> None:
-    events = LineEvents()
-    events.edges(event(1, 1, 2**32 - 1))
-    assert [edge.number for edge in events.edges(event(2, 2, 0) + event(3, 1, 1))] == [2**32, 2**32 + 1]
+    events = LineEventDecoder()
+    events.decode(event(1, 1, 2**32 - 1))
+    assert [edge.number for edge in events.decode(event(2, 2, 0) + event(3, 1, 1))] == [2**32, 2**32 + 1]
     assert events.lost == 2**32 - 2
 
 
 def test_numbers_go_on_after_a_restart() -> None:
-    events = LineEvents()
-    events.edges(event(1, 1, 1) + event(2, 2, 2))
+    events = LineEventDecoder()
+    events.decode(event(1, 1, 1) + event(2, 2, 2))
     events.restart()
-    assert [edge.number for edge in events.edges(event(3, 1, 1))] == [3]
+    assert [edge.number for edge in events.decode(event(3, 1, 1))] == [3]
     assert events.lost == 0

@@ -13,8 +13,8 @@ from gpiod.line import Edge as Detection
 from imud.contracts.lines import Edge, InputSettings, OutputSettings, ResetSettings
 from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.signals.gpio import GPIO_LINES, GpioInput, GpioOutput
-from imud.signals.gpio_lines import KERNEL_EVENTS, READ_EVENTS
-from imud.signals.line_events import EVENT
+from imud.signals.gpio.kernel_interface import EVENT
+from imud.signals.gpio.line_request import KERNEL_EVENTS, READ_EVENTS
 from tests.support.fake_gpiod import FakeGpiod
 from tests.support.in_loop import in_loop
 

@@ -1,9 +1,9 @@
-"""Inputs and outputs of GPIO chips.
+"""Line requests: inputs and outputs of GPIO chips.
 
-gpiod requests a line. Edges are then read from the descriptor of the request as the kernel's own structs, for less than
-half of what gpiod's objects cost. Nothing is debounced: a debounced edge is stamped when it was believed, not when it
-was. Where both edges are asked for, the kernel reads the level only when its interrupt thread runs, and a short pulse
-may become one edge; of a line that tells by its rising edges, only those are asked for.
+gpiod requests a line. Edge events are then read from the request's file descriptor as the kernel's own structs, for
+less than half of what gpiod's objects cost. Nothing is debounced: a debounced edge has the time of its acceptance, not
+its own. With detection of both edges the kernel reads the level only when its interrupt thread runs, and a short pulse
+may become one edge; where only rising edges carry information, only those are requested.
 """
 
 import asyncio
@@ -15,58 +15,58 @@ from typing import Any, Final
 
 from imud.contracts.lines import InputSettings, LineSettings, OnEdges, OnLineEnd, OutputSettings
 from imud.errors import LinkError, LinkMissing
-from imud.signals.driving import drive_line
-from imud.signals.gpio_chips import DEVICES, GONE, Place, find_line, load_gpiod, refusal
-from imud.signals.line_events import EVENT, LineEvents
+from imud.signals.gpio.chips import DEVICES, GONE, LineLocation, find_line, load_gpiod, request_error
+from imud.signals.gpio.kernel_interface import EVENT, LineEventDecoder, set_line
 
 KERNEL_EVENTS: Final = 1024
-"""Edges the kernel keeps for a line until they are read, its most: a second of SOUT at 1 kHz."""
+"""Capacity of the kernel's event buffer of a line, its maximum: one second of SOUT at 1 kHz."""
 READ_EVENTS: Final = 64
+"""Events per read."""
 CONSUMER_CHARACTERS: Final = 31
-"""Longest name of a user of a line that the kernel keeps (GPIO_MAX_NAME_SIZE - 1)."""
+"""Longest consumer name that the kernel keeps (GPIO_MAX_NAME_SIZE - 1)."""
 
 
 class _Line:
-    """A line that can be requested and released."""
+    """Request and release of a line."""
 
     def __init__(self, settings: LineSettings, purpose: str, devices: Path) -> None:
-        """`purpose` is what other programs are told that imud needs the line for."""
+        """`purpose` follows `imud` in the consumer name that other programs see."""
         self._settings = settings
         self._purpose = purpose
         self._devices = devices
         self._request: Any = None
-        self._place = Place(settings.chip, -1, "")
+        self._location = LineLocation(settings.chip, -1, "")
         self._fd = -1
         self.title = f"{settings.chip} line {settings.line}".lstrip()
 
     def _open(self, config: Callable[[Any], Any], events: int | None) -> None:
         """Find and request the line. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
         gpiod = load_gpiod()
-        place = find_line(gpiod, self._settings, self._devices)
+        location = find_line(gpiod, self._settings, self._devices)
         consumer = f"imud {self._purpose}".strip()[:CONSUMER_CHARACTERS]
         try:
             self._request = gpiod.request_lines(
-                place.path, {place.offset: config(gpiod)}, consumer, event_buffer_size=events
+                location.path, {location.offset: config(gpiod)}, consumer, event_buffer_size=events
             )
         except OSError as error:
-            raise refusal(gpiod, error, place) from error
-        self._place, self._fd = place, self._request.fd
-        self.title = str(place)
+            raise request_error(gpiod, error, location) from error
+        self._location, self._fd = location, self._request.fd
+        self.title = str(location)
 
     def _release(self) -> None:
         request, self._request, self._fd = self._request, None, -1
         if request is not None:
             request.release()
 
-    def _trouble(self, error: OSError) -> LinkError:
-        """The LinkError for a request that does not do what it did."""
+    def _error(self, error: OSError) -> LinkError:
+        """Return the LinkError for a system call that failed on the open request."""
         if error.errno in GONE:
             return LinkMissing(f"{self.title} is gone ({os.strerror(error.errno or 0)}): was an adapter pulled out?")
         return LinkError(f"{self.title} cannot be used: {os.strerror(error.errno or 0)}")
 
 
 class GpioInput(_Line):
-    """An `InputLine` of a GPIO chip."""
+    """Input line of a GPIO chip, an `InputLine`. Synchronization: the loop's thread only."""
 
     def __init__(
         self, settings: InputSettings, purpose: str = "", rising_only: bool = False, *, devices: Path = DEVICES
@@ -74,53 +74,53 @@ class GpioInput(_Line):
         super().__init__(settings, purpose, devices)
         self._edges = "RISING" if rising_only else "BOTH"
         self._bias = settings.bias.replace("-", "_").upper()
-        self._events = LineEvents()
+        self._decoder = LineEventDecoder()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._on_edges: OnEdges | None = None
         self._on_end: OnLineEnd | None = None
 
     @property
     def edges_lost(self) -> int:
-        """Edges that the kernel dropped because they were not read in time."""
-        return self._events.lost
+        """Edges that the kernel dropped because they were not read in time, over all requests."""
+        return self._decoder.lost
 
     def open(self) -> None:
-        """Request the line; edges count from now on. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
+        """Request the line; the kernel buffers its edges. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
         self._open(self._config, KERNEL_EVENTS)
         os.set_blocking(self._fd, False)
-        self._events.restart()
+        self._decoder.restart()
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
-        """Deliver edges from now on, and those since `open`; without `watch` only when `drain` is called."""
+        """Deliver the edges since `open`, and new ones as they come; without `watch` only when `drain` is called."""
         self._on_edges, self._on_end = on_edges, on_end
         self._loop = asyncio.get_running_loop()
         if watch:
             self._loop.add_reader(self._fd, self.drain)
 
     def drain(self) -> None:
-        """Deliver what the kernel has. Costs one system call where it has nothing."""
+        """Read and deliver the buffered edges; one system call if there are none. Does not block."""
         if self._on_edges is None:
             return
-        for _ in range(KERNEL_EVENTS // READ_EVENTS):  # and no more: a wire that floats must not hold up the rest
+        for _ in range(KERNEL_EVENTS // READ_EVENTS):  # bounded: a floating wire must not block the loop
             try:
                 data = os.read(self._fd, READ_EVENTS * EVENT.size)
             except BlockingIOError:
                 return
             except OSError as error:
-                self._end(self._trouble(error))
+                self._end(self._error(error))
                 return
-            self._on_edges(self._events.edges(data))
+            self._on_edges(self._decoder.decode(data))
             if len(data) < READ_EVENTS * EVENT.size or self._on_edges is None:
                 return
 
     def level(self) -> bool:
-        """Whether the line is active now. Raises LinkMissing, LinkError."""
+        """Return whether the line is active now. Raises LinkMissing, LinkError."""
         if self._request is None:
             raise LinkError(f"{self.title} is not open")
         try:
-            return bool(self._request.get_value(self._place.offset))
+            return bool(self._request.get_value(self._location.offset))
         except OSError as error:
-            raise self._trouble(error) from error
+            raise self._error(error) from error
 
     def close(self) -> None:
         """Release the line; may be called twice."""
@@ -147,7 +147,7 @@ class GpioInput(_Line):
 
 
 class GpioOutput(_Line):
-    """An `OutputLine` of a GPIO chip. Between `open` and `close` any one thread may drive it."""
+    """Output line of a GPIO chip, an `OutputLine`. Synchronization: one thread at a time."""
 
     def __init__(
         self,
@@ -157,26 +157,26 @@ class GpioOutput(_Line):
         devices: Path = DEVICES,
         drive: Callable[[int, bool], None] | None = None,
     ) -> None:
-        """`drive` sets the level of the line of a request's descriptor; without one it is the kernel's."""
+        """`drive` sets the level of the line, from the descriptor of its request; `set_line` if None."""
         super().__init__(settings, purpose, devices)
         self._open_drain = settings.open_drain
-        self._drive = drive or drive_line
+        self._drive = drive or set_line
 
     def open(self) -> None:
-        """Request the line as an output, inactive from its first moment. Raises as `GpioInput.open`."""
+        """Request the line as an output that is inactive from the start. Raises as `GpioInput.open`."""
         self._open(self._config, None)
 
     def set(self, active: bool) -> None:
-        """Drive it. Raises LinkMissing, LinkError."""
+        """Set the level of the line. Raises LinkMissing, LinkError."""
         if self._request is None:
             raise LinkError(f"{self.title} is not open")
         try:
             self._drive(self._fd, active)
         except OSError as error:
-            raise self._trouble(error) from error
+            raise self._error(error) from error
 
     def close(self) -> None:
-        """Make it inactive and release it; may be called twice."""
+        """Set the line inactive and release it; may be called twice."""
         with suppress(OSError):  # the chip is gone, and the line with it
             if self._request is not None:
                 self._drive(self._fd, False)

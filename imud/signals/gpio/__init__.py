@@ -1,9 +1,9 @@
-"""Lines of GPIO chips through libgpiod 2, for `imud.contracts.lines`."""
+"""GPIO character devices through libgpiod 2: the inputs and outputs that `imud.contracts.lines` specifies."""
 
 from typing import Final
 
 from imud.contracts.lines import LineFactory
-from imud.signals.gpio_lines import GpioInput, GpioOutput
+from imud.signals.gpio.line_request import GpioInput, GpioOutput
 
 __all__ = ["GPIO_LINES", "GpioInput", "GpioOutput"]
 
