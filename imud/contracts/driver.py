@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from imud.contracts.action import Actions
 from imud.contracts.codec import StreamCodec
+from imud.contracts.lines import AlarmRanges
 from imud.contracts.session import RequestScript
 from imud.contracts.settings import Settings
 from imud.contracts.timing import NO_TIME_BITS, TimeBits
@@ -48,7 +49,9 @@ class Driver:
     actions: Actions = field(default_factory=dict)
     """What the device can be told to do, by name."""
     lines: frozenset[str] = frozenset()
-    """Wires besides its data that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
+    """Lines that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
+    alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
+    """Reads from the device's settings what its ALARM line indicates; None if they do not say."""
     time_bits: TimeBits = NO_TIME_BITS
     """Bits of `Measurement.status` that speak of time."""
 

@@ -1,4 +1,11 @@
-"""Lines: single wires beside a device's data, which say when something happened (SOUT, PPS) or that it did (ALARM)."""
+"""Lines: GPIO signals of a device next to its data link. Their settings, and what an input and an output provide.
+
+SOUT, SOUT_DIV, data ready   device → host   when a sample was measured
+SIN                          host → device   when to measure
+PPS                          receiver → host and device's SIN   when a second of UTC begins
+ALARM                        device → host   an angle is out of its range
+reset                        host → device   restart
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,25 +17,26 @@ from msgspec.structs import fields
 from imud.contracts.settings import Settings
 from imud.contracts.timing import SIN_DELAY_US, SOUT_WIDTH_US, SoutTiming, TriggerTiming
 from imud.errors import LinkError
+from imud.worker import BusThread, StartWorker
 
 Offset = Annotated[float, Meta(ge=-100_000, le=100_000)]
 Bias = Annotated[float, Meta(ge=0, le=100_000)]
 
 
 class Edge(NamedTuple):
-    """One change of a line's level."""
+    """One change of the level of a line."""
 
     t_ns: int
     """CLOCK_MONOTONIC as the kernel stamped it."""
     rising: bool
     """Whether the line became active."""
     number: int
-    """Counts the edges of this line from 1, rising and falling, those that were lost on the way included. It goes on
-    when the line is opened again."""
+    """Counts the edges of this line from 1, rising and falling, including lost ones. It continues when the line is
+    opened again."""
 
 
 class LineSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which wire: by chip and number, or by a name that is on one chip only."""
+    """Address of a line: chip and offset, or a line name that exists once."""
 
     line: Annotated[int, Meta(ge=0, le=1023)] | Annotated[str, Meta(min_length=1, max_length=31)]
     """Number of the line on its chip, or its name, for example `GPIO17`."""
@@ -43,25 +51,25 @@ class LineSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class InputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A wire that the device drives."""
+    """An input: a line that the device drives."""
 
     bias: Literal["as-is", "pull-up", "pull-down", "disabled"] = "as-is"
-    """Resistor inside the host's chip: a wire that nobody drives floats, and a floating wire makes edges."""
+    """Resistor inside the host's chip: a wire that is not driven floats, and a floating wire makes edges."""
 
 
 class SoutSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SOUT."""
 
     offset_us: Offset = 0.0
-    """Instant of measurement minus rising edge, µs; negative when the device measures before its pulse."""
+    """Instant of measurement minus rising edge, µs; negative if the device measures before its pulse."""
     bias_us: Bias = SIN_DELAY_US - SOUT_WIDTH_US
-    """How far the truth can be from that, µs; 0 when it was calibrated (`imud.contracts.timing.SoutTiming`)."""
+    """Bound of the error of `offset_us`, µs; 0 if it was calibrated (`imud.contracts.timing.SoutTiming`)."""
     width_us: Bias = SOUT_WIDTH_US
     """Length of the pulse, µs."""
 
     @property
     def timing(self) -> SoutTiming:
-        """Where on a pulse the measurement is."""
+        """Position of the measurement on a pulse."""
         return SoutTiming(offset_us=self.offset_us, bias_us=self.bias_us, width_us=self.width_us)
 
 
@@ -69,15 +77,15 @@ class DividedSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_f
     """SOUT_DIV."""
 
     divisor: Annotated[int, Meta(ge=1, le=64)] = 8
-    """How many samples there are to one pulse, as the device is set to (`CONFIG PMUX4 DIV8`; 8 as delivered)."""
+    """Samples per pulse, as the device is set to (`CONFIG PMUX4 DIV8`; 8 as delivered)."""
 
 
 class PpsSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The pulse per second."""
 
     chrony: str = ""
-    """Socket of chronyd's SOCK reference clock that is given the pulses, for example `/run/chrony/imud.sock`; empty for
-    none. Which second a pulse is must be known from `rmc`."""
+    """Socket of chronyd's SOCK reference clock that the pulses are sent to, for example `/run/chrony/imud.sock`; empty
+    for none. The second of each pulse must be known from `rmc`."""
 
 
 class ReadySettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -86,13 +94,13 @@ class ReadySettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_fie
     edge: Literal["rising", "falling"] = "rising"
     """The edge after which new data can be read; `rising` is from inactive to active."""
     offset_us: Offset = 0.0
-    """Instant of measurement minus edge, µs; negative when the device measures before it tells so."""
+    """Instant of measurement minus edge, µs; negative if the device measures before the edge."""
     bias_us: Bias = 100.0
-    """How far the truth can be from that, µs; 0 when it was calibrated. No manual says: 100 is an assumption."""
+    """Bound of the error of `offset_us`, µs; 0 if it was calibrated. No manual gives it: 100 is an assumption."""
 
 
 class OutputSettings(LineSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A wire that imud drives."""
+    """An output: a line that imud drives."""
 
     open_drain: bool = False
     """Whether high is left to a pull-up resistor, so that no current flows into a device without power."""
@@ -102,18 +110,18 @@ class TriggerSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_
     """SIN."""
 
     rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 100.0
-    """Rising edges per second; 0 for none but those that are asked for one by one."""
+    """Rising edges per second; 0 for single edges on request only."""
     pulse_ms: Annotated[float, Meta(ge=0.01, le=500)] = 1.0
-    """How long a pulse is, or half a period where that is shorter, ms. The manual of HiPNUC names none for triggers; 1
-    ms passes any level shifter, a slow optocoupler needs more."""
+    """Length of a pulse, at most half a period, ms. The HiPNUC manual gives none for triggers; 1 ms passes any level
+    shifter, a slow optocoupler needs more."""
     offset_us: Offset = 0.0
     """Instant of measurement minus trigger, µs."""
     bias_us: Bias = SIN_DELAY_US
-    """How far the truth can be from that, µs; 0 when it was calibrated (`imud.contracts.timing.TriggerTiming`)."""
+    """Bound of the error of `offset_us`, µs; 0 if it was calibrated (`imud.contracts.timing.TriggerTiming`)."""
 
     @property
     def timing(self) -> TriggerTiming:
-        """Where behind a trigger the measurement is."""
+        """Position of the measurement after a trigger."""
         return TriggerTiming(offset_us=self.offset_us, bias_us=self.bias_us)
 
 
@@ -123,18 +131,18 @@ class ResetSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fi
     active_low: bool = True
     """Whether a low level resets the device, as on a pin called nRST."""
     hold_ms: Annotated[float, Meta(ge=0.01, le=10_000)] = 10.0
-    """How long the line is held active, ms."""
+    """Length of the reset pulse, ms."""
     wait_s: Annotated[float, Meta(ge=0, le=60)] = 3.0
-    """How long the device needs after it, s: an IMU61x 3 s (manual, note 1 of 2.2)."""
+    """Start-up time of the device after the pulse, s: 3 s for an IMU61x (manual, note 1 of 2.2)."""
 
 
 class DeviceLines(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The wires of one device besides its data."""
+    """The lines of one device."""
 
     sout: SoutSettings | None = None
     """SOUT of the device: a pulse before each frame."""
     sout_div: DividedSettings | None = None
-    """SOUT_DIV of the device: a pulse for every so many samples."""
+    """SOUT_DIV of the device: a pulse every `divisor` samples."""
     sin: TriggerSettings | None = None
     """SIN of the device, driven by imud: one frame for each rising edge (ONMARK)."""
     alarm: InputSettings | None = None
@@ -144,7 +152,7 @@ class DeviceLines(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     data_ready: ReadySettings | None = None
     """Data ready of the device: it has new values."""
     pps: PpsSettings | None = None
-    """The pulse per second that the device's SIN gets, at the host too."""
+    """The pulse per second that the device's SIN receives, connected to the host as well."""
 
 
 LINE_SCHEMAS: Final[Mapping[str, type[LineSettings]]] = {
@@ -153,24 +161,43 @@ LINE_SCHEMAS: Final[Mapping[str, type[LineSettings]]] = {
 """Schema of each key of `DeviceLines`."""
 
 
+class AlarmRange(NamedTuple):
+    """Range of one angle; the ALARM line is active while the angle is outside it."""
+
+    euler_index: int
+    """Index of the angle in `Sample.euler_rad`."""
+    low_deg: float
+    high_deg: float
+    enabled: bool
+
+
+class AlarmRanges(NamedTuple):
+    """What the ALARM line of a device indicates, as its settings say."""
+
+    by_axis: Mapping[str, AlarmRange]
+    """By the device's name of the axis; an axis that the settings do not give is missing."""
+    pin_setting: str
+    """Name of the setting that selects the pin's function, for messages."""
+    mounting_setting: str
+    """Name of the setting of the mounting orientation, for messages."""
+
+
 OnEdges = Callable[[Sequence[Edge]], None]
 """Called in the loop's thread with edges in their order."""
 OnLineEnd = Callable[[LinkError], None]
-"""Called once when the line is gone; nothing comes after it."""
+"""Called once when the line is gone; no calls follow."""
 
 
 class InputLine(Protocol):
-    """A line that is watched. Synchronization: the loop's thread only."""
+    """An input whose edges are delivered. Synchronization: the loop's thread only."""
 
     title: str
     """The line for people, for example `gpiochip0 line 17 (GPIO17)`."""
 
     @property
     def edges_lost(self) -> int:
-        """Edges that the kernel dropped because they were not read in time, over all times the line was open.
-
-        Edges that follow each other before the kernel's interrupt thread runs become one; nobody counts those.
-        """
+        """Edges that the kernel dropped because they were not read in time, over all requests of the line. Not counted
+        are edges so close that the kernel's interrupt thread saw them as one."""
         ...
 
     def open(self) -> None:
@@ -178,15 +205,15 @@ class InputLine(Protocol):
         ...
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
-        """Deliver edges from now on; without `watch` only when `drain` is called. Needs a loop and an open line."""
+        """Deliver edges; without `watch` only when `drain` is called. Needs a running loop and an open line."""
         ...
 
     def drain(self) -> None:
-        """Deliver now what the kernel has and the loop did not read yet. Does not wait."""
+        """Deliver at once the edges that the kernel has buffered. Does not block."""
         ...
 
     def level(self) -> bool:
-        """Whether the line is active now. Raises LinkError."""
+        """Return whether the line is active now. Raises LinkError."""
         ...
 
     def close(self) -> None:
@@ -195,20 +222,20 @@ class InputLine(Protocol):
 
 
 class OutputLine(Protocol):
-    """A line that is driven. Synchronization: one thread at a time."""
+    """An output. Synchronization: one thread at a time."""
 
     title: str
 
     def open(self) -> None:
-        """Request the line and make it inactive. Raises as `InputLine.open`."""
+        """Request the line and set it inactive. Raises as `InputLine.open`."""
         ...
 
     def set(self, active: bool) -> None:
-        """Drive it. Raises LinkError."""
+        """Set the level of the line. Raises LinkError."""
         ...
 
     def close(self) -> None:
-        """Make it inactive and release it; may be called twice."""
+        """Set the line inactive and release it; may be called twice."""
         ...
 
 
@@ -217,6 +244,8 @@ class LineFactory:
     """Makes closed lines from their settings and a purpose for people, for example `bow sout`."""
 
     make_input: Callable[[Any, str, bool], InputLine]
-    """From `InputSettings`; the last argument says whether falling edges are of no interest."""
+    """From `InputSettings`; the last argument is True if only rising edges are needed."""
     make_output: Callable[[Any, str], OutputLine]
     """From `OutputSettings`."""
+    start_worker: StartWorker = BusThread
+    """Starts the thread that drives SIN."""

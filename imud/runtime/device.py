@@ -81,8 +81,10 @@ class Device(ABC):
         self._wires: SyncSignals | None = None
         if config.lines is not None:
             on_pulses = self._utc.pulses if self._utc is not None else None
-            self._wires = SyncSignals(config.name, config.lines, lines, self._notices.tell, on_pulses)
-        self._reset = make_reset(config.name, config.lines, lines, self._notices.tell, self._on_reset)
+            self._wires = SyncSignals(
+                config.name, config.lines, lines, self._notices.tell, monotonic_ns, on_pulses=on_pulses
+            )
+        self._reset = make_reset(config.name, config.lines, lines, self._notices.tell, monotonic_ns, self._on_reset)
         self._by_lines = LineActions(self._reset, self._wires)
         self._driver: Driver | None = None
         self._clock: SampleClock | None = None
@@ -97,14 +99,14 @@ class Device(ABC):
         """Keep the device alive until cancelled, or until a replay ends."""
         try:
             if self._reset is not None:
-                self._reset.tick(monotonic_ns())
+                self._reset.tick(monotonic_ns(), None)
             if self._utc is not None:
                 self._utc.start()
             await self._live_again_and_again()
             self._set(DeviceState.FINISHED)
         finally:
             if self._wires is not None:
-                self._wires.stop()
+                self._wires.close()
             if self._reset is not None:
                 self._reset.close()
             if self._utc is not None:
@@ -116,7 +118,7 @@ class Device(ABC):
         if self._wires is not None:
             self._wires.tick(now_ns, self._path.newest if self._path is not None else None)
         if self._reset is not None:
-            self._reset.tick(now_ns)
+            self._reset.tick(now_ns, None)
         if self._utc is not None:
             self._utc.tick(now_ns, self._clock)
         path = self._path
@@ -211,7 +213,7 @@ class Device(ABC):
             self._end_work()
             self.close()
             if self._wires is not None:
-                self._wires.rest()
+                self._wires.stop()
             if self._path is not None:
                 self._path.reset()
 
@@ -259,7 +261,8 @@ class Device(ABC):
     def _learn(self, identity: Identity, settings: Mapping[str, str]) -> None:
         self._known.learn(monotonic_ns(), identity, settings)
         if self._wires is not None:
-            self._wires.settings(settings)
+            read = self._driver.alarm_ranges if self._driver is not None else None
+            self._wires.set_alarm_ranges(read(settings) if read is not None else None)
 
     # --- what it can be told -----------------------------------------------------------------------------------------
 
@@ -282,7 +285,7 @@ class Device(ABC):
             )
         params = action.arguments(arguments)
         if self._wires is not None:
-            self._wires.settings({})  # what was read back need not hold any more
+            self._wires.set_alarm_ranges(None)  # what was read back need not hold any more
         return await self._do(action, params)
 
     @property

@@ -1,11 +1,11 @@
-"""Which data-ready edge the bytes of a read belong to: the newest before it began, if the read is not too late for it.
+"""Matches reads to data-ready edges: a read belongs to the newest edge before it began, unless it is too late for it.
 
     edge 7        edge 8                 edge 9          edge 10
       │             │  ┌─read─┐            │               │ ┌─read─┐
       └─────────────┴──┴──────┴────────────┴───────────────┴─┴──────┘
-                       is of edge 8                          is of edge 10; the values of 9 are lost
+                       of edge 8                             of edge 10; the values of 9 are lost
 
-Told by kernel stamps after the fact, so it does not matter how late the host noticed an edge. Without I/O.
+Matched by kernel time stamps afterwards, so that the host's delay in noticing an edge has no effect. Without I/O.
 """
 
 from collections import deque
@@ -18,43 +18,43 @@ from imud.contracts.lines import Edge, ReadySettings
 from imud.units import NS_PER_MS, NS_PER_US
 
 QUIET_NS: Final = 500 * NS_PER_MS
-"""So long without an edge: it is shorter than what makes a device silent."""
+"""Edges count as stopped after this time, which is shorter than what makes a device silent."""
 KEPT: Final = 1024
-"""Edges that wait for the read they belong to: as many as the kernel keeps for a host that stalls."""
+"""Capacity of the buffer of edges without a read: that of the kernel's event buffer."""
 AGE_LIMIT: Final = 1.5
-"""Another read of an edge that begins so many intervals after it may be of one that nobody saw: the wire broke."""
+"""A further read of an edge that begins later than this, in intervals, may belong to an unseen edge: the wire broke."""
 EITHER: Final = 1 / sqrt(2)
-"""Root mean square of an error that is 0 or its bound, either as likely."""
+"""Root mean square of an error that is 0 or its bound with equal probability."""
 
 
 class Stamp(NamedTuple):
-    """When the bytes of a read were measured."""
+    """Instant of measurement of what a read returned."""
 
     t_ns: int
-    """CLOCK_MONOTONIC; never after the read began."""
+    """CLOCK_MONOTONIC; not after the begin of the read."""
     err_ns: int
-    """One-sigma error of it."""
+    """One-sigma error of `t_ns`."""
     number: int
     """`Edge.number`."""
 
 
 class ReadyEdges:
-    """The edges of one device's line. Synchronization: the loop's thread only."""
+    """Edges of one data-ready line. Synchronization: the loop's thread only."""
 
     def __init__(self, settings: ReadySettings, period_ns: int) -> None:
-        """`period_ns` is the interval of edges to expect until two have come."""
+        """`period_ns` is the expected interval of edges, used until two have come."""
         self.missed = 0
-        """Edges whose values were never read: the next came first, or the kernel dropped them."""
+        """Edges without a read: the next edge came first, or the kernel dropped the edge."""
         self.interval_ns = period_ns
-        """Between the two newest edges."""
+        """Interval of the two newest edges."""
         self._offset_ns = round(settings.offset_us * NS_PER_US)
         self._error_ns = settings.bias_us * NS_PER_US / sqrt(3) + STAMP_FLOOR_NS
         self._edges: deque[Edge] = deque(maxlen=KEPT)
         self._newest: Edge | None = None
         self._read: int | None = None
 
-    def take(self, edges: Sequence[Edge]) -> None:
-        """Edges after which there are new values, oldest first."""
+    def on_edges(self, edges: Sequence[Edge]) -> None:
+        """Add edges after which new values can be read, oldest first."""
         for edge in edges:
             before, self._newest = self._newest, edge
             if before is not None:
@@ -62,11 +62,11 @@ class ReadyEdges:
             self._edges.append(edge)
 
     def restart(self) -> None:
-        """Reading begins, perhaps of another device: edges before it are not missed."""
+        """Begin to read, possibly another device: earlier edges do not count as missed."""
         self._read = None
 
-    def of(self, start_ns: int, end_ns: int) -> Stamp | None:
-        """The stamp of a read between these, whether it succeeded or not; None where no edge tells. Reads in order."""
+    def match(self, start_ns: int, end_ns: int) -> Stamp | None:
+        """Return the stamp of a read from `start_ns` to `end_ns`, failed or not; None without edge. In order only."""
         edges = self._edges
         while len(edges) > 1 and edges[1].t_ns <= start_ns:
             edges.popleft()
@@ -76,11 +76,11 @@ class ReadyEdges:
         limit_ns = AGE_LIMIT * self.interval_ns
         if self._read is not None and number != self._read:
             self.missed += max(0, number - self._read - 1)
-            limit_ns = max(limit_ns, QUIET_NS)  # its first read: the host was late for it
+            limit_ns = max(limit_ns, QUIET_NS)  # the first read of an edge: the host was late
         self._read = number
         if start_ns - t_ns > limit_ns:
             return None
         error_ns = self._error_ns
-        if len(edges) > 1 and edges[1].t_ns <= end_ns:  # new values came while the old ones were read: which are these?
+        if len(edges) > 1 and edges[1].t_ns <= end_ns:  # new values during the read: either
             error_ns = hypot(error_ns, EITHER * (edges[1].t_ns - t_ns))
         return Stamp(min(t_ns + self._offset_ns, start_ns), int(error_ns) + 1, number)

@@ -1,35 +1,37 @@
-"""The reset line of a device: pulsed when asked, and when a search for the device has found nothing for long.
+"""The reset line of a device: pulsed on request, and when a search for the device has failed for long.
 
-A pulse is the last resort: a device that restarted by itself is not there for `wait_s` either, and one that was pulled
-out is not helped. So it takes ROUNDS rounds of search without an answer and more than `wait_s`, and then comes once a
-minute at most.
+A pulse is the last resort: a device that restarts by itself is absent for `wait_s` as well, and one that was unplugged
+is not helped. It needs ROUNDS failed rounds of search and more than `wait_s`, and comes once a minute at most.
 """
 
 import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Final
 
+from imud.clock import SampleClock
 from imud.contracts.lines import DeviceLines, LineFactory, OutputLine, ResetSettings
 from imud.errors import CommandError, LinkError
 from imud.event import EventKind, RaiseEvent
+from imud.sample import Sample
 from imud.signals.watched_line import RETRY_NS
 from imud.units import NS_PER_S
 
 MS_PER_S: Final = 1000
 ROUNDS: Final = 3
+"""Failed rounds of search before the line is pulsed."""
 MARGIN_NS: Final = 1 * NS_PER_S
-"""So much longer than `wait_s` a search lasts before the line is pulsed."""
+"""The line is pulsed after a search of `wait_s` and this."""
 AGAIN_NS: Final = 60 * NS_PER_S
-"""Between two pulses that nobody asked for."""
+"""Least interval between two automatic pulses."""
 
 Sleep = Callable[[float], Awaitable[None]]
-"""`asyncio.sleep`, or a test's."""
+"""`asyncio.sleep`, or a replacement of it."""
 
 
 async def reset(line: OutputLine, settings: ResetSettings, sleep: Sleep = asyncio.sleep) -> None:
-    """Hold the open line active, let it go, and wait as long as the device needs. Raises LinkError.
+    """Pulse the open line, and wait for the device's start-up. Raises LinkError.
 
-    Cancelled at any moment, it leaves the line inactive.
+    The line is left inactive, also when the coroutine is cancelled.
     """
     line.set(True)
     try:
@@ -40,46 +42,55 @@ async def reset(line: OutputLine, settings: ResetSettings, sleep: Sleep = asynci
 
 
 class ResetLine:
-    """Owns the line, which is kept open and inactive. Synchronization: the loop's thread only."""
+    """Owns the line, and keeps it open and inactive. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, line: OutputLine, settings: ResetSettings, raise_event: RaiseEvent, on_pulse: Callable[[], None]
+        self,
+        line: OutputLine,
+        settings: ResetSettings,
+        raise_event: RaiseEvent,
+        now_ns: Callable[[], int],
+        on_pulse: Callable[[], None],
     ) -> None:
-        """`on_pulse` is told right before the device is reset."""
+        """`now_ns` is CLOCK_MONOTONIC. `on_pulse` is called right before each pulse."""
         self.problem = ""
-        """Why it cannot be driven now, one sentence; empty when it can."""
+        """Why the line cannot be driven, one sentence; empty if it can."""
         self._line = line
         self._settings = settings
-        self._raise_event = raise_event
+        self._raise_event, self._now_ns = raise_event, now_ns
         self._on_pulse = on_pulse
         self._is_open = False
-        self._stopped = False
+        self._closed = False
         self._open_ns = 0
-        self._now_ns = 0
         self._rounds = 0
         self._since_ns = 0
         self._again_ns = 0
         self._pulsing = asyncio.Lock()
 
-    def tick(self, now_ns: int) -> None:
-        """Ten times a second: open it, and again when it failed."""
-        self._now_ns = now_ns
-        if self._is_open or self._stopped or now_ns < self._open_ns:
+    def start(self, clock: SampleClock) -> None:
+        """Do nothing: a device counts as found when its first sample comes (`found`)."""
+
+    def tick(self, now_ns: int, newest: Sample | None) -> None:
+        """Open the line if that is due. Call it at 10 Hz."""
+        if self._is_open or self._closed or now_ns < self._open_ns:
             return
         try:
             self._line.open()
         except LinkError as error:
-            self._fail(error)
+            self._fail(error, now_ns)
         else:
             self._is_open, self.problem = True, ""
 
+    def stop(self) -> None:
+        """Do nothing: the line stays open while the device's link is down."""
+
     def close(self) -> None:
-        """Leave it inactive and let go of it for good; may be called twice."""
-        self._is_open, self._stopped = False, True
+        """Release the line, inactive; may be called twice. `tick` does not open it again."""
+        self._is_open, self._closed = False, True
         self._line.close()
 
     async def pulse(self) -> None:
-        """Reset the device and wait until it works again. Raises CommandError."""
+        """Reset the device and wait for its start-up. Raises CommandError."""
         async with self._pulsing:
             if not self._is_open:
                 raise CommandError(f"reset: {self.problem or 'the line is not open'}")
@@ -88,20 +99,20 @@ class ResetLine:
             try:
                 await reset(self._line, self._settings)
             except LinkError as error:
-                self._fail(error)
+                self._fail(error, self._now_ns())
                 raise CommandError(f"reset: {error}") from error
 
     async def settled(self) -> None:
-        """Return when no pulse is on its way and the device had its time."""
+        """Wait until no pulse and no start-up is in progress."""
         async with self._pulsing:
             return
 
     def found(self) -> None:
-        """The device is there."""
+        """End the search: the device sends samples."""
         self._rounds = 0
 
     async def not_found(self, now_ns: int) -> None:
-        """A round of search ended without it: pulse the line if it is time to."""
+        """Count a failed round of search, and pulse the line if that is due."""
         if self._rounds == 0:
             self._since_ns = now_ns
         self._rounds += 1
@@ -115,21 +126,27 @@ class ResetLine:
         try:
             await self.pulse()
         except CommandError:
-            return  # told where it failed
+            return  # `pulse` has raised the event
 
-    def _fail(self, error: LinkError) -> None:
+    def _fail(self, error: LinkError, now_ns: int) -> None:
         self._is_open = False
         self._line.close()
-        self._open_ns = self._now_ns + RETRY_NS
+        self._open_ns = now_ns + RETRY_NS
         if str(error) != self.problem:
             self.problem = str(error)
-            self._raise_event(self._now_ns, EventKind.LINK, f"line reset: {self.problem}", line="reset")
+            self._raise_event(now_ns, EventKind.LINK, f"line reset: {self.problem}", line="reset")
 
 
 def make_reset(
-    device: str, lines: DeviceLines | None, maker: LineFactory, raise_event: RaiseEvent, on_pulse: Callable[[], None]
+    device: str,
+    lines: DeviceLines | None,
+    factory: LineFactory,
+    raise_event: RaiseEvent,
+    now_ns: Callable[[], int],
+    on_pulse: Callable[[], None],
 ) -> ResetLine | None:
-    """The reset line of a device that has one."""
+    """Make the reset line of a device; None if it has none."""
     if lines is None or lines.reset is None:
         return None
-    return ResetLine(maker.make_output(lines.reset, f"{device} reset"), lines.reset, raise_event, on_pulse)
+    output = factory.make_output(lines.reset, f"{device} reset")
+    return ResetLine(output, lines.reset, raise_event, now_ns, on_pulse)

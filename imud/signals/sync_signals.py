@@ -1,94 +1,83 @@
-"""The lines of one device: SOUT, SOUT_DIV, PPS and SIN tell its clock when, ALARM that something is wrong.
+"""The synchronisation lines of one device: SOUT, SOUT_DIV, PPS and SIN for its clock, ALARM for its status.
 
-Edges reach the clock before the frame that follows them: `drain` is called right before what was read is fed.
-A line that fails costs the device nothing but what the line told; it is opened again when it can be.
+Edges have to reach the clock before the frame that follows them: `drain` is called before the data of a read is
+decoded. A line that fails affects only what it provides, and is opened again when that is possible.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from time import monotonic_ns
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from imud.clock import SampleClock
-from imud.contracts.lines import DeviceLines, Edge, LineFactory
+from imud.contracts.lines import AlarmRanges, DeviceLines, Edge, LineFactory, OnEdges
 from imud.contracts.status import LinesStatus
 from imud.contracts.timing import Mark, TriggerStamp
 from imud.errors import CommandError, LinkError
 from imud.event import EventKind, RaiseEvent
 from imud.sample import Sample
-from imud.signals.alarm_watch import AlarmWatch
+from imud.signals.alarm_line import AlarmMonitor
 from imud.signals.reset import ResetLine
-from imud.signals.trigger import Trigger
-from imud.signals.watched_line import RETRY_NS, WatchedLine
-from imud.units import NS_PER_MS
+from imud.signals.trigger import SinTrigger, TriggerCounts
+from imud.signals.watched_line import WatchedLine
 
 ALARM_STATUS: Final = 1 << 31
-"""Bit of `Sample.status` that is imud's own: the ALARM line was active. The devices' own bits are below 2¹⁶."""
+"""Bit of `Sample.status` that imud sets: the ALARM line was active. The devices' own bits are below 2¹⁶."""
 WITH_FRAMES: Final = ("sout", "sout_div")
-"""Lines whose edges are of use only together with frames: waking up for each would cost as much as for a frame."""
-OnPulses = Callable[[Sequence[Edge]], None]
+"""Lines whose edges are needed only together with frames: the loop is not woken for them, which costs as much as a
+frame."""
 
 
 class SyncSignals:
-    """Owns the lines of one device. Synchronization: the loop's thread only."""
+    """Owns the lines of one device, except reset and data ready. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
         device: str,
         lines: DeviceLines,
-        maker: LineFactory,
+        factory: LineFactory,
         raise_event: RaiseEvent,
-        on_pulses: OnPulses | None = None,
+        now_ns: Callable[[], int],
+        *,
+        on_pulses: OnEdges | None = None,
     ) -> None:
-        """`on_pulses` is told the edges of PPS besides the clock."""
-        self._raise_event = raise_event
+        """`now_ns` is CLOCK_MONOTONIC. `on_pulses` receives the edges of PPS after the clock."""
+        self._raise_event, self._now_ns = raise_event, now_ns
         self._on_pulses = on_pulses
         self._clock: SampleClock | None = None
-        self._alarm = AlarmWatch(raise_event)
+        self._alarm = AlarmMonitor(raise_event)
+        self._closed = False
         self._watched: dict[str, WatchedLine] = {}
-        for key, take in (
-            ("sout", self._on_sout),
-            ("sout_div", self._on_divided),
-            ("pps", self._on_pps),
-            ("alarm", self._on_alarm),
-        ):
+        handlers: dict[str, OnEdges] = {
+            "sout": self._on_sout, "sout_div": self._on_divided, "pps": self._on_pps, "alarm": self._on_alarm
+        }  # fmt: skip
+        for key, on_edges in handlers.items():
             settings = getattr(lines, key)
             if settings is not None:
-                on_level = self._on_alarm_level if key == "alarm" else _ignore
-                line = maker.make_input(settings, f"{device} {key}", key != "alarm")
+                line = factory.make_input(settings, f"{device} {key}", key != "alarm")
                 self._watched[key] = WatchedLine(
-                    line, take, on_level, self._complainer(key), watch=key not in WITH_FRAMES
+                    line,
+                    on_edges,
+                    self._on_alarm_level if key == "alarm" else _ignore_level,
+                    self._reporter(key),
+                    now_ns,
+                    watch=key not in WITH_FRAMES,
                 )
         self._drained = [watched for key, watched in self._watched.items() if key != "alarm"]
-        self._sin = maker.make_output(lines.sin, f"{device} sin") if lines.sin is not None else None
-        self._trigger: Trigger | None = None
-        if self._sin is not None and lines.sin is not None:
-            pulse_ns = round(lines.sin.pulse_ms * NS_PER_MS)
-            self._trigger = Trigger(self._sin, lines.sin.rate_hz, pulse_ns=pulse_ns)
-        self._triggering = False
-        self._trigger_due_ns = 0
-        self._trigger_problem = ""
-        self._stopped = False
+        self._sin: SinTrigger | None = None
+        if lines.sin is not None:
+            output = factory.make_output(lines.sin, f"{device} sin")
+            self._sin = SinTrigger(
+                output, lines.sin, self._on_stamps, self._reporter("sin"), now_ns, factory.start_worker
+            )
 
     def start(self, clock: SampleClock) -> None:
-        """The device is found: what the lines tell is for this clock, and SIN is driven."""
+        """Deliver edges to the clock of the device that was found, and drive SIN."""
         self._clock = clock
         self._show_alarm()
-        self.tick(monotonic_ns())
+        self.tick(self._now_ns(), None)
 
-    def settings(self, settings: Mapping[str, str]) -> None:
-        """What the device is set to, as read back: what its ALARM line should say follows from that."""
-        self._alarm.settings(settings)
-
-    def drain(self) -> None:
-        """Give the clock all edges there are. Does not wait; one system call per line."""
-        for watched in self._drained:
-            watched.drain()
-        if self._trigger is not None:
-            self._trigger.drain()
-
-    def tick(self, now_ns: int, newest: Sample | None = None) -> None:
-        """Ten times a second, with the device's newest sample: open what is to be opened, tell what has gathered."""
-        if self._stopped:
+    def tick(self, now_ns: int, newest: Sample | None) -> None:
+        """Open lines that are due, raise pending events, check ALARM against the newest sample. Call it at 10 Hz."""
+        if self._closed:
             return
         for watched in self._watched.values():
             watched.tick(now_ns)
@@ -96,66 +85,75 @@ class SyncSignals:
         clock = self._clock
         if clock is None:
             return
-        if self._trigger is not None and not self._triggering and now_ns >= self._trigger_due_ns:
-            self._start_trigger(now_ns)
+        if self._sin is not None:
+            self._sin.tick(now_ns)
         for mark in clock.take_marks():
-            self._tell_mark(mark)
-
-    def rest(self) -> None:
-        """The device's link ended: SIN is left inactive, and what the other lines tell is for no clock."""
-        self._clock = None
-        if self._trigger is not None and self._sin is not None:
-            self._trigger.stop()
-            self._sin.close()
-            self._triggering = False
-            self._trigger_due_ns = 0
+            self._raise_mark(mark)
 
     def stop(self) -> None:
-        """Let go of all lines for good; may be called twice."""
-        self._stopped = True
-        self.rest()
+        """Stop at the end of the device's link: release SIN, drop further edges; may be called twice."""
+        self._clock = None
+        if self._sin is not None:
+            self._sin.stop()
+
+    def close(self) -> None:
+        """Release all lines; may be called twice. `tick` does not open them again."""
+        self._closed = True
+        self.stop()
         for watched in self._watched.values():
             watched.close()
 
+    def drain(self) -> None:
+        """Deliver all buffered edges and trigger stamps to the clock. Does not block; one system call per line."""
+        for watched in self._drained:
+            watched.drain()
+        if self._sin is not None:
+            self._sin.drain()
+
+    def set_alarm_ranges(self, ranges: AlarmRanges | None) -> None:
+        """Set what ALARM should indicate by the device's settings; None: not known, and not checked."""
+        self._alarm.set_ranges(ranges)
+
     def trigger_once(self) -> None:
-        """Make one edge on SIN besides those of its rate. Raises CommandError."""
-        if self._trigger is None:
+        """Make one edge on SIN in addition to those of its rate. Raises CommandError."""
+        if self._sin is None:
             raise CommandError("trigger: expected the key sin below lines of the device, got none")
         try:
-            self._trigger.once()
+            self._sin.once()
         except LinkError as error:
             raise CommandError(f"trigger: {error}") from error
 
     @property
     def can_trigger(self) -> bool:
-        """Whether there is a line to SIN."""
-        return self._trigger is not None
+        """Whether SIN is configured."""
+        return self._sin is not None
 
     def status(self, reset: ResetLine | None = None) -> LinesStatus:
-        """How the lines are doing, that of reset included."""
-        problems = {key: watched.problem for key, watched in self._watched.items() if watched.problem}
-        if self._trigger_problem:
-            problems["sin"] = self._trigger_problem
+        """Return state and counters of the lines, with the problem of the reset line."""
+        watched, sin = self._watched, self._sin
+        problems = {key: line.problem for key, line in watched.items() if line.problem}
+        if sin is not None and sin.problem:
+            problems["sin"] = sin.problem
         if reset is not None and reset.problem:
             problems["reset"] = reset.problem
         if self._alarm.problem:
             problems.setdefault("alarm", self._alarm.problem)
-        counts = self._trigger.counts if self._trigger is not None else None
+        counts = sin.counts if sin is not None else TriggerCounts()
         return LinesStatus(
             problems=problems,
-            edges={key: watched.edges for key, watched in self._watched.items()},
-            edges_lost={key: watched.line.edges_lost for key, watched in self._watched.items()},
+            edges={key: line.edges for key, line in watched.items()},
+            edges_lost={key: line.edges_lost for key, line in watched.items()},
             alarm=self._alarm.line.active,
             alarms=self._alarm.line.raised,
-            sin=self._trigger is not None,
-            triggers=counts.edges if counts else 0,
-            triggers_missed=counts.missed if counts else 0,
-            trigger_late_mean_ns=round(counts.mean_late_ns) if counts else 0,
-            trigger_late_worst_ns=counts.worst_late_ns if counts else 0,
-            trigger_late_sum_ns=counts.sum_late_ns if counts else 0,
+            sin=sin is not None,
+            triggers=counts.edges,
+            triggers_missed=counts.missed,
+            trigger_late_mean_ns=round(counts.mean_late_ns),
+            trigger_late_worst_ns=counts.worst_late_ns,
+            trigger_late_sum_ns=counts.sum_late_ns,
         )
 
-    # --- what the lines tell -----------------------------------------------------------------------------------------
+    # --- edges by line -----------------------------------------------------------------------------------------------
 
     def _on_sout(self, edges: Sequence[Edge]) -> None:
         if self._clock is not None:
@@ -176,51 +174,29 @@ class SyncSignals:
             self._clock.triggers(stamps)
 
     def _on_alarm(self, edges: Sequence[Edge]) -> None:
-        self._alarm.edges(edges)
+        self._alarm.line.on_edges(edges)
         self._show_alarm()
 
     def _on_alarm_level(self, active: bool | None) -> None:
-        self._alarm.level(monotonic_ns(), active)
+        self._alarm.line.on_level(self._now_ns(), active)
         self._show_alarm()
 
     def _show_alarm(self) -> None:
-        """In the samples from now on."""
+        """Set the alarm bit of the samples from now on."""
         if self._clock is not None:
             self._clock.own_status = ALARM_STATUS if self._alarm.line.active else None
 
-    def _tell_mark(self, mark: Mark) -> None:
+    def _raise_mark(self, mark: Mark) -> None:
         words = f"sample {mark.seq}" if mark.seq is not None else "a sample that was lost"
         self._raise_event(
             mark.t_ns, EventKind.MARK, f"pulse {mark.number} on SOUT_DIV belongs to {words}",
             t_ns=mark.t_ns, edge_seq=mark.number, seq=mark.seq,
         )  # fmt: skip
 
-    # --- SIN ---------------------------------------------------------------------------------------------------------
-
-    def _start_trigger(self, now_ns: int) -> None:
-        assert self._trigger is not None
-        assert self._sin is not None
-        try:
-            self._sin.open()
-        except LinkError as error:
-            self._end_trigger(error, now_ns)
-            return
-        self._trigger_problem = ""
-        self._triggering = True
-        self._trigger.start(self._on_stamps, self._end_trigger)
-
-    def _end_trigger(self, error: LinkError, now_ns: int | None = None) -> None:
-        assert self._sin is not None
-        self._sin.close()
-        self._triggering = False
-        self._trigger_due_ns = (monotonic_ns() if now_ns is None else now_ns) + RETRY_NS
-        if str(error) != self._trigger_problem:
-            self._trigger_problem = str(error)
-            self._complainer("sin")(self._trigger_problem)
-
-    def _complainer(self, key: str) -> Callable[[str], None]:
-        return lambda problem: self._raise_event(monotonic_ns(), EventKind.LINK, f"line {key}: {problem}", line=key)
+    def _reporter(self, key: str) -> Callable[[str], None]:
+        """Return a function that raises an event about the line."""
+        return lambda message: self._raise_event(self._now_ns(), EventKind.LINK, f"line {key}: {message}", line=key)
 
 
-def _ignore(_active: bool | None) -> None:
-    """The level of a line that tells by its edges."""
+def _ignore_level(_active: bool | None) -> None:
+    """Ignore the level of a line whose edges carry the information."""

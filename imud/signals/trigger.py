@@ -1,7 +1,7 @@
-"""SIN as a trigger: imud makes rising edges on a line at absolute deadlines, and says when each of them was.
+"""SIN as a trigger: imud makes rising edges on a line at absolute deadlines, and time-stamps each of them.
 
-    deadline ─▶ clock, line high, clock ─▶ stamp ─┐ gathered; the loop is woken for them now and then,
-    pulse length ─▶ line low                      ┘ or takes them with `drain` before it feeds what it read
+    deadline ─▶ clock, line high, clock ─▶ stamp ─┐ buffered; the loop is woken for them every HAND_OVER_NS,
+    pulse length ─▶ line low                      ┘ or fetches them with `drain` before it decodes what it read
 
 A device in ONMARK mode answers each rising edge with a frame, 125 µs later on average (HiPNUC manual, 1.2.1).
 """
@@ -10,32 +10,32 @@ import asyncio
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from time import monotonic_ns
 from typing import Final
 
-from imud.contracts.lines import OnLineEnd, OutputLine
+from imud.contracts.lines import OnLineEnd, OutputLine, TriggerSettings
 from imud.contracts.timing import TriggerStamp
 from imud.errors import LinkError
+from imud.signals.watched_line import RETRY_NS
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.worker import BusThread, StartWorker, Worker
 
 PULSE_NS: Final = NS_PER_MS
-"""Length of a pulse, or half a period where that is shorter. The manual names none for triggers; 1 ms passes any level
-shifter."""
+"""Length of a pulse, at most half a period. The manual gives none for triggers; 1 ms passes any level shifter."""
 LATE_SHARE: Final = 4
-"""An edge that cannot be made within a quarter of a period is left out: the next would come too soon after it."""
+"""An edge that would be more than a quarter of a period late is skipped: the next would follow it too soon."""
 HAND_OVER_NS: Final = 50 * NS_PER_MS
-"""The loop is woken for stamps at most so often."""
+"""Least interval between two wake-ups of the loop for stamps."""
 STAMPS_MAX: Final = 10_000
-"""Stamps that wait for a loop that does not run; the oldest go first."""
+"""Capacity of the buffer of stamps while the loop is stalled; the oldest are dropped."""
 IDLE_NS: Final = 60 * NS_PER_S
+"""Sleep of the thread while nothing is due."""
 
 OnStamps = Callable[[Sequence[TriggerStamp]], None]
 """Called in the loop's thread with stamps in their order."""
 
 
 class TriggerCounts:
-    """How a trigger kept its deadlines. Written by its thread, read by any."""
+    """Counters of a trigger. Written by its thread, read by any."""
 
     __slots__ = ("edges", "missed", "singles", "sum_late_ns", "worst_late_ns")
 
@@ -43,26 +43,26 @@ class TriggerCounts:
         self.edges = 0
         """Rising edges made."""
         self.singles = 0
-        """Of these, those that were asked for one by one."""
+        """Of these, those requested one by one."""
         self.missed = 0
-        """Deadlines that were not kept: no edge was made for them."""
+        """Deadlines missed: no edge was made for them."""
         self.sum_late_ns = 0
-        """Time from deadline to edge, summed over the edges that have a deadline."""
+        """Sum of the times from deadline to edge, over the edges that have a deadline."""
         self.worst_late_ns = 0
 
     @property
     def mean_late_ns(self) -> float:
-        """Mean time from deadline to edge, 0 without an edge."""
+        """Mean time from deadline to edge; 0 without edges."""
         return self.sum_late_ns / max(self.edges - self.singles, 1)
 
 
 class SquareWave:
-    """Raises and lowers a line. Synchronization: one thread calls `work`; `once` any."""
+    """Generates pulses on a line. Synchronization: one thread calls `work`; any thread may call `once`."""
 
     def __init__(
         self, line: OutputLine, rate_hz: float, counts: TriggerCounts, now_ns: Callable[[], int], pulse_ns: int
     ) -> None:
-        """The first deadline is now; without a rate there is none."""
+        """The first deadline is now; there are no deadlines if `rate_hz` is 0."""
         self._line, self._counts, self._now_ns = line, counts, now_ns
         self._period_ns = round(NS_PER_S / rate_hz) if rate_hz else 0
         self._pulse_ns = min(pulse_ns, self._period_ns // 2) if rate_hz else pulse_ns
@@ -72,7 +72,7 @@ class SquareWave:
         self._fall_ns: int | None = None
         self._wanted: deque[None] = deque()
         self.stamps: deque[TriggerStamp] = deque(maxlen=STAMPS_MAX)
-        """What was made, oldest first; taken out by the other side."""
+        """Stamps of the edges, oldest first; the consumer removes them."""
 
     @property
     def high(self) -> bool:
@@ -80,11 +80,11 @@ class SquareWave:
         return self._fall_ns is not None
 
     def once(self) -> None:
-        """Make one edge besides those of the rate, as soon as the line is low."""
+        """Request one edge in addition to those of the rate, as soon as the line is low."""
         self._wanted.append(None)
 
     def work(self) -> int:
-        """Do what is due; returns how many ns may pass before it is called again. Raises LinkError."""
+        """Make the edges that are due; return the time until the next call, ns. Raises LinkError."""
         now_ns = self._now_ns()
         if self._fall_ns is not None:
             if now_ns < self._fall_ns:
@@ -98,12 +98,12 @@ class SquareWave:
         if self._period_ns:
             self._pass_over(now_ns)
             if now_ns >= max(self._due_ns, self._rest_until_ns):
-                self._keep()
+                self._raise_on_deadline()
                 return self._pulse_ns
         return self._next_ns() - now_ns
 
     def _next_ns(self) -> int:
-        """When the line is to be raised."""
+        """Return the time of the next rising edge."""
         if self._wanted:
             return self._rest_until_ns
         if self._period_ns:
@@ -111,14 +111,14 @@ class SquareWave:
         return self._now_ns() + IDLE_NS
 
     def _pass_over(self, now_ns: int) -> None:
-        """Count the deadlines that cannot be kept any more, and go to the next."""
+        """Count the deadlines that are missed, and advance to the next."""
         over_ns = now_ns - self._late_ns - self._due_ns
         if over_ns > 0:
             passed = -(-over_ns // self._period_ns)
             self._counts.missed += passed
             self._due_ns += passed * self._period_ns
 
-    def _keep(self) -> None:
+    def _raise_on_deadline(self) -> None:
         counts, due_ns = self._counts, self._due_ns
         self._due_ns += self._period_ns
         self._raise()
@@ -144,18 +144,18 @@ class SquareWave:
 
 
 class Trigger:
-    """Drives an open line from a thread of its own. Synchronization: the loop's thread only."""
+    """Drives an open line from its own thread. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
         line: OutputLine,
         rate_hz: float,
+        now_ns: Callable[[], int],
         *,
-        now_ns: Callable[[], int] = monotonic_ns,
         start_worker: StartWorker = BusThread,
         pulse_ns: int = PULSE_NS,
     ) -> None:
-        """`rate_hz` 0 is for no edges but those of `once`. The line stays its owner's, who opens and closes it."""
+        """With `rate_hz` 0 only `once` makes edges. The caller opens and closes the line."""
         self._line, self._rate_hz, self._pulse_ns = line, rate_hz, pulse_ns
         self._now_ns, self._start_worker = now_ns, start_worker
         self.counts = TriggerCounts()
@@ -164,11 +164,11 @@ class Trigger:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._on_stamps: OnStamps | None = None
         self._on_end: OnLineEnd | None = None
-        self._told_ns = 0
+        self._handed_over_ns = 0
         self._problem: LinkError | None = None
 
     def start(self, on_stamps: OnStamps, on_end: OnLineEnd) -> None:
-        """Make edges from now on. Needs a running loop and an open line."""
+        """Start the thread. Needs a running loop and an open line."""
         self._loop = asyncio.get_running_loop()
         self._on_stamps, self._on_end = on_stamps, on_end
         self._problem = None
@@ -176,14 +176,14 @@ class Trigger:
         self._worker = self._start_worker(f"trigger {self._line.title}", self._round, self._failed)
 
     def once(self) -> None:
-        """Make one edge as soon as the line is low; its stamp comes as those of the others do. Raises LinkError."""
+        """Request one edge as soon as the line is low; its stamp is delivered like the others. Raises LinkError."""
         if self._wave is None or self._worker is None or self._problem is not None:
             raise self._problem or LinkError(f"{self._line.title} is not driven: no edge can be made")
         self._wave.once()
         self._worker.ring()
 
     def drain(self) -> None:
-        """Deliver now the stamps of all edges made so far. Does not wait."""
+        """Deliver the stamps of all edges made so far. Does not block."""
         wave, on_stamps = self._wave, self._on_stamps
         if wave is None or on_stamps is None or not wave.stamps:
             return
@@ -194,12 +194,12 @@ class Trigger:
         on_stamps(found)
 
     def stop(self) -> None:
-        """End the thread, deliver what is left, and leave the line inactive and open; may be called twice."""
+        """End the thread, deliver the remaining stamps, and leave the line inactive and open; may be called twice."""
         if self._worker is None:
             return
         self._worker.end()
         self._worker = None
-        with suppress(LinkError):  # it is gone, and its level with it
+        with suppress(LinkError):  # the line is gone
             self._line.set(False)
         self.drain()
         self._wave = self._on_stamps = self._on_end = None
@@ -218,13 +218,13 @@ class Trigger:
             self._call_loop(self._end)
             return IDLE_NS
         if wave.stamps and not wave.high:
-            self._tell()
+            self._hand_over()
         return rest_ns
 
-    def _tell(self) -> None:
+    def _hand_over(self) -> None:
         now_ns = self._now_ns()
-        if not self._rate_hz or now_ns - self._told_ns >= HAND_OVER_NS:
-            self._told_ns = now_ns
+        if not self._rate_hz or now_ns - self._handed_over_ns >= HAND_OVER_NS:
+            self._handed_over_ns = now_ns
             self._call_loop(self.drain)
 
     def _failed(self, error: BaseException) -> None:
@@ -235,13 +235,79 @@ class Trigger:
 
     def _call_loop(self, callback: Callable[[], None]) -> None:
         assert self._loop is not None
-        with suppress(RuntimeError):  # the loop is closed: nobody is there to be told
+        with suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(callback)
 
     def _end(self) -> None:
         problem, on_end = self._problem, self._on_end
         if problem is None:
-            return  # it was of an earlier start
+            return  # the failure belongs to an earlier start
         self.stop()
         if on_end is not None:
             on_end(problem)
+
+
+class SinTrigger:
+    """Keeps SIN driven: opens the line, runs its `Trigger`, and starts both again after a failure.
+
+    Synchronization: the loop's thread only.
+    """
+
+    def __init__(
+        self,
+        line: OutputLine,
+        settings: TriggerSettings,
+        on_stamps: OnStamps,
+        report: Callable[[str], None],
+        now_ns: Callable[[], int],
+        start_worker: StartWorker,
+    ) -> None:
+        """`report` receives a message when the line fails for a new reason."""
+        self.problem = ""
+        """Why SIN cannot be driven, one sentence; empty if it can."""
+        self._line, self._on_stamps, self._report, self._now_ns = line, on_stamps, report, now_ns
+        pulse_ns = round(settings.pulse_ms * NS_PER_MS)
+        self._trigger = Trigger(line, settings.rate_hz, now_ns, start_worker=start_worker, pulse_ns=pulse_ns)
+        self._running = False
+        self._due_ns = 0
+
+    @property
+    def counts(self) -> TriggerCounts:
+        """Counters since the start."""
+        return self._trigger.counts
+
+    def tick(self, now_ns: int) -> None:
+        """Start to drive the line if that is due. Call it at 10 Hz."""
+        if self._running or now_ns < self._due_ns:
+            return
+        try:
+            self._line.open()
+        except LinkError as error:
+            self._end(error)
+            return
+        self.problem = ""
+        self._running = True
+        self._trigger.start(self._on_stamps, self._end)
+
+    def once(self) -> None:
+        """Make one edge in addition to those of the rate. Raises LinkError."""
+        self._trigger.once()
+
+    def drain(self) -> None:
+        """Deliver the stamps of all edges made so far. Does not block."""
+        self._trigger.drain()
+
+    def stop(self) -> None:
+        """Leave the line inactive and release it; may be called twice. The next `tick` opens it again."""
+        self._trigger.stop()
+        self._line.close()
+        self._running = False
+        self._due_ns = 0
+
+    def _end(self, error: LinkError) -> None:
+        self._line.close()
+        self._running = False
+        self._due_ns = self._now_ns() + RETRY_NS
+        if str(error) != self.problem:
+            self.problem = str(error)
+            self._report(self.problem)

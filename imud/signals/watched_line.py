@@ -1,7 +1,6 @@
-"""One input line that is kept open: what it cannot do now is told once, and tried again."""
+"""An input line that is kept open: a failure is reported once, and the line is opened again when that is possible."""
 
 from collections.abc import Callable, Sequence
-from time import monotonic_ns
 from typing import Final
 
 from imud.contracts.lines import Edge, InputLine, OnEdges
@@ -9,7 +8,7 @@ from imud.errors import LinkError
 from imud.units import NS_PER_S
 
 RETRY_NS: Final = 5 * NS_PER_S
-"""A chip that is not there, or a line that another program has, may be free later."""
+"""Pause before a line is opened again: its chip may return, or another program may release it."""
 
 
 class WatchedLine:
@@ -20,29 +19,38 @@ class WatchedLine:
         line: InputLine,
         on_edges: OnEdges,
         on_level: Callable[[bool | None], None],
-        complain: Callable[[str], None],
+        report: Callable[[str], None],
+        now_ns: Callable[[], int],
         *,
         watch: bool = True,
     ) -> None:
-        """`on_level` is told the level after each opening and after edges were lost, and None when it is gone.
+        """`on_level` receives the level after each opening and after lost edges, and None when the line is closed.
 
-        Without `watch` the loop does not wake up for edges; they are taken by `drain`, and by `tick` when that is rare.
+        `report` receives a message when the line fails for a new reason, and when it is open again. Without `watch` the
+        loop does not wake up for edges; `drain` and `tick` deliver them.
         """
         self.line = line
+        """The input itself."""
         self.problem = ""
-        """Why it is not watched now, one sentence; empty when it is."""
+        """Why the line is not open, one sentence; empty if it is."""
         self.edges = 0
         """Edges delivered since the start."""
         self._on_edges = on_edges
         self._on_level = on_level
-        self._complain = complain
+        self._report = report
+        self._now_ns = now_ns
         self._watch = watch
         self._is_open = False
         self._due_ns = 0
         self._lost = 0
 
+    @property
+    def edges_lost(self) -> int:
+        """Edges that the kernel dropped since the start."""
+        return self.line.edges_lost
+
     def tick(self, now_ns: int) -> None:
-        """Open it if it is due; look at the level again where edges were lost."""
+        """Open the line if that is due; read the level again if edges were lost. Call it at 10 Hz."""
         if not self._is_open:
             if now_ns >= self._due_ns:
                 self._open(now_ns)
@@ -51,15 +59,15 @@ class WatchedLine:
             self.line.drain()
         if self._is_open and self.line.edges_lost != self._lost:
             self._lost = self.line.edges_lost
-            self._ask()
+            self._read_level()
 
     def drain(self) -> None:
-        """Take now what the kernel has."""
+        """Deliver the edges that the kernel has buffered. Does not block."""
         if self._is_open:
             self.line.drain()
 
     def close(self) -> None:
-        """Let go of it; may be called twice. The next `tick` opens it again."""
+        """Release the line; may be called twice. The next `tick` opens it again."""
         self._is_open = False
         self._due_ns = 0
         self.line.close()
@@ -68,7 +76,7 @@ class WatchedLine:
     def _open(self, now_ns: int) -> None:
         try:
             self.line.open()
-            self.line.start(self._take, self._end, self._watch)
+            self.line.start(self._count_edges, self._end, self._watch)
         except LinkError as error:
             self.line.close()
             self._fail(error, now_ns)
@@ -76,26 +84,26 @@ class WatchedLine:
         self._is_open = True
         if self.problem:
             self.problem = ""
-            self._complain("watched again")
-        self._ask()
+            self._report("watched again")
+        self._read_level()
 
-    def _take(self, edges: Sequence[Edge]) -> None:
+    def _count_edges(self, edges: Sequence[Edge]) -> None:
         self.edges += len(edges)
         self._on_edges(edges)
 
-    def _ask(self) -> None:
+    def _read_level(self) -> None:
         try:
             self._on_level(self.line.level())
         except LinkError as error:
             self._end(error)
 
     def _end(self, error: LinkError) -> None:
-        """It is gone."""
+        """Close the line, which is gone."""
         self.close()
-        self._fail(error, monotonic_ns())
+        self._fail(error, self._now_ns())
 
     def _fail(self, error: LinkError, now_ns: int) -> None:
         self._due_ns = now_ns + RETRY_NS
         if str(error) != self.problem:
             self.problem = str(error)
-            self._complain(self.problem)
+            self._report(self.problem)

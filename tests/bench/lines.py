@@ -80,7 +80,7 @@ async def _trigger(
 ) -> tuple[Trigger, Sequence[TriggerStamp], float]:
     line = PipeLine(library(None).ioctl)
     line.open()
-    trigger, stamps, stop = Trigger(line, rate_hz), list[TriggerStamp](), threading.Event()
+    trigger, stamps, stop = Trigger(line, rate_hz, time.monotonic_ns), list[TriggerStamp](), threading.Event()
     load = threading.Thread(target=_compute, args=(stop,))
     if busy:
         load.start()

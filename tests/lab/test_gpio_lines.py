@@ -267,7 +267,7 @@ async def test_sin_has_its_period_and_its_stamps_are_true(gpio_chip: GpioChip) -
 
     with rising_edges(gpio_chip.path.name, gpio_chip.names.index("PPS")) as seen:
         line.open()
-        trigger = Trigger(line, TRIGGER_HZ)
+        trigger = Trigger(line, TRIGGER_HZ, monotonic_ns)
         trigger.start(on_stamps, lambda error: pytest.fail(str(error)))
         await asyncio.wait_for(enough.wait(), LIMIT_S)
         trigger.stop()

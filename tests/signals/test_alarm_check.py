@@ -1,55 +1,29 @@
-"""What the alarm line should say by settings and angles, on the simulated module and by hand."""
+"""The level of the ALARM line against the angles: verdicts on one sample, and over time."""
 
 from math import radians
 
 import pytest
 
-from imud.devices.hipnuc.uart.replies import parse_report
+from imud.contracts.lines import AlarmRange
 from imud.sample import Vector3
 from imud.signals.alarm_check import (
     FAULT_NS,
     MARGIN_DEG,
     SETTLE_NS,
     AlarmCheck,
-    AlarmRange,
     AlarmVerdict,
-    alarm_settings,
     judge,
 )
-from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings
 from imud.units import NS_PER_MS
 
-BOTH = {"X": AlarmRange(-10, 10, True), "Y": AlarmRange(-5, 5, True)}
-ONLY_Y = {"X": AlarmRange(-10, 10, False), "Y": AlarmRange(-5, 5, True)}
+ROLL, PITCH = 0, 1
+BOTH = {"X": AlarmRange(PITCH, -10, 10, True), "Y": AlarmRange(ROLL, -5, 5, True)}
+ONLY_Y = {"X": AlarmRange(PITCH, -10, 10, False), "Y": AlarmRange(ROLL, -5, 5, True)}
 
 
 def angles(x_deg: float, y_deg: float) -> Vector3:
     """Roll is about Y, pitch about X."""
     return radians(y_deg), radians(x_deg), radians(77)
-
-
-def test_the_modules_own_lines_are_read() -> None:
-    settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
-    told = parse_report([*settings.user_lines(), "OK"]).values
-    assert alarm_settings(told) == {"X": AlarmRange(-5, 5.5, False), "Y": AlarmRange(-30.25, 12, True)}
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("PMUX5", "Y,-5,5,0,1", {"Y": AlarmRange(-5, 5, True)}),
-        ("ALARM X", " +1.5 , 2 , 0 , 0 ", {"X": AlarmRange(1.5, 2, False)}),
-        ("pmux5_y", "-5,5,0,1", {"Y": AlarmRange(-5, 5, True)}),
-        ("IO_ALARM", "x,-5,5,0,1", {"X": AlarmRange(-5, 5, True)}),
-        ("PMUX5", "IO9", {}),
-        ("PMUX5", "-5,5,0,1", {}),  # which axis?
-        ("ALARM_X", "-5,5,0,2", {}),
-        ("ALARM_X", "-5,5,1", {}),
-        ("URFR", "1,0,0,0,1,0,0,0,1", {}),
-    ],
-)
-def test_other_forms(name: str, value: str, expected: dict[str, AlarmRange]) -> None:
-    assert alarm_settings({name: value}) == expected
 
 
 @pytest.mark.parametrize(
@@ -88,7 +62,7 @@ def test_only_what_lasts_is_told_and_once() -> None:
     for number in range(1000):
         out = 100 <= number < 200 or number >= 300
         level = 103 <= number < 203  # it lags, and from 300 on the wire is broken
-        change = check.take(number * step_ns, angles(0, 9.0 if out else 0.0), level)
+        change = check.add_sample(number * step_ns, angles(0, 9.0 if out else 0.0), level)
         if change:
             told.append((number, change))
     assert told == [
@@ -104,7 +78,7 @@ def run(levels_of_y: bool, *, stuck: bool = False) -> AlarmVerdict:
     for number in range(4000):
         x_deg, y_deg = (9.0, 0.0) if number % 2000 < 500 else (0.0, 9.0) if number % 2000 < 1000 else (0.0, 0.0)
         level = not stuck and (y_deg if levels_of_y else x_deg) > 5
-        check.take(number * 10 * NS_PER_MS, angles(x_deg, y_deg), level)
+        check.add_sample(number * 10 * NS_PER_MS, angles(x_deg, y_deg), level)
         if number % 2000 == 900:
             verdict = check.verdict
     return verdict
@@ -119,5 +93,5 @@ def test_exchanged_axes_are_told_from_a_line_that_is_not_connected() -> None:
 def test_a_line_that_never_changed_is_not_blamed_on_the_axes() -> None:
     check = AlarmCheck(ONLY_Y)
     for number in range(1000):
-        check.take(number * 10 * NS_PER_MS, angles(0, 9), level=False)
+        check.add_sample(number * 10 * NS_PER_MS, angles(0, 9), level=False)
     assert check.verdict is AlarmVerdict.STUCK_LOW

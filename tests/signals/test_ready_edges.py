@@ -1,4 +1,4 @@
-"""Which edge a read belongs to, told afterwards by stamps alone."""
+"""Which edge a read belongs to, by time stamps alone."""
 
 from math import sqrt
 
@@ -18,13 +18,13 @@ def edge(number: int, t_ns: int | None = None) -> Edge:
 
 def edges(*numbers: int, settings: ReadySettings = EXACT) -> ReadyEdges:
     made = ReadyEdges(settings, MS)
-    made.take([edge(number) for number in numbers])
+    made.on_edges([edge(number) for number in numbers])
     return made
 
 
 def read(made: ReadyEdges, start_ms: float, end_ms: float) -> tuple[int, int] | None:
     """(Number, time in ns) of the edge."""
-    stamp = made.of(round(start_ms * MS), round(end_ms * MS))
+    stamp = made.match(round(start_ms * MS), round(end_ms * MS))
     return (stamp.number, stamp.t_ns) if stamp is not None else None
 
 
@@ -72,7 +72,7 @@ def test_a_read_before_all_edges_and_one_long_after_them_are_of_none() -> None:
 
 
 def test_the_error_is_that_of_the_stamp_and_of_the_assumption() -> None:
-    plain, assumed = edges(1).of(MS, MS + 1), edges(1, settings=ReadySettings(line="Y")).of(MS, MS + 1)
+    plain, assumed = edges(1).match(MS, MS + 1), edges(1, settings=ReadySettings(line="Y")).match(MS, MS + 1)
     assert plain is not None
     assert assumed is not None
     assert plain.err_ns == pytest.approx(3_000, abs=2)
@@ -81,7 +81,7 @@ def test_the_error_is_that_of_the_stamp_and_of_the_assumption() -> None:
 
 @pytest.mark.parametrize(("end_ms", "either"), [(1.999, False), (2.0, True), (2.7, True)])
 def test_new_values_during_a_read_may_be_those_that_were_read(end_ms: float, either: bool) -> None:
-    stamp = edges(1, 2).of(round(1.9 * MS), round(end_ms * MS))
+    stamp = edges(1, 2).match(round(1.9 * MS), round(end_ms * MS))
     assert stamp is not None
     assert stamp.number == 1
     assert stamp.err_ns == pytest.approx(MS / sqrt(2) if either else 3_000, abs=10)
@@ -89,14 +89,15 @@ def test_new_values_during_a_read_may_be_those_that_were_read(end_ms: float, eit
 
 @pytest.mark.parametrize(("offset_us", "t_ns"), [(-400, 600_000), (50, 1_050_000), (500, 1_100_000)])
 def test_the_offset_moves_the_stamp_but_not_behind_the_read(offset_us: float, t_ns: int) -> None:
-    stamp = edges(1, settings=ReadySettings(line="Y", offset_us=offset_us)).of(round(1.1 * MS), 2 * MS)
+    stamp = edges(1, settings=ReadySettings(line="Y", offset_us=offset_us)).match(round(1.1 * MS), 2 * MS)
     assert stamp is not None
     assert stamp.t_ns == t_ns
 
 
-def test_edges_that_nobody_reads_are_forgotten() -> None:
+def test_edges_without_a_read_are_dropped_oldest_first() -> None:
     made = edges(*range(1, 3 * KEPT))
-    assert len(made._edges) == KEPT
+    assert read(made, 2 * KEPT - 0.5, 2 * KEPT - 0.4) is None
+    assert read(made, 2 * KEPT + 0.1, 2 * KEPT + 0.2) == (2 * KEPT, 2 * KEPT * MS)
     assert read(made, 3 * KEPT - 0.9, 3 * KEPT - 0.8) == (3 * KEPT - 1, (3 * KEPT - 1) * MS)
 
 
@@ -105,5 +106,5 @@ def test_a_late_first_read_of_an_edge_is_of_it_up_to_half_a_second() -> None:
     assert read(made, 1.1, 1.2) == (1, MS)
     assert read(made, 400, 401) == (3, 3 * MS)
     assert read(made, 402, 403) is None
-    made.take([edge(4, 500 * MS)])
+    made.on_edges([edge(4, 500 * MS)])
     assert read(made, 1300, 1301) is None

@@ -1,21 +1,19 @@
-"""Reset: how long, how often, and what a cancellation leaves behind; and when a device is reset unasked."""
+"""Reset: how long, how often, and what a cancellation leaves behind; and when a device is reset automatically."""
 
 import asyncio
 from itertools import pairwise
 
 import pytest
 
-from imud.contracts.lines import DeviceLines, LineFactory, ResetSettings
+from imud.contracts.lines import DeviceLines, ResetSettings
 from imud.errors import CommandError, LinkBusy, LinkMissing
-from imud.event import Event
-from imud.ledger import Ledger
-from imud.runtime.notices import Notices
 from imud.signals.reset import AGAIN_NS, ResetLine, make_reset, reset
 from imud.signals.watched_line import RETRY_NS
 from imud.sim.ports.lines import MemoryOutput
 from imud.units import NS_PER_S
 from tests.support.in_loop import in_loop
-from tests.support.virtual_time import VirtualClock, run_virtually
+from tests.support.signal_bench import DEVICE, SignalBench
+from tests.support.virtual_time import run_virtually
 
 SETTINGS = ResetSettings(line="RESET", hold_ms=20)
 
@@ -65,15 +63,21 @@ class Scene:
     """A reset line in virtual time."""
 
     def __init__(self) -> None:
-        self.clock = VirtualClock()
-        self.line = MemoryOutput(now_ns=self.clock.now_ns)
-        self.events: list[Event] = []
-        self.told = 0
-        maker = LineFactory(lambda *_: pytest.fail("an input"), lambda _settings, _purpose: self.line)
-        notices = Notices("imu", Ledger(), self.events.append)
-        made = make_reset("imu", DeviceLines(reset=SETTINGS), maker, notices.tell, self._on_pulse)
+        signals = SignalBench()
+        self.clock, self.events = signals.clock, signals.events
+        self.announced = 0
+        made = make_reset(
+            DEVICE, DeviceLines(reset=SETTINGS), signals.factory, signals.raise_event, self.clock.now_ns, self._on_pulse
+        )
         assert made is not None
         self.reset: ResetLine = made
+        self.line = signals.output("reset")
+        assert signals.memory.inputs == {}
+
+    def tick(self, ahead_ns: int = 0) -> None:
+        """So much time passes."""
+        self.clock.advance(ahead_ns)
+        self.reset.tick(self.clock.now_ns(), None)
 
     @property
     def pulses_s(self) -> list[float]:
@@ -85,12 +89,12 @@ class Scene:
         end_ns = self.clock.now_ns() + seconds * NS_PER_S
         while self.clock.now_ns() < end_ns:
             await asyncio.sleep(every_s)
-            self.reset.tick(self.clock.now_ns())
+            self.tick()
             await self.reset.not_found(self.clock.now_ns())
 
     def _on_pulse(self) -> None:
         assert not self.line.active
-        self.told += 1
+        self.announced += 1
 
 
 @pytest.mark.parametrize(("every_s", "first_s"), [(0.5, 4.5), (6.0, 18.0)])
@@ -100,7 +104,7 @@ def test_after_three_rounds_and_the_time_a_device_needs_and_then_once_a_minute(e
     run_virtually(it.clock, it.search(150, every_s))
     assert it.pulses_s[0] == pytest.approx(first_s, abs=0.01)
     assert all(AGAIN_NS / 1e9 <= b - a < AGAIN_NS / 1e9 + 2 * every_s for a, b in pairwise(it.pulses_s))
-    assert len(it.pulses_s) == it.told == 3
+    assert len(it.pulses_s) == it.announced == 3
     assert it.events[0].message == f"not found for {first_s - every_s:.0f} s: reset by its line"
     assert [event.detail["line"] for event in it.events] == ["reset"] * 3
     held = [b - a for (a, up), (b, _) in pairwise(it.line.history) if up]
@@ -119,11 +123,11 @@ def test_a_device_that_was_found_meanwhile_is_not_reset() -> None:
     assert it.pulses_s == []
 
 
-def test_asked_for_it_is_at_once_and_nobody_searches_before_it_is_over() -> None:
+def test_a_pulse_on_request_is_at_once_and_a_search_waits_for_its_end() -> None:
     it = Scene()
 
     async def body() -> None:
-        it.reset.tick(it.clock.now_ns())
+        it.tick()
         begin_ns = it.clock.now_ns()
         task = asyncio.create_task(it.reset.pulse())
         await asyncio.sleep(0)
@@ -138,27 +142,27 @@ def test_asked_for_it_is_at_once_and_nobody_searches_before_it_is_over() -> None
 
 def test_the_line_is_kept_inactive_and_left_so() -> None:
     it = Scene()
-    it.reset.tick(0)
+    it.tick()
     assert it.line.is_open
     it.reset.close()
     assert not it.line.is_open
-    it.reset.tick(10 * RETRY_NS)
+    it.tick(10 * RETRY_NS)
     assert not it.line.is_open
     assert it.line.history == []
 
 
 @in_loop
-async def test_a_line_that_another_program_has_is_told_once_and_tried_again() -> None:
+async def test_a_line_that_another_program_has_is_reported_once_and_tried_again() -> None:
     it = Scene()
     it.line.open_error = LinkBusy("in use by gpioset")
-    for now_ns in range(0, 3 * RETRY_NS, RETRY_NS // 2):
-        it.reset.tick(now_ns)
+    for _ in range(6):
+        it.tick(RETRY_NS // 2)
     assert [event.message for event in it.events] == ["line reset: in use by gpioset"]
     assert it.reset.problem == "in use by gpioset"
     with pytest.raises(CommandError, match="in use by gpioset"):
         await it.reset.pulse()
     it.line.open_error = None
-    it.reset.tick(4 * RETRY_NS)
+    it.tick(RETRY_NS)
     assert it.line.is_open
     assert not it.reset.problem
 
@@ -166,12 +170,12 @@ async def test_a_line_that_another_program_has_is_told_once_and_tried_again() ->
 @in_loop
 async def test_a_line_that_fails_when_it_is_driven() -> None:
     it = Scene()
-    it.reset.tick(0)
+    it.tick()
     it.line.set_error = LinkMissing("gone")
     with pytest.raises(CommandError, match="gone"):
         await it.reset.pulse()
     assert it.reset.problem == "gone"
     assert not it.line.is_open
     it.line.set_error = None
-    it.reset.tick(RETRY_NS)
+    it.tick(RETRY_NS)
     assert it.line.is_open

@@ -1,6 +1,6 @@
-"""The lines of one device one by one: who is told what and when, what fails, and that nothing is held afterwards."""
+"""The lines of one device one by one: what reaches the clock and when, what fails, and that all lines are released."""
 
-from collections.abc import Sequence
+import asyncio
 
 import pytest
 
@@ -15,18 +15,13 @@ from imud.contracts.lines import (
     TriggerSettings,
 )
 from imud.errors import CommandError, LinkBusy, LinkError
-from imud.event import Event, EventKind
-from imud.ledger import Ledger
-from imud.runtime.notices import Notices
+from imud.event import EventKind
 from imud.sample import Measurement
-from imud.signals import sync_signals as wires_module
 from imud.signals.sync_signals import ALARM_STATUS, SyncSignals
-from imud.signals.trigger import Trigger
 from imud.signals.watched_line import RETRY_NS
-from imud.sim.ports.lines import MemoryInput, MemoryLines
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.in_loop import in_loop
-from tests.support.virtual_time import LoopWorker, VirtualClock
+from tests.support.signal_bench import DEVICE, SignalBench
 
 ALL = DeviceLines(
     sout=SoutSettings(line="A"),
@@ -37,214 +32,194 @@ ALL = DeviceLines(
 )
 
 
-class Bench:
-    """SyncSignals, their far ends, and what they tell."""
+class Bench(SignalBench):
+    """SyncSignals on a device's clock."""
 
-    def __init__(self, lines: DeviceLines = ALL, clock: VirtualClock | None = None) -> None:
-        self.time = clock or VirtualClock()
-        self.memory = MemoryLines(self.time.now_ns)
-        self.events: list[Event] = []
+    def __init__(self, lines: DeviceLines = ALL) -> None:
+        super().__init__()
         self.pulses: list[Edge] = []
-        notices = Notices("bow", Ledger(), self.events.append)
-        self.wires = SyncSignals("bow", lines, self.memory.maker, notices.tell, self._on_pulses)
-        self.clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
-
-    def _on_pulses(self, edges: Sequence[Edge]) -> None:
-        self.pulses += edges
-
-    def line(self, key: str) -> MemoryInput:
-        return self.memory.inputs[f"bow {key}"]
+        self.signals = SyncSignals(
+            DEVICE, lines, self.factory, self.raise_event, self.clock.now_ns, on_pulses=self.pulses.extend
+        )
+        self.sample_clock = sample_clock()
 
     def start(self) -> None:
-        self.wires.start(self.clock)
+        self.signals.start(self.sample_clock)
 
     def tick(self, ahead_ns: int = 0) -> None:
-        self.time.advance(ahead_ns)
-        self.wires.tick(self.time.now_ns())
+        self.clock.advance(ahead_ns)
+        self.signals.tick(self.clock.now_ns(), None)
 
     def status_of_sample(self, own: int | None) -> int | None:
-        now_ns = self.time.now_ns()
-        return self.clock.sample(Measurement(82, 0, now_ns // NS_PER_MS, status=own), now_ns, 0).status
+        now_ns = self.clock.now_ns()
+        return self.sample_clock.sample(Measurement(82, 0, now_ns // NS_PER_MS, status=own), now_ns, 0).status
 
 
-@pytest.fixture(autouse=True)
-def time(monkeypatch: pytest.MonkeyPatch) -> VirtualClock:
-    made = VirtualClock()
-    made.stand_for_monotonic(monkeypatch, "imud.signals.sync_signals", "imud.signals.watched_line")
-
-    def virtual(*arguments: object, **more: object) -> Trigger:
-        return Trigger(*arguments, now_ns=made.now_ns, start_worker=LoopWorker, **more)  # type: ignore[arg-type]  # as given
-
-    monkeypatch.setattr(wires_module, "Trigger", virtual)
-    return made
+def sample_clock() -> SampleClock:
+    return SampleClock(DEVICE, tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
 
 
 @in_loop
-async def test_lines_are_watched_before_there_is_a_clock_and_told_to_it_afterwards(time: VirtualClock) -> None:
-    bench = Bench(clock=time)
+async def test_lines_are_watched_before_there_is_a_clock_and_delivered_to_it_afterwards() -> None:
+    bench = Bench()
     assert not any(line.is_open for line in bench.memory.inputs.values())
     bench.tick()
     assert all(line.is_open for line in bench.memory.inputs.values())
-    assert not bench.memory.outputs["bow sin"].is_open
-    bench.line("sout").pulse(time.now_ns(), 80_000)
-    bench.wires.drain()
-    assert bench.clock.status().edges == 0
+    assert not bench.output("sin").is_open
+    bench.input("sout").pulse(bench.clock.now_ns(), 80_000)
+    bench.signals.drain()
+    assert bench.sample_clock.status().edges == 0
     bench.start()
-    assert bench.memory.outputs["bow sin"].is_open
+    assert bench.output("sin").is_open
     for key in ("sout", "sout_div", "pps"):
-        bench.line(key).pulse(time.now_ns(), 80_000)
-    assert bench.clock.status().edges == 0
-    bench.wires.drain()  # now, not when the loop comes round
-    assert bench.clock.status().edges == 1
+        bench.input(key).pulse(bench.clock.now_ns(), 80_000)
+    assert bench.sample_clock.status().edges == 0
+    bench.signals.drain()  # now, not when the loop comes round
+    assert bench.sample_clock.status().edges == 1
     assert [edge.rising for edge in bench.pulses] == [True]  # the falling edges are not even asked for
-    status = bench.wires.status()
+    status = bench.signals.status()
     assert status.edges == {"sout": 2, "sout_div": 1, "pps": 1, "alarm": 0}
     assert status.edges_lost == {"sout": 0, "sout_div": 0, "pps": 0, "alarm": 0}
-    bench.line("pps").lose(4)
-    assert bench.wires.status().edges_lost["pps"] == 4
-    bench.wires.stop()
+    bench.input("pps").lose(4)
+    assert bench.signals.status().edges_lost["pps"] == 4
+    bench.signals.close()
 
 
 @in_loop
-async def test_the_alarm_is_in_the_samples_of_whatever_clock(time: VirtualClock) -> None:
-    bench = Bench(DeviceLines(alarm=InputSettings(line="D")), time)
+async def test_the_alarm_is_in_the_samples_of_whatever_clock() -> None:
+    bench = Bench(DeviceLines(alarm=InputSettings(line="D")))
     bench.start()
     assert bench.status_of_sample(None) is None
     assert bench.status_of_sample(5) == 5
-    bench.line("alarm").edge(time.now_ns(), True)
-    bench.line("alarm").drain()
+    bench.input("alarm").edge(bench.clock.now_ns(), True)
+    bench.input("alarm").drain()
     assert bench.status_of_sample(None) == ALARM_STATUS
     assert bench.status_of_sample(5) == ALARM_STATUS | 5
-    bench.clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
+    bench.sample_clock = sample_clock()
     bench.start()
     assert bench.status_of_sample(5) == ALARM_STATUS | 5
-    bench.line("alarm").edge(time.now_ns(), False)
-    bench.line("alarm").drain()
+    bench.input("alarm").edge(bench.clock.now_ns(), False)
+    bench.input("alarm").drain()
     assert bench.status_of_sample(5) == 5
-    bench.line("alarm").edge(time.now_ns(), True)
-    bench.line("alarm").drain()
-    bench.line("alarm").vanish(LinkError("gone"))
+    bench.input("alarm").edge(bench.clock.now_ns(), True)
+    bench.input("alarm").drain()
+    bench.input("alarm").vanish(LinkError("gone"))
     assert bench.status_of_sample(5) == 5
-    status = bench.wires.status()
+    status = bench.signals.status()
     assert (status.alarm, status.alarms, status.problems) == (None, 2, {"alarm": "gone"})
-    assert [event.message for event in bench.events if event.kind is EventKind.LINK] == ["line alarm: gone"]
-    bench.wires.stop()
+    assert bench.messages(EventKind.LINK) == ["line alarm: gone"]
+    bench.signals.close()
 
 
 @in_loop
-async def test_one_edge_by_command(time: VirtualClock) -> None:
-    bench = Bench(clock=time)
-    assert bench.wires.can_trigger
+async def test_one_edge_by_command() -> None:
+    bench = Bench()
+    assert bench.signals.can_trigger
     with pytest.raises(CommandError, match="trigger: bow sin is not driven"):
-        bench.wires.trigger_once()
+        bench.signals.trigger_once()
     bench.start()
-    bench.wires.trigger_once()
-    worker = bench.wires._trigger
-    assert worker is not None
-    worker._round()
+    bench.signals.trigger_once()
+    (worker,) = bench.workers
+    worker.work()
     for _ in range(2):
-        assert bench.memory.outputs["bow sin"].active
-        time.advance(NS_PER_MS)
-        worker._round()
-    history = bench.memory.outputs["bow sin"].history
+        assert bench.output("sin").active
+        bench.clock.advance(NS_PER_MS)
+        worker.work()
+    history = bench.output("sin").history
     assert [level for _, level in history] == [True, False]
     assert history[1][0] - history[0][0] == 2 * NS_PER_MS  # pulse_ms
-    bench.wires.drain()
-    status = bench.wires.status()
-    assert (status.sin, status.triggers, bench.clock.status().edges) == (True, 1, 1)
-    bench.wires.stop()
-    assert not bench.memory.outputs["bow sin"].is_open
+    bench.signals.drain()
+    status = bench.signals.status()
+    assert (status.sin, status.triggers, bench.sample_clock.status().edges) == (True, 1, 1)
+    bench.signals.close()
+    assert not bench.output("sin").is_open
 
 
 @in_loop
-async def test_without_sin_there_is_nothing_to_trigger(time: VirtualClock) -> None:
-    bench = Bench(DeviceLines(sout=SoutSettings(line="A")), time)
-    assert not bench.wires.can_trigger
+async def test_without_sin_there_is_nothing_to_trigger() -> None:
+    bench = Bench(DeviceLines(sout=SoutSettings(line="A")))
+    assert not bench.signals.can_trigger
     with pytest.raises(CommandError, match="expected the key sin"):
-        bench.wires.trigger_once()
-    assert bench.wires.status().sin is False
+        bench.signals.trigger_once()
+    assert bench.signals.status().sin is False
 
 
 @in_loop
-async def test_sin_that_cannot_be_had_is_told_once_and_tried_again(time: VirtualClock) -> None:
-    bench = Bench(clock=time)
-    output = bench.memory.maker.make_output(ALL.sin, "bow sin")
-    assert output is bench.memory.outputs["bow sin"]
-    bench.memory.outputs["bow sin"].open_error = LinkBusy("line 5 is in use")
+async def test_sin_that_cannot_be_had_is_reported_once_and_tried_again() -> None:
+    bench = Bench()
+    bench.output("sin").open_error = LinkBusy("line 5 is in use")
     bench.start()
     bench.tick(RETRY_NS - 1)
     bench.tick(RETRY_NS)
-    assert [event.message for event in bench.events] == ["line sin: line 5 is in use"]
-    assert bench.wires.status().problems == {"sin": "line 5 is in use"}
-    bench.memory.outputs["bow sin"].open_error = None
+    assert bench.messages() == ["line sin: line 5 is in use"]
+    assert bench.signals.status().problems == {"sin": "line 5 is in use"}
+    bench.output("sin").open_error = None
     bench.tick(RETRY_NS)
-    assert bench.wires.status().problems == {}
-    bench.wires.trigger_once()
-    bench.wires.stop()
+    assert bench.signals.status().problems == {}
+    bench.signals.trigger_once()
+    bench.signals.close()
 
 
 @in_loop
-async def test_sin_that_breaks_while_driven_is_driven_again(time: VirtualClock) -> None:
-    bench = Bench(clock=time)
+async def test_sin_that_breaks_while_driven_is_driven_again() -> None:
+    bench = Bench()
     bench.start()
-    output = bench.memory.outputs["bow sin"]
+    output = bench.output("sin")
     output.set_error = LinkError("SIN is gone")
-    bench.wires.trigger_once()
-    trigger = bench.wires._trigger
-    assert trigger is not None
-    trigger._round()
-    trigger._end()
-    assert bench.wires.status().problems == {"sin": "SIN is gone"}
+    bench.signals.trigger_once()
+    bench.workers[0].work()
+    await asyncio.sleep(0)
+    assert bench.signals.status().problems == {"sin": "SIN is gone"}
     assert not output.is_open
     output.set_error = None
     bench.tick(RETRY_NS - 1)
     assert not output.is_open
     bench.tick(1)
     assert output.is_open
-    assert bench.wires.status().problems == {}
-    bench.wires.stop()
+    assert bench.signals.status().problems == {}
+    bench.signals.close()
 
 
 @in_loop
-async def test_at_the_end_of_the_link_sin_rests_and_edges_are_for_nobody(time: VirtualClock) -> None:
-    bench = Bench(clock=time)
+async def test_at_the_end_of_the_link_sin_is_released_and_edges_are_dropped() -> None:
+    bench = Bench()
     bench.start()
-    bench.wires.rest()
-    assert not bench.memory.outputs["bow sin"].is_open
-    assert bench.line("sout").is_open
-    bench.line("sout").pulse(time.now_ns(), 80_000)
-    bench.wires.drain()
-    assert bench.clock.status().edges == 0
+    bench.signals.stop()
+    assert not bench.output("sin").is_open
+    assert bench.input("sout").is_open
+    bench.input("sout").pulse(bench.clock.now_ns(), 80_000)
+    bench.signals.drain()
+    assert bench.sample_clock.status().edges == 0
     bench.tick(NS_PER_S)
-    assert not bench.memory.outputs["bow sin"].is_open
+    assert not bench.output("sin").is_open
     bench.start()
-    assert bench.memory.outputs["bow sin"].is_open
-    bench.wires.stop()
+    assert bench.output("sin").is_open
+    bench.signals.close()
 
 
 @in_loop
-async def test_what_was_stopped_stays_stopped(time: VirtualClock) -> None:
-    """A replay that came to its end is looked at ten times a second as before."""
-    bench = Bench(clock=time)
+async def test_closed_lines_stay_closed() -> None:
+    """A replay that came to its end is ticked ten times a second as before."""
+    bench = Bench()
     bench.start()
-    bench.wires.stop()
-    bench.wires.stop()
+    bench.signals.close()
+    bench.signals.close()
     bench.tick(RETRY_NS)
     assert not any(line.is_open for line in bench.memory.inputs.values())
-    assert not bench.memory.outputs["bow sin"].is_open
+    assert not bench.output("sin").is_open
 
 
 @in_loop
-async def test_marks_are_told_with_their_samples(time: VirtualClock) -> None:
-    bench = Bench(DeviceLines(sout_div=DividedSettings(line="B")), time)
+async def test_marks_are_raised_with_their_samples() -> None:
+    bench = Bench(DeviceLines(sout_div=DividedSettings(line="B")))
     bench.start()
     for i in range(60):
-        time.advance(10 * NS_PER_MS)
+        bench.clock.advance(10 * NS_PER_MS)
         if i % 8 == 0:
-            bench.line("sout_div").pulse(time.now_ns(), 80_000)
-        bench.wires.drain()
-        time.advance(100_000)
-        bench.clock.sample(Measurement(82, 0, time.now_ns() // NS_PER_MS), time.now_ns(), 0)
+            bench.input("sout_div").pulse(bench.clock.now_ns(), 80_000)
+        bench.signals.drain()
+        bench.clock.advance(100_000)
+        bench.sample_clock.sample(Measurement(82, 0, bench.clock.now_ns() // NS_PER_MS), bench.clock.now_ns(), 0)
     bench.tick()
     marks = [event for event in bench.events if event.kind is EventKind.MARK]
     last = marks[-1]
@@ -252,5 +227,5 @@ async def test_marks_are_told_with_their_samples(time: VirtualClock) -> None:
     assert last.detail["seq"] == 57
     assert last.message == "pulse 8 on SOUT_DIV belongs to sample 57"
     bench.tick()
-    assert len([event for event in bench.events if event.kind is EventKind.MARK]) == len(marks)
-    bench.wires.stop()
+    assert len(bench.messages(EventKind.MARK)) == len(marks)
+    bench.signals.close()

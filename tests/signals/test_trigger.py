@@ -1,7 +1,8 @@
 """SIN: deadlines without drift, honest stamps, and what is left out when there is no time."""
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from time import monotonic_ns
 
 import pytest
 
@@ -10,8 +11,8 @@ from imud.errors import LinkError, LinkMissing
 from imud.signals.trigger import IDLE_NS, PULSE_NS, STAMPS_MAX, SquareWave, Trigger, TriggerCounts
 from imud.sim.ports.lines import MemoryOutput
 from imud.units import NS_PER_MS, NS_PER_S
-from imud.worker import Round
 from tests.support.in_loop import in_loop
+from tests.support.signal_bench import SignalBench
 
 LIMIT_S = 10
 CALL_NS = 2_000
@@ -128,7 +129,7 @@ def test_a_pulse_that_lasted_too_long_gets_its_pause() -> None:
     assert bench.counts.missed == 1
 
 
-def test_without_a_rate_there_are_only_the_edges_asked_for() -> None:
+def test_without_a_rate_there_are_only_the_edges_requested() -> None:
     bench = Bench(0.0)
     assert bench.wave.work() > IDLE_NS - NS_PER_MS
     bench.wave.once()
@@ -151,7 +152,7 @@ def test_a_single_edge_between_those_of_the_rate() -> None:
     assert bench.counts.worst_late_ns < 10 * CALL_NS
 
 
-def test_stamps_that_nobody_takes_are_given_up_oldest_first() -> None:
+def test_stamps_that_are_not_fetched_are_dropped_oldest_first() -> None:
     bench = Bench(1000.0)
     bench.run((STAMPS_MAX + 50) * NS_PER_MS)
     assert len(bench.wave.stamps) == STAMPS_MAX
@@ -161,36 +162,18 @@ def test_stamps_that_nobody_takes_are_given_up_oldest_first() -> None:
 # --- the thread and the loop ------------------------------------------------------------------------------------------
 
 
-class HandWorker:
-    """A worker that the test turns."""
-
-    def __init__(self, _name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
-        self.work, self.failed = work, failed
-        self.rung = 0
-        self.ended = False
-
-    def ring(self) -> None:
-        self.rung += 1
-
-    def end(self) -> None:
-        self.ended = True
-
-
 class Rig:
-    """A trigger whose thread is the test."""
+    """A trigger whose thread the test runs."""
 
     def __init__(self, rate_hz: float) -> None:
         self.time = Time()
         self.line = MemoryOutput(now_ns=lambda: self.time.t_ns)
         self.line.open()
-        self.workers: list[HandWorker] = []
-        self.trigger = Trigger(self.line, rate_hz, now_ns=self.time, start_worker=self._worker)
+        signals = SignalBench()
+        self.workers = signals.workers
+        self.trigger = Trigger(self.line, rate_hz, self.time, start_worker=signals.start_worker)
         self.batches: list[Sequence[TriggerStamp]] = []
         self.ends: list[LinkError] = []
-
-    def _worker(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> HandWorker:
-        self.workers.append(HandWorker(name, work, failed))
-        return self.workers[-1]
 
     def start(self) -> None:
         self.trigger.start(self.batches.append, self.ends.append)
@@ -229,7 +212,7 @@ async def test_drain_delivers_at_once_and_each_stamp_once() -> None:
 
 
 @in_loop
-async def test_a_single_edge_is_told_without_waiting_for_more() -> None:
+async def test_a_single_edge_is_delivered_without_waiting_for_more() -> None:
     rig = Rig(0.0)
     with pytest.raises(LinkError, match="is not driven"):
         rig.trigger.once()
@@ -278,7 +261,7 @@ async def test_a_line_that_vanishes_ends_the_trigger_once() -> None:
 
 
 @in_loop
-async def test_news_of_an_earlier_end_does_not_stop_a_new_start() -> None:
+async def test_a_failure_of_an_earlier_start_does_not_stop_a_new_start() -> None:
     rig = Rig(100.0)
     rig.start()
     rig.line.set_error = LinkMissing("pulled out")
@@ -315,7 +298,7 @@ async def test_on_a_real_thread() -> None:
         if len(found) >= 5:
             enough.set()
 
-    trigger = Trigger(line, 200.0)
+    trigger = Trigger(line, 200.0, monotonic_ns)
     trigger.start(on_stamps, lambda error: pytest.fail(str(error)))
     trigger.once()
     await asyncio.wait_for(enough.wait(), LIMIT_S)

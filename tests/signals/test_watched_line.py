@@ -1,8 +1,6 @@
-"""A line that is kept open: opened when due, its troubles told once, its level asked for when it may have changed."""
+"""A line that is kept open: opened when due, failures reported once, its level read when it may have changed."""
 
 import asyncio
-
-import pytest
 
 from imud.contracts.lines import Edge
 from imud.errors import LinkBusy, LinkError, LinkMissing
@@ -14,90 +12,86 @@ from tests.support.virtual_time import VirtualClock
 BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
 
 
-class Bench:
-    """One watched line and everything it tells."""
+class Watched:
+    """One watched line and everything it delivers and reports."""
 
     def __init__(self, line: MemoryInput | None = None) -> None:
+        self.clock = VirtualClock()
         self.line = line or MemoryInput()
         self.edges: list[Edge] = []
         self.levels: list[bool | None] = []
-        self.told: list[str] = []
-        self.watched = WatchedLine(self.line, self.edges.extend, self.levels.append, self.told.append)
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> VirtualClock:
-    made = VirtualClock()
-    made.stand_for_monotonic(monkeypatch, "imud.signals.watched_line")
-    return made
+        self.reports: list[str] = []
+        self.watched = WatchedLine(
+            self.line, self.edges.extend, self.levels.append, self.reports.append, self.clock.now_ns
+        )
 
 
 @in_loop
-async def test_it_is_opened_at_once_and_its_level_told() -> None:
-    bench = Bench()
-    bench.watched.drain()  # before it is open there is nothing
-    bench.watched.tick(0)
-    assert bench.line.is_open
-    assert bench.levels == [False]
-    bench.line.edge(10, True)
-    bench.watched.drain()
-    bench.line.edge(20, False)
+async def test_it_is_opened_at_once_and_its_level_read() -> None:
+    it = Watched()
+    it.watched.drain()  # before it is open there is nothing
+    it.watched.tick(0)
+    assert it.line.is_open
+    assert it.levels == [False]
+    it.line.edge(10, True)
+    it.watched.drain()
+    it.line.edge(20, False)
     await asyncio.sleep(0)
-    assert bench.edges == [Edge(10, True, 1), Edge(20, False, 2)]
-    assert (bench.watched.edges, bench.told, bench.watched.problem) == (2, [], "")
-    bench.watched.tick(1)
-    assert bench.levels == [False]  # edges say the rest
+    assert it.edges == [Edge(10, True, 1), Edge(20, False, 2)]
+    assert (it.watched.edges, it.reports, it.watched.problem) == (2, [], "")
+    it.watched.tick(1)
+    assert it.levels == [False]  # edges say the rest
 
 
 @in_loop
-async def test_a_line_that_cannot_be_had_is_told_once_and_tried_again() -> None:
-    bench = Bench()
-    bench.line.open_error = BUSY
-    bench.watched.tick(0)
-    bench.watched.tick(RETRY_NS - 1)
-    assert bench.told == [str(BUSY)]
-    bench.watched.tick(RETRY_NS)
-    assert bench.told == [str(BUSY)]
-    bench.line.open_error = LinkMissing("gpiochip0 is not there")
-    bench.watched.tick(2 * RETRY_NS)
-    assert bench.told[1:] == ["gpiochip0 is not there"]
-    assert bench.watched.problem == "gpiochip0 is not there"
-    bench.line.open_error = None
-    bench.watched.tick(3 * RETRY_NS - 1)
-    assert not bench.line.is_open
-    bench.watched.tick(3 * RETRY_NS)
-    assert bench.line.is_open
-    assert bench.watched.problem == ""
-    assert bench.told[2:] == ["watched again"]
-    assert bench.levels == [False]
+async def test_a_line_that_cannot_be_had_is_reported_once_and_tried_again() -> None:
+    it = Watched()
+    it.line.open_error = BUSY
+    it.watched.tick(0)
+    it.watched.tick(RETRY_NS - 1)
+    assert it.reports == [str(BUSY)]
+    it.watched.tick(RETRY_NS)
+    assert it.reports == [str(BUSY)]
+    it.line.open_error = LinkMissing("gpiochip0 is not there")
+    it.watched.tick(2 * RETRY_NS)
+    assert it.reports[1:] == ["gpiochip0 is not there"]
+    assert it.watched.problem == "gpiochip0 is not there"
+    it.line.open_error = None
+    it.watched.tick(3 * RETRY_NS - 1)
+    assert not it.line.is_open
+    it.watched.tick(3 * RETRY_NS)
+    assert it.line.is_open
+    assert it.watched.problem == ""
+    assert it.reports[2:] == ["watched again"]
+    assert it.levels == [False]
 
 
 @in_loop
-async def test_a_line_that_goes_is_nobodys_level_and_comes_back(clock: VirtualClock) -> None:
-    bench = Bench()
-    bench.watched.tick(clock.now_ns())
-    bench.line.edge(5, True)
-    bench.line.vanish(LinkMissing("it was pulled out"))
-    assert bench.levels == [False, None]
-    assert bench.told == ["it was pulled out"]
-    bench.watched.tick(clock.now_ns() + RETRY_NS - 1)
-    assert not bench.line.is_open
-    bench.watched.tick(clock.now_ns() + RETRY_NS)
-    assert bench.levels == [False, None, True]
-    bench.line.edge(30, False)
-    bench.watched.drain()
-    assert bench.edges == [Edge(30, False, 2)]  # numbers go on; the one that was not delivered shows
+async def test_a_line_that_goes_has_no_level_and_comes_back() -> None:
+    it = Watched()
+    it.watched.tick(it.clock.now_ns())
+    it.line.edge(5, True)
+    it.line.vanish(LinkMissing("it was pulled out"))
+    assert it.levels == [False, None]
+    assert it.reports == ["it was pulled out"]
+    it.watched.tick(it.clock.now_ns() + RETRY_NS - 1)
+    assert not it.line.is_open
+    it.watched.tick(it.clock.now_ns() + RETRY_NS)
+    assert it.levels == [False, None, True]
+    it.line.edge(30, False)
+    it.watched.drain()
+    assert it.edges == [Edge(30, False, 2)]  # numbers go on; the one that was not delivered shows
 
 
 @in_loop
-async def test_after_lost_edges_the_level_is_asked_once() -> None:
-    bench = Bench()
-    bench.watched.tick(0)
-    bench.line.edge(5, True)
-    bench.line.lose(3)
-    bench.watched.tick(1)
-    bench.watched.tick(2)
-    assert bench.levels == [False, True]
+async def test_after_lost_edges_the_level_is_read_once() -> None:
+    it = Watched()
+    it.watched.tick(0)
+    it.line.edge(5, True)
+    it.line.lose(3)
+    it.watched.tick(1)
+    it.watched.tick(2)
+    assert it.levels == [False, True]
 
 
 class Blind(MemoryInput):
@@ -108,21 +102,21 @@ class Blind(MemoryInput):
 
 
 @in_loop
-async def test_a_level_that_cannot_be_read_ends_it(clock: VirtualClock) -> None:
-    bench = Bench(Blind())
-    bench.watched.tick(clock.now_ns())
-    assert not bench.line.is_open
-    assert bench.watched.problem == "no level"
-    assert bench.levels == [None]
+async def test_a_level_that_cannot_be_read_ends_it() -> None:
+    it = Watched(Blind())
+    it.watched.tick(it.clock.now_ns())
+    assert not it.line.is_open
+    assert it.watched.problem == "no level"
+    assert it.levels == [None]
 
 
 @in_loop
-async def test_closing_is_no_trouble_and_the_next_look_opens_again() -> None:
-    bench = Bench()
-    bench.watched.tick(0)
-    bench.watched.close()
-    bench.watched.close()
-    assert not bench.line.is_open
-    assert bench.told == []
-    bench.watched.tick(1)
-    assert bench.line.is_open
+async def test_closing_is_no_failure_and_the_next_look_opens_again() -> None:
+    it = Watched()
+    it.watched.tick(0)
+    it.watched.close()
+    it.watched.close()
+    assert not it.line.is_open
+    assert it.reports == []
+    it.watched.tick(1)
+    assert it.line.is_open

@@ -17,8 +17,6 @@ from imud.runtime import utc_keeper
 from imud.runtime.detection.remembered import Remembered
 from imud.runtime.stream.runner import DeviceRunner
 from imud.sample import Sample
-from imud.signals import sync_signals as wires_module
-from imud.signals.trigger import Trigger
 from imud.sim.hipnuc.uart.hardware import HipnucHardware
 from imud.sim.hipnuc.uart.settings import ModuleSettings
 from imud.sim.hipnuc.uart.simulator import HipnucModule
@@ -44,8 +42,6 @@ CLOCKED = (
     "imud.runtime.stream.runner",
     "imud.runtime.path",
     "imud.runtime.exchange",
-    "imud.signals.watched_line",
-    "imud.signals.sync_signals",
 )
 
 
@@ -105,15 +101,14 @@ class Wired:
         """Run the device while the story is told; at the end the ledger closes and the lines are released."""
         clock = self.clock
         clock.stand_for_monotonic(monkeypatch, *CLOCKED)
-        monkeypatch.setattr(wires_module, "Trigger", partial(Trigger, now_ns=clock.now_ns, start_worker=LoopWorker))
         monkeypatch.setattr(utc_keeper, "RmcFeed", partial(RmcFeed, now_ns=clock.now_ns))
         monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _make_port: self.source})
         monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 0, 0))
         run_virtually(clock, self._play(story))
 
     async def _play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        maker = LineFactory(self.memory.input, self._output)
-        self.runner = DeviceRunner(self._config, 7, self._publish, self.events.append, Remembered(None), lines=maker)
+        factory = LineFactory(self.memory.input, self._output, LoopWorker)
+        self.runner = DeviceRunner(self._config, 7, self._publish, self.events.append, Remembered(None), lines=factory)
         assert isinstance(self.runner.link, MemoryLink)
         self.link = self.runner.link
         self.power_on()
@@ -133,8 +128,8 @@ class Wired:
             if not isinstance(end, asyncio.CancelledError):
                 raise AssertionError(end) from end
         assert self.runner.ledger.closes()
-        wires: Sequence[MemoryInput | MemoryOutput] = [*self.memory.inputs.values(), *self.memory.outputs.values()]
-        assert not any(wire.is_open for wire in wires)
+        lines: Sequence[MemoryInput | MemoryOutput] = [*self.memory.inputs.values(), *self.memory.outputs.values()]
+        assert not any(line.is_open for line in lines)
 
     # --- what a story may do -----------------------------------------------------------------------------------------
 

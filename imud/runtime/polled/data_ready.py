@@ -1,6 +1,6 @@
 """The data-ready line of a polled device: an edge has the bus's thread read at once, and is the time of what was read.
 
-    edge ──kernel stamp──▶ loop ──ReadySchedule.seen──▶ bus's thread: read ──▶ loop: drain, ReadyEdges.of ──▶ clock
+    edge ──kernel stamp──▶ loop ──ReadySchedule.seen──▶ bus's thread: read ──▶ loop: drain, ReadyEdges.match ──▶ clock
 
 The edges up to the end of a read are taken from the kernel before it is said which of them the read is of.
 """
@@ -33,7 +33,7 @@ class DataReady:
         self._notices = notices
         self._now_ns = 0
         line = maker.make_input(_rising(settings), f"{device} data_ready", True)
-        self.watched = WatchedLine(line, self._on_edges, _ignore, self._complain)
+        self.watched = WatchedLine(line, self._on_edges, _ignore, self._complain, lambda: self._now_ns)
         self.edges = ReadyEdges(settings, round(NS_PER_S / rate_hz))
         self._member: Member | None = None
         self._schedule: ReadySchedule | None = None
@@ -86,7 +86,7 @@ class DataReady:
         )
 
     def _on_edges(self, edges: Sequence[Edge]) -> None:
-        self.edges.take(edges)
+        self.edges.on_edges(edges)
         member, schedule = self._member, self._schedule
         if member is not None and schedule is not None:
             t_ns, interval_ns = edges[-1].t_ns, self.edges.interval_ns

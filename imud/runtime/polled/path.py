@@ -70,7 +70,7 @@ class PolledPath(SamplePath):
             if gone:
                 self.disbelieve(reading)
                 continue
-            stamp = edges.of(reading.start_ns, reading.end_ns) if edges is not None and reading.poll == 0 else None
+            stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None and reading.poll == 0 else None
             if reading.error is not None:
                 gone = self._failed(reading)
             else:

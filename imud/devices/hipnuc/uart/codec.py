@@ -42,6 +42,7 @@ from imud.devices.hipnuc.common.packets import (
     pack_hi92,
 )
 from imud.devices.hipnuc.uart.actions import ACTIONS
+from imud.devices.hipnuc.uart.alarm import alarm_ranges
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
 from imud.devices.hipnuc.uart.session import identify, read_settings
 from imud.devices.hipnuc.uart.text_lines import LINE_CHARACTERS_MAX, LineFinder
@@ -359,6 +360,7 @@ DRIVER: Final = StreamDriver(
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
     navigation_frame="ENU",
     lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
+    alarm_ranges=alarm_ranges,
     time_bits=TIME_BITS,
     actions=ACTIONS,
     identify=identify,
