@@ -37,6 +37,7 @@ from imud.signals.line_actions import LineActions
 from imud.signals.reset import make_reset
 from imud.signals.sync_signals import SyncSignals
 from imud.units import NS_PER_MS, NS_PER_S
+from imud.utc.system_clock import realtime_offset_ns
 
 log = logging.getLogger(__name__)
 
@@ -77,10 +78,11 @@ class Device(ABC):
         self._notices = Notices(config.name, self.ledger, tell)
         self.link = link
         self._exchange = Exchange(self.ledger, link.write, self._change_rate)
-        self._utc = make_keeper(config, DevicePort(link.write, lambda: self._rate_bit_s, lambda: self._exchange.busy))
+        port = DevicePort(link.write, lambda: self._rate_bit_s, lambda: self._exchange.busy)
+        self._utc = make_keeper(config, port, monotonic_ns, realtime_offset_ns)
         self._wires: SyncSignals | None = None
         if config.lines is not None:
-            on_pulses = self._utc.pulses if self._utc is not None else None
+            on_pulses = self._utc.on_pulses if self._utc is not None else None
             self._wires = SyncSignals(
                 config.name, config.lines, lines, self._notices.tell, monotonic_ns, on_pulses=on_pulses
             )
@@ -100,8 +102,6 @@ class Device(ABC):
         try:
             if self._reset is not None:
                 self._reset.tick(monotonic_ns(), None)
-            if self._utc is not None:
-                self._utc.start()
             await self._live_again_and_again()
             self._set(DeviceState.FINISHED)
         finally:
@@ -110,7 +110,7 @@ class Device(ABC):
             if self._reset is not None:
                 self._reset.close()
             if self._utc is not None:
-                await self._utc.close()
+                self._utc.close()
 
     def tick(self, now_ns: int) -> None:
         """Ten times a second: states, idle line, events that gathered."""
@@ -120,7 +120,7 @@ class Device(ABC):
         if self._reset is not None:
             self._reset.tick(now_ns, None)
         if self._utc is not None:
-            self._utc.tick(now_ns, self._clock)
+            self._utc.tick(now_ns, None)
         path = self._path
         if path is None:
             return
@@ -214,6 +214,8 @@ class Device(ABC):
             self.close()
             if self._wires is not None:
                 self._wires.stop()
+            if self._utc is not None:
+                self._utc.stop()
             if self._path is not None:
                 self._path.reset()
 

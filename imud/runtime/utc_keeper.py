@@ -1,8 +1,8 @@
-"""UTC of one device: sentences from a source to its port, and what the host knows of UTC to its clock.
+"""UTC of one device: sentences from a source to its port, and the host's UTC reference to its clock.
 
 source ──RMC──▶ feed ──▶ the device's port            (its time becomes UTC)
           └───▶ PpsReference ◀── pulses of the line ──▶ chronyd
-                     └─ or the system clock, whichever is the better ──▶ clock.reference
+                     └─ or the system clock, whichever has the smaller error ──▶ clock
 """
 
 from collections.abc import Callable, Sequence
@@ -17,21 +17,17 @@ from imud.contracts.link import StreamLink
 from imud.contracts.status import UtcStatus
 from imud.contracts.timing import UtcReference
 from imud.links import LINKS
+from imud.sample import Sample
 from imud.units import NS_PER_S
 from imud.utc import RMC_SOURCES
-from imud.utc.adjtimex import kernel_clock, realtime_offset_ns, system_reference
 from imud.utc.chrony import ChronyFeed
 from imud.utc.pps import PpsReference
 from imud.utc.rmc_feed import RmcFeed
-from imud.utc.source import RmcSource
+from imud.utc.source import RmcSource, SourceContext
+from imud.utc.system_clock import kernel_clock, system_reference
 
 ASK_NS = NS_PER_S
-"""How often the system clock is asked how good it is."""
-
-
-def system_utc() -> UtcReference | None:
-    """What the system clock says of UTC, None while nothing keeps it."""
-    return system_reference(kernel_clock(), realtime_offset_ns())
+"""Interval at which the reference is updated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,21 +37,27 @@ class DevicePort:
     write: Callable[[bytes], None]
     baud: Callable[[], int]
     busy: Callable[[], bool]
-    """Whether a conversation with the device is going on."""
+    """Whether a request script is running on the device."""
 
 
 class UtcKeeper:
-    """Synchronization: the loop's thread only."""
+    """Feeds a device's port and clock with UTC. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
         source: RmcSource | None,
         port: DevicePort | None,
+        system: Callable[[int], UtcReference | None],
+        now_ns: Callable[[], int],
+        *,
         rate_hz: int = 1,
         chrony: ChronyFeed | None = None,
-        system: Callable[[], UtcReference | None] = system_utc,
     ) -> None:
-        """`source` is None where the device is fed nothing; `port` None where it has none that can be written to."""
+        """`source` and `port` are None if the device is fed no sentences.
+
+        `system` returns the system clock as a reference, from CLOCK_MONOTONIC as read last; `rate_hz` is the greatest
+        rate of sentences to the device.
+        """
         self._source = source
         self._chrony = chrony
         self._pps = PpsReference(self._on_second if chrony is not None else None)
@@ -63,38 +65,51 @@ class UtcKeeper:
         self._reference: UtcReference | None = None
         self._clock: SampleClock | None = None
         self._due_ns = 0
+        self._begun = self._closed = False
         self._feed: RmcFeed | None = None
         if port is not None:
-            self._feed = RmcFeed(port.write, port.baud, port.busy, rate_hz, lambda: self._reference)
+            self._feed = RmcFeed(port.write, port.baud, port.busy, now_ns, rate_hz, lambda: self._reference)
 
-    def start(self) -> None:
-        """Take sentences from now on."""
+    def start(self, clock: SampleClock) -> None:
+        """Deliver the reference to the clock of the device that was found."""
+        self._clock = clock
+        clock.reference = self._reference
+        self._due_ns = 0
+
+    def tick(self, now_ns: int, newest: Sample | None) -> None:
+        """Start the source the first time; update the reference if that is due. Call it at 10 Hz in the loop."""
+        if self._closed:
+            return
+        if not self._begun:
+            self._begun = True
+            if self._source is not None:
+                self._source.start(self._on_sentence)
+        if now_ns >= self._due_ns:
+            self._update_reference(now_ns)
+
+    def stop(self) -> None:
+        """Deliver no more references, at the end of the device's link; may be called twice. The source continues."""
+        self._clock = None
+
+    def close(self) -> None:
+        """Release source and chronyd's socket; may be called twice."""
+        self._closed = True
+        self.stop()
         if self._source is not None:
-            self._source.start(self._on_sentence)
-
-    def pulses(self, edges: Sequence[Edge]) -> None:
-        """Edges of the pulse per second that the device's SIN gets."""
-        for edge in edges:
-            if edge.rising:
-                self._pps.pulse(edge.t_ns)
-                if self._feed is not None:
-                    self._feed.pulse(edge.t_ns)
-
-    def tick(self, now_ns: int, clock: SampleClock | None) -> None:
-        """Ten times a second: what is known of UTC now, for the clock."""
-        if clock is not self._clock or now_ns >= self._due_ns:
-            self._clock = clock
-            self._refer(now_ns)
-
-    async def close(self) -> None:
-        """Let go of everything; may be called twice."""
-        if self._source is not None:
-            await self._source.close()
+            self._source.close()
         if self._chrony is not None:
             self._chrony.close()
 
+    def on_pulses(self, edges: Sequence[Edge]) -> None:
+        """Add edges of the pulse per second that the device's SIN receives."""
+        for edge in edges:
+            if edge.rising:
+                self._pps.on_pulse(edge.t_ns)
+                if self._feed is not None:
+                    self._feed.on_pulse(edge.t_ns)
+
     def status(self) -> UtcStatus:
-        """How it is doing."""
+        """Return problem and counters."""
         source, feed, chrony = self._source, self._feed, self._chrony
         return UtcStatus(
             source=source.title if source is not None else "",
@@ -108,45 +123,55 @@ class UtcKeeper:
             chrony_refused=chrony.refused if chrony is not None else 0,
         )
 
-    def _refer(self, now_ns: int) -> None:
+    def _update_reference(self, now_ns: int) -> None:
         self._due_ns = now_ns + ASK_NS
-        self._reference = _better(self._pps.reference(now_ns), self._system())
+        self._reference = _better(self._pps.reference(now_ns), self._system(now_ns))
         if self._clock is not None:
             self._clock.reference = self._reference
 
     def _on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
-        """The sentence that tells the device which second it is may tell the host so too: the clock has to know UTC
-        before the device's time turns into it, or it takes that for a jump."""
-        self._pps.sentence(sentence, t_rx_ns)
+        """Use a sentence for the host first: its clock must know UTC before the device's time becomes UTC, or it takes
+        that for a jump."""
+        self._pps.on_sentence(sentence, t_rx_ns)
         if self._reference is None:
-            self._refer(t_rx_ns)
+            self._update_reference(t_rx_ns)
         if self._feed is not None:
             self._feed.on_sentence(sentence, t_rx_ns)
 
     def _on_second(self, t_ns: int, unix_s: int) -> None:
         if self._chrony is not None:
-            self._chrony.pulse(t_ns, unix_s)
+            self._chrony.send_pulse(t_ns, unix_s)
 
 
 def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReference | None:
-    """The reference with the smaller error; the first where they are equal."""
+    """Return the reference with the smaller error; the first if they are equal."""
     if one is None or other is None:
         return one or other
     return one if one.error_ns <= other.error_ns else other
 
 
-def make_keeper(config: DeviceConfig, port: DevicePort) -> UtcKeeper | None:
-    """What a device needs by its configuration; None where it has neither sentences nor a pulse per second."""
+def make_keeper(
+    config: DeviceConfig, port: DevicePort, now_ns: Callable[[], int], utc_offset_ns: Callable[[int], int]
+) -> UtcKeeper | None:
+    """Make the keeper that a device's configuration needs; None if it has neither sentences nor a pulse per second.
+
+    `now_ns` and `utc_offset_ns` as in `SourceContext`.
+    """
     rmc, pps = config.rmc, config.lines.pps if config.lines is not None else None
     if rmc is None and pps is None:
         return None
-    chrony = ChronyFeed(pps.chrony) if pps is not None and pps.chrony else None
+    chrony = ChronyFeed(pps.chrony, utc_offset_ns) if pps is not None and pps.chrony else None
+
+    def system(just_now_ns: int) -> UtcReference | None:
+        return system_reference(kernel_clock(), utc_offset_ns(just_now_ns))
+
     if rmc is None:
-        return UtcKeeper(None, None, chrony=chrony)
-    return UtcKeeper(RMC_SOURCES[rmc.source](rmc, _serial_port), port, rmc.rate_hz, chrony)
+        return UtcKeeper(None, None, system, now_ns, chrony=chrony)
+    source = RMC_SOURCES[rmc.source](rmc, SourceContext(_serial_port, now_ns, utc_offset_ns))
+    return UtcKeeper(source, port, system, now_ns, rate_hz=rmc.rate_hz, chrony=chrony)
 
 
 def _serial_port(path: str, baud: int) -> StreamLink:
-    """The port of a GNSS receiver."""
+    """Make the port of a GNSS receiver."""
     row = LINKS["uart"]
     return row.make(msgspec.convert({"port": path, "baud": baud}, row.settings))

@@ -1,4 +1,4 @@
-"""UTC from outside: sources of RMC sentences, what the kernel and PPS edges say of UTC, the feed of chrony."""
+"""UTC: sources of RMC sentences, references from PPS pulses and the system clock, the feeds of device and chronyd."""
 
 from imud.contracts.table import Table
 from imud.utc.source import MakeSource
@@ -6,8 +6,8 @@ from imud.utc.source import MakeSource
 RMC_SOURCES: Table[MakeSource] = Table(
     "RMC source",
     {
-        "gpsd": "imud.utc.gpsd:make",
-        "nmea": "imud.utc.nmea_port:make",
+        "gpsd": "imud.utc.receivers:make_gpsd",
+        "nmea": "imud.utc.receivers:make_nmea",
         "system": "imud.utc.system_clock:make",
     },
 )

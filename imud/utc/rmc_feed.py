@@ -1,16 +1,15 @@
 """Feeds a device RMC sentences over its own serial port, so that its time becomes UTC (HiPNUC manual 1.2.1).
 
-A sentence names the second that a pulse began; the device takes it for the last pulse it saw. So it has to be through
-the wire before the next one, else the device would be a second wrong, and it must not be believed if the receiver does
-not stand by it. What is known of the present second, best first: the pulse line, what the host knows of UTC, nothing.
-A sentence is written whole and only while no conversation with the device is going on; it waits for nothing.
+A sentence names the second that a pulse began; the device assigns it to the last pulse it saw. It therefore has to be
+transmitted before the next pulse, or the device would be wrong by one second, and only if the receiver marks it valid.
+The begin of the present second is known from the host's UTC reference, else from the pulse line, else not at all.
+A sentence is written whole, at once or never, and not while a request script runs on the device.
 """
 
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from time import monotonic_ns
 from typing import Final
 
 from imud.contracts.timing import UtcReference
@@ -19,58 +18,59 @@ from imud.formats.rmc import Rmc, RmcFault, as_gprmc, parse
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 GUARD_NS: Final = 20 * NS_PER_MS
-"""A sentence has to be through so long before the next second; the device has to read it as well."""
+"""A sentence is transmitted at least this long before the next second: the device has to process it as well."""
 PULSE_FRESH_NS: Final = NS_PER_S + 100 * NS_PER_MS
-"""An older pulse does not tell when the next one comes."""
+"""An older pulse does not predict the next one."""
 AHEAD_NS: Final = 5 * NS_PER_MS
+"""A sentence may name a time that is this far ahead of the reference."""
 SIGMAS: Final = 3
 DOUBT_MOST_NS: Final = NS_PER_S // 4
-"""What knows UTC worse than this is not asked."""
+"""A reference with a larger error is not used."""
 
 
 class Refusal(StrEnum):
     """Why a sentence was not sent."""
 
     DAMAGED = "damaged"
-    """It is no RMC sentence, or its checksum is wrong."""
+    """No RMC sentence, or a wrong checksum."""
     NOT_VALID = "not_valid"
-    """The receiver does not stand by it (status V), or it has no time."""
+    """Marked as not valid by the receiver (status V), or without time."""
     STALE = "stale"
-    """It would not be through before the next second."""
+    """It would not be transmitted before the next second."""
     AHEAD = "ahead"
-    """It names a time that has not been yet, by the pulse line or by what the host knows of UTC."""
+    """It names a time in the future, by the pulse line or the host's UTC reference."""
     TOO_MANY = "too_many"
-    """More came than the device is to be fed."""
+    """Above the configured rate."""
     BUSY = "busy"
-    """A conversation with the device was going on."""
+    """A request script was running on the device."""
     LINK = "link"
-    """The port took no bytes."""
+    """The port accepted no bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class RmcFeedStatus:
-    """What became of the sentences so far."""
+    """Counters of the sentences."""
 
     sent: int
     refused: dict[str, int]
     """By `Refusal`."""
     last_sent_ns: int
-    """CLOCK_MONOTONIC of the last one sent, 0 before."""
+    """CLOCK_MONOTONIC of the last sentence sent, 0 if none."""
 
 
 class RmcFeed:
-    """Sentences in, sentences out on the device's port. Synchronization: the loop's thread only."""
+    """Passes sentences on to the device's port. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
         write: Callable[[bytes], None],
         baud: Callable[[], int],
         busy: Callable[[], bool],
+        now_ns: Callable[[], int],
         rate_hz: int = 1,
         reference: Callable[[], UtcReference | None] = lambda: None,
-        now_ns: Callable[[], int] = monotonic_ns,
     ) -> None:
-        """`write` is the link's, `baud` its present rate, `busy` whether a conversation is going on."""
+        """`write` and `baud` are those of the link, `busy` returns whether a request script is running."""
         self.sent = 0
         self.refused: Counter[Refusal] = Counter()
         self._write, self._baud, self._busy = write, baud, busy
@@ -80,12 +80,12 @@ class RmcFeed:
         self._last_slot = -1
         self._last_sent_ns = 0
 
-    def pulse(self, t_ns: int) -> None:
-        """A rising edge of the pulse that the device's SIN gets, at CLOCK_MONOTONIC `t_ns`."""
+    def on_pulse(self, t_ns: int) -> None:
+        """Note a rising edge of the PPS that the device's SIN receives, at CLOCK_MONOTONIC `t_ns`."""
         self._pulse_ns = t_ns
 
     def on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
-        """A sentence from the source; `t_rx_ns` is when it came."""
+        """Send a sentence of the source if it is timely; `t_rx_ns` is CLOCK_MONOTONIC of its arrival."""
         refusal = self._feed(sentence, t_rx_ns)
         if refusal is None:
             self.sent += 1
@@ -93,7 +93,7 @@ class RmcFeed:
             self.refused[refusal] += 1
 
     def status(self) -> RmcFeedStatus:
-        """Counters since it was made."""
+        """Return the counters since the start."""
         return RmcFeedStatus(self.sent, {str(kind): count for kind, count in self.refused.items()}, self._last_sent_ns)
 
     def _feed(self, sentence: bytes, t_rx_ns: int) -> Refusal | None:
@@ -114,7 +114,7 @@ class RmcFeed:
         return refusal
 
     def _timely(self, rmc: Rmc, t_rx_ns: int, now_ns: int, through_ns: int) -> Refusal | None:
-        """Whether the device, reading the sentence at `through_ns`, takes it for the right second."""
+        """Return why the device would assign the sentence, received at `through_ns`, to a wrong second, or None."""
         second_ns, doubt_ns = self._second_ns(rmc, t_rx_ns, now_ns)
         if second_ns is None:
             return None if through_ns - t_rx_ns < NS_PER_S - GUARD_NS else Refusal.STALE
@@ -123,12 +123,12 @@ class RmcFeed:
         return None if through_ns < second_ns + NS_PER_S - GUARD_NS - doubt_ns else Refusal.STALE
 
     def _second_ns(self, rmc: Rmc, t_rx_ns: int, now_ns: int) -> tuple[int | None, int]:
-        """CLOCK_MONOTONIC at which the second began that the sentence names, and how far that may be off."""
+        """Return CLOCK_MONOTONIC at the begin of the second that the sentence names, and its uncertainty (ns)."""
         reference, pulse_ns = self._reference(), self._pulse_ns
         if reference is not None and SIGMAS * reference.error_ns + AHEAD_NS <= DOUBT_MOST_NS:
             return rmc.unix_s * NS_PER_S - reference.offset_ns, SIGMAS * reference.error_ns + AHEAD_NS
         if pulse_ns is not None and now_ns - pulse_ns < PULSE_FRESH_NS:
-            # a sentence whose time of the second was not yet since the last pulse names the second before it
+            # a fraction of a second not yet reached since the last pulse belongs to the second before it
             before = t_rx_ns - pulse_ns < rmc.fraction_ns
             return pulse_ns - before * NS_PER_S, 0
         return None, 0

@@ -1,7 +1,7 @@
-"""What a source of RMC sentences is, and how one is configured."""
+"""Contract of the sources of RMC sentences, and their settings."""
 
 from collections.abc import Callable
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal, NamedTuple, Protocol
 
 from msgspec import Meta
 
@@ -9,13 +9,13 @@ from imud.contracts.link import StreamLink
 from imud.contracts.settings import Settings
 
 OnSentence = Callable[[bytes, int], None]
-"""Called with one RMC sentence, its line end included, and CLOCK_MONOTONIC (ns) right after it came."""
+"""Called with one RMC sentence, including its line end, and CLOCK_MONOTONIC (ns) right after its arrival."""
 MakePort = Callable[[str, int], StreamLink]
 """Makes a closed serial link from a path and a rate in bit/s."""
 
 
 class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the sentences that a device is fed come from."""
+    """The source of the sentences that a device is fed."""
 
     source: Literal["gpsd", "nmea", "system"]
     """`gpsd`: a GNSS receiver that gpsd owns. `nmea`: one on a serial port of its own. `system`: the system clock,
@@ -33,8 +33,8 @@ class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     baud: Annotated[int, Meta(ge=4800, le=921_600)] = 9600
     """Rate of that port in bit/s."""
     error_ms: Annotated[float, Meta(gt=0, le=60)] = 50.0
-    """The system clock is used while it is right within so much, one sigma. Sentences say which second it is, no more,
-    and are sent 200 ms after it began, so that much can be allowed."""
+    """The system clock is used while its one-sigma error is below this. Sentences only name the second, and are sent
+    200 ms after its begin, so that such an error does no harm."""
 
     def __post_init__(self) -> None:
         if self.source == "nmea" and not self.port:
@@ -42,23 +42,33 @@ class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class RmcSource(Protocol):
-    """Gives sentences as they come, good or bad, and comes back by itself. Synchronization: the loop's thread only."""
+    """Delivers sentences as they come, good or bad; recovers from failures. Synchronization: the loop's thread only."""
 
     title: str
     """The source for people, for example `gpsd at 127.0.0.1:2947`."""
     problem: str
-    """Why it gives nothing now, one sentence; empty when all is well."""
+    """Why it delivers nothing, one sentence; empty if it does."""
     sentences: int
-    """Sentences given since it was made."""
+    """Sentences delivered since the start."""
 
     def start(self, on_sentence: OnSentence) -> None:
-        """Give sentences from now on. Needs a running loop."""
+        """Deliver sentences from now on. Needs a running loop."""
         ...
 
-    async def close(self) -> None:
-        """Stop and let go of everything; may be called twice."""
+    def close(self) -> None:
+        """Deliver nothing more, and release port or connection; may be called twice."""
         ...
 
 
-MakeSource = Callable[[RmcSettings, MakePort], RmcSource]
-"""The row a source file ends with."""
+class SourceContext(NamedTuple):
+    """What sources need of the host."""
+
+    make_port: MakePort
+    now_ns: Callable[[], int]
+    """CLOCK_MONOTONIC."""
+    utc_offset_ns: Callable[[int], int]
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC; its argument is CLOCK_MONOTONIC as read last."""
+
+
+MakeSource = Callable[[RmcSettings, SourceContext], RmcSource]
+"""Makes a source; `imud.utc.RMC_SOURCES` has one for each value of `RmcSettings.source`."""

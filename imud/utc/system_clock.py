@@ -1,58 +1,137 @@
-"""RMC sentences made from the system clock, right after each second, while the kernel says that it is synchronised."""
+"""The system clock: whether the kernel reports it as synchronised, and RMC sentences made from it while it is.
+
+A daemon that keeps the clock (chronyd, ntpd, systemd-timesyncd) clears STA_UNSYNC and sets its estimate of the error
+and a bound of it; the kernel increases the bound by 500 µs each second and sets STA_UNSYNC at 16 s. adjtimex(2) reads
+this without changing anything.
+"""
 
 import asyncio
+import ctypes
+import os
 from collections.abc import Callable
-from time import monotonic_ns
-from typing import Final
+from math import sqrt
+from time import monotonic_ns, time_ns
+from typing import Final, NamedTuple
 
+from imud.contracts.timing import UtcReference
 from imud.formats.rmc import build
-from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.adjtimex import KernelClock, kernel_clock, realtime_offset_ns
-from imud.utc.source import MakePort, OnSentence, RmcSettings
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from imud.utc.source import OnSentence, RmcSettings, SourceContext
 
+STA_UNSYNC: Final = 0x40
+TIME_ERROR: Final = 5
+READINGS: Final = 5
+"""Readings of both clocks, of which the shortest counts."""
 AFTER_NS: Final = 200 * NS_PER_MS
-"""A sentence comes so long after the instant it names: more than the clock may be off (60 ms, three sigma), so that it
-never comes before the pulse of its second."""
+"""Delay of a sentence after the instant it names: more than the allowed error of the clock (60 ms, three sigma), so
+that it never precedes the pulse of its second."""
 LATEST_NS: Final = 800 * NS_PER_MS
-"""None comes later in a second, when it could be taken for the next one's."""
+"""No sentence is sent later in a second, where it could be assigned to the next."""
 LATE_NS: Final = 50 * NS_PER_MS
-"""Woken later than this, a sentence is left out: the next one is near."""
+"""A sentence that is due longer than this is skipped: the next one is near."""
+
+
+class Timex(ctypes.Structure):
+    """struct timex of <linux/timex.h>, with the machine's `long`."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint), ("offset", ctypes.c_long), ("freq", ctypes.c_long), ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long), ("status", ctypes.c_int), ("constant", ctypes.c_long),
+        ("precision", ctypes.c_long), ("tolerance", ctypes.c_long), ("time", ctypes.c_long * 2),
+        ("tick", ctypes.c_long), ("ppsfreq", ctypes.c_long), ("jitter", ctypes.c_long), ("shift", ctypes.c_int),
+        ("stabil", ctypes.c_long), ("jitcnt", ctypes.c_long), ("calcnt", ctypes.c_long), ("errcnt", ctypes.c_long),
+        ("stbcnt", ctypes.c_long), ("tai", ctypes.c_int), ("padding", ctypes.c_int * 11),
+    )  # fmt: skip
+
+
+class KernelClock(NamedTuple):
+    """State of the system clock, as the kernel reports it."""
+
+    synchronised: bool
+    """Whether a daemon synchronises it."""
+    estimated_error_us: int
+    """One-sigma error as the daemon estimates it; 0 if it does not (systemd-timesyncd)."""
+    most_error_us: int
+    """Bound of the error."""
+
+    @property
+    def error_ns(self) -> int:
+        """One-sigma error: the estimate, or that of a uniform distribution within the bound, whichever is greater."""
+        return round(max(self.estimated_error_us, self.most_error_us / sqrt(3)) * NS_PER_US)
+
+
+def ask_kernel(timex: Timex) -> int:
+    """Call adjtimex(2): fill `timex`, return the state of the clock. Raises OSError."""
+    state: int = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
+    if state < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return state
+
+
+def kernel_clock(ask: Callable[[Timex], int] = ask_kernel) -> KernelClock:
+    """Read the state of the clock; not synchronised if the call is refused (a container's filter)."""
+    timex = Timex()
+    try:
+        state = ask(timex)
+    except OSError:
+        return KernelClock(False, 0, 0)
+    synchronised = state != TIME_ERROR and not timex.status & STA_UNSYNC
+    return KernelClock(synchronised, max(timex.esterror, 0), max(timex.maxerror, 0))
+
+
+def realtime_offset_ns(_just_now_ns: int = 0) -> int:
+    """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, as `SourceContext.utc_offset_ns`."""
+    best_ns, offset_ns = 1 << 63, 0
+    for _ in range(READINGS):
+        before_ns = monotonic_ns()
+        real_ns = time_ns()
+        after_ns = monotonic_ns()
+        if after_ns - before_ns < best_ns:
+            best_ns, offset_ns = after_ns - before_ns, real_ns - (before_ns + after_ns) // 2
+    return offset_ns
+
+
+def system_reference(clock: KernelClock, offset_ns: int) -> UtcReference | None:
+    """Return the system clock as a reference of UTC; None if it is not synchronised."""
+    return UtcReference(offset_ns, clock.error_ns) if clock.synchronised else None
 
 
 class SystemClockSource:
-    """The system clock as an `RmcSource`."""
+    """Sentences after each second of the system clock, an `RmcSource`. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
         settings: RmcSettings,
+        now_ns: Callable[[], int],
+        utc_offset_ns: Callable[[int], int],
         ask: Callable[[], KernelClock] = kernel_clock,
-        offset_ns: Callable[[], int] = realtime_offset_ns,
-        now_ns: Callable[[], int] = monotonic_ns,
     ) -> None:
+        """`now_ns` and `utc_offset_ns` as in `SourceContext`; `ask` reads the state of the clock."""
         self.title = "the system clock"
         self.problem = ""
         self.sentences = 0
         self._step_ns = NS_PER_S // settings.rate_hz
         self._most_ns = round(settings.error_ms * NS_PER_MS)
-        self._ask, self._offset_ns, self._now_ns = ask, offset_ns, now_ns
+        self._ask, self._utc_offset_ns, self._now_ns = ask, utc_offset_ns, now_ns
         self._on_sentence: OnSentence = lambda _sentence, _t_rx_ns: None
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self, on_sentence: OnSentence) -> None:
-        """Give a sentence after each second, or part of one."""
+        """Deliver a sentence after each second, or part of one. Needs a running loop."""
         self._on_sentence = on_sentence
-        self._wait()
+        self._schedule()
 
-    async def close(self) -> None:
-        """Stop; may be called twice."""
+    def close(self) -> None:
+        """Deliver nothing more; may be called twice."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def tick(self) -> None:
-        """Give the sentence that is due, if any is and the clock is good enough."""
+        """Deliver the sentence that is due, if any, and if the clock is good enough."""
         now_ns = self._now_ns()
-        utc_ns = now_ns + self._offset_ns()
+        utc_ns = now_ns + self._utc_offset_ns(now_ns)
         named_ns = self._named_ns(utc_ns)
         if utc_ns % NS_PER_S < AFTER_NS or utc_ns % NS_PER_S >= LATEST_NS:
             return
@@ -64,22 +143,23 @@ class SystemClockSource:
             self._on_sentence(build(named_ns), now_ns)
 
     def wait_ns(self) -> int:
-        """How long until the next sentence is due."""
-        utc_ns = self._now_ns() + self._offset_ns()
+        """Return the time until the next sentence is due, ns."""
+        now_ns = self._now_ns()
+        utc_ns = now_ns + self._utc_offset_ns(now_ns)
         named_ns = self._named_ns(utc_ns)
         next_second_ns = (named_ns // NS_PER_S + 1) * NS_PER_S
         return min(named_ns + self._step_ns, next_second_ns) + AFTER_NS - utc_ns
 
     def _named_ns(self, utc_ns: int) -> int:
-        """The last instant of which a sentence was due."""
+        """Return the last instant that a sentence is to name."""
         second, rest_ns = divmod(utc_ns - AFTER_NS, NS_PER_S)
         return second * NS_PER_S + rest_ns // self._step_ns * self._step_ns
 
-    def _wait(self) -> None:
+    def _schedule(self) -> None:
         self._timer = asyncio.get_running_loop().call_later(self.wait_ns() / NS_PER_S, self._on_time)
 
     def _on_time(self) -> None:
-        self._wait()
+        self._schedule()
         self.tick()
 
     def _complaint(self) -> str:
@@ -92,6 +172,6 @@ class SystemClockSource:
         return ""
 
 
-def make(settings: RmcSettings, _make_port: MakePort) -> SystemClockSource:
-    """The source."""
-    return SystemClockSource(settings)
+def make(settings: RmcSettings, context: SourceContext) -> SystemClockSource:
+    """Make the source `system`."""
+    return SystemClockSource(settings, context.now_ns, context.utc_offset_ns)

@@ -1,4 +1,4 @@
-"""What is known of UTC and who is told: the device by sentences, its clock by a reference, chronyd by pulses."""
+"""UTC of one device: sentences to its port, a reference for its clock, pulses to chronyd."""
 
 from typing import cast
 
@@ -11,12 +11,11 @@ from imud.contracts.timing import UtcReference
 from imud.formats.rmc import build
 from imud.links.memory import MemorySettings
 from imud.runtime import utc_keeper
-from imud.runtime.utc_keeper import DevicePort, UtcKeeper, make_keeper, system_utc
+from imud.runtime.utc_keeper import DevicePort, UtcKeeper, make_keeper
 from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.adjtimex import KernelClock
 from imud.utc.chrony import ChronyFeed
 from imud.utc.source import RmcSettings
-from tests.support.in_loop import in_loop
+from imud.utc.system_clock import KernelClock
 from tests.support.wired import FakeSource
 
 UTC_S = 1_795_000_000
@@ -38,7 +37,7 @@ class FakeChrony:
     def sent(self) -> int:
         return len(self.pulses)
 
-    def pulse(self, t_ns: int, unix_s: int) -> None:
+    def send_pulse(self, t_ns: int, unix_s: int) -> None:
         self.pulses.append((t_ns, unix_s))
 
     def close(self) -> None:
@@ -57,31 +56,28 @@ class Bench:
         self.keeper = UtcKeeper(
             self.source if source else None,
             port if source else None,
+            lambda _now_ns: self.system,
+            lambda: self.now_ns,
             chrony=cast(ChronyFeed, self.chrony),
-            system=lambda: self.system,
         )
-        self.keeper.start()
+        self.now_ns = BEGIN_NS - NS_PER_S
         self.clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
+        self.keeper.tick(self.now_ns, None)
+        self.keeper.start(self.clock)
 
     def second(self, number: int, *, pulse: bool = True, sentence: bool = True) -> None:
         t_ns = BEGIN_NS + number * NS_PER_S
         if pulse:
-            self.keeper.pulses([Edge(t_ns, True, 2 * number), Edge(t_ns + NS_PER_MS, False, 2 * number + 1)])
+            self.keeper.on_pulses([Edge(t_ns, True, 2 * number), Edge(t_ns + NS_PER_MS, False, 2 * number + 1)])
         self.now_ns = t_ns + NS_PER_S // 5
         if sentence:
             self.source.give(build((UTC_S + number) * NS_PER_S), self.now_ns)
-        self.keeper.tick(self.now_ns, self.clock)
+        self.keeper.tick(self.now_ns, None)
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    made = Bench()
-
-    def now_ns() -> int:
-        return made.now_ns
-
-    monkeypatch.setattr(made.keeper._feed, "_now_ns", now_ns)
-    return made
+def bench() -> Bench:
+    return Bench()
 
 
 def test_sentences_go_to_the_device_and_make_pulses_utc(bench: Bench) -> None:
@@ -138,26 +134,50 @@ def test_the_better_of_two_references_counts(bench: Bench) -> None:
     assert by_pulses.offset_ns != good.offset_ns
 
 
-def test_it_is_asked_once_a_second_and_forgotten_when_nobody_knows() -> None:
+def test_the_reference_is_updated_once_a_second_and_dropped_when_there_is_none() -> None:
     bench = Bench(source=False, system=UtcReference(5, 5))
-    bench.keeper.tick(BEGIN_NS, bench.clock)
+    bench.keeper.tick(BEGIN_NS, None)
     assert bench.clock.reference == UtcReference(5, 5)
     bench.system = None
-    bench.keeper.tick(BEGIN_NS + NS_PER_S - 1, bench.clock)
+    bench.keeper.tick(BEGIN_NS + NS_PER_S - 1, None)
     assert bench.clock.reference == UtcReference(5, 5)
     bench.keeper.tick(BEGIN_NS + NS_PER_S, None)
-    bench.keeper.tick(BEGIN_NS + 2 * NS_PER_S, bench.clock)
     assert bench.clock.reference is None
 
 
-@in_loop
-async def test_everything_is_let_go_of() -> None:
+def test_a_clock_has_the_reference_from_its_start_and_none_after_the_end_of_the_link() -> None:
+    bench = Bench(source=False, system=UtcReference(5, 5))
+    bench.keeper.tick(BEGIN_NS, None)
+    other = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
+    bench.keeper.start(other)
+    assert other.reference == UtcReference(5, 5)
+    bench.keeper.stop()
+    bench.keeper.stop()
+    bench.system = UtcReference(6, 6)
+    bench.keeper.tick(BEGIN_NS + NS_PER_S, None)
+    assert other.reference == UtcReference(5, 5)
+    bench.keeper.start(other)
+    assert other.reference == UtcReference(6, 6)
+
+
+def test_close_releases_source_and_socket_and_nothing_starts_again() -> None:
     bench = Bench()
-    await bench.keeper.close()
-    await bench.keeper.close()
+    bench.keeper.close()
+    bench.keeper.close()
     assert bench.source.closed
     assert bench.chrony.closed
-    await UtcKeeper(None, None).close()
+    bench.source.started = 0
+    bench.keeper.tick(BEGIN_NS, None)
+    assert bench.source.started == 0
+    UtcKeeper(None, None, lambda _now_ns: None, lambda: 0).close()
+
+
+def test_a_keeper_that_was_closed_before_its_first_tick_starts_no_source() -> None:
+    source = FakeSource()
+    keeper = UtcKeeper(source, None, lambda _now_ns: None, lambda: 0)
+    keeper.close()
+    keeper.tick(BEGIN_NS, None)
+    assert source.started == 0
 
 
 def test_problems_of_source_and_chrony_show(bench: Bench) -> None:
@@ -169,25 +189,56 @@ def test_problems_of_source_and_chrony_show(bench: Bench) -> None:
 
 
 def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
+    port = DevicePort(lambda _data: None, lambda: 9600, lambda: False)
+    keeper = make_keeper(
+        configured(None, PpsSettings(line="A")), port, lambda: BEGIN_NS, lambda now_ns: OFFSET_NS + now_ns
+    )
+    assert keeper is not None
+    keeper.start(clock)
     monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 100, 100))
-    assert system_utc() is None
+    keeper.tick(BEGIN_NS, None)
+    assert clock.reference is None
     monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(True, 100, 0))
-    reference = system_utc()
-    assert reference is not None
-    assert reference.error_ns == 100_000
+    keeper.tick(BEGIN_NS + NS_PER_S, None)
+    assert clock.reference == UtcReference(OFFSET_NS + BEGIN_NS + NS_PER_S, 100_000)
+    keeper.close()
+
+
+def configured(rmc: RmcSettings | None, pps: PpsSettings | None) -> DeviceConfig:
+    return DeviceConfig(
+        "bow", "hipnuc-uart", None, False, "memory", MemorySettings(), lines=DeviceLines(pps=pps), rmc=rmc
+    )
 
 
 @pytest.mark.parametrize("rmc", [None, RmcSettings(source="gpsd", rate_hz=5)])
 @pytest.mark.parametrize("pps", [None, PpsSettings(line="A"), PpsSettings(line="A", chrony="/nowhere/imud.sock")])
-@in_loop
-async def test_a_device_gets_what_it_is_configured_for(rmc: RmcSettings | None, pps: PpsSettings | None) -> None:
-    config = DeviceConfig(
-        "bow", "hipnuc-uart", None, False, "memory", MemorySettings(), lines=DeviceLines(pps=pps), rmc=rmc
-    )
-    keeper = make_keeper(config, DevicePort(lambda _data: None, lambda: 9600, lambda: False))
-    assert (keeper is None) == (rmc is None and pps is None)
-    if keeper is not None:
-        assert keeper.status().source.startswith("gpsd" if rmc else "")
-        assert (keeper._feed is None) == (rmc is None)
-        assert (keeper._chrony is None) == (pps is None or not pps.chrony)
-        await keeper.close()
+def test_a_device_gets_what_it_is_configured_for(
+    monkeypatch: pytest.MonkeyPatch, rmc: RmcSettings | None, pps: PpsSettings | None
+) -> None:
+    now_ns, written, source = [BEGIN_NS], list[bytes](), FakeSource()
+
+    def make() -> UtcKeeper | None:
+        port = DevicePort(written.append, lambda: 9600, lambda: False)
+        return make_keeper(configured(rmc, pps), port, lambda: now_ns[0], lambda _now_ns: OFFSET_NS)
+
+    real = make()
+    assert (real is None) == (rmc is None and pps is None)
+    if real is None:
+        return
+    assert real.status().source.startswith("gpsd" if rmc else "")
+    assert bool(real.status().source) == (rmc is not None)
+    real.close()
+    monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: source})
+    keeper = make()
+    assert keeper is not None
+    keeper.tick(BEGIN_NS, None)
+    assert source.started == (rmc is not None)
+    for second in range(1, 7):
+        keeper.on_pulses([Edge(BEGIN_NS + second * NS_PER_S, True, second)])
+        now_ns[0] = BEGIN_NS + second * NS_PER_S + NS_PER_S // 5
+        source.give(build((UTC_S + second) * NS_PER_S), now_ns[0])
+    assert len(written) == (6 if rmc is not None else 0)
+    to_chrony = pps is not None and pps.chrony and rmc is not None  # the second of a pulse must be known
+    assert bool(keeper.status().chrony_refused) == bool(to_chrony)
+    keeper.close()

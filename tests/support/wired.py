@@ -25,9 +25,8 @@ from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
 from imud.sim.ports.pin import Pin
 from imud.sim.ports.pins import OnEdge, PinFaults, Pins
 from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.adjtimex import KernelClock
-from imud.utc.rmc_feed import RmcFeed
 from imud.utc.source import OnSentence, RmcSettings
+from imud.utc.system_clock import KernelClock
 from tests.support.virtual_time import LoopWorker, VirtualClock, run_virtually
 
 BEGIN_NS = 1000 * NS_PER_S + 123_456_789
@@ -54,12 +53,14 @@ class FakeSource:
     def __init__(self) -> None:
         self.sentences = 0
         self.give: OnSentence = lambda _sentence, _t_rx_ns: None
+        self.started = 0
         self.closed = False
 
     def start(self, on_sentence: OnSentence) -> None:
+        self.started += 1
         self.give = on_sentence
 
-    async def close(self) -> None:
+    def close(self) -> None:
         self.closed = True
 
 
@@ -101,8 +102,7 @@ class Wired:
         """Run the device while the story is told; at the end the ledger closes and the lines are released."""
         clock = self.clock
         clock.stand_for_monotonic(monkeypatch, *CLOCKED)
-        monkeypatch.setattr(utc_keeper, "RmcFeed", partial(RmcFeed, now_ns=clock.now_ns))
-        monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _make_port: self.source})
+        monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: self.source})
         monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 0, 0))
         run_virtually(clock, self._play(story))
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.adjtimex import realtime_offset_ns
 from imud.utc.chrony import ChronyFeed, encode
+from imud.utc.system_clock import realtime_offset_ns
 
 UTC_S = 1_795_000_000
 LIMIT_S = 20.0
@@ -29,7 +29,7 @@ def receiver(tmp_path: Path) -> Iterator[socket.socket]:
 
 def feed(receiver: socket.socket, ahead_ns: int = 0) -> ChronyFeed:
     """A feed on a host whose clock is `ahead_ns` ahead of UTC, and whose CLOCK_MONOTONIC is UTC less UTC_S."""
-    return ChronyFeed(receiver.getsockname(), lambda: UTC_S * NS_PER_S + ahead_ns)
+    return ChronyFeed(receiver.getsockname(), lambda _now_ns: UTC_S * NS_PER_S + ahead_ns)
 
 
 def test_the_layout_byte_by_byte() -> None:
@@ -43,9 +43,9 @@ def test_the_layout_byte_by_byte() -> None:
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 300 * NS_PER_MS, -7 * NS_PER_S - 1])
-def test_a_pulse_of_a_known_second_tells_the_whole_offset(receiver: socket.socket, ahead_ns: int) -> None:
+def test_a_pulse_of_a_known_second_gives_the_whole_offset(receiver: socket.socket, ahead_ns: int) -> None:
     chrony = feed(receiver, ahead_ns)
-    assert chrony.pulse(10 * NS_PER_S, UTC_S + 10)
+    assert chrony.send_pulse(10 * NS_PER_S, UTC_S + 10)
     assert receiver.recv(100) == encode((UTC_S + 10) * NS_PER_S + ahead_ns, -ahead_ns, pulse=False)
     assert (chrony.sent, chrony.refused, chrony.problem) == (1, 0, "")
     chrony.close()
@@ -53,34 +53,34 @@ def test_a_pulse_of_a_known_second_tells_the_whole_offset(receiver: socket.socke
 
 
 @pytest.mark.parametrize(
-    ("ahead_ns", "told_ns"), [(0, 0), (300, -300), (-400, 400), (600, 400), (-600, -400), (3200, -200)]
+    ("ahead_ns", "given_ns"), [(0, 0), (300, -300), (-400, 400), (600, 400), (-600, -400), (3200, -200)]
 )
-def test_a_pulse_alone_tells_the_nearest_second(receiver: socket.socket, ahead_ns: int, told_ns: int) -> None:
+def test_a_pulse_alone_gives_the_nearest_second(receiver: socket.socket, ahead_ns: int, given_ns: int) -> None:
     chrony = feed(receiver, ahead_ns * NS_PER_MS)
-    chrony.pulse(10 * NS_PER_S)
-    expected = encode((UTC_S + 10) * NS_PER_S + ahead_ns * NS_PER_MS, told_ns * NS_PER_MS, pulse=True)
+    chrony.send_pulse(10 * NS_PER_S)
+    expected = encode((UTC_S + 10) * NS_PER_S + ahead_ns * NS_PER_MS, given_ns * NS_PER_MS, pulse=True)
     assert receiver.recv(100) == expected
     chrony.close()
 
 
-def test_nobody_there_is_counted_and_the_next_is_tried(tmp_path: Path) -> None:
-    chrony = ChronyFeed(str(tmp_path / "sock"))
-    assert not chrony.pulse(time.monotonic_ns())
+def test_a_missing_socket_is_counted_and_the_next_sample_tried(tmp_path: Path) -> None:
+    chrony = ChronyFeed(str(tmp_path / "sock"), realtime_offset_ns)
+    assert not chrony.send_pulse(time.monotonic_ns())
     assert chrony.refused == 1
     assert "is it running" in chrony.problem
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
         sock.bind(str(tmp_path / "sock"))
-        assert chrony.pulse(time.monotonic_ns())
+        assert chrony.send_pulse(time.monotonic_ns())
         assert chrony.problem == ""
-    assert not chrony.pulse(time.monotonic_ns())
+    assert not chrony.send_pulse(time.monotonic_ns())
     assert (chrony.sent, chrony.refused) == (1, 2)
     chrony.close()
 
 
-def test_a_receiver_that_does_not_read_stops_nobody(receiver: socket.socket) -> None:
+def test_a_receiver_that_does_not_read_blocks_nothing(receiver: socket.socket) -> None:
     chrony = feed(receiver)
     for _ in range(5000):
-        chrony.pulse(0)
+        chrony.send_pulse(0)
     assert chrony.refused > 0
     assert chrony.sent + chrony.refused == 5000
     chrony.close()
@@ -89,7 +89,7 @@ def test_a_receiver_that_does_not_read_stops_nobody(receiver: socket.socket) -> 
 def test_a_closed_feed_refuses(receiver: socket.socket) -> None:
     chrony = feed(receiver)
     chrony.close()
-    assert not chrony.pulse(0)
+    assert not chrony.send_pulse(0)
     assert chrony.refused == 1
 
 
@@ -133,16 +133,16 @@ def sources(folder: Path) -> dict[str, list[str]]:
 @pytest.mark.skipif(bool(NO_CHRONY), reason=NO_CHRONY)
 def test_chronyd_takes_the_samples_and_sees_the_offset(chronyd: Path) -> None:
     offset_ns = 123 * NS_PER_MS  # UTC by the pulses is so much ahead of the system clock
-    chrony = ChronyFeed(str(chronyd / "imud.sock"))
-    give_up_s = time.monotonic() + LIMIT_S
+    chrony = ChronyFeed(str(chronyd / "imud.sock"), realtime_offset_ns)
+    limit_s = time.monotonic() + LIMIT_S
     while True:
         now_ns = time.monotonic_ns()
         utc_ns = now_ns + realtime_offset_ns() + offset_ns
-        chrony.pulse(now_ns - utc_ns % NS_PER_S, utc_ns // NS_PER_S)
+        chrony.send_pulse(now_ns - utc_ns % NS_PER_S, utc_ns // NS_PER_S)
         source = sources(chronyd).get("IMUD")
         if source and source[5] != "0" and float(source[7]):
             break
-        assert time.monotonic() < give_up_s, (source, chrony.problem)
+        assert time.monotonic() < limit_s, (source, chrony.problem)
         time.sleep(0.2)
     assert source[0] == "#"  # a reference clock
     # fields 7 and 8: offset of the last sample as adjusted and as measured; positive means the system clock is ahead

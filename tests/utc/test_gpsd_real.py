@@ -9,13 +9,14 @@ import tty
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from time import monotonic_ns
 
 import pytest
 
 from imud.formats.rmc import Rmc, build, checksum, parse
 from imud.units import NS_PER_S
-from imud.utc.gpsd import GpsdSource
-from imud.utc.retry import Retry
+from imud.utc.receivers import GpsdSource
+from imud.utc.sentence_stream import Retry
 from imud.utc.source import RmcSettings
 from tests.support.sentences import Sentences
 
@@ -86,7 +87,9 @@ def test_sentences_of_the_receiver_come_through_gpsd(receiver: Receiver, tmp_pat
 
     async def scene() -> Sentences:
         sentences = Sentences()
-        source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port), Retry(lambda _s: asyncio.sleep(0.1)))
+        source = GpsdSource(
+            RmcSettings(source="gpsd", tcp_port=port), monotonic_ns, Retry(lambda _s: asyncio.sleep(0.1))
+        )
         source.start(sentences)
         try:
             async with asyncio.timeout(LIMIT_S):
@@ -95,13 +98,13 @@ def test_sentences_of_the_receiver_come_through_gpsd(receiver: Receiver, tmp_pat
                     await asyncio.sleep(0.05)
             assert source.problem == ""
         finally:
-            await source.close()
+            source.close()
         return sentences
 
     with gpsd(port, receiver.path, tmp_path):
         sentences = asyncio.run(scene())
-    told = [parse(sentence) for sentence in sentences.data]
-    seconds = [rmc.unix_s for rmc in told if isinstance(rmc, Rmc) and rmc.valid]
-    assert len(seconds) == len(told)
+    parsed = [parse(sentence) for sentence in sentences.data]
+    seconds = [rmc.unix_s for rmc in parsed if isinstance(rmc, Rmc) and rmc.valid]
+    assert len(seconds) == len(parsed)
     assert seconds == sorted(set(seconds))
     assert set(seconds) <= set(range(UTC_S, receiver.second))

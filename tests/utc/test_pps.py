@@ -32,9 +32,9 @@ class Receiver:
         for _ in range(seconds):
             self.number += 1
             if pulse:
-                self.reference.pulse(self.t_ns() + round(abs(self._random.gauss(0, self._late_ns))))
+                self.reference.on_pulse(self.t_ns() + round(abs(self._random.gauss(0, self._late_ns))))
             if says is not None:
-                self.reference.sentence(build((UTC_S + self.number + says) * NS_PER_S), self.t_ns(0.3))
+                self.reference.on_sentence(build((UTC_S + self.number + says) * NS_PER_S), self.t_ns(0.3))
 
     def known(self, after_s: float = 0.0) -> UtcReference:
         reference = self.reference.reference(self.t_ns(after_s))
@@ -42,12 +42,12 @@ class Receiver:
         return reference
 
     def error_ns(self, after_s: float = 0.0) -> float:
-        """What is told less the truth."""
+        """The estimate minus the truth."""
         truth_ns = UTC_S * NS_PER_S + (self.number + after_s) * NS_PER_S
         return self.known(after_s).offset_ns - (int(truth_ns) - self.t_ns(after_s))
 
 
-def test_three_pulses_and_two_sentences_tell_utc() -> None:
+def test_three_pulses_and_two_sentences_give_utc() -> None:
     receiver = Receiver()
     receiver.go(PULSES_NEEDED)
     assert receiver.reference.reference(receiver.t_ns()) is None
@@ -60,7 +60,7 @@ def test_three_pulses_and_two_sentences_tell_utc() -> None:
 
 @pytest.mark.parametrize("ppm", [-100.0, 0.0, 100.0])
 @pytest.mark.parametrize("late_ns", [0.0, 5_000.0, 50_000.0])
-def test_the_error_told_is_honest(ppm: float, late_ns: float) -> None:
+def test_the_stated_error_is_honest(ppm: float, late_ns: float) -> None:
     receiver, inside = Receiver(ppm, late_ns), 0
     receiver.go(20)
     for _ in range(100):
@@ -77,7 +77,7 @@ def test_without_sentences_only_the_pulses_count() -> None:
     assert receiver.seconds == []
 
 
-def test_each_pulse_of_a_known_second_is_told() -> None:
+def test_each_pulse_of_a_known_second_is_reported() -> None:
     receiver = Receiver()
     receiver.go(10)
     assert [unix_s for _, unix_s in receiver.seconds] == [UTC_S + n for n in range(5, 11)]
@@ -88,8 +88,8 @@ def test_disturbances_are_ignored_and_missing_pulses_bridged() -> None:
     receiver = Receiver()
     receiver.go(10)
     for gap in (0, 1, 5, 9):
-        assert not receiver.reference.pulse(receiver.t_ns(0.4))
-        assert not receiver.reference.pulse(receiver.t_ns(0.7))
+        assert not receiver.reference.on_pulse(receiver.t_ns(0.4))
+        assert not receiver.reference.on_pulse(receiver.t_ns(0.7))
         receiver.go(gap, pulse=False)
         receiver.go(1)
         assert abs(receiver.error_ns()) < 1000
@@ -121,10 +121,10 @@ def test_another_receiver_takes_over() -> None:
     receiver = Receiver()
     receiver.go(10)
     for number in range(1, 5):
-        receiver.reference.pulse(receiver.t_ns(number + 0.25))
+        receiver.reference.on_pulse(receiver.t_ns(number + 0.25))
     assert receiver.reference.reference(receiver.t_ns(5)) is None
     for _ in range(2):
-        receiver.reference.sentence(build((UTC_S + 40) * NS_PER_S), receiver.t_ns(4.6))
+        receiver.reference.on_sentence(build((UTC_S + 40) * NS_PER_S), receiver.t_ns(4.6))
     reference = receiver.reference.reference(receiver.t_ns(4.6))
     assert reference
     assert reference.offset_ns + receiver.t_ns(4.6) == pytest.approx((UTC_S + 40.35) * NS_PER_S, abs=1000)
@@ -155,6 +155,6 @@ def test_sentences_that_name_no_pulse_are_ignored(sentence: bytes, after_s: floa
     receiver = Receiver()
     receiver.go(5, says=None)
     for _ in range(3):
-        receiver.reference.sentence(sentence, receiver.t_ns(after_s))
+        receiver.reference.on_sentence(sentence, receiver.t_ns(after_s))
     assert receiver.reference.sentences_ignored == 3
     assert receiver.reference.reference(receiver.t_ns()) is None

@@ -33,7 +33,7 @@ class Bench:
         self.broken = False
         self.reference = reference
         self.feed = RmcFeed(
-            self._write, lambda: baud, lambda: self.busy, rate_hz, lambda: self.reference, lambda: self.now_ns
+            self._write, lambda: baud, lambda: self.busy, lambda: self.now_ns, rate_hz, lambda: self.reference
         )
 
     def _write(self, data: bytes) -> None:
@@ -102,7 +102,7 @@ def test_it_has_to_be_through_before_the_next_second(
 ) -> None:
     bench = Bench(reference=reference)
     if reference is None:
-        bench.feed.pulse(BEGIN_NS)
+        bench.feed.on_pulse(BEGIN_NS)
         refusal = Refusal.STALE if refusal is Refusal.AHEAD else refusal  # by pulses alone, of the second before
     assert bench.give(named_s, at_s) == refusal
 
@@ -126,7 +126,7 @@ def test_a_sentence_that_waited_is_judged_by_the_time_it_is_sent() -> None:
 def test_a_poor_reference_and_an_old_pulse_are_not_asked() -> None:
     assert Bench(reference=UtcReference(OFFSET_NS, 90 * NS_PER_MS)).give(0, 1.5) == ""
     bench = Bench(reference=None)
-    bench.feed.pulse(BEGIN_NS)
+    bench.feed.on_pulse(BEGIN_NS)
     assert bench.give(1, 1.99) == ""
 
 
@@ -137,7 +137,7 @@ def test_no_more_than_the_device_is_to_have() -> None:
     assert set(refusals) == {"", Refusal.TOO_MANY}
 
 
-def test_no_conversation_is_interrupted_and_a_refused_one_is_not_counted_as_sent() -> None:
+def test_no_request_script_is_interrupted_and_a_refused_one_is_not_counted_as_sent() -> None:
     bench = Bench()
     bench.busy = True
     assert bench.give(0, 0.1) == Refusal.BUSY
@@ -152,7 +152,7 @@ def test_a_module_that_is_fed_shows_utc() -> None:
     module = HipnucModule(BEGIN_NS - 3 * NS_PER_S, hardware=HipnucHardware(skew_ppm=30.0))
     bench = Bench()
     codec = DRIVER.make_codec(Ledger(), DRIVER.settings())
-    told: list[int] = []
+    ticks: list[int] = []
     for second in range(8):
         module.mark(BEGIN_NS + second * NS_PER_S)
         assert bench.give(second, second + 0.2) == ""
@@ -161,6 +161,6 @@ def test_a_module_that_is_fed_shows_utc() -> None:
             for event in codec.feed(burst.data):
                 assert isinstance(event, Measurement)
                 assert event.dev_ticks is not None
-                told.append(event.dev_ticks)
-    assert 980 <= told[-1] - (UTC_S + 7) * 1000 % 2**32 < 1000
-    assert sum(after - before != pytest.approx(10, abs=1) for before, after in pairwise(told)) == 1
+                ticks.append(event.dev_ticks)
+    assert 980 <= ticks[-1] - (UTC_S + 7) * 1000 % 2**32 < 1000
+    assert sum(after - before != pytest.approx(10, abs=1) for before, after in pairwise(ticks)) == 1

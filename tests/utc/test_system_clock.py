@@ -1,31 +1,99 @@
-"""Sentences from the system clock: right second, right moment, and none from a clock that nothing keeps."""
+"""The system clock: the kernel's own answer, what it means, and sentences at the right moment or not at all."""
 
 import asyncio
+import time
 
 import pytest
 
 from imud.formats.rmc import Rmc, parse
 from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.adjtimex import KernelClock
 from imud.utc.source import RmcSettings
-from imud.utc.system_clock import AFTER_NS, LATEST_NS, SystemClockSource
+from imud.utc.system_clock import (
+    AFTER_NS,
+    LATEST_NS,
+    KernelClock,
+    SystemClockSource,
+    Timex,
+    kernel_clock,
+    realtime_offset_ns,
+    system_reference,
+)
+from tests.support.in_loop import in_loop
 from tests.support.sentences import Sentences
 
 GOOD = KernelClock(True, 500, 1000)
 OFFSET_NS = 1_795_000_000 * NS_PER_S + 123_456_789
 
 
+def test_the_kernel_answers_sensibly() -> None:
+    clock = kernel_clock()
+    assert 0 <= clock.most_error_us <= 16_000_000  # NTP_PHASE_LIMIT
+    assert 0 <= clock.estimated_error_us <= 16_000_000
+    assert clock.synchronised or clock.most_error_us > 0
+
+
+@pytest.mark.parametrize(
+    ("state", "status", "synchronised"),
+    [(0, 0x0001, True), (1, 0x2011, True), (5, 0x0040, False), (5, 0x0001, False), (0, 0x0040, False)],
+)
+def test_what_counts_as_synchronised(state: int, status: int, synchronised: bool) -> None:
+    def ask(timex: Timex) -> int:
+        assert timex.modes == 0  # nothing is to be changed
+        timex.status, timex.esterror, timex.maxerror = status, 7, 99
+        return state
+
+    assert kernel_clock(ask) == KernelClock(synchronised, 7, 99)
+
+
+def test_a_kernel_that_may_not_be_asked_vouches_for_nothing() -> None:
+    def ask(_timex: Timex) -> int:
+        raise PermissionError(1, "Operation not permitted")
+
+    assert not kernel_clock(ask).synchronised
+    assert system_reference(kernel_clock(ask), 42) is None
+
+
+def test_the_offset_joins_both_clocks() -> None:
+    offset_ns = realtime_offset_ns()
+    assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the machine may stall in between
+
+
+@pytest.mark.parametrize(
+    ("clock", "error_ns"),
+    [
+        (KernelClock(True, 250, 300), 250_000),
+        (KernelClock(True, 0, 1732), 999_971),  # uniform within ±1732 µs: 1732 / √3
+        (KernelClock(True, 5, 17_320), 9_999_707),
+    ],
+)
+def test_the_error_is_the_greater_of_both(clock: KernelClock, error_ns: int) -> None:
+    reference = system_reference(clock, 42)
+    assert reference
+    assert reference.offset_ns == 42
+    assert reference.error_ns == pytest.approx(error_ns, abs=1)
+
+
+def test_a_clock_that_nothing_keeps_is_no_reference() -> None:
+    assert system_reference(KernelClock(False, 1, NS_PER_MS), 42) is None
+
+
+# --- sentences --------------------------------------------------------------------------------------------------------
+
+
 class Bench:
-    """A source with a clock of the test's."""
+    """A source with a clock of the test's. Its timer does not run, as the tests do not wait."""
 
     def __init__(self, rate_hz: int = 1, clock: KernelClock = GOOD) -> None:
         self.now_ns = 5 * NS_PER_S
         self.clock = clock
         self.got: list[tuple[bytes, int]] = []
         self.source = SystemClockSource(
-            RmcSettings(source="system", rate_hz=rate_hz), lambda: self.clock, lambda: OFFSET_NS, lambda: self.now_ns
+            RmcSettings(source="system", rate_hz=rate_hz),
+            lambda: self.now_ns,
+            lambda _now_ns: OFFSET_NS,
+            lambda: self.clock,
         )
-        self.source._on_sentence = lambda sentence, t_rx_ns: self.got.append((sentence, t_rx_ns))
+        self.source.start(lambda sentence, t_rx_ns: self.got.append((sentence, t_rx_ns)))
 
     def go(self, times: int, late_ns: int = 50_000) -> None:
         """Wait as long as the source says, and a little more."""
@@ -35,7 +103,8 @@ class Bench:
 
 
 @pytest.mark.parametrize("rate_hz", range(1, 11))
-def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz: int) -> None:
+@in_loop
+async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz: int) -> None:
     bench = Bench(rate_hz)
     bench.go(20 * rate_hz)
     assert len(bench.got) >= 18
@@ -51,7 +120,8 @@ def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz: int)
     assert sum(name % NS_PER_S == 0 for name in names) >= 18
 
 
-def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
+@in_loop
+async def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
     bench = Bench()
     bench.go(1, late_ns=-1000)
     assert bench.got == []
@@ -69,7 +139,8 @@ def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
         (KernelClock(True, 0, 100_000), "may be wrong by 57.7 ms"),
     ],
 )
-def test_a_clock_that_is_not_good_enough_gives_none_and_says_why(clock: KernelClock, problem: str) -> None:
+@in_loop
+async def test_a_clock_that_is_not_good_enough_gives_none_and_says_why(clock: KernelClock, problem: str) -> None:
     bench = Bench(clock=clock)
     bench.go(3)
     assert bench.got == []
@@ -83,11 +154,13 @@ def test_a_clock_that_is_not_good_enough_gives_none_and_says_why(clock: KernelCl
 def test_it_runs_in_the_loop_and_stops() -> None:
     async def scene() -> None:
         sentences = Sentences()
-        source = SystemClockSource(RmcSettings(source="system", rate_hz=10), lambda: GOOD)
+        source = SystemClockSource(
+            RmcSettings(source="system", rate_hz=10), time.monotonic_ns, realtime_offset_ns, lambda: GOOD
+        )
         source.start(sentences)
         await sentences.until(lambda: len(sentences.got) >= 2)
-        await source.close()
-        await source.close()
+        source.close()
+        source.close()
         assert source.sentences == len(sentences.got)
 
     asyncio.run(scene())

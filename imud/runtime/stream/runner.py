@@ -141,6 +141,8 @@ class DeviceRunner(Device):
         if self._searchable:
             self._remembered.put(self.config.name, RememberedDevice(driver.name, link.baud))
         self._path = path
+        if self._utc is not None:
+            self._utc.start(self._clock)
         if self._wires is not None:
             self._wires.start(self._clock)
             path.drain = self._wires.drain

@@ -1,12 +1,14 @@
-"""RMC sentences are found in any split, among anything, and nothing is kept without bound."""
+"""RMC sentences in a byte stream: found in any split, buffered within a bound; pauses between connections."""
 
+import asyncio
+import tracemalloc
 from random import Random
 
 import pytest
 
 from imud.formats.rmc import build
 from imud.units import NS_PER_S
-from imud.utc.splitter import LINE_BYTES_MAX, SentenceSplitter
+from imud.utc.sentence_stream import FIRST_PAUSE_S, LINE_BYTES_MAX, LONGEST_PAUSE_S, Retry, SentenceSplitter
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
@@ -26,12 +28,16 @@ def test_a_sentence_behind_a_broken_one_is_found() -> None:
     assert SentenceSplitter().feed(broken + b"noise\xff$" + SENTENCES[2]) == SENTENCES[1:3]
 
 
-def test_a_line_without_end_is_passed_over_and_not_kept() -> None:
+def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
     splitter = SentenceSplitter()
-    for _ in range(100):
-        assert splitter.feed(b"$" + b"x" * 1000) == []
-        assert len(splitter._tail) <= LINE_BYTES_MAX + 1001
-    assert splitter.feed(SENTENCES[0][5:] + SENTENCES[1]) == [SENTENCES[1]]
+    tracemalloc.start()
+    try:
+        for _ in range(100):
+            assert splitter.feed(b"$" + b"x" * 1000) == []
+            assert tracemalloc.get_traced_memory()[0] <= LINE_BYTES_MAX + 4000
+    finally:
+        tracemalloc.stop()
+    assert splitter.feed(SENTENCES[0] + SENTENCES[1]) == [SENTENCES[1]]  # the first ends the skipped line
 
 
 def test_what_came_before_a_break_is_forgotten() -> None:
@@ -46,3 +52,21 @@ def test_too_long_sentences_and_noise_are_none() -> None:
     assert splitter.feed(b"$GPRMC," + b"1" * 120 + b"\r\n") == []
     for _ in range(500):
         splitter.feed(random.randbytes(random.randrange(200)))
+
+
+def test_pauses() -> None:
+    pauses: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    async def scene() -> None:
+        retry = Retry(sleep)
+        for _ in range(10):
+            await retry.pause()
+        retry.reset()
+        await retry.pause()
+
+    asyncio.run(scene())
+    assert pauses[:3] == [FIRST_PAUSE_S, 2 * FIRST_PAUSE_S, 4 * FIRST_PAUSE_S]
+    assert pauses[-2:] == [LONGEST_PAUSE_S, FIRST_PAUSE_S]

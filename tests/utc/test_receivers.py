@@ -1,0 +1,254 @@
+"""Sources that read a receiver: gpsd against a server that the test plays, a serial port with a link in memory."""
+
+import asyncio
+import json
+import time
+from collections.abc import Awaitable, Callable
+
+from imud.contracts.link import OnData, OnEnd
+from imud.contracts.status import KernelCounters
+from imud.errors import LinkError, LinkMissing
+from imud.formats.rmc import build
+from imud.units import NS_PER_S
+from imud.utc.receivers import GpsdSource, NmeaPortSource, make_nmea
+from imud.utc.sentence_stream import FIRST_PAUSE_S, Retry
+from imud.utc.source import RmcSettings, SourceContext
+from tests.support.sentences import LIMIT_S, Sentences, soon
+
+SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
+VERSION = b'{"class":"VERSION","release":"3.22","rev":"3.22","proto_major":3,"proto_minor":14}\r\n'
+Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+Scene = Callable[[GpsdSource, Sentences], Awaitable[None]]
+
+
+def play(serve: Serve, scene: Scene, gps: str = "", retry: Retry | None = None) -> Sentences:
+    async def whole() -> Sentences:
+        async def one(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            try:
+                await serve(reader, writer)
+            finally:
+                writer.close()
+
+        server = await asyncio.start_server(one, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        sentences = Sentences()
+        source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port, gps=gps), time.monotonic_ns, retry or Retry(soon))
+        async with server:
+            source.start(sentences)
+            try:
+                async with asyncio.timeout(LIMIT_S):
+                    await scene(source, sentences)
+            finally:
+                source.close()
+                source.close()
+        return sentences
+
+    return asyncio.run(whole())
+
+
+def test_it_asks_for_nmea_and_gives_rmc_with_its_time() -> None:
+    asked: list[bytes] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(VERSION)
+        asked.append(await reader.readline())
+        writer.write(b'{"class":"WATCH","enable":true,"nmea":true}\r\n' + SENTENCES[0] + b"$GPGGA,,,*00\r\n")
+        writer.write(SENTENCES[1])
+        await reader.read()
+
+    async def scene(source: GpsdSource, sentences: Sentences) -> None:
+        await sentences.until(lambda: len(sentences.got) == 2)
+        assert source.problem == ""
+        assert source.sentences == 2
+
+    begin_ns = time.monotonic_ns()
+    sentences = play(serve, scene, gps="/dev/ttyACM0")
+    assert sentences.data == SENTENCES[:2]
+    assert all(begin_ns <= t_rx_ns <= time.monotonic_ns() for _, t_rx_ns in sentences.got)
+    command, _, rest = asked[0].partition(b"=")
+    assert command == b"?WATCH"
+    assert rest.endswith(b";\n")
+    assert json.loads(rest[:-2]) == {"enable": True, "nmea": True, "device": "/dev/ttyACM0"}
+
+
+def test_a_server_that_closes_is_connected_to_again() -> None:
+    connections = 0
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal connections
+        connections += 1
+        await reader.readline()
+        writer.write(SENTENCES[connections] + SENTENCES[0][:20])
+        await writer.drain()
+
+    async def scene(_source: GpsdSource, sentences: Sentences) -> None:
+        await sentences.until(lambda: len(sentences.got) >= 3)
+
+    pauses: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    assert play(serve, scene, retry=Retry(sleep)).data[:3] == SENTENCES[1:4]
+    assert set(pauses) == {FIRST_PAUSE_S}  # after each success the next pause is short again
+
+
+def test_an_unreachable_server_is_a_problem_and_not_the_end() -> None:
+    async def scene() -> None:
+        server = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        server.close()
+        await server.wait_closed()
+        paused = asyncio.Event()
+
+        async def sleep(_seconds: float) -> None:
+            paused.set()
+            await asyncio.sleep(0)
+
+        source = GpsdSource(RmcSettings(source="gpsd", tcp_port=port), time.monotonic_ns, Retry(sleep))
+        source.start(Sentences())
+        async with asyncio.timeout(LIMIT_S):
+            await paused.wait()
+        assert "cannot be reached" in source.problem
+        assert "is gpsd running?" in source.problem
+        source.close()
+
+    asyncio.run(scene())
+
+
+def test_a_silent_server_is_a_problem() -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(b"x" * 100_000 + b"\n" + SENTENCES[0])
+        await reader.read()
+
+    problems: list[str] = []
+
+    async def scene(source: GpsdSource, sentences: Sentences) -> None:
+        await sentences.until(lambda: bool(sentences.got))
+        problems.append(source.problem)
+
+    assert play(serve, scene).data == SENTENCES[:1]
+    assert problems == [""]
+
+
+def test_closing_ends_the_connection_at_once() -> None:
+    ended = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(SENTENCES[0])
+        assert await reader.read() == b""
+        ended.set()
+
+    async def scene(source: GpsdSource, sentences: Sentences) -> None:
+        await sentences.until(lambda: bool(sentences.got))
+        source.close()
+        await ended.wait()
+
+    play(serve, scene)
+
+
+# --- a serial port ----------------------------------------------------------------------------------------------------
+
+
+class Port:
+    """A link of bytes whose far end is the test."""
+
+    title = "/dev/ttyGNSS"
+    writable = True
+    baud = 9600
+    auto_baud = False
+    hold_ns = 0
+
+    def __init__(self, refusals: int = 0) -> None:
+        self.opened = self.closed = 0
+        self.on_data: OnData | None = None
+        self.on_end: OnEnd | None = None
+        self.started = asyncio.Event()
+        self._refusals = refusals
+
+    async def wait_present(self) -> None:
+        await asyncio.sleep(0)
+
+    def open(self) -> None:
+        if self._refusals:
+            self._refusals -= 1
+            raise LinkError("/dev/ttyGNSS is in use")
+        self.opened += 1
+
+    def start(self, on_data: OnData, on_end: OnEnd) -> None:
+        self.on_data, self.on_end = on_data, on_end
+        self.started.set()
+
+    def write(self, data: bytes) -> None:
+        raise AssertionError(data)
+
+    def set_baud(self, baud: int) -> None:
+        raise AssertionError(baud)
+
+    def kernel_counters(self) -> KernelCounters:
+        return KernelCounters()
+
+    def close(self) -> None:
+        self.closed += 1
+        self.started.clear()
+
+
+def test_sentences_come_with_the_time_of_their_last_byte() -> None:
+    async def scene() -> None:
+        port, sentences = Port(), Sentences()
+        source = NmeaPortSource(port, Retry(soon))
+        source.start(sentences)
+        async with asyncio.timeout(LIMIT_S):
+            await port.started.wait()
+            assert "9600 bit/s" in source.problem
+            assert port.on_data
+            port.on_data(SENTENCES[0][:30], 1000)
+            port.on_data(SENTENCES[0][30:] + b"$GPGSV,*00\r\n" + SENTENCES[1], 2000)
+        assert sentences.got == [(SENTENCES[0], 2000), (SENTENCES[1], 2000)]
+        assert (source.problem, source.sentences) == ("", 2)
+        source.close()
+        source.close()
+        assert port.closed >= 1
+
+    asyncio.run(scene())
+
+
+def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
+    async def scene() -> None:
+        port, sentences = Port(refusals=3), Sentences()
+        source = NmeaPortSource(port, Retry(soon))
+        source.start(sentences)
+        async with asyncio.timeout(LIMIT_S):
+            await port.started.wait()
+            assert port.on_data
+            assert port.on_end
+            port.on_data(SENTENCES[0] + SENTENCES[1][:20], 1)
+            port.on_end(LinkMissing("/dev/ttyGNSS is gone"))
+            assert source.problem == "/dev/ttyGNSS is gone"
+            port.started.clear()
+            await port.started.wait()
+            port.on_data(SENTENCES[1][20:] + SENTENCES[2], 2)
+        assert sentences.data == [SENTENCES[0], SENTENCES[2]]
+        assert port.opened == 2
+        source.close()
+
+    asyncio.run(scene())
+
+
+def test_the_row_makes_it_of_the_port_that_is_named() -> None:
+    asked: list[tuple[str, int]] = []
+
+    def make_port(path: str, baud: int) -> Port:
+        asked.append((path, baud))
+        return Port()
+
+    context = SourceContext(make_port, time.monotonic_ns, lambda _now_ns: 0)
+
+    async def scene() -> None:
+        source = make_nmea(RmcSettings(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
+        assert source.title == "NMEA receiver on /dev/ttyGNSS"
+
+    asyncio.run(scene())
+    assert asked == [("/dev/ttyGNSS", 38400)]
