@@ -1,4 +1,4 @@
-"""Who may use a node of /dev, for messages to people."""
+"""Names of the user and of a device node's group, for messages of links and signals, which share only this."""
 
 import grp
 import os
@@ -6,7 +6,7 @@ import pwd
 
 
 def group_of(path: str, otherwise: str) -> str:
-    """Name of the group that may use the node; `otherwise` where only root may or nothing is known."""
+    """Return the name of the node's group; `otherwise` if that is root or not known."""
     try:
         gid = os.stat(path).st_gid
         return grp.getgrgid(gid).gr_name if gid else otherwise
@@ -15,7 +15,7 @@ def group_of(path: str, otherwise: str) -> str:
 
 
 def user_name() -> str:
-    """Name of the user this process runs as, or its number."""
+    """Return the name of the user that this process runs as, or its number."""
     uid = os.geteuid()
     try:
         return pwd.getpwuid(uid).pw_name

@@ -268,6 +268,8 @@ class SinTrigger:
         self._line, self._on_stamps, self._report, self._now_ns = line, on_stamps, report, now_ns
         pulse_ns = round(settings.pulse_ms * NS_PER_MS)
         self._trigger = Trigger(line, settings.rate_hz, now_ns, start_worker=start_worker, pulse_ns=pulse_ns)
+        self.drain: Callable[[], None] = self._trigger.drain
+        """Delivers the stamps of all edges made so far. Does not block."""
         self._running = False
         self._due_ns = 0
 
@@ -292,10 +294,6 @@ class SinTrigger:
     def once(self) -> None:
         """Make one edge in addition to those of the rate. Raises LinkError."""
         self._trigger.once()
-
-    def drain(self) -> None:
-        """Deliver the stamps of all edges made so far. Does not block."""
-        self._trigger.drain()
 
     def stop(self) -> None:
         """Leave the line inactive and release it; may be called twice. The next `tick` opens it again."""

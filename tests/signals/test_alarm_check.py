@@ -56,16 +56,16 @@ def test_at_the_limit_either_level_is_right() -> None:
     assert judge(ONLY_Y, angles(0, -5 + 1.1 * MARGIN_DEG), False) is AlarmVerdict.RIGHT
 
 
-def test_only_what_lasts_is_told_and_once() -> None:
-    check, told = AlarmCheck(ONLY_Y), []
+def test_only_what_lasts_is_reported_and_once() -> None:
+    check, changes = AlarmCheck(ONLY_Y), []
     step_ns = 10 * NS_PER_MS
     for number in range(1000):
         out = 100 <= number < 200 or number >= 300
         level = 103 <= number < 203  # it lags, and from 300 on the wire is broken
         change = check.add_sample(number * step_ns, angles(0, 9.0 if out else 0.0), level)
         if change:
-            told.append((number, change))
-    assert told == [
+            changes.append((number, change))
+    assert changes == [
         (SETTLE_NS // step_ns, AlarmVerdict.RIGHT),
         (300 + FAULT_NS // step_ns, AlarmVerdict.STUCK_LOW),
     ]
@@ -84,7 +84,7 @@ def run(levels_of_y: bool, *, stuck: bool = False) -> AlarmVerdict:
     return verdict
 
 
-def test_exchanged_axes_are_told_from_a_line_that_is_not_connected() -> None:
+def test_exchanged_axes_are_distinguished_from_a_line_that_is_not_connected() -> None:
     assert run(levels_of_y=True) is AlarmVerdict.RIGHT
     assert run(levels_of_y=False) is AlarmVerdict.OTHER_AXIS
     assert run(levels_of_y=True, stuck=True) is AlarmVerdict.STUCK_LOW

@@ -155,16 +155,16 @@ ALARM = DeviceLines(alarm=InputSettings(line="C"))
 RANGE = ModuleSettings(alarm_y=AlarmSetting(-5, 5, True))
 
 
-def test_an_alarm_is_told_and_shown_in_the_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_alarm_is_an_event_and_shown_in_the_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """The motion swings by 25°."""
     wired = Wired(ALARM, RANGE, identify=True)
 
     async def story() -> None:
         samples = await wired.wait(10)
-        told = [event.message for event in wired.of_kind(EventKind.ALARM)]
-        assert any(message.startswith("alarm") for message in told)
-        assert any(message.startswith("no alarm any more") for message in told)
-        assert not any("line alarm" in message for message in told)
+        messages = [event.message for event in wired.of_kind(EventKind.ALARM)]
+        assert any(message.startswith("alarm") for message in messages)
+        assert any(message.startswith("no alarm any more") for message in messages)
+        assert not any("line alarm" in message for message in messages)
         status = wired.runner.status()
         assert status.settings["ALARM_Y"] == "-5,5,0,1"
         assert status.lines is not None
@@ -180,7 +180,7 @@ def test_an_alarm_is_told_and_shown_in_the_samples(monkeypatch: pytest.MonkeyPat
     wired.play(monkeypatch, story)
 
 
-def test_an_alarm_wire_that_is_cut_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_alarm_wire_that_is_cut_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     tilted = HipnucHardware(motion=Still(roll_rad=0.3))
     wired = Wired(ALARM, RANGE, tilted, identify=True)
     wired.cut.add(Pin.ALARM)
@@ -235,7 +235,7 @@ WITHOUT_S = 30
 
 @pytest.mark.parametrize("skew_ppm", [30.0, -30.0])
 @pytest.mark.parametrize("lines", [PPS, DeviceLines(pps=PPS.pps, sout=SOUT.sout)], ids=["pps", "pps and sout"])
-def test_a_module_that_is_told_utc_is_on_utc_and_stays_in_time(
+def test_a_module_that_is_fed_utc_is_on_utc_and_stays_in_time(
     monkeypatch: pytest.MonkeyPatch, lines: DeviceLines, skew_ppm: float
 ) -> None:
     hardware = HipnucHardware(skew_ppm=skew_ppm)

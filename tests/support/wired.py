@@ -65,7 +65,7 @@ class FakeSource:
 
 
 class Wired:
-    """The module, the runner, and the wires between them."""
+    """The module, the runner, and the lines between them."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class Wired:
         self._heard = 0
 
     def play(self, monkeypatch: pytest.MonkeyPatch, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device while the story is told; at the end the ledger closes and the lines are released."""
+        """Run the device during the story; at the end the ledger closes and the lines are released."""
         clock = self.clock
         clock.stand_for_monotonic(monkeypatch, *CLOCKED)
         monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: self.source})
@@ -140,7 +140,7 @@ class Wired:
         return self.samples[before:]
 
     def power_on(self) -> None:
-        """A module that begins anew on the same wires."""
+        """A module that begins anew on the same lines."""
         self.module = HipnucModule(self.clock.now_ns(), self._settings, self._hardware)
         on_edge: Mapping[Pin, OnEdge] = {pin: partial(self._on_edge, pin) for pin in Pin}
         self.pins = Pins(self.module, on_edge, self._pin_faults)

@@ -64,7 +64,7 @@ def test_a_device_is_fed_what_gpsd_hears(receiver: Receiver, port: Port, tmp_pat
         while len(fed) < WANTED:
             assert time.monotonic() < end, daemon.statuses()["bow"].utc
             now_s = time.time()
-            if int(now_s) > receiver.second and now_s % 1 < 0.5:  # a receiver tells each second early in it
+            if int(now_s) > receiver.second and now_s % 1 < 0.5:  # a receiver names each second early in it
                 receiver.second = int(now_s)
                 receiver.cycle()
                 receiver.second -= 1

@@ -71,7 +71,7 @@ async def test_edges_come_by_the_loop_and_by_drain(gpiod: FakeGpiod, tmp_path: P
     line.open()
     (request,) = gpiod.requests
     request.feed((100, 1, 1))
-    line.drain()  # nobody is there to be told
+    line.drain()  # before `start` nothing is delivered
     line.start(sink.on_edges, sink.on_end)
     await sink.wait()
     assert sink.edges == [Edge(100, True, 1)]
@@ -114,7 +114,7 @@ async def test_many_edges_are_read_in_batches_but_not_for_ever(gpiod: FakeGpiod,
 
 
 @in_loop
-async def test_a_line_closed_by_who_hears_of_its_edges(gpiod: FakeGpiod, tmp_path: Path) -> None:
+async def test_a_line_closed_by_the_handler_of_its_edges(gpiod: FakeGpiod, tmp_path: Path) -> None:
     line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
 
