@@ -177,5 +177,7 @@ async def test_a_line_that_fails_when_it_is_driven() -> None:
     assert it.reset.problem == "gone"
     assert not it.line.is_open
     it.line.set_error = None
-    it.tick(RETRY_NS)
+    it.tick(RETRY_NS - 1)
+    assert not it.line.is_open
+    it.tick(1)
     assert it.line.is_open
