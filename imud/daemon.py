@@ -17,10 +17,9 @@ from typing import Any, cast
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.contracts.action import ActionInfo, described
-from imud.contracts.batch import Batch
 from imud.contracts.can import CanDriver
 from imud.contracts.lines import LineFactory
-from imud.contracts.publisher import Publisher, PublisherContext, PublisherSettings
+from imud.contracts.publisher import Batch, Publisher, PublisherContext, PublisherSettings
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.devices import DRIVERS
 from imud.errors import ConfigError, ServerError

@@ -11,8 +11,8 @@ from imud import config
 from imud.cli.options import add_option, driver_settings, given_options
 from imud.cli.run import start_log
 from imud.cli.status import block
-from imud.contracts.batch import Batch
 from imud.contracts.can import CanDriver
+from imud.contracts.publisher import Batch
 from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ImudError

@@ -5,14 +5,35 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from imud.contracts.action import ActionInfo
-from imud.contracts.batch import Batch
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.errors import CommandError
 from imud.event import Event
+from imud.formats.slot import encode_slot
+from imud.sample import Sample
 
 StatusSource = Callable[[], Sequence[DeviceStatus]]
 """The state of every device now. To be called in the event loop's thread only."""
+
+
+class Batch:
+    """The samples that one read of one device completed, oldest first, at least one; shared by all, changed by none."""
+
+    __slots__ = ("_slots", "device", "device_id", "samples")
+
+    def __init__(self, device: str, device_id: int, samples: Sequence[Sample]) -> None:
+        self.device = device
+        self.device_id = device_id
+        """The daemon's number of the device, as it stands in slots."""
+        self.samples = samples
+        self._slots: list[bytes] | None = None
+
+    def slots(self) -> list[bytes]:
+        """The samples as slots (`imud.formats.slot`), encoded on first use."""
+        if self._slots is None:
+            device_id = self.device_id
+            self._slots = [encode_slot(sample, device_id) for sample in self.samples]
+        return self._slots
 
 
 class Publisher(Protocol):

@@ -16,10 +16,10 @@ from typing import Any
 from imud.clock import SampleClock
 from imud.config import DeviceConfig
 from imud.contracts.action import Action, Actions, Target
-from imud.contracts.batch import Batch
 from imud.contracts.driver import Driver, Identity
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
+from imud.contracts.publisher import Batch
 from imud.contracts.session import RequestScript
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus

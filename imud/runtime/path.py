@@ -10,9 +10,9 @@ from time import monotonic_ns, time_ns
 from typing import Any
 
 from imud.clock import SampleClock
-from imud.contracts.batch import Batch
 from imud.contracts.can import CanCodec
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, Message, ReplyFrame, StreamCodec, TextLine
+from imud.contracts.publisher import Batch
 from imud.formats.can import CanFrame
 from imud.ledger import Ledger
 from imud.runtime.meters import LatencyMeter, LossMeter

@@ -10,8 +10,8 @@ from contextlib import ExitStack
 from time import monotonic_ns, process_time_ns
 
 from imud.clock import SampleClock
-from imud.contracts.batch import Batch
 from imud.contracts.can import CanDriver
+from imud.contracts.publisher import Batch
 from imud.devices import DRIVERS
 from imud.formats.can import RAW_FRAME, CanFilter
 from imud.formats.slot import encode_slot

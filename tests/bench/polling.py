@@ -16,9 +16,9 @@ from tempfile import TemporaryDirectory
 
 import imud.links.spi as spi_link
 from imud.config import DeviceConfig
-from imud.contracts.batch import Batch
 from imud.contracts.lines import DeviceLines, LineFactory, ReadySettings
 from imud.contracts.link import LinkType
+from imud.contracts.publisher import Batch
 from imud.devices.imu61x.spi import codec as spi
 from imud.links.spi import SpiLink, SpiSettings
 from imud.runtime.polled.bus import Buses

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from imud.client.ring import Ring
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext
+from imud.contracts.publisher import Batch, PublisherContext
 from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.sample import Sample, Sync
 from tests.bench.rows import Row

@@ -17,8 +17,7 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
 
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext
+from imud.contracts.publisher import Batch, PublisherContext
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.sample import Sample, Sync

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from imud.client import Client, RpcError
 from imud.client.watch import event_of
-from imud.contracts.batch import Batch
+from imud.contracts.publisher import Batch
 from imud.errors import LinkDenied, LinkMissing, ServerError
 from imud.event import Event, EventKind
 from imud.publishers.socket.publisher import SocketServer

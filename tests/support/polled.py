@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 
 from imud.config import DeviceConfig
-from imud.contracts.batch import Batch
 from imud.contracts.lines import LineFactory
+from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
 from imud.event import Event, EventKind

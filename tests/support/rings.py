@@ -3,8 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext
+from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.formats.ring import OFFSETS
 from imud.ledger import Ledger

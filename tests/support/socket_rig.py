@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from imud.contracts.action import Action, described
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext
+from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.errors import Rejected

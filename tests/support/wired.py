@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
-from imud.contracts.batch import Batch
 from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings
+from imud.contracts.publisher import Batch
 from imud.event import Event, EventKind
 from imud.formats.rmc import build
 from imud.links.memory import MemoryLink, MemorySettings

@@ -23,8 +23,7 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample as Line
 
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext, PublisherType
+from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.event import Event

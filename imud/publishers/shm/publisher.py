@@ -11,8 +11,7 @@ from typing import Annotated
 
 import msgspec
 
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext, PublisherType
+from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.settings import Settings
 from imud.errors import ServerError
 from imud.event import Event

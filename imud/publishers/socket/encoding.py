@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Final, Protocol
 
-from imud.contracts.batch import Batch
+from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import FRAME_HEADER, encode, encode_notification, frame_of, line_of
 from imud.formats.slot import SLOT_BYTES
 from imud.sample import Sample

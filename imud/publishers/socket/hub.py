@@ -5,8 +5,7 @@ from collections.abc import Coroutine, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext
+from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClientStatus, SocketStatus
 from imud.event import Event
 from imud.formats.jsonrpc import encode_notification

@@ -16,8 +16,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext, PublisherType
+from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.settings import Settings
 from imud.event import Event
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of

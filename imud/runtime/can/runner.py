@@ -8,10 +8,10 @@ from typing import Any
 
 from imud.config import DeviceConfig
 from imud.contracts.action import Target
-from imud.contracts.batch import Batch
 from imud.contracts.can import CanCodec, CanDriver
 from imud.contracts.driver import Identity, of_kind
 from imud.contracts.link import CanLink
+from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
 from imud.errors import LinkError, NothingHeard

@@ -15,11 +15,11 @@ import msgspec
 
 from imud.config import DeviceConfig
 from imud.contracts.action import Action
-from imud.contracts.batch import Batch
 from imud.contracts.driver import Identity, of_kind
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import PolledLink
 from imud.contracts.polling import PolledDriver, Reading
+from imud.contracts.publisher import Batch
 from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
 from imud.devices import DRIVERS

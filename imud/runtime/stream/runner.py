@@ -6,10 +6,10 @@ from collections.abc import Callable
 from time import monotonic_ns
 
 from imud.config import DeviceConfig
-from imud.contracts.batch import Batch
 from imud.contracts.driver import Identity, StreamDriver
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import StreamLink
+from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
 from imud.errors import CommandError, NothingHeard

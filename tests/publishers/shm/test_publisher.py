@@ -12,8 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.contracts.batch import Batch
-from imud.contracts.publisher import PublisherContext
+from imud.contracts.publisher import Batch, PublisherContext
 from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.formats.ring import (

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from imud.contracts.batch import Batch
+from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import LINE_MAX_BYTES, RpcError, parse_request
 from tests.support.socket_rig import LIMIT_S, Peer, batch, run, serving
 

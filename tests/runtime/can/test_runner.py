@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
-from imud.contracts.batch import Batch
 from imud.contracts.can import CanDriver
+from imud.contracts.publisher import Batch
 from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState, KernelCounters
 from imud.devices import DRIVERS

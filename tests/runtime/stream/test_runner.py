@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
-from imud.contracts.batch import Batch
+from imud.contracts.publisher import Batch
 from imud.contracts.session import Request, RequestScript, never
 from imud.contracts.status import DeviceState, KernelCounters
 from imud.errors import LinkBusy, LinkError
