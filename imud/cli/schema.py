@@ -6,7 +6,7 @@ import msgspec
 
 from imud.cli.table import table
 from imud.devices import DRIVERS
-from imud.formats.fields import FIELDS
+from imud.sample import SAMPLE_SCHEMA
 
 FIELD_HEAD = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
 DRIVER_HEAD = ("DRIVER", "NAVIGATION FRAME", "EULER ANGLES")
@@ -24,9 +24,9 @@ def run(args: argparse.Namespace) -> int:
         for name, driver in DRIVERS.items()
     }
     if args.json:
-        print(msgspec.json.encode({"fields": FIELDS, "drivers": conventions}).decode())
+        print(msgspec.json.encode({"fields": SAMPLE_SCHEMA, "drivers": conventions}).decode())
         return 0
-    print(table(FIELD_HEAD, [(f.name, f.type, f.unit, f.frame, f.meaning) for f in FIELDS]))
+    print(table(FIELD_HEAD, [(f.name, f.type, f.unit, f.frame, f.meaning) for f in SAMPLE_SCHEMA]))
     print()
     print(table(DRIVER_HEAD, [(name, c["navigation_frame"], c["euler_convention"]) for name, c in conventions.items()]))
     return 0

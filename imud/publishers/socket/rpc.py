@@ -8,7 +8,6 @@ import msgspec
 
 from imud import __version__
 from imud.errors import ImudError
-from imud.formats.fields import FIELDS
 from imud.formats.jsonrpc import (
     PROTOCOL,
     Code,
@@ -26,7 +25,7 @@ from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.outbox import NO_FD
 from imud.publishers.socket.rights import Rights
 from imud.publishers.socket.subscription import Form, Subscription
-from imud.sample import SAMPLE_FIELDS
+from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA
 
 RATE_MIN_HZ: Final = 0.001
 """Slower than one sample in 1,000 s is a mistake of units more likely than a wish; `poll` serves it."""
@@ -202,7 +201,7 @@ def _schema(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
         }
         for device in hub.context.status()
     }
-    return Answer({"protocol": PROTOCOL, "fields": FIELDS, "devices": devices, "slot": SLOT_SCHEMA})
+    return Answer({"protocol": PROTOCOL, "fields": SAMPLE_SCHEMA, "devices": devices, "slot": SLOT_SCHEMA})
 
 
 SLOT_SCHEMA: Final = {

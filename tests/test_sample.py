@@ -1,10 +1,9 @@
-"""The table of a sample's members says what is in them."""
+"""The schema of a sample describes every member in its order, as the C and JSON readers see them."""
 
-from imud.formats.fields import FIELDS
-from imud.sample import SAMPLE_FIELDS, Sample
+from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
 from imud.signals.sync_signals import ALARM_STATUS
 
-BY_NAME = {field.name: field for field in FIELDS}
+BY_NAME = {field.name: field for field in SAMPLE_SCHEMA}
 
 
 def test_every_member_has_its_row_in_its_place() -> None:
