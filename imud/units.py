@@ -15,6 +15,9 @@ STANDARD_GRAVITY_M_S2: Final = 9.80665
 T_PER_UT: Final = 1e-6
 """Microtesla to tesla."""
 
+PPM_PER_ONE: Final = 1_000_000
+"""Parts per million in a ratio of 1."""
+
 NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from threading import Event, Thread
 
-from imud.publishers.metrics.publisher import Renderer, Snapshot
+from imud.publishers.metrics.family import Snapshot
+from imud.publishers.metrics.publisher import Renderer
 from tests.bench.rows import Row, at_most
 from tests.support.device_status import client, equipped
 

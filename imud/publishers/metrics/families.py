@@ -1,194 +1,391 @@
-"""The metrics of devices and daemon: name, help, labels, and how each is read. `docs/metrics.md` lists them.
+"""Table: all metrics of imud except the process's own, in the order they are shown. `docs/metrics.md` lists them.
 
 Base units, `_total` for counters, labels of bounded sets only. Counters of one scrape come from one moment of the
-event loop, so sums over them are exact: the ledger closes in every scrape.
+event loop, so sums over them are exact: the ledger closes in every scrape. Values of clients are summed over all:
+a label per client would make a new time series for every connection.
 """
 
 import platform
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Mapping
 from typing import Final
 
-from prometheus_client.core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-    HistogramMetricFamily,
-    InfoMetricFamily,
-    Metric,
-)
-
 import imud
-from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
+from imud.contracts.status import LATENCY_BOUNDS_NS, ClockStatus, DeviceState, DeviceStatus, LinesStatus, UtcStatus
 from imud.ledger import bytes_open, frames_open
-from imud.publishers.metrics.clock import TIME_FAMILIES
-from imud.publishers.metrics.family import Family, Labelled, one, seconds
-from imud.publishers.metrics.lines import LINE_FAMILIES
-from imud.publishers.metrics.polling import POLLING_FAMILIES
+from imud.publishers.metrics.family import (
+    BYTES,
+    CELSIUS,
+    HERTZ,
+    NO_UNIT,
+    RATIO,
+    SECONDS,
+    DevicePart,
+    Family,
+    Histogram,
+    Lines,
+    MetricType,
+    Reader,
+    Snapshot,
+    Unit,
+    daemon,
+)
 from imud.sample import Sync
-from imud.units import NS_PER_S
+
+DEVICE_INFO_LABELS: Final = ("device", "driver", "link", "product", "serial_number", "firmware")
+CLIENT_ENCODINGS: Final = ("json", "binary", "none")
 
 
-def _ledger(*fields: str) -> Callable[[DeviceStatus], Labelled]:
-    """One counter, `bytes_in`; or several with a label, `crc=lost_crc`."""
-    pairs = [(tuple(label for label in field.split("=")[:-1]), field.split("=")[-1]) for field in fields]
-    return lambda device: ((labels, device.ledger[field]) for labels, field in pairs)
+def _counter(name: str, help_: str, reader: Reader, unit: Unit = NO_UNIT) -> Family:
+    return Family(name, MetricType.COUNTER, unit, help_, reader)
 
 
-def _kernel(device: DeviceStatus) -> Labelled:
-    kernel = device.kernel
-    return (
-        (("overrun",), kernel.overrun),
-        (("framing",), kernel.framing),
-        (("parity",), kernel.parity),
-        (("break",), kernel.break_),
-        (("error_passive",), kernel.error_passive),
-        (("bus_off",), kernel.bus_off),
-    )
+def _gauge(name: str, help_: str, reader: Reader, unit: Unit = NO_UNIT) -> Family:
+    return Family(name, MetricType.GAUGE, unit, help_, reader)
 
+
+def _info(name: str, help_: str, reader: Reader) -> Family:
+    return Family(name, MetricType.INFO, NO_UNIT, help_, reader)
+
+
+# --- how values are read ----------------------------------------------------------------------------------------------
+
+
+def _edged(device: DeviceStatus) -> ClockStatus | None:
+    """The clock of a device with lines."""
+    return device.clock if device.lines is not None else None
+
+
+def _with_alarm(device: DeviceStatus) -> LinesStatus | None:
+    return device.lines if device.lines is not None and "alarm" in device.lines.edges else None
+
+
+def _with_sin(device: DeviceStatus) -> LinesStatus | None:
+    """The lines of a device whose SIN imud drives."""
+    return device.lines if device.lines is not None and device.lines.sin else None
+
+
+def _triggered(device: DeviceStatus) -> ClockStatus | None:
+    """The clock of such a device."""
+    return device.clock if _with_sin(device) is not None else None
+
+
+def _fed(device: DeviceStatus) -> UtcStatus | None:
+    """UTC of a device that sentences are sent to."""
+    return device.utc if device.utc is not None and device.utc.source else None
+
+
+DEVICE: Final = DevicePart(lambda device: device)
+CLOCK: Final = DevicePart(lambda device: device.clock)
+LEDGER: Final = DevicePart(lambda device: device.ledger)
+KERNEL: Final = DevicePart(lambda device: device.kernel)
+POLLING: Final = DevicePart(lambda device: device.polling)
+SERIAL_LINE: Final = DevicePart(lambda device: device.serial_line)
+EDGES: Final = DevicePart(_edged)
+TRIGGERS: Final = DevicePart(_triggered)
+LINES: Final = DevicePart(lambda device: device.lines)
+ALARM: Final = DevicePart(_with_alarm)
+SIN: Final = DevicePart(_with_sin)
+UTC: Final = DevicePart(lambda device: device.utc)
+SENTENCES: Final = DevicePart(_fed)
+
+
+def _ledger(field: str) -> Reader:
+    return LEDGER.one(lambda ledger: ledger[field])
+
+
+def _ledger_by(label: str, **fields: str) -> Reader:
+    """Fields of the ledger by the label's value: `crc="lost_crc"`."""
+    return LEDGER.by(label, lambda ledger: {value: ledger[field] for value, field in fields.items()})
+
+
+def _line_problems(lines: LinesStatus) -> Mapping[str, float]:
+    names = dict.fromkeys((*lines.edges, *(("sin",) if lines.sin else ()), *lines.problems))
+    return {name: name in lines.problems for name in names}
+
+
+def _device_info(snapshot: Snapshot) -> Lines:
+    for device in snapshot.devices:
+        identity = (device.identity.get(key, "") for key in ("product", "serial_number", "firmware"))
+        yield (device.name, device.driver, device.link, *identity), 1
+
+
+def _clients_by_encoding(snapshot: Snapshot) -> Lines:
+    encodings = Counter(client.encoding or "none" for client in snapshot.clients)
+    return (((encoding,), encodings[encoding]) for encoding in CLIENT_ENCODINGS)
+
+
+# --- the daemon and what its devices are ------------------------------------------------------------------------------
+
+DAEMON_FAMILIES: Final = (
+    _info(
+        "imud_build_info", "What runs here; always 1.",
+        Reader(("version", "python"), lambda _snapshot: (((imud.__version__, platform.python_version()), 1),)),
+    ),
+    _gauge(
+        "imud_heartbeat_age_seconds",
+        "Time since the daemon's ten-times-a-second tick; grows when the event loop is stuck.",
+        daemon(lambda snapshot: snapshot.heartbeat_age_ns), SECONDS,
+    ),
+    _info("imud_device_info", "What the device is; always 1.", Reader(DEVICE_INFO_LABELS, _device_info)),
+)  # fmt: skip
+
+# --- every device -----------------------------------------------------------------------------------------------------
 
 DEVICE_FAMILIES: Final = (
-    Family(
-        "imud_device_up", "1 while samples flow, else 0.", (), one(lambda d: float(d.state is DeviceState.RUNNING))
+    _gauge("imud_device_up", "1 while samples flow, else 0.", DEVICE.one(lambda d: d.state is DeviceState.RUNNING)),
+    _gauge(
+        "imud_device_state", "1 for the state the device is in, 0 for the others.",
+        DEVICE.by("state", lambda d: {state.value: d.state is state for state in DeviceState}),
     ),
-    Family(
-        "imud_device_state", "1 for the state the device is in, 0 for the others.", ("state",),
-        lambda d: (((state.value,), float(d.state is state)) for state in DeviceState),
+    _counter("imud_device_connects_total", "Times the link was opened.", DEVICE.one(lambda d: d.connects)),
+    _counter("imud_bytes_in_total", "Bytes that the link delivered.", _ledger("bytes_in")),
+    _counter(
+        "imud_bytes_total", "Bytes by what became of them.",
+        _ledger_by("fate", good_frames="bytes_in_good_frames", bad_frames="bytes_in_bad_frames",
+                   skipped="bytes_skipped"), BYTES,
     ),
-    Family("imud_device_connects_total", "Times the link was opened.", (), one(lambda d: d.connects)),
-    Family("imud_bytes_in_total", "Bytes that the link delivered.", (), _ledger("bytes_in")),
-    Family(
-        "imud_bytes_total", "Bytes by what became of them.", ("fate",),
-        _ledger("good_frames=bytes_in_good_frames", "bad_frames=bytes_in_bad_frames", "skipped=bytes_skipped"),
+    _gauge("imud_bytes_pending", "Bytes that may still become a frame.", _ledger("bytes_pending")),
+    _counter("imud_frames_good_total", "Frames whose check value was right.", _ledger("frames_good")),
+    _counter(
+        "imud_frames_total", "Good frames by what became of them.",
+        _ledger_by("fate", samples="frames_in_samples", replies="frames_in_replies", ignored="frames_ignored"),
     ),
-    Family("imud_bytes_pending", "Bytes that may still become a frame.", (), _ledger("bytes_pending")),
-    Family("imud_frames_good_total", "Frames whose check value was right.", (), _ledger("frames_good")),
-    Family(
-        "imud_frames_total", "Good frames by what became of them.", ("fate",),
-        _ledger("samples=frames_in_samples", "replies=frames_in_replies", "ignored=frames_ignored"),
-    ),
-    Family("imud_frames_pending", "Good frames that wait for the rest of their sample.", (), _ledger("frames_pending")),
-    Family(
+    _gauge("imud_frames_pending", "Good frames that wait for the rest of their sample.", _ledger("frames_pending")),
+    _counter(
         "imud_frames_bad_total", "Damaged frames by reason; not_finite ones are used without those values.",
-        ("reason",),
-        _ledger(
-            "crc=frames_bad_crc", "length=frames_bad_length", "content=frames_bad_content",
-            "not_finite=frames_not_finite",
-        ),
+        _ledger_by("reason", crc="frames_bad_crc", length="frames_bad_length", content="frames_bad_content",
+                   not_finite="frames_not_finite"),
     ),
-    Family("imud_unknown_tags_total", "Sub-packets of good frames with an unknown tag.", (), _ledger("unknown_tags")),
-    Family(
-        "imud_ledger_unaccounted_bytes", "Bytes delivered less bytes accounted for; 0 unless imud has a bug.", (),
-        one(lambda device: bytes_open(device.ledger)),
+    _counter("imud_unknown_tags_total", "Sub-packets of good frames with an unknown tag.", _ledger("unknown_tags")),
+    _gauge(
+        "imud_ledger_unaccounted_bytes", "Bytes delivered less bytes accounted for; 0 unless imud has a bug.",
+        LEDGER.one(bytes_open), BYTES,
     ),
-    Family(
-        "imud_ledger_unaccounted_frames", "Good frames less frames accounted for; 0 unless imud has a bug.", (),
-        one(lambda device: frames_open(device.ledger)),
+    _gauge(
+        "imud_ledger_unaccounted_frames", "Good frames less frames accounted for; 0 unless imud has a bug.",
+        LEDGER.one(frames_open),
     ),
-    Family("imud_samples_total", "Samples made.", (), _ledger("samples")),
-    Family(
-        "imud_samples_lost_total", "Samples lost by cause.", ("cause",),
-        _ledger("gap_device=lost_gap_device", "crc=lost_crc", "overrun=lost_overrun", "queue=lost_queue"),
+    _counter("imud_samples_total", "Samples made.", _ledger("samples")),
+    _counter(
+        "imud_samples_lost_total", "Samples lost by cause.",
+        _ledger_by("cause", gap_device="lost_gap_device", crc="lost_crc", overrun="lost_overrun", queue="lost_queue"),
     ),
-    Family(
-        "imud_replies_stray_total", "Lines of text from the device that answered no request in time.", ("kind",),
-        _ledger("late=replies_late", "unsolicited=replies_unsolicited"),
+    _counter(
+        "imud_replies_stray_total", "Lines of text from the device that answered no request in time.",
+        _ledger_by("kind", late="replies_late", unsolicited="replies_unsolicited"),
     ),
-    Family("imud_sample_rate_hertz", "Samples per second over the last seconds.", (), one(lambda d: d.rate_hz)),
-    Family(
-        "imud_sample_rate_expected_hertz", "Rate by the device's own time stamps; absent while unknown.", (),
-        one(lambda d: d.expected_rate_hz or None),
+    _gauge(
+        "imud_sample_rate_hertz", "Samples per second over the last seconds.", DEVICE.one(lambda d: d.rate_hz), HERTZ
     ),
-    Family(
-        "imud_clock_sync", "1 for the present source of time stamps, 0 for the others.", ("sync",),
-        lambda d: (((sync.value,), float(d.clock.sync is sync)) for sync in Sync),
+    _gauge(
+        "imud_sample_rate_expected_hertz", "Rate by the device's own time stamps; absent while unknown.",
+        DEVICE.one(lambda d: d.expected_rate_hz or None), HERTZ,
     ),
-    Family(
-        "imud_clock_offset_seconds", "Host CLOCK_MONOTONIC minus device time, at the newest sample.", (),
-        seconds(lambda d: d.clock.offset_ns),
+    _gauge(
+        "imud_clock_sync", "1 for the present source of time stamps, 0 for the others.",
+        CLOCK.by("sync", lambda clock: {sync.value: clock.sync is sync for sync in Sync}),
     ),
-    Family(
-        "imud_clock_skew_ratio", "How much faster than the host's the device's clock runs; 4e-05 is 40 ppm.", (),
-        one(lambda d: d.clock.skew_ppm / 1e6),
+    _gauge(
+        "imud_clock_offset_seconds", "Host CLOCK_MONOTONIC minus device time, at the newest sample.",
+        CLOCK.one(lambda clock: clock.offset_ns), SECONDS,
     ),
-    Family(
-        "imud_clock_residual_seconds", "One-sigma spread of arrival times around the fitted clock.", (),
-        seconds(lambda d: d.clock.residual_ns),
+    _gauge(
+        "imud_clock_skew_ratio", "How much faster than the host's the device's clock runs; 4e-05 is 40 ppm.",
+        CLOCK.one(lambda clock: clock.skew_ppm), RATIO,
     ),
-    Family(
-        "imud_clock_error_seconds", "One-sigma error of the newest time stamp.", (),
-        seconds(lambda d: d.clock.t_err_ns),
+    _gauge(
+        "imud_clock_residual_seconds", "One-sigma spread of arrival times around the fitted clock.",
+        CLOCK.one(lambda clock: clock.residual_ns), SECONDS,
     ),
-    Family("imud_clock_resets_total", "Times the device's clock started anew.", (), one(lambda d: d.clock.resets)),
-    Family("imud_temperature_celsius", "Temperature that the device sends.", (), one(lambda d: d.temperature_c)),
-    Family("imud_status_bits", "Status word of the newest sample.", (), one(lambda d: d.status_bits)),
-    Family(
-        "imud_kernel_errors_total", "Errors of the port that the kernel counted since the link was opened.", ("kind",),
-        _kernel,
+    _gauge(
+        "imud_clock_error_seconds", "One-sigma error of the newest time stamp.",
+        CLOCK.one(lambda clock: clock.t_err_ns), SECONDS,
     ),
+    _counter("imud_clock_resets_total", "Times the device's clock started anew.", CLOCK.one(lambda c: c.resets)),
+    _gauge(
+        "imud_temperature_celsius", "Temperature that the device sends.", DEVICE.one(lambda d: d.temperature_c), CELSIUS
+    ),
+    _gauge("imud_status_bits", "Status word of the newest sample.", DEVICE.one(lambda d: d.status_bits)),
+    _counter(
+        "imud_kernel_errors_total", "Errors of the port that the kernel counted since the link was opened.",
+        KERNEL.by("kind", lambda kernel: {
+            "overrun": kernel.overrun, "framing": kernel.framing, "parity": kernel.parity, "break": kernel.break_,
+            "error_passive": kernel.error_passive, "bus_off": kernel.bus_off,
+        }),
+    ),
+)  # fmt: skip
+
+# --- what only some devices have --------------------------------------------------------------------------------------
+
+POLLING_FAMILIES: Final = (
+    _counter("imud_polls_total", "Deadlines at which the device was read.", POLLING.one(lambda p: p.polls)),
+    _counter(
+        "imud_polls_late_total", "Of these, begun more than a quarter of the period after the deadline.",
+        POLLING.one(lambda p: p.late),
+    ),
+    _counter("imud_polls_missed_total", "Deadlines that passed without a read.", POLLING.one(lambda p: p.missed)),
+    _counter("imud_polls_stale_total", "Reads that gave nothing new.", POLLING.one(lambda p: p.stale)),
+    _counter(
+        "imud_poll_delay_seconds_total", "Time from deadline to read, summed over all polls.",
+        POLLING.one(lambda p: p.late_sum_ns), SECONDS,
+    ),
+    _gauge(
+        "imud_poll_delay_worst_seconds", "Longest time from deadline to read since start.",
+        POLLING.one(lambda p: p.late_worst_ns), SECONDS,
+    ),
+    _counter("imud_transfers_failed_total", "Transfers of polls that failed.", POLLING.one(lambda p: p.failed)),
+    _counter(
+        "imud_device_vanished_total", "Times a polled device had to be identified again.",
+        POLLING.one(lambda p: p.vanished),
+    ),
+    _counter(
+        "imud_serial_line_timeouts_total", "Requests on the device's line that got no reply.",
+        SERIAL_LINE.one(lambda line: line.timeouts),
+    ),
+    _counter(
+        "imud_serial_line_late_bytes_total", "Bytes on the device's line that came when nothing was asked.",
+        SERIAL_LINE.one(lambda line: line.late_bytes), BYTES,
+    ),
+    _counter(
+        "imud_serial_line_strange_bytes_total", "Bytes on the device's line before a reply, or instead of it.",
+        SERIAL_LINE.one(lambda line: line.strange_bytes), BYTES,
+    ),
+    _counter(
+        "imud_serial_line_echoes_total", "Requests on the device's line that came back as an echo.",
+        SERIAL_LINE.one(lambda line: line.echoes),
+    ),
+)  # fmt: skip
+
+TIME_FAMILIES: Final = (
+    _gauge(
+        "imud_clock_hold_seconds", "How long the link's adapter may hold bytes back; 0 for none.",
+        CLOCK.one(lambda clock: clock.hold_ns), SECONDS,
+    ),
+    _counter(
+        "imud_clock_edges_total", "Pulses on SOUT, or triggers given on SIN, that reached the clock.",
+        EDGES.one(lambda clock: clock.edges),
+    ),
+    _counter(
+        "imud_clock_edges_unpaired_total", "Pulses on SOUT that belong to no sample.",
+        EDGES.one(lambda clock: clock.edges_unpaired),
+    ),
+    _counter(
+        "imud_clock_samples_unpaired_total",
+        "Samples whose own pulse or trigger was not seen, though others were.",
+        EDGES.one(lambda clock: clock.samples_unpaired),
+    ),
+    _counter(
+        "imud_triggers_unanswered_total", "Triggers on SIN that no sample answered.",
+        TRIGGERS.one(lambda clock: clock.triggers_missed),
+    ),
+    _gauge(
+        "imud_clock_reference_error_seconds", "One-sigma error of what the host knows of UTC; absent while nothing.",
+        CLOCK.one(lambda clock: clock.reference_error_ns or None), SECONDS,
+    ),
+    _gauge(
+        "imud_utc_problem", "1 while something is wrong with the source of UTC or the feed of chronyd.",
+        UTC.one(lambda utc: bool(utc.problem)),
+    ),
+    _counter(
+        "imud_utc_sentences_total", "RMC sentences that the source gave.", SENTENCES.one(lambda utc: utc.sentences)
+    ),
+    _counter(
+        "imud_utc_sentences_sent_total", "Of these, sent to the device.", SENTENCES.one(lambda utc: utc.sent)
+    ),
+    _counter(
+        "imud_utc_sentences_refused_total", "Of these, not sent, by cause.",
+        SENTENCES.by("cause", lambda utc: utc.refused),
+    ),
+    _counter("imud_pps_pulses_total", "Pulses per second that counted.", UTC.one(lambda utc: utc.pulses)),
+    _counter(
+        "imud_pps_pulses_ignored_total", "Pulses that were in step with none.",
+        UTC.one(lambda utc: utc.pulses_ignored),
+    ),
+    _counter(
+        "imud_chrony_samples_total", "Samples for chronyd: sent to it, or refused by it.",
+        UTC.by("fate", lambda utc: {"sent": utc.chrony_sent, "refused": utc.chrony_refused}),
+    ),
+)  # fmt: skip
+
+LINE_FAMILIES: Final = (
+    _gauge(
+        "imud_line_problem", "1 while a line cannot be used, or its level cannot be right.",
+        LINES.by("line", _line_problems),
+    ),
+    _counter("imud_line_edges_total", "Edges seen on a line.", LINES.by("line", lambda lines: lines.edges)),
+    _counter(
+        "imud_line_edges_lost_total", "Edges that the kernel dropped because they were not read in time.",
+        LINES.by("line", lambda lines: lines.edges_lost),
+    ),
+    _gauge(
+        "imud_alarm_active", "1 while the ALARM line is active; absent while its level is not known.",
+        LINES.one(lambda lines: lines.alarm),
+    ),
+    _counter("imud_alarms_total", "Times the ALARM line became active.", ALARM.one(lambda lines: lines.alarms)),
+    _counter("imud_triggers_total", "Triggers made on SIN.", SIN.one(lambda lines: lines.triggers)),
+    _counter(
+        "imud_triggers_missed_total", "Deadlines for which no trigger was made, the host being busy.",
+        SIN.one(lambda lines: lines.triggers_missed),
+    ),
+    _counter(
+        "imud_trigger_delay_seconds_total", "Time from deadline to trigger, summed over all.",
+        SIN.one(lambda lines: lines.trigger_late_sum_ns), SECONDS,
+    ),
+    _gauge(
+        "imud_trigger_delay_worst_seconds", "Longest time from deadline to trigger since start.",
+        SIN.one(lambda lines: lines.trigger_late_worst_ns), SECONDS,
+    ),
+)  # fmt: skip
+
+LATENCY: Final = Histogram(
+    "imud_sample_latency_seconds",
+    "Time from the measurement to its publication.",
+    LATENCY_BOUNDS_NS,
+    lambda device: (device.latency_buckets, device.latency_sum_ns),
+)
+
+# --- clients and events -----------------------------------------------------------------------------------------------
+
+CLIENT_FAMILIES: Final = (
+    _gauge(
+        "imud_clients", "Clients by the encoding they watch in; none for those that do not watch.",
+        Reader(("encoding",), _clients_by_encoding),
+    ),
+    _gauge(
+        "imud_client_queue_samples", "Samples that wait for clients to read them, all clients together.",
+        daemon(lambda snapshot: sum(client.queue_samples for client in snapshot.clients)),
+    ),
+    _gauge(
+        "imud_client_queue_samples_max", "Samples that wait for the slowest client.",
+        daemon(lambda snapshot: max((client.queue_samples for client in snapshot.clients), default=0)),
+    ),
+    _gauge(
+        "imud_client_queue_bytes", "Bytes that wait for clients to read them, all clients together.",
+        daemon(lambda snapshot: sum(client.queue_bytes for client in snapshot.clients)), BYTES,
+    ),
+    _counter(
+        "imud_client_samples_sent_total", "Samples given to clients, as seen at scrapes.",
+        daemon(lambda snapshot: snapshot.client_samples_sent),
+    ),
+    _counter(
+        "imud_client_samples_dropped_total",
+        "Samples dropped for clients that did not read fast enough, as seen at scrapes.",
+        daemon(lambda snapshot: snapshot.client_samples_dropped),
+    ),
+    _counter(
+        "imud_events_total", "Events by kind; device is empty for the daemon's own.",
+        Reader(("device", "kind"), lambda snapshot: snapshot.events),
+    ),
+)  # fmt: skip
+
+FAMILIES: Final[tuple[Family | Histogram, ...]] = (
+    *DAEMON_FAMILIES,
+    *DEVICE_FAMILIES,
     *POLLING_FAMILIES,
     *TIME_FAMILIES,
     *LINE_FAMILIES,
-)  # fmt: skip
-"""Metrics of a device with one value per label set, in the order they are shown."""
-
-LATENCY_NAME: Final = "imud_sample_latency_seconds"
-LATENCY_HELP: Final = "Time from the measurement to its publication."
-DEVICE_INFO_NAME: Final = "imud_device_info"
-DEVICE_INFO_HELP: Final = "What the device is; always 1."
-DEVICE_INFO_LABELS: Final = ("device", "driver", "link", "product", "serial_number", "firmware")
-BUILD_INFO_NAME: Final = "imud_build_info"
-BUILD_INFO_HELP: Final = "What runs here; always 1."
-HEARTBEAT_NAME: Final = "imud_heartbeat_age_seconds"
-HEARTBEAT_HELP: Final = "Time since the daemon's ten-times-a-second tick; grows when the event loop is stuck."
-EVENTS_NAME: Final = "imud_events_total"
-EVENTS_HELP: Final = "Events by kind; device is empty for the daemon's own."
-
-_BOUNDS: Final = (*(str(bound / NS_PER_S) for bound in LATENCY_BOUNDS_NS), "+Inf")
-
-
-def device_metrics(devices: Sequence[DeviceStatus]) -> Iterator[Metric]:
-    """All metrics of all devices, one at a time, so that a caller can pause between them."""
-    yield device_info(devices)
-    for family in DEVICE_FAMILIES:
-        yield family.metric(devices)
-    yield latency(devices)
-
-
-def device_info(devices: Sequence[DeviceStatus]) -> Metric:
-    """Driver, link and identity of each device as labels."""
-    info = InfoMetricFamily(DEVICE_INFO_NAME.removesuffix("_info"), DEVICE_INFO_HELP, labels=DEVICE_INFO_LABELS)
-    for device in devices:
-        identity = (device.identity.get(key, "") for key in ("product", "serial_number", "firmware"))
-        info.add_metric((device.name, device.driver, device.link, *identity), {})
-    return info
-
-
-def latency(devices: Sequence[DeviceStatus]) -> Metric:
-    """Histogram of the time from measurement to publication; its counts are cumulative, as Prometheus has them."""
-    histogram = HistogramMetricFamily(LATENCY_NAME, LATENCY_HELP, labels=("device",))
-    for device in devices:
-        count, buckets = 0, []
-        for bound, samples in zip(_BOUNDS, device.latency_buckets, strict=True):
-            count += samples
-            buckets.append((bound, count))
-        histogram.add_metric((device.name,), buckets, device.latency_sum_ns / NS_PER_S)
-    return histogram
-
-
-def build_info() -> Metric:
-    """Versions of imud and Python."""
-    info = InfoMetricFamily(BUILD_INFO_NAME.removesuffix("_info"), BUILD_INFO_HELP, labels=("version", "python"))
-    info.add_metric((imud.__version__, platform.python_version()), {})
-    return info
-
-
-def heartbeat(age_ns: int) -> Metric:
-    """How long ago the daemon's tick was."""
-    return GaugeMetricFamily(HEARTBEAT_NAME, HEARTBEAT_HELP, value=age_ns / NS_PER_S)
-
-
-def events(counts: Iterable[tuple[tuple[str, str], int]]) -> Metric:
-    """Counts by (device, kind)."""
-    family = CounterMetricFamily(EVENTS_NAME, EVENTS_HELP, labels=("device", "kind"))
-    for labels, count in counts:
-        family.add_metric(labels, count)
-    return family
+    LATENCY,
+    *CLIENT_FAMILIES,
+)
+"""Every metric, in the order they are shown."""

@@ -1,73 +1,165 @@
-"""What a metric of devices is: name, help, labels, and how it is read from a device's status."""
+"""What describes a metric: name, type, unit, help, labels, and how its values are read from the snapshot of a scrape.
 
-from collections.abc import Callable, Iterable, Sequence
+A `Reader` has the names of the labels and gives the values. Those of devices come from a `DevicePart`: it finds the
+record that the values are in, and leaves out devices that have none, because absent is not zero.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from enum import StrEnum
+from typing import Any, Final, Generic, TypeVar
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    InfoMetricFamily,
+    Metric,
+)
 
-from imud.contracts.status import DeviceStatus
-from imud.units import NS_PER_S
+from imud.contracts.status import ClientStatus, DeviceStatus
+from imud.units import NS_PER_S, PPM_PER_ONE
 
 T = TypeVar("T")
 
-Labelled = Iterable[tuple[tuple[str, ...], float]]
-"""Label values (besides `device`) and value."""
-DeviceReader = Callable[[DeviceStatus], Labelled]
-"""Reads the values of one metric from one device."""
+Lines = Iterable[tuple[tuple[str, ...], float]]
+"""Values of the labels, and the value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What one scrape shows, all of one moment of the event loop."""
+
+    devices: Sequence[DeviceStatus] = ()
+    clients: Sequence[ClientStatus] = ()
+    events: Sequence[tuple[tuple[str, str], int]] = ()
+    """Events so far, by device and kind."""
+    heartbeat_age_ns: int = 0
+    client_samples_sent: int = 0
+    """Samples sent to clients, those that disconnected included, as seen at scrapes."""
+    client_samples_dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """The unit of a metric."""
+
+    name: str
+    """The end of the metric's name, in front of `_total`; empty for numbers without a unit."""
+    divisor: float = 1
+    """Turns the values that are read into this unit."""
+
+
+NO_UNIT: Final = Unit("")
+BYTES: Final = Unit("bytes")
+CELSIUS: Final = Unit("celsius")
+HERTZ: Final = Unit("hertz")
+RATIO: Final = Unit("ratio", PPM_PER_ONE)
+SECONDS: Final = Unit("seconds", NS_PER_S)
+
+
+class MetricType(StrEnum):
+    """Types of metrics with one value per set of labels, by their names in OpenMetrics."""
+
+    GAUGE = "gauge"
+    COUNTER = "counter"
+    INFO = "info"
+    """Always 1; what it says is in the labels."""
+
+
+_MAKE: Final[Mapping[MetricType, Callable[..., Any]]] = {
+    MetricType.GAUGE: GaugeMetricFamily,
+    MetricType.COUNTER: CounterMetricFamily,
+    MetricType.INFO: InfoMetricFamily,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """Reads the values of one metric."""
+
+    labels: tuple[str, ...]
+    lines: Callable[[Snapshot], Lines]
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """One metric of every device."""
+    """The description of one metric."""
 
     name: str
-    """As it stands in the text, `_total` included."""
+    """As it stands in the text, `_total` and `_info` included."""
+    type: MetricType
+    unit: Unit
     help: str
-    labels: tuple[str, ...]
-    """Labels besides `device`."""
-    read: DeviceReader
+    reader: Reader
 
-    def metric(self, devices: Sequence[DeviceStatus]) -> Metric:
-        """The metric with its samples."""
-        make = CounterMetricFamily if self.name.endswith("_total") else GaugeMetricFamily
-        family = make(self.name, self.help, labels=("device", *self.labels))
-        for device in devices:
-            for labels, value in self.read(device):
-                family.add_metric((device.name, *labels), value)
-        return family
+    def metric(self, snapshot: Snapshot) -> Metric:
+        """The metric with its values."""
+        info, divisor = self.type is MetricType.INFO, self.unit.divisor
+        metric: Metric = _MAKE[self.type](self.name.removesuffix("_info"), self.help, labels=self.reader.labels)
+        add = metric.add_metric  # type: ignore[attr-defined]  # all three have it
+        for labels, value in self.reader.lines(snapshot):
+            add(labels, {} if info else value / divisor)
+        return metric
 
 
-def one(read: Callable[[DeviceStatus], float | None]) -> DeviceReader:
-    """A value without labels; absent where the device has none, because absent is not zero."""
+@dataclass(frozen=True, slots=True)
+class Histogram:
+    """The description of one histogram over times in ns, shown in seconds, with the label `device`."""
 
-    def labelled(device: DeviceStatus) -> Labelled:
-        value = read(device)
-        return () if value is None else (((), value),)
+    name: str
+    help: str
+    bounds_ns: Sequence[int]
+    """Upper bounds of the buckets; one without bound follows."""
+    read: Callable[[DeviceStatus], tuple[Sequence[int], int]]
+    """Values per bucket, the unbounded last included, and the sum of all in ns."""
 
-    return labelled
+    def metric(self, snapshot: Snapshot) -> Metric:
+        """The metric with its values; its counts are cumulative, as Prometheus has them."""
+        bounds = (*(str(bound / SECONDS.divisor) for bound in self.bounds_ns), "+Inf")
+        metric = HistogramMetricFamily(self.name, self.help, labels=("device",))
+        for device in snapshot.devices:
+            counts, sum_ns = self.read(device)
+            total, buckets = 0, []
+            for bound, count in zip(bounds, counts, strict=True):
+                total += count
+                buckets.append((bound, total))
+            metric.add_metric((device.name,), buckets, sum_ns / SECONDS.divisor)
+        return metric
 
 
-def seconds(read: Callable[[DeviceStatus], int]) -> DeviceReader:
-    """A time in ns, shown in seconds."""
-    return one(lambda device: read(device) / NS_PER_S)
+@dataclass(frozen=True, slots=True)
+class DevicePart(Generic[T]):
+    """A record of the device's status; the label `device` of its values is the device's name."""
+
+    find: Callable[[DeviceStatus], T | None]
+    """None for a device without it: its metrics are absent."""
+
+    def one(self, read: Callable[[T], float | None]) -> Reader:
+        """Reads one value without further labels; absent where it is None."""
+
+        def lines(snapshot: Snapshot) -> Iterator[tuple[tuple[str], float]]:
+            for device in snapshot.devices:
+                part = self.find(device)
+                value = None if part is None else read(part)
+                if value is not None:
+                    yield (device.name,), value
+
+        return Reader(("device",), lines)
+
+    def by(self, label: str, read: Callable[[T], Mapping[str, float]]) -> Reader:
+        """Reads values by one further label."""
+
+        def lines(snapshot: Snapshot) -> Iterator[tuple[tuple[str, str], float]]:
+            for device in snapshot.devices:
+                part = self.find(device)
+                if part is not None:
+                    for name, value in read(part).items():
+                        yield (device.name, name), value
+
+        return Reader(("device", label), lines)
 
 
-def part(get: Callable[[DeviceStatus], T | None], read: Callable[[T], float | None]) -> DeviceReader:
-    """A value of what only some devices have: absent where `get` gives None."""
-
-    def value(device: DeviceStatus) -> float | None:
-        found = get(device)
-        return None if found is None else read(found)
-
-    return one(value)
-
-
-def part_labelled(get: Callable[[DeviceStatus], T | None], read: Callable[[T], Labelled]) -> DeviceReader:
-    """The same with labels."""
-
-    def labelled(device: DeviceStatus) -> Labelled:
-        found = get(device)
-        return () if found is None else read(found)
-
-    return labelled
+def daemon(read: Callable[[Snapshot], float]) -> Reader:
+    """Reads one value of the daemon, without labels."""
+    return Reader((), lambda snapshot: (((), read(snapshot)),))

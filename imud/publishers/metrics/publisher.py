@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Annotated, Final
 
 import msgspec
@@ -25,10 +25,10 @@ from prometheus_client.samples import Sample as Line
 
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.settings import Settings
-from imud.contracts.status import ClientStatus, DeviceStatus
+from imud.contracts.status import ClientStatus
 from imud.event import Event
-from imud.publishers.metrics.clients import ClientTotals, client_metrics
-from imud.publishers.metrics.families import build_info, device_metrics, events, heartbeat
+from imud.publishers.metrics.families import FAMILIES
+from imud.publishers.metrics.family import Snapshot
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 
 log = logging.getLogger(__name__)
@@ -55,24 +55,38 @@ class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields
     """TCP port; 0 takes any free one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """What one scrape shows, all of one moment of the event loop."""
+class ClientTotals:
+    """Adds up samples sent to and dropped for clients; a sum over the present ones would fall when one leaves."""
 
-    devices: Sequence[DeviceStatus] = ()
-    clients: Sequence[ClientStatus] = ()
-    events: Sequence[tuple[tuple[str, str], int]] = ()
-    """Events so far, by device and kind."""
-    heartbeat_age_ns: int = 0
+    def __init__(self) -> None:
+        self.sent = 0
+        self.dropped = 0
+        self._seen: dict[int, tuple[int, int]] = {}
+
+    def update(self, clients: Sequence[ClientStatus]) -> None:
+        """Add what happened since the last call."""
+        for client in clients:
+            sent, dropped = self._seen.get(client.number, (0, 0))
+            self.sent += client.sent - sent
+            self.dropped += client.dropped - dropped
+        self._seen = {client.number: (client.sent, client.dropped) for client in clients}
 
 
 class DaemonCollector(Collector):
-    """Turns the newest snapshot into metrics. Synchronization: the HTTP thread."""
+    """Turns a snapshot into metrics. Synchronization: the HTTP thread."""
 
     def __init__(self, pause: Callable[[], None]) -> None:
-        self.snapshot = Snapshot()
+        self._snapshot = Snapshot()
         self._totals = ClientTotals()
         self._pause = pause
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Collect from `snapshot` from now on."""
+        totals = self._totals
+        totals.update(snapshot.clients)
+        self._snapshot = replace(
+            snapshot, client_samples_sent=totals.sent, client_samples_dropped=totals.dropped
+        )  # fmt: skip
 
     def describe(self) -> list[Metric]:
         """No names are claimed ahead: they would be rendered once for nothing."""
@@ -80,22 +94,14 @@ class DaemonCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """All metrics of the snapshot, which pause while they are rendered."""
-        for metric in self._metrics():
-            metric.samples = _Unhurried(metric.samples, self._pause)
+        for family in FAMILIES:
+            metric = family.metric(self._snapshot)
+            metric.samples = _PausingList(metric.samples, self._pause)
             yield metric
 
-    def _metrics(self) -> Iterator[Metric]:
-        snapshot = self.snapshot
-        self._totals.update(snapshot.clients)
-        yield build_info()
-        yield heartbeat(snapshot.heartbeat_age_ns)
-        yield from device_metrics(snapshot.devices)
-        yield from client_metrics(snapshot.clients, self._totals)
-        yield events(snapshot.events)
 
-
-class _Unhurried(list[Line]):
-    """The samples of a metric; whoever goes through them pauses now and then."""
+class _PausingList(list[Line]):
+    """The lines of a metric; iteration pauses before the first and after every SAMPLES_PER_TURN."""
 
     def __init__(self, samples: Sequence[Line], pause: Callable[[], None]) -> None:
         super().__init__(samples)
@@ -118,7 +124,7 @@ class Renderer:
 
     def render(self, snapshot: Snapshot, accept: str) -> HttpResponse:
         """The metrics in the format that the Accept header asks for."""
-        self._collector.snapshot = snapshot
+        self._collector.show(snapshot)
         encode, content_type = choose_encoder(accept)
         return HttpResponse("200 OK", encode(self._registry), content_type)
 

@@ -13,11 +13,9 @@ import imud
 from imud.contracts.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState
 from imud.event import EventKind
 from imud.ledger import LEDGER_FIELDS
-from imud.publishers.metrics.clients import ClientTotals
-from imud.publishers.metrics.clock import TIME_FAMILIES
-from imud.publishers.metrics.lines import LINE_FAMILIES
-from imud.publishers.metrics.polling import POLLING_FAMILIES
-from imud.publishers.metrics.publisher import SAMPLES_PER_TURN, Renderer, Snapshot
+from imud.publishers.metrics.families import FAMILIES, LINE_FAMILIES, POLLING_FAMILIES, TIME_FAMILIES
+from imud.publishers.metrics.family import BYTES, CELSIUS, HERTZ, RATIO, SECONDS, Family, MetricType, Snapshot
+from imud.publishers.metrics.publisher import SAMPLES_PER_TURN, ClientTotals, Renderer
 from imud.sample import Sync
 from imud.utc.rmc_feed import Refusal
 from tests.support.device_status import LINES, UTC, client, device, equipped
@@ -358,6 +356,17 @@ def test_names_follow_the_conventions() -> None:
         assert metric.documentation.endswith(".")
         for line in metric.samples:
             assert (metric.type == "counter") == line.name.endswith("_total")
+
+
+def test_names_say_type_and_unit() -> None:
+    for family in FAMILIES:
+        if isinstance(family, Family):
+            assert (family.type is MetricType.COUNTER) == family.name.endswith("_total")
+            assert (family.type is MetricType.INFO) == family.name.endswith("_info")
+            stem = family.name.removesuffix("_total")
+            assert stem.endswith(family.unit.name)
+            for unit in (BYTES, CELSIUS, HERTZ, RATIO, SECONDS):
+                assert stem.endswith("_" + unit.name) == (family.unit is unit), family.name
 
 
 def test_alerts_use_metrics_that_exist() -> None:
