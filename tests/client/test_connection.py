@@ -17,8 +17,7 @@ from imud.contracts.publisher import Batch
 from imud.errors import LinkDenied, LinkMissing, ServerError
 from imud.event import Event, EventKind
 from imud.publishers.socket.publisher import SocketServer
-from tests.support.socket_daemon import Daemon, daemon
-from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, batch, sample
+from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, Daemon, batch, daemon, sample
 
 HELLO = b'{"jsonrpc":"2.0","method":"hello","params":{"protocol":1,"version":"9","epoch":7,"rights":["read"],"x":1}}\n'
 

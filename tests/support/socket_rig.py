@@ -1,4 +1,4 @@
-"""A socket server with two devices, and a bare peer that speaks to it byte by byte, in one event loop."""
+"""A socket server with two devices, in the test's event loop (`serving`) or in a thread (`daemon`), and a bare peer."""
 
 import asyncio
 import grp
@@ -6,8 +6,10 @@ import json
 import os
 import socket
 import struct
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -142,6 +144,59 @@ async def until(condition: Callable[[], bool]) -> None:
     """Let the loop run until something is so; `run` limits the time."""
     while not condition():
         await asyncio.sleep(0)
+
+
+class Daemon:
+    """Runs a server's work in the loop of its thread and waits for it."""
+
+    def __init__(self, server: SocketServer) -> None:
+        self.server = server
+        self.path = server.hub.path
+        self._loop = asyncio.get_running_loop()
+        self._stop = asyncio.Event()
+
+    def do(self, work: Callable[[SocketServer], T]) -> T:
+        """`work(server)` in the loop's thread; its result."""
+
+        async def called(server: SocketServer) -> T:
+            return work(server)
+
+        return self.start(called).result(LIMIT_S)
+
+    def start(self, work: Callable[[SocketServer], Coroutine[Any, Any, T]]) -> Future[T]:
+        """Start `work(server)` in the loop's thread."""
+        return asyncio.run_coroutine_threadsafe(work(self.server), self._loop)
+
+    def stop(self) -> None:
+        """End the server; to be called from another thread."""
+        self._loop.call_soon_threadsafe(self._stop.set)
+
+    async def stopped(self) -> None:
+        """Wait for `stop`."""
+        await self._stop.wait()
+
+
+@contextmanager
+def daemon(directory: Path) -> Iterator[Daemon]:
+    """A server in a thread of its own until the end of the block, for clients that block."""
+    ready = threading.Event()
+    found: list[Daemon] = []
+
+    async def main() -> None:
+        async with serving(directory) as server:
+            found.append(Daemon(server))
+            ready.set()
+            await found[0].stopped()
+
+    thread = threading.Thread(target=asyncio.run, args=(main(),))
+    thread.start()
+    try:
+        assert ready.wait(LIMIT_S)
+        yield found[0]
+    finally:
+        found[0].stop()
+        thread.join(LIMIT_S)
+        assert not thread.is_alive()
 
 
 class Peer:

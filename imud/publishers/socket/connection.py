@@ -1,9 +1,9 @@
-"""One client of the socket: its lines come in, its subscriptions are kept, everything for it goes out through here."""
+"""One client of the socket: reads its lines, sends it replies, events and samples, and ends the connection."""
 
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,16 +11,15 @@ from imud.contracts.status import ClientStatus
 from imud.formats.jsonrpc import LINE_MAX_BYTES, Code, RpcError, encode_error, frame_of, line_of
 from imud.publishers.socket.outbox import NO_FD, Limits, Outbox
 from imud.publishers.socket.rights import Peer, Rights
-from imud.publishers.socket.subscription import Subscription
-from imud.publishers.socket.waker import Waker
+from imud.publishers.socket.waker import ClientWakers
 
 log = logging.getLogger(__name__)
 
 RECV_BYTES: Final = 65536
 LINES_PER_TURN: Final = 4
-"""After so many requests of one client the event loop has its turn: 64 KiB hold a thousand `status` requests."""
+"""After so many requests of one client others have their turn: 64 KiB hold a thousand `status` requests."""
 LINGER_TICKS: Final = 20
-"""A client that is done has so many ticks (100 ms each) to take what still waits for it."""
+"""A client that ended its side has so many ticks (100 ms each) to read what still waits for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +40,9 @@ class Connection:
         self.peer = peer
         self.rights = rights
         self.outbox = Outbox(sock, owner.limits, self._broken, self._flooded, self._emptied)
-        self.subscription: Subscription | None = None
-        self.event_devices: Collection[str] | None = ()
-        """Devices whose events are wanted; None for all, empty for none."""
-        self.framed = False
-        """Whether messages go out as frames; stays so once it is."""
-        self.wakers: dict[str, Waker] = {}
-        """By device whose batches wake the client."""
+        self.wakers = ClientWakers()
         self.closed = False
+        self._framed = False
         self._sock = sock
         self._owner = owner
         self._input = bytearray()
@@ -60,60 +54,42 @@ class Connection:
     def post(self, body: bytes, fd: int = NO_FD) -> None:
         """Send one JSON object, with a copy of a descriptor where one is given."""
         if not self.closed:
-            self.outbox.put_reply(frame_of(body) if self.framed else line_of(body), fd)
+            self.outbox.put_reply(frame_of(body) if self._framed else line_of(body), fd)
             if not self.outbox.waiting:
-                self._handed_over()
+                self.wakers.handed_over()
 
-    def wants_events_of(self, device: str) -> bool:
-        """Whether events of `device` are wanted; those of the daemon itself ("") go to all who want any."""
-        wanted = self.event_devices
-        return wanted is None or device in wanted or (not device and bool(wanted))
+    @property
+    def framed(self) -> bool:
+        """Whether messages go out as frames."""
+        return self._framed
 
-    def status(self) -> ClientStatus:
-        """What is known of this client now."""
+    def use_frames(self) -> None:
+        """Send everything from now on as frames; there is no way back to lines."""
+        self._framed = True
+
+    @property
+    def finishing(self) -> bool:
+        """Whether the connection only sends what waits, and ends then."""
+        return self._linger_ticks is not None
+
+    def status(self, encoding: str) -> ClientStatus:
+        """The state of this client now; `encoding` is that of its subscription, empty without one."""
         outbox = self.outbox
         return ClientStatus(
             number=self.number,
             pid=self.peer.pid,
             uid=self.peer.uid,
             control=Rights.CONTROL in self.rights,
-            encoding=str(self.subscription.form) if self.subscription else "",
+            encoding=encoding,
             sent=outbox.sent,
             dropped=outbox.dropped,
             queue_samples=outbox.queue_samples,
             queue_bytes=outbox.queue_bytes,
         )
 
-    def make_waker(self, device: str) -> int:
-        """A new descriptor for the client, to be sent with the next `post`: batches of `device` wake it, not the old.
-
-        Raises RpcError where that cannot be, for one while the old one still waits to be sent: it is not in place of
-        what the client has not seen, and a client that never reads would gather descriptors of the daemon's.
-        """
-        old = self.wakers.get(device)
-        if old is not None and old.client_end != NO_FD:
-            message = "notify: the reply to the one before still waits for this client; read it, then ask again"
-            raise RpcError(Code.UNAVAILABLE, message)
-        try:
-            waker = Waker()
-        except OSError as error:
-            raise RpcError(Code.UNAVAILABLE, f"notify: the daemon cannot make a descriptor: {error.strerror}") from None
-        if old is not None:
-            old.close()
-        self.wakers[device] = waker
-        return waker.client_end
-
-    def wake(self, device: str) -> bool:
-        """Wake the client if it wants that; False, once, when it has closed its descriptor, which ends it."""
-        waker = self.wakers.get(device)
-        if waker is None or waker.wake():
-            return True
-        self.wakers.pop(device).close()
-        return False
-
     def finish(self) -> None:
-        """Take nothing more from the client, give it what waits, then close."""
-        if self.closed or self._linger_ticks is not None:
+        """Read nothing more from the client, send what waits, then close; no-op if already so."""
+        if self.closed or self.finishing:
             return
         self._loop.remove_reader(self._sock)
         self._linger_ticks = LINGER_TICKS
@@ -135,9 +111,7 @@ class Connection:
         self._loop.remove_reader(self._sock)
         self.outbox.close()
         self._sock.close()
-        for waker in self.wakers.values():
-            waker.close()
-        self.wakers.clear()
+        self.wakers.close()
         self._input.clear()
         self._owner.on_close(self)
 
@@ -158,11 +132,11 @@ class Connection:
         self._work()
 
     def _work(self) -> None:
-        """Handle lines that are there; after some of them, let others have their turn first."""
+        """Handle the lines that are there; after LINES_PER_TURN, go on in the next turn of the event loop."""
         for _ in range(LINES_PER_TURN):
-            if self.closed or self._linger_ticks is not None:
+            if self.closed or self.finishing:
                 return
-            line = self._take_line()
+            line = self._next_line()
             if line is None:
                 return
             if line.strip():
@@ -172,12 +146,12 @@ class Connection:
             self._loop.call_soon(self._resume)
 
     def _resume(self) -> None:
-        if self.closed or self._linger_ticks is not None:
+        if self.closed or self.finishing:
             return
         self._loop.add_reader(self._sock, self._readable)
         self._work()
 
-    def _take_line(self) -> bytes | None:
+    def _next_line(self) -> bytes | None:
         """The next whole line; None when there is none yet, or when the client is over the limit and finished."""
         data = self._input
         end = data.find(b"\n", self._searched)
@@ -199,10 +173,10 @@ class Connection:
         self.post(encode_error(RpcError(Code.LINE_TOO_LONG, message)))
         self.finish()
 
-    # --- the outbox's side ------------------------------------------------------------------------------------------
+    # --- callbacks of the outbox --------------------------------------------------------------------------------------
 
     def _broken(self, reason: str) -> None:
-        """The client is gone, or does not deserve to stay. Called from `publish` too: nothing is iterated over here."""
+        """Close: the client is gone, or was evicted. Called during `publish` too, which iterates over outboxes."""
         if not self.closed:
             log.info("client %d (pid %d, uid %d) is gone: %s", self.number, self.peer.pid, self.peer.uid, reason)
             self.close()
@@ -212,11 +186,6 @@ class Connection:
         self._broken("it does not read the answers to what it asks")
 
     def _emptied(self) -> None:
-        self._handed_over()
-        if self._linger_ticks is not None:
+        self.wakers.handed_over()
+        if self.finishing:
             self.close()
-
-    def _handed_over(self) -> None:
-        """All that waited is sent, descriptors too."""
-        for waker in self.wakers.values():
-            waker.handed_over()

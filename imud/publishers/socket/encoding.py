@@ -10,7 +10,7 @@ from imud.formats.slot import SLOT_BYTES
 from imud.sample import Sample
 
 ALWAYS_FIELDS: Final = ("device", "seq", "t_ns")
-"""What a JSON sample has whatever was selected: without them it cannot be placed."""
+"""Members of every JSON sample, whatever was selected: without them it cannot be identified."""
 _HEAD: Final = b'{"jsonrpc":"2.0","method":"sample","params":'
 _TAIL: Final = b"}"
 _SLOT_HEADER: Final = FRAME_HEADER.pack(SLOT_BYTES)
@@ -28,7 +28,7 @@ class Encoding(Protocol):
         ...
 
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
-        """A message of `device` that also tells how many samples of which devices were dropped before it."""
+        """`message`, of `device`, with the number of samples dropped before it, by device."""
         ...
 
 
@@ -48,7 +48,7 @@ class JsonEncoding:
         return self._message(batch.samples[index])
 
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
-        """The device's own number becomes a member of the sample; the others come as notifications before it."""
+        """Add the device's own number as a member of the sample, and put notifications of the others before it."""
         notices = [_dropped_notice(name, count, self._wrap) for name, count in dropped.items() if name != device]
         own = dropped.get(device)
         if own is not None:
@@ -72,12 +72,12 @@ class BinaryEncoding:
         return _SLOT_HEADER + batch.slots()[index]
 
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
-        """`dropped` notifications, then the slot."""
+        """Put `dropped` notifications before the slot."""
         return b"".join((*(_dropped_notice(name, count, frame_of) for name, count in dropped.items()), message))
 
 
 def selector(fields: tuple[str, ...]) -> Callable[[Sample], dict[str, object]]:
-    """A function that takes the selected members of a sample, and those that are always there; absent ones stay out."""
+    """Return a function that gives the selected members of a sample and ALWAYS_FIELDS; absent ones are left out."""
     names = tuple(dict.fromkeys((*ALWAYS_FIELDS, *fields)))
     values = attrgetter(*names)
 

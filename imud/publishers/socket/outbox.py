@@ -1,11 +1,11 @@
-"""What one client is sent: straight from `publish` while its socket takes it, through a bounded queue when it does not.
+"""Sends to one client: straight from `publish` while its socket has room, through a bounded queue while it has not.
 
 Goal: at 1 kHz one `send` per client and batch is the whole cost. A client with nothing queued gets the bytes that all
 clients share, in one system call; a queue, and a writer in the event loop, exist only while a socket is full.
 
 Order is kept. Two queues hold what waits, joined by an order number, because they are bounded differently: samples go
-oldest first when there are too many, replies never, but whoever lets too many gather is disconnected. A message that
-was sent in part is finished before anything else and cannot be dropped.
+oldest first when there are too many, replies never, but a client for which too many gather is disconnected. A message
+that was sent in part is finished before anything else and cannot be dropped.
 """
 
 import array
@@ -42,7 +42,7 @@ class Outbox:
 
     __slots__ = (
         "_limits", "_loop", "_on_broken", "_on_empty", "_on_flooded", "_order", "_partial", "_partial_fd", "_replies",
-        "_reply_bytes", "_sample_bytes", "_samples", "_send", "_sock", "_untold", "dropped", "sent", "waiting",
+        "_reply_bytes", "_sample_bytes", "_samples", "_send", "_sock", "_unreported", "dropped", "sent", "waiting",
     )  # fmt: skip
 
     def __init__(
@@ -73,13 +73,18 @@ class Outbox:
         self._reply_bytes = 0
         self._partial = b""
         self._partial_fd = NO_FD
-        self._untold: dict[str, int] = {}
-        """Samples dropped per device that the client was not told of yet."""
+        self._unreported: dict[str, int] = {}
+        """Samples dropped per device that no message has reported to the client yet."""
 
     @property
     def queue_samples(self) -> int:
         """Whole samples that wait."""
         return len(self._samples)
+
+    @property
+    def queue_replies(self) -> int:
+        """Whole messages other than samples that wait."""
+        return len(self._replies)
 
     @property
     def queue_bytes(self) -> int:
@@ -121,7 +126,7 @@ class Outbox:
             self._on_flooded()
 
     def close(self) -> None:
-        """Forget everything that waits; the socket is the owner's to close."""
+        """Drop everything that waits; the owner closes the socket."""
         if self._sock.fileno() >= 0:
             self._loop.remove_writer(self._sock)
         self.waiting = False
@@ -157,7 +162,7 @@ class Outbox:
     def _drop_oldest(self) -> None:
         _, message, device, _ = self._samples.popleft()
         self._sample_bytes -= len(message)
-        self._untold[device] = self._untold.get(device, 0) + 1
+        self._unreported[device] = self._unreported.get(device, 0) + 1
         self.dropped += 1
 
     def _wait(self) -> None:
@@ -192,7 +197,7 @@ class Outbox:
         return count
 
     def _next(self) -> bool:
-        """Take what is to be sent next into `_partial`: some messages, or one reply with its descriptor."""
+        """Move what is sent next into `_partial`: some messages, or one reply with its descriptor. False if none is."""
         chunk: list[bytes] = []
         size = 0
         samples, replies = self._samples, self._replies
@@ -200,25 +205,25 @@ class Outbox:
             if replies and (not samples or replies[0][0] < samples[0][0]):
                 if replies[0][2] != NO_FD and chunk:
                     break
-                chunk.append(self._take_reply())
+                chunk.append(self._next_reply())
                 if self._partial_fd != NO_FD:
                     break
             else:
-                chunk.append(self._take_sample())
+                chunk.append(self._next_sample())
             size += len(chunk[-1])
         self._partial = b"".join(chunk)
         return bool(chunk)
 
-    def _take_reply(self) -> bytes:
+    def _next_reply(self) -> bytes:
         _, message, self._partial_fd = self._replies.popleft()
         self._reply_bytes -= len(message)
         return message
 
-    def _take_sample(self) -> bytes:
+    def _next_sample(self) -> bytes:
         _, message, device, encoding = self._samples.popleft()
         self._sample_bytes -= len(message)
         self.sent += 1
-        if self._untold:
-            message = encoding.with_dropped(message, device, self._untold)
-            self._untold.clear()
+        if self._unreported:
+            message = encoding.with_dropped(message, device, self._unreported)
+            self._unreported.clear()
         return message

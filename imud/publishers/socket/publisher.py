@@ -1,7 +1,7 @@
 """The UNIX socket publisher: JSON-RPC 2.0 for questions, samples as JSON lines or binary slots (docs/socket.md).
 
     Listener ──accept──▶ Guard (rights) ──▶ Connection ──line──▶ rpc.handle_line ──▶ Hub
-    publish(batch) ──▶ Hub ──▶ Group per form ──the same bytes──▶ Outbox per client ──▶ send, or a bounded queue
+    publish(batch) ──▶ Hub ──▶ DeliveryGroup per form ──the same bytes──▶ Outbox per client ──▶ send, or a bounded queue
 
 Readers and writers are descriptors in the event loop, no streams: measured elsewhere, asyncio streams cost three times
 as much per sample.
@@ -44,7 +44,7 @@ class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     control_group: str = "imud-control"
     """Members of this group may also change things."""
     clients_max: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
-    """At most so many clients at a time; one more is told so and disconnected."""
+    """At most so many clients at a time; one more gets an error and is disconnected."""
     queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
     """At most so many samples wait for a client that does not read; 4096 are 4 s at 1 kHz. The oldest are dropped."""
     queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
@@ -59,7 +59,7 @@ class SocketServer:
         self._context = context
         self.hub = Hub(settings.path, context)
         self._owner = Owner(
-            self._on_line, self._on_close, self._on_evicted, Limits(settings.queue_samples, settings.queue_bytes)
+            self._on_line, self.hub.remove, self.hub.count_evicted, Limits(settings.queue_samples, settings.queue_bytes)
         )
         self._listener: Listener | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -84,11 +84,11 @@ class SocketServer:
         self.hub.remove_device(name)
 
     def publish(self, batch: Batch) -> None:
-        """Give the batch to the clients that want it."""
+        """Send the batch to the clients that watch its device."""
         self.hub.publish(batch)
 
     def event(self, event: Event) -> None:
-        """Tell clients of an event."""
+        """Send the event to the clients that asked for it."""
         self.hub.event(event)
 
     def tick(self, now_ns: int) -> None:
@@ -107,9 +107,7 @@ class SocketServer:
             self._loop.remove_reader(self._listener.sock)
         self._listener.close()
         self._listener = None
-        for connection in list(self.hub.connections.values()):
-            connection.close()
-        self.hub.end()
+        self.hub.close()
         self._context.client_sources.remove(self.hub.clients)
 
     # --- clients ----------------------------------------------------------------------------------------------------
@@ -129,7 +127,7 @@ class SocketServer:
             self._welcome(sock)
 
     def _pause(self, error: OSError) -> None:
-        """Out of descriptors or memory: without a pause until the next tick, the loop would do nothing but fail."""
+        """Stop accepting until the next tick: out of descriptors or memory, an immediate retry would be a busy loop."""
         assert self._listener is not None
         assert self._loop is not None
         log.warning("cannot accept a client: %s", error.strerror)
@@ -145,13 +143,11 @@ class SocketServer:
         rights = self._guard.rights_of(peer)
         refusal = self._refusal(peer, rights)
         if refusal is not None:
-            self.hub.refused += 1
+            self.hub.count_refused()
             _refuse(sock, refusal)
             return
-        self.hub.accepted += 1
-        number = self.hub.accepted
-        connection = Connection(number, sock, peer, rights, self._owner)
-        self.hub.connections[number] = connection
+        connection = Connection(self.hub.next_number(), sock, peer, rights, self._owner)
+        self.hub.add(connection)
         connection.post(hello(self.hub, connection))
 
     def _refusal(self, peer: Peer, rights: Rights) -> RpcError | None:
@@ -167,16 +163,9 @@ class SocketServer:
     def _on_line(self, connection: Connection, line: bytes) -> None:
         handle_line(self.hub, connection, line)
 
-    def _on_close(self, connection: Connection) -> None:
-        self.hub.connections.pop(connection.number, None)
-        self.hub.changed()
-
-    def _on_evicted(self) -> None:
-        self.hub.evicted += 1
-
 
 def _refuse(sock: socket.socket, error: RpcError) -> None:
-    """Say why and close. The socket is new, so its buffer takes the line; if the peer is gone, so be it."""
+    """Send the reason and close. The socket is new, so its buffer has room for the line."""
     try:
         sock.send(line_of(encode_error(error)))
     except OSError as problem:

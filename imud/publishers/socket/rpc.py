@@ -98,9 +98,9 @@ class Method(Generic[P]):
     params: type[P]
     run: Callable[[Hub, Connection, P], Answer | Later]
     right: Rights = Rights.READ
-    """What the client must be allowed to do."""
+    """The permission that the client needs."""
     acts: bool = False
-    """Whether it does something besides answering: only then is there a point in a request that wants no reply."""
+    """Whether it does more than answer: only then is a request without a reply carried out."""
 
 
 def hello(hub: Hub, connection: Connection) -> bytes:
@@ -111,7 +111,7 @@ def hello(hub: Hub, connection: Connection) -> bytes:
 
 
 def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
-    """Do what a line asks and send the reply. Whatever the line is, the connection lives on."""
+    """Carry out the request in `line` and send the reply. The connection stays open whatever the line is."""
     try:
         request = parse_request(line)
     except RpcError as error:
@@ -121,8 +121,7 @@ def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
         answer = _call(hub, connection, request)
     except RpcError as error:
         if request.wants_reply:
-            error.request_id = request.request_id
-            connection.post(encode_error(error))
+            connection.post(encode_error(RpcError(error.code, str(error), request.request_id)))
         return
     if answer is None:
         return
@@ -131,8 +130,8 @@ def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
         return
     if request.wants_reply:
         connection.post(encode_result(request.request_id, answer.result), answer.fd)
-    if answer.framed_from_here and not connection.framed:
-        connection.framed = True
+    if answer.framed_from_here:
+        connection.use_frames()
 
 
 async def _answer_later(connection: Connection, request: RpcRequest, later: Later) -> None:
@@ -163,11 +162,11 @@ def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Lat
     return method.run(hub, connection, params)
 
 
-# --- what there is ------------------------------------------------------------------------------------------------
+# --- questions ------------------------------------------------------------------------------------------------------
 
 
 def _devices(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
-    """What there is: one line's worth of each device."""
+    """The devices, each in one line."""
     return Answer(
         [
             {
@@ -187,7 +186,7 @@ def _devices(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
 
 
 def _status(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
-    """Everything: each device with its clock and ledger, the socket with its clients."""
+    """The full state: each device with its clock and ledger, the socket with its clients."""
     return Answer({"now_ns": hub.context.now_ns(), "devices": hub.context.status(), "socket": hub.status()})
 
 
@@ -218,21 +217,19 @@ SLOT_SCHEMA: Final = {
 
 
 def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
-    """Samples from now on; replaces what the client watched before."""
+    """Send samples from now on; replaces what the client watched before."""
     devices = _known_devices(hub, params.devices)
     fields = _known_fields(params.fields)
     rate_hz = _rate(params.rate_hz)
-    connection.subscription = Subscription(devices, fields, rate_hz, params.encoding)
-    hub.changed()
+    hub.subscribe(connection, Subscription(devices, fields, rate_hz, params.encoding))
     numbers = hub.devices if devices is None else {name: hub.devices[name] for name in devices}
     result = {"encoding": params.encoding, "devices": numbers, "rate_hz": rate_hz}
     return Answer(result, framed_from_here=params.encoding is Form.BINARY)
 
 
 def _unwatch(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
-    """No more samples; what already waits for the client is still sent."""
-    connection.subscription = None
-    hub.changed()
+    """Send no more samples; what already waits for the client is still sent."""
+    hub.unsubscribe(connection)
     return Answer({})
 
 
@@ -246,31 +243,32 @@ def _poll(hub: Hub, _connection: Connection, params: PollParams) -> Answer:
 
 
 def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
-    """Events from now on, or none any more; replaces what was asked before."""
+    """Send events from now on, or no more; replaces what was asked before."""
     devices = _known_devices(hub, params.devices)
-    connection.event_devices = devices if params.enable else ()
+    if params.enable:
+        hub.subscribe_events(connection, devices)
+    else:
+        hub.unsubscribe_events(connection)
     return Answer({"enable": params.enable})
 
 
 def _notify(hub: Hub, connection: Connection, params: DeviceParams) -> Answer:
-    """A descriptor that becomes readable with each batch of one device; asked again, a new one in place of the old."""
+    """Send a descriptor that becomes readable with each batch of one device; it replaces an earlier one."""
     _known_devices(hub, [params.device])
-    fd = connection.make_waker(params.device)
-    hub.changed()
-    return Answer({"device": params.device}, fd)
+    return Answer({"device": params.device}, hub.make_waker(connection, params.device))
 
 
 # --- commands -------------------------------------------------------------------------------------------------------
 
 
 def _actions(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
-    """What a device can be told to do."""
+    """The actions of a device."""
     _known_devices(hub, [params.device])
     return Answer(hub.context.actions(params.device))
 
 
 def _command(hub: Hub, connection: Connection, params: CommandParams) -> Later:
-    """Have a device do something; the reply comes when it is done."""
+    """Run an action of a device; the reply comes when it is done."""
     _known_devices(hub, [params.device])
     if hub.busy(connection):
         raise RpcError(Code.UNAVAILABLE, "command: the one before is not done yet; wait for its reply")

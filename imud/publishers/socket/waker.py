@@ -1,4 +1,4 @@
-"""Wakes one client after batches of one device: it gets a descriptor to poll and read, the daemon sends a byte.
+"""Wakes a client after batches of a device: it gets a descriptor to poll and read, the daemon sends a byte.
 
 Nothing the client does with its descriptor may make the daemon wait. That rules out
 
@@ -15,6 +15,9 @@ lock that a sender needs while it copies. The daemon keeps one end, which takes 
 import socket
 from typing import Final
 
+from imud.formats.jsonrpc import Code, RpcError
+from imud.publishers.socket.outbox import NO_FD
+
 BYTE: Final = b"\1"
 FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
 BUFFER_BYTES: Final = 1
@@ -30,16 +33,16 @@ class Waker:
         self._sock, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self._theirs.setblocking(False)  # a convenience of the client's, which may change it
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-        self._sock.shutdown(socket.SHUT_RD)  # the client cannot send bytes, or descriptors, that nobody would take
+        self._sock.shutdown(socket.SHUT_RD)  # the client cannot send bytes or descriptors, which would not be read
         self._send = self._sock.send
 
     @property
     def client_end(self) -> int:
-        """The descriptor for the client, -1 once it is handed over."""
+        """The descriptor for the client, NO_FD once it is handed over."""
         return self._theirs.fileno()
 
     def handed_over(self) -> None:
-        """The client has its end: the daemon's copy goes, so that it shows when the client closes its own."""
+        """Close the daemon's copy of the client's end, so that it shows when the client closes its own."""
         self._theirs.close()
 
     def wake(self) -> bool:
@@ -53,6 +56,62 @@ class Waker:
         return True
 
     def close(self) -> None:
-        """The client reads what waits, then the end; may be called twice."""
+        """End the descriptor: the client reads what waits, then end of file; may be called twice."""
         self._sock.close()
         self._theirs.close()
+
+
+class ClientWakers:
+    """The wakers of one client, at most one per device. Synchronization: the event loop's thread."""
+
+    def __init__(self) -> None:
+        self._wakers: dict[str, Waker] = {}
+
+    def __contains__(self, device: str) -> bool:
+        return device in self._wakers
+
+    def __len__(self) -> int:
+        return len(self._wakers)
+
+    @property
+    def client_ends(self) -> int:
+        """Descriptors of the client's that the daemon still holds because their replies wait to be sent."""
+        return sum(waker.client_end != NO_FD for waker in self._wakers.values())
+
+    def make(self, device: str) -> int:
+        """Make a descriptor for the client, to be sent with the next reply; it replaces the one of `device` before.
+
+        Raises RpcError when none can be made, or while the one before still waits to be sent: a client that never
+        reads would gather descriptors in the daemon.
+        """
+        old = self._wakers.get(device)
+        if old is not None and old.client_end != NO_FD:
+            message = "notify: the reply to the one before still waits for this client; read it, then ask again"
+            raise RpcError(Code.UNAVAILABLE, message)
+        try:
+            waker = Waker()
+        except OSError as error:
+            raise RpcError(Code.UNAVAILABLE, f"notify: the daemon cannot make a descriptor: {error.strerror}") from None
+        if old is not None:
+            old.close()
+        self._wakers[device] = waker
+        return waker.client_end
+
+    def wake(self, device: str) -> bool:
+        """Wake the client if it asked for that; False, once, when it has closed its descriptor, which ends it."""
+        waker = self._wakers.get(device)
+        if waker is None or waker.wake():
+            return True
+        self._wakers.pop(device).close()
+        return False
+
+    def handed_over(self) -> None:
+        """All replies are sent, and their descriptors with them."""
+        for waker in self._wakers.values():
+            waker.handed_over()
+
+    def close(self) -> None:
+        """End all descriptors; may be called twice."""
+        for waker in self._wakers.values():
+            waker.close()
+        self._wakers.clear()

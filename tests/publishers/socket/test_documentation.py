@@ -1,6 +1,5 @@
 """Every example of docs/socket.md is played against the server."""
 
-import asyncio
 import json
 import os
 import re
@@ -22,8 +21,7 @@ from imud.publishers.socket.outbox import Limits
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.publishers.socket.rpc import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
 from tests.support.paths import ROOT
-from tests.support.socket_daemon import daemon
-from tests.support.socket_rig import NOW_NS, Peer, batch, run, serving
+from tests.support.socket_rig import LIMIT_S, NOW_NS, Peer, batch, daemon, run, serving, until
 
 DOCUMENT = (ROOT / "docs" / "socket.md").read_text()
 ANYTHING = "…"
@@ -54,7 +52,7 @@ def assert_like(found: Any, shown: Any) -> None:
 
 
 def happen(server: SocketServer, shown: dict[str, Any], published: list[int]) -> None:
-    """Make the daemon do what the notification of the example tells."""
+    """Make the daemon do what the notification of the example says."""
     if shown.get("method") == "sample":
         published.append(shown["params"]["seq"])
         server.publish(batch("imu0", published[-1]))
@@ -90,22 +88,16 @@ def test_examples(tmp_path: Path) -> None:
 def test_python_example(tmp_path: Path, capsys: Any) -> None:
     (code,) = blocks("python")
     with daemon(tmp_path) as served:
-        # the example waits for a sample, so the server gives one to every watch
-        served.do(publish_on_watch)
+        published = served.start(publish_on_watch)  # the example waits for a sample
         exec(compile(code.replace(DEFAULT_PATH, served.path), "docs/socket.md", "exec"), {})
+        published.result(LIMIT_S)
     assert capsys.readouterr().out.splitlines()[1] == "80000001000000 (0.125, -0.5, 9.75)"
 
 
-def publish_on_watch(server: SocketServer) -> None:
-    """Give one sample right after a watch."""
-    changed = server.hub.changed
-
-    def after_change() -> None:
-        changed()
-        if any(connection.subscription for connection in server.hub.connections.values()):
-            asyncio.get_running_loop().call_soon(server.publish, batch("imu0"))
-
-    server.hub.changed = after_change  # type: ignore[method-assign]  # a hook for this test
+async def publish_on_watch(server: SocketServer) -> None:
+    """Publish one sample as soon as a client watches."""
+    await until(lambda: any(client.encoding for client in server.hub.clients()))
+    server.publish(batch("imu0"))
 
 
 def test_numbers_and_codes_of_the_text() -> None:

@@ -1,4 +1,4 @@
-"""Slow clients: nobody waits for them, the oldest samples go first, and they are told how many."""
+"""Slow clients delay nothing; their oldest samples are dropped first, and they learn how many."""
 
 import asyncio
 import json
@@ -14,16 +14,16 @@ from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.publishers.socket.connection import Connection
 from imud.publishers.socket.encoding import JsonEncoding
-from imud.publishers.socket.outbox import NO_FD, Limits, Outbox
+from imud.publishers.socket.outbox import Limits, Outbox
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.waker import BYTE
 from tests.support.socket_rig import Peer, batch, run, serving, until
 
 
 async def read_samples(peer: Peer, last: dict[str, int]) -> list[tuple[str, int, dict[str, int]]]:
-    """Device, seq and the drops told before it, until the last sample of every device has come."""
+    """Device, seq and the drops reported before it, until the last sample of every device has come."""
     seen: list[tuple[str, int, dict[str, int]]] = []
-    told: dict[str, int] = {}
+    reported: dict[str, int] = {}
     left = dict(last)
     while left:
         if peer.framed and len(body := await peer.body()) % SLOT_BYTES == 0:
@@ -33,13 +33,13 @@ async def read_samples(peer: Peer, last: dict[str, int]) -> list[tuple[str, int,
             message = await peer.message() if not peer.framed else _json(body)
             params = message["params"]
             if "dropped" in params:
-                assert params["device"] not in told
-                told[params["device"]] = params["dropped"]
+                assert params["device"] not in reported
+                reported[params["device"]] = params["dropped"]
             if message["method"] == "dropped":
                 continue
             device, seq = params["device"], params["seq"]
-        seen.append((device, seq, told))
-        told = {}
+        seen.append((device, seq, reported))
+        reported = {}
         if left.get(device) == seq:
             del left[device]
     return seen
@@ -52,11 +52,11 @@ def _json(body: bytes) -> dict[str, Any]:
 
 
 def assert_accounted(seen: list[tuple[str, int, dict[str, int]]], devices: tuple[str, ...]) -> dict[str, int]:
-    """Every sample came in order or is among those told as dropped. Returns the drops by device."""
+    """Every sample came in order or is among those reported as dropped. Returns the drops by device."""
     dropped = dict.fromkeys(devices, 0)
     newest = dict.fromkeys(devices, 0)
-    for device, seq, told in seen:
-        for name, count in told.items():
+    for device, seq, reported in seen:
+        for name, count in reported.items():
             dropped[name] += count
         assert seq > newest[device]
         newest[device] = seq
@@ -89,7 +89,7 @@ def test_a_client_that_does_not_read_loses_the_oldest_and_slows_nobody(tmp_path:
             seen = await read_samples(slow, {"imu0": total, "imu1": total})
             dropped = assert_accounted(seen, ("imu0", "imu1"))
             assert sum(dropped.values()) == first.dropped
-            assert sum(bool(told) for _, _, told in seen) == 1  # one loss, told at once
+            assert sum(bool(reported) for _, _, reported in seen) == 1  # one loss, reported at once
             server.publish(batch("imu0", total + 1))  # the writer is gone again, the queue empty
             assert [await read_one(peer) for peer in (slow, fast)] == [("imu0", total + 1)] * 2
             slow.close()
@@ -168,7 +168,7 @@ def test_replies_keep_their_place_and_are_never_dropped(tmp_path: Path) -> None:
             for number in range(20):
                 await peer.send(b'{"jsonrpc":"2.0","id":%d,"method":"unheard-of"}\n' % number)
             (connection,) = server.hub.connections.values()
-            await until(lambda: len(connection.outbox._replies) == 20)
+            await until(lambda: connection.outbox.queue_replies == 20)
             for _ in range(20):
                 seq += 1
                 server.publish(batch("imu0", seq))
@@ -203,7 +203,7 @@ def test_who_asks_without_reading_is_disconnected(tmp_path: Path) -> None:
 
             with pytest.raises((BrokenPipeError, ConnectionResetError)):
                 await ask_on()
-            assert server.hub.evicted == 1
+            assert server.hub.status().evicted == 1
             assert len(await other.result("devices")) == 2
             asking.close()
             other.close()
@@ -241,7 +241,7 @@ def test_a_descriptor_waits_its_turn_behind_what_is_queued(tmp_path: Path) -> No
             server.publish(batch("imu1", 8000, 2))  # waits behind the reply
             assert await descriptors(peer, connection) == 1
             await until(lambda: not connection.outbox.waiting)
-            assert connection.wakers["imu0"].client_end == NO_FD  # sent, so the daemon has no copy left
+            assert connection.wakers.client_ends == 0  # sent, so the daemon has no copy left
             data, fds, _flags, _address = socket.recv_fds(peer.sock, 65536, 4)
             assert b'"seq":8001' in data
             assert not fds
@@ -277,7 +277,7 @@ async def descriptors(peer: Peer, connection: Connection) -> int:
             at = len(data)
             found += fds
     assert at - READ_BYTES <= data.index(b'{"jsonrpc":"2.0","id":7,') < at  # with the first byte of its reply
-    assert connection.wake("imu0")
+    assert connection.wakers.wake("imu0")
     assert [os.read(fd, 64) for fd in found] == [BYTE]
     for fd in found:
         os.close(fd)
@@ -292,7 +292,7 @@ def test_large_answers_reach_a_client_that_ended_its_side(tmp_path: Path) -> Non
             note = encode_notification("big", "x" * 500_000)
             connection.post(note)
             peer.sock.shutdown(1)
-            await until(lambda: connection._linger_ticks is not None)
+            await until(lambda: connection.finishing)
             assert await peer.body() == note
             assert await peer.ended()
             peer.close()

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import LINE_MAX_BYTES, RpcError, parse_request
+from imud.publishers.socket.publisher import SocketServer
 from tests.support.socket_rig import LIMIT_S, Peer, batch, run, serving
 
 
@@ -81,11 +82,16 @@ def test_bad_parameters(tmp_path: Path, method: str, params: dict[str, Any], wor
             assert code == -32602
             assert words in message
             (connection,) = server.hub.connections.values()
-            assert connection.subscription is None
+            assert connection.number not in watching(server)
             assert not connection.wakers
             peer.close()
 
     run(body)
+
+
+def watching(server: SocketServer) -> set[int]:
+    """Numbers of the clients that watch."""
+    return {client.number for client in server.hub.clients() if client.encoding}
 
 
 def test_unknown_members_are_ignored(tmp_path: Path) -> None:
@@ -111,7 +117,7 @@ def test_notifications_act_and_are_not_answered(tmp_path: Path) -> None:
             await peer.send(b'{"jsonrpc":"2.0","id":9,"method":"devices"}\n')
             assert (await peer.message())["id"] == 9
             (connection,) = server.hub.connections.values()
-            assert connection.subscription is not None
+            assert connection.number in watching(server)
             assert not connection.wakers
             peer.close()
 
@@ -162,7 +168,7 @@ def test_a_line_over_the_limit_ends_the_connection(tmp_path: Path, newline: byte
             await peer.send(b"x" * (LINE_MAX_BYTES + 1) + newline)
             assert (await peer.message())["error"]["code"] == -32003
             assert await peer.ended()
-            assert server.hub.evicted == 1
+            assert server.hub.status().evicted == 1
             assert len(await other.result("devices")) == 2
             peer.close()
             other.close()

@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 
 from imud.formats.jsonrpc import encode_notification
-from imud.publishers.socket.outbox import NO_FD
 from imud.publishers.socket.waker import BYTE
 from tests.support.socket_rig import Peer, batch, run, serving, until
 
 
 async def notified(peer: Peer, device: str = "imu0") -> int:
-    """Ask for a descriptor and take it."""
+    """Ask for a descriptor and receive it."""
     await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"notify","params":{"device":"%s"}}\n' % device.encode())
     await until(lambda: bool(select.select([peer.sock], [], [], 0)[0]))
     data, fds, _flags, _address = socket.recv_fds(peer.sock, 4096, 4)
@@ -48,7 +47,7 @@ def test_notify_wakes_for_batches_of_one_device(tmp_path: Path) -> None:
             peer = await Peer.greeted(server)
             fd = await notified(peer)
             (connection,) = server.hub.connections.values()
-            assert connection.wakers["imu0"].client_end == NO_FD  # the daemon keeps no copy
+            assert connection.wakers.client_ends == 0  # the daemon keeps no copy
             server.publish(batch("imu1"))
             await wakened()
             assert read_all(fd) is None
@@ -96,7 +95,7 @@ def test_no_client_makes_the_daemon_wait(tmp_path: Path) -> None:
             held, fd = await notified(hostile), await notified(other)
             os.set_blocking(held, True)
             with pytest.raises(BrokenPipeError), socket.socket(fileno=os.dup(held)) as sock:
-                sock.send(b"nobody takes this")
+                sock.send(b"this is never read")
             woken = 0
             for seq in range(1, 301):
                 server.publish(batch("imu0", seq))
@@ -113,7 +112,7 @@ def test_no_client_makes_the_daemon_wait(tmp_path: Path) -> None:
                 assert len(await peer.result("devices")) == 2
                 peer.close()
 
-    # a daemon that waits does not come back: only a signal ends the test then
+    # a daemon that waits never returns: only a signal ends the test then
     with time_limit():
         run(body)
 
@@ -134,7 +133,7 @@ def time_limit() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def test_whoever_closes_its_descriptor_is_not_woken_any_more(tmp_path: Path) -> None:
+def test_a_client_that_closes_its_descriptor_is_not_woken_any_more(tmp_path: Path) -> None:
     async def body() -> None:
         async with serving(tmp_path) as server:
             closing, other = await Peer.greeted(server), await Peer.greeted(server)
@@ -151,7 +150,7 @@ def test_whoever_closes_its_descriptor_is_not_woken_any_more(tmp_path: Path) -> 
             await wakened()
             assert not second.wakers
             server.publish(batch("imu0", 4))
-            assert not server.hub._plans["imu0"].wakes  # nobody is left to wake
+            assert not server.hub.plan_of("imu0").wakes  # no client is left to wake
             for peer in (closing, other):
                 assert len(await peer.result("devices")) == 2
                 peer.close()
