@@ -1,20 +1,19 @@
 """What the commands that ask a running daemon share: the socket option, the connection, the status."""
 
 import argparse
-import os
 
 import msgspec
 
 from imud.client import Client
+from imud.client.connection import default_path
 from imud.contracts.status import DeviceStatus
-from imud.formats.jsonrpc import DEFAULT_PATH
 
 
 def add_socket(parser: argparse.ArgumentParser) -> None:
     """`--socket PATH`, with the environment variable IMUD_SOCKET as its default."""
     parser.add_argument(
         "--socket",
-        default=os.environ.get("IMUD_SOCKET", DEFAULT_PATH),
+        default=default_path(),
         metavar="PATH",
         help="the daemon's socket (default: $IMUD_SOCKET or %(default)s)",
     )

@@ -57,18 +57,18 @@ class Hello(msgspec.Struct, frozen=True):
 
 
 class Client:
-    """A connection to the daemon at `path`.
+    """A connection to the daemon at `path`, by default where `default_path` says.
 
-    Raises LinkMissing (nobody serves there), LinkDenied (no right), ServerError (answers that are not the protocol's),
+    Raises LinkMissing (no daemon there), LinkDenied (no permission), ServerError (answers that are not the protocol's),
     TimeoutError where an answer takes longer than `timeout_s`. RpcError, a ServerError, is what the daemon refused.
     """
 
-    def __init__(self, path: str | os.PathLike[str] = DEFAULT_PATH, *, timeout_s: float = 5.0) -> None:
-        self.path = os.fspath(path)
+    def __init__(self, path: str | os.PathLike[str] | None = None, *, timeout_s: float = 5.0) -> None:
+        self.path = default_path() if path is None else os.fspath(path)
         self.timeout_s = timeout_s
         self._buffer = bytearray()
         self.given_up = 0
-        """Messages thrown away because no iterator took them while `INBOX_MAX` others waited."""
+        """Messages discarded because no iterator read them while `INBOX_MAX` others waited."""
         self._inbox: deque[Message] = deque()
         self._watch: Watch | None = None
         self._fds: list[int] = []
@@ -101,7 +101,7 @@ class Client:
     # --- questions --------------------------------------------------------------------------------------------------
 
     def devices(self) -> list[dict[str, Any]]:
-        """What there is, one mapping per device."""
+        """The devices, one mapping each."""
         return msgspec.convert(self.call("devices"), list[dict[str, Any]])
 
     def status(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class Client:
             message = self._receive(deadline_s, method)
             if isinstance(message, bytes) or "id" not in message or "method" in message:
                 self._keep(message)
-            elif message["id"] in (self._id, None):  # another id answers a call that was given up
+            elif message["id"] in (self._id, None):  # another id is of a call that timed out
                 if "error" in message:
                     raise rpc_error(message["error"])
                 return message.get("result")
@@ -152,7 +152,7 @@ class Client:
         if encoding == "binary":
             self._framed = True
         self._end_watch()
-        while self.take_kept(Watch.NAMES) is not None:
+        while self.kept_message(Watch.NAMES) is not None:
             pass  # of the earlier one
         self._watch = Watch(self, reply["devices"], timeout_s)
         return self._watch
@@ -178,17 +178,17 @@ class Client:
             raise ServerError("the daemon's answer to notify came without a descriptor")
         return self._fds.pop()
 
-    def take_kept(self, names: frozenset[str]) -> Message | None:
-        """Like `take`, of the messages that came while something else was waited for; None when there is none."""
+    def kept_message(self, names: frozenset[str]) -> Message | None:
+        """The oldest such message among those kept while waiting for something else; None when there is none."""
         for index, message in enumerate(self._inbox):
             if _is_one_of(message, names):
                 del self._inbox[index]
                 return message
         return None
 
-    def take(self, names: frozenset[str], timeout_s: float | None) -> Message:
-        """The next message: slots, or a notification whose method is among `names`; others are kept for others."""
-        kept = self.take_kept(names)
+    def next_message(self, names: frozenset[str], timeout_s: float | None) -> Message:
+        """The next message: slots, or a notification whose method is among `names`; others are kept."""
+        kept = self.kept_message(names)
         if kept is not None:
             return kept
         deadline_s = None if timeout_s is None else monotonic() + timeout_s
@@ -222,7 +222,7 @@ class Client:
 
     def _end_watch(self) -> None:
         if self._watch is not None:
-            self._watch.ended = True
+            self._watch.end()
             self._watch = None
 
     def _send(self, data: bytes) -> None:
@@ -230,7 +230,7 @@ class Client:
             self._sock.settimeout(self.timeout_s)
             self._sock.sendall(data)
         except TimeoutError:
-            raise TimeoutError(f"{self.path}: the daemon took nothing for {self.timeout_s} s") from None
+            raise TimeoutError(f"{self.path}: the daemon read nothing for {self.timeout_s} s") from None
         except OSError as error:
             raise _lost(self.path, error) from error
 
@@ -254,7 +254,7 @@ class Client:
         return message
 
     def _parse(self) -> Message | None:
-        """Take a whole message off the buffer."""
+        """Remove a whole message from the buffer and return it; None while there is none."""
         buffer = self._buffer
         if not self._framed:
             end = buffer.find(b"\n")
@@ -280,6 +280,11 @@ class Client:
             return parse_object(body)
         except RpcError as error:
             raise ServerError(f"{self.path}: expected a JSON object, {error}: {body[:80]!r}") from error
+
+
+def default_path() -> str:
+    """The socket's path: the environment variable IMUD_SOCKET; where that is not set or empty, /run/imud/imud.sock."""
+    return os.environ.get("IMUD_SOCKET") or DEFAULT_PATH
 
 
 def rpc_error(error: object) -> RpcError:

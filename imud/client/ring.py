@@ -61,14 +61,15 @@ class Ring:
     """An open ring. Synchronization: one thread; every thread or process may open its own."""
 
     def __init__(
-        self, device_or_path: str | Path, *, directory: str = DIRECTORY, now_ns: Callable[[], int] = time.monotonic_ns
+        self, device_or_path: str | Path, *, directory: str | None = None, now_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         """Open by device name, or by path if there is a '/' in it; `read` gives the samples that come from now on.
 
+        A name is looked up in `directory`, by default the one that `default_directory` gives.
         Raises ServerError: no such ring, not permitted, or of another layout.
         """
         text = str(device_or_path)
-        self.path = Path(text) if "/" in text else ring_path(directory, text)
+        self.path = Path(text) if "/" in text else ring_path(directory or default_directory(), text)
         self.missed = 0
         """Samples missed since opening."""
         self._now_ns = now_ns
@@ -199,7 +200,7 @@ class Ring:
             if sample is not None:
                 samples.append(sample)
             elif not self._overtaken():
-                if not self._gave_up():
+                if not self._never_whole():
                     break
                 missed += 1
             else:
@@ -233,7 +234,7 @@ class Ring:
         """Whether the writer has meanwhile begun to use the slot of `_next` anew."""
         return self._oldest(self.newest_seq) > self._next
 
-    def _gave_up(self) -> bool:
+    def _never_whole(self) -> bool:
         """Whether `_next`, not whole before, still is not although newer samples were finished: it never will be."""
         newest = self.newest_seq
         seq, newest_then = self._torn
@@ -241,6 +242,11 @@ class Ring:
             self._torn = (self._next, newest)
             return False
         return newest > newest_then
+
+
+def default_directory() -> str:
+    """The directory of rings: the environment variable IMUD_SHM; where that is not set or empty, /dev/shm."""
+    return os.environ.get("IMUD_SHM") or DIRECTORY
 
 
 def _map(path: Path) -> tuple[RingHeader, mmap.mmap, tuple[int, int]]:

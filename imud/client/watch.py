@@ -15,13 +15,13 @@ _DEVICE_ID_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.n
 
 
 class Source(Protocol):
-    """Where the iterators take their messages from."""
+    """Gives the iterators their messages."""
 
-    def take_kept(self, names: frozenset[str]) -> dict[str, Any] | bytes | None:
+    def kept_message(self, names: frozenset[str]) -> dict[str, Any] | bytes | None:
         """A message that came before, or None."""
         ...
 
-    def take(self, names: frozenset[str], timeout_s: float | None) -> dict[str, Any] | bytes:
+    def next_message(self, names: frozenset[str], timeout_s: float | None) -> dict[str, Any] | bytes:
         """The next message: slots, or a notification with one of these methods."""
         ...
 
@@ -40,7 +40,7 @@ class Watch:
         self.dropped: dict[str, int] = {}
         """Samples per device that the daemon dropped because this client read too slowly."""
         self.on_dropped: Callable[[str, int], None] | None = None
-        self.ended = False
+        self._ended = False
         self._names = {number: name for name, number in self.device_ids.items()}
         self._source = source
         self._timeout_s = timeout_s
@@ -51,11 +51,15 @@ class Watch:
 
     def __next__(self) -> Sample:
         while not self._ready:
-            message = self._source.take_kept(self.NAMES)
-            if message is None and self.ended:
+            message = self._source.kept_message(self.NAMES)
+            if message is None and self._ended:
                 raise StopIteration
-            self._handle(self._source.take(self.NAMES, self._timeout_s) if message is None else message)
+            self._handle(self._source.next_message(self.NAMES, self._timeout_s) if message is None else message)
         return self._ready.popleft()
+
+    def end(self) -> None:
+        """Stop the iteration after the samples that came already."""
+        self._ended = True
 
     def _handle(self, message: dict[str, Any] | bytes) -> None:
         if isinstance(message, bytes):
@@ -102,7 +106,7 @@ class EventStream:
         return self
 
     def __next__(self) -> Event:
-        message = self._source.take(self.NAMES, self._timeout_s)
+        message = self._source.next_message(self.NAMES, self._timeout_s)
         assert isinstance(message, dict)
         return event_of(message.get("params", {}))
 

@@ -12,6 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from imud.client import Client, RpcError
+from imud.client.connection import default_path
 from imud.client.watch import event_of
 from imud.contracts.publisher import Batch
 from imud.errors import LinkDenied, LinkMissing, ServerError
@@ -169,7 +170,23 @@ def test_notify_gives_a_descriptor_that_wakes(served: Daemon) -> None:
         assert next(watch).seq == 1
 
 
-def test_nobody_there(tmp_path: Path) -> None:
+def test_path_of_the_environment(served: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IMUD_SOCKET", served.path)
+    with Client() as client:
+        assert client.path == served.path
+    with pytest.raises(LinkMissing, match="no daemon at /nowhere"):
+        Client("/nowhere")  # an argument counts more
+
+
+@pytest.mark.parametrize("value", [None, ""])
+def test_path_without_the_environment(monkeypatch: pytest.MonkeyPatch, value: str | None) -> None:
+    monkeypatch.delenv("IMUD_SOCKET", raising=False)
+    if value is not None:
+        monkeypatch.setenv("IMUD_SOCKET", value)
+    assert default_path() == "/run/imud/imud.sock"
+
+
+def test_no_daemon_there(tmp_path: Path) -> None:
     path = tmp_path / "imud.sock"
     with pytest.raises(LinkMissing, match="is imud running"):
         Client(path)

@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 
-from imud.client.ring import Ring
+from imud.client.ring import Ring, default_directory
 from imud.errors import LinkMissing, ServerError
 from imud.formats.ring import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode_ledger_block
 from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, encode_slot
@@ -55,6 +55,22 @@ def test_no_such_ring(board: Board) -> None:
 def test_no_rings_at_all(tmp_path: Path) -> None:
     with pytest.raises(ServerError, match="is imud running"):
         Ring("imu9", directory=str(tmp_path))
+
+
+def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IMUD_SHM", str(tmp_path))
+    with Ring(DEVICE) as ring:
+        assert ring.path == board.path
+    with pytest.raises(ServerError, match=r"/nowhere/imud\.imu0: no such ring"):
+        Ring(DEVICE, directory="/nowhere")  # an argument counts more
+
+
+@pytest.mark.parametrize("value", [None, ""])
+def test_directory_without_the_environment(monkeypatch: pytest.MonkeyPatch, value: str | None) -> None:
+    monkeypatch.delenv("IMUD_SHM", raising=False)
+    if value is not None:
+        monkeypatch.setenv("IMUD_SHM", value)
+    assert default_directory() == "/dev/shm"
 
 
 def test_no_ring_but_a_file(tmp_path: Path) -> None:

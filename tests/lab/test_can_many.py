@@ -36,7 +36,7 @@ def collect(client: Client, seconds: float) -> dict[str, list[Sample]]:
     taken: list[bytes] = []
     end = monotonic() + seconds
     while monotonic() < end:
-        message = client.take(Watch.NAMES, LIMIT_S)
+        message = client.next_message(Watch.NAMES, LIMIT_S)
         assert isinstance(message, bytes), message  # nothing was dropped
         taken.append(message)
     client.unwatch()
