@@ -8,7 +8,7 @@ log = logging.getLogger(__name__)
 
 
 def notify(state: str) -> None:
-    """Send `state`, for example `READY=1`; does nothing when not started by a service manager."""
+    """Send `state`, for example `READY=1`; no-op when not started by a service manager."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
@@ -18,7 +18,7 @@ def notify(state: str) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK) as sock:
             sock.sendto(state.encode(), address)
     except OSError as error:
-        log.warning("cannot tell the service manager %s: %s", state.partition("\n")[0], error)
+        log.warning("cannot notify the service manager of %s: %s", state.partition("\n")[0], error)
 
 
 def watchdog_interval_s() -> float | None:

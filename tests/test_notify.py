@@ -34,7 +34,7 @@ def test_no_manager_no_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ca
     assert caplog.text == ""
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
     notify("READY=1")
-    assert "cannot tell the service manager READY=1" in caplog.text
+    assert "cannot notify the service manager of READY=1" in caplog.text
 
 
 @pytest.mark.parametrize(

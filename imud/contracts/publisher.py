@@ -1,4 +1,4 @@
-"""What a publisher is: an output that takes samples and events and never makes the pipeline wait."""
+"""What a publisher promises: it outputs samples and events and never makes the pipeline wait."""
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -56,7 +56,7 @@ class Publisher(Protocol):
         ...
 
     def event(self, event: Event) -> None:
-        """Tell readers of an event."""
+        """Give an event to readers."""
         ...
 
     def tick(self, now_ns: int) -> None:
@@ -68,8 +68,8 @@ class Publisher(Protocol):
         ...
 
 
-async def _nobody_acts(device: str, _name: str, _arguments: Mapping[str, Any]) -> object:
-    raise CommandError(f"{device}: nothing here can be told to do anything")
+async def _no_actions(device: str, _name: str, _arguments: Mapping[str, Any]) -> object:
+    raise CommandError(f"{device}: no device here has actions")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +82,9 @@ class PublisherContext:
     now_ns: Callable[[], int]
     """CLOCK_MONOTONIC."""
     actions: Callable[[str], Sequence[ActionInfo]] = lambda _device: ()
-    """What a device can be told to do."""
-    act: Callable[[str, str, Mapping[str, Any]], Awaitable[object]] = _nobody_acts
-    """Have a device do something: its name, the action's, arguments. Raises ImudError; the answer is JSON's values."""
+    """The actions of a device."""
+    act: Callable[[str, str, Mapping[str, Any]], Awaitable[object]] = _no_actions
+    """Run an action of a device: its name, the action's, arguments. Raises ImudError; the answer is JSON values."""
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
 

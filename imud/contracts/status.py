@@ -90,7 +90,7 @@ class PollingStatus(msgspec.Struct, frozen=True):
 
 
 class SerialLineCounters(msgspec.Struct, frozen=True):
-    """What was heard on a serial line that several devices share besides replies, since it was opened."""
+    """What came on a shared serial line other than replies, since it was opened."""
 
     timeouts: int = 0
     """Requests without a reply."""
@@ -103,7 +103,7 @@ class SerialLineCounters(msgspec.Struct, frozen=True):
 
 
 class LinesStatus(msgspec.Struct, frozen=True):
-    """The wires of one device besides its data, since start."""
+    """The GPIO lines of one device, since start."""
 
     problems: dict[str, str]
     """Why a line is not watched or driven now, by its key in the configuration; empty when all are."""
@@ -112,7 +112,7 @@ class LinesStatus(msgspec.Struct, frozen=True):
     edges_lost: dict[str, int]
     """Edges that the kernel dropped because they were not read in time, by line."""
     alarm: bool | None = None
-    """Whether the ALARM line is active; None without one, or while nobody knows."""
+    """Whether the ALARM line is active; None without one, or while its level is not known."""
     alarms: int = 0
     """Times it became active."""
     sin: bool = False
@@ -130,10 +130,10 @@ class LinesStatus(msgspec.Struct, frozen=True):
 
 
 class UtcStatus(msgspec.Struct, frozen=True):
-    """How a device is told UTC, and what the host knows of it, since start."""
+    """How a device gets UTC, and what the host knows of it, since start."""
 
     source: str
-    """Where RMC sentences come from, for people; empty where it is fed none."""
+    """Where RMC sentences come from, for people; empty without a source."""
     problem: str
     """What is wrong with that or with the feed of chronyd now, one sentence; empty when all is well."""
     sentences: int = 0
@@ -167,7 +167,7 @@ LATENCY_BOUNDS_NS = (
 
 
 class DeviceStatus(msgspec.Struct, frozen=True):
-    """One device, all that imud can say of it. Lives for one answer; nothing in it changes afterwards."""
+    """The full state of one device. Made for one answer and never changed."""
 
     name: str
     device_id: int
@@ -178,7 +178,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     problem: str
     """Why it is not running, one sentence; empty when it runs."""
     identity: dict[str, str]
-    """`product`, `serial_number`, `firmware` and what else the device told."""
+    """`product`, `serial_number`, `firmware` and what else the device sent."""
     settings: dict[str, str]
     """The device's own settings as read back."""
     rate_hz: float

@@ -2,12 +2,12 @@
 
     line     {"jsonrpc":"2.0",…}\\n
     frame    +-----------------+------------------------------------------------------------+
-             | length: u32, LE | length % 256 == 0: that many bytes of slots (kit/slot.py)  |
+             | length: u32, LE | length % 256 == 0: that many bytes of slots (slot.py)      |
              |                 | otherwise: one JSON object and its newline                 |
              +-----------------+------------------------------------------------------------+
 
-The kind of a frame is told by its length: a slot may begin with any byte, `{` included (seq 123), so its content
-cannot tell. JSON whose length happens to be a multiple of 256 gets a second newline.
+The length gives the kind of a frame: a slot may begin with any byte, `{` included (seq 123), so its content does
+not. JSON whose length happens to be a multiple of 256 gets a second newline.
 """
 
 import struct
@@ -44,7 +44,7 @@ class Code(IntEnum):
     INVALID_PARAMS = -32602
     INTERNAL = -32603
     DENIED = -32001
-    """The peer has not the right."""
+    """The peer lacks the permission."""
     TOO_MANY_CLIENTS = -32002
     LINE_TOO_LONG = -32003
     UNAVAILABLE = -32004

@@ -30,7 +30,7 @@ class ShmSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     enabled: bool = True
     """Whether there are rings at all."""
     directory: str = DIRECTORY
-    """Where the files are. Readers look into /dev/shm unless told otherwise."""
+    """Where the files are. Readers look into /dev/shm, or where their environment variable IMUD_SHM says."""
     slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
     """Samples a ring holds, a power of two, 256 bytes each: 4096 are four seconds at 1 kHz and 1 MB per device."""
     group: str = "imud"
@@ -81,7 +81,7 @@ class ShmPublisher:
             self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
 
     def remove_device(self, name: str) -> None:
-        """Close the device's ring and remove its file."""
+        """Close the device's ring and remove its file; no-op if absent."""
         ring = self._rings.pop(name, None)
         if ring is not None:
             ring.close()
@@ -119,7 +119,7 @@ class ShmPublisher:
             return None
 
     def _warn_of_group(self, why: str) -> None:
-        """Say once why the group cannot read; that is never a reason not to start."""
+        """Log once why the group cannot read; the daemon starts all the same."""
         self._group_id = None
         log.warning("shm: group %s %s; its members cannot read shared memory", self._settings.group, why)
 

@@ -88,7 +88,7 @@ class ShmRing:
         self._words[LEDGER_UPDATE_WORD] = self._update
 
     def close(self) -> None:
-        """Tell readers that this is the end, and remove the file if it is still this one; may be called twice."""
+        """Mark the ring closed for its readers, and remove the file if it is still this one; may be called twice."""
         if self._closed:
             return
         self._closed = True

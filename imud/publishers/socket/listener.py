@@ -1,11 +1,11 @@
 """A listening UNIX socket in the file system: replaces a dead one's, never a live one's, removes only its own.
 
-The file appears whole. Bound in its place, it would refuse whoever connects before `listen`, and have the wrong mode
-and group for a moment. So it is bound beside its place, as `imud.sock.PID`, and renamed when all is done.
+The file appears whole. Bound in its place, it would refuse clients that connect before `listen`, and have the wrong
+mode and group for a moment. So it is bound beside its place, as `imud.sock.PID`, and renamed when all is done.
 
 Of two daemons that start at the same moment the second sees the first's socket, before its rename at the latest; if
 both looked before either renamed, the one whose file was replaced sees that after its own rename. What remains: the
-second's rename comes after both looks of the second and the first. The first then serves a socket that nobody finds.
+second's rename comes after both looks of the second and the first. The first then serves a socket that no client finds.
 No system call renames over dead sockets only; the window is that of two system calls.
 """
 
@@ -133,7 +133,7 @@ def _remove_leftovers(path: Path) -> None:
     for file in path.parent.glob("*"):
         stem, _, number = file.name.rpartition(".")
         if stem == path.name and number.isdecimal() and _is_leftover(file, int(number)):
-            with suppress(OSError):  # in nobody's way, unless it has our own number; then `bind` says so
+            with suppress(OSError):  # harmless, unless it has our own number; then `bind` reports it
                 file.unlink()
                 log.info("removed %s, left behind by a daemon that died while it started", file)
 
@@ -148,12 +148,12 @@ def _is_leftover(file: Path, pid: int) -> bool:
         return False
     try:
         return file.is_socket() and not _is_alive(file)
-    except ServerError:  # not ours to judge
+    except ServerError:  # not accessible to us
         return False
 
 
 def _is_alive(path: Path) -> bool:
-    """Whether somebody listens. Raises ServerError where that cannot be told."""
+    """Whether a process listens. Raises ServerError where that cannot be determined."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(PROBE_TIMEOUT_S)
         try:
@@ -163,7 +163,7 @@ def _is_alive(path: Path) -> bool:
         except (TimeoutError, BlockingIOError):
             return True
         except OSError as error:
-            raise ServerError(f"cannot tell whether {path} is in use: {_reason(error, path)}") from error
+            raise ServerError(f"cannot determine whether {path} is in use: {_reason(error, path)}") from error
     return True
 
 
