@@ -30,6 +30,7 @@ from imud.formats.ring import (
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, encode_slot
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers import PUBLISHERS
+from imud.publishers.shm import ring
 from imud.publishers.shm.publisher import PUBLISHER, ShmPublisher, ShmSettings
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 
@@ -132,25 +133,29 @@ def test_gap_in_the_numbers_moves_the_first(board: Board) -> None:
 class Spy:
     """Stands before a memoryview and notes what is written where, in bytes."""
 
-    def __init__(self, target: memoryview, width: int, notes: list[tuple[int, int, object]]) -> None:
-        self.target, self.width, self.notes = target, width, notes
+    def __init__(self, target: memoryview, notes: list[tuple[int, int, object]]) -> None:
+        self.target, self.notes = target, notes
+
+    def cast(self, code: Any) -> "Spy":
+        return Spy(self.target.cast(code), self.notes)
 
     def __setitem__(self, at: int | slice, value: Any) -> None:
         if isinstance(at, slice):
             self.notes.append((at.start, at.stop - at.start, bytes(value)))
         else:
-            self.notes.append((at * self.width, self.width, value))
+            width = self.target.itemsize
+            self.notes.append((at * width, width, value))
         self.target[at] = value
 
     def release(self) -> None:
         self.target.release()
 
 
-def test_order_of_writes(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     notes: list[tuple[int, int, object]] = []
-    ring: Any = board.publisher._rings[DEVICE]
-    monkeypatch.setattr(ring, "_words", Spy(ring._words, 8, notes))
-    monkeypatch.setattr(ring, "_bytes", Spy(ring._bytes, 1, notes))
+    with monkeypatch.context() as patch:
+        patch.setattr(ring, "memoryview", lambda memory: Spy(memoryview(memory), notes), raising=False)
+        board = Board(tmp_path)
     board.publish([1])
     slot = encode_slot(make_sample(1), 3)
     assert notes == [
@@ -165,6 +170,7 @@ def test_order_of_writes(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [note[:2] for note in notes[:3]] == [(update, 8), (update + 8, LEDGER_BLOCK_BYTES - 8), (update, 8)]
     assert [notes[0][2], notes[2][2]] == [SEQ_INVALID, 1]
     assert notes[3:] == [(OFFSETS["heartbeat_ns"], 8, board.now_ns)]
+    board.publisher.close()
 
 
 def test_tick_shows_ledger_driver_and_heartbeat(board: Board) -> None:
