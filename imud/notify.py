@@ -1,4 +1,4 @@
-"""The service manager's notification protocol, sd_notify(3): one datagram to the socket named in NOTIFY_SOCKET."""
+"""The whole of sd_notify(3), the notification protocol of service managers: one datagram to NOTIFY_SOCKET."""
 
 import logging
 import os
