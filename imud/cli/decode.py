@@ -21,7 +21,7 @@ from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
 from imud.errors import ImudError
 from imud.formats.candump import CandumpReader
-from imud.formats.capture import read_capture
+from imud.formats.capture import CaptureReader
 from imud.ledger import Ledger
 from imud.sample import Measurement
 
@@ -72,7 +72,7 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings
     """Everything that the driver's codec says of a capture."""
     if isinstance(driver, StreamDriver):
         codec = driver.make_codec(ledger, settings)
-        for _, data in read_capture(file):
+        for _, data in CaptureReader(file):
             yield from codec.feed(data)
         yield from codec.flush()
     elif isinstance(driver, CanDriver):

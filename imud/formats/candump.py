@@ -8,10 +8,10 @@ the identifier). A direction mark (`R`, `T`) after the data and a raw length cod
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import BinaryIO, Final
 
-from imud.formats.can import DATA_BYTES_MAX, ERROR_FLAG, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
+from imud.formats.can import ERROR_FLAG, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
 from imud.units import NS_PER_S
 
 LINE_BYTES_MAX: Final = 512
@@ -23,7 +23,6 @@ _FRAME: Final = re.compile(
 _OTHER: Final = re.compile(
     rb"\(\d{1,18}\.\d{1,9}\) +\S+ +[0-9A-Fa-f]{3,8}#(?:#[0-9A-Fa-f]+|R[\dA-Fa-f_]*)(?: [RT])?\s*"
 )
-_SEEMS: Final = re.compile(rb"\(\d{1,18}\.\d{1,9}\) +\S+ +[0-9A-Fa-f]{3,8}#")
 
 
 class CandumpReader:
@@ -66,27 +65,3 @@ class CandumpReader:
         elif line.strip():
             self.bad_lines += 1
             self.first_bad = self.first_bad or number
-
-
-def is_candump(head: bytes) -> bool:
-    """Whether a file that begins so is such a log."""
-    return _SEEMS.match(head) is not None
-
-
-def candump_line(frame: CanFrame, bus: str = "can0") -> str:
-    """A frame as a line of a log, its `t_rx_ns` taken for the wall clock. Raises ValueError for no classical frame."""
-    most = EXTENDED_ID_MAX if frame.extended else STANDARD_ID_MAX
-    if not 0 <= frame.can_id <= most or len(frame.data) > DATA_BYTES_MAX or frame.t_rx_ns < 0:
-        raise ValueError(f"no classical CAN frame: {frame}")
-    seconds, ns = divmod(frame.t_rx_ns, NS_PER_S)
-    digits = 8 if frame.extended else 3
-    return f"({seconds:010d}.{ns // 1000:06d}) {bus} {frame.can_id:0{digits}X}#{frame.data.hex().upper()}\n"
-
-
-def write_candump(file: BinaryIO, frames: Iterable[CanFrame], bus: str = "can0") -> int:
-    """Append frames to a log; returns how many."""
-    count = 0
-    for frame in frames:
-        file.write(candump_line(frame, bus).encode("ascii"))
-        count += 1
-    return count

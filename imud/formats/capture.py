@@ -1,4 +1,4 @@
-"""Captures: what a link delivered, in a file. A raw capture is the bytes; a stamped one also says when each read came.
+"""Capture files: the bytes a link delivered. A raw capture is the bytes alone; a stamped one has the time of each read.
 
 A stamped capture begins with one line of ASCII, then come records to the end of the file, little-endian::
 
@@ -15,7 +15,7 @@ RECORD_BYTES_MAX or a time before its predecessor's means damage: reading stops 
 import struct
 from collections.abc import Iterator, Mapping
 from typing import BinaryIO, Final, NamedTuple
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
 from imud.errors import ImudError
 
@@ -26,10 +26,9 @@ RECORD_BYTES_MAX: Final = 1 << 20
 """No link reads more at once; a larger length is damage."""
 RAW_CHUNK_BYTES: Final = 4096
 """Size of the pieces of a raw capture: as much as a tty hands over at once."""
-WRITE_BYTES_MAX: Final = 1 << 30
-"""Default bound of a capture being written: 1 GiB, 26 hours at 115200 baud."""
 
-_RECORD = struct.Struct("<qI")
+RECORD: Final = struct.Struct("<qI")
+"""Head of a record: `t_ns`, length."""
 
 
 class Chunk(NamedTuple):
@@ -41,7 +40,10 @@ class Chunk(NamedTuple):
 
 
 class CaptureReader:
-    """Reads raw and stamped captures from any binary stream, seekable or not. Iterate once."""
+    """Reads a raw or stamped capture from any binary stream, seekable or not. Iterate once.
+
+    The first bytes of the file decide which of the two it is.
+    """
 
     def __init__(self, file: BinaryIO) -> None:
         """Raises ImudError for a stamped capture of another version, or with a broken first line."""
@@ -94,11 +96,11 @@ class CaptureReader:
 
     def _records(self) -> Iterator[Chunk]:
         newest_ns: int | None = None
-        while header := _read_fully(self._file, _RECORD.size):
-            if len(header) < _RECORD.size:
+        while header := _read_fully(self._file, RECORD.size):
+            if len(header) < RECORD.size:
                 self.problem = f"the last {len(header)} bytes are a record cut short, left out"
                 return
-            t_ns, length = _RECORD.unpack(header)
+            t_ns, length = RECORD.unpack(header)
             if length > RECORD_BYTES_MAX or (newest_ns is not None and t_ns < newest_ns):
                 self.problem = (
                     f"damaged at byte {self._offset}: record of {length} bytes at {t_ns} ns; the rest is left out"
@@ -111,51 +113,6 @@ class CaptureReader:
             self._offset += len(header) + length
             newest_ns = t_ns
             yield Chunk(t_ns, data)
-
-
-def read_capture(file: BinaryIO) -> CaptureReader:
-    """The chunks in a raw or stamped capture, told apart by its first bytes. Raises ImudError for another version."""
-    return CaptureReader(file)
-
-
-class CaptureWriter:
-    """Writes a stamped capture, up to a bound. The file stays the caller's to flush and close."""
-
-    def __init__(
-        self,
-        file: BinaryIO,
-        *,
-        driver: str = "",
-        baud: int = 0,
-        details: Mapping[str, str | int] | None = None,
-        bytes_max: int = WRITE_BYTES_MAX,
-    ) -> None:
-        """Writes the first line; empty and zero values are left out of it. Raises ValueError when it gets too long."""
-        self._file = file
-        self._room = bytes_max
-        self._newest_ns = -(1 << 63)
-        self.bytes_refused = 0
-        """Bytes that were not written because the bound was reached."""
-        values: dict[str, str | int] = {"driver": driver, "baud": baud, **(details or {})}
-        pairs = [f"{key}={quote(str(value), safe='')}" for key, value in values.items() if value not in ("", 0)]
-        header = MAGIC + " ".join([VERSION, *pairs]).encode("ascii") + b"\n"
-        if len(header) > HEADER_BYTES_MAX:
-            raise ValueError(f"first line of {len(header)} bytes: at most {HEADER_BYTES_MAX} can be read back")
-        self._room -= self._file.write(header)
-
-    def write(self, data: bytes, t_ns: int) -> bool:
-        """Append one read; False once the bound is reached, and from then on. A time that ran back is held."""
-        if not data:
-            return self.bytes_refused == 0
-        if self.bytes_refused or _RECORD.size + len(data) > self._room:
-            self.bytes_refused += len(data)
-            return False
-        self._newest_ns = max(self._newest_ns, t_ns)
-        for start in range(0, len(data), RECORD_BYTES_MAX):
-            piece = data[start : start + RECORD_BYTES_MAX]
-            self._file.write(_RECORD.pack(self._newest_ns, len(piece)) + piece)
-            self._room -= _RECORD.size + len(piece)
-        return True
 
 
 def _read_fully(file: BinaryIO, size: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Modbus RTU frames as every master sees them: address, function, data, CRC; replies told from echoes and strangers.
+"""Modbus RTU framing as a master needs it: address, function, data, CRC, and finding the reply to a request.
 
     request   address | function | data … | CRC low | CRC high
     reply     address | function | data … | CRC low | CRC high        exception  address | function + 0x80 | code | CRC
@@ -9,7 +9,6 @@ frame has no sync word and no end mark: what it is follows from what was asked, 
 
 from typing import Final
 
-from imud.formats.checksum import crc16_modbus
 from imud.units import NS_PER_US, uart_byte_ns
 
 READ_HOLDING: Final = 0x03
@@ -44,6 +43,27 @@ EXCEPTIONS: Final = {
     8: "its memory has a parity error",
 }
 """What a slave says instead of a reply."""
+
+
+def crc16_modbus(data: bytes) -> int:
+    """CRC-16/MODBUS: reflected polynomial 0xA001, start value 0xFFFF, no final XOR. "123456789" gives 0x4B37.
+
+    The check value follows what it covers, low byte first; over both together the result is 0. The standard library
+    has none; a table takes 60 ns a byte, where a frame of 57 bytes takes 5 ms on its wire.
+    """
+    crc = 0xFFFF
+    for byte in data:
+        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def _crc_of(byte: int) -> int:
+    for _ in range(8):
+        byte = byte >> 1 ^ (0xA001 if byte & 1 else 0)
+    return byte
+
+
+_CRC_TABLE: Final = tuple(map(_crc_of, range(256)))
 
 
 def framed(address: int, request: bytes) -> bytes:

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.errors import ImudError
-from imud.formats.capture import MAGIC, RAW_CHUNK_BYTES, RECORD_BYTES_MAX, CaptureReader, CaptureWriter, read_capture
+from imud.formats.capture import MAGIC, RAW_CHUNK_BYTES, RECORD_BYTES_MAX, CaptureReader
+from tests.support.captures import CaptureWriter
 
 GOLDEN = (
     b"#imud-capture 1 driver=hipnuc-uart baud=115200\n"
@@ -36,7 +37,7 @@ class Dripping(io.RawIOBase):
 
 
 def chunks(data: bytes) -> list[tuple[int | None, bytes]]:
-    return [(chunk.t_ns, chunk.data) for chunk in read_capture(io.BytesIO(data))]
+    return [(chunk.t_ns, chunk.data) for chunk in CaptureReader(io.BytesIO(data))]
 
 
 def written(**details: str | int) -> bytes:
@@ -48,7 +49,7 @@ def written(**details: str | int) -> bytes:
 
 
 def test_the_golden_capture_is_read_and_written() -> None:
-    reader = read_capture(io.BytesIO(GOLDEN))
+    reader = CaptureReader(io.BytesIO(GOLDEN))
     assert (reader.stamped, reader.driver, reader.baud, reader.hold_ns) == (True, "hipnuc-uart", 115200, 0)
     assert list(reader) == [(258, b"abc"), (259, b"d")]
     assert reader.problem == ""
@@ -56,7 +57,7 @@ def test_the_golden_capture_is_read_and_written() -> None:
 
 
 def test_unknown_details_and_odd_characters_survive() -> None:
-    reader = read_capture(io.BytesIO(written(note="20 °C, 5 = five %\n", hold_ns=16_000_000)))
+    reader = CaptureReader(io.BytesIO(written(note="20 °C, 5 = five %\n", hold_ns=16_000_000)))
     assert reader.details["note"] == "20 °C, 5 = five %\n"
     assert reader.hold_ns == 16_000_000
     assert list(reader) == [(258, b"abc"), (259, b"d")]
@@ -64,7 +65,7 @@ def test_unknown_details_and_odd_characters_survive() -> None:
 
 @given(st.binary(max_size=3 * RAW_CHUNK_BYTES).filter(lambda data: not data.startswith(MAGIC)))
 def test_everything_else_is_raw(data: bytes) -> None:
-    reader = read_capture(io.BytesIO(data))
+    reader = CaptureReader(io.BytesIO(data))
     pieces = list(reader)
     assert not reader.stamped
     assert b"".join(piece for _, piece in pieces) == data
@@ -81,7 +82,7 @@ def test_a_cut_at_any_byte_loses_only_the_cut_record() -> None:
     records_at = GOLDEN.index(b"\n") + 1
     ends = {records_at: 0, records_at + 15: 1, len(GOLDEN): 2}
     for cut in range(records_at, len(GOLDEN) + 1):
-        reader = read_capture(io.BytesIO(GOLDEN[:cut]))
+        reader = CaptureReader(io.BytesIO(GOLDEN[:cut]))
         whole = [(258, b"abc"), (259, b"d")][: max(number for end, number in ends.items() if end <= cut)]
         assert list(reader) == whole
         assert ("cut short" in reader.problem) == (cut not in ends)
@@ -89,7 +90,7 @@ def test_a_cut_at_any_byte_loses_only_the_cut_record() -> None:
 
 def test_damage_is_named_with_its_place() -> None:
     for record in (struct.pack("<qI", 300, RECORD_BYTES_MAX + 1), struct.pack("<qI", 100, 1) + b"x"):
-        reader = read_capture(io.BytesIO(GOLDEN + record + b"more"))
+        reader = CaptureReader(io.BytesIO(GOLDEN + record + b"more"))
         assert list(reader) == [(258, b"abc"), (259, b"d")]
         assert reader.problem.startswith(f"damaged at byte {len(GOLDEN)}:")
 
@@ -97,7 +98,7 @@ def test_damage_is_named_with_its_place() -> None:
 @pytest.mark.parametrize("line", [b"2 driver=x\n", b"1 driver=x", b"\n", b"\xff\xff\n"])
 def test_other_versions_and_broken_first_lines_are_refused(line: bytes) -> None:
     with pytest.raises(ImudError, match="this imud reads version 1"):
-        read_capture(io.BytesIO(MAGIC + line))
+        CaptureReader(io.BytesIO(MAGIC + line))
 
 
 @pytest.mark.parametrize("baud", ["", "fast", "-1", "²", "9" * 30])
@@ -105,7 +106,7 @@ def test_a_rate_that_is_no_number_is_unknown(baud: str) -> None:
     file = io.BytesIO()
     CaptureWriter(file, details={"note": baud})
     header = file.getvalue().replace(b"note=", b"baud=")
-    assert read_capture(io.BytesIO(header)).baud == 0
+    assert CaptureReader(io.BytesIO(header)).baud == 0
 
 
 @given(st.lists(st.tuples(st.binary(max_size=50), st.integers(-(1 << 62), 1 << 62))))

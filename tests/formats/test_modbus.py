@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imud.formats.checksum import crc16_modbus
 from imud.formats.modbus import (
     ReplyFinder,
+    crc16_modbus,
     exception_text,
     frame_gap_ns,
     framed,
@@ -28,6 +28,7 @@ def finder(echoes: bool | None = False, request: bytes = REQUEST, size: int = le
 
 def test_check_value_and_frames() -> None:
     assert crc16_modbus(b"123456789") == 0x4B37
+    assert crc16_modbus(b"123456789\x37\x4b") == 0
     assert framed(0x50, bytes.fromhex("03 0034 0018")).hex() == "50030034001809" + "8f"
     assert is_whole(REPLY)
     assert not is_whole(REPLY[:-1])

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from imud.devices.imu61x.can.codec import encode_set
 from imud.formats.can import CanFrame
-from imud.formats.candump import candump_line
+from tests.support.captures import candump_line
 
 BEGIN_NS = 1_763_717_507_000_000_000
 PERIOD_NS = 10_000_000

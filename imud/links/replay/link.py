@@ -22,7 +22,7 @@ from typing import BinaryIO, Final
 from imud.contracts.link import LinkType, OnData, OnEnd
 from imud.contracts.status import KernelCounters
 from imud.errors import ImudError, LinkError
-from imud.formats.capture import CaptureReader, read_capture
+from imud.formats.capture import CaptureReader
 from imud.links.inotify import wait_until
 from imud.links.replay.can import CanReplayLink
 from imud.links.replay.file import ReplaySettings, open_regular
@@ -177,7 +177,7 @@ class ReplayLink:
             raise LinkError(f"{self.title} is not open")
         self._file.seek(0)
         try:
-            return read_capture(self._file)
+            return CaptureReader(self._file)
         except ImudError as error:
             raise LinkError(f"{self.title}: {error}") from error
 

@@ -12,8 +12,8 @@ import pytest
 from imud.contracts.link import CanLink
 from imud.errors import LinkError, LinkMissing
 from imud.formats.can import CanFilter, CanFrame
-from imud.formats.candump import candump_line
 from imud.links import LINKS
+from tests.support.captures import candump_line
 
 MS = 1_000_000
 BEGIN_NS = 1_763_717_507_000 * MS

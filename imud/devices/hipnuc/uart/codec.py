@@ -21,6 +21,7 @@ one. `tests/bench/decode.py` measures it.
 import re
 import struct
 import sys
+from binascii import crc_hqx as crc16_xmodem  # polynomial 0x1021, not reflected, first `crc` 0, no final XOR
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from random import Random
@@ -46,7 +47,6 @@ from imud.devices.hipnuc.uart.alarm import alarm_ranges
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
 from imud.devices.hipnuc.uart.session import identify, read_settings
 from imud.devices.hipnuc.uart.text_lines import LINE_CHARACTERS_MAX, LineFinder
-from imud.formats.checksum import crc16_xmodem
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.units import NS_PER_MS, RAD_PER_DEG, T_PER_UT

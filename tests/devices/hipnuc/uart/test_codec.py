@@ -2,6 +2,7 @@
 
 import math
 import struct
+from binascii import crc_hqx
 from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
@@ -408,3 +409,8 @@ def test_half_a_frame_that_looks_like_the_end_of_a_line_survives_an_idle_line() 
     assert codec.flush() == []
     assert len(codec.feed(frame[cut:])) == 1
     assert codec.ledger.bytes_in_good_frames == len(frame)
+
+
+def test_the_check_value_of_crc16_xmodem() -> None:
+    assert crc_hqx(b"123456789", 0) == 0x31C3
+    assert crc_hqx(b"6789", crc_hqx(b"12345", 0)) == 0x31C3

@@ -1,0 +1,62 @@
+"""Writes captures: the stamped format of docs/captures.md, and the log format of `candump -L`."""
+
+from collections.abc import Mapping
+from typing import BinaryIO, Final
+from urllib.parse import quote
+
+from imud.formats.can import DATA_BYTES_MAX, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
+from imud.formats.capture import HEADER_BYTES_MAX, MAGIC, RECORD, RECORD_BYTES_MAX, VERSION
+from imud.units import NS_PER_S, NS_PER_US
+
+WRITE_BYTES_MAX: Final = 1 << 30
+"""Default bound of a capture being written: 1 GiB, 26 hours at 115200 baud."""
+
+
+class CaptureWriter:
+    """Writes a stamped capture, up to a bound. The file stays the caller's to flush and close."""
+
+    def __init__(
+        self,
+        file: BinaryIO,
+        *,
+        driver: str = "",
+        baud: int = 0,
+        details: Mapping[str, str | int] | None = None,
+        bytes_max: int = WRITE_BYTES_MAX,
+    ) -> None:
+        """Writes the first line; empty and zero values are left out of it. Raises ValueError when it gets too long."""
+        self._file = file
+        self._room = bytes_max
+        self._newest_ns = -(1 << 63)
+        self.bytes_refused = 0
+        """Bytes that were not written because the bound was reached."""
+        values: dict[str, str | int] = {"driver": driver, "baud": baud, **(details or {})}
+        pairs = [f"{key}={quote(str(value), safe='')}" for key, value in values.items() if value not in ("", 0)]
+        header = MAGIC + " ".join([VERSION, *pairs]).encode("ascii") + b"\n"
+        if len(header) > HEADER_BYTES_MAX:
+            raise ValueError(f"first line of {len(header)} bytes: at most {HEADER_BYTES_MAX} can be read back")
+        self._room -= self._file.write(header)
+
+    def write(self, data: bytes, t_ns: int) -> bool:
+        """Append one read; False once the bound is reached, and from then on. A time that ran back is held."""
+        if not data:
+            return self.bytes_refused == 0
+        if self.bytes_refused or RECORD.size + len(data) > self._room:
+            self.bytes_refused += len(data)
+            return False
+        self._newest_ns = max(self._newest_ns, t_ns)
+        for start in range(0, len(data), RECORD_BYTES_MAX):
+            piece = data[start : start + RECORD_BYTES_MAX]
+            self._file.write(RECORD.pack(self._newest_ns, len(piece)) + piece)
+            self._room -= RECORD.size + len(piece)
+        return True
+
+
+def candump_line(frame: CanFrame, bus: str = "can0") -> str:
+    """A frame as a line of a log, with `t_rx_ns` as its wall-clock time. Raises ValueError for no classical frame."""
+    most = EXTENDED_ID_MAX if frame.extended else STANDARD_ID_MAX
+    if not 0 <= frame.can_id <= most or len(frame.data) > DATA_BYTES_MAX or frame.t_rx_ns < 0:
+        raise ValueError(f"no classical CAN frame: {frame}")
+    seconds, ns = divmod(frame.t_rx_ns, NS_PER_S)
+    digits = 8 if frame.extended else 3
+    return f"({seconds:010d}.{ns // NS_PER_US:06d}) {bus} {frame.can_id:0{digits}X}#{frame.data.hex().upper()}\n"
