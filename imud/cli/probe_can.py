@@ -16,8 +16,8 @@ from imud.errors import CommandError, ImudError, NothingHeard
 from imud.formats.can import CanFrame
 from imud.ledger import Ledger
 from imud.links import LINKS
+from imud.links.can.bus_state import ControllerState
 from imud.links.can.netlink import can_details
-from imud.links.can.state import ControllerState
 from imud.runtime.detection import CanDevice, CanSearch
 from imud.runtime.detection.can_round import EVERYTHING, CanFinder
 from imud.runtime.exchange import Exchange

@@ -4,7 +4,6 @@ Controllers that are SMBus only (I2C_FUNCS without I2C_FUNC_I2C) get block reads
 the same bits on the bus. The bus's time-out is shortened, so that one that hangs does not hold up its devices for long.
 """
 
-import errno
 import fcntl
 from collections.abc import Callable
 from typing import Annotated, Final, Literal, Protocol
@@ -17,7 +16,7 @@ from imud.contracts.polling import Transfer
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
 from imud.errors import LinkError
-from imud.links.bus_node import node_present, open_problem, transfer_problem
+from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
 
 I2C_TIMEOUT: Final = 0x0702
 """ioctl: time-out of the adapter in units of 10 ms (<linux/i2c-dev.h>)."""
@@ -79,8 +78,8 @@ class I2cLink:
         ioctl: Callable[[int, int, int], object] = fcntl.ioctl,
     ) -> None:
         self._open_bus, self._ioctl = open_bus, ioctl
+        self._node = DeviceNode(f"/dev/i2c-{settings.bus}")
         self._bus: I2cBus | None = None
-        self._denied = False
         self._address = 0
         self._place = ""
         self.title = f"/dev/i2c-{settings.bus}"
@@ -92,19 +91,12 @@ class I2cLink:
 
     async def wait_present(self) -> None:
         """Return when the node is there."""
-        await node_present(self.title, denied=self._denied)
+        await self._node.wait_present()
 
     def open(self) -> None:
         """Open the node. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        self._denied = False
-        try:
-            self._bus = self._open_bus(self.title)
-            self._ioctl(self._bus.fd or 0, I2C_TIMEOUT, TIMEOUT_10MS)
-        except OSError as error:
-            self.close()
-            self._denied = error.errno in (errno.EACCES, errno.EPERM)
-            hint = "is I2C switched on (`dtparam=i2c_arm=on` on a Raspberry Pi), is module i2c-dev loaded?"
-            raise open_problem(error, self.title, hint) from error
+        with self._node.opening():
+            self._open()
 
     def select(self, target: int) -> None:
         """Speak to a 7-bit address."""
@@ -128,21 +120,30 @@ class I2cLink:
             raise transfer_problem(error, self.title, self._place) from error
 
     def write(self, data: bytes) -> None:
-        """Nothing is sent but in transfers. Raises LinkError."""
+        """Raises LinkError: bytes are sent in transfers only."""
         raise LinkError(f"{self.title} cannot send {len(data)} bytes outside of a transfer")
 
     def kernel_counters(self) -> KernelCounters:
-        """The kernel counts none."""
+        """Zeros: the kernel counts no errors of this bus."""
         return KernelCounters()
 
     def serial_line(self) -> None:
-        """It has a clock: nothing comes unasked."""
+        """None: a bus with a clock carries nothing unasked."""
 
     def close(self) -> None:
         """Release the node; may be called twice."""
         bus, self._bus = self._bus, None
         if bus is not None:
             bus.close()
+
+    def _open(self) -> None:
+        try:
+            self._bus = self._open_bus(self.title)
+            self._ioctl(self._bus.fd or 0, I2C_TIMEOUT, TIMEOUT_10MS)
+        except OSError as error:
+            self.close()
+            hint = "is I2C switched on (`dtparam=i2c_arm=on` on a Raspberry Pi), is module i2c-dev loaded?"
+            raise bus_open_problem(error, self.title, hint) from error
 
     def _combined(self, bus: I2cBus, sent: bytes, read_bytes: int) -> bytes:
         write = i2c_msg.write(self._address, sent)

@@ -22,7 +22,7 @@ from imud.contracts.polling import Transfer
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
 from imud.errors import LinkError
-from imud.links.bus_node import node_present, open_problem, transfer_problem
+from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
 
 WR_MODE: Final = 0x40016B01
 """_IOW('k', 1, __u8)"""
@@ -65,9 +65,9 @@ class SpiLink:
     ) -> None:
         self._settings = settings
         self._ioctl, self._open_node, self._close_node = ioctl, open_node, close_node
+        self._node = DeviceNode(settings.port)
         self._fd = -1
         self._bits = 16
-        self._denied = False
         self._prepared: dict[Transfer, _Message] = {}
         self._place = ""
         self.title = settings.port
@@ -79,19 +79,12 @@ class SpiLink:
 
     async def wait_present(self) -> None:
         """Return when the node is there."""
-        await node_present(self.title, denied=self._denied)
+        await self._node.wait_present()
 
     def open(self) -> None:
         """Open the node and set the clock. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        self._denied = False
-        try:
-            self._fd = self._open_node(self.title, os.O_RDWR | os.O_CLOEXEC)
-            self._ioctl(self._fd, WR_MAX_SPEED_HZ, struct.pack("=I", self._settings.speed_hz))
-            self._set_bits(self._accepted_bits())
-        except OSError as error:
-            self.close()
-            self._denied = error.errno in (errno.EACCES, errno.EPERM)
-            raise open_problem(error, self.title, "is SPI switched on (`dtparam=spi=on` on a Raspberry Pi)?") from error
+        with self._node.opening():
+            self._open()
 
     def select(self, target: int) -> None:
         """Use an SPI mode, 0 to 3. Raises LinkError."""
@@ -118,15 +111,15 @@ class SpiLink:
         return message.read()
 
     def write(self, data: bytes) -> None:
-        """Nothing is sent but in transfers. Raises LinkError."""
+        """Raises LinkError: bytes are sent in transfers only."""
         raise LinkError(f"{self.title} cannot send {len(data)} bytes outside of a transfer")
 
     def kernel_counters(self) -> KernelCounters:
-        """The kernel counts none."""
+        """Zeros: the kernel counts no errors of this bus."""
         return KernelCounters()
 
     def serial_line(self) -> None:
-        """It has a clock: nothing comes unasked."""
+        """None: a bus with a clock carries nothing unasked."""
 
     def close(self) -> None:
         """Release the node; may be called twice."""
@@ -134,6 +127,17 @@ class SpiLink:
         self._prepared.clear()
         if fd >= 0:
             self._close_node(fd)
+
+    def _open(self) -> None:
+        try:
+            self._fd = self._open_node(self.title, os.O_RDWR | os.O_CLOEXEC)
+            self._ioctl(self._fd, WR_MAX_SPEED_HZ, struct.pack("=I", self._settings.speed_hz))
+            self._set_bits(self._accepted_bits())
+        except OSError as error:
+            self.close()
+            raise bus_open_problem(
+                error, self.title, "is SPI switched on (`dtparam=spi=on` on a Raspberry Pi)?"
+            ) from error
 
     def _accepted_bits(self) -> int:
         """16 if the controller has such words, otherwise 8."""

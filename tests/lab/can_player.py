@@ -19,7 +19,7 @@ from functools import partial
 
 from imud.devices.imu61x.can.codec import INDEX_MODULUS, SET_FRAMES
 from imud.formats.can import RAW_FRAME, pack_frame
-from imud.links.can.mmsg import MessageBuffers, Vector, libc
+from imud.links.can.frame_reader import MessageBuffers, Vector, libc
 from imud.sim import CAN_SIMULATORS
 from imud.sim.physics.motion import MOTIONS
 from imud.sim.ports.can_modules import CanModules

@@ -12,7 +12,7 @@ from imud.config import DeviceConfig
 from imud.contracts.status import DeviceState
 from imud.errors import LinkMissing
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
-from imud.links.can.cyclic import KernelSender, LoopSender
+from imud.links.can.cyclic_sender import KernelSender, LoopSender
 from imud.links.can.frame_reader import FrameReader
 from imud.links.can.link import SocketCanLink, SocketCanSettings
 from imud.runtime.can.buses import CanBuses

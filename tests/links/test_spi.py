@@ -56,7 +56,7 @@ def test_controller_that_refuses_16_bits_in_a_message_only() -> None:
     link = link_to(bus)
     link.open()
     link.select(0)
-    bus._word_bits = 8
+    bus.word_bits = 8
     assert link.transfer(Transfer((b"\x12\x34",))) == b"\xed\xcb"
     assert bus.messages[-1][1] == 8
 

@@ -19,7 +19,8 @@ class PtyPort:
         tty.setraw(slave)
         os.set_blocking(self.master, False)
         self.path = os.ttyname(slave)
-        self._slave = slave
+        self.slave = slave
+        """The near end, held open so that the port has a holder between a close and the next open."""
 
     def send(self, data: bytes) -> None:
         """Bytes for the link."""
@@ -34,7 +35,7 @@ class PtyPort:
 
     def unplug(self) -> None:
         """Hang up; may be called twice."""
-        for name in ("master", "_slave"):
+        for name in ("master", "slave"):
             fd = getattr(self, name)
             if fd >= 0:
                 os.close(fd)

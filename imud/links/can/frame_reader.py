@@ -20,7 +20,6 @@ from collections.abc import Callable
 from typing import Final
 
 from imud.formats.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, CanFrame
-from imud.links.can.mmsg import MessageBuffers, Vector, libc
 from imud.units import NS_PER_S, NS_PER_US
 
 BATCH_FRAMES: Final = 64
@@ -43,8 +42,37 @@ OnErrorFrame = Callable[[int, bytes], bool]
 """Called with class bits and data of an error frame; returns whether frames are missing since."""
 
 
+libc: Final = ctypes.CDLL(None, use_errno=True)
+
+
+class MessageHeader(ctypes.Structure):
+    """`struct msghdr` (recvmsg(2))."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_bytes", ctypes.c_uint32),
+        ("vector", ctypes.c_void_p),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_bytes", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class MessageBuffers(ctypes.Structure):
+    """`struct mmsghdr` (recvmmsg(2), sendmmsg(2))."""
+
+    _fields_ = (("header", MessageHeader), ("received_bytes", ctypes.c_uint))
+
+
+class Vector(ctypes.Structure):
+    """`struct iovec`."""
+
+    _fields_ = (("base", ctypes.c_void_p), ("bytes", ctypes.c_size_t))
+
+
 class FrameReader:
-    """The receiving side of a socket whose messages are `struct can_frame`. The socket stays its owner's."""
+    """The receiving side of a socket whose messages are `struct can_frame`. The caller keeps and closes the socket."""
 
     def __init__(
         self,
@@ -53,11 +81,11 @@ class FrameReader:
         now_ns: Callable[[], int] = time.monotonic_ns,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Switches stamps and the drop count on."""
+        """Enable time stamps and the drop count on the socket."""
         receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS_NEW, 1)
         receiver.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         self.dropped = 0
-        """Frames that the kernel dropped because nobody read them in time."""
+        """Frames that the kernel dropped because they were not read in time."""
         self._fd = receiver.fileno()
         self._on_error = on_error
         self._now_ns = now_ns
@@ -67,7 +95,7 @@ class FrameReader:
         self._vectors = (Vector * BATCH_FRAMES)()
         self._headers = bytearray(ctypes.sizeof(MessageBuffers) * BATCH_FRAMES)
         self._messages = (MessageBuffers * BATCH_FRAMES).from_buffer(self._headers)
-        self._lay_out()
+        self._assign_buffers()
         self._fresh_headers = bytes(self._headers)
         self._empty_ns = now_ns()
         self._newest_ns = self._empty_ns
@@ -80,14 +108,14 @@ class FrameReader:
         if count < 0:
             return self._failed(ctypes.get_errno(), begun_ns)
         offset_ns, now_ns = self._clocks()
-        frames = self._taken(count, offset_ns, now_ns)
+        frames = self._decoded(count, offset_ns, now_ns)
         if count < BATCH_FRAMES:
             self._empty_ns = begun_ns
         header_size = count * ctypes.sizeof(MessageBuffers)
         self._headers[:header_size] = self._fresh_headers[:header_size]
         return frames
 
-    def _taken(self, count: int, offset_ns: int, now_ns: int) -> list[CanFrame]:
+    def _decoded(self, count: int, offset_ns: int, now_ns: int) -> list[CanFrame]:
         frames: list[CanFrame] = []
         newest_ns = max(self._newest_ns, self._empty_ns)
         raw = memoryview(self._frames)[: count * RAW_FRAME.size]
@@ -124,8 +152,8 @@ class FrameReader:
             return []
         raise OSError(number, os.strerror(number))
 
-    def _lay_out(self) -> None:
-        """Each message gets one frame's bytes and its share of the control buffer."""
+    def _assign_buffers(self) -> None:
+        """Give each message one frame's bytes and its share of the control buffer."""
         frames = ctypes.addressof(ctypes.c_char.from_buffer(self._frames))
         control = ctypes.addressof(ctypes.c_char.from_buffer(self._control))
         vector = ctypes.addressof(self._vectors)

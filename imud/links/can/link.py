@@ -23,9 +23,9 @@ from imud.contracts.status import KernelCounters
 from imud.errors import LinkDenied, LinkError, LinkMissing
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, REMOTE_FLAG, CanFilter, CyclicFrame
 from imud.links.can import netlink
-from imud.links.can.cyclic import NO_MANAGER, KernelSender, LoopSender, Sender
+from imud.links.can.bus_state import WATCHED, BusState
+from imud.links.can.cyclic_sender import NO_MANAGER, KernelSender, LoopSender, Sender
 from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
-from imud.links.can.state import WATCHED, BusState
 
 NATIVE: Final = "socketcan"
 FRAME_BUFFER_BYTES: Final = 960
@@ -225,7 +225,7 @@ class SocketCanLink:
     def _on_error_frame(self, classes: int, data: bytes) -> bool:
         state = self._state
         overflows = state.overflows
-        if news := state.take(classes, data):
+        if news := state.add_error_frame(classes, data):
             self._on_news(news, state.problem)
         return state.overflows > overflows
 

@@ -17,7 +17,7 @@ from imud.contracts.link import OnBusNews, OnEnd, OnFrames
 from imud.contracts.status import KernelCounters
 from imud.errors import LinkError
 from imud.formats.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilter, CanFrame, CyclicFrame
-from imud.links.can.cyclic import LoopSender
+from imud.links.can.cyclic_sender import LoopSender
 
 LOOK_S: Final = 0.05
 """How long the thread waits for a frame before it looks whether it is to end."""

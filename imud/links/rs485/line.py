@@ -29,9 +29,7 @@ from imud.formats.modbus import (
     framed,
 )
 from imud.links.rs485.direction import Direction
-from imud.links.uart.low_latency import hold_ns, request_low_latency
-from imud.links.uart.port_setup import explain, open_port
-from imud.links.uart.tty_counters import TtyCounters
+from imud.links.uart.serial_port import TtyCounters, hold_ns, open_port, port_problem, request_low_latency
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 READ_BYTES: Final = 4096
@@ -184,7 +182,7 @@ class Line:
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            raise explain(error, self.path, self._proc) from error
+            raise port_problem(error, self.path, self._proc) from error
         if sent != len(frame):
             raise TransferError(Trouble.STUCK, f"{self.path} does not send: is the port stuck?")
         self._quiet_ns = time.monotonic_ns() + len(frame) * self._byte_ns

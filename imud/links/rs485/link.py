@@ -13,8 +13,8 @@ from imud.contracts.link import LinkType
 from imud.contracts.polling import Transfer
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters, SerialLineCounters
-from imud.errors import LinkDenied, LinkError, LinkMissing
-from imud.links.bus_node import node_present
+from imud.errors import LinkError, LinkMissing
+from imud.links.device_node import PROC, DeviceNode
 from imud.links.rs485.line import SHARED_PORTS, DirectionWish, Echo, Line, LineCounters, Lines
 from imud.units import NS_PER_MS
 
@@ -48,12 +48,12 @@ class Rs485Link:
         *,
         lines: Lines = SHARED_PORTS,
         sys: Path = Path("/sys"),
-        proc: Path = Path("/proc"),
+        proc: Path = PROC,
     ) -> None:
         self._settings = settings
         self._lines, self._sys, self._proc = lines, sys, proc
         self._line: Line | None = None
-        self._denied = False
+        self._node = DeviceNode(settings.line)
         self._address = 0
         self._reply_ns = settings.reply_ms * NS_PER_MS
         self.title = settings.line
@@ -70,18 +70,15 @@ class Rs485Link:
 
     async def wait_present(self) -> None:
         """Return when the port is there."""
-        await node_present(self.title, denied=self._denied)
+        await self._node.wait_present()
 
     def open(self) -> None:
         """Open the port exclusively, or share it. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        settings, self._denied = self._settings, False
+        settings = self._settings
         direction: DirectionWish = settings.direction
         echo: Echo = settings.echo
-        try:
+        with self._node.opening():
             self._line = self._lines.share(self.title, settings.baud, direction, echo, self._sys, self._proc)
-        except LinkDenied:
-            self._denied = True
-            raise
 
     def select(self, target: int) -> None:
         """Speak to an address; 0 is all of them, and nobody answers."""

@@ -17,11 +17,16 @@ from msgspec import Meta
 from imud.contracts.link import LinkType, OnData, OnEnd
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkDenied, LinkError, LinkMissing
-from imud.links.inotify import wait_until
-from imud.links.uart.low_latency import hold_ns, request_low_latency
-from imud.links.uart.port_setup import change_baud, explain, open_port
-from imud.links.uart.tty_counters import TtyCounters
+from imud.errors import LinkError, LinkMissing
+from imud.links.device_node import PROC, DeviceNode
+from imud.links.uart.serial_port import (
+    TtyCounters,
+    change_baud,
+    hold_ns,
+    open_port,
+    port_problem,
+    request_low_latency,
+)
 from imud.units import NS_PER_MS
 
 READ_BYTES: Final = 65536
@@ -31,8 +36,6 @@ WRITE_QUEUE_BYTES: Final = 4096
 """Commands are some dozens of bytes; more waiting means that the port does not send."""
 DEFAULT_BAUD: Final = 115200
 """Rate of a port that is opened for detection, until detection sets its own."""
-ACCESS_WAIT_S: Final = 1.0
-"""How long `wait_present` waits for access after a refusal: udev sets a node's group within some ms of its making."""
 
 
 class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -51,16 +54,16 @@ class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class UartLink:
     """A serial port as a `StreamLink`. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: UartSettings, *, sys: Path = Path("/sys"), proc: Path = Path("/proc")) -> None:
+    def __init__(self, settings: UartSettings, *, sys: Path = Path("/sys"), proc: Path = PROC) -> None:
         self._settings = settings
         self._sys = sys
         self._proc = proc
         self._port: serial.Serial | None = None
         self._fd = -1
         self._counters: TtyCounters | None = None
-        self._denied = False
-        self._on_data: OnData = _nobody
-        self._on_end: OnEnd = _nobody_ends
+        self._node = DeviceNode(settings.port)
+        self._on_data: OnData = _ignore_data
+        self._on_end: OnEnd = _ignore_end
         self._loop: asyncio.AbstractEventLoop | None = None
         self._timer: asyncio.Handle | None = None
         self._unsent = bytearray()
@@ -72,26 +75,14 @@ class UartLink:
         self.hold_ns = 0
 
     async def wait_present(self) -> None:
-        """Return when the port is there. After a refused `open`: when access is given, or after ACCESS_WAIT_S."""
-        path = Path(self._settings.port)
-        await wait_until(path, path.exists)
-        if not self._denied:
-            return
-        try:
-            async with asyncio.timeout(ACCESS_WAIT_S):
-                await wait_until(path, lambda: os.access(path, os.R_OK | os.W_OK, effective_ids=True))
-        except TimeoutError:
-            return
+        """Return when the port is there; after a refused `open`, when access is granted or after ACCESS_WAIT_S."""
+        await self._node.wait_present()
 
     def open(self) -> None:
         """Open the port exclusively, raw 8N1. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
         path = self._settings.port
-        self._denied = False
-        try:
+        with self._node.opening():
             self._port = open_port(path, self.baud, self._proc)
-        except LinkDenied:
-            self._denied = True
-            raise
         self._fd = self._port.fileno()
         self._counters = TtyCounters(self._fd)
         if self._settings.low_latency:
@@ -105,7 +96,7 @@ class UartLink:
         self._loop.add_reader(self._fd, self._read_coalescing if self._coalesce_s else self._read)
 
     def write(self, data: bytes) -> None:
-        """Send bytes; what the port does not take at once is queued, up to WRITE_QUEUE_BYTES. Raises LinkError."""
+        """Send bytes; what the port does not accept at once is queued, up to WRITE_QUEUE_BYTES. Raises LinkError."""
         if self._fd < 0:
             raise LinkError(f"{self.title} is not open: nothing can be sent")
         if len(self._unsent) + len(data) > WRITE_QUEUE_BYTES:
@@ -120,7 +111,7 @@ class UartLink:
             self._loop.add_writer(self._fd, self._write_more)
 
     def set_baud(self, baud: int) -> None:
-        """Change the rate; bytes received at the old one are thrown away. Raises LinkError if the port cannot do it."""
+        """Change the rate; bytes received at the old one are discarded. Raises LinkError if the port cannot do it."""
         if self._port is None:
             raise LinkError(f"{self.title} is not open: its rate cannot be set")
         change_baud(self._port, self._settings.port, baud, self._proc)
@@ -180,12 +171,12 @@ class UartLink:
         except BlockingIOError:
             return 0
         except OSError as error:
-            raise explain(error, self.title, self._proc) from error
+            raise port_problem(error, self.title, self._proc) from error
 
     def _write_more(self) -> None:
         try:
             sent = self._send(self._unsent)
-        except LinkError:  # the reader sees the same end, and tells
+        except LinkError:  # the reader sees the same end, and reports it
             sent = len(self._unsent)
         del self._unsent[:sent]
         if not self._unsent and self._loop is not None:
@@ -201,12 +192,12 @@ class UartLink:
         self._loop = None
 
 
-def _nobody(data: bytes, t_rx_ns: int) -> None:
-    """Before `start` nobody listens."""
+def _ignore_data(data: bytes, t_rx_ns: int) -> None:
+    """The receiver before `start`."""
 
 
-def _nobody_ends(error: LinkError | None) -> None:
-    """Before `start` nobody listens."""
+def _ignore_end(error: LinkError | None) -> None:
+    """The receiver before `start`."""
 
 
 LINK = LinkType("uart", UartSettings, UartLink)

@@ -5,13 +5,16 @@ one system call, so that a stall of the simulator's process falls between bursts
 queue does not take is lost and counted, as on a bus that is too full.
 """
 
+import ctypes
+import errno
 import os
 import socket
+from collections.abc import Sequence
 from typing import Final
 
 from imud.errors import LinkError
 from imud.formats.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, pack_frame
-from imud.links.can.mmsg import send_all
+from imud.links.can.frame_reader import MessageBuffers, Vector, libc
 from imud.links.can.netlink import can_interfaces
 from imud.sim.can_module import CanModule
 
@@ -106,3 +109,29 @@ def default_interface() -> str:
             "ip link set vcan0 up"
         )
     return found[0]
+
+
+def send_all(fd: int, datagrams: Sequence[bytes]) -> list[OSError]:
+    """Send datagrams in order by sendmmsg(2), one system call if all are accepted; return an error for each refused.
+
+    No other sender comes between two of them unless one is refused, and a stall of this process cannot part them.
+    """
+    count = len(datagrams)
+    if not count:
+        return []
+    content = ctypes.create_string_buffer(b"".join(datagrams))
+    vectors, messages, base = (Vector * count)(), (MessageBuffers * count)(), ctypes.addressof(content)
+    for vector, message, data in zip(vectors, messages, datagrams, strict=True):
+        vector.base, vector.bytes = base, len(data)
+        base += len(data)
+        message.header.vector, message.header.vector_count = ctypes.addressof(vector), 1
+    refused, at, size = list[OSError](), 0, ctypes.sizeof(MessageBuffers)
+    while at < count:
+        sent = libc.sendmmsg(fd, ctypes.byref(messages, at * size), count - at, 0)
+        number = ctypes.get_errno()
+        if sent < 0 and number == errno.EINTR:
+            continue
+        if sent <= 0:
+            refused.append(OSError(number, os.strerror(number)))
+        at += max(sent, 1)
+    return refused

@@ -86,7 +86,7 @@ class InProcessSpi:
         self.messages: list[tuple[tuple[bytes, ...], int, int]] = []
         """MOSI of each selection, word size and speed of every message."""
         self.keep_messages = True
-        self._word_bits = word_bits
+        self.word_bits = word_bits
 
     def open(self, _path: str, _flags: int) -> int:
         """As `os.open`."""
@@ -103,7 +103,7 @@ class InProcessSpi:
         """As `fcntl.ioctl` on spidev."""
         if request == spi.WR_MODE:
             self.mode = argument[0]
-        elif request == spi.WR_BITS_PER_WORD and argument[0] > self._word_bits:
+        elif request == spi.WR_BITS_PER_WORD and argument[0] > self.word_bits:
             raise OSError(errno.EINVAL, "words of that size are not supported")
         elif request not in (spi.WR_BITS_PER_WORD, spi.WR_MAX_SPEED_HZ):
             self._message(argument)
@@ -111,7 +111,7 @@ class InProcessSpi:
 
     def _message(self, argument: bytes) -> None:
         rows = list(spi.ROW.iter_unpack(argument))
-        if any(row[5] > self._word_bits for row in rows):
+        if any(row[5] > self.word_bits for row in rows):
             raise OSError(errno.EINVAL, "words of that size are not supported")
         mosi = [_swapped(ctypes.string_at(tx, size), bits) for tx, _, size, _, _, bits, *_ in rows]
         selections: list[bytes] = [b""]

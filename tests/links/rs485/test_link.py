@@ -24,7 +24,7 @@ from imud.formats.modbus import framed, is_exception, is_whole
 from imud.links.rs485.direction import ENABLED, RTS_ON_SEND, TIOCGRS485, TIOCSRS485, Direction
 from imud.links.rs485.line import Lines
 from imud.links.rs485.link import Rs485Link, Rs485Settings
-from imud.links.uart.port_setup import open_port
+from imud.links.uart.serial_port import open_port
 from tests.support.modbus_wire import BAUD, serial_of, slave, wired
 from tests.support.pty_port import PtyPort
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import select
 import termios
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -15,7 +16,7 @@ from imud.contracts.status import KernelCounters
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.links import LINKS
 from imud.links.uart.link import FULL_READ_BYTES, WRITE_QUEUE_BYTES, UartLink, UartSettings
-from imud.links.uart.port_setup import baud_of
+from imud.links.uart.serial_port import baud_of
 from imud.units import NS_PER_MS
 from tests.support.pty_port import PtyPort, unprivileged, waiting_bytes
 
@@ -30,12 +31,12 @@ def pty() -> Iterator[PtyPort]:
 
 
 class Receiver:
-    """Keeps what a link tells."""
+    """Keeps what a link delivers."""
 
     def __init__(self) -> None:
         self.chunks: list[tuple[bytes, int]] = []
         self.ends: list[LinkError | None] = []
-        self.told = asyncio.Event()
+        self.called = asyncio.Event()
 
     @property
     def data(self) -> bytes:
@@ -43,17 +44,17 @@ class Receiver:
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         self.chunks.append((data, t_rx_ns))
-        self.told.set()
+        self.called.set()
 
     def on_end(self, error: LinkError | None) -> None:
         self.ends.append(error)
-        self.told.set()
+        self.called.set()
 
     async def until(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(LIMIT_S):
             while not condition():
-                self.told.clear()
-                await self.told.wait()
+                self.called.clear()
+                await self.called.wait()
 
 
 def play(link: UartLink, scene: Callable[[Receiver], Awaitable[None]]) -> Receiver:
@@ -136,11 +137,13 @@ def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort
 def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
     async def scene(receiver: Receiver) -> None:
         sent = 0
-        while not link._unsent:
+        while select.select([], [pty.slave], [], 0)[1]:
             link.write(bytes(1000))
             sent += 1000
+        link.write(bytes(1000))  # the port has no room: this is queued
+        sent += 1000
         received = b""
-        while len(received) < 2000:  # room again
+        while not select.select([], [pty.slave], [], 0)[1]:  # until there is room again
             received += pty.received()
         link.write(b"last")
         everything = asyncio.Event()
@@ -176,10 +179,21 @@ def test_unplugging_ends_the_link_once(pty: PtyPort) -> None:
 
 def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
     async def scene(receiver: Receiver) -> None:
-        link._read()
+        stolen: list[bytes] = []
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _loop, context: failures.append(context))
+        pty.send(b"x")
+        deadline_s = time.monotonic() + LIMIT_S
+        while waiting_bytes(pty.slave) < 1:  # without a look at the descriptor by the loop
+            assert time.monotonic() < deadline_s
+        loop.call_soon(lambda: stolen.append(os.read(pty.slave, 1)))
+        for _ in range(5):  # the descriptor was readable, but not any more when the link reads it
+            await asyncio.sleep(0)
+        assert stolen == [b"x"]
 
-    link = UartLink(UartSettings(port=pty.path))
-    assert play(link, scene).ends == []
+    failures: list[dict[str, object]] = []
+    receiver = play(UartLink(UartSettings(port=pty.path)), scene)
+    assert (receiver.data, receiver.ends, failures) == (b"", [], [])
 
 
 def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
@@ -205,20 +219,20 @@ def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
         link.start(on_data, receiver.on_end)
         pty.send(b"x")
         await asyncio.wait_for(got.wait(), LIMIT_S)
-        assert link._timer is None
+        await asyncio.sleep(0.01)  # a timer that was left would read, and end the link
 
     assert play(link, scene).ends == []
 
 
 def test_the_port_is_raw_8n1_at_the_rate(pty: PtyPort) -> None:
-    tty_settings = termios.tcgetattr(pty._slave)
+    tty_settings = termios.tcgetattr(pty.slave)
     tty_settings[0] |= termios.BRKINT | termios.IXON | termios.ICRNL | termios.ISTRIP
     tty_settings[2] |= termios.HUPCL
     tty_settings[3] |= termios.ICANON | termios.ECHO | termios.ISIG
-    termios.tcsetattr(pty._slave, termios.TCSANOW, tty_settings)
+    termios.tcsetattr(pty.slave, termios.TCSANOW, tty_settings)
     link = UartLink(UartSettings(port=pty.path, baud=921600))
     link.open()
-    iflag, oflag, cflag, lflag, _, _, characters = termios.tcgetattr(pty._slave)
+    iflag, oflag, cflag, lflag, _, _, characters = termios.tcgetattr(pty.slave)
     link.close()
     assert not iflag & (termios.BRKINT | termios.IGNBRK | termios.IXON | termios.ICRNL | termios.ISTRIP | termios.INPCK)
     assert not oflag & termios.OPOST
@@ -232,11 +246,11 @@ def test_the_port_is_raw_8n1_at_the_rate(pty: PtyPort) -> None:
 def test_every_rate_is_set_when_opening_and_later(pty: PtyPort, baud: int) -> None:
     link = UartLink(UartSettings(port=pty.path, baud=baud))
     link.open()
-    assert baud_of(pty._slave) == baud
+    assert baud_of(pty.slave) == baud
     link.set_baud(57600)
-    assert baud_of(pty._slave) == link.baud == 57600
+    assert baud_of(pty.slave) == link.baud == 57600
     link.set_baud(baud)
-    assert baud_of(pty._slave) == link.baud == baud
+    assert baud_of(pty.slave) == link.baud == baud
     link.close()
 
 
@@ -245,17 +259,17 @@ def test_a_change_of_rate_throws_old_bytes_away(pty: PtyPort) -> None:
     link.open()
     pty.send(b"old bytes")
     deadline_s = time.monotonic() + LIMIT_S
-    while waiting_bytes(pty._slave) < 9:  # the pty hands over in the kernel's own time
+    while waiting_bytes(pty.slave) < 9:  # the pty hands over in the kernel's own time
         assert time.monotonic() < deadline_s
     link.set_baud(9600)
-    assert waiting_bytes(pty._slave) == 0
+    assert waiting_bytes(pty.slave) == 0
     link.close()
 
 
 def test_a_rate_that_the_driver_changes_is_refused(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
     link = UartLink(UartSettings(port=pty.path, baud=115200))
     link.open()
-    monkeypatch.setattr("imud.links.uart.port_setup.baud_of", lambda fd: 115200)
+    monkeypatch.setattr("imud.links.uart.serial_port.baud_of", lambda fd: 115200)
     with pytest.raises(LinkError, match="cannot do 256000 baud: asked for it, its driver set 115200"):
         link.set_baud(256000)
     assert link.baud == 115200
@@ -367,7 +381,7 @@ def test_after_a_refusal_access_is_waited_for(pty: PtyPort) -> None:
 
 
 def test_after_a_refusal_the_wait_ends_anyway(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.links.uart.link.ACCESS_WAIT_S", 0.01)
+    monkeypatch.setattr("imud.links.device_node.ACCESS_WAIT_S", 0.01)
     os.chmod(pty.path, 0)
     link = UartLink(UartSettings(port=pty.path))
     with unprivileged():
@@ -401,8 +415,7 @@ def test_coalescing_goes_back_to_waiting_and_sees_the_end(pty: PtyPort) -> None:
         for round_ in range(3):
             pty.send(b"x")
             await receiver.until(lambda wanted=round_ + 1: len(receiver.data) == wanted)  # type: ignore[misc]  # bound now
-            while link._timer is not None:  # until it waits for the descriptor again
-                await asyncio.sleep(0.001)
+            await asyncio.sleep(0.02)  # the read after 2 ms found nothing: it waits for the descriptor again
         pty.unplug()
         await receiver.until(lambda: bool(receiver.ends))
 
@@ -425,7 +438,7 @@ def test_coalescing_keeps_up_with_more_than_one_read_gives(pty: PtyPort) -> None
     assert receiver.chunks[2][1] - receiver.chunks[0][1] < 90 * NS_PER_MS
 
 
-def test_the_latency_timer_is_lowered_and_what_remains_is_told(pty: PtyPort, tmp_path: Path) -> None:
+def test_the_latency_timer_is_lowered_and_what_remains_is_reported(pty: PtyPort, tmp_path: Path) -> None:
     timer = tmp_path / "class" / "tty" / os.path.basename(pty.path) / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)
     for low_latency, left_ms in ((False, 16), (True, 1)):

@@ -1,11 +1,13 @@
-"""Who holds a port, from a made-up /proc."""
+"""What is reported of a node that cannot be opened, with holders from a made-up /proc."""
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
-from imud.links.port_owner import SERIAL_GROUP, group_of, holders_of
+from imud.errors import LinkBusy, LinkDenied, LinkMissing
+from imud.links.device_node import SERIAL_GROUP, holders_of, open_problem
 from imud.permissions import user_name
 
 
@@ -37,9 +39,23 @@ def test_a_process_without_a_name(tmp_path: Path) -> None:
 
 
 def test_the_group_of_serial_ports_where_only_root_may(tmp_path: Path) -> None:
-    assert group_of(str(tmp_path / "missing")) == SERIAL_GROUP
-    if os.stat("/dev/null").st_gid == 0:
-        assert group_of("/dev/null") == SERIAL_GROUP
+    root_only = ["/dev/null"] if os.stat("/dev/null").st_gid == 0 else []
+    for path in (str(tmp_path / "missing"), *root_only):
+        denied = open_problem(PermissionError(errno.EACCES, ""), path, "")
+        assert isinstance(denied, LinkDenied)
+        assert f"belongs to group {SERIAL_GROUP};" in str(denied)
+
+
+def test_a_node_that_is_absent_or_held(tmp_path: Path) -> None:
+    process(tmp_path, 10, "minicom", "/dev/i2c-1")
+    absent = open_problem(OSError(errno.ENODEV, ""), "/dev/i2c-1", "is I2C on?")
+    held = open_problem(OSError(errno.EBUSY, ""), "/dev/i2c-1", "", tmp_path)
+    by_driver = open_problem(OSError(errno.EBUSY, ""), "/dev/i2c-2", "", tmp_path)
+    assert (type(absent), str(absent)) == (LinkMissing, "/dev/i2c-1 is not there: is I2C on?")
+    assert (type(held), type(by_driver)) == (LinkBusy, LinkBusy)
+    assert "in use by minicom (pid 10): stop" in str(held)
+    assert "in use by another program or by a driver of the kernel: stop" in str(by_driver)
+    assert open_problem(OSError(errno.EMFILE, ""), "/dev/i2c-1", "") is None
 
 
 @pytest.mark.parametrize(("uid", "name"), [(0, "root"), (4_242_424, "4242424")])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.links.can.state import BusState, ControllerState
+from imud.links.can.bus_state import BusState, ControllerState
 
 
 def frame(status: int) -> bytes:
@@ -12,27 +12,27 @@ def frame(status: int) -> bytes:
 def test_life_of_a_controller() -> None:
     bus = BusState("can0", 0)
     assert bus.problem == ""
-    assert bus.take(0x4, frame(0x08)) == "can0 is near its error limit (warning)"
+    assert bus.add_error_frame(0x4, frame(0x08)) == "can0 is near its error limit (warning)"
     assert bus.problem == ""
-    assert bus.take(0x4, frame(0x20)).startswith("can0 is error-passive: ")
-    assert bus.take(0x4, frame(0x10)) == ""  # still
+    assert bus.add_error_frame(0x4, frame(0x20)).startswith("can0 is error-passive: ")
+    assert bus.add_error_frame(0x4, frame(0x10)) == ""  # still
     assert "terminated" in bus.problem
-    assert bus.take(0x40, frame(0)).startswith("can0 is bus-off: ")
+    assert bus.add_error_frame(0x40, frame(0)).startswith("can0 is bus-off: ")
     assert "restart-ms" in bus.problem
-    assert bus.take(0x100, frame(0)) == "can0 is error-active again"
+    assert bus.add_error_frame(0x100, frame(0)) == "can0 is error-active again"
     assert bus.problem == ""
     assert (bus.passive_count, bus.bus_off_count) == (1, 1)
 
 
 def test_overflow_is_counted_and_changes_no_state() -> None:
     bus = BusState("can0", 0)
-    assert bus.take(0x4, frame(0x01)) == ""
+    assert bus.add_error_frame(0x4, frame(0x01)) == ""
     assert (bus.overflows, bus.state) == (1, ControllerState.ACTIVE)
 
 
 def test_other_classes_say_nothing() -> None:
     bus = BusState("can0", 2)
-    assert bus.take(0x80, frame(0x20 | 0x01)) == ""
+    assert bus.add_error_frame(0x80, frame(0x20 | 0x01)) == ""
     assert (bus.overflows, bus.state) == (0, ControllerState.PASSIVE)
 
 

@@ -20,7 +20,7 @@ class ControllerState(IntEnum):
     """As `enum can_state` of linux/can/netlink.h numbers them."""
 
     ACTIVE = 0
-    """Takes part in everything."""
+    """Takes part in all traffic."""
     WARNING = 1
     """An error counter is above 96."""
     PASSIVE = 2
@@ -42,7 +42,7 @@ _HELP: Final = {
 
 
 class BusState:
-    """What is known of the controller of one interface, and how often it was bad."""
+    """The state of one interface's controller, with counts of its error-passive and bus-off states."""
 
     def __init__(self, name: str, state: int | None = None) -> None:
         """`state` as the kernel numbers it; None where it says none (virtual interfaces)."""
@@ -56,12 +56,12 @@ class BusState:
 
     @property
     def problem(self) -> str:
-        """What is wrong, one sentence; empty when nothing is that matters."""
+        """What is wrong, one sentence; empty in the states error-active and warning."""
         advice = _HELP.get(self.state)
         return f"{self._name} is {_WORDS[self.state]}: {advice.format(name=self._name)}" if advice else ""
 
-    def take(self, classes: int, data: bytes) -> str:
-        """Take an error frame; return the news in it, one sentence, or nothing."""
+    def add_error_frame(self, classes: int, data: bytes) -> str:
+        """Record an error frame; return the change of state in it, one sentence, or an empty text."""
         status = data[1] if classes & CLASS_CONTROLLER else 0
         if status & RECEIVE_OVERFLOW:
             self.overflows += 1

@@ -7,7 +7,7 @@ import pytest
 
 from imud.errors import LinkError
 from imud.formats.can import RAW_FRAME, CyclicFrame, pack_frame
-from imud.links.can.cyclic import LoopSender, setup
+from imud.links.can.cyclic_sender import LoopSender, setup
 
 MS = 1_000_000
 SYNC = CyclicFrame(0x80, False, b"\7", 10 * MS)

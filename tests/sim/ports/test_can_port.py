@@ -1,4 +1,4 @@
-"""Several datagrams in one system call."""
+"""Several datagrams in one system call, as the frames of a simulated module leave."""
 
 import errno
 import socket
@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from imud.links.can import mmsg
+from imud.links.can.frame_reader import libc
+from imud.sim.ports import can_port
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def test_datagrams_come_whole_and_in_order(
 ) -> None:
     near, far = pair
     calls: list[int] = []
-    real = mmsg.libc.sendmmsg
+    real = libc.sendmmsg
 
     class Counting:
         @staticmethod
@@ -31,19 +32,19 @@ def test_datagrams_come_whole_and_in_order(
             calls.append(1)
             return int(real(*arguments))
 
-    monkeypatch.setattr(mmsg, "libc", Counting)
-    assert mmsg.send_all(near.fileno(), [b"one", b"", b"\0three\0"]) == []
+    monkeypatch.setattr(can_port, "libc", Counting)
+    assert can_port.send_all(near.fileno(), [b"one", b"", b"\0three\0"]) == []
     assert [far.recv(64) for _ in range(3)] == [b"one", b"", b"\0three\0"]
     assert len(calls) == 1
-    assert mmsg.send_all(near.fileno(), []) == []
+    assert can_port.send_all(near.fileno(), []) == []
     assert len(calls) == 1
 
 
-def test_those_that_are_refused_are_told_one_by_one(pair: tuple[socket.socket, socket.socket]) -> None:
+def test_those_that_are_refused_are_reported_one_by_one(pair: tuple[socket.socket, socket.socket]) -> None:
     near, far = pair
     far.setblocking(True)
     datagrams = [bytes([number]) * 8 for number in range(250)] * 8
-    refused = mmsg.send_all(near.fileno(), datagrams)
+    refused = can_port.send_all(near.fileno(), datagrams)
     assert refused
     assert {error.errno for error in refused} == {errno.EAGAIN}
     got = [far.recv(64) for _ in range(len(datagrams) - len(refused))]
@@ -55,4 +56,4 @@ def test_a_closed_socket_refuses_all() -> None:
     fd = near.fileno()
     near.close()
     far.close()
-    assert [error.errno for error in mmsg.send_all(fd, [b"a", b"b"])] == [errno.EBADF, errno.EBADF]
+    assert [error.errno for error in can_port.send_all(fd, [b"a", b"b"])] == [errno.EBADF, errno.EBADF]

@@ -1,0 +1,144 @@
+"""Device nodes in /dev: waiting for one, and what a failed open or transfer means as errors of imud.
+
+A node is missing until its driver makes it, and refused until udev sets its group. What people are told of it (its
+group, the processes that have it open) is read from the file system and /proc.
+"""
+
+import asyncio
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
+from imud.links.inotify import wait_until
+from imud.permissions import group_of, user_name
+
+MISSING: Final = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN})
+"""Errors of `open` without a device behind the path."""
+REFUSED: Final = frozenset({errno.EACCES, errno.EPERM})
+HELD: Final = frozenset({errno.EBUSY, errno.EAGAIN})
+"""Errors of `open` and of the locks after it where another process or a kernel driver has the device."""
+GONE: Final = frozenset({errno.ENOENT, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN, errno.EBADF})
+"""Errors of a transfer after the adapter was removed."""
+NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
+"""Documentation/i2c/fault-codes.rst has ENXIO; the Raspberry Pi's controller says EREMOTEIO."""
+STUCK: Final = frozenset({errno.ETIMEDOUT})
+
+ACCESS_WAIT_S: Final = 1.0
+"""How long to wait for access after a refusal: udev sets a node's group within some ms of its making."""
+SERIAL_GROUP: Final = "dialout"
+"""Group of serial ports and buses on Debian and its relatives; named where only root may open the node."""
+PROC: Final = Path("/proc")
+
+
+class DeviceNode:
+    """The node of one link: waits until it can be opened. Synchronization: the loop's thread only."""
+
+    def __init__(self, path: str) -> None:
+        self._path = Path(path)
+        self._denied = False
+
+    async def wait_present(self) -> None:
+        """Return when the node exists; after a refused open, when access is granted or after ACCESS_WAIT_S.
+
+        Raises LinkError when inotify cannot be had, LinkDenied when the directory may not be read.
+        """
+        await wait_until(self._path, self._path.exists)
+        if not self._denied:
+            return
+        try:
+            async with asyncio.timeout(ACCESS_WAIT_S):
+                await wait_until(self._path, self._accessible)
+        except TimeoutError:
+            return
+
+    @contextmanager
+    def opening(self) -> Iterator[None]:
+        """The block that opens the node: a LinkDenied raised in it makes the next wait one for access."""
+        self._denied = False
+        try:
+            yield
+        except LinkDenied:
+            self._denied = True
+            raise
+
+    def _accessible(self) -> bool:
+        return os.access(self._path, os.R_OK | os.W_OK, effective_ids=True)
+
+
+def open_problem(error: Exception, path: str, missing: str, proc: Path = PROC) -> LinkError | None:
+    """The LinkError for an `open` whose node is absent, refused or held; None for any other error.
+
+    `missing` is the question to a user whose node is absent. Holders are looked up in `proc`.
+    """
+    number = errno_of(error)
+    if number in MISSING:
+        return LinkMissing(f"{path} is not there: {missing}")
+    if number in REFUSED:
+        group = group_of(path, SERIAL_GROUP)
+        return LinkDenied(
+            f"{path} may not be opened by user {user_name()}: it belongs to group {group}; "
+            f"`sudo usermod -aG {group} {user_name()}` and a new login give access"
+        )
+    if number in HELD:
+        holders = holders_of(path, proc) or "another program or by a driver of the kernel"
+        return LinkBusy(f"{path} is in use by {holders}: stop that first")
+    return None
+
+
+def bus_open_problem(error: OSError, path: str, missing: str) -> LinkError:
+    """The LinkError for an I2C or SPI bus that cannot be opened; `missing` as for `open_problem`."""
+    return open_problem(error, path, missing) or LinkError(f"{path} cannot be used: {error}")
+
+
+def errno_of(error: Exception) -> int | None:
+    """The error number of an OSError, or of a termios.error, which has it among its arguments."""
+    if isinstance(error, OSError):
+        return error.errno
+    return next((argument for argument in error.args if isinstance(argument, int)), None)
+
+
+def transfer_problem(error: OSError, path: str, place: str) -> LinkError | TransferError:
+    """The error for a failed transfer: LinkMissing when the bus is gone, TransferError for this transfer only."""
+    if error.errno in GONE:
+        return LinkMissing(f"{path} is gone ({os.strerror(error.errno or 0)}): was an adapter pulled out?")
+    if error.errno in NOT_ACKNOWLEDGED:
+        return TransferError(Trouble.ABSENT, f"no acknowledgement at {place} on {path}: is it powered, is it wired?")
+    if error.errno in STUCK:
+        return TransferError(Trouble.STUCK, f"{path} timed out at {place}: is a line of the bus held low?")
+    return TransferError(Trouble.DISTURBED, f"transfer failed at {place} on {path}: {os.strerror(error.errno or 0)}")
+
+
+def holders_of(path: str, proc: Path = PROC) -> str:
+    """`minicom (pid 123)` for each process that has the node open, as far as /proc lets this user see; else empty."""
+    target = os.path.realpath(path)
+    holders = []
+    for process in sorted(proc.glob("[0-9]*")):
+        if _has_open(process, target):
+            holders.append(f"{_name(process)} (pid {process.name})")
+    return ", ".join(holders)
+
+
+def _has_open(process: Path, target: str) -> bool:
+    try:
+        descriptors = os.listdir(process / "fd")
+    except OSError:  # another user's process, or one that just ended
+        return False
+    return any(_target(process / "fd" / descriptor) == target for descriptor in descriptors)
+
+
+def _target(descriptor: Path) -> str:
+    try:
+        return os.readlink(descriptor)
+    except OSError:  # closed in between
+        return ""
+
+
+def _name(process: Path) -> str:
+    try:
+        return (process / "comm").read_text().strip()
+    except OSError:
+        return "a process"
