@@ -4,11 +4,14 @@ import array
 import fcntl
 import os
 import termios
+import time
 import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 NOBODY_UID = 65534
+SETTLED_S = 0.05
+"""The kernel moves bytes from one of a port's buffers to the next within some ms."""
 
 
 class PtyPort:
@@ -32,6 +35,16 @@ class PtyPort:
             return os.read(self.master, 65536)
         except BlockingIOError:
             return b""
+
+    def fill(self) -> int:
+        """Write to the near end until the port has no room left; return how many zeros it took."""
+        os.set_blocking(self.slave, False)
+        size, full_since_s = 0, time.monotonic()
+        while time.monotonic() < full_since_s + SETTLED_S:
+            with suppress(BlockingIOError):
+                size += os.write(self.slave, bytes(1000))
+                full_since_s = time.monotonic()
+        return size
 
     def unplug(self) -> None:
         """Hang up; may be called twice."""

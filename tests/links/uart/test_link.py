@@ -136,11 +136,8 @@ def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort
 
 def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
     async def scene(receiver: Receiver) -> None:
-        sent = 0
-        while select.select([], [pty.slave], [], 0)[1]:
-            link.write(bytes(1000))
-            sent += 1000
-        link.write(bytes(1000))  # the port has no room: this is queued
+        sent = pty.fill()
+        link.write(bytes(1000))  # all of it is queued
         sent += 1000
         received = b""
         while not select.select([], [pty.slave], [], 0)[1]:  # until there is room again
