@@ -1,20 +1,28 @@
-"""One RS-485 line: a serial port that is opened once for all devices on it, and what is asked and answered there.
+"""One RS-485 line: a serial port opened once for all devices on it, its direction control, requests and replies.
 
     silence ▸ request ▸ (echo) ▸ silence, thinking ▸ reply ▸ silence …
 
 One request is under way at a time. The silence between frames is kept, counted from when the last byte was read. A
 module that did not answer in time owes a reply: before it is asked anything else it is asked for one register, whose
-reply has another length than the one owed, so that an answer to the old question can never be taken for one to the new.
+reply has another length than the one owed, so that an answer to the old question is never mistaken for one to the new.
+
+The transmitter is switched by the kernel's driver with RTS (TIOCSRS485, Documentation/driver-api/serial/
+serial-rs485.rst), or by the adapter: drivers without that ioctl, USB adapters and ptys among them, say ENOTTY.
+pyserial's own `rs485_mode` is not used: where the driver refuses it, every later setting of that object fails.
 """
 
 import contextlib
+import errno
+import fcntl
 import os
 import select
+import struct
 import termios
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import serial
 
@@ -28,7 +36,7 @@ from imud.formats.modbus import (
     frame_gap_ns,
     framed,
 )
-from imud.links.rs485.direction import Direction
+from imud.links.device_node import PROC
 from imud.links.uart.serial_port import TtyCounters, hold_ns, open_port, port_problem, request_low_latency
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
@@ -37,9 +45,59 @@ BROADCAST_NS: Final = 100 * NS_PER_MS
 """Pause after a request to all: "MODBUS over Serial Line" 2.4.1 gives 100 to 200 ms."""
 ASLEEP_SHARE: Final = 0.9
 """How much of the time that missing bytes need at least is slept through: fewer wake-ups, none late."""
+TIOCGRS485: Final = 0x542E
+TIOCSRS485: Final = 0x542F
+SERIAL_RS485: Final = struct.Struct("8I")
+"""flags, delay_rts_before_send ms, delay_rts_after_send ms, padding (linux/serial.h)."""
+ENABLED: Final = 1 << 0
+RTS_ON_SEND: Final = 1 << 1
+UNSUPPORTED: Final = frozenset({errno.ENOTTY, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP})
 
 Echo = Literal["auto", True, False]
 DirectionWish = Literal["auto", "kernel", "none"]
+
+
+class Direction:
+    """Direction control of one open port by its driver, where it has it."""
+
+    def __init__(self, fd: int, title: str, *, required: bool) -> None:
+        """Enable the driver's direction control. Raises LinkError if it is `required` and the driver has none.
+
+        A port where it is enabled already (device tree) is left as it is.
+        """
+        self._fd = fd
+        self._before: bytes | None = None
+        self.by_kernel = False
+        """Whether the driver switches the direction."""
+        try:
+            before = fcntl.ioctl(fd, TIOCGRS485, bytes(SERIAL_RS485.size))
+            if not SERIAL_RS485.unpack(before)[0] & ENABLED:
+                fcntl.ioctl(fd, TIOCSRS485, SERIAL_RS485.pack(ENABLED | RTS_ON_SEND, *[0] * 7))
+                self._before = before
+            self.by_kernel = True
+        except OSError as error:
+            if required or error.errno not in UNSUPPORTED:
+                raise LinkError(
+                    f"{title}: its driver cannot switch the direction of RS-485 ({error.strerror}); `direction: none` "
+                    "if the adapter does it by itself"
+                ) from error
+
+    def restore(self) -> None:
+        """Leave the port as it was; may be called twice, and on a port that is gone."""
+        before, self._before = self._before, None
+        if before is not None:
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(self._fd, TIOCSRS485, before)
+
+
+class PortSetup(NamedTuple):
+    """What all devices of a line must agree on."""
+
+    path: str
+    baud: int
+    """Rate in bit/s."""
+    direction: DirectionWish = "auto"
+    echo: Echo = "auto"
 
 
 class LineCounters:
@@ -58,18 +116,18 @@ class LineCounters:
         """Requests without a reply."""
 
 
-class Line:
-    """An open port. Transfers: the bus's thread; `share` and `release` in any, under the lock of `lines`."""
+class Rs485Line:
+    """An open port. Synchronization: the bus's thread makes the transfers; open and close hold `SharedPorts`' lock."""
 
-    def __init__(self, path: str, baud: int, direction: DirectionWish, echo: Echo, sys: Path, proc: Path) -> None:
+    def __init__(self, setup: PortSetup, sys: Path, proc: Path, now_ns: Callable[[], int]) -> None:
         """Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        self.path, self.baud = path, baud
-        self.wishes = direction, echo
-        """As configured."""
-        self.users = 1
+        path, baud = setup.path, setup.baud
+        self.setup = setup
         self.counters = LineCounters()
-        self.echoes: bool | None = None if echo == "auto" else echo
-        """Whether the port hears what it sends; None until it was seen."""
+        self.echoes: bool | None = None if setup.echo == "auto" else setup.echo
+        """Whether the port receives what it sends; None until that was observed."""
+        self._path = path
+        self._now_ns = now_ns
         self._port: serial.Serial | None = open_port(path, baud, proc)
         self._proc = proc
         self._fd = self._port.fileno()
@@ -77,12 +135,13 @@ class Line:
         self._tty = TtyCounters(self._fd)
         self._hold_ns = hold_ns(path, sys)
         self._byte_ns, self._gap_ns = uart_byte_ns(baud), frame_gap_ns(baud)
-        self._quiet_ns = time.monotonic_ns()
+        self._quiet_ns = now_ns()
         self._owing: dict[int, bytes] = {}
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         try:
-            self._direction = None if direction == "none" else Direction(self._fd, path, required=direction == "kernel")
+            required = setup.direction == "kernel"
+            self._direction = None if setup.direction == "none" else Direction(self._fd, path, required=required)
         except LinkError:
             self._port.close()
             raise
@@ -108,10 +167,10 @@ class Line:
         `reply_ns` is how long the module may think.
         """
         if self._port is None:
-            raise LinkError(f"{self.path} is not open")
+            raise LinkError(f"{self._path} is not open")
         if target == BROADCAST or not reply_bytes:
             self._send(framed(target, request))
-            self._sleep_until(time.monotonic_ns() + (len(request) + 3) * self._byte_ns + BROADCAST_NS)
+            self._sleep_until(self._now_ns() + (len(request) + 3) * self._byte_ns + BROADCAST_NS)
             self._read()
             return b""
         owed = self._owing.get(target)
@@ -131,9 +190,9 @@ class Line:
         finder = ReplyFinder(frame, reply_bytes, echoes=self.echoes)
         self._send(frame)
         wire_ns = (2 * len(frame) + reply_bytes) * self._byte_ns  # an echo comes with the request, not after it
-        deadline_ns = time.monotonic_ns() + wire_ns + 2 * self._gap_ns + reply_ns + self._hold_ns
+        deadline_ns = self._now_ns() + wire_ns + 2 * self._gap_ns + reply_ns + self._hold_ns
         reply = self._wait(finder, deadline_ns)
-        self._learn_echo(finder, reply)
+        self._note_echo(finder, reply)
         self.counters.strange += finder.strange
         if reply is None and finder.looks_damaged:
             reply = finder.rest()
@@ -147,7 +206,7 @@ class Line:
 
     def _wait(self, finder: ReplyFinder, deadline_ns: int) -> bytes | None:
         """Read until the reply is there or the time is over."""
-        while (left_ns := deadline_ns - time.monotonic_ns()) > 0:
+        while (left_ns := deadline_ns - self._now_ns()) > 0:
             if not self._poll.poll(left_ns / NS_PER_MS):
                 break
             reply = finder.feed(self._read())
@@ -157,7 +216,7 @@ class Line:
                 time.sleep(finder.missing * self._byte_ns * ASLEEP_SHARE / NS_PER_S)
         return finder.feed(self._read())  # this thread itself may have been late
 
-    def _learn_echo(self, finder: ReplyFinder, reply: bytes | None) -> None:
+    def _note_echo(self, finder: ReplyFinder, reply: bytes | None) -> None:
         """An echo behind noise is not seen: only a reply with nothing before it shows that there is none."""
         if finder.echo_seen:
             self.counters.echoed += 1
@@ -167,37 +226,38 @@ class Line:
     def _no_reply(self, target: int, finder: ReplyFinder) -> TransferError:
         rest = finder.rest()
         if rest or finder.strange:
-            message = f"no reply from address {target} on {self.path}, but other bytes: {rest[:16].hex(' ')}"
+            message = f"no reply from address {target} on {self._path}, but other bytes: {rest[:16].hex(' ')}"
             return TransferError(Trouble.DISTURBED, f"{message}; is the baud rate right, is an address given twice?")
-        # DISTURBED, not ABSENT: one request hit by noise is not answered either, and a module is given up after three
+        # DISTURBED, not ABSENT: one request hit by noise is not answered either, and three of these make a module lost
         return TransferError(
-            Trouble.DISTURBED, f"no reply from address {target} on {self.path}: is it powered, are A and B not swapped?"
+            Trouble.DISTURBED,
+            f"no reply from address {target} on {self._path}: is it powered, are A and B not swapped?",
         )
 
     def _send(self, frame: bytes) -> None:
         """Write a frame after the silence that must be before it. Raises TransferError, LinkError."""
-        self._hush()
+        self._await_silence()
         try:
             sent = os.write(self._fd, frame)
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            raise port_problem(error, self.path, self._proc) from error
+            raise port_problem(error, self._path, self._proc) from error
         if sent != len(frame):
-            raise TransferError(Trouble.STUCK, f"{self.path} does not send: is the port stuck?")
-        self._quiet_ns = time.monotonic_ns() + len(frame) * self._byte_ns
+            raise TransferError(Trouble.STUCK, f"{self._path} does not send: is the port stuck?")
+        self._quiet_ns = self._now_ns() + len(frame) * self._byte_ns
 
-    def _hush(self) -> None:
+    def _await_silence(self) -> None:
         """Return when the line was silent for a gap; what came meanwhile belongs to nobody."""
-        limit_ns = time.monotonic_ns() + 2 * ADU_BYTES_MAX * self._byte_ns + self._gap_ns
+        limit_ns = self._now_ns() + 2 * ADU_BYTES_MAX * self._byte_ns + self._gap_ns
         while True:
             late = len(self._read())
             self.counters.late += late
-            now_ns = time.monotonic_ns()
+            now_ns = self._now_ns()
             if not late and now_ns >= self._quiet_ns + self._gap_ns:
                 return
             if now_ns > limit_ns:
-                raise TransferError(Trouble.STUCK, f"{self.path} is never silent: does another master speak there?")
+                raise TransferError(Trouble.STUCK, f"{self._path} is never silent: does another master speak there?")
             self._sleep_until(self._quiet_ns + self._gap_ns)
 
     def _read(self) -> bytes:
@@ -210,59 +270,65 @@ class Line:
             raise self._gone(os.strerror(error.errno or 0)) from error
         if not data:
             raise self._gone("hung up")
-        self._quiet_ns = time.monotonic_ns()
+        self._quiet_ns = self._now_ns()
         return data
 
     def _gone(self, why: str) -> LinkMissing:
-        return LinkMissing(f"{self.path} is gone ({why}): was the cable or the adapter pulled out?")
+        return LinkMissing(f"{self._path} is gone ({why}): was the cable or the adapter pulled out?")
 
-    @staticmethod
-    def _sleep_until(deadline_ns: int) -> None:
-        left_ns = deadline_ns - time.monotonic_ns()
+    def _sleep_until(self, deadline_ns: int) -> None:
+        left_ns = deadline_ns - self._now_ns()
         if left_ns > 0:
             time.sleep(left_ns / NS_PER_S)
 
 
-class Lines:
+class SharedPorts:
     """The lines that are open, by path. Synchronization: any thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._lock = threading.Lock()
-        self._open: dict[str, Line] = {}
+        self._open: dict[str, Rs485Line] = {}
+        self._users: dict[Rs485Line, int] = {}
+        self._now_ns = now_ns
 
-    def share(self, path: str, baud: int, direction: DirectionWish, echo: Echo, sys: Path, proc: Path) -> Line:
-        """The line of that path, opened if nobody has it open. Raises LinkError, also for another rate."""
+    def share(self, setup: PortSetup, sys: Path = Path("/sys"), proc: Path = PROC) -> Rs485Line:
+        """The line of that path, opened if it is not open. Raises LinkError, also for another rate or setting."""
         with self._lock:
-            line = self._open.get(path)
+            line = self._open.get(setup.path)
             if line is None:
-                line = self._open[path] = Line(path, baud, direction, echo, sys, proc)
-                return line
-            if line.baud != baud:
-                raise LinkError(f"{path}: expected one baud rate for all its devices, got {line.baud} and {baud}")
-            if line.wishes != (direction, echo):
-                raise LinkError(
-                    f"{path}: expected the same `direction` and `echo` for all its devices, got {line.wishes[0]}, "
-                    f"{line.wishes[1]} and {direction}, {echo}"
-                )
-            line.users += 1
+                line = self._open[setup.path] = Rs485Line(setup, sys, proc, self._now_ns)
+            _check_agreement(line.setup, setup)
+            self._users[line] = self._users.get(line, 0) + 1
             return line
 
-    def lose(self, line: Line) -> None:
-        """The port is gone: who opens it next gets a new one."""
+    def discard(self, line: Rs485Line) -> None:
+        """Forget a line whose port is gone: the next `share` opens it anew."""
         with self._lock:
-            if self._open.get(line.path) is line:
-                del self._open[line.path]
+            if self._open.get(line.setup.path) is line:
+                del self._open[line.setup.path]
 
-    def release(self, line: Line) -> None:
-        """One user less; the last one closes the port."""
+    def release(self, line: Rs485Line) -> None:
+        """Remove one user; the last one closes the port."""
         with self._lock:
-            line.users -= 1
-            if line.users:
+            self._users[line] -= 1
+            if self._users[line]:
                 return
-            if self._open.get(line.path) is line:
-                del self._open[line.path]
+            del self._users[line]
+            if self._open.get(line.setup.path) is line:
+                del self._open[line.setup.path]
             line.close()
 
 
-SHARED_PORTS: Final = Lines()
+def _check_agreement(first: PortSetup, other: PortSetup) -> None:
+    path = first.path
+    if first.baud != other.baud:
+        raise LinkError(f"{path}: expected one baud rate for all its devices, got {first.baud} and {other.baud}")
+    if first != other:
+        raise LinkError(
+            f"{path}: expected the same `direction` and `echo` for all its devices, got {first.direction}, "
+            f"{first.echo} and {other.direction}, {other.echo}"
+        )
+
+
+SHARED_PORTS: Final = SharedPorts()
 """Those of this process."""

@@ -15,7 +15,7 @@ from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters, SerialLineCounters
 from imud.errors import LinkError, LinkMissing
 from imud.links.device_node import PROC, DeviceNode
-from imud.links.rs485.line import SHARED_PORTS, DirectionWish, Echo, Line, LineCounters, Lines
+from imud.links.rs485.line import SHARED_PORTS, LineCounters, PortSetup, Rs485Line, SharedPorts
 from imud.units import NS_PER_MS
 
 
@@ -46,13 +46,13 @@ class Rs485Link:
         self,
         settings: Rs485Settings,
         *,
-        lines: Lines = SHARED_PORTS,
+        ports: SharedPorts = SHARED_PORTS,
         sys: Path = Path("/sys"),
         proc: Path = PROC,
     ) -> None:
         self._settings = settings
-        self._lines, self._sys, self._proc = lines, sys, proc
-        self._line: Line | None = None
+        self._ports, self._sys, self._proc = ports, sys, proc
+        self._line: Rs485Line | None = None
         self._node = DeviceNode(settings.line)
         self._address = 0
         self._reply_ns = settings.reply_ms * NS_PER_MS
@@ -75,10 +75,9 @@ class Rs485Link:
     def open(self) -> None:
         """Open the port exclusively, or share it. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
         settings = self._settings
-        direction: DirectionWish = settings.direction
-        echo: Echo = settings.echo
+        setup = PortSetup(settings.line, settings.baud, settings.direction, settings.echo)
         with self._node.opening():
-            self._line = self._lines.share(self.title, settings.baud, direction, echo, self._sys, self._proc)
+            self._line = self._ports.share(setup, self._sys, self._proc)
 
     def select(self, target: int) -> None:
         """Speak to an address; 0 is all of them, and nobody answers."""
@@ -96,11 +95,11 @@ class Rs485Link:
         try:
             return line.transfer(self._address, request, transfer.read_bytes, self._reply_ns)
         except LinkMissing:
-            self._lines.lose(line)
+            self._ports.discard(line)
             raise
 
     def write(self, data: bytes) -> None:
-        """Nothing is sent but in transfers. Raises LinkError."""
+        """Raises LinkError: bytes are sent in transfers only."""
         raise LinkError(f"{self.title} cannot send {len(data)} bytes outside of a transfer")
 
     def kernel_counters(self) -> KernelCounters:
@@ -116,7 +115,7 @@ class Rs485Link:
         """Leave the line, whose last user closes the port; may be called twice."""
         line, self._line = self._line, None
         if line is not None:
-            self._lines.release(line)
+            self._ports.release(line)
 
 
 LINK = LinkType("rs485", Rs485Settings, make_polled=Rs485Link)

@@ -21,8 +21,7 @@ from imud.contracts.status import SerialLineCounters
 from imud.devices.hipnuc.modbus.frames import read_registers, set_id_by_serial, write_register
 from imud.errors import LinkBusy, LinkError, LinkMissing, TransferError, Trouble
 from imud.formats.modbus import framed, is_exception, is_whole
-from imud.links.rs485.direction import ENABLED, RTS_ON_SEND, TIOCGRS485, TIOCSRS485, Direction
-from imud.links.rs485.line import Lines
+from imud.links.rs485.line import ENABLED, RTS_ON_SEND, TIOCGRS485, TIOCSRS485, Direction, SharedPorts
 from imud.links.rs485.link import Rs485Link, Rs485Settings
 from imud.links.uart.serial_port import open_port
 from tests.support.modbus_wire import BAUD, serial_of, slave, wired
@@ -35,9 +34,9 @@ TRIES = 200
 
 
 @contextmanager
-def opened(path: Path | str, lines: Lines | None = None, address: int = 1, **more: Any) -> Iterator[Rs485Link]:
+def opened(path: Path | str, ports: SharedPorts | None = None, address: int = 1, **more: Any) -> Iterator[Rs485Link]:
     settings = {"line": str(path), "baud": BAUD, "reply_ms": 200, **more}
-    link = Rs485Link(msgspec.convert(settings, Rs485Settings), lines=lines or Lines())
+    link = Rs485Link(msgspec.convert(settings, Rs485Settings), ports=ports or SharedPorts())
     link.open()
     link.select(address)
     try:
@@ -66,11 +65,11 @@ def pty() -> Iterator[PtyPort]:
 
 @pytest.mark.parametrize("chunk_bytes", [0, 1])
 def test_modules_of_a_line_share_its_port(tmp_path: Path, chunk_bytes: int) -> None:
-    lines = Lines()
+    ports = SharedPorts()
     with (
         wired(tmp_path, slave(1), slave(2), chunk_bytes=chunk_bytes) as (path, _),
-        opened(path, lines, 1) as one,
-        opened(path, lines, 2) as two,
+        opened(path, ports, 1) as one,
+        opened(path, ports, 2) as two,
     ):
         assert one.bus == two.bus == str(path)
         assert one.transfer(SERIAL)[3:11] == serial_of(1)
@@ -82,7 +81,7 @@ def test_modules_of_a_line_share_its_port(tmp_path: Path, chunk_bytes: int) -> N
         with pytest.raises(LinkBusy):
             open_port(str(path), BAUD, PROC)
         with pytest.raises(LinkError, match="one baud rate for all its devices, got 921600 and 9600"), ExitStack() as s:
-            s.enter_context(opened(path, lines, 3, baud=9600))
+            s.enter_context(opened(path, ports, 3, baud=9600))
         two.close()
         open_port(str(path), BAUD, PROC).close()
 
@@ -136,14 +135,14 @@ def test_noise_before_the_first_echo_does_not_hide_that_there_are_echoes(pty: Pt
 
 @pytest.mark.parametrize("more", [{"echo": True}, {"direction": "none"}])
 def test_devices_of_a_line_agree_on_it(pty: PtyPort, more: dict[str, object]) -> None:
-    lines = Lines()
-    with opened(pty.path, lines):
+    ports = SharedPorts()
+    with opened(pty.path, ports):
         with (
             pytest.raises(LinkError, match="expected the same `direction` and `echo` for all its devices"),
-            opened(pty.path, lines, 2, **more),
+            opened(pty.path, ports, 2, **more),
         ):
             pass
-        with opened(pty.path, lines, 2):
+        with opened(pty.path, ports, 2):
             pass
 
 
@@ -248,9 +247,9 @@ def test_request_to_all_expects_no_reply(tmp_path: Path) -> None:
 
 
 def test_cable_pulled_and_back(pty: PtyPort) -> None:
-    lines = Lines()
-    link_a = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), lines=lines)
-    link_b = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), lines=lines)
+    ports = SharedPorts()
+    link_a = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    link_b = Rs485Link(Rs485Settings(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
     link_a.open()
     link_b.open()
     pty.unplug()

@@ -29,7 +29,7 @@ from imud.devices.hipnuc.modbus.codec import (
 from imud.devices.hipnuc.modbus.session import LineMounting, set_heading_mode, set_mounting
 from imud.devices.hipnuc.uart.commands import AttitudeMode
 from imud.ledger import Ledger
-from imud.links.rs485.line import Lines
+from imud.links.rs485.line import SharedPorts
 from imud.links.rs485.link import Rs485Link, Rs485Settings
 from imud.sample import Measurement
 from tests.devices.hipnuc.modbus.test_codec import SENSORS
@@ -119,7 +119,7 @@ def served(*devices: SimDevice) -> Iterator[str]:
 
 @contextmanager
 def linked(path: str) -> Iterator[Rs485Link]:
-    link = Rs485Link(Rs485Settings(line=path, baud=BAUD, reply_ms=1000), lines=Lines())
+    link = Rs485Link(Rs485Settings(line=path, baud=BAUD, reply_ms=1000), ports=SharedPorts())
     link.open()
     try:
         yield link
