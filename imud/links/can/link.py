@@ -1,8 +1,8 @@
 """A CAN bus: a raw SocketCAN socket of our own, or any other interface that python-can knows.
 
-Every device opens its own socket with filters for its frames, so that several share a bus and none sees the others'.
-Bit rate and state of the interface belong to the system (docs/can.md): imud reads them and changes nothing. It needs no
-privilege, only the receive buffer may be larger than net.core.rmem_max with CAP_NET_ADMIN.
+Every device opens its own socket with filters for its frames, so that several share a bus without seeing the
+frames of the others. Bit rate and state of the interface belong to the system (docs/can.md): imud reads them and
+changes nothing. It needs no privilege, only the receive buffer may be larger than net.core.rmem_max with CAP_NET_ADMIN.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ import logging
 import os
 import socket
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -58,11 +58,53 @@ class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ValueError("bitrate: expected none with backend socketcan, the system sets it (docs/can.md)")
 
 
+OpenSocket = Callable[[SocketCanSettings, Sequence[CanFilter]], socket.socket]
+
+
+def open_raw(settings: SocketCanSettings, filters: Sequence[CanFilter]) -> socket.socket:
+    """A raw CAN socket bound to the interface, with filters and the error frames to watch. Raises OSError."""
+    opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+    try:
+        opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
+        opened.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, struct.pack("=I", WATCHED))
+        _enlarge(opened, settings)
+        opened.bind((settings.interface,))
+    except OSError:
+        opened.close()
+        raise
+    return opened
+
+
+def _enlarge(opened: socket.socket, settings: SocketCanSettings) -> None:
+    """As much receive buffer as is wanted, or as the system gives; the kernel doubles and reports the double."""
+    wanted = settings.receive_buffer_bytes
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted // 2)
+    except PermissionError:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted // 2)
+    got = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    if got < wanted:
+        log.info(
+            "%s: receive buffer of %d bytes, wanted %d (sysctl net.core.rmem_max): room for about %d frames",
+            settings.interface, got, wanted, got // FRAME_BUFFER_BYTES,
+        )  # fmt: skip
+
+
+def pack_filters(filters: Sequence[CanFilter]) -> bytes:
+    """Filters as `struct can_filter`: data frames only, and only of the named length of identifier."""
+    flags = EXTENDED_FLAG | REMOTE_FLAG
+    return b"".join(struct.pack("=II", f.can_id | EXTENDED_FLAG * f.extended, f.mask | flags) for f in filters)
+
+
 class SocketCanLink:
     """A CAN network interface as a `CanLink`. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: SocketCanSettings, *, sys: Path = netlink.SYS) -> None:
+    def __init__(
+        self, settings: SocketCanSettings, *, sys: Path = netlink.SYS, open_socket: OpenSocket = open_raw
+    ) -> None:
+        """`open_socket` makes a bound, non-blocking socket whose messages are `struct can_frame`."""
         self._settings = settings
+        self._open_socket = open_socket
         self._coalesce_s = settings.coalesce_ms / 1000
         self._timer: asyncio.TimerHandle | None = None
         self._sys = sys
@@ -70,9 +112,9 @@ class SocketCanLink:
         self._reader: FrameReader | None = None
         self._state = BusState(settings.interface)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._on_frames: OnFrames = _nobody
-        self._on_news: OnBusNews = _nobody_hears
-        self._on_end: OnEnd = _nobody_ends
+        self._on_frames: OnFrames = _ignore_frames
+        self._on_news: OnBusNews = _ignore_news
+        self._on_end: OnEnd = _ignore_end
         self._filters: Sequence[CanFilter] = ()
         self._sender: Sender | None = None
         self.title = self.bus = settings.interface
@@ -106,7 +148,7 @@ class SocketCanLink:
         self.bitrate = details.bitrate or 0
         self._state = BusState(self._settings.interface, details.state)
         try:
-            self._socket = self._bound()
+            self._socket = self._open_socket(self._settings, self._filters)
         except OSError as error:
             raise self._explained(error) from error
         self._reader = FrameReader(self._socket, self._on_error_frame)
@@ -168,32 +210,6 @@ class SocketCanLink:
         if sender is not None:
             sender.close()
 
-    def _bound(self) -> socket.socket:
-        opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
-        try:
-            opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(self._filters))
-            opened.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, struct.pack("=I", WATCHED))
-            self._enlarge(opened)
-            opened.bind((self._settings.interface,))
-        except OSError:
-            opened.close()
-            raise
-        return opened
-
-    def _enlarge(self, opened: socket.socket) -> None:
-        """As much receive buffer as is wanted, or as the system gives; the kernel doubles and reports the double."""
-        wanted = self._settings.receive_buffer_bytes // 2
-        try:
-            opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted)
-        except PermissionError:
-            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
-        got = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        if got < self._settings.receive_buffer_bytes:
-            log.info(
-                "%s: receive buffer of %d bytes, wanted %d (sysctl net.core.rmem_max): room for about %d frames",
-                self.title, got, self._settings.receive_buffer_bytes, got // FRAME_BUFFER_BYTES,
-            )  # fmt: skip
-
     def _read(self) -> int:
         """One batch, and how many frames it had; what is left makes the loop call again. -1 when the bus ended."""
         assert self._reader is not None
@@ -207,7 +223,7 @@ class SocketCanLink:
         return len(frames)
 
     def _read_coalescing(self) -> None:
-        """A batch; when there is no more, look away for a while. A bus without frames is watched again."""
+        """A batch; when it took all, read again after `coalesce_ms`. A bus without frames is watched again."""
         loop, opened = self._loop, self._socket
         count = self._read()
         if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed
@@ -246,22 +262,16 @@ class SocketCanLink:
         return LinkError(f"{name}: {os.strerror(error.errno or 0)}")
 
 
-def pack_filters(filters: Sequence[CanFilter]) -> bytes:
-    """Filters as `struct can_filter`: data frames only, and only of the named length of identifier."""
-    flags = EXTENDED_FLAG | REMOTE_FLAG
-    return b"".join(struct.pack("=II", f.can_id | EXTENDED_FLAG * f.extended, f.mask | flags) for f in filters)
+def _ignore_frames(_frames: object) -> None:
+    """The receiver before `start`."""
 
 
-def _nobody(_frames: object) -> None:
-    """Before `start` nobody listens."""
+def _ignore_news(_news: str, _problem: str) -> None:
+    """The receiver before `start`."""
 
 
-def _nobody_hears(_news: str, _problem: str) -> None:
-    """Before `start` nobody listens."""
-
-
-def _nobody_ends(_error: LinkError | None) -> None:
-    """Before `start` nobody listens."""
+def _ignore_end(_error: LinkError | None) -> None:
+    """The receiver before `start`."""
 
 
 def make(settings: SocketCanSettings) -> CanLink:

@@ -1,23 +1,21 @@
 """A CAN log (`candump -L`) as a bus: the frames of a file, through the same path as those of an interface.
 
-Speeds as in `replay`: `recorded` and `real` play by the stamps in the file, `maximum` as fast as the receiver takes it,
-in virtual time that ends at the moment of the start. `baud` says nothing here.
+Speeds as in `imud.links.replay.link`: `recorded` and `real` play by the stamps in the file, `maximum` as fast as the
+receiver decodes, in virtual time that ends at the moment of the start. `baud` has no effect.
 """
 
 import asyncio
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 from imud.contracts.link import OnBusNews, OnEnd, OnFrames
-from imud.contracts.status import KernelCounters
 from imud.errors import LinkError
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.formats.candump import CandumpReader
-from imud.links.inotify import wait_until
-from imud.links.replay.file import ReplaySettings, open_regular
+from imud.links.replay.file import FileReplay, ReplaySettings, open_regular
 from imud.units import NS_PER_MS, NS_PER_S
 
 TURN_FRAMES: Final = 512
@@ -26,31 +24,23 @@ TURN_FRAMES: Final = 512
 log = logging.getLogger(__name__)
 
 
-class CanReplayLink:
+class CanReplayLink(FileReplay):
     """A log as a `CanLink`. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: ReplaySettings) -> None:
-        self._settings = settings
-        self._file: BinaryIO | None = None
-        self._handle: asyncio.Handle | None = None
+    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(settings, now_ns)
         self._span_ns = 0
         self._frames: Iterator[CanFrame] = iter(())
         self.filters: Sequence[CanFilter] = ()
-        self.title = self.bus = settings.path
+        self.bus = settings.path
         self.bitrate = 0
-        self.writable = False
 
     def absence(self) -> str:
         """Whether the file is missing."""
         return "" if Path(self.title).exists() else f"{self.title} is not there: expected a candump log"
 
-    async def wait_present(self) -> None:
-        """Return when the file is there."""
-        path = Path(self.title)
-        await wait_until(path, path.exists)
-
     def open(self) -> None:
-        """Open the log and look whether it is one. Raises LinkMissing, LinkDenied, LinkError."""
+        """Open the log and check that it has frames. Raises LinkMissing, LinkDenied, LinkError."""
         self._file = open_regular(self.title)
         reader = CandumpReader(self._file)
         first_ns = newest_ns = -1
@@ -66,34 +56,16 @@ class CanReplayLink:
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Play from the beginning."""
-        self._frames = self._play(time.monotonic_ns() - self._span_ns)
-        self._handle = asyncio.get_running_loop().call_soon(self._turn, on_frames, on_end, None)
+        self._frames = self._play(self._now_ns() - self._span_ns)
+        self._timer = asyncio.get_running_loop().call_soon(self._turn, on_frames, on_end, None)
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
-        """Raises LinkError: there is nobody at the far end."""
+        """Raises LinkError: a file has no far end."""
         raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
-
-    def write(self, data: bytes) -> None:
-        """Raises LinkError: there is nobody at the far end."""
-        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
-
-    def kernel_counters(self) -> KernelCounters:
-        """A file has none."""
-        return KernelCounters()
-
-    def close(self) -> None:
-        """Release the file; may be called twice."""
-        if self._handle is not None:
-            self._handle.cancel()
-            self._handle = None
-        self._frames = iter(())
-        file, self._file = self._file, None
-        if file is not None:
-            file.close()
 
     def _turn(self, on_frames: OnFrames, on_end: OnEnd, waiting: CanFrame | None) -> None:
         """Deliver what is due, at most TURN_FRAMES, then give way."""
-        loop, frames, now_ns = asyncio.get_running_loop(), list[CanFrame](), time.monotonic_ns()
+        file, frames, now_ns = self._file, list[CanFrame](), self._now_ns()
         while (frame := waiting or next(self._frames, None)) is not None:
             waiting = frame if frame.t_rx_ns > now_ns or len(frames) >= TURN_FRAMES else None
             if waiting:
@@ -101,14 +73,14 @@ class CanReplayLink:
             frames.append(frame)
         if frames:
             on_frames(frames)
-        if self._file is None:  # closed by the receiver
+        if self._file is not file:  # closed by the receiver
             return
         if waiting is None:
             self.close()
             on_end(None)
             return
-        delay_s = max(0, waiting.t_rx_ns - time.monotonic_ns()) / NS_PER_S
-        self._handle = loop.call_later(delay_s, self._turn, on_frames, on_end, waiting)
+        delay_s = max(0, waiting.t_rx_ns - self._now_ns()) / NS_PER_S
+        self._timer = asyncio.get_running_loop().call_later(delay_s, self._turn, on_frames, on_end, waiting)
 
     def _play(self, origin_ns: int) -> Iterator[CanFrame]:
         """Frames that pass the filters, with the CLOCK_MONOTONIC at which each is due."""

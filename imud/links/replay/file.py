@@ -1,13 +1,18 @@
-"""What a replayed file of any kind needs: the settings of the link, and a file that is one."""
+"""The file of a replay: its settings, waiting for it, opening and closing it, for both kinds of replay."""
 
+import asyncio
 import os
 import stat
+from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, BinaryIO, Literal
 
 from msgspec import Meta
 
 from imud.contracts.settings import Settings
+from imud.contracts.status import KernelCounters
 from imud.errors import LinkDenied, LinkError, LinkMissing
+from imud.links.inotify import wait_until
 
 
 class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -26,6 +31,44 @@ class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         """Raises ValueError for keys that exclude each other."""
         if self.repeat and self.speed == "maximum":
             raise ValueError("repeat needs speed recorded or real: virtual time would run into the future")
+
+
+class FileReplay:
+    """The part of a replay that does not depend on what is in the file. Synchronization: the loop's thread only.
+
+    `close` drops the timer and the file: a turn that finds another file in `_file` than at its begin has ended.
+    """
+
+    writable = False
+
+    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int]) -> None:
+        self.title = settings.path
+        self._settings = settings
+        self._now_ns = now_ns
+        self._file: BinaryIO | None = None
+        self._timer: asyncio.Handle | None = None
+
+    async def wait_present(self) -> None:
+        """Return when the file is there."""
+        path = Path(self.title)
+        await wait_until(path, path.exists)
+
+    def write(self, data: bytes) -> None:
+        """Raises LinkError: a file has no far end."""
+        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
+
+    def kernel_counters(self) -> KernelCounters:
+        """Zeros: the kernel counts no errors of a file."""
+        return KernelCounters()
+
+    def close(self) -> None:
+        """Release the file; may be called twice."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
 
 
 def open_regular(path: str) -> BinaryIO:

@@ -1,11 +1,11 @@
-"""Plays a capture through the same path as a port.
+"""A capture file as a source of bytes, through the same path as a port.
 
 Speeds, and what `t_rx_ns` is (it never decreases and never lies in the future):
 
 - `recorded`: each read of a stamped capture comes as long after the first as it did then; `t_rx_ns` is that due time,
   so the recorded arrival jitter is what the clock sees, not the jitter of this process.
 - `real`: bytes come as fast as the wire at `baud` carries them, PIECE_NS at a time; `t_rx_ns` is the due time.
-- `maximum`: as fast as the receiver takes it. Time is virtual: recorded stamps, or wire time at `baud` (all the same
+- `maximum`: as fast as the receiver decodes. Time is virtual: recorded stamps, or wire time at `baud` (all the same
   instant where neither is known), shifted so that the end of the capture is the moment of the start. It can be negative
   where the capture is longer than the machine is up.
 """
@@ -14,18 +14,15 @@ import asyncio
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain
-from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 from imud.contracts.link import LinkType, OnData, OnEnd
-from imud.contracts.status import KernelCounters
 from imud.errors import ImudError, LinkError
 from imud.formats.capture import CaptureReader
-from imud.links.inotify import wait_until
 from imud.links.replay.can import CanReplayLink
-from imud.links.replay.file import ReplaySettings, open_regular
+from imud.links.replay.file import FileReplay, ReplaySettings, open_regular
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 PIECE_NS: Final = 2 * NS_PER_MS
@@ -38,31 +35,21 @@ TURN_BYTES: Final = 16384
 log = logging.getLogger(__name__)
 
 
-class ReplayLink:
+class ReplayLink(FileReplay):
     """A capture as a `StreamLink`. Synchronization: the loop's thread only."""
 
-    def __init__(self, settings: ReplaySettings) -> None:
-        self._settings = settings
-        self._file: BinaryIO | None = None
-        self._handle: asyncio.Handle | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+    def __init__(self, settings: ReplaySettings, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(settings, now_ns)
         self._player: Iterator[tuple[bytes, int]] = iter(())
         self._span_ns = 0
-        self.title = settings.path
         self.baud = settings.baud
         self.auto_baud = False
-        self.writable = False
         self.hold_ns = 0
-
-    async def wait_present(self) -> None:
-        """Return when the file is there."""
-        path = Path(self._settings.path)
-        await wait_until(path, path.exists)
 
     def open(self) -> None:
         """Open and check the capture. Raises LinkMissing, LinkDenied, LinkError."""
-        path, settings = self._settings.path, self._settings
-        self._file = file = open_regular(path)
+        path, settings = self.title, self._settings
+        self._file = open_regular(path)
         try:
             reader = self._reader()
             self.baud = settings.baud or reader.baud
@@ -73,54 +60,34 @@ class ReplayLink:
                 raise LinkError(f"{path} does not say its baud rate: speed real needs `baud`")
             self._span_ns = self._measure(reader) if settings.speed == "maximum" else 0
         except LinkError:
-            file.close()
+            self.close()
             raise
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         """Play from the beginning."""
-        self._loop = asyncio.get_running_loop()
-        self._player = self._play(time.monotonic_ns() - self._span_ns)
-        self._handle = self._loop.call_soon(self._turn, on_data, on_end, None)
-
-    def write(self, data: bytes) -> None:
-        """Raises LinkError: there is nobody at the far end."""
-        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
+        self._player = self._play(self._now_ns() - self._span_ns)
+        self._timer = asyncio.get_running_loop().call_soon(self._turn, on_data, on_end, None)
 
     def set_baud(self, baud: int) -> None:
         """Raises LinkError: a recording has the rate it has."""
         raise LinkError(f"{self.title} is a replay: its rate cannot be changed")
 
-    def kernel_counters(self) -> KernelCounters:
-        """A file has none."""
-        return KernelCounters()
-
-    def close(self) -> None:
-        """Release the file; may be called twice."""
-        if self._handle is not None:
-            self._handle.cancel()
-            self._handle = None
-        self._loop = None
-        self._player = iter(())
-        file, self._file = self._file, None
-        if file is not None:
-            file.close()
-
     def _turn(self, on_data: OnData, on_end: OnEnd, waiting: tuple[bytes, int] | None) -> None:
         """Deliver what is due, at most TURN_BYTES, then give way."""
-        loop, room, now_ns = self._loop, TURN_BYTES, time.monotonic_ns()
-        while loop is not None and self._loop is loop:
+        loop, file, room, now_ns = asyncio.get_running_loop(), self._file, TURN_BYTES, self._now_ns()
+        while self._file is file:  # until the receiver closes it
             data, due_ns = item = waiting or next(self._player, (b"", 0))
             waiting = None
             if not data:
                 self.close()
                 on_end(None)
                 return
-            if due_ns > now_ns and due_ns > (now_ns := time.monotonic_ns()):
+            if due_ns > now_ns and due_ns > (now_ns := self._now_ns()):
                 delay_s = (due_ns - now_ns) / NS_PER_S
-                self._handle = loop.call_later(delay_s, self._turn, on_data, on_end, item)
+                self._timer = loop.call_later(delay_s, self._turn, on_data, on_end, item)
                 return
             if room <= 0:
-                self._handle = loop.call_soon(self._turn, on_data, on_end, item)
+                self._timer = loop.call_soon(self._turn, on_data, on_end, item)
                 return
             room -= len(data)
             on_data(data, due_ns)

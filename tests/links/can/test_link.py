@@ -6,6 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
+from pathlib import Path
 
 import pytest
 
@@ -18,12 +19,16 @@ from imud.links.can.link import SocketCanLink, SocketCanSettings
 LIMIT_S = 10.0
 COALESCE_MS = 40
 
+Ends = tuple[socket.socket, socket.socket, Path]
+
 
 class Bus:
     """A link whose socket is one of the loop device, what it delivered, and when it meant to look again."""
 
-    def __init__(self, receiver: socket.socket, sender: socket.socket, coalesce_ms: int) -> None:
-        self.link = SocketCanLink(SocketCanSettings(interface="lo", coalesce_ms=coalesce_ms))
+    def __init__(self, ends: Ends, coalesce_ms: int) -> None:
+        receiver, sender, sys = ends
+        settings = SocketCanSettings(interface="lo", coalesce_ms=coalesce_ms)
+        self.link = SocketCanLink(settings, sys=sys, open_socket=lambda _settings, _filters: receiver.dup())
         self.batches: list[list[CanFrame]] = []
         self.delivered_ns: list[int] = []
         self.ends: list[LinkError | None] = []
@@ -35,7 +40,6 @@ class Bus:
         """Of each batch, whether it was read when a timer ended."""
         self.then: Callable[[], None] = lambda: None
         """Done once, right after the next delivery."""
-        self._receiver = receiver
         self._sender = sender
         self._news = asyncio.Event()
         self._looking = False
@@ -57,8 +61,6 @@ class Bus:
 
     def run(self, monkeypatch: pytest.MonkeyPatch, story: Callable[["Bus"], Coroutine[None, None, None]]) -> None:
         """Open, tell the story, close."""
-        monkeypatch.setattr(self.link, "absence", lambda: "")
-        monkeypatch.setattr(self.link, "_bound", self._receiver.dup)
         monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, None))
 
         async def play() -> None:
@@ -69,26 +71,26 @@ class Bus:
                 if getattr(call, "__self__", None) is not self.link:
                     return call_later(delay_s, call, *arguments)
                 self.delays_s.append(delay_s)
-                return call_later(delay_s, self._look, call)
+                return call_later(delay_s, self._run_timer, call)
 
             loop.set_exception_handler(lambda _loop, context: self._failures.append(context))
             monkeypatch.setattr(loop, "call_later", noted)
             self.link.open()
-            self.link.start(self._take, lambda news, problem: None, self.ends.append)
+            self.link.start(self._on_frames, lambda news, problem: None, self.ends.append)
             await story(self)
             self.link.close()
 
         asyncio.run(play())
         assert self._failures == []
 
-    def _look(self, call: Callable[[], object]) -> None:
+    def _run_timer(self, call: Callable[[], object]) -> None:
         self._looking = True
         call()
         self._looking = False
         self.looks += 1
         self._news.set()
 
-    def _take(self, frames: Sequence[CanFrame]) -> None:
+    def _on_frames(self, frames: Sequence[CanFrame]) -> None:
         self.delivered_ns.append(time.monotonic_ns())
         self.batches.append(list(frames))
         self.by_timer.append(self._looking)
@@ -98,8 +100,12 @@ class Bus:
 
 
 @pytest.fixture
-def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
-    """Two ends of a datagram path whose frames are stamped by the kernel, from the first one on."""
+def ends(tmp_path: Path) -> Iterator[Ends]:
+    """Two ends of a datagram path whose frames are stamped by the kernel, from the first one on, and a made-up /sys."""
+    interface = tmp_path / "class/net/lo"
+    interface.mkdir(parents=True)
+    (interface / "type").write_text(f"{netlink.ARPHRD_CAN}\n")
+    (interface / "flags").write_text(f"{netlink.IFF_UP:#x}\n")
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
@@ -116,12 +122,10 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
             sent_ns = time.monotonic_ns()
             time.sleep(0.002)
             stamped = any(frame.t_rx_ns < sent_ns + 1_000_000 for frame in reader.read())
-        yield receiver, sender
+        yield receiver, sender, tmp_path
 
 
-def test_frames_gather_and_keep_their_time(
-    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_gather_and_keep_their_time(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first is read at once; those that come next are read together, when the time is over."""
     sent_ns: list[int] = []
 
@@ -134,7 +138,7 @@ def test_frames_gather_and_keep_their_time(
         bus.send(1)
         await bus.until(lambda: len(bus.batches) == 2)
 
-    bus = Bus(*ends, COALESCE_MS)
+    bus = Bus(ends, COALESCE_MS)
     bus.run(monkeypatch, story)
     assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2, 3, 4]]
     assert bus.delays_s == [COALESCE_MS / 1000] * 2
@@ -142,23 +146,19 @@ def test_frames_gather_and_keep_their_time(
     assert all(frame.t_rx_ns <= sent_ns[0] + 200_000 for frame in bus.batches[1])
 
 
-def test_what_is_more_than_a_batch_is_read_at_once(
-    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_more_than_a_batch_is_read_at_once(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(bus: Bus) -> None:
         bus.then = lambda: bus.send(*range(2 * BATCH_FRAMES + 5))
         bus.send(0x700)
         await bus.until(lambda: len(bus.batches) == 4)
 
-    bus = Bus(*ends, COALESCE_MS)
+    bus = Bus(ends, COALESCE_MS)
     bus.run(monkeypatch, story)
     assert [len(batch) for batch in bus.batches] == [1, BATCH_FRAMES, BATCH_FRAMES, 5]
     assert bus.delays_s == [COALESCE_MS / 1000, 0, 0, COALESCE_MS / 1000]
 
 
-def test_a_bus_that_fell_silent_is_watched_again(
-    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bus_that_fell_silent_is_watched_again(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(bus: Bus) -> None:
         for number in range(1, 4):
             bus.then = lambda: bus.send(0x100)
@@ -166,30 +166,26 @@ def test_a_bus_that_fell_silent_is_watched_again(
             await bus.until(lambda: bus.looks == 2 * number)  # noqa: B023 - called before the number changes
             assert len(bus.delays_s) == 2 * number  # no timer runs while nothing comes
 
-    bus = Bus(*ends, 1)
+    bus = Bus(ends, 1)
     bus.run(monkeypatch, story)
     assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [0x100], [2], [0x100], [3], [0x100]]
     assert bus.by_timer == [False, True] * 3
 
 
-def test_without_it_every_frame_is_read_as_it_comes(
-    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_it_every_frame_is_read_as_it_comes(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(bus: Bus) -> None:
         for number in range(3):
             bus.send(number)
             await bus.until(lambda: len(bus.batches) == number + 1)  # noqa: B023 - as above
 
-    bus = Bus(*ends, 0)
+    bus = Bus(ends, 0)
     bus.run(monkeypatch, story)
     assert [len(batch) for batch in bus.batches] == [1, 1, 1]
     assert bus.delays_s == []
 
 
 @pytest.mark.parametrize("at", ["delivery", "pause"])
-def test_closed_while_frames_gather(
-    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch, at: str
-) -> None:
+def test_closed_while_frames_gather(ends: Ends, monkeypatch: pytest.MonkeyPatch, at: str) -> None:
     """By the one who takes the frames, or later: nothing is delivered any more, and no timer is left."""
 
     async def story(bus: Bus) -> None:
@@ -201,28 +197,32 @@ def test_closed_while_frames_gather(
         bus.link.close()
         await asyncio.sleep(0.005)
 
-    bus = Bus(*ends, 1)
+    bus = Bus(ends, 1)
     bus.run(monkeypatch, story)
     assert [frame.can_id for batch in bus.batches for frame in batch] == [1]
     assert bus.looks == 0
     assert len(bus.delays_s) == (at == "pause")
 
 
-def test_a_bus_that_ends_in_the_pause_says_so_once(
-    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def down() -> list[CanFrame]:
-        raise OSError(errno.ENETDOWN, os.strerror(errno.ENETDOWN))
+def test_a_bus_that_ends_in_the_pause_says_so_once(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Reader(FrameReader):
+        down = False
+
+        def read(self) -> list[CanFrame]:
+            if Reader.down:
+                raise OSError(errno.ENETDOWN, os.strerror(errno.ENETDOWN))
+            return super().read()
 
     async def story(bus: Bus) -> None:
         bus.send(1)
         await bus.until(lambda: bus.batches)
-        monkeypatch.setattr(bus.link._reader, "read", down)
+        Reader.down = True
         bus.send(2)  # it must not be watched any more
         await bus.until(lambda: bus.ends)
         await asyncio.sleep(0.005)
 
-    bus = Bus(*ends, 1)
+    monkeypatch.setattr("imud.links.can.link.FrameReader", Reader)
+    bus = Bus(ends, 1)
     bus.run(monkeypatch, story)
     (ended,) = bus.ends
     assert isinstance(ended, LinkMissing)
