@@ -1,9 +1,11 @@
-"""Links: each owns one kind of port."""
+"""Table: the links by name, each for one kind of port."""
+
+from typing import Any
 
 from imud.contracts.link import LinkType
 from imud.contracts.table import Table
 
-LINKS: Table[LinkType] = Table(
+LINKS: Table[LinkType[Any]] = Table(
     "link",
     {
         "uart": "imud.links.uart.link:LINK",
