@@ -33,46 +33,21 @@ class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """Whether it pretends that a device listens."""
 
 
-class MemoryLink:
-    """A `StreamLink` whose far end is the test. Synchronization: the loop's thread only."""
+class MemoryPort:
+    """The part of both links that does not depend on what is delivered. Synchronization: the loop's thread only."""
 
     def __init__(self, settings: MemorySettings) -> None:
         self.title = settings.name
-        self.auto_baud = settings.baud == "auto"
         self.baud: int = 0 if settings.baud == "auto" else settings.baud
         self.writable = settings.writable
-        self.hold_ns = settings.hold_ns
         self.written: list[bytes] = []
         """Every `write`, in order."""
-        self.bauds: list[int] = []
-        """Every `set_baud`, in order."""
         self.counters = KernelCounters()
-        """What `kernel_counters` returns; set it at will."""
+        """What `kernel_counters` returns; a test may set it."""
         self.is_open = False
         self._present = asyncio.Event()
         self._present.set()
-        self._on_data: OnData | None = None
         self._on_end: OnEnd | None = None
-
-    # --- the test's side -----------------------------------------------------------------------------------------
-
-    @property
-    def listening(self) -> bool:
-        """Whether `start` was called and the link did not end since."""
-        return self._on_data is not None
-
-    def feed(self, data: bytes, t_rx_ns: int) -> bool:
-        """Deliver bytes as if read at `t_rx_ns`; False when nobody listens, and then they are lost."""
-        if self._on_data is None:
-            return False
-        self._on_data(data, t_rx_ns)
-        return True
-
-    def end(self, error: LinkError | None = None) -> None:
-        """The link ends by itself: with an error, or None for the regular end."""
-        on_end, self._on_end, self._on_data = self._on_end, None, None
-        if on_end is not None:
-            on_end(error)
 
     def appear(self) -> None:
         """The port is there (as it is in the beginning)."""
@@ -83,7 +58,16 @@ class MemoryLink:
         self._present.clear()
         self.end(LinkMissing(f"{self.title} is gone: the test pulled it out"))
 
-    # --- the StreamLink ------------------------------------------------------------------------------------------
+    def end(self, error: LinkError | None = None) -> None:
+        """The link ends by itself: with an error, or None for the regular end."""
+        on_end, self._on_end = self._on_end, None
+        self._stop()
+        if on_end is not None:
+            on_end(error)
+
+    def absence(self) -> str:
+        """Why the port is not there; empty when it is."""
+        return "" if self._present.is_set() else f"{self.title} is not there: the test pulled it out"
 
     async def wait_present(self) -> None:
         """Return when the port is there."""
@@ -91,21 +75,58 @@ class MemoryLink:
 
     def open(self) -> None:
         """Raises LinkMissing after `disappear`, LinkBusy when it is open already."""
-        if not self._present.is_set():
-            raise LinkMissing(f"{self.title} is not there: the test pulled it out")
+        if reason := self.absence():
+            raise LinkMissing(reason)
         if self.is_open:
             raise LinkBusy(f"{self.title} is open already")
         self.is_open = True
-
-    def start(self, on_data: OnData, on_end: OnEnd) -> None:
-        """Deliver what is fed from now on."""
-        self._on_data, self._on_end = on_data, on_end
 
     def write(self, data: bytes) -> None:
         """Keep the bytes in `written`. Raises LinkError when closed."""
         if not self.is_open:
             raise LinkError(f"{self.title} is not open: nothing can be sent")
         self.written.append(data)
+
+    def kernel_counters(self) -> KernelCounters:
+        """What the test put into `counters`."""
+        return self.counters
+
+    def close(self) -> None:
+        """Stop delivering; may be called twice."""
+        self.is_open = False
+        self._on_end = None
+        self._stop()
+
+    def _stop(self) -> None:
+        """Forget the receiver."""
+
+
+class MemoryLink(MemoryPort):
+    """A `StreamLink` whose far end is the test."""
+
+    def __init__(self, settings: MemorySettings) -> None:
+        super().__init__(settings)
+        self.auto_baud = settings.baud == "auto"
+        self.hold_ns = settings.hold_ns
+        self.bauds: list[int] = []
+        """Every `set_baud`, in order."""
+        self._on_data: OnData | None = None
+
+    @property
+    def listening(self) -> bool:
+        """Whether `start` was called and the link did not end since."""
+        return self._on_data is not None
+
+    def feed(self, data: bytes, t_rx_ns: int) -> bool:
+        """Deliver bytes as if read at `t_rx_ns`; False when the link is not started, and then they are lost."""
+        if self._on_data is None:
+            return False
+        self._on_data(data, t_rx_ns)
+        return True
+
+    def start(self, on_data: OnData, on_end: OnEnd) -> None:
+        """Deliver what is fed from now on."""
+        self._on_data, self._on_end = on_data, on_end
 
     def set_baud(self, baud: int) -> None:
         """Keep the rate in `bauds`. Raises LinkError when closed."""
@@ -114,38 +135,22 @@ class MemoryLink:
         self.bauds.append(baud)
         self.baud = baud
 
-    def kernel_counters(self) -> KernelCounters:
-        """What the test put into `counters`."""
-        return self.counters
-
-    def close(self) -> None:
-        """Nobody listens from now on; may be called twice."""
-        self.is_open = False
-        self._on_data = self._on_end = None
+    def _stop(self) -> None:
+        self._on_data = None
 
 
-class MemoryCanLink:
-    """A `CanLink` whose far end is the test. Synchronization: the loop's thread only."""
+class MemoryCanLink(MemoryPort):
+    """A `CanLink` whose far end is the test."""
 
     def __init__(self, settings: MemorySettings) -> None:
-        self.title = self.bus = settings.name
-        self.writable = settings.writable
+        super().__init__(settings)
+        self.bus = settings.name
+        self.bitrate = self.baud
         self.filters: Sequence[CanFilter] = ()
         self.cyclic: Sequence[CyclicFrame] = ()
         """What `send_cyclic` was given; empty when closed."""
-        self.bitrate: int = 0 if settings.baud == "auto" else settings.baud
-        self.written: list[bytes] = []
-        """Every `write`, in order."""
-        self.counters = KernelCounters()
-        """What `kernel_counters` returns; set it at will."""
-        self.is_open = False
-        self._present = asyncio.Event()
-        self._present.set()
         self._on_frames: OnFrames | None = None
         self._on_news: OnBusNews | None = None
-        self._on_end: OnEnd | None = None
-
-    # --- the test's side -----------------------------------------------------------------------------------------
 
     @property
     def listening(self) -> bool:
@@ -153,7 +158,7 @@ class MemoryCanLink:
         return self._on_frames is not None
 
     def feed(self, frames: Sequence[CanFrame]) -> bool:
-        """Deliver those frames that pass the filters; False when nobody listens, and then they are lost."""
+        """Deliver those frames that pass the filters; False when the link is not started, and then they are lost."""
         if self._on_frames is None:
             return False
         passed = [f for f in frames if any(wanted.takes(f.can_id, f.extended) for wanted in self.filters)]
@@ -166,34 +171,9 @@ class MemoryCanLink:
         assert self._on_news is not None
         self._on_news(news, problem)
 
-    def appear(self) -> None:
-        """The bus is there (as it is in the beginning)."""
-        self._present.set()
-
-    def disappear(self) -> None:
-        """The bus goes down: `wait_present` waits, and a running link ends with LinkMissing."""
-        self._present.clear()
-        on_end, self._on_end, self._on_frames = self._on_end, None, None
-        if on_end is not None:
-            on_end(LinkMissing(f"{self.title} was taken down by the test"))
-
-    # --- the CanLink ---------------------------------------------------------------------------------------------
-
     def absence(self) -> str:
         """Why the bus is not there; empty when it is."""
-        return "" if self._present.is_set() else f"{self.title} is down: the test took it down"
-
-    async def wait_present(self) -> None:
-        """Return when the bus is there."""
-        await self._present.wait()
-
-    def open(self) -> None:
-        """Raises LinkMissing after `disappear`, LinkBusy when it is open already."""
-        if reason := self.absence():
-            raise LinkMissing(reason)
-        if self.is_open:
-            raise LinkBusy(f"{self.title} is open already")
-        self.is_open = True
+        return f"{self.title} is down: the test took it down" if super().absence() else ""
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Deliver what is fed from now on."""
@@ -205,21 +185,13 @@ class MemoryCanLink:
             raise LinkError(f"{self.title} is not open: nothing can be sent")
         self.cyclic = frames
 
-    def write(self, data: bytes) -> None:
-        """Keep the frames in `written`. Raises LinkError when closed."""
-        if not self.is_open:
-            raise LinkError(f"{self.title} is not open: nothing can be sent")
-        self.written.append(data)
-
-    def kernel_counters(self) -> KernelCounters:
-        """What the test put into `counters`."""
-        return self.counters
-
     def close(self) -> None:
-        """Nobody listens from now on; may be called twice."""
-        self.is_open = False
+        """Stop delivering and sending; may be called twice."""
+        super().close()
         self.cyclic = ()
-        self._on_frames = self._on_news = self._on_end = None
+
+    def _stop(self) -> None:
+        self._on_frames = self._on_news = None
 
 
 LINK = LinkType("memory", MemorySettings, MemoryLink, MemoryCanLink)
