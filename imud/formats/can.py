@@ -13,17 +13,17 @@ DATA_BYTES_MAX: Final = 8
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFF_FFFF
 EXTENDED_FLAG: Final = 0x8000_0000
-"""In the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)."""
+"""Flag in the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)."""
 REMOTE_FLAG: Final = 0x4000_0000
-"""The same: a request without data (CAN_RTR_FLAG)."""
+"""Flag there: a remote frame, without data (CAN_RTR_FLAG)."""
 ERROR_FLAG: Final = 0x2000_0000
-"""The same: news of the controller, no frame of the bus (CAN_ERR_FLAG)."""
+"""Flag there: an error frame of the controller, no frame of the bus (CAN_ERR_FLAG)."""
 
 RAW_FRAME: Final = struct.Struct("=IB3x8s")
 """`struct can_frame` in the machine's byte order: identifier with flags, length, data."""
 STANDARD_OVERHEAD_BITS, EXTENDED_OVERHEAD_BITS = 47, 67
-"""Bits of a frame besides its data, the pause of three bits behind it included, stuff bits not (ISO 11898-1): with an
-identifier of 11 bits, and of 29."""
+"""Bits of a frame without its data and stuff bits, with the interframe space of three bits (ISO 11898-1), for
+identifiers of 11 and of 29 bits."""
 
 
 class CanFrame(NamedTuple):
@@ -35,7 +35,7 @@ class CanFrame(NamedTuple):
     """Whether the identifier has 29 bits."""
     data: bytes
     t_rx_ns: int
-    """CLOCK_MONOTONIC of its arrival: when the kernel had it, where the kernel says so."""
+    """CLOCK_MONOTONIC of its arrival, ns: the kernel's time stamp where there is one."""
     after_loss: bool = False
     """Whether frames are known to be missing right before it."""
 
@@ -49,15 +49,16 @@ class CanFilter:
     extended: bool
 
     def takes(self, can_id: int, extended: bool) -> bool:
-        """Whether a frame passes."""
+        """Whether a frame passes the filter."""
         return extended == self.extended and not (can_id ^ self.can_id) & self.mask
 
 
 @dataclass(frozen=True, slots=True)
 class CyclicFrame:
-    """A frame that a bus must carry again and again for its devices to work (CANopen SYNC, say); imud sends it.
+    """A frame that imud sends at a fixed period because devices need it, such as CANopen SYNC.
 
-    One device of a bus has it sent for all of them: a second one with a frame of the same identifier is refused."""
+    One device of a bus has it sent for all of them: a second one with a frame of the same identifier is refused.
+    """
 
     can_id: int
     extended: bool
@@ -67,12 +68,12 @@ class CyclicFrame:
 
 
 def frame_bits(extended: bool, data_bytes: int) -> int:
-    """Shortest time of a frame on the wire, pause included, in bits; stuff bits make it up to 22 % longer."""
+    """Length of a frame on the wire in bits, interframe space included; stuff bits make it up to 22 % longer."""
     return (EXTENDED_OVERHEAD_BITS if extended else STANDARD_OVERHEAD_BITS) + 8 * data_bytes
 
 
 def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:
-    """A frame as `struct can_frame`. Raises ValueError for an identifier or a length that no frame can have."""
+    """A frame as `struct can_frame`. Raises ValueError for an identifier or a length out of range."""
     if not 0 <= can_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) or len(data) > DATA_BYTES_MAX:
         raise ValueError(f"no CAN frame: identifier {can_id:#x}{' (29 bits)' * extended}, {len(data)} data bytes")
     return RAW_FRAME.pack(can_id | EXTENDED_FLAG if extended else can_id, len(data), data)

@@ -3,8 +3,9 @@
     (1763717507.123456) can0 065#0000803F00000040
      time s              bus  identifier, 3 hex digits (11 bits) or 8 (29 bits), # data
 
-What is no classical data frame is passed over and counted: remote frames (`#R`), CAN FD (`##`), error frames (bit 29 of
-the identifier). A direction mark (`R`, `T`) after the data and a raw length code (`_9`) after eight bytes are accepted.
+Lines that are not classical data frames are skipped and counted: remote frames (`#R`), CAN FD (`##`), error frames
+(bit 29 of the identifier). A direction mark (`R`, `T`) after the data and a raw length code (`_9`) after eight bytes
+are accepted.
 """
 
 import re
@@ -38,7 +39,7 @@ class CandumpReader:
 
     @property
     def problem(self) -> str:
-        """After iterating: what is wrong with the file, one sentence; empty when nothing is."""
+        """After iterating: the fault of the file, one sentence; empty when it has none."""
         if not self.bad_lines:
             return ""
         return f"{self.bad_lines} lines are none of a candump log (candump -L), the first is line {self.first_bad}"

@@ -5,9 +5,9 @@
     | priority| EDP | DP | PF            | PS          | source   |
     +---------+-----+----+---------------+-------------+----------+
 
-PF below 240 (PDU1): PS is the address of the one that the message is for, and no part of its number. From 240 on (PDU2)
-PS is part of the number, and the message is for all. The parameter group number (PGN) is EDP, DP, PF, PS. Priority only
-decides who goes first on the bus: on reception it means nothing.
+PF below 240 (PDU1): PS is the destination address, and no part of the number. From 240 on (PDU2) PS is part of the
+number, and the message is a broadcast. The parameter group number (PGN) is EDP, DP, PF, PS. Priority only decides the
+arbitration on the bus; receivers ignore it.
 """
 
 from collections.abc import Container
@@ -16,15 +16,15 @@ from typing import Final, NamedTuple
 from imud.formats.can import DATA_BYTES_MAX, CanFilter
 
 GLOBAL: Final = 0xFF
-"""Destination of what is for all."""
+"""Destination address of broadcasts."""
 ADDRESS_MAX: Final = 253
-"""Of a node; 254 is the address of those that have none."""
+"""Highest address of a node; 254 is the null address, of nodes that have none."""
 PDU2_MIN: Final = 240
-"""First PF of messages for all."""
+"""First PF of broadcasts."""
 PRIORITY_MAX: Final = 7
 PGN_MAX: Final = 0x3_FFFF
 WITHOUT_PRIORITY: Final = 0x03FF_FFFF
-"""The bits of an identifier that tell messages apart."""
+"""Mask of an identifier without its priority, which distinguishes no messages."""
 _WITHOUT_SOURCE: Final = WITHOUT_PRIORITY & ~0xFF
 
 
@@ -32,7 +32,7 @@ class J1939Id(NamedTuple):
     """An identifier, split."""
 
     priority: int
-    """0 goes first, 7 last."""
+    """0 is the highest, 7 the lowest."""
     pgn: int
     """Its low byte is 0 where a destination stands in the identifier."""
     source: int
@@ -48,7 +48,7 @@ def split(can_id: int) -> J1939Id:
 
 
 def join(parts: J1939Id) -> int:
-    """The identifier. Raises ValueError for what none can say, such as a destination for a message for all."""
+    """The identifier. Raises ValueError for parts out of range, or a destination with a PDU2 number."""
     priority, pgn, source, destination = parts
     is_for_one = pgn >> 8 & 0xFF < PDU2_MIN
     if not (0 <= priority <= PRIORITY_MAX and 0 <= pgn <= PGN_MAX and 0 <= source <= 0xFF and 0 <= destination <= 0xFF):

@@ -4,7 +4,7 @@
     reply     address | function | data … | CRC low | CRC high        exception  address | function + 0x80 | code | CRC
 
 Source: "MODBUS over Serial Line" V1.02, chapter 2.5, and "MODBUS Application Protocol" V1.1b3, chapters 6 and 7. A
-frame has no sync word and no end mark: what it is follows from what was asked, and from the silence around it.
+frame has no sync word and no end mark: its meaning follows from the request, and from the silence around it.
 """
 
 from typing import Final
@@ -23,7 +23,7 @@ ADU_BYTES_MAX: Final = 256
 REGISTERS_MAX: Final = 125
 """Most registers in one read: 250 bytes."""
 BROADCAST: Final = 0
-"""Address that all slaves obey and none answers."""
+"""Address of all slaves; none replies."""
 SLAVES: Final = range(1, 248)
 """Addresses of slaves."""
 
@@ -42,7 +42,7 @@ EXCEPTIONS: Final = {
     6: "the device is busy",
     8: "its memory has a parity error",
 }
-"""What a slave says instead of a reply."""
+"""Meaning of the exception codes ("MODBUS Application Protocol" V1.1b3, chapter 7)."""
 
 
 def crc16_modbus(data: bytes) -> int:
@@ -67,7 +67,7 @@ _CRC_TABLE: Final = tuple(map(_crc_of, range(256)))
 
 
 def framed(address: int, request: bytes) -> bytes:
-    """A whole frame of function and data."""
+    """The whole frame for a request: address, function and data, CRC."""
     frame = bytes([address]) + request
     return frame + crc16_modbus(frame).to_bytes(CRC_BYTES, "little")
 
@@ -78,37 +78,37 @@ def is_whole(frame: bytes) -> bool:
 
 
 def is_exception(frame: bytes) -> bool:
-    """Whether a frame says why there is no reply; its code is `frame[2]`."""
+    """Whether a frame is an exception response with a correct CRC; its code is `frame[2]`."""
     return len(frame) == EXCEPTION_BYTES and frame[1] & EXCEPTION_BIT != 0 and is_whole(frame)
 
 
 def exception_text(code: int) -> str:
-    """An exception in words."""
+    """Text of an exception code."""
     return f"exception {code}: {EXCEPTIONS.get(code, 'no meaning known')}"
 
 
 def frame_gap_ns(baud: int) -> int:
-    """Silence that ends a frame."""
+    """Silence that ends a frame, ns ("MODBUS over Serial Line" V1.02, 2.5.1.1)."""
     return FAST_GAP_NS if baud > FAST_BAUD else round(FRAME_GAP_CHARACTERS * uart_byte_ns(baud))
 
 
 class ReplyFinder:
-    """Finds the reply to one request in what comes back, without I/O.
+    """Finds the reply to one request among the received bytes, without I/O.
 
-    A frame that stands first and looks like the reply is it, damaged or not: who asked counts damage. After bytes that
-    belong to something else only a frame with a matching CRC is believed. `feed` all that is read; ask `rest` at the
-    end of waiting.
+    A frame at the beginning with the head of the reply is the reply, damaged or not: the caller counts damage. After
+    other bytes only a frame with a matching CRC is accepted. `feed` all that is read; `rest` has what is left when the
+    time is over.
     """
 
     def __init__(self, request: bytes, reply_bytes: int, *, echoes: bool | None) -> None:
-        """`request` is the whole frame; `echoes`: whether the port hears what it sends, None for not known.
+        """`request` is the whole frame; `echoes`: whether the port receives what it sends, None if unknown.
 
         Where it is not known, the request must be no WRITE_SINGLE, whose reply is the same as an echo.
         """
         self.echo_seen: bool | None = None
-        """Whether the request came back; None while that is open."""
+        """Whether the echo of the request was received; None while that is undecided."""
         self.strange = 0
-        """Bytes that were neither echo nor reply."""
+        """Number of bytes that were neither echo nor reply."""
         self._request = request
         self._size = reply_bytes
         self._expects_echo = echoes
@@ -116,7 +116,7 @@ class ReplyFinder:
 
     @property
     def missing(self) -> int:
-        """How many bytes are still to come at least."""
+        """Least number of bytes that are still to come."""
         may_be_echo = self.echo_seen is None and self._expects_echo is not False
         may_be_short = may_be_echo or self._data[1:2] in (b"", self._error_function)
         size = min(EXCEPTION_BYTES, self._size) if may_be_short else self._size
@@ -125,26 +125,26 @@ class ReplyFinder:
         return max(1, size - len(self._data))
 
     def feed(self, data: bytes) -> bytes | None:
-        """Take bytes; return the reply once it is there."""
+        """Add received bytes; return the reply once it is complete."""
         self._data += data
-        if self.echo_seen is None and self._expects_echo is not False and not self._take_echo():
+        if self.echo_seen is None and self._expects_echo is not False and not self._skip_echo():
             return None
         return self._find()
 
     def rest(self) -> bytes:
-        """What came and is no reply. If it has the size of one and is damaged, it may have been."""
+        """The bytes after the last reply; of the size of a reply they may be one that was damaged."""
         return self._data
 
     @property
     def looks_damaged(self) -> bool:
-        """Whether `rest` is a reply whose first bytes were hit."""
+        """Whether `rest` has the size of a reply, and a wrong CRC."""
         return len(self._data) == self._size and not self.strange and not is_whole(self._data)
 
     @property
     def _error_function(self) -> bytes:
         return bytes([self._request[1] | EXCEPTION_BIT])
 
-    def _take_echo(self) -> bool:
+    def _skip_echo(self) -> bool:
         """Skip the echo; False while it may still be coming."""
         request, data = self._request, self._data
         if data.startswith(request):

@@ -1,4 +1,4 @@
-"""RMC sentences of NMEA 0183: the date and time that a GNSS receiver tells, as `$GPRMC` or `$GNRMC`.
+"""RMC sentences of NMEA 0183: date and time of a GNSS receiver, as `$GPRMC` or `$GNRMC`.
 
     $GPRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,A*57<CR><LF>
      |   | |         |                                        |        | |
@@ -30,7 +30,7 @@ _STATUS, _DAY, _MODE = 1, 8, 11  # numbers of the fields after the time
 
 
 class RmcFault(StrEnum):
-    """Why bytes are no usable sentence."""
+    """Why bytes are not a usable sentence."""
 
     LENGTH = "length"
     """Longer than SENTENCE_BYTES_MAX."""
@@ -43,14 +43,14 @@ class RmcFault(StrEnum):
 
 
 class Rmc(NamedTuple):
-    """What a sentence says."""
+    """The date and time of a sentence."""
 
     unix_s: int
     """The second it names, since 1970-01-01."""
     fraction_ns: int
     """Rest of its time, 0 … 999 999 999."""
     valid: bool
-    """Whether the receiver stands by it: status A, and not without a fix."""
+    """Whether the receiver reports a fix: status A, and mode not N."""
     leap: bool = False
     """Whether the second is a leap second (60); `unix_s` is then that of the second after."""
 
@@ -61,7 +61,7 @@ class Rmc(NamedTuple):
 
 
 def parse(sentence: bytes) -> Rmc | RmcFault:
-    """Take a sentence apart, with or without its line end. Never raises, whatever the bytes."""
+    """Decode a sentence, with or without its line end. Returns the fault of any other bytes; never raises."""
     if len(sentence) > SENTENCE_BYTES_MAX:
         return RmcFault.LENGTH
     match = _SENTENCE.fullmatch(sentence)
@@ -76,7 +76,7 @@ def parse(sentence: bytes) -> Rmc | RmcFault:
 def build(utc_ns: int, *, valid: bool = True) -> bytes:
     """A `$GPRMC` sentence for an instant (ns since 1970-01-01, from 1980 to 2079), truncated to hundredths of a second.
 
-    It is made to tell time: the position is 0° N 0° E. Raises ValueError outside those years.
+    For time only: the position is 0° N 0° E. Raises ValueError outside those years.
     """
     unix_s, rest_ns = divmod(utc_ns, NS_PER_S)
     at = gmtime(unix_s)
@@ -92,7 +92,7 @@ def build(utc_ns: int, *, valid: bool = True) -> bytes:
 def as_gprmc(sentence: bytes) -> bytes:
     """A well-formed RMC sentence of any talker as `$GPRMC` with its line end, for devices that know no other talker.
 
-    Raises ValueError for what `parse` does not take.
+    Raises ValueError for bytes that `parse` refuses.
     """
     match = _SENTENCE.fullmatch(sentence)
     if match is None or isinstance(parse(sentence), RmcFault):

@@ -1,7 +1,7 @@
 """Device nodes in /dev: waiting for one, and what a failed open or transfer means as errors of imud.
 
-A node is missing until its driver makes it, and refused until udev sets its group. What people are told of it (its
-group, the processes that have it open) is read from the file system and /proc.
+A node is missing until its driver makes it, and refused until udev sets its group. Messages name its group and the
+processes that have it open, read from the file system and /proc.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ HELD: Final = frozenset({errno.EBUSY, errno.EAGAIN})
 GONE: Final = frozenset({errno.ENOENT, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN, errno.EBADF})
 """Errors of a transfer after the adapter was removed."""
 NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
-"""Documentation/i2c/fault-codes.rst has ENXIO; the Raspberry Pi's controller says EREMOTEIO."""
+"""Documentation/i2c/fault-codes.rst has ENXIO; the Raspberry Pi's controller returns EREMOTEIO."""
 STUCK: Final = frozenset({errno.ETIMEDOUT})
 
 ACCESS_WAIT_S: Final = 1.0

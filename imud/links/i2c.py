@@ -38,7 +38,7 @@ class I2cSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class I2cBus(Protocol):
-    """What is used of smbus2.SMBus."""
+    """The part of smbus2.SMBus that the link uses."""
 
     @property
     def fd(self) -> int | None:
@@ -99,12 +99,12 @@ class I2cLink:
             self._open()
 
     def select(self, target: int) -> None:
-        """Speak to a 7-bit address."""
+        """Address the next transfers, 7 bits."""
         self._address = target
         self._place = self.place(target)
 
     def place(self, target: int) -> str:
-        """An address for people."""
+        """An address in messages."""
         return f"address {target:#04x}"
 
     def transfer(self, transfer: Transfer) -> bytes:

@@ -59,7 +59,7 @@ class DirectoryWatch:
         os.read(self._fd, EVENT_BUFFER_BYTES)
 
     def close(self) -> None:
-        """Release the descriptor; may be called twice. Done in a thread: the kernel takes 8 ms and more for it."""
+        """Release the descriptor; may be called twice. A thread does it: the kernel needs 8 ms and more."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             asyncio.get_running_loop().run_in_executor(None, os.close, fd)

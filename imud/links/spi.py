@@ -95,7 +95,7 @@ class SpiLink:
             raise LinkError(f"{self.title} cannot do mode {target}: {os.strerror(error.errno or 0)}") from error
 
     def place(self, target: int) -> str:
-        """A mode for people."""
+        """A mode in messages."""
         return f"mode {target}"
 
     def transfer(self, transfer: Transfer) -> bytes:

@@ -97,7 +97,7 @@ def test_reply_with_a_damaged_head_may_have_been_one_but_another_module_may_not(
     assert not found.looks_damaged
 
 
-def test_confirmation_is_told_from_the_echo() -> None:
+def test_confirmation_is_distinguished_from_the_echo() -> None:
     write = framed(5, bytes.fromhex("06 0006 0001"))
     found = finder(True, write, len(write))
     assert found.feed(write) is None

@@ -13,7 +13,7 @@ from imud.links.memory import MemoryLink, MemorySettings
 
 
 class Listener:
-    """Keeps what it is told."""
+    """Keeps what it receives."""
 
     def __init__(self) -> None:
         self.chunks: list[tuple[bytes, int]] = []
@@ -53,7 +53,7 @@ def test_writes_and_rates_are_kept() -> None:
     assert link.kernel_counters().overrun == 3
 
 
-def test_the_end_is_told_once() -> None:
+def test_the_end_is_reported_once() -> None:
     link, listener = opened()
     link.end(None)
     link.end(LinkError("late"))

@@ -50,7 +50,7 @@ def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0
                     select.select([node.fileno()], [], [], wait_s)
                 else:
                     ended.wait(min(wait_s, 0.002))
-        except BaseException as error:  # noqa: BLE001 - told to the test below
+        except BaseException as error:  # noqa: BLE001 - reported to the test below
             failed.append(error)
 
     thread = threading.Thread(target=run, name="line", daemon=True)

@@ -45,7 +45,7 @@ class BusState:
     """The state of one interface's controller, with counts of its error-passive and bus-off states."""
 
     def __init__(self, name: str, state: int | None = None) -> None:
-        """`state` as the kernel numbers it; None where it says none (virtual interfaces)."""
+        """`state` as the kernel numbers it; None where it reports none (virtual interfaces)."""
         self._name = name
         known = state is not None and state in ControllerState.__members__.values()
         self.state = ControllerState(state) if known else ControllerState.ACTIVE  # type: ignore[arg-type]  # not None

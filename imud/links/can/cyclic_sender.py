@@ -1,10 +1,10 @@
-"""Frames that are sent again and again: by the kernel's broadcast manager, or by the event loop where there is none.
+"""Cyclic frames: sent by the kernel's broadcast manager, or by the event loop where there is none.
 
-The broadcast manager (CAN_BCM, linux/can/bcm.h) sends from a high-resolution timer of the kernel, whatever this process
-does meanwhile, and stops when its socket closes. It sets the timer anew each time, so that a period is longer by the
+The broadcast manager (CAN_BCM, linux/can/bcm.h) sends from a high-resolution timer of the kernel, independent of this
+process, and stops when its socket closes. It sets the timer anew each time, so that a period is longer by the
 latency of the interrupt: microseconds on a real machine (0.25 ms of 10 ms in the lab's emulated one). The event loop's
-timer has absolute deadlines, so that its error does not add up, but it waits for whatever else the process does;
-periods that it slept through are left out.
+timer has absolute deadlines, so that its error does not add up, but a busy process delays it;
+periods that it missed are left out.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ TX_SETUP: Final = 1
 SETTIMER: Final = 0x0001
 """Flag: the intervals in this message hold."""
 STARTTIMER: Final = 0x0002
-"""Flag: begin now, with a frame sent at once."""
+"""Flag: start now, with a frame sent at once."""
 NO_MANAGER: Final = frozenset({errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT, errno.EAFNOSUPPORT})
 """Errors of a kernel without CAN_BCM."""
 
@@ -35,7 +35,7 @@ _PAD: Final = bytes(-_HEAD.size % 8)
 
 
 class Sender(Protocol):
-    """Something that sends until it is closed."""
+    """Sends cyclic frames until it is closed."""
 
     def close(self) -> None:
         """Stop; may be called twice."""
@@ -43,7 +43,7 @@ class Sender(Protocol):
 
 
 def setup(frame: CyclicFrame) -> bytes:
-    """The message that has a frame sent until the socket closes."""
+    """The TX_SETUP message for a frame, which is sent until the socket closes."""
     seconds, rest_ns = divmod(frame.every_ns, NS_PER_S)
     can_id = frame.can_id | EXTENDED_FLAG * frame.extended
     head = _HEAD.pack(TX_SETUP, SETTIMER | STARTTIMER, 0, 0, 0, seconds, rest_ns // NS_PER_US, can_id, 1)
@@ -54,7 +54,7 @@ class KernelSender:
     """Frames sent by the broadcast manager on one interface."""
 
     def __init__(self, interface: str, frames: Sequence[CyclicFrame]) -> None:
-        """Begins at once. Raises OSError, one of NO_MANAGER when the kernel has none."""
+        """Starts at once. Raises OSError, one of NO_MANAGER when the kernel has none."""
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, socket.CAN_BCM)
         try:
             self._socket.connect((interface,))
@@ -79,7 +79,7 @@ class LoopSender:
         frames: Sequence[CyclicFrame],
         now_ns: Callable[[], int] = monotonic_ns,
     ) -> None:
-        """Begins at once; `on_error` is told what `write` raises, and then this has stopped. Raises LinkError."""
+        """Starts at once. An error of a later `write` stops it and goes to `on_error`. Raises LinkError."""
         self._write = write
         self._on_error = on_error
         self._now_ns = now_ns

@@ -154,7 +154,7 @@ class SocketCanLink:
         self._reader = FrameReader(self._socket, self._on_error_frame)
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
-        """Deliver frames from now on; a bus that is in trouble already says so at once."""
+        """Deliver frames from now on; a present problem of the bus is reported at once."""
         assert self._socket is not None
         self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
         self._loop = asyncio.get_running_loop()
@@ -211,7 +211,7 @@ class SocketCanLink:
             sender.close()
 
     def _read(self) -> int:
-        """One batch, and how many frames it had; what is left makes the loop call again. -1 when the bus ended."""
+        """Read one batch; returns its number of frames, -1 when the bus ended. The loop calls again for the rest."""
         assert self._reader is not None
         try:
             frames = self._reader.read()
@@ -223,7 +223,7 @@ class SocketCanLink:
         return len(frames)
 
     def _read_coalescing(self) -> None:
-        """A batch; when it took all, read again after `coalesce_ms`. A bus without frames is watched again."""
+        """A batch; when it emptied the queue, read again after `coalesce_ms`. A bus without frames is watched again."""
         loop, opened = self._loop, self._socket
         count = self._read()
         if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed

@@ -1,4 +1,4 @@
-"""Network interfaces by rtnetlink(7): waits for changes without polling, and asks what the kernel knows of one."""
+"""Network interfaces by rtnetlink(7): waiting for changes without polling; bit rate and state of a CAN interface."""
 
 import asyncio
 import socket
@@ -32,7 +32,7 @@ _ATTRIBUTE: Final = struct.Struct("=HH")
 
 
 class CanDetails(NamedTuple):
-    """What the driver of a CAN interface says; None where it says nothing (virtual interfaces)."""
+    """Settings and state that the driver of a CAN interface reports; None where it reports none (virtual ones)."""
 
     bitrate: int | None
     """Bit rate of the bus, bit/s."""
@@ -64,7 +64,7 @@ def can_interfaces(sys: Path = SYS, *, down: bool = False) -> list[str]:
 
 
 async def wait_until(holds: Callable[[], bool]) -> None:
-    """Return when `holds()` is true; it is looked at again after every change of any interface."""
+    """Return when `holds()` is true; it is evaluated again after every change of any interface."""
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.NETLINK_ROUTE) as news:
         news.bind((0, RTMGRP_LINK))
         changed = asyncio.Event()
@@ -80,7 +80,7 @@ async def wait_until(holds: Callable[[], bool]) -> None:
 
 
 def _drain(news: socket.socket) -> None:
-    """Forget what came: only that something did matters. News that did not fit the buffer (ENOBUFS) are news, too."""
+    """Discard the messages: only that there were some matters, also those that overran the buffer (ENOBUFS)."""
     while True:
         try:
             news.recv(NEWS_BYTES)

@@ -1,7 +1,7 @@
-"""A CAN bus through python-can, for what is no network interface: serial adapters, vendors' drivers, `virtual`.
+"""A CAN bus through python-can, for adapters without a network interface: serial ones, vendors' drivers, `virtual`.
 
-A thread receives and hands frames to the event loop in batches. Its stamps are taken when python-can returns a frame:
-what an adapter says of its own clock has no common meaning.
+A thread receives frames and hands them to the event loop in batches. A frame's time stamp is the moment python-can
+returns it: the stamps of adapters have no common time base.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from imud.formats.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilte
 from imud.links.can.cyclic_sender import LoopSender
 
 LOOK_S: Final = 0.05
-"""How long the thread waits for a frame before it looks whether it is to end."""
+"""How long the thread waits for a frame before it checks whether it is to end."""
 BATCH_FRAMES: Final = 64
 
 
@@ -52,14 +52,14 @@ class PythonCanLink:
             self._bus.set_filters(_as_python_can(filters))
 
     def absence(self) -> str:
-        """Nobody says before it is opened."""
+        """Empty: unknown before the bus is opened."""
         return ""
 
     async def wait_present(self) -> None:
         """Return at once."""
 
     def open(self) -> None:
-        """Open the bus. Raises LinkError with what python-can says."""
+        """Open the bus. Raises LinkError with the message of python-can."""
         filters = _as_python_can(self._filters)
         rate: dict[str, Any] = {"bitrate": self.bitrate} if self.bitrate else {}
         try:
@@ -68,7 +68,7 @@ class PythonCanLink:
             raise LinkError(f"{self.title} cannot be opened: {error}") from error
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
-        """Deliver frames from now on; this kind of bus tells no news."""
+        """Deliver frames from now on; python-can reports no changes of the bus state."""
         assert self._bus is not None
         self._on_end = on_end
         self._stop = threading.Event()
@@ -93,14 +93,14 @@ class PythonCanLink:
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
         """Send these from the event loop; the link ends when one cannot be sent. Raises LinkError.
 
-        python-can's own `send_periodic` needs a thread for each frame and tells nobody when it fails.
+        python-can's own `send_periodic` needs a thread for each frame and does not report failures.
         """
         if self._sender is not None:
             self._sender.close()
         self._sender = LoopSender(self.write, self._failed, frames)
 
     def kernel_counters(self) -> KernelCounters:
-        """python-can counts nothing."""
+        """Zeros: python-can counts no errors."""
         return KernelCounters()
 
     def close(self) -> None:

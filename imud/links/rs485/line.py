@@ -1,10 +1,10 @@
 """One RS-485 line: a serial port opened once for all devices on it, its direction control, requests and replies.
 
-    silence ▸ request ▸ (echo) ▸ silence, thinking ▸ reply ▸ silence …
+    silence ▸ request ▸ (echo) ▸ silence ▸ reply ▸ silence …
 
 One request is under way at a time. The silence between frames is kept, counted from when the last byte was read. A
-module that did not answer in time owes a reply: before it is asked anything else it is asked for one register, whose
-reply has another length than the one owed, so that an answer to the old question is never mistaken for one to the new.
+module that did not reply in time owes a reply: before its next request one register is read, whose reply has another
+length than the one owed, so that a late reply is never mistaken for the one to the new request.
 
 The transmitter is switched by the kernel's driver with RTS (TIOCSRS485, Documentation/driver-api/serial/
 serial-rs485.rst), or by the adapter: drivers without that ioctl, USB adapters and ptys among them, say ENOTTY.
@@ -42,9 +42,9 @@ from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 READ_BYTES: Final = 4096
 BROADCAST_NS: Final = 100 * NS_PER_MS
-"""Pause after a request to all: "MODBUS over Serial Line" 2.4.1 gives 100 to 200 ms."""
+"""Pause after a broadcast: "MODBUS over Serial Line" 2.4.1 gives 100 to 200 ms."""
 ASLEEP_SHARE: Final = 0.9
-"""How much of the time that missing bytes need at least is slept through: fewer wake-ups, none late."""
+"""Share of the wire time of the missing bytes that is slept: fewer wake-ups, none late."""
 TIOCGRS485: Final = 0x542E
 TIOCSRS485: Final = 0x542F
 SERIAL_RS485: Final = struct.Struct("8I")
@@ -101,17 +101,17 @@ class PortSetup(NamedTuple):
 
 
 class LineCounters:
-    """What was heard on a line besides replies, in bytes unless said otherwise."""
+    """Traffic on a line other than replies, in bytes unless stated otherwise."""
 
     __slots__ = ("echoed", "late", "strange", "timeouts")
 
     def __init__(self) -> None:
         self.echoed = 0
-        """Requests that came back as an echo."""
+        """Requests whose echo was received."""
         self.late = 0
-        """Came when nothing was asked."""
+        """Received while no request was pending."""
         self.strange = 0
-        """Came before a reply, or instead of it."""
+        """Received before a reply, or in place of one."""
         self.timeouts = 0
         """Requests without a reply."""
 
@@ -162,9 +162,9 @@ class Rs485Line:
                 port.close()
 
     def transfer(self, target: int, request: bytes, reply_bytes: int, reply_ns: int) -> bytes:
-        """Ask and return the whole reply, damaged or not, or an exception. Raises TransferError, LinkError.
+        """Return the whole reply to a request, damaged or not, or an exception. Raises TransferError, LinkError.
 
-        `reply_ns` is how long the module may think.
+        `reply_ns` is the module's time to begin its reply.
         """
         if self._port is None:
             raise LinkError(f"{self._path} is not open")
@@ -179,7 +179,7 @@ class Rs485Line:
         return self._ask(target, request, reply_bytes, reply_ns)
 
     def _settle(self, target: int, owed: bytes, reply_ns: int) -> None:
-        """Ask for so few registers that the reply differs in length from the one owed; what came before is old."""
+        """Read so few registers that the reply differs in length from the one owed, which may come before it."""
         first, count = owed[1:3], owed[3:5]
         few = 2 if owed[0] == READ_HOLDING and count == b"\0\1" else 1
         request = bytes([READ_HOLDING]) + first + few.to_bytes(2, "big")
@@ -205,7 +205,7 @@ class Rs485Line:
         return reply
 
     def _wait(self, finder: ReplyFinder, deadline_ns: int) -> bytes | None:
-        """Read until the reply is there or the time is over."""
+        """Read until the reply is complete or the deadline has passed."""
         while (left_ns := deadline_ns - self._now_ns()) > 0:
             if not self._poll.poll(left_ns / NS_PER_MS):
                 break
@@ -248,7 +248,7 @@ class Rs485Line:
         self._quiet_ns = self._now_ns() + len(frame) * self._byte_ns
 
     def _await_silence(self) -> None:
-        """Return when the line was silent for a gap; what came meanwhile belongs to nobody."""
+        """Return when the line was silent for a frame gap; bytes received until then are counted as late."""
         limit_ns = self._now_ns() + 2 * ADU_BYTES_MAX * self._byte_ns + self._gap_ns
         while True:
             late = len(self._read())
@@ -261,7 +261,7 @@ class Rs485Line:
             self._sleep_until(self._quiet_ns + self._gap_ns)
 
     def _read(self) -> bytes:
-        """What is there now. Raises LinkMissing when the port is gone."""
+        """The bytes received so far. Raises LinkMissing when the port is gone."""
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:

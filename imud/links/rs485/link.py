@@ -65,7 +65,7 @@ class Rs485Link:
 
     @property
     def heard(self) -> LineCounters:
-        """What was heard on the line besides replies since it was opened."""
+        """Bytes other than replies, received on the line since it was opened."""
         return self._line.counters if self._line else LineCounters()
 
     async def wait_present(self) -> None:
@@ -80,15 +80,15 @@ class Rs485Link:
             self._line = self._ports.share(setup, self._sys, self._proc)
 
     def select(self, target: int) -> None:
-        """Speak to an address; 0 is all of them, and nobody answers."""
+        """Address the next transfers; 0 is a broadcast, which has no reply."""
         self._address = target
 
     def place(self, target: int) -> str:
-        """An address for people, as the vendor's documents and programs write it."""
+        """An address in messages, as the vendor's documents and programs write it."""
         return f"address {target}"
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Ask, and return the whole reply, an exception or a damaged reply. Raises TransferError, LinkError."""
+        """Return the whole reply to a request, an exception or a damaged reply. Raises TransferError, LinkError."""
         line, (request,) = self._line, transfer.sends
         if line is None:
             raise LinkError(f"{self.title} is not open")
@@ -107,7 +107,7 @@ class Rs485Link:
         return self._line.counted.read() if self._line else KernelCounters()
 
     def serial_line(self) -> SerialLineCounters:
-        """What was heard on the line besides replies since it was opened, by any of its devices."""
+        """Bytes other than replies, received on the line since it was opened, for any of its devices."""
         heard = self.heard
         return SerialLineCounters(heard.timeouts, heard.late, heard.strange, heard.echoed)
 

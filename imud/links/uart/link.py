@@ -1,7 +1,7 @@
 """A serial port: UART, RS-232, USB adapter or USB virtual port, read inside the event loop.
 
-What was measured to matter at 1 kHz is the number of wake-ups and system calls, so a wake-up is one read of whatever
-is there and one time stamp. With `coalesce_ms` the descriptor is not watched at all while data flows: a timer
+At 1 kHz the cost is the number of wake-ups and system calls (measured), so a wake-up is one read of all that is
+there and one time stamp. With `coalesce_ms` the descriptor is not watched at all while data flows: a timer
 reads it, and only a read that finds nothing goes back to waiting for the descriptor.
 """
 

@@ -1,6 +1,6 @@
-"""Serial ports of this machine that may have a device behind them, found without opening any of them.
+"""Serial ports of this machine that may have a device, found without opening any of them.
 
-Opening a port raises DTR and RTS, which resets some boards; the kernel says in /sys all that is needed here.
+Opening a port raises DTR and RTS, which resets some boards; /sys has all that is needed.
 """
 
 import os

@@ -1,7 +1,7 @@
 """A serial port: opened exclusively and raw, its rate read back, its adapter's latency lowered, its errors counted.
 
 What pyserial leaves undone is done here: TIOCEXCL beside its flock (programs that do not lock are refused too), no
-BRKINT (with it, a break, which is what a wrong baud rate looks like, throws away everything received), no HUPCL (DTR
+BRKINT (with it, a break, which is what a wrong baud rate looks like, discards everything received), no HUPCL (DTR
 stays as it is between close and open, and a board that resets on DTR is left alone), and the rate is read back.
 
 FTDI-like USB adapters send a packet when 62 bytes are there or their latency timer (16 ms as delivered) runs out.
@@ -64,7 +64,7 @@ def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
 
 
 def change_baud(port: serial.Serial, path: str, baud: int, proc: Path) -> None:
-    """Set another rate and throw away what was received at the old one. Raises LinkError if the port cannot do it."""
+    """Set another rate and discard bytes received at the old one. Raises LinkError if the port cannot do it."""
     try:
         port.baudrate = baud
         termios.tcflush(port.fileno(), termios.TCIFLUSH)

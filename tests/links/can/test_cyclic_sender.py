@@ -36,7 +36,7 @@ class Clock:
 
 
 def run(sent_at: list[int], late_ns: list[int], frames: list[CyclicFrame], *, fail_after: int = 1 << 30) -> list[str]:
-    """Send until `late_ns` is used up; the errors that were told."""
+    """Send until `late_ns` is used up; the errors that were reported."""
     clock, errors = Clock(), list[str]()
 
     async def story() -> None:

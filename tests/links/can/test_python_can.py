@@ -33,13 +33,13 @@ def test_frames_pass_the_filters_and_come_in_the_loops_thread() -> None:
         threads: set[threading.Thread] = set()
         done = asyncio.Event()
 
-        def take(frames: Sequence[CanFrame]) -> None:
+        def on_frames(frames: Sequence[CanFrame]) -> None:
             threads.add(threading.current_thread())
             got.extend(frames)
             if len(got) == 2:
                 done.set()
 
-        link.start(take, lambda news, problem: None, lambda error: None)
+        link.start(on_frames, lambda news, problem: None, lambda error: None)
         with can.Bus("pass", "virtual") as far:
             for can_id, extended in ((0x65, False), (0x66, False), (0x65, True), (0x65, False)):
                 far.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1\2"))

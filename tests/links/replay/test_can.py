@@ -43,7 +43,7 @@ def play(link: CanLink, enough: int = 1 << 30) -> tuple[list[CanFrame], list[Lin
         ends: list[LinkError | None] = []
         done = asyncio.Event()
 
-        def take(some: Sequence[CanFrame]) -> None:
+        def on_frames(some: Sequence[CanFrame]) -> None:
             frames.extend(some)
             if len(frames) >= enough:
                 link.close()
@@ -55,7 +55,7 @@ def play(link: CanLink, enough: int = 1 << 30) -> tuple[list[CanFrame], list[Lin
 
         await link.wait_present()
         link.open()
-        link.start(take, lambda news, problem: None, end)
+        link.start(on_frames, lambda news, problem: None, end)
         await asyncio.wait_for(done.wait(), LIMIT_S)
         link.close()
         return frames, ends

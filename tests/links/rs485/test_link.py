@@ -205,7 +205,7 @@ def wait_for(holds: Callable[[], bool]) -> None:
     raise AssertionError("it did not happen")
 
 
-def test_bytes_that_nobody_asked_for_are_thrown_away_and_counted(pty: PtyPort) -> None:
+def test_unrequested_bytes_are_discarded_and_counted(pty: PtyPort) -> None:
     with opened(pty.path, reply_ms=1) as link:
         pty.send(framed(1, b"\x03\x08" + bytes(8)))
         with pytest.raises(TransferError):
@@ -214,14 +214,14 @@ def test_bytes_that_nobody_asked_for_are_thrown_away_and_counted(pty: PtyPort) -
         assert pty.received() == framed(1, SERIAL.sends[0])
 
 
-def test_two_modules_of_one_address_are_told(tmp_path: Path) -> None:
+def test_two_modules_of_one_address_are_detected(tmp_path: Path) -> None:
     """They begin alike, so that their reply has its place, and is damaged."""
     twins = slave(1, serial=0x0F), slave(1, serial=0xF0)
     with wired(tmp_path, *twins) as (path, _), opened(path) as link:
         assert not is_whole(link.transfer(SERIAL))
 
 
-def test_garbage_instead_of_a_reply_is_told(pty: PtyPort) -> None:
+def test_garbage_instead_of_a_reply_is_reported(pty: PtyPort) -> None:
     def babble() -> None:
         select.select([pty.master], [], [], 10)
         pty.send(b"\x81\x00\xfe" * 7)

@@ -119,13 +119,13 @@ def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort
         received = b""
         drained = asyncio.Event()
 
-        def take() -> None:
+        def on_readable() -> None:
             nonlocal received
             received += pty.received()
             if len(received) >= accepted * 1000:
                 drained.set()
 
-        asyncio.get_running_loop().add_reader(pty.master, take)
+        asyncio.get_running_loop().add_reader(pty.master, on_readable)
         await asyncio.wait_for(drained.wait(), LIMIT_S)
         asyncio.get_running_loop().remove_reader(pty.master)
         assert received == b"".join(blocks[:accepted])
@@ -145,13 +145,13 @@ def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
         link.write(b"last")
         everything = asyncio.Event()
 
-        def take() -> None:
+        def on_readable() -> None:
             nonlocal received
             received += pty.received()
             if len(received) >= sent + 4:
                 everything.set()
 
-        asyncio.get_running_loop().add_reader(pty.master, take)
+        asyncio.get_running_loop().add_reader(pty.master, on_readable)
         await asyncio.wait_for(everything.wait(), LIMIT_S)
         asyncio.get_running_loop().remove_reader(pty.master)
         assert received == bytes(sent) + b"last"
