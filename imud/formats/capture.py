@@ -57,11 +57,6 @@ class CaptureReader:
         """Everything in the first line, decoded."""
 
     @property
-    def driver(self) -> str:
-        """Driver named in the first line; empty when none is."""
-        return self.details.get("driver", "")
-
-    @property
     def baud(self) -> int:
         """Rate named in the first line, bit/s; 0 when none is."""
         return self._number("baud")

@@ -50,7 +50,7 @@ def written(**details: str | int) -> bytes:
 
 def test_the_golden_capture_is_read_and_written() -> None:
     reader = CaptureReader(io.BytesIO(GOLDEN))
-    assert (reader.stamped, reader.driver, reader.baud, reader.hold_ns) == (True, "hipnuc-uart", 115200, 0)
+    assert (reader.stamped, reader.details["driver"], reader.baud, reader.hold_ns) == (True, "hipnuc-uart", 115200, 0)
     assert list(reader) == [(258, b"abc"), (259, b"d")]
     assert reader.problem == ""
     assert written() == GOLDEN

@@ -228,7 +228,7 @@ class Rs485Line:
         if rest or finder.strange:
             message = f"no reply from address {target} on {self._path}, but other bytes: {rest[:16].hex(' ')}"
             return TransferError(Trouble.DISTURBED, f"{message}; is the baud rate right, is an address given twice?")
-        # DISTURBED, not ABSENT: one request hit by noise is not answered either, and three of these make a module lost
+        # DISTURBED, not ABSENT: a request hit by noise has no reply either; three in a row mean that the module is lost
         return TransferError(
             Trouble.DISTURBED,
             f"no reply from address {target} on {self._path}: is it powered, are A and B not swapped?",
