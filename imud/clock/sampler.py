@@ -1,58 +1,79 @@
-"""The clock of one device: the only maker of `Sample`. It gives each measurement its place in the host's time.
+"""The clock of one device: the only maker of `Sample`. It dates each measurement in the host's time.
 
-Per message: device time is unwrapped and checked against the host's (`unwrap`, `_believable`), the point (device time,
-arrival less wire time) goes to the lower envelope (`envelope`), and the line of the envelope, less half of the bias
-the link can hide (`arrival`), is the time of measurement; corrections are slewed (`slew`). Until the line has enough
-behind it, and for devices without time, a message is dated by its arrival. Lines beside the data and UTC improve on
-that (`aids`) where there are any; without them they cost a comparison.
+Per message (`SampleClock.sample`, then `_by_device`):
+
+    ticks ─▶ device time (`device_time`) ─┐
+    arrival less wire time ───────────────┴▶ above or below the fit of arrivals (`arrival_fit`)?
+        ├─ the counter was corrected: device time is made even again
+        ├─ the clock jumped: a new fit begins, or time goes on by UTC (`Holdover`)
+        └─ the point is added to the fit
+    time of measurement = fit − half of the bias that the link can hide (`link_delay`) + what is still slewed (`Slew`)
+        └─ edges, a pulse per second and UTC improve on that (`steering`), where there are any
+
+Until the fit is known well enough, and for devices without time, a message is dated by its arrival.
 
 Three rules hold for any input: `t_ns` rises strictly, is never after arrival, and a device clock that jumps starts a
 new fit instead of carrying the stamps along.
 Synchronization: none; one thread.
 """
 
-from math import hypot, sqrt
+from collections.abc import Iterable, Sequence
+from math import hypot
 from typing import Final
 
-from imud.clock.aids import AidingSources
-from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
-from imud.clock.coast import Holdover
-from imud.clock.correction import corrected
-from imud.clock.envelope import SLOPE_HIGHEST, Envelope
-from imud.clock.inputs import LineInputs
-from imud.clock.jump import EARLY_NS, EARLY_SIGMAS, FIRST_EARLY_NS, LATE_NS, Jump
-from imud.clock.number import SampleNumber
-from imud.clock.slew import SETTLED_AFTER_NS, Slew
-from imud.clock.unwrap import DeviceTime
+from imud.clock.arrival_fit import SLOPE_HIGHEST, ArrivalFit
+from imud.clock.device_time import (
+    FIRST_EARLY_NS,
+    JUMP_EARLY_NS,
+    JUMP_EARLY_SIGMAS,
+    JUMP_LATE_NS,
+    DeviceTime,
+    JumpDetector,
+    SampleNumber,
+)
+from imud.clock.intervals import SIGMA_OF_RANGE
+from imud.clock.link_delay import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
+from imud.clock.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
+from imud.contracts.lines import Edge
 from imud.contracts.status import ClockStatus
-from imud.contracts.timing import NO_TIME_BITS, SoutTiming, TimeBits, TriggerTiming
+from imud.contracts.timing import (
+    NO_TIME_BITS,
+    Mark,
+    SoutTiming,
+    TimeBits,
+    TriggerStamp,
+    TriggerTiming,
+    UtcReference,
+)
 from imud.sample import Measurement, Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 
 ENOUGH_POINTS: Final = 8
 ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
 ENOUGH_HOLDS: Final = 20
-"""A line counts once it is laid under so many points, and spans so much time or so many periods of a latency timer."""
-COAST_NS: Final = 16 * NS_PER_S
-"""The same where a known line goes on: a young one swings, and the known one is 0.3 ms off by then at worst."""
+"""A fit is used once it has so many points, and spans so much time or so many periods of a latency timer."""
+HOLDOVER_NS: Final = 16 * NS_PER_S
+"""The same during holdover: a young fit swings, and holdover is 0.3 ms off by then at worst."""
 YOUNG_NS: Final = 32 * NS_PER_S
 YOUNG_FACTOR: Final = 1.5
-"""A corridor this short has not seen the timer's beat, and a stalled read in it weighs more."""
+"""A fit this short has not seen the timer's beat, and a stalled read in it weighs more."""
 T_ERR_MOST: Final = 0xFFFF_FFFF
 """`t_err_ns` is 32 bits wide wherever it is published."""
-SIGMA_OF_RANGE: Final = 1 / sqrt(12)
 WIRE_SLACK: Final = 1.05
 """Messages that follow each other this much faster than the wire can carry them did not come over such a wire."""
 _ARRIVAL: Final = Sync.ARRIVAL
 
 
-class SampleClock(LineInputs):
+class SampleClock:
     """Makes samples of one device's measurements.
 
     `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
     known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
-    the samples: it tells how many are missing, and the arrivals tell when they were. `bits`, `sout` and `sin` are for
-    lines, which are given to the methods of `LineInputs`.
+    the samples: it shows how many are missing, and the arrivals show when they were. `bits` are the status bits of the
+    device that concern time, `sout` and `sin` where on their edges the measurement is.
+
+    Edges, triggers and UTC (`on_…`, `set_utc_reference`) are given before the messages that follow them, in the order
+    of time. Only a device that sends time can make use of them; for others they are ignored.
     """
 
     def __init__(
@@ -67,34 +88,41 @@ class SampleClock(LineInputs):
         sout: SoutTiming | None = None,
         sin: TriggerTiming | None = None,
     ) -> None:
-        super().__init__(tick_ns, tick_modulus, bits, sout, sin)
         self._device = device
+        self._aiding_of = tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming()
+        self._aiding: AidingSources | None = None
         self._time = DeviceTime(tick_ns, tick_modulus)
         self._number = SampleNumber(tick_modulus) if tick_ns == 0 else None
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._spread = ArrivalSpread()
+        self._jump = JumpDetector()
         self._slew = Slew()
-        self._envelope: Envelope | None = None
-        self._coast: Holdover | None = None
+        self._holdover: Holdover | None = None
+        self._fit: ArrivalFit | None = None
+        self._fit_begin_ns = 0
+        """Device time at which the fit began."""
+        self._fit_bias_ns = 0.0
+        """How far under the fit the time of measurement is."""
+        self._fit_error_ns = 0.0
+        self._fit_sync = Sync.ARRIVAL
+        """REGRESSION once the fit is used."""
         self._sync = Sync.ARRIVAL
-        """By the fit of arrivals."""
-        self._told_sync = Sync.ARRIVAL
+        """What the newest sample rests on, where there are aiding sources."""
+        self._known = False
+        """Whether device time has begun."""
         self._seq = 0
         self._t_ns = 0
-        self._t_err_ns = 0
-        self._t_err = 0.0
         self._t_rx_ns = 0
-        self._resets = 0
-        self._begun = False
-        self._epoch_x = 0
-        self._shift_ns = 0.0
+        self._t_err_ns = 0
         self._error_ns = 0.0
-        self._jump = Jump()
+        """One-sigma error of the newest time, before it is lifted or held back."""
+        self._resets = 0
+        self._own_status: int | None = None
         self.missed = 0
         """Samples missing right before the newest one, by device time."""
 
     def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
-        """The measurement with its place in time, as the next sample of the device.
+        """Return the measurement with its place in time, as the next sample of the device.
 
         `t_rx_ns` is CLOCK_MONOTONIC right after the read that completed the message; it must not fall. Where it stands
         still for more messages than there is room for before it, `t_rx_ns` of the sample is lifted by nanoseconds.
@@ -106,57 +134,102 @@ class SampleClock(LineInputs):
         size_bytes, ticks = m.size_bytes, m.dev_ticks
         byte_ns = self._delay.byte_ns or 1
         trailing_ns = m.trailing_bytes * byte_ns
-        y = t_rx_ns - size_bytes * byte_ns - trailing_ns if t_begin_ns is None else t_begin_ns
+        arrival_ns = t_rx_ns - size_bytes * byte_ns - trailing_ns if t_begin_ns is None else t_begin_ns
         if ticks is None or self._number is not None:
-            wanted, t_dev_ns, sync = self._by_arrival(ticks, y, size_bytes), None, _ARRIVAL
+            wanted_ns, t_dev_ns, sync = self._by_arrival(ticks, arrival_ns, size_bytes), None, _ARRIVAL
         else:
-            wanted = self._by_device(ticks, y, trailing_ns, t_rx_ns, size_bytes)
-            t_dev_ns, sync = self._time.raw_ns, self._sync
-        edge_seq, aids, slew, own = None, self._aids, self._slew, self.own_status
-        if aids is not None:
-            if t_dev_ns is not None and (sync is not _ARRIVAL or self._coast is not None):
-                wanted, slew = self._steered(aids, m, wanted, y), aids.slew
-                sync, edge_seq = aids.sync, aids.edge_seq
-            self._told_sync = sync
-        t_ns = wanted if wanted <= y else y
+            wanted_ns = self._by_device(ticks, arrival_ns, trailing_ns, t_rx_ns, size_bytes)
+            t_dev_ns, sync = self._time.raw_ns, self._fit_sync
+        edge_seq, aiding, slew, own = None, self._aiding, self._slew, self._own_status
+        if aiding is not None:
+            if t_dev_ns is not None and (sync is not _ARRIVAL or self._holdover is not None):
+                wanted_ns, slew = self._steered(aiding, m, wanted_ns, arrival_ns), aiding.slew
+                sync, edge_seq = aiding.sync, aiding.edge_seq
+            self._sync = sync
+        t_ns = wanted_ns if wanted_ns <= arrival_ns else arrival_ns
         if t_ns <= self._t_ns:
             t_ns = self._t_ns + 1
-        t_err = self._t_err
-        if t_ns != wanted:
-            slew.left_ns += t_ns - wanted
-            t_err += abs(t_ns - wanted)
+        error_ns = self._error_ns
+        if t_ns != wanted_ns:
+            slew.add(t_ns - wanted_ns)
+            error_ns += abs(t_ns - wanted_ns)
         if t_ns > t_rx_ns:  # noqa: PLR1730 - as above
             t_rx_ns = t_ns
         self._t_ns, self._t_rx_ns = t_ns, t_rx_ns
         self._seq = seq = self._seq + 1
-        self._t_err_ns = t_err_ns = int(t_err) + 1 if t_err < T_ERR_MOST else T_ERR_MOST
-        if aids is not None and aids.marks is not None:
-            aids.marks.take(t_ns - aids.before_measurement_ns, seq, self._period_ns())
+        self._t_err_ns = t_err_ns = int(error_ns) + 1 if error_ns < T_ERR_MOST else T_ERR_MOST
+        if aiding is not None and aiding.marks is not None:
+            aiding.marks.add_sample(t_ns - aiding.sout_offset_ns, seq, self._period_ns())
         return Sample(
             self._device, seq, t_ns, t_err_ns, sync, t_rx_ns, t_ns + utc_offset_ns, t_dev_ns,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
             m.incli_rad, m.status if own is None else own | (m.status or 0), m.pps_age_ms, edge_seq,
         )  # fmt: skip
 
-    def sample_asked(
+    def sample_polled(
         self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int, edge_seq: int | None = None
     ) -> Sample:
-        """A measurement that the host asked for, as the next sample of the device.
+        """Return a measurement that the host polled, as the next sample of the device.
 
-        `t_ns` is CLOCK_MONOTONIC right before the asking, or by the data-ready edge of number `edge_seq`; `t_err_ns` is
+        `t_ns` is CLOCK_MONOTONIC right before the poll, or by the data-ready edge of number `edge_seq`; `t_err_ns` is
         its one-sigma error, `t_rx_ns` right after the answer. A `t_ns` that does not rise is lifted, and the error too.
         """
-        self.missed, self._sync = 0, _ARRIVAL if edge_seq is None else Sync.EDGE
-        self._spread.add(t_ns)
+        self.missed, self._fit_sync = 0, _ARRIVAL if edge_seq is None else Sync.EDGE
+        self._spread.add_arrival(t_ns)
         t_err_ns = min(t_err_ns + max(0, self._t_ns + 1 - t_ns), T_ERR_MOST)
         self._t_ns = t_ns = max(t_ns, self._t_ns + 1)
         self._t_rx_ns = t_rx_ns = max(t_rx_ns, self._t_rx_ns, t_ns)
         self._seq, self._t_err_ns = self._seq + 1, t_err_ns
         return Sample(
-            self._device, self._seq, t_ns, t_err_ns, self._sync, t_rx_ns, t_ns + utc_offset_ns, None,
+            self._device, self._seq, t_ns, t_err_ns, self._fit_sync, t_rx_ns, t_ns + utc_offset_ns, None,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
             m.incli_rad, m.status, m.pps_age_ms, edge_seq,
         )  # fmt: skip
+
+    # --- aiding sources ------------------------------------------------------------------------------------------
+
+    def on_sout_edges(self, edges: Sequence[Edge]) -> None:
+        """Add edges of SOUT, rising and falling."""
+        self._aided().on_sout_edges(edges)
+
+    def on_divided_edges(self, edges: Sequence[Edge]) -> None:
+        """Add edges of SOUT_DIV; `take_marks` returns which samples they belong to."""
+        self._aided().on_divided_edges(edges)
+
+    def on_trigger_stamps(self, stamps: Iterable[TriggerStamp]) -> None:
+        """Add triggers that the host gave on SIN, each answered by one message."""
+        self._aided().on_trigger_stamps(stamps)
+
+    def on_pps_edges(self, edges: Sequence[Edge]) -> None:
+        """Add edges of the pulse per second that the device's SIN gets; for messages with `pps_age_ms`."""
+        self._aided().on_pps_edges(edges)
+
+    def set_utc_reference(self, reference: UtcReference | None) -> None:
+        """Set what the host knows of UTC; None while it knows nothing. A device on UTC is recognised by it."""
+        if reference is not None or self._aiding is not None:
+            self._aided().utc.set_reference(reference)
+
+    @property
+    def utc_reference(self) -> UtcReference | None:
+        """What the host knows of UTC; None while it knows nothing."""
+        return self._aiding.utc.reference if self._aiding else None
+
+    def set_own_status(self, bits: int | None) -> None:
+        """Set the host's own bits, which `sample` adds to the status from now on; None for none."""
+        self._own_status = bits
+
+    def take_marks(self) -> list[Mark]:
+        """Return the pulses on SOUT_DIV whose samples are known by now, in order, each once."""
+        if self._aiding is None or self._aiding.marks is None:
+            return []
+        return self._aiding.marks.take_marks()
+
+    def _aided(self) -> AidingSources:
+        if self._aiding is None:
+            self._aiding = AidingSources(*self._aiding_of)
+        return self._aiding
+
+    # --- state ---------------------------------------------------------------------------------------------------
 
     @property
     def expected_rate_hz(self) -> float:
@@ -165,16 +238,16 @@ class SampleClock(LineInputs):
         return NS_PER_S / period_ns if period_ns else 0.0
 
     def status(self) -> ClockStatus:
-        """The state of the estimate at the newest sample."""
-        fitted = self._envelope if self._sync is not Sync.ARRIVAL else None
-        aids = self._aids
-        sout, sin = (aids.sout, aids.sin) if aids else (None, None)
+        """Return the state of the estimate at the newest sample."""
+        fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
+        aiding, reference = self._aiding, self.utc_reference
+        sout, sin = (aiding.sout, aiding.sin) if aiding else (None, None)
         first = sout or sin
         return ClockStatus(
-            sync=self._told_sync if aids else self._sync,
-            offset_ns=self._t_ns - self._time.raw_ns if self._begun else 0,
-            skew_ppm=(1 / fitted.slope - 1) * 1e6 if fitted else 0.0,
-            residual_ns=int(fitted.residual_ns if fitted else self._spread.sigma_ns),
+            sync=self._sync if aiding else self._fit_sync,
+            offset_ns=self._t_ns - self._time.raw_ns if self._known else 0,
+            skew_ppm=(1 / fit.slope - 1) * 1e6 if fit else 0.0,
+            residual_ns=int(fit.residual_ns if fit else self._spread.sigma_ns),
             t_err_ns=self._t_err_ns,
             resets=self._resets,
             hold_ns=self._delay.hold_ns,
@@ -182,203 +255,200 @@ class SampleClock(LineInputs):
             edges_unpaired=sout.pairing.events_unpaired if sout else 0,
             samples_unpaired=first.pairing.samples_unpaired if first else 0,
             triggers_missed=sin.pairing.events_unpaired if sin else 0,
-            reference_error_ns=self.reference.error_ns if self.reference else 0,
+            reference_error_ns=reference.error_ns if reference else 0,
         )
 
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
-        """Another baud rate or port: what is known of arrivals no longer holds. `t_ns` goes on rising."""
+        """Begin a new fit for another baud rate or port. `t_ns` goes on rising."""
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._spread = ArrivalSpread()
-        self._forget()
+        self._drop_fit()
 
     def restart(self) -> None:
-        """The device or the link came back: the next stamp begins anew and counts neither as a reset nor as a gap."""
-        self._begun = False
+        """Begin anew after the device or the link was away: the next stamp counts neither as a reset nor as a gap."""
+        self._known = False
         self._spread = ArrivalSpread()
         if self._number is not None:
-            self._number.begun = False
+            self._number.restart()
         self.missed = 0
-        self._forget()
+        self._drop_fit()
 
-    def follow(self, other: "SampleClock") -> None:
+    def continue_from(self, other: "SampleClock") -> None:
         """Go on where another clock of the same device ends: `seq` and `t_ns` keep rising."""
         self._seq, self._t_ns, self._t_rx_ns = other._seq, other._t_ns, other._t_rx_ns
-        self.reference = other.reference
+        self.set_utc_reference(other.utc_reference)
 
     # --- by arrival ----------------------------------------------------------------------------------------------
 
-    def _by_arrival(self, ticks: int | None, y: int, size_bytes: int) -> int:
-        """Time of a message without device time; it may have a number."""
+    def _by_arrival(self, ticks: int | None, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of a message without device time; it may have a number."""
         spread, number = self._spread, self._number
         self.missed = 0
         if number is None or ticks is None:
-            spread.add(y)
+            spread.add_arrival(arrival_ns)
         else:
-            steps = number.steps(ticks, y, spread.period_ns)
+            steps = number.steps(ticks, arrival_ns, spread.period_ns)
             if steps:
                 self.missed = steps - 1
-                spread.add(y, steps)
+                spread.add_arrival(arrival_ns, steps)
             else:
-                self._resets += number.begun
+                self._resets += number.known
                 self._spread = spread = ArrivalSpread()
-                spread.add(y)
-            number.take(ticks, y)
-        return self._from_arrival(y, size_bytes, spread.period_ns, spread.sigma_ns)
+                spread.add_arrival(arrival_ns)
+            number.advance(ticks, arrival_ns)
+        return self._less_bias(arrival_ns, size_bytes, spread.period_ns, spread.sigma_ns)
 
-    def _from_arrival(self, y: int, size_bytes: int, period_ns: float, sigma_ns: float) -> int:
+    def _less_bias(self, arrival_ns: int, size_bytes: int, period_ns: float, sigma_ns: float) -> int:
+        """Return the time of a message by its arrival alone; leave its error in `_error_ns`."""
         bias_ns = self._delay.floor_ns + self._delay.held_ns(period_ns, size_bytes)
-        self._t_err = SIGMA_OF_RANGE * bias_ns + sigma_ns
-        return y - int(bias_ns / 2)
+        self._error_ns = SIGMA_OF_RANGE * bias_ns + sigma_ns
+        return arrival_ns - int(bias_ns / 2)
 
     # --- by device time ------------------------------------------------------------------------------------------
 
-    def _by_device(self, ticks: int, y: int, trailing_ns: int, t_rx_ns: int, size_bytes: int) -> int:
-        """Time of a message with device time; leaves its error in `_t_err`."""
-        time, envelope = self._time, self._envelope
-        if envelope is None:
-            self._begin(ticks, y, t_rx_ns)
-            return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
-        x_before = time.even_ns
+    def _by_device(self, ticks: int, arrival_ns: int, trailing_ns: int, t_rx_ns: int, size_bytes: int) -> int:
+        """Return the time of a message with device time; leave its error in `_error_ns`."""
+        time, fit = self._time, self._fit
+        if fit is None:
+            self._begin(ticks, arrival_ns, t_rx_ns)
+            return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+        before_ns = time.even_ns
         time.advance(ticks)
-        x = time.even_ns
-        line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
-        height = y - line
-        if time.watched and self._sync is not _ARRIVAL and corrected(time, envelope, x_before, y):
-            x = time.even_ns
-            line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
-            height = y - line
-        odd = height < -EARLY_NS or height > LATE_NS or self._jump.late_reads
-        if odd and self._jumped(height, x - x_before, t_rx_ns):
-            told_ns = self._turned(ticks, y)
-            if told_ns is not None:
-                return told_ns
-            self._reset(ticks, y)
-            return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+        device_ns = time.even_ns
+        fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+        above_ns = arrival_ns - fit_ns
+        if time.watched and self._fit_sync is not _ARRIVAL and time.absorb_correction(fit, before_ns, arrival_ns):
+            device_ns = time.even_ns
+            fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+            above_ns = arrival_ns - fit_ns
+        odd = above_ns < -JUMP_EARLY_NS or above_ns > JUMP_LATE_NS or self._jump.late_reads
+        if odd and self._jumped(fit, above_ns, device_ns - before_ns, t_rx_ns):
+            return self._after_jump(ticks, arrival_ns, size_bytes)
         self.missed = time.missed
-        if envelope.add(x, y, trailing_ns, height):
-            if envelope.recent_ns > EARLY_NS + EARLY_SIGMAS * self._error_ns:
-                self._reset(ticks, y)  # messages come late for good: the device's clock stood still for a while
+        if fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
+            if fit.recent_ns > JUMP_EARLY_NS + JUMP_EARLY_SIGMAS * self._fit_error_ns:
+                self._reset(ticks, arrival_ns)  # messages stay late: the device's clock stood still for a while
             elif not self._wire_carries(size_bytes):
                 self._delay = LinkDelay(0, self._delay.hold_ns)
-                self._start(y)
+                self._start_fit(arrival_ns)
             else:
-                line = self._refit(x, x - x_before, line, size_bytes)
-        if self._sync is _ARRIVAL:
-            if self._coast is not None:
-                self._t_err = self._coast.error_ns(x)
-                return self._coast.at(x)
-            return self._from_arrival(y, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
-        left = self._slew.over(x - x_before, x - self._epoch_x) if self._slew.left_ns else 0.0
-        error = self._error_ns + envelope.slope_error * (x - envelope.x_fit) + abs(left) + time.doubt_ns
-        self._t_err = error if height < LATE_NS else error + height
-        return int(line - self._shift_ns + left)
+                fit_ns = self._refit(fit, device_ns, device_ns - before_ns, fit_ns, size_bytes)
+        if self._fit_sync is _ARRIVAL:
+            if self._holdover is not None:
+                self._error_ns = self._holdover.error_ns(device_ns)
+                return self._holdover.at(device_ns)
+            return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+        slew = self._slew
+        left_ns = slew.advance(device_ns - before_ns, device_ns - self._fit_begin_ns) if slew.left_ns else 0.0
+        error_ns = self._fit_error_ns + fit.slope_error * (device_ns - fit.fitted_ns) + abs(left_ns) + time.doubt_ns
+        self._error_ns = error_ns if above_ns < JUMP_LATE_NS else error_ns + above_ns
+        return int(fit_ns - self._fit_bias_ns + left_ns)
 
-    def _begin(self, ticks: int, y: int, t_rx_ns: int) -> None:
-        """Take the first stamp of a fit: of a new device, or of one whose clock runs on over a changed link."""
+    def _begin(self, ticks: int, arrival_ns: int, t_rx_ns: int) -> None:
+        """Set the first stamp of a fit: of a new device, or of one whose clock runs on over a changed link."""
         time = self._time
-        if self._begun and time.peek_ns(ticks) <= SLOPE_HIGHEST * (t_rx_ns - self._t_rx_ns) + FIRST_EARLY_NS:
+        if self._known and time.elapsed_ns(ticks) <= SLOPE_HIGHEST * (t_rx_ns - self._t_rx_ns) + FIRST_EARLY_NS:
             time.advance(ticks)
         else:
-            self._resets += self._begun
-            self._begun = True
+            self._resets += self._known
+            self._known = True
             time.begin(ticks)
         self.missed = time.missed
-        self._start(y)
+        self._start_fit(arrival_ns)
 
-    def _reset(self, ticks: int, y: int) -> None:
-        """The device's clock started anew."""
+    def _jumped(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, t_rx_ns: int) -> bool:
+        """Whether a message so far below or above the fit shows that the device's clock jumped."""
+        if above_ns < -JUMP_EARLY_NS:
+            error_ns = None if self._fit_sync is _ARRIVAL else self._fit_error_ns
+            return self._jump.is_early(fit, above_ns, elapsed_ns, error_ns)
+        return self._jump.is_late(fit, above_ns, elapsed_ns, t_rx_ns, new_read=t_rx_ns > self._t_rx_ns)
+
+    def _after_jump(self, ticks: int, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of the first message after a jump: by UTC if the counter jumped to it, else by arrival."""
+        aiding = self._aiding
+        if aiding is not None:
+            above_ns = aiding.utc.above(ticks, arrival_ns, FIRST_SPREAD_NS + self._delay.hold_ns)
+            if above_ns is not None:
+                return self._hold_over(aiding, ticks, arrival_ns, arrival_ns + above_ns + self._time.tick_ns // 2)
+        self._reset(ticks, arrival_ns)
+        return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+
+    def _reset(self, ticks: int, arrival_ns: int) -> None:
+        """Begin anew: the device's clock did."""
         self._resets += 1
         self.missed = 0
         self._time.begin(ticks)
-        self._start(y)
+        self._start_fit(arrival_ns)
 
-    def _turned(self, ticks: int, y: int) -> int | None:
-        """Time of a message whose counter jumped, if it jumped to UTC or within it; then time goes on over the jump."""
-        aids = self._aids
-        if aids is None:
-            return None
-        above = aids.utc.above(ticks, y, FIRST_SPREAD_NS + self._delay.hold_ns)
-        if above is None:
-            return None
+    def _hold_over(self, aiding: AidingSources, ticks: int, arrival_ns: int, utc_ns: int) -> int:
+        """Return the time of a message whose counter jumped to `utc_ns`, or within UTC; holdover begins there."""
         period_ns, tick_ns, error_ns = self._period_ns() or 1.0, self._time.tick_ns, float(self._t_err_ns)
-        by_utc = y + above + tick_ns // 2
-        t_ns = self._t_ns + int(max(round((by_utc - self._t_ns) / period_ns), 1) * period_ns)
-        unknown = self._sync is _ARRIVAL and self._coast is None
-        if unknown or abs(t_ns - by_utc) > tick_ns + 2 * error_ns:
-            t_ns, error_ns = max(by_utc, self._t_ns + 1), aids.utc.tick_error_ns  # or the device samples anew
+        t_ns = self._t_ns + int(max(round((utc_ns - self._t_ns) / period_ns), 1) * period_ns)
+        unknown = self._fit_sync is _ARRIVAL and self._holdover is None
+        if unknown or abs(t_ns - utc_ns) > tick_ns + 2 * error_ns:
+            t_ns, error_ns = max(utc_ns, self._t_ns + 1), aiding.utc.tick_error_ns  # or the device samples anew
         self.missed = 0
         self._time.begin(ticks)
-        self._start(y)
-        aids.utc.turned()
-        self._coast = coast = Holdover(self._epoch_x, t_ns, error_ns, tick_ns)
-        self._t_err = coast.error_ns(self._epoch_x)
-        self._epoch_x -= SETTLED_AFTER_NS  # time went on: corrections stay slow
+        self._start_fit(arrival_ns)
+        aiding.utc.confirm()
+        self._holdover = holdover = Holdover(self._fit_begin_ns, t_ns, error_ns, tick_ns)
+        self._error_ns = holdover.error_ns(self._fit_begin_ns)
+        self._fit_begin_ns -= SETTLED_AFTER_NS  # time went on: corrections stay slow
         return t_ns
 
-    def _steered(self, aids: AidingSources, m: Measurement, wanted: int, y: int) -> int:
-        """What lines and UTC make of a time by the fit; leaves its error in `_t_err`."""
-        x, coast, envelope = self._time.even_ns, self._coast, self._envelope
-        assert envelope is not None
-        line, age_ns = coast or envelope, x - self._epoch_x
-        t_ns = aids.steer(
-            m, x, y, wanted, self._t_err, self._sync, self._period_ns(), line.slope, line.slope_error, age_ns
-        )
-        self._t_err = aids.error_ns
-        return t_ns
+    def _start_fit(self, arrival_ns: int) -> None:
+        """Begin a new fit at the present device time."""
+        self._drop_fit()
+        self._fit_begin_ns = self._time.even_ns
+        self._fit = ArrivalFit(self._fit_begin_ns, arrival_ns, self._delay.hold_ns)
 
-    def _start(self, y: int) -> None:
-        """A new fit from the present device time on."""
-        self._forget()
-        self._epoch_x = self._time.even_ns
-        self._envelope = Envelope(self._epoch_x, y, self._delay.hold_ns)
+    def _drop_fit(self) -> None:
+        self._fit = self._holdover = None
+        self._fit_sync = _ARRIVAL
+        self._jump.reset()
+        self._slew.set(0.0)
+        if self._aiding is not None:
+            self._aiding.restart()
 
-    def _forget(self) -> None:
-        self._envelope = self._coast = None
-        self._sync = _ARRIVAL
-        self._jump.late_reads = 0
-        self._slew.left_ns = 0.0
-        if self._aids is not None:
-            self._aids.restart()
-
-    def _jumped(self, height: float, elapsed_ns: int, t_rx_ns: int) -> bool:
-        """Whether a message so far before or behind the line says that the device's clock jumped."""
-        envelope = self._envelope
-        assert envelope is not None
-        if height < -EARLY_NS:
-            return self._jump.early(envelope, height, elapsed_ns, None if self._sync is _ARRIVAL else self._error_ns)
-        return self._jump.late(envelope, height, elapsed_ns, t_rx_ns, new_read=t_rx_ns > self._t_rx_ns)
-
-    def _refit(self, x: int, elapsed_ns: int, line_before: float, size_bytes: int) -> float:
-        """Take over a line that changed, without a step; returns its value at `x`."""
-        envelope = self._envelope
-        assert envelope is not None
+    def _refit(self, fit: ArrivalFit, device_ns: int, elapsed_ns: int, fit_ns_before: float, size_bytes: int) -> float:
+        """Use a fit that changed, without a step; return its value at `device_ns`."""
         delay = self._delay
         period_ns = self._period_ns()
-        line = envelope.y_ref + envelope.slope * (x - envelope.x_ref)
-        told = line_before - self._shift_ns + self._slew.left_ns
+        fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+        published_ns = fit_ns_before - self._fit_bias_ns + self._slew.left_ns
         if period_ns:
-            envelope.held_ns = delay.held_ns(period_ns, size_bytes)
-            envelope.held_count = int(delay.hold_ns / period_ns) + 2
-        bias_ns = delay.floor_ns + envelope.hidden_ns
-        self._shift_ns = delay.floor_ns / 2 + envelope.shift_ns
-        self._error_ns = hypot(envelope.error_ns, SIGMA_OF_RANGE * bias_ns) + self._time.error_ns
-        if delay.hold_ns and envelope.span_ns < YOUNG_NS:
-            self._error_ns *= YOUNG_FACTOR
-        if self._sync is not _ARRIVAL:
-            self._slew.left_ns = told - (line - self._shift_ns)
-        elif envelope.count >= ENOUGH_POINTS and envelope.span_ns >= max(
-            ENOUGH_SPAN_NS if self._coast is None else COAST_NS, ENOUGH_HOLDS * delay.hold_ns
+            fit.set_pause(delay.held_ns(period_ns, size_bytes), int(delay.hold_ns / period_ns) + 2)
+        bias_ns = delay.floor_ns + fit.hidden_ns
+        self._fit_bias_ns = delay.floor_ns / 2 + fit.shift_ns
+        self._fit_error_ns = hypot(fit.error_ns, SIGMA_OF_RANGE * bias_ns) + self._time.error_ns
+        if delay.hold_ns and fit.span_ns < YOUNG_NS:
+            self._fit_error_ns *= YOUNG_FACTOR
+        if self._fit_sync is not _ARRIVAL:
+            self._slew.set(published_ns - (fit_ns - self._fit_bias_ns))
+        elif fit.count >= ENOUGH_POINTS and fit.span_ns >= max(
+            ENOUGH_SPAN_NS if self._holdover is None else HOLDOVER_NS, ENOUGH_HOLDS * delay.hold_ns
         ):
-            self._sync = Sync.REGRESSION
-            told = self._coast.at(x) if self._coast else self._t_ns + elapsed_ns * envelope.slope
-            self._coast = None
-            self._slew.left_ns = told - (line - self._shift_ns)
-        return line
+            self._fit_sync = Sync.REGRESSION
+            held_ns = self._holdover.at(device_ns) if self._holdover else self._t_ns + elapsed_ns * fit.slope
+            self._holdover = None
+            self._slew.set(held_ns - (fit_ns - self._fit_bias_ns))
+        return fit_ns
+
+    def _steered(self, aiding: AidingSources, m: Measurement, fit_ns: int, arrival_ns: int) -> int:
+        """Return what aiding sources make of a time by the fit; leave its error in `_error_ns`."""
+        device_ns, fit = self._time.even_ns, self._holdover or self._fit
+        assert fit is not None
+        t_ns = aiding.steer(
+            m, device_ns, arrival_ns, fit_ns, self._error_ns, self._fit_sync, self._period_ns(), fit.slope,
+            fit.slope_error, device_ns - self._fit_begin_ns,
+        )  # fmt: skip
+        self._error_ns = aiding.error_ns
+        return t_ns
 
     def _wire_carries(self, size_bytes: int) -> bool:
-        """Whether the wire time fits the rate; a pty or a USB device names any baud rate it likes."""
-        envelope, period_ns = self._envelope, self._period_ns()
-        if envelope is None or not period_ns or envelope.span_ns < NS_PER_S:
+        """Whether the wire time fits the rate; a pty or a USB device accepts any baud rate."""
+        fit, period_ns = self._fit, self._period_ns()
+        if fit is None or not period_ns or fit.span_ns < NS_PER_S:
             return True
         return period_ns * WIRE_SLACK >= size_bytes * self._delay.byte_ns
 
@@ -386,5 +456,5 @@ class SampleClock(LineInputs):
         """Host time between samples; 0 while unknown."""
         if self._number is not None:
             return self._spread.period_ns
-        time, envelope = self._time, self._envelope
-        return time.period.period_ticks * time.tick_ns * (envelope.slope if envelope else 1.0)
+        time, fit = self._time, self._fit
+        return time.period.period_ticks * time.tick_ns * (fit.slope if fit else 1.0)

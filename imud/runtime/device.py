@@ -232,7 +232,7 @@ class Device(ABC):
             sin=lines.sin.timing if lines is not None and lines.sin is not None else None,
         )
         if self._clock is not None:
-            clock.follow(self._clock)
+            clock.continue_from(self._clock)
         return clock
 
     def _path_parts(self, clock: SampleClock) -> tuple[object, ...]:

@@ -73,7 +73,7 @@ class UtcKeeper:
     def start(self, clock: SampleClock) -> None:
         """Deliver the reference to the clock of the device that was found."""
         self._clock = clock
-        clock.reference = self._reference
+        clock.set_utc_reference(self._reference)
         self._due_ns = 0
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
@@ -127,7 +127,7 @@ class UtcKeeper:
         self._due_ns = now_ns + ASK_NS
         self._reference = _better(self._pps.reference(now_ns), self._system(now_ns))
         if self._clock is not None:
-            self._clock.reference = self._reference
+            self._clock.set_utc_reference(self._reference)
 
     def _on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
         """Use a sentence for the host first: its clock must know UTC before the device's time becomes UTC, or it takes

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from math import hypot, sqrt
 from typing import Final, NamedTuple
 
-from imud.clock.aids import STAMP_FLOOR_NS
+from imud.clock.steering import STAMP_FLOOR_NS
 from imud.contracts.lines import Edge, ReadySettings
 from imud.units import NS_PER_MS, NS_PER_US
 

@@ -157,21 +157,21 @@ class SyncSignals:
 
     def _on_sout(self, edges: Sequence[Edge]) -> None:
         if self._clock is not None:
-            self._clock.edges(edges)
+            self._clock.on_sout_edges(edges)
 
     def _on_divided(self, edges: Sequence[Edge]) -> None:
         if self._clock is not None:
-            self._clock.divided(edges)
+            self._clock.on_divided_edges(edges)
 
     def _on_pps(self, edges: Sequence[Edge]) -> None:
         if self._clock is not None:
-            self._clock.pulses(edges)
+            self._clock.on_pps_edges(edges)
         if self._on_pulses is not None:
             self._on_pulses(edges)
 
     def _on_stamps(self, stamps: Sequence[TriggerStamp]) -> None:
         if self._clock is not None:
-            self._clock.triggers(stamps)
+            self._clock.on_trigger_stamps(stamps)
 
     def _on_alarm(self, edges: Sequence[Edge]) -> None:
         self._alarm.line.on_edges(edges)
@@ -184,7 +184,7 @@ class SyncSignals:
     def _show_alarm(self) -> None:
         """Set the alarm bit of the samples from now on."""
         if self._clock is not None:
-            self._clock.own_status = ALARM_STATUS if self._alarm.line.active else None
+            self._clock.set_own_status(ALARM_STATUS if self._alarm.line.active else None)
 
     def _raise_mark(self, mark: Mark) -> None:
         words = f"sample {mark.seq}" if mark.seq is not None else "a sample that was lost"

@@ -65,7 +65,7 @@ def with_sout(clock: SampleClock, reads: Sequence[Heard], *, silent: range = ran
     told = []
     for i, read in enumerate(reads):
         if i not in silent:
-            clock.edges(read.edges)
+            clock.on_sout_edges(read.edges)
         for a, number in zip(read.arrivals, read.numbers, strict=True):
             told.append(Told(clock.sample(measurement(a), a.t_rx_ns, 0), measured_ns(a), number))
     return told
@@ -87,7 +87,7 @@ def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) ->
     for a in arrivals:
         due: list[Edge] = [p for p in pulses[given : given + 3] if p.t_ns <= a.t_rx_ns]
         given += len(due)
-        clock.pulses(due)
+        clock.on_pps_edges(due)
         # without a pulse the age goes on
         newest = max((p.t_ns // NS_PER_S for p in pulses[:given] if p.t_ns <= a.t_ns), default=a.t_ns // NS_PER_S)
         age = pps_age_ms(a, model.crystal.skew_ppm) + 1000 * (a.t_ns // NS_PER_S - newest)
@@ -101,7 +101,7 @@ def run_utc(
 ) -> tuple[list[Told], SampleClock]:  # fmt: skip
     """A device whose counter turns into UTC ms modulo `turn_ms` at a share of the run, and back at another."""
     clock, told = clock_for(model), []
-    clock.reference = reference
+    clock.set_utc_reference(reference)
     count = int(model.rate_hz) * seconds
     for i, a in enumerate(model.run(count)):
         utc = i >= turn_at * count and i < back_at * count
@@ -114,7 +114,7 @@ def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[li
     """A device that answers most triggers; also how many it did not answer."""
     clock, told, missed = clock_for(model), [], 0
     for stamp, a in triggered(model, int(model.rate_hz) * seconds, answered):
-        clock.triggers([stamp])
+        clock.on_trigger_stamps([stamp])
         if a is None:
             missed += 1
         else:

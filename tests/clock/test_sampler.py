@@ -1,4 +1,4 @@
-"""The clock as a whole: three rules for any input, and what devices and hosts do to it."""
+"""The clock as a whole: three rules for any input, what devices and hosts do to it, polled samples."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -6,9 +6,13 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imud.clock import SampleClock
 from imud.sample import Measurement, Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.streams import BEGIN_NS, MODULUS, Point, feed, make_clock, message, rises, steady
+
+# --- samples that arrive ----------------------------------------------------------------------------------------------
+
 
 NEAR_NS = 2 * NS_PER_MS
 """Messages are read 1 ms after they were measured and take 0.9 ms on the wire."""
@@ -252,7 +256,7 @@ def test_a_restart_counts_neither_reset_nor_gap() -> None:
 def test_one_clock_follows_another() -> None:
     first, second = make_clock(), make_clock()
     samples = feed(first, steady(0, 0, 100))
-    second.follow(first)
+    second.continue_from(first)
     samples += feed(second, steady(5, 990, 100))
     assert rises(samples)
     assert [s.seq for s in samples] == list(range(1, 201))
@@ -307,3 +311,57 @@ def test_a_device_restarted_behind_a_changed_link_is_a_reset() -> None:
     assert clock.missed == 0
     assert rises(samples)
     assert samples[300].t_dev_ns == 7 * NS_PER_MS
+
+
+# --- polled samples ---------------------------------------------------------------------------------------------------
+
+
+FRAME = Measurement(28, 0, None, (0.0, 0.0, 9.8))
+
+
+def polled_clock() -> SampleClock:
+    return SampleClock("imu", tick_ns=0, tick_modulus=2, byte_ns=0, hold_ns=0)
+
+
+def test_time_is_that_of_the_poll() -> None:
+    sample = polled_clock().sample_polled(FRAME, 1_000_000, 300, 1_200_000, 5_000_000_000)
+    assert (sample.t_ns, sample.t_err_ns, sample.t_rx_ns, sample.utc_ns) == (1_000_000, 300, 1_200_000, 5_001_000_000)
+    assert (sample.seq, sample.sync, sample.t_dev_ns) == (1, Sync.ARRIVAL, None)
+
+
+def test_time_rises_strictly_and_is_never_after_the_answer() -> None:
+    one = polled_clock()
+    samples = [one.sample_polled(FRAME, t_ns, 1, t_ns + 5, 0) for t_ns in (100, 100, 50, 103, 200)]
+    assert [sample.t_ns for sample in samples] == [100, 101, 102, 103, 200]
+    assert all(sample.t_ns <= sample.t_rx_ns for sample in samples)
+    assert [sample.seq for sample in samples] == [1, 2, 3, 4, 5]
+
+
+def test_error_that_does_not_fit_is_the_largest() -> None:
+    assert polled_clock().sample_polled(FRAME, 1, 2**40, 2, 0).t_err_ns == 2**32 - 1
+
+
+def test_another_clock_of_the_device_goes_on_where_it_ended() -> None:
+    one, other = polled_clock(), polled_clock()
+    one.sample_polled(FRAME, 1000, 1, 1001, 0)
+    other.continue_from(one)
+    sample = other.sample_polled(FRAME, 500, 1, 501, 0)
+    assert (sample.seq, sample.t_ns) == (2, 1001)
+
+
+def test_by_an_edge() -> None:
+    one = polled_clock()
+    samples = [
+        one.sample_polled(FRAME, t_ns, 5, t_ns + 50, 0, edge) for t_ns, edge in ((100, 7), (200, None), (300, 8))
+    ]
+    assert [(sample.sync, sample.edge_seq, sample.t_ns) for sample in samples] == [
+        (Sync.EDGE, 7, 100), (Sync.ARRIVAL, None, 200), (Sync.EDGE, 8, 300),
+    ]  # fmt: skip
+    assert one.status().sync is Sync.EDGE
+
+
+def test_what_is_lifted_is_part_of_the_error() -> None:
+    one = polled_clock()
+    one.sample_polled(FRAME, 1000, 5, 1001, 0)
+    sample = one.sample_polled(FRAME, 400, 5, 1002, 0)
+    assert (sample.t_ns, sample.t_err_ns) == (1001, 606)

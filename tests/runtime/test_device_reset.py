@@ -12,17 +12,18 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
-from imud.contracts.lines import DeviceLines, ResetSettings, SoutSettings, TriggerSettings
+from imud.contracts.lines import DeviceLines, Edge, ResetSettings, SoutSettings, TriggerSettings
 from imud.contracts.status import DeviceState
-from imud.contracts.timing import SoutTiming, TriggerTiming
+from imud.contracts.timing import TriggerStamp
 from imud.devices.imu61x.uart.codec import DRIVER, encode_ahrs
 from imud.errors import BadArgument, CommandError
 from imud.event import Event, EventKind
 from imud.links.memory import MemoryLink, MemorySettings
 from imud.runtime.detection.remembered import Remembered
 from imud.runtime.stream.runner import DeviceRunner
-from imud.sample import Sample
+from imud.sample import Measurement, Sample, Sync
 from imud.sim.ports.lines import MemoryLines, MemoryOutput
+from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.polled import Rig
 from tests.support.stage import Stage
 from tests.support.virtual_time import VirtualClock, run_virtually
@@ -305,6 +306,13 @@ def test_where_the_measurement_is_reaches_the_clock() -> None:
         sout=SoutSettings(line="O", offset_us=-7, bias_us=2, width_us=90), sin=TriggerSettings(line="I", offset_us=9)
     )
     runner = Uart(VirtualClock(), lines, baud=115200).runner
-    clock = runner._new_clock(DRIVER)
-    assert clock._sout_timing == SoutTiming(offset_us=-7, bias_us=2, width_us=90)
-    assert clock._sin_timing == TriggerTiming(offset_us=9)
+    by_sout, by_sin = runner._new_clock(DRIVER), runner._new_clock(DRIVER)
+    for i in range(200):
+        at_ns = NS_PER_S + i * 10 * NS_PER_MS
+        by_sout.on_sout_edges([Edge(at_ns + 90_000, False, 2 * i + 2)])  # the rising edge is counted back
+        by_sin.on_trigger_stamps([TriggerStamp(at_ns, 0, i + 1)])
+        m, t_rx_ns = Measurement(82, 0, 10_000 * i), at_ns + NS_PER_MS
+        sample, answer = by_sout.sample(m, t_rx_ns, 0), by_sin.sample(m, t_rx_ns, 0)
+    assert (sample.sync, sample.t_ns - at_ns) == (Sync.EDGE, -7_000)
+    assert sample.t_err_ns < 10_000  # 26 µs and more with the default of bias_us
+    assert (answer.sync, answer.t_ns - at_ns) == (Sync.EDGE, 9_000)

@@ -85,7 +85,7 @@ def test_sentences_go_to_the_device_and_make_pulses_utc(bench: Bench) -> None:
         bench.second(number)
     assert len(bench.written) == 6
     assert bench.written[3] == build((UTC_S + 3) * NS_PER_S)
-    reference = bench.clock.reference
+    reference = bench.clock.utc_reference
     assert reference is not None
     assert reference.offset_ns == pytest.approx(OFFSET_NS, abs=1000)
     assert reference.error_ns < 100_000
@@ -118,18 +118,18 @@ def test_the_better_of_two_references_counts(bench: Bench) -> None:
     good, bad = UtcReference(OFFSET_NS + 77, 10), UtcReference(OFFSET_NS + 55, 10**9)
     bench.system = bad
     bench.second(0)
-    assert bench.clock.reference == bad
+    assert bench.clock.utc_reference == bad
     for number in range(1, 6):
         bench.second(number)
-    by_pulses = bench.clock.reference
+    by_pulses = bench.clock.utc_reference
     assert by_pulses is not None
     assert by_pulses.error_ns < 10**6
     bench.system = good
     bench.second(6)
-    assert bench.clock.reference == good
+    assert bench.clock.utc_reference == good
     bench.system = None
     bench.second(7)
-    by_pulses = bench.clock.reference
+    by_pulses = bench.clock.utc_reference
     assert by_pulses is not None
     assert by_pulses.offset_ns != good.offset_ns
 
@@ -137,12 +137,12 @@ def test_the_better_of_two_references_counts(bench: Bench) -> None:
 def test_the_reference_is_updated_once_a_second_and_dropped_when_there_is_none() -> None:
     bench = Bench(source=False, system=UtcReference(5, 5))
     bench.keeper.tick(BEGIN_NS, None)
-    assert bench.clock.reference == UtcReference(5, 5)
+    assert bench.clock.utc_reference == UtcReference(5, 5)
     bench.system = None
     bench.keeper.tick(BEGIN_NS + NS_PER_S - 1, None)
-    assert bench.clock.reference == UtcReference(5, 5)
+    assert bench.clock.utc_reference == UtcReference(5, 5)
     bench.keeper.tick(BEGIN_NS + NS_PER_S, None)
-    assert bench.clock.reference is None
+    assert bench.clock.utc_reference is None
 
 
 def test_a_clock_has_the_reference_from_its_start_and_none_after_the_end_of_the_link() -> None:
@@ -150,14 +150,14 @@ def test_a_clock_has_the_reference_from_its_start_and_none_after_the_end_of_the_
     bench.keeper.tick(BEGIN_NS, None)
     other = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
     bench.keeper.start(other)
-    assert other.reference == UtcReference(5, 5)
+    assert other.utc_reference == UtcReference(5, 5)
     bench.keeper.stop()
     bench.keeper.stop()
     bench.system = UtcReference(6, 6)
     bench.keeper.tick(BEGIN_NS + NS_PER_S, None)
-    assert other.reference == UtcReference(5, 5)
+    assert other.utc_reference == UtcReference(5, 5)
     bench.keeper.start(other)
-    assert other.reference == UtcReference(6, 6)
+    assert other.utc_reference == UtcReference(6, 6)
 
 
 def test_close_releases_source_and_socket_and_nothing_starts_again() -> None:
@@ -198,10 +198,10 @@ def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pyte
     keeper.start(clock)
     monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 100, 100))
     keeper.tick(BEGIN_NS, None)
-    assert clock.reference is None
+    assert clock.utc_reference is None
     monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(True, 100, 0))
     keeper.tick(BEGIN_NS + NS_PER_S, None)
-    assert clock.reference == UtcReference(OFFSET_NS + BEGIN_NS + NS_PER_S, 100_000)
+    assert clock.utc_reference == UtcReference(OFFSET_NS + BEGIN_NS + NS_PER_S, 100_000)
     keeper.close()
 
 

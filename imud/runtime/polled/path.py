@@ -90,7 +90,7 @@ class PolledPath(SamplePath):
             if type(event) is Measurement:
                 self._faults = 0
                 t_ns, error_ns, edge_seq = stamp or (reading.start_ns, self._error_ns(reading), None)
-                sample = self.clock.sample_asked(event, t_ns, error_ns, reading.end_ns, utc_offset_ns, edge_seq)
+                sample = self.clock.sample_polled(event, t_ns, error_ns, reading.end_ns, utc_offset_ns, edge_seq)
                 samples.append(sample)
             elif type(event) is Vanished:
                 gone = event.why

@@ -3,7 +3,7 @@
 import pytest
 
 from imud.clock import SampleClock
-from imud.clock.utc import DAY_NS
+from imud.clock.device_utc import DAY_NS
 from imud.contracts.timing import TimeBits, UtcReference
 from imud.sample import Measurement, Sync
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
@@ -90,7 +90,7 @@ def test_an_unsure_host_refuses_no_more_than_it_must() -> None:
 def test_a_device_that_was_on_utc_before_is_recognised() -> None:
     told, _ = run_utc(model(BARE_UART), 20, turn_ms=UNIX)
     clock = clock_for(model(BARE_UART))
-    clock.reference = REFERENCE
+    clock.set_utc_reference(REFERENCE)
     samples = []
     for t in told[600:]:
         ticks = (t.truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
@@ -111,7 +111,7 @@ def on_utc(clock: SampleClock, count: int, status: int | None, off_ms: float, fi
 def test_the_status_bit_is_respected() -> None:
     bits = TimeBits(not_utc=0x800)
     clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=UNIX, byte_ns=10_850, hold_ns=0, bits=bits)
-    clock.reference = REFERENCE
+    clock.set_utc_reference(REFERENCE)
     assert Sync.UTC not in on_utc(clock, 500, 0x800, 0.0)
     assert on_utc(clock, 500, 0, 0.0, 500)[-1] is Sync.UTC
     assert on_utc(clock, 10, 0x800, 0.0, 1000)[0] is Sync.REGRESSION
@@ -119,17 +119,17 @@ def test_the_status_bit_is_respected() -> None:
 
 def test_utc_that_drifts_away_is_given_up() -> None:
     clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=UNIX, byte_ns=10_850, hold_ns=0)
-    clock.reference = REFERENCE
+    clock.set_utc_reference(REFERENCE)
     assert on_utc(clock, 1000, None, 0.0)[-1] is Sync.UTC
     assert on_utc(clock, 3000, None, 0.01, 1000)[-1] is Sync.REGRESSION  # 30 ms
 
 
 def test_a_reference_that_goes_away_is_no_step() -> None:
     clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=UNIX, byte_ns=10_850, hold_ns=0)
-    clock.reference = REFERENCE
+    clock.set_utc_reference(REFERENCE)
     on_utc(clock, 1000, None, 0.0)
     before = clock.status()
-    clock.reference = None
+    clock.set_utc_reference(None)
     assert on_utc(clock, 1, None, 0.0, 1000) == [Sync.REGRESSION]
     assert abs(clock.status().offset_ns - before.offset_ns) < 10_000 + NS_PER_MS
     assert clock.status().reference_error_ns == 0

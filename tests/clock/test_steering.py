@@ -1,4 +1,4 @@
-"""SOUT through the whole clock: every pair right, no step when edges come and go, honest all the time."""
+"""Edges through the whole clock: every pair right, no step when edges come and go, errors honest; slewing."""
 
 from itertools import pairwise
 from math import sqrt
@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imud.clock import SampleClock
+from imud.clock.steering import SETTLED_AFTER_NS, SLEW, SLEW_SETTLING, Slew
 from imud.contracts.lines import Edge
 from imud.contracts.timing import SoutTiming, TimeBits, TriggerStamp, UtcReference
 from imud.sample import Measurement, Sync
@@ -39,7 +40,30 @@ from tests.bench.line_runs import (
 )  # fmt: skip
 from tests.support.streams import BEGIN_NS, make_clock, message, rises
 
-SLEW = 550e-6
+# --- slewing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("age_ns", "rate"), [(0, SLEW_SETTLING), (SETTLED_AFTER_NS + 1, SLEW)])
+def test_the_rate_is_bounded(sign: int, age_ns: int, rate: float) -> None:
+    slew = Slew()
+    slew.left_ns = sign * 10.0 * NS_PER_S
+    before = slew.left_ns
+    after = slew.advance(10 * NS_PER_MS, age_ns)
+    assert before - after == pytest.approx(sign * rate * 10 * NS_PER_MS)
+
+
+def test_it_ends_at_nothing() -> None:
+    slew = Slew()
+    slew.left_ns = -3.0
+    assert slew.advance(NS_PER_S, SETTLED_AFTER_NS + 1) == 0.0
+    assert slew.left_ns == 0.0
+
+
+# --- edges ------------------------------------------------------------------------------------------------------------
+
+
+STEEPEST = 550e-6
 UNIX = 1 << 32
 JITTER_STEP_NS = 60_000
 HALF_LOST = LineFaults(pulse_loss=0.1, edge_loss=0.02, frame_loss=0.1, extra=0.02, loaded=True)
@@ -108,7 +132,7 @@ def test_edges_that_stop_and_come_back_make_no_step(profile: ArrivalProfile) -> 
     assert syncs(told[end + 50 :]) == {Sync.EDGE}
     # the jitter of the stamps themselves, beyond which only slewing is allowed
     assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(told[1010:])) < JITTER_STEP_NS
-    assert steepest(told[begin + 3 : end]) < 2 * SLEW
+    assert steepest(told[begin + 3 : end]) < 2 * STEEPEST
     assert share_honest(told) >= 0.95
 
 
@@ -116,9 +140,9 @@ def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
     """A device on UTC whose own crystal is 5 % slow: its milliseconds say little of which pulse is a sample's."""
     m = model(LOADED, 1000, 3078, Crystal(-50_000.0))
     clock, told = sout_clock(m), []
-    clock.reference = REFERENCE
+    clock.set_utc_reference(REFERENCE)
     for read in heard(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
-        clock.edges(read.edges)
+        clock.on_sout_edges(read.edges)
         for a in read.arrivals:
             truth_ns = measured_ns(a)
             ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
@@ -188,7 +212,7 @@ def frames_with_bit(clock: SampleClock, *, every: int, knows: bool) -> list[int 
         at = BEGIN_NS + 10 * i * NS_PER_MS
         pulse = i % every == 0
         if pulse:
-            clock.edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
+            clock.on_sout_edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
         m = Measurement(82, 0, 10 * i, status=0x1000 if pulse and knows else 0)
         numbers.append(clock.sample(m, at + 2 * NS_PER_MS, 0).edge_seq)
     return numbers
@@ -244,17 +268,17 @@ def give(clock: SampleClock, what: str, t_ns: int, number: int) -> None:
     """One thing that is no message."""
     edges = [Edge(t_ns, True, 2 * number + 1), Edge(t_ns + 80_000, False, 2 * number + 2)]
     if what == "edges":
-        clock.edges(edges)
+        clock.on_sout_edges(edges)
     elif what == "pulses":
-        clock.pulses(edges)
+        clock.on_pps_edges(edges)
     elif what == "divided":
-        clock.divided(edges)
+        clock.on_divided_edges(edges)
     elif what == "triggers":
-        clock.triggers([TriggerStamp(t_ns, 1000, number)])
+        clock.on_trigger_stamps([TriggerStamp(t_ns, 1000, number)])
     elif what == "reference":
-        clock.reference = UtcReference(-t_ns % (1000 * NS_PER_MS), 1000)
+        clock.set_utc_reference(UtcReference(-t_ns % (1000 * NS_PER_MS), 1000))
     elif what == "nothing known":
-        clock.reference = None
+        clock.set_utc_reference(None)
 
 
 def test_divided_pulses_find_their_samples() -> None:
@@ -263,7 +287,7 @@ def test_divided_pulses_find_their_samples() -> None:
     for i in range(1000):
         at = BEGIN_NS + 10 * i * NS_PER_MS
         if i % 4 == 0:
-            clock.divided([Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
+            clock.on_divided_edges([Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
         if i % 100 == 48:
             expected.append((i + 1, None))  # its sample is lost
             continue

@@ -1,23 +1,49 @@
-"""Pairs by device time, whichever side loses."""
+"""Edges paired with samples by device time, whichever side loses; pulses decoded from edges."""
 
-from imud.clock.pairing import MISSES_MOST, QUEUE_MOST, WRONG_MOST, Pairing
+from imud.clock.edge_pairing import MISSES_MOST, QUEUE_MOST, WRONG_MOST, EdgePairing, PulseDecoder, rising_edges
+from imud.contracts.lines import Edge
 from imud.units import NS_PER_MS
+
+# --- pulses -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_pulse_is_its_rising_edge() -> None:
+    assert PulseDecoder(80_000).decode([Edge(1000, True, 1), Edge(81_000, False, 2)]) == [(1000, 1)]
+
+
+def test_the_halves_of_a_pulse_may_come_apart() -> None:
+    pulses = PulseDecoder(80_000)
+    assert pulses.decode([Edge(1000, True, 1)]) == [(1000, 1)]
+    assert pulses.decode([Edge(81_000, False, 2), Edge(500_000, True, 3)]) == [(500_000, 3)]
+
+
+def test_a_falling_edge_alone_is_counted_back() -> None:
+    pulses = PulseDecoder(80_000)
+    assert pulses.decode([Edge(1000, True, 1), Edge(581_000, False, 4)]) == [(1000, 1), (501_000, 3)]
+
+
+def test_only_rising_edges() -> None:
+    assert rising_edges([Edge(1, True, 1), Edge(2, False, 2), Edge(3, True, 3)]) == [(1, 1), (3, 3)]
+
+
+# --- pairing ----------------------------------------------------------------------------------------------------------
+
 
 PERIOD_NS = 10 * NS_PER_MS
 LEAD_NS = 80_000
 ERROR_NS = 100_000.0
 
 
-def pair(pairing: Pairing, i: int, fit_off_ns: int = LEAD_NS) -> bool:
+def pair(pairing: EdgePairing, i: int, fit_off_ns: int = LEAD_NS) -> bool:
     """Sample `i`, whose event was at i periods; the fit is where its message began."""
     at = i * PERIOD_NS
     return pairing.pair(at, at + NS_PER_MS, at + fit_off_ns, ERROR_NS, float(PERIOD_NS), 1.0)
 
 
-def running(count: int = 100) -> Pairing:
-    pairing = Pairing(LEAD_NS)
+def running(count: int = 100) -> EdgePairing:
+    pairing = EdgePairing(LEAD_NS)
     for i in range(count):
-        pairing.give([(i * PERIOD_NS, i)])
+        pairing.add_events([(i * PERIOD_NS, i)])
         pair(pairing, i)
     assert pairing.running
     return pairing
@@ -25,13 +51,13 @@ def running(count: int = 100) -> Pairing:
 
 def test_events_that_come_together_are_told_apart() -> None:
     pairing = running()
-    pairing.give([(i * PERIOD_NS, i) for i in range(100, 116)])
+    pairing.add_events([(i * PERIOD_NS, i) for i in range(100, 116)])
     assert [(pair(pairing, i), pairing.number) for i in range(100, 116)] == [(True, i) for i in range(100, 116)]
 
 
 def test_either_side_may_lose() -> None:
     pairing = running()
-    pairing.give([(i * PERIOD_NS, i) for i in (100, 102, 103)])
+    pairing.add_events([(i * PERIOD_NS, i) for i in (100, 102, 103)])
     assert [(pair(pairing, i), pairing.number) for i in (100, 101, 103)] == [(True, 100), (False, 100), (True, 103)]
     assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
 
@@ -39,7 +65,7 @@ def test_either_side_may_lose() -> None:
 def test_the_nearest_is_taken_and_a_distant_one_is_not() -> None:
     pairing = running()
     at = 100 * PERIOD_NS
-    pairing.give([(at - 3 * NS_PER_MS, 1), (at - 20_000, 2), (at + 5_000, 3), (at + 3 * NS_PER_MS, 4)])
+    pairing.add_events([(at - 3 * NS_PER_MS, 1), (at - 20_000, 2), (at + 5_000, 3), (at + 3 * NS_PER_MS, 4)])
     assert pair(pairing, 100)
     assert (pairing.stamp_ns, pairing.number) == (at + 5_000, 3)
     assert not pair(pairing, 101)
@@ -47,23 +73,23 @@ def test_the_nearest_is_taken_and_a_distant_one_is_not() -> None:
 
 def test_what_is_near_but_not_near_enough_is_counted_on_both_sides() -> None:
     pairing = running()
-    pairing.give([(100 * PERIOD_NS + NS_PER_MS, 100)])
+    pairing.add_events([(100 * PERIOD_NS + NS_PER_MS, 100)])
     assert not pair(pairing, 100)
     assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
 
 
 def test_it_begins_only_when_most_agree() -> None:
-    pairing = Pairing(LEAD_NS)
+    pairing = EdgePairing(LEAD_NS)
     for i in range(30):
-        pairing.give([(i * PERIOD_NS + (i % 4) * NS_PER_MS, i)])
+        pairing.add_events([(i * PERIOD_NS + (i % 4) * NS_PER_MS, i)])
         assert not pair(pairing, i)
     assert not pairing.running
 
 
 def test_an_unsure_fit_begins_nothing() -> None:
-    pairing = Pairing(LEAD_NS)
+    pairing = EdgePairing(LEAD_NS)
     for i in range(30):
-        pairing.give([(i * PERIOD_NS, i)])
+        pairing.add_events([(i * PERIOD_NS, i)])
         at = i * PERIOD_NS
         pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, 0.5 * PERIOD_NS, float(PERIOD_NS), 1.0)
     assert not pairing.running
@@ -79,13 +105,13 @@ def test_a_line_without_events_is_given_up() -> None:
 def test_a_line_off_by_a_period_is_found_by_the_fit() -> None:
     pairing = running()
     for i in range(100, 100 + WRONG_MOST + 200):
-        pairing.give([(i * PERIOD_NS, i)])
+        pairing.add_events([(i * PERIOD_NS, i)])
         pair(pairing, i, PERIOD_NS + LEAD_NS)
     assert pairing.number < 300 + WRONG_MOST
     assert not pairing.learned or abs(pairing.delay_ns) < PERIOD_NS / 2
 
 
 def test_events_nobody_asks_for_are_bounded() -> None:
-    pairing = Pairing(LEAD_NS)
-    pairing.give([(i, i) for i in range(QUEUE_MOST + 10)])
+    pairing = EdgePairing(LEAD_NS)
+    pairing.add_events([(i, i) for i in range(QUEUE_MOST + 10)])
     assert pairing.events_unpaired == 10

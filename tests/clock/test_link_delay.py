@@ -1,6 +1,6 @@
 """What is known of a delay from the link alone."""
 
-from imud.clock.arrival import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
+from imud.clock.link_delay import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
 from imud.units import NS_PER_MS
 
 
@@ -20,8 +20,8 @@ def test_spread_of_even_and_uneven_arrivals() -> None:
     even, uneven = ArrivalSpread(), ArrivalSpread()
     assert even.sigma_ns == FIRST_SPREAD_NS
     for i in range(1, 500):
-        even.add(i * 10 * NS_PER_MS)
-        uneven.add(i * 10 * NS_PER_MS + (i % 2) * 4 * NS_PER_MS)
+        even.add_arrival(i * 10 * NS_PER_MS)
+        uneven.add_arrival(i * 10 * NS_PER_MS + (i % 2) * 4 * NS_PER_MS)
     assert even.sigma_ns < 10_000
     assert abs(even.period_ns - 10 * NS_PER_MS) < 1000
     assert 2 * NS_PER_MS < uneven.sigma_ns < 12 * NS_PER_MS

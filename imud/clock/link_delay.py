@@ -1,4 +1,4 @@
-"""Where the delay of a message can lie when nothing but its arrival is known: the bias of a link and its spread."""
+"""The delay of a message as far as the link alone bounds it: the bias that no arrival shows, the spread of arrivals."""
 
 from typing import Final
 
@@ -7,16 +7,19 @@ from imud.units import NS_PER_MS, NS_PER_US
 WAKE_NS: Final = 100 * NS_PER_US
 """Shortest way from the interrupt to the reader, at most (30–100 µs on small boards)."""
 FIFO_BYTES: Final = 4
-"""A 16550 or PL011 receive FIFO tells of a tail below its trigger level after up to four byte times."""
+"""A 16550 or PL011 receive FIFO reports a tail below its trigger level after up to four byte times."""
 USB_POLL_NS: Final = 125 * NS_PER_US
-"""One micro-frame: how long a full adapter waits for the host to ask."""
+"""One micro-frame: how long a full adapter waits for the host's poll."""
 FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
 """Spread assumed of arrivals before any is known."""
 SMOOTHING: Final = 1 / 32
 
 
 class LinkDelay:
-    """Bounds of the part of the delay that never varies, and so cannot be seen: 0 … a bias that the link can have."""
+    """Bounds of the constant part of the delay, which no arrival shows: between 0 and the bias that the link can have.
+
+    `byte_ns` is the time of a byte on the wire (0: unknown), `hold_ns` the period of an adapter's latency timer.
+    """
 
     __slots__ = ("byte_ns", "hold_ns")
 
@@ -26,13 +29,13 @@ class LinkDelay:
 
     @property
     def floor_ns(self) -> int:
-        """Bound of the delay of even the luckiest message."""
+        """Upper bound of the delay of the message that was delayed least."""
         if self.hold_ns:
             return WAKE_NS + USB_POLL_NS
         return WAKE_NS + FIFO_BYTES * self.byte_ns
 
     def held_ns(self, period_ns: float, size_bytes: int) -> float:
-        """Longest time an adapter's timer can hide behind bytes that follow.
+        """Longest time that an adapter's timer can hide behind bytes that follow.
 
         A read ends either in the pause after a message or inside the next one, and then counting back the bytes that
         trail leaves the pause: with messages every `period_ns`, no more than that pause, and never more than the timer.
@@ -45,20 +48,20 @@ class LinkDelay:
 class ArrivalSpread:
     """Mean and spread of the steps between arrivals, for devices that send no time."""
 
-    __slots__ = ("_last", "_spread", "period_ns")
+    __slots__ = ("_last_ns", "_spread", "period_ns")
 
     def __init__(self) -> None:
-        self._last = 0
+        self._last_ns = 0
         self._spread = 0.0
         self.period_ns = 0.0
         """Mean step between messages; 0 while unknown."""
 
-    def add(self, y: int, steps: int = 1) -> None:
-        """Take the arrival of a message, less its wire time; `steps` messages after the one before."""
-        last, self._last = self._last, y
-        if not last:
+    def add_arrival(self, arrival_ns: int, steps: int = 1) -> None:
+        """Add the arrival of a message, less its wire time; `steps` messages after the one before."""
+        last_ns, self._last_ns = self._last_ns, arrival_ns
+        if not last_ns:
             return
-        step = (y - last) / steps
+        step = (arrival_ns - last_ns) / steps
         if not self.period_ns:
             self.period_ns = step
             self._spread = FIRST_SPREAD_NS

@@ -1,0 +1,314 @@
+"""The fit of arrivals: offset and skew of a device's clock from the lower envelope of arrival times over device time.
+
+An arrival is `arrival_ns = truth + delay` (less the time on the wire) with a delay that is never negative, so the truth
+lies on or under every point (device_ns, arrival_ns), and the points that were hardly delayed lie on it. An average
+follows the mean delay and every burst; the lower convex hull does not (Zhang, Liu, Xia: Clock synchronization
+algorithms for network measurements, INFOCOM 2002).
+
+Plan: each bin of device time keeps its lowest point above the present fit; bins begin as single samples and double
+in width until 64 of them cover about a minute; then the oldest goes. Whenever a bin opens, the lower hull over the
+bins gives the fit: its edge over a point at three quarters of the window. (The edge over the mean minimises the summed
+distance, but is later to follow a crystal that drifts: its error at the newest end is 51 µs at 0.1 ppm/s and 64 s,
+at three quarters 13 µs.) A sample costs one evaluation of the fit and one comparison; the hull is paid once per bin.
+
+Latency timers (USB adapters): a message waits in the adapter between nothing and the timer's period, so the truth lies
+under every arrival and above every arrival less that period. Where the timer beats with the samples (100 Hz on 16 ms,
+or two crystals 30 ppm apart) the shortest wait creeps from nothing to the step between phases and falls back, once in
+a minute or an hour, and an envelope alone follows it. `feasible_lines` bounds the truth from both sides; the middle of
+the lines between the bounds is the better estimate, and their spread is the error.
+"""
+
+from dataclasses import dataclass
+from math import inf, sqrt
+from typing import Final
+
+from imud.units import NS_PER_S, NS_PER_US
+
+BINS: Final = 64
+BIN_LONGEST_NS: Final = NS_PER_S
+"""64 s of window: long against the beat of two crystals with an adapter's timer, short against their warming up."""
+SLOPE_LOWEST: Final = 1 / 1.07
+SLOPE_HIGHEST: Final = 1 / 0.93
+"""Host ns per device ns. Parts 4.08 % off nominal have been sold; past 7 % it is another tick, not a crystal."""
+SUPPORT_AT: Final = 0.75
+"""Where in the window the hull edge is taken."""
+SPREAD_BINS: Final = 12
+"""A fit under n bins is off by their mean distance times this over n, one sigma (by simulation, loaded host)."""
+RECENT_BINS: Final = 8
+RECENT_NS: Final = 2 * NS_PER_S
+"""A delay that so many of the newest bins share, arriving over at least this time, is no delay of single messages."""
+LATENCIES_NS: Final = (200 * NS_PER_US, 600 * NS_PER_US, 2000 * NS_PER_US, 6000 * NS_PER_US)
+"""What polling and wake-up may add to the longest wait, tried in turn until some line fits."""
+
+Point = tuple[float, float]
+"""(device ns, ns)."""
+
+
+class _Bin:
+    """The lowest point of a stretch of device time, and how long its messages waited, least and on average."""
+
+    __slots__ = ("arrival_ns", "begin_ns", "count", "device_ns", "lowest", "wait", "wait_least", "wait_most")
+
+    def __init__(self, device_ns: int, arrival_ns: int, lowest: float, wait: float) -> None:
+        self.begin_ns = device_ns
+        self.device_ns = device_ns
+        self.arrival_ns = arrival_ns
+        self.lowest = lowest
+        """Distance of (device_ns, arrival_ns) above the fit."""
+        self.wait = wait
+        """Sum over `count` messages of how long they waited, above the fit."""
+        self.wait_least = wait
+        self.wait_most = wait
+        self.count = 1
+
+    def longest_wait(self) -> float:
+        """How long the timer held a message at most, without the stalls of the host.
+
+        Waits that sweep the timer's period, or repeat in even steps, lie as far above their mean as the least lies
+        below it; a stall adds little to a mean.
+        """
+        return min(2 * self.wait / self.count - self.wait_least, self.wait_most)
+
+    def merged(self, after: "_Bin") -> "_Bin":
+        """This bin and its neighbour as one."""
+        low = self if self.lowest <= after.lowest else after
+        merged = _Bin(low.device_ns, low.arrival_ns, low.lowest, self.wait + after.wait)
+        merged.begin_ns = self.begin_ns
+        merged.wait_least = min(self.wait_least, after.wait_least)
+        merged.wait_most = max(self.wait_most, after.wait_most)
+        merged.count = self.count + after.count
+        return merged
+
+
+class ArrivalFit:
+    """A line from device time to host time under all arrivals. Times are int ns, `slope` is host ns per device ns.
+
+    Its value at `device_ns` is `ref_arrival_ns + slope * (device_ns - ref_device_ns)`; the sample path computes that
+    itself, without a call.
+    """
+
+    __slots__ = (
+        "_bins", "_open", "_pause_count", "_pause_ns", "_until_ns", "_wait_most", "_width_ns", "count", "error_ns",
+        "fitted_ns", "hidden_ns", "hold_ns", "recent_ns", "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns",
+        "slope", "slope_error",
+    )  # fmt: skip
+
+    def __init__(self, device_ns: int, arrival_ns: int, hold_ns: int = 0) -> None:
+        self.ref_device_ns = device_ns
+        self.ref_arrival_ns = arrival_ns
+        self.slope = 1.0
+        self.fitted_ns = device_ns
+        """Device time of the newest change of the fit."""
+        self.count = 1
+        """Number of arrivals."""
+        self.error_ns = 0.0
+        """One-sigma error of the fit at its newest end, as far as the spread of the points shows it."""
+        self.slope_error = 0.07
+        self.residual_ns = 0.0
+        """Root mean square distance of the bins' lowest points above the fit."""
+        self.recent_ns = 0.0
+        """Distance of the lowest point of the newest bins: more than spread, if the device's clock stood still."""
+        self.hold_ns = hold_ns
+        """Period of the adapter's latency timer; 0 for none."""
+        self.hidden_ns = float(hold_ns)
+        """Width of what a latency timer leaves open at the newest end (`feasible_lines`)."""
+        self.shift_ns = hold_ns / 2
+        """How far under the fit the middle of that is."""
+        self._wait_most = float(hold_ns + LATENCIES_NS[0])
+        self._pause_ns = float(hold_ns)
+        self._pause_count = 1
+        self._width_ns = 0
+        self._until_ns = device_ns + 1
+        self._open = _Bin(device_ns, arrival_ns, 0.0, 0.0)
+        self._bins = [self._open]
+
+    @property
+    def span_ns(self) -> int:
+        """Device time between the oldest and the newest bin."""
+        return self._open.device_ns - self._bins[0].device_ns
+
+    def set_pause(self, pause_ns: float, count: int) -> None:
+        """Set the longest pause between messages that a read can end in, at most the timer's period.
+
+        `count` messages cannot all be followed by whole others in their reads.
+        """
+        self._pause_ns, self._pause_count = pause_ns, count
+
+    def add_arrival(self, device_ns: int, arrival_ns: int, trailing_ns: int, above_ns: float) -> bool:
+        """Add an arrival `above_ns` above the fit; `device_ns` never falls. Return whether the fit changed.
+
+        Bytes of `trailing_ns` on the wire followed the message in the same read.
+        """
+        self.count += 1
+        wait = above_ns + trailing_ns
+        if wait > self._wait_most:  # noqa: PLR1730 - a call of min() costs 60 ns on the sample path
+            wait = self._wait_most  # the truth is under the fit: a timer alone cannot have held it for longer
+        if device_ns >= self._until_ns:
+            bin_ = _Bin(device_ns, arrival_ns, above_ns, wait)
+            self._bins.append(bin_)
+            self._open = bin_
+            if len(self._bins) > BINS:
+                self._make_room()
+            self._until_ns = device_ns + max(self._width_ns, 1)
+            self._fit(device_ns)
+            return True
+        bin_ = self._open
+        bin_.count += 1
+        bin_.wait += wait
+        if wait < bin_.wait_least:
+            bin_.wait_least = wait
+        elif wait > bin_.wait_most:
+            bin_.wait_most = wait
+        if above_ns < bin_.lowest:
+            bin_.lowest = above_ns
+            bin_.device_ns = device_ns
+            bin_.arrival_ns = arrival_ns
+        return False
+
+    def _make_room(self) -> None:
+        """Drop the oldest bin, or merge pairs of them while they are short."""
+        bins = self._bins
+        if self._width_ns >= BIN_LONGEST_NS:
+            del bins[0]
+            return
+        newest = bins.pop()
+        self._bins = [bins[i].merged(bins[i + 1]) for i in range(0, BINS, 2)]
+        self._bins.append(newest)
+        self._width_ns = min((newest.begin_ns - bins[0].begin_ns) // (BINS // 2), BIN_LONGEST_NS)
+
+    def _fit(self, device_ns: int) -> None:
+        """Fit the line to the bins again."""
+        bins = self._bins
+        origin = bins[0]
+        x0, y0 = origin.device_ns, origin.arrival_ns
+        hull = lower_hull([(float(b.device_ns - x0), float(b.arrival_ns - y0)) for b in bins])
+        slope, dx, dy = _edge_over(hull, SUPPORT_AT * (bins[-1].device_ns - x0), SLOPE_LOWEST, SLOPE_HIGHEST)
+        self._move(x0 + int(dx), y0 + int(dy), slope)
+        self._judge(device_ns)
+        if self.hold_ns:
+            self._look_through_timer(device_ns)
+
+    def _look_through_timer(self, device_ns: int) -> None:
+        """Replace the fit by the middle of the lines that the timer leaves open."""
+        x0 = self._bins[0].device_ns
+        upper = lower_hull([(float(b.device_ns - x0), b.lowest) for b in self._bins])
+        lower = [(float(b.device_ns - x0), -f) for b, f in zip(self._bins, self._floors(), strict=True)]
+        lower = [(xl, -f) for xl, f in lower_hull(lower)]
+        for latency_ns in LATENCIES_NS:
+            found = feasible_lines(upper, [(xl, f - latency_ns) for xl, f in lower], float(device_ns - x0))
+            if found is not None:
+                break
+        else:
+            self.hidden_ns = float(min(self.hold_ns, LATENCIES_NS[-1]))
+            self.shift_ns = self.hidden_ns / 2
+            return
+        slope = (found.slope_lowest + found.slope_highest) / 2
+        slope = min(max(self.slope + slope, SLOPE_LOWEST), SLOPE_HIGHEST) - self.slope
+        xu, yu = min(upper, key=lambda p: p[1] - slope * p[0])
+        self.hidden_ns = found.highest_ns - found.lowest_ns + latency_ns - LATENCIES_NS[0]
+        self.shift_ns = yu + slope * (device_ns - x0 - xu) - (found.highest_ns + found.lowest_ns) / 2
+        self.slope_error += (found.slope_highest - found.slope_lowest) / 4
+        touch_ns = x0 + int(xu)
+        above_ref = self.slope * (touch_ns - self.ref_device_ns)
+        self._move(touch_ns, self.ref_arrival_ns + int(above_ref + yu), self.slope + slope)
+
+    def _floors(self) -> list[float]:
+        """Lower bounds of the truth, bin by bin: the longest wait less the timer, and the least less the pause.
+
+        A bin that stands out above its two neighbours on either side was stalled, and is brought down to them.
+        """
+        hold, pause, enough = self.hold_ns, self._pause_ns, self._pause_count
+        floors = [
+            max(b.longest_wait() - hold, b.lowest - pause if b.count >= enough else -hold - pause) for b in self._bins
+        ]
+        padded = [-inf, -inf, *floors, -inf, -inf]
+        return [min(f, max(padded[i : i + 2] + padded[i + 3 : i + 5])) for i, f in enumerate(floors)]
+
+    def _move(self, ref_device_ns: int, ref_arrival_ns: int, slope: float) -> None:
+        """Change the line, and with it all distances above it."""
+        x_old, y_old, slope_old = self.ref_device_ns, self.ref_arrival_ns, self.slope
+        self.ref_device_ns, self.ref_arrival_ns, self.slope = ref_device_ns, ref_arrival_ns, slope
+        for b in self._bins:
+            lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
+            was = b.arrival_ns - y_old - slope_old * (b.device_ns - x_old)
+            b.wait += (lowest - was) * b.count
+            b.wait_least += lowest - was
+            b.wait_most += lowest - was
+            b.lowest = lowest
+
+    def _judge(self, device_ns: int) -> None:
+        """Estimate the error of the fit from the distances of the bins above it."""
+        bins = self._bins
+        n = len(bins)
+        mean = sum(b.lowest for b in bins) / n
+        self.residual_ns = sqrt(sum(b.lowest * b.lowest for b in bins) / n)
+        recent = bins[-RECENT_BINS:]
+        recent_span_ns = recent[-1].arrival_ns - recent[0].arrival_ns
+        self.recent_ns = min(b.lowest for b in recent) if recent_span_ns > RECENT_NS else 0.0
+        self.error_ns = mean * min(1.0, SPREAD_BINS / n) + (0.0 if self.hold_ns else self.recent_ns)
+        span = bins[-1].device_ns - bins[0].device_ns
+        self.slope_error = min(0.07, 2e-6 + 4 * self.error_ns / span) if n > 2 and span else 0.07
+        self.fitted_ns = device_ns
+
+
+def lower_hull(points: list[Point]) -> list[Point]:
+    """Lower convex hull of points in order of x (Andrew's monotone chain)."""
+    hull: list[Point] = []
+    for x, y in points:
+        while len(hull) >= 2:
+            (xa, ya), (xb, yb) = hull[-2], hull[-1]
+            if (yb - ya) * (x - xa) < (y - ya) * (xb - xa):
+                break
+            hull.pop()
+        hull.append((x, y))
+    return hull
+
+
+def _edge_over(hull: list[Point], x: float, lowest: float, highest: float) -> tuple[float, float, float]:
+    """Slope of the hull's edge over `x`, held between two bounds, and a point (x, y) of the line under the hull."""
+    if len(hull) < 2:
+        return (lowest + highest) / 2, *hull[0]
+    i = 1
+    while i < len(hull) - 1 and hull[i][0] < x:
+        i += 1
+    (xa, ya), (xb, yb) = hull[i - 1], hull[i]
+    slope = (yb - ya) / (xb - xa)
+    if lowest <= slope <= highest:
+        return slope, xa, ya
+    slope = min(max(slope, lowest), highest)
+    xa, ya = min(hull, key=lambda p: p[1] - slope * p[0])
+    return slope, xa, ya
+
+
+@dataclass(frozen=True, slots=True)
+class FeasibleLines:
+    """All lines between an upper and a lower bound, evaluated at the newest point."""
+
+    lowest_ns: float
+    """Lowest value of any such line there."""
+    highest_ns: float
+    slope_lowest: float
+    slope_highest: float
+
+
+def feasible_lines(upper: list[Point], lower: list[Point], x: float) -> FeasibleLines | None:
+    """Return the lines under all points of `upper` and above all of `lower` up to `x`; None where there are none.
+
+    The points are the corners of two convex chains; every pair of them bounds the slope, so with some ten corners each
+    this is exact and cheap.
+    """
+    steepest, flattest = 1.0, -1.0
+    for xu, yu in upper:
+        for xl, yl in lower:
+            room, apart = yu - yl, xu - xl
+            if apart > 0:
+                steepest = min(steepest, room / apart)
+            elif apart < 0:
+                flattest = max(flattest, room / apart)
+            elif room < 0:
+                return None
+    if flattest > steepest:
+        return None
+    highest = min(y + steepest * (x - xu) for xu, y in upper)
+    lowest = max(y + flattest * (x - xl) for xl, y in lower)
+    return FeasibleLines(lowest, highest, flattest, steepest)

@@ -1,0 +1,390 @@
+"""Device time from a counter: unwrapped, finer than its tick, without its corrections; missing samples; jumps.
+
+    ticks ─▶ DeviceTime.advance ─▶ raw_ns, even_ns, missed        PeriodLearner: the step between samples
+                    │
+                    ├─ absorb_correction: the counter was set by a little while the samples went on
+                    └─ JumpDetector: the counter began anew, or is another time
+
+`SampleNumber` serves counters that number the samples and give no time. Nothing here reads a clock.
+"""
+
+from typing import Final
+
+from imud.clock.arrival_fit import SLOPE_HIGHEST, ArrivalFit
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+# --- period and missing samples -------------------------------------------------------------------------------------
+CONSISTENT: Final = 4
+"""So many equal steps in a row are a rate."""
+CONSISTENT_LONGER: Final = 12
+"""The same for a longer step than before: where one of ten messages is lost, every second minute at 1 kHz leaves the
+same hole four times in a row, and a period of two ticks for one would shift device time by a tick."""
+WHOLE_AFTER: Final = 64
+"""After so many equal steps the period is whole: what differed in the beginning was a loss."""
+EVERY_TICK: Final = 1.5
+"""With a shorter period two samples can be in one tick; with a longer one it is the same sample."""
+MEMORY: Final = 4096
+"""Steps in the mean of a period that is no whole number of ticks; then both sums are halved."""
+
+# --- device time finer than a tick ----------------------------------------------------------------------------------
+QUANTISED: Final = 0.29
+"""One-sigma error of a truncated stamp, in ticks: 1 / √12."""
+SETTLED_CHANGES: Final = 64
+"""After so many steps that differ from the one before, the phase of an uneven rate within its ticks is known to a small
+part of one. At 400 Hz in ms that is 64 samples; a rate 50 ppm off 100 Hz takes ten minutes."""
+EVEN_FOR: Final = 64
+"""After so many even samples one uneven step is the counter's, not the device's: its samples stay even."""
+FOLLOWED_NS: Final = 15 * NS_PER_US
+"""A sample that is outside its tick by no more shows the error of the learned period, which is followed."""
+UNEVEN_NS: Final = 200 * NS_PER_US
+"""A step that is off by less than this or a tick is no correction of the counter."""
+UNEVEN_SHARE: Final = 0.25
+WATCHED: Final = 256
+"""For so many samples after an uneven step or a gap, device time is compared with the arrivals."""
+
+# --- corrections ----------------------------------------------------------------------------------------------------
+CORRECTION_MOST_NS: Final = 250 * NS_PER_MS
+"""A counter that moves by more jumped to another time. An hour and more without pulses at 50 ppm."""
+CORRECTION_SPAN_NS: Final = 5 * NS_PER_S
+"""A fit over less time swings by more than a correction."""
+CORRECTION_SIGMAS: Final = 4
+CORRECTION_TICKS: Final = 0.5
+"""A message so far below the fit came before its sample, if that was taken when the stamp says."""
+
+# --- jumps ----------------------------------------------------------------------------------------------------------
+JUMP_EARLY_NS: Final = 5 * NS_PER_MS
+JUMP_EARLY_SIGMAS: Final = 10
+"""A message so far below the fit shows that the device's clock jumped ahead."""
+FIRST_EARLY_NS: Final = NS_PER_S
+"""The same before the fit is used: the first message may have waited that long in a buffer."""
+JUMP_LATE_NS: Final = NS_PER_S // 2
+JUMP_LATE_READS: Final = 3
+"""Messages may queue up while the host is busy; late in so many reads over a second, it is the device's clock."""
+
+# --- counters of samples --------------------------------------------------------------------------------------------
+STEPS_ALWAYS: Final = 4
+"""So many steps are accepted at any arrival: messages that waited arrive together."""
+STEPS_FACTOR: Final = 1.5
+"""Error of the rate over a longer gap, at most; a larger jump is a counter that began anew."""
+QUEUED_NS: Final = NS_PER_S // 2
+"""How long messages may wait and then arrive together; no device starts anew within that time."""
+STEPS_UNKNOWN: Final = 1000
+"""So many steps are accepted while the rate is not known."""
+
+
+class PeriodLearner:
+    """Learn the step between samples, in device ticks, and count the samples missing in a longer one.
+
+    The period is measured, not taken from the nominal rate.
+    """
+
+    __slots__ = ("_before", "_candidate", "_count", "_even", "_run", "_run_sum", "_sum", "changes", "period_ticks")
+
+    def __init__(self) -> None:
+        self.period_ticks = 0.0
+        """Mean step; 0 while unknown."""
+        self._sum = 0.0
+        self._count = 0.0
+        self._even = 0
+        self._before = -1
+        self._candidate = 0
+        self._run = 0
+        self._run_sum = 0
+        self.changes = 0
+        """Times that a period of no whole number of ticks showed where in a tick it is; 0 where it is a whole one."""
+
+    def add_step(self, ticks: int) -> int:
+        """Add the step to the newest sample; return how many samples are missing in it."""
+        period = self.period_ticks
+        if ticks <= 0:
+            if 0 < period < EVERY_TICK:
+                self._refine(0)
+            return 0
+        if ticks == period:
+            self._run = 0
+            self._even += 1
+            return 0
+        if period and abs(ticks - period) <= 1 and int(ticks / period + 0.5) == 1:
+            self._refine(ticks)
+            return 0
+        if self._learn(ticks):
+            return 0
+        if not period:
+            return 0
+        steps = max(int(ticks / period + 0.5), 1)
+        if self.changes and abs(ticks - steps * period) <= 1:
+            self._average(ticks, steps)  # the mean of what is left, where one of ten is lost, is off by a thousandth
+        return steps - 1
+
+    def _average(self, ticks: int, steps: int) -> None:
+        """Add `steps` periods of `ticks` in all to the mean."""
+        self._sum += ticks + int(self._even * self.period_ticks)
+        self._count += steps + self._even
+        self._even = 0
+        self.period_ticks = self._sum / self._count
+
+    def _refine(self, ticks: int) -> None:
+        self._run = 0
+        self._average(ticks, 1)
+        same, self._before = ticks == self._before, ticks
+        self.changes += not same
+        if same and self.changes <= 1 and self._count >= WHOLE_AFTER:
+            self.period_ticks, self._sum, self._count, self.changes = float(ticks), float(ticks), 1.0, 0
+        while self._count >= MEMORY:
+            self._sum /= 2
+            self._count /= 2
+
+    def _learn(self, ticks: int) -> bool:
+        """Adopt another period when the last steps agree on it; return whether they do."""
+        if self._run and abs(ticks - self._candidate) <= 1:
+            self._run += 1
+            self._run_sum += ticks
+        else:
+            self._candidate, self._run, self._run_sum = ticks, 1, ticks
+        if self._run < (CONSISTENT_LONGER if 0 < self.period_ticks < self._candidate else CONSISTENT):
+            return False
+        self._sum, self._count = float(self._run_sum), float(self._run)
+        self.period_ticks = self._sum / self._count
+        self._run = self._even = self.changes = 0
+        self._before = -1
+        return True
+
+
+class DeviceTime:
+    """Unwrapped device time in ns, of the newest sample.
+
+    A stamp is truncated to a tick, so at 400 Hz a millisecond counter steps 2, 3, 2, 3. The samples are even all the
+    same: `even_ns` steps by the learned period and is held inside the tick that the stamp names. Where a device that
+    was even so far leaves its tick, the counter was corrected, or had been before: then the ticks are shifted instead.
+
+    A module on UTC takes back at the first pulse after a break what its crystal gathered: 0.9 ms after 30 s at 30 ppm,
+    30 ms after ten minutes at 50 ppm. Its sampling does not move with the counter. A step that is no whole number of
+    periods, or one over samples that were not lost, is therefore compared with the arrivals (`absorb_correction`):
+    where they fit the next sample better than the stamp, the step is taken out of device time, and the fit and the
+    pairing of edges go on undisturbed. Corrections within a tick need no arrivals: samples stay even over them.
+    """
+
+    __slots__ = (
+        "_even_for", "_gap", "_modulus", "_phase_ns", "_shift_ns", "_step_ns", "_ticks", "doubt_ns", "even_ns",
+        "missed", "period", "raw_ns", "tick_ns", "uneven", "watched",
+    )  # fmt: skip
+
+    def __init__(self, tick_ns: int, tick_modulus: int) -> None:
+        self.tick_ns = tick_ns
+        self._modulus = tick_modulus
+        self._ticks = 0
+        self._phase_ns = 0.0
+        self._shift_ns = 0.0
+        """What corrections took from the counter and `even_ns` still has."""
+        self._even_for = 0
+        self._step_ns = 0
+        """The newest step of the counter; negative where that is shorter than half a turn forward."""
+        self._gap = 0
+        """Samples missing in the last gap, while it is watched."""
+        self.uneven = False
+        """Whether the newest step, after many even ones, is no whole number of periods by more than a tick."""
+        self.doubt_ns = 0.0
+        """By how much even samples were preferred to stamps, until an arrival confirms it."""
+        self.watched = 0
+        """Number of further samples whose device time is compared with their arrivals."""
+        self.period = PeriodLearner()
+        self.raw_ns = 0
+        """Unwrapped device time as stamped."""
+        self.even_ns = 0
+        """As `raw_ns`, plus the part of a tick that an uneven rate reveals; never falls while the clock runs on."""
+        self.missed = 0
+        """Samples missing between the last two."""
+
+    def begin(self, ticks: int) -> None:
+        """Set the first stamp of a device, or the first after its clock started anew."""
+        self._ticks = ticks
+        self._phase_ns = self._shift_ns = self.doubt_ns = 0.0
+        self.missed = self._gap = self.watched = self._even_for = 0
+        self.uneven = False
+        self.raw_ns = self.even_ns = ticks % self._modulus * self.tick_ns
+
+    def elapsed_ns(self, ticks: int) -> int:
+        """Device time from the newest stamp to `ticks`, if the counter only went forward and wrapped once at most."""
+        return (ticks - self._ticks) % self._modulus * self.tick_ns
+
+    def advance(self, ticks: int) -> None:
+        """Set the next stamp."""
+        step = (ticks - self._ticks) % self._modulus
+        self._ticks = ticks
+        tick_ns = self.tick_ns
+        self.raw_ns += step * tick_ns
+        period = self.period
+        self.missed = missed = period.add_step(step)
+        self._even_for += 1
+        if self.watched:
+            self.watched -= 1
+            self.uneven = False
+        if missed:
+            self._gap, self.watched = missed, WATCHED
+            if step > self._modulus // 2:
+                self._note_uneven(step)
+        if step != period.period_ticks and (step or period.period_ticks < EVERY_TICK):
+            off_ns = ((missed + 1) * period.period_ticks - step) * tick_ns
+            phase_ns = self._phase_ns + off_ns
+            self._phase_ns = held_ns = min(max(phase_ns, 0.0), float(tick_ns))
+            if phase_ns != held_ns:
+                self._leave_tick(step, off_ns, phase_ns - held_ns)
+        self.even_ns = self.raw_ns + int(self._phase_ns + self._shift_ns)
+
+    def _leave_tick(self, step: int, off_ns: float, over_ns: float) -> None:
+        """Handle a sample that is even with those before only if it is `over_ns` outside of its tick."""
+        off, over, tick_ns = abs(off_ns), abs(over_ns), self.tick_ns
+        settled = self._even_for >= EVEN_FOR and self.period.period_ticks > 0
+        if off > max(tick_ns * 1.01, UNEVEN_NS):
+            self._note_uneven(step)
+        elif settled and over > FOLLOWED_NS:
+            self._shift_ns += over_ns
+            self.doubt_ns = max(self.doubt_ns, over)
+            self.watched = WATCHED
+        if over > UNEVEN_SHARE * tick_ns:
+            self._even_for = 0
+
+    def _note_uneven(self, step: int) -> None:
+        """Note a step that lost samples do not explain; backward, if that is shorter than half a turn forward."""
+        self._step_ns = (step - self._modulus if step > self._modulus // 2 else step) * self.tick_ns
+        self.uneven = self.uneven or self._even_for >= EVEN_FOR
+        self.watched = WATCHED
+        self._even_for = 0
+
+    def absorb_correction(self, fit: ArrivalFit, before_ns: int, arrival_ns: int) -> bool:
+        """Take a correction of the counter at the newest sample, or shortly before, out of device time.
+
+        The sample before was at device time `before_ns`; the message began at `arrival_ns` at the latest. Returns
+        whether there was one; `even_ns` and `missed` are then set anew.
+        """
+        period_ns = self.period.period_ticks * self.tick_ns
+        if not period_ns or fit.span_ns < CORRECTION_SPAN_NS:
+            return False
+        slope, device_ns = fit.slope, self.even_ns
+        due_ns = fit.ref_arrival_ns + slope * (before_ns - fit.ref_device_ns)
+        early_ns = CORRECTION_TICKS * self.tick_ns + CORRECTION_SIGMAS * fit.error_ns
+        early_ns += fit.slope_error * max(min(device_ns - fit.fitted_ns, CORRECTION_MOST_NS), 0)
+        above_ns = arrival_ns - due_ns - slope * (device_ns - before_ns)
+        if self.uneven:
+            return self._absorb_step(before_ns, (arrival_ns - due_ns) / slope, above_ns, early_ns, fit.hold_ns)
+        if self._gap and above_ns < -early_ns:
+            periods = min(round(-above_ns / (slope * period_ns)), self._gap)
+            if (
+                periods
+                and above_ns + periods * slope * period_ns >= -early_ns
+                and periods * period_ns <= CORRECTION_MOST_NS
+            ):
+                self._shorten_gap(periods)
+                return True
+        if -early_ns <= above_ns <= self.doubt_ns / 2:
+            self.doubt_ns = 0.0
+        return False
+
+    def _absorb_step(self, before_ns: int, elapsed_ns: float, above_ns: float, early_ns: float, hold_ns: int) -> bool:
+        """Make an uneven step even, if the message, `elapsed_ns` after the sample before, fits that better."""
+        period_ns = self.period.period_ticks * self.tick_ns
+        waited_ns = elapsed_ns - period_ns
+        if waited_ns < -early_ns:
+            return False
+        periods = 1 + int(max(waited_ns - hold_ns, 0.0) / period_ns)
+        moved_ns = self._step_ns - periods * period_ns
+        if abs(moved_ns) > CORRECTION_MOST_NS:
+            return False
+        late_ns = elapsed_ns - periods * period_ns
+        if -early_ns <= above_ns <= late_ns:
+            return False
+        self._make_even(before_ns, periods)
+        return True
+
+    def _make_even(self, before_ns: int, periods: int) -> None:
+        """Place the newest sample `periods` after the one before, which was at `before_ns`."""
+        period_ns = self.period.period_ticks * self.tick_ns
+        if self._step_ns < 0:
+            self.raw_ns -= self._modulus * self.tick_ns
+        self.even_ns = before_ns + round(periods * period_ns)
+        self._shift_ns = self.even_ns - self.raw_ns - self._phase_ns
+        self.missed, self._gap = periods - 1, 0
+        self.doubt_ns = min(abs(self._step_ns - periods * period_ns), period_ns)
+        self.uneven = False
+
+    def _shorten_gap(self, periods: int) -> None:
+        """Count `periods` of the samples in the last gap as never missing: the counter was set forward."""
+        back_ns = round(periods * self.period.period_ticks * self.tick_ns)
+        self._shift_ns -= back_ns
+        self.even_ns -= back_ns
+        self.missed = max(self.missed - periods, 0)
+        self._gap -= periods
+        self._even_for = 0
+
+    @property
+    def error_ns(self) -> float:
+        """One-sigma error of `even_ns` by the length of a tick; 0 where every stamp is off by the same."""
+        changes = self.period.changes
+        if not changes:
+            return 0.0
+        return QUANTISED * self.tick_ns * min(1.0, SETTLED_CHANGES / changes)
+
+
+class JumpDetector:
+    """Detect that the device's clock jumped: early messages show it at once, late ones when they stay late."""
+
+    __slots__ = ("_since_ns", "late_reads")
+
+    def __init__(self) -> None:
+        self._since_ns = 0
+        self.late_reads = 0
+        """Number of late reads in a row."""
+
+    def reset(self) -> None:
+        """Forget late reads: a new fit begins."""
+        self.late_reads = 0
+
+    def is_early(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, error_ns: float | None) -> bool:
+        """Whether a message `above_ns` (negative) above the fit came before it could; no `error_ns`: a young fit."""
+        if error_ns is None:
+            return above_ns < -FIRST_EARLY_NS - (SLOPE_HIGHEST - 1) * (elapsed_ns + fit.span_ns)
+        return above_ns < -JUMP_EARLY_SIGMAS * error_ns - JUMP_EARLY_NS - 4 * fit.slope_error * elapsed_ns
+
+    def is_late(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, t_rx_ns: int, *, new_read: bool) -> bool:
+        """Whether messages have been so late for so long that the device's clock must have stood still."""
+        if above_ns < JUMP_LATE_NS + fit.slope_error * elapsed_ns:
+            self.late_reads = 0
+            return False
+        if not self.late_reads:
+            self._since_ns = t_rx_ns
+        self.late_reads += new_read
+        return self.late_reads >= JUMP_LATE_READS and t_rx_ns - self._since_ns > NS_PER_S
+
+
+class SampleNumber:
+    """A wrapping counter that numbers a device's samples and gives no time.
+
+    A gap in which it wraps once or more (11 minutes at 100 Hz and 16 bits) is counted short by whole turns.
+    """
+
+    __slots__ = ("_arrival_ns", "_modulus", "_number", "known")
+
+    def __init__(self, modulus: int) -> None:
+        self._modulus = modulus
+        self._number = 0
+        self._arrival_ns = 0
+        self.known = False
+        """Whether there is a sample before."""
+
+    def restart(self) -> None:
+        """Forget the newest sample: the next one is the first."""
+        self.known = False
+
+    def steps(self, number: int, arrival_ns: int, period_ns: float) -> int:
+        """Number of samples from the newest one to this; 0 for the first one and after a counter began anew."""
+        if not self.known:
+            return 0
+        steps = (number - self._number) % self._modulus
+        if steps <= STEPS_ALWAYS:
+            return steps
+        most = STEPS_FACTOR * (arrival_ns - self._arrival_ns + QUEUED_NS) / period_ns if period_ns else STEPS_UNKNOWN
+        return steps if steps <= most else 0
+
+    def advance(self, number: int, arrival_ns: int) -> None:
+        """Set the newest sample."""
+        self._number, self._arrival_ns, self.known = number, arrival_ns, True

@@ -1,0 +1,94 @@
+"""The fit under the arrivals, and the lines that a latency timer leaves open, against a brute-force search."""
+
+from random import Random
+
+import pytest
+
+from imud.clock.arrival_fit import BINS, ArrivalFit, feasible_lines
+from imud.units import NS_PER_MS, NS_PER_S
+
+
+def at(fit: ArrivalFit, device_ns: int) -> float:
+    """Host time by the fit."""
+    return fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
+
+
+def add(fit: ArrivalFit, device_ns: int, arrival_ns: int) -> bool:
+    """Add an arrival without bytes behind it; whether the fit changed."""
+    return fit.add_arrival(device_ns, arrival_ns, 0, arrival_ns - at(fit, device_ns))
+
+
+def fitted(slope: float, delay_mean_ns: float, seconds: int, seed: int = 1) -> tuple[ArrivalFit, int]:
+    """A fit under 100 points a second of a line through the origin, and its error at the newest point."""
+    random = Random(seed)
+    fit, device_ns = ArrivalFit(0, 0), 0
+    for i in range(1, 100 * seconds):
+        device_ns = i * 10 * NS_PER_MS
+        add(fit, device_ns, int(slope * device_ns + random.expovariate(1 / delay_mean_ns)))
+    return fit, int(at(fit, device_ns) - slope * device_ns)
+
+
+@pytest.mark.parametrize("slope", [1.0, 1 / 0.95, 1 / 1.05, 1.00005])
+def test_it_lies_where_nothing_was_delayed(slope: float) -> None:
+    fit, off_ns = fitted(slope, 1_000_000, 100)
+    assert abs(off_ns) < 20_000  # the mean delay is 1 ms
+    assert fit.slope == pytest.approx(slope, abs=1e-6)
+    assert fit.error_ns < 20_000
+
+
+def test_it_is_young_but_not_wild() -> None:
+    fit, off_ns = fitted(1.0, 1_000_000, 1)
+    assert abs(off_ns) < 1_000_000
+    assert fit.slope_error > 1e-5
+
+
+def test_the_window_is_bounded() -> None:
+    """A bin opens with each change: no more in a window's time than the window may have."""
+    fit, _ = fitted(1.0, 1_000_000, 200)
+    assert 30 * NS_PER_S < fit.span_ns < (BINS + 2) * NS_PER_S
+    later = range(200 * NS_PER_S, 200 * NS_PER_S + fit.span_ns, 10 * NS_PER_MS)
+    assert sum(add(fit, device_ns, device_ns + 1_000_000) for device_ns in later) <= BINS
+
+
+def test_an_old_minimum_goes() -> None:
+    """One impossible early arrival bends the line for no more than a window."""
+    fit, device_ns = ArrivalFit(0, -5_000_000), 0
+    for i in range(1, 100 * 100):
+        device_ns = i * 10 * NS_PER_MS
+        add(fit, device_ns, device_ns)
+    assert abs(at(fit, device_ns) - device_ns) < 10
+
+
+# --- feasible lines ---------------------------------------------------------------------------------------------------
+
+
+def test_level_bounds() -> None:
+    found = feasible_lines([(0.0, 10.0), (10.0, 10.0)], [(0.0, 0.0), (10.0, 0.0)], 10.0)
+    assert found is not None
+    assert (found.lowest_ns, found.highest_ns) == (0.0, 10.0)
+    assert (found.slope_lowest, found.slope_highest) == (-1.0, 1.0)
+
+
+def test_no_line_fits() -> None:
+    assert feasible_lines([(0.0, 0.0), (10.0, 0.0)], [(5.0, 1.0)], 10.0) is None
+    assert feasible_lines([(5.0, 0.0)], [(5.0, 1.0)], 10.0) is None
+
+
+def test_bounds_hold_for_every_line_that_fits() -> None:
+    random = Random(5)
+    ceiling = [(float(x), random.uniform(5, 15)) for x in range(0, 100, 9)]
+    floor = [(float(x), random.uniform(-15, -5)) for x in range(3, 100, 9)]
+    found = feasible_lines(ceiling, floor, 100.0)
+    assert found is not None
+    seen = []
+    for _ in range(20_000):
+        slope, at_end = random.uniform(-0.4, 0.4), random.uniform(-40, 40)
+        if all(at_end + slope * (x - 100) <= y for x, y in ceiling) and all(
+            at_end + slope * (x - 100) >= y for x, y in floor
+        ):
+            seen.append(at_end)
+            assert found.slope_lowest <= slope <= found.slope_highest
+            assert found.lowest_ns <= at_end <= found.highest_ns
+    assert len(seen) > 100
+    assert max(seen) > found.highest_ns - 2
+    assert min(seen) < found.lowest_ns + 2
