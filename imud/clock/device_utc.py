@@ -1,4 +1,4 @@
-"""Devices on UTC or beside a pulse per second: each sample lies within a millisecond that the host knows too.
+"""Devices on UTC or beside a pulse per second: each sample lies within a millisecond of known time.
 
 `DeviceUtc`: with PPS and RMC the ms counter of a HiPNUC module turns into "UTC in ms" (manual 1.2.1); of 32 bits, so
 either Unix time modulo 2³² or the time of day, no source says which. A counter that agrees with the host's UTC within

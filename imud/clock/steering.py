@@ -138,7 +138,7 @@ class EdgeSource:
 
 
 class AidingSources:
-    """All that shows a sample's time besides its arrival; a source counts from its first edge on.
+    """The sources of a sample's time other than its arrival; each counts from its first edge on.
 
     Edges are added before the messages that follow them, in the order of time. Synchronization: none; one thread.
     """

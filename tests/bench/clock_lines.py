@@ -18,9 +18,9 @@ from imud.sim.ports.arrival import (
 )
 from imud.units import NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE, CRYSTALS, TICK_NS, clock_for
-from tests.bench.line_model import LineFaults, heard, restarted
+from tests.bench.line_model import LineFaults, restarted, simulate_reads
 from tests.bench.line_runs import (
-    Told,
+    DatedSample,
     after,
     run_pps,
     run_sout,
@@ -40,7 +40,7 @@ FAULTS = {
     "5 % extra edges": LineFaults(extra=0.05),
     "10 % of pulses and of frames lost, loaded": LineFaults(pulse_loss=0.1, frame_loss=0.1, loaded=True),
 }
-Case = tuple[str, str, int, Callable[[], list[Told]]]
+Case = tuple[str, str, int, Callable[[], list[DatedSample]]]
 """Source, what is special, rate, and how to run it."""
 
 
@@ -53,7 +53,7 @@ def sout_cases(rate_hz: int) -> Iterator[Case]:
     """SOUT behind each link, with each crystal, with each fault, and a device that restarts."""
     plain = CRYSTALS["+50 ppm"]
 
-    def case(profile: ArrivalProfile, crystal: Crystal, faults: LineFaults) -> Callable[[], list[Told]]:
+    def case(profile: ArrivalProfile, crystal: Crystal, faults: LineFaults) -> Callable[[], list[DatedSample]]:
         return lambda: run_sout(model(profile, rate_hz, crystal), 60, faults)
 
     for profile in (BARE_UART, USB_1MS, USB_16MS, USB_16MS_PACKET, LOADED):
@@ -67,7 +67,7 @@ def sout_cases(rate_hz: int) -> Iterator[Case]:
     m = model(USB_16MS, rate_hz, plain)
     yield (
         "SOUT", "usb-16ms, device restarts", rate_hz,
-        lambda: with_sout(sout_clock(m), heard(restarted(m, 60 * rate_hz, NS_PER_S), 1, LineFaults())),
+        lambda: with_sout(sout_clock(m), simulate_reads(restarted(m, 60 * rate_hz, NS_PER_S), 1, LineFaults())),
     )  # fmt: skip
 
 
@@ -80,12 +80,12 @@ def other_cases() -> Iterator[Case]:
 
             def pps(
                 profile: ArrivalProfile = profile, rate_hz: int = rate_hz, crystal: Crystal = crystal
-            ) -> list[Told]:
+            ) -> list[DatedSample]:
                 return run_pps(model(profile, rate_hz, crystal), 120)
 
             def utc(
                 profile: ArrivalProfile = profile, rate_hz: int = rate_hz, crystal: Crystal = crystal
-            ) -> list[Told]:
+            ) -> list[DatedSample]:
                 return run_utc(model(profile, rate_hz, crystal), 120, turn_ms=1 << 32)[0]
 
             yield "PPS", at, rate_hz, pps
@@ -93,7 +93,7 @@ def other_cases() -> Iterator[Case]:
     for rate_hz in (100, 1000):
         for name in ("0 ppm", "+5 %"):
 
-            def trigger(rate_hz: int = rate_hz, name: str = name) -> list[Told]:
+            def trigger(rate_hz: int = rate_hz, name: str = name) -> list[DatedSample]:
                 return run_triggers(model(BARE_UART, rate_hz, CRYSTALS[name]), 60, 0.99)[0]
 
             yield "SIN trigger", f"bare-uart, crystal {name}", rate_hz, trigger
@@ -112,9 +112,9 @@ def print_table() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for source, over, rate_hz, run in (*sout_cases(100), *sout_cases(1000), *other_cases()):
-        told = run()
-        settled = after(told, SETTLED_S)
-        settling = told[: len(told) - len(settled)]
+        dated = run()
+        settled = after(dated, SETTLED_S)
+        settling = dated[: len(dated) - len(settled)]
         offs = [t.off_ns for t in settled]
         figures = (
             sigma_ns(offs), sum(offs) / len(offs), sorted(map(abs, offs))[int(len(offs) * 0.999)],
@@ -132,7 +132,7 @@ def speed_ns(*, edges: bool, count: int = 20_000) -> float:
     m = model(BARE_UART, 1000, CRYSTALS["+50 ppm"])
     clock = clock_for(m)
     best, begin, done = float("inf"), perf_counter_ns(), 0
-    for read in heard(m.run(count), 1, LineFaults()):
+    for read in simulate_reads(m.run(count), 1, LineFaults()):
         messages = [
             (
                 Measurement(82, a.trailing_bytes, a.dev_ns // TICK_NS, v, v, v, (1.0, 0.0, 0.0, 0.0), v, 20.0, 1e5),
@@ -160,12 +160,12 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
     plain, with_edges = speed_ns(edges=False), speed_ns(edges=True)
     yield at_most("clock: what SOUT adds to one sample at 1 kHz", with_edges - plain, "ns", 4000)
     for profile, rate_hz in ((USB_16MS, 100), (LOADED, 1000)):
-        told = run_sout(
+        dated = run_sout(
             model(profile, rate_hz, CRYSTALS["+50 ppm"]), seconds, LineFaults(edge_loss=0.01), SoutTiming(bias_us=0.0)
         )
         name = f"clock: with SOUT at {rate_hz} Hz, {profile.name}"
-        yield at_most(f"{name}, sigma", sigma_ns([t.off_ns for t in after(told, 5)]) / 1000, "us", 5)
-        yield at_least(f"{name}, share within 2 t_err", share_honest(told), "", 0.95)
+        yield at_most(f"{name}, sigma", sigma_ns([t.off_ns for t in after(dated, 5)]) / 1000, "us", 5)
+        yield at_least(f"{name}, share within 2 t_err", share_honest(dated), "", 0.95)
 
 
 if __name__ == "__main__":

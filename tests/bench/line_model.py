@@ -39,7 +39,7 @@ class LineFaults:
     loaded: bool = False
 
 
-class Heard(NamedTuple):
+class LineRead(NamedTuple):
     """One read: what the line gave before it, then the messages."""
 
     edges: list[Edge]
@@ -55,7 +55,7 @@ def measured_ns(arrival: Arrival) -> int:
     return arrival.t_ns - PULSE_NS
 
 
-def heard(arrivals: Iterable[Arrival], seed: int, faults: LineFaults) -> list[Heard]:
+def simulate_reads(arrivals: Iterable[Arrival], seed: int, faults: LineFaults) -> list[LineRead]:
     """All reads of a run, with the edges that the kernel had by then."""
     random = Random(f"lines {seed}")
     all_of = list(arrivals)
@@ -70,7 +70,7 @@ def heard(arrivals: Iterable[Arrival], seed: int, faults: LineFaults) -> list[He
             at += 1
         kept = [a for a in group if random.random() >= faults.frame_loss]
         indices = [index[id(a)] for a in kept]
-        reads.append(Heard(edges[begin:at], kept, [numbers[i] for i in indices], [stamps[i] for i in indices]))
+        reads.append(LineRead(edges[begin:at], kept, [numbers[i] for i in indices], [stamps[i] for i in indices]))
     return reads
 
 

@@ -12,12 +12,12 @@ from imud.sim.ports.arrival import Arrival, ArrivalModel
 from imud.units import NS_PER_S
 from tests.bench.clock import TICK_MODULUS, TICK_NS, clock_for
 from tests.bench.line_model import (
-    Heard,
     LineFaults,
-    heard,
+    LineRead,
     measured_ns,
     pps_age_ms,
     pulses_per_second,
+    simulate_reads,
     triggered,
 )  # fmt: skip
 
@@ -25,7 +25,7 @@ UTC_OFFSET_NS = 1_790_000_000_123_456_789
 REFERENCE = UtcReference(UTC_OFFSET_NS, 20_000)
 
 
-class Told(NamedTuple):
+class DatedSample(NamedTuple):
     """One sample beside its truth."""
 
     sample: Sample
@@ -60,26 +60,28 @@ def sout_clock(model: ArrivalModel, timing: SoutTiming | None = None) -> SampleC
     )  # fmt: skip
 
 
-def with_sout(clock: SampleClock, reads: Sequence[Heard], *, silent: range = range(0)) -> list[Told]:
+def with_sout(clock: SampleClock, reads: Sequence[LineRead], *, silent: range = range(0)) -> list[DatedSample]:
     """Reads through a clock; those whose place is in `silent` bring no edges."""
-    told = []
+    dated = []
     for i, read in enumerate(reads):
         if i not in silent:
             clock.on_sout_edges(read.edges)
         for a, number in zip(read.arrivals, read.numbers, strict=True):
-            told.append(Told(clock.sample(measurement(a), a.t_rx_ns, 0), measured_ns(a), number))
-    return told
+            dated.append(DatedSample(clock.sample(measurement(a), a.t_rx_ns, 0), measured_ns(a), number))
+    return dated
 
 
-def run_sout(model: ArrivalModel, seconds: int, faults: LineFaults, timing: SoutTiming | None = None) -> list[Told]:
+def run_sout(
+    model: ArrivalModel, seconds: int, faults: LineFaults, timing: SoutTiming | None = None
+) -> list[DatedSample]:
     """A device with SOUT."""
-    reads = heard(model.run(int(model.rate_hz) * seconds), model.seed, faults)
+    reads = simulate_reads(model.run(int(model.rate_hz) * seconds), model.seed, faults)
     return with_sout(sout_clock(model, timing), reads)
 
 
-def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) -> list[Told]:
+def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) -> list[DatedSample]:
     """A device that says how long ago the pulse per second was; none comes in some seconds of the run."""
-    clock, told = clock_for(model), []
+    clock, dated = clock_for(model), []
     arrivals = list(model.run(int(model.rate_hz) * seconds))
     first_s = arrivals[0].t_ns // NS_PER_S
     pulses = [p for p in pulses_per_second(arrivals, model.seed) if p.t_ns // NS_PER_S - first_s not in silent_s]
@@ -91,54 +93,56 @@ def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) ->
         # without a pulse the age goes on
         newest = max((p.t_ns // NS_PER_S for p in pulses[:given] if p.t_ns <= a.t_ns), default=a.t_ns // NS_PER_S)
         age = pps_age_ms(a, model.crystal.skew_ppm) + 1000 * (a.t_ns // NS_PER_S - newest)
-        told.append(Told(clock.sample(measurement(a, pps_age=age % 8192), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a)))
-    return told
+        dated.append(
+            DatedSample(clock.sample(measurement(a, pps_age=age % 8192), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a))
+        )
+    return dated
 
 
 def run_utc(
     model: ArrivalModel, seconds: int, *, turn_ms: int, ahead_ns: int = 0, reference: UtcReference = REFERENCE,
     turn_at: float = 0.25, back_at: float = 1.0,
-) -> tuple[list[Told], SampleClock]:  # fmt: skip
+) -> tuple[list[DatedSample], SampleClock]:  # fmt: skip
     """A device whose counter turns into UTC ms modulo `turn_ms` at a share of the run, and back at another."""
-    clock, told = clock_for(model), []
+    clock, dated = clock_for(model), []
     clock.set_utc_reference(reference)
     count = int(model.rate_hz) * seconds
     for i, a in enumerate(model.run(count)):
         utc = i >= turn_at * count and i < back_at * count
         ticks = (a.t_ns + UTC_OFFSET_NS + ahead_ns) // TICK_NS % turn_ms if utc else None
-        told.append(Told(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a)))
-    return told, clock
+        dated.append(DatedSample(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a)))
+    return dated, clock
 
 
-def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[list[Told], SampleClock, int]:
+def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[list[DatedSample], SampleClock, int]:
     """A device that answers most triggers; also how many it did not answer."""
-    clock, told, missed = clock_for(model), [], 0
+    clock, dated, missed = clock_for(model), [], 0
     for stamp, a in triggered(model, int(model.rate_hz) * seconds, answered):
         clock.on_trigger_stamps([stamp])
         if a is None:
             missed += 1
         else:
-            told.append(Told(clock.sample(measurement(a), a.t_rx_ns, 0), a.t_ns, stamp.number))
-    return told, clock, missed
+            dated.append(DatedSample(clock.sample(measurement(a), a.t_rx_ns, 0), a.t_ns, stamp.number))
+    return dated, clock, missed
 
 
-def after(told: Sequence[Told], seconds: float) -> list[Told]:
+def after(dated: Sequence[DatedSample], seconds: float) -> list[DatedSample]:
     """Without the beginning."""
-    return [t for t in told if t.truth_ns - told[0].truth_ns > seconds * NS_PER_S]
+    return [t for t in dated if t.truth_ns - dated[0].truth_ns > seconds * NS_PER_S]
 
 
-def share_honest(told: Sequence[Told]) -> float:
+def share_honest(dated: Sequence[DatedSample]) -> float:
     """Of the samples, those within twice their stated error."""
-    return sum(abs(t.off_ns) <= 2 * t.sample.t_err_ns for t in told) / len(told)
+    return sum(abs(t.off_ns) <= 2 * t.sample.t_err_ns for t in dated) / len(dated)
 
 
-def steepest(told: Sequence[Told]) -> float:
+def steepest(dated: Sequence[DatedSample]) -> float:
     """Largest error of a step between samples, per length of the step; but no stamp is later than its message."""
     return max(
-        abs(b.off_ns - a.off_ns) / (b.truth_ns - a.truth_ns) for a, b in pairwise(told) if b.sample.t_ns != b.begun_ns
+        abs(b.off_ns - a.off_ns) / (b.truth_ns - a.truth_ns) for a, b in pairwise(dated) if b.sample.t_ns != b.begun_ns
     )
 
 
-def syncs(told: Sequence[Told]) -> set[Sync]:
+def syncs(dated: Sequence[DatedSample]) -> set[Sync]:
     """All sources that occur."""
-    return {t.sample.sync for t in told}
+    return {t.sample.sync for t in dated}

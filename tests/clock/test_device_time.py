@@ -14,11 +14,11 @@ from imud.sample import Measurement, Sample, Sync
 from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE
-from tests.bench.line_model import LineFaults, heard, measured_ns
+from tests.bench.line_model import LineFaults, measured_ns, simulate_reads
 from tests.bench.line_runs import (
     REFERENCE,
     UTC_OFFSET_NS,
-    Told,
+    DatedSample,
     after,
     begun_ns,
     measurement,
@@ -62,7 +62,7 @@ def test_an_uneven_rate_becomes_even() -> None:
     assert 0 < time.error_ns < 50_000
 
 
-def test_two_samples_in_one_tick_are_told_apart() -> None:
+def test_two_samples_in_one_tick_are_distinguished() -> None:
     """1 kHz in milliseconds, 100 ppm fast: after 5 s a stamp comes twice."""
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(0)
@@ -209,13 +209,13 @@ def run(
     edges: bool,
     reference: UtcReference | None = None,
     faults: LineFaults | None = None,
-) -> tuple[list[Told], Callable[[], int]]:
+) -> tuple[list[DatedSample], Callable[[], int]]:
     """A device on UTC whose counter is set by so much; also how often that was taken for a restart."""
     model = ArrivalModel(profile, rate_hz, SEED, Crystal(0.0), BAUD_OF_RATE[rate_hz])
-    clock, told = sout_clock(model), []
+    clock, dated = sout_clock(model), []
     clock.set_utc_reference(reference)
     first_ns = 0
-    for read in heard(model.run(rate_hz * SECONDS), SEED, faults or LineFaults()):
+    for read in simulate_reads(model.run(rate_hz * SECONDS), SEED, faults or LineFaults()):
         if edges:
             clock.on_sout_edges(read.edges)
         for a, number in zip(read.arrivals, read.numbers, strict=True):
@@ -224,12 +224,14 @@ def run(
             age_ns = truth_ns - first_ns
             moved_ns = set_ms * NS_PER_MS * (age_ns >= SET_AT_S * NS_PER_S)
             ticks = (truth_ns + UTC_OFFSET_NS + NS_PER_MS // 3 + int(moved_ns)) // NS_PER_MS % UNIX
-            told.append(Told(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, number, begun_ns(model, a)))
-    return told, lambda: clock.status().resets
+            dated.append(
+                DatedSample(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, number, begun_ns(model, a))
+            )
+    return dated, lambda: clock.status().resets
 
 
-def largest_step_ns(told: list[Told]) -> int:
-    return max(abs(b.off_ns - a.off_ns) for a, b in pairwise(told))
+def largest_step_ns(dated: list[DatedSample]) -> int:
+    return max(abs(b.off_ns - a.off_ns) for a, b in pairwise(dated))
 
 
 @pytest.mark.parametrize("reference", [None, REFERENCE], ids=["unknown", "utc"])
@@ -237,11 +239,11 @@ def largest_step_ns(told: list[Told]) -> int:
 @pytest.mark.parametrize("rate_hz", [100, 1000])
 @pytest.mark.parametrize("set_ms", [-0.9, 0.9, -30.0, 30.0])
 def test_a_correction_is_no_step(set_ms: float, rate_hz: int, edges: bool, reference: UtcReference | None) -> None:
-    told, resets = run(BARE_UART, rate_hz, set_ms, edges=edges, reference=reference)
-    settled = after(told, SETTLED_S)
+    dated, resets = run(BARE_UART, rate_hz, set_ms, edges=edges, reference=reference)
+    settled = after(dated, SETTLED_S)
     assert resets() == 0
     assert all(abs(t.off_ns) <= 2 * t.sample.t_err_ns for t in settled)
-    assert rises(t.sample for t in told)
+    assert rises(t.sample for t in dated)
     if edges:
         assert largest_step_ns(settled) < JITTER_STEP_NS
         assert all(t.sample.edge_seq == t.number for t in settled)
@@ -255,12 +257,12 @@ def test_a_correction_is_no_step(set_ms: float, rate_hz: int, edges: bool, refer
 @pytest.mark.parametrize("set_ms", [-0.9, 0.9, -30.0, 30.0])
 def test_a_correction_behind_a_slow_adapter_with_losses_is_covered(set_ms: float, rate_hz: int, edges: bool) -> None:
     faults = LineFaults(pulse_loss=0.02, frame_loss=0.02)
-    told, resets = run(USB_16MS, rate_hz, set_ms, edges=edges, reference=REFERENCE, faults=faults)
-    settled = after(told, SETTLED_S)
+    dated, resets = run(USB_16MS, rate_hz, set_ms, edges=edges, reference=REFERENCE, faults=faults)
+    settled = after(dated, SETTLED_S)
     assert resets() == 0
     assert share_honest(settled) > 0.99
     assert all(abs(t.off_ns) <= 3 * t.sample.t_err_ns for t in settled)
-    assert rises(t.sample for t in told)
+    assert rises(t.sample for t in dated)
     wrong = sum(t.sample.edge_seq not in (None, t.number) for t in settled)
     assert wrong <= 16 * rate_hz // 1000  # no more than the adapter holds in one read, until the next shows it
 
@@ -313,7 +315,7 @@ def test_a_counter_that_moves_far_began_anew(set_ms: int) -> None:
     assert clock.status().resets == 1
 
 
-def test_samples_that_were_never_missing_are_not_told_missing() -> None:
+def test_samples_that_were_never_missing_are_not_counted_missing() -> None:
     clock = make_clock()
     feed(clock, steady(0, 0, 1000))
     feed(clock, [(10_030, 10_000)])

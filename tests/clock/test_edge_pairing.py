@@ -49,7 +49,7 @@ def running(count: int = 100) -> EdgePairing:
     return pairing
 
 
-def test_events_that_come_together_are_told_apart() -> None:
+def test_events_that_come_together_are_distinguished() -> None:
     pairing = running()
     pairing.add_events([(i * PERIOD_NS, i) for i in range(100, 116)])
     assert [(pair(pairing, i), pairing.number) for i in range(100, 116)] == [(True, i) for i in range(100, 116)]
@@ -95,7 +95,7 @@ def test_an_unsure_fit_begins_nothing() -> None:
     assert not pairing.running
 
 
-def test_a_line_without_events_is_given_up() -> None:
+def test_a_line_without_events_is_dropped() -> None:
     pairing = running()
     assert not any(pair(pairing, 100 + i) for i in range(MISSES_MOST))
     assert not pairing.running
@@ -111,7 +111,7 @@ def test_a_line_off_by_a_period_is_found_by_the_fit() -> None:
     assert not pairing.learned or abs(pairing.delay_ns) < PERIOD_NS / 2
 
 
-def test_events_nobody_asks_for_are_bounded() -> None:
+def test_events_without_samples_are_bounded() -> None:
     pairing = EdgePairing(LEAD_NS)
     pairing.add_events([(i, i) for i in range(QUEUE_MOST + 10)])
     assert pairing.events_unpaired == 10

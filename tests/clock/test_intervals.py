@@ -34,7 +34,7 @@ def test_a_drift_through_the_milliseconds_narrows() -> None:
     assert abs(fix) < 2 * error
 
 
-def test_a_fit_that_knows_more_stays_within() -> None:
+def test_a_better_fit_stays_within() -> None:
     intervals, x = filled(0.0)
     assert abs(intervals.combined(x, x + 50_000, 1000.0, 0.0)[0]) < 100
     fix, error = intervals.combined(x, x + 5 * MS, 1000.0, 0.0)
@@ -82,7 +82,7 @@ def test_contradictions_drop_what_is_old() -> None:
 
 
 def test_a_fit_that_contradicts_narrow_intervals_is_covered() -> None:
-    """A device without pulses drifts away and still says UTC: its milliseconds agree with each other, not with it."""
+    """A device without pulses drifts away and still reports UTC: its milliseconds agree with each other only."""
     intervals, x = IntervalFit(), 0
     for _ in range(1000):
         x += 10_037_000

@@ -1,4 +1,4 @@
-"""What is known of a delay from the link alone."""
+"""Bounds of a delay by the link alone."""
 
 from imud.clock.link_delay import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
 from imud.units import NS_PER_MS

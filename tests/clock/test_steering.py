@@ -24,11 +24,11 @@ from imud.sim.ports.arrival import (
 )
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE
-from tests.bench.line_model import LineFaults, heard, measured_ns, restarted
+from tests.bench.line_model import LineFaults, measured_ns, restarted, simulate_reads
 from tests.bench.line_runs import (
     REFERENCE,
     UTC_OFFSET_NS,
-    Told,
+    DatedSample,
     after,
     measurement,
     run_sout,
@@ -76,12 +76,12 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: C
 @pytest.mark.parametrize("profile", [BARE_UART, USB_16MS, LOADED], ids=lambda p: p.name)
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 2)])
 def test_every_pair_is_right_under_loss_on_either_side(profile: ArrivalProfile, rate_hz: int, seconds: int) -> None:
-    told = run_sout(model(profile, rate_hz, 3), seconds, HALF_LOST)
-    paired = [t for t in told if t.sample.edge_seq is not None]
-    assert len(paired) > 0.6 * len(told)
+    dated = run_sout(model(profile, rate_hz, 3), seconds, HALF_LOST)
+    paired = [t for t in dated if t.sample.edge_seq is not None]
+    assert len(paired) > 0.6 * len(dated)
     assert all(t.sample.edge_seq == t.number for t in paired)
-    assert rises(t.sample for t in told)
-    assert share_honest(told) >= 0.95
+    assert rises(t.sample for t in dated)
+    assert share_honest(dated) >= 0.95
 
 
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 4)])
@@ -93,110 +93,112 @@ def test_rising_edges_alone_are_enough(rate_hz: int, seconds: int) -> None:
             edges=[Edge(e.t_ns, True, (e.number + 1) // 2) for e in read.edges if e.rising],
             numbers=[(number + 1) // 2 for number in read.numbers],
         )
-        for read in heard(m.run(rate_hz * seconds), 5, HALF_LOST)
+        for read in simulate_reads(m.run(rate_hz * seconds), 5, HALF_LOST)
     ]
-    told = with_sout(sout_clock(m), reads)
-    paired = [t for t in told if t.sample.edge_seq is not None]
-    assert len(paired) > 0.6 * len(told)
+    dated = with_sout(sout_clock(m), reads)
+    paired = [t for t in dated if t.sample.edge_seq is not None]
+    assert len(paired) > 0.6 * len(dated)
     assert all(t.sample.edge_seq == t.number for t in paired)
-    assert share_honest(told) >= 0.95
+    assert share_honest(dated) >= 0.95
 
 
 @pytest.mark.parametrize("crystal", [Crystal(-50_000.0), Crystal(50_000.0), Crystal(20.0, 0.1)], ids=str)
 def test_with_edges_only_their_own_jitter_is_left(crystal: Crystal) -> None:
     """Simulated stamps are late by 3 µs and an exponential law of 4 µs."""
-    told = after(run_sout(model(USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5)
-    mean = sum(t.off_ns for t in told) / len(told)
-    assert sqrt(sum((t.off_ns - mean) ** 2 for t in told) / len(told)) < 5_000
-    assert syncs(told) == {Sync.EDGE}
+    dated = after(run_sout(model(USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5)
+    mean = sum(t.off_ns for t in dated) / len(dated)
+    assert sqrt(sum((t.off_ns - mean) ** 2 for t in dated) / len(dated)) < 5_000
+    assert syncs(dated) == {Sync.EDGE}
 
 
 def test_the_error_is_honest_without_a_bias() -> None:
-    told = run_sout(model(BARE_UART), 30, HALF_LOST, SoutTiming(bias_us=0.0))
-    assert share_honest(told) >= 0.95
-    assert sum(t.sample.t_err_ns for t in after(told, 10)) / len(after(told, 10)) < 20_000
+    dated = run_sout(model(BARE_UART), 30, HALF_LOST, SoutTiming(bias_us=0.0))
+    assert share_honest(dated) >= 0.95
+    assert sum(t.sample.t_err_ns for t in after(dated, 10)) / len(after(dated, 10)) < 20_000
 
 
 @pytest.mark.parametrize("profile", [BARE_UART, USB_16MS_PACKET], ids=lambda p: p.name)
 def test_edges_that_stop_and_come_back_make_no_step(profile: ArrivalProfile) -> None:
     m = model(profile, 100)
-    reads = heard(m.run(3600), 1, LineFaults())
+    reads = simulate_reads(m.run(3600), 1, LineFaults())
     silent = range(len(reads) // 3, 2 * len(reads) // 3)
-    told = with_sout(sout_clock(m), reads, silent=silent)
+    dated = with_sout(sout_clock(m), reads, silent=silent)
     begin = sum(len(read.arrivals) for read in reads[: silent.start])
     end = sum(len(read.arrivals) for read in reads[: silent.stop])
-    assert {t.sample.sync for t in told[begin - 300 : begin]} == {Sync.EDGE}
-    last = max(i for i, t in enumerate(told[:end]) if t.sample.edge_seq is not None)  # of a pulse seen before
+    assert {t.sample.sync for t in dated[begin - 300 : begin]} == {Sync.EDGE}
+    last = max(i for i, t in enumerate(dated[:end]) if t.sample.edge_seq is not None)  # of a pulse seen before
     assert last <= begin + 2
-    assert syncs(told[last + 3 : end]) == {Sync.REGRESSION}
-    assert syncs(told[end + 50 :]) == {Sync.EDGE}
+    assert syncs(dated[last + 3 : end]) == {Sync.REGRESSION}
+    assert syncs(dated[end + 50 :]) == {Sync.EDGE}
     # the jitter of the stamps themselves, beyond which only slewing is allowed
-    assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(told[1010:])) < JITTER_STEP_NS
-    assert steepest(told[begin + 3 : end]) < 2 * STEEPEST
-    assert share_honest(told) >= 0.95
+    assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(dated[1010:])) < JITTER_STEP_NS
+    assert steepest(dated[begin + 3 : end]) < 2 * STEEPEST
+    assert share_honest(dated) >= 0.95
 
 
 def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
     """A device on UTC whose own crystal is 5 % slow: its milliseconds say little of which pulse is a sample's."""
     m = model(LOADED, 1000, 3078, Crystal(-50_000.0))
-    clock, told = sout_clock(m), []
+    clock, dated = sout_clock(m), []
     clock.set_utc_reference(REFERENCE)
-    for read in heard(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
+    for read in simulate_reads(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
         clock.on_sout_edges(read.edges)
         for a in read.arrivals:
             truth_ns = measured_ns(a)
             ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
-            told.append(Told(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0))
-    assert max(abs(t.off_ns) for t in after(told, 1)) < 4 * NS_PER_MS
-    assert rises(t.sample for t in told)
+            dated.append(DatedSample(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0))
+    assert max(abs(t.off_ns) for t in after(dated, 1)) < 4 * NS_PER_MS
+    assert rises(t.sample for t in dated)
 
 
-def test_the_fit_keeps_what_edges_taught_it() -> None:
+def test_the_fit_keeps_the_delay_learned_from_edges() -> None:
     """Behind this adapter the fit alone is 1.5 ms off."""
     m = model(USB_16MS_PACKET, 100)
-    reads = heard(m.run(4000), 1, LineFaults())
-    told = with_sout(sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
-    assert abs(told[-1].off_ns) < 300_000
-    assert told[-1].sample.sync is Sync.REGRESSION
+    reads = simulate_reads(m.run(4000), 1, LineFaults())
+    dated = with_sout(sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
+    assert abs(dated[-1].off_ns) < 300_000
+    assert dated[-1].sample.sync is Sync.REGRESSION
 
 
-def test_what_edges_taught_a_young_fit_is_doubted() -> None:
-    """Pulses for 6 s only: the fit moves by a millisecond afterwards, and what was added to it does not know."""
+def test_a_delay_learned_by_a_young_fit_adds_to_the_error() -> None:
+    """Pulses for 6 s only: the fit moves by a millisecond afterwards, and the learned delay does not follow."""
     m = model(USB_16MS, 100, 1048, Crystal(-50.0))
-    reads = heard(m.run(4500), 1048, LineFaults())
+    reads = simulate_reads(m.run(4500), 1048, LineFaults())
     begin = next(i for i, read in enumerate(reads) if read.arrivals[0].t_ns > m.begin_ns + 6 * NS_PER_S)
-    told = with_sout(sout_clock(m), reads, silent=range(begin, len(reads)))
-    assert share_honest(told) >= 0.95
+    dated = with_sout(sout_clock(m), reads, silent=range(begin, len(reads)))
+    assert share_honest(dated) >= 0.95
 
 
 def test_a_restarted_device_is_paired_again() -> None:
     m = model(USB_1MS, 100)
-    told = with_sout(clock := sout_clock(m), heard(restarted(m, 4000, 2 * NS_PER_S), 1, LineFaults(edge_loss=0.01)))
+    dated = with_sout(
+        clock := sout_clock(m), simulate_reads(restarted(m, 4000, 2 * NS_PER_S), 1, LineFaults(edge_loss=0.01))
+    )
     assert clock.status().resets == 1
-    assert syncs(told[-500:]) == {Sync.EDGE}
-    assert all(t.sample.edge_seq in (None, t.number) for t in told)
-    assert rises(t.sample for t in told)
-    assert share_honest(told) >= 0.95
+    assert syncs(dated[-500:]) == {Sync.EDGE}
+    assert all(t.sample.edge_seq in (None, t.number) for t in dated)
+    assert rises(t.sample for t in dated)
+    assert share_honest(dated) >= 0.95
 
 
 def test_a_lost_rising_edge_is_counted_back() -> None:
-    told = after(run_sout(model(BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
-    unpaired = sum(t.sample.edge_seq is None for t in told)
-    assert 0 < unpaired < 0.07 * len(told)  # both edges lost: 4 %
-    assert all(t.sample.edge_seq in (None, t.number) for t in told)
+    dated = after(run_sout(model(BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
+    unpaired = sum(t.sample.edge_seq is None for t in dated)
+    assert 0 < unpaired < 0.07 * len(dated)  # both edges lost: 4 %
+    assert all(t.sample.edge_seq in (None, t.number) for t in dated)
 
 
 def test_what_was_lost_is_counted() -> None:
     m = model(BARE_UART)
-    reads = heard(m.run(3000), 1, LineFaults(pulse_loss=0.1, frame_loss=0.05))
-    told = with_sout(clock := sout_clock(m), reads)
+    reads = simulate_reads(m.run(3000), 1, LineFaults(pulse_loss=0.1, frame_loss=0.05))
+    dated = with_sout(clock := sout_clock(m), reads)
     status = clock.status()
     seen = sum(edge.rising for read in reads for edge in read.edges)
     assert status.edges == seen
-    paired = sum(t.sample.edge_seq is not None for t in told)
+    paired = sum(t.sample.edge_seq is not None for t in dated)
     assert 0.03 * seen < status.edges_unpaired < 0.07 * seen
     assert seen - paired - status.edges_unpaired < 100  # those of the beginning
-    assert 0 <= len(told) - paired - status.samples_unpaired < 100
+    assert 0 <= len(dated) - paired - status.samples_unpaired < 100
 
 
 def test_the_offset_of_the_edge_is_configured() -> None:
