@@ -131,8 +131,7 @@ class SampleClock:
         """
         if t_rx_ns < self._t_rx_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
             t_rx_ns = self._t_rx_ns
-        size_bytes, ticks = m.size_bytes, m.dev_ticks
-        byte_ns = self._delay.byte_ns or 1
+        size_bytes, ticks, byte_ns = m.size_bytes, m.dev_ticks, self._delay.byte_ns or 1
         trailing_ns = m.trailing_bytes * byte_ns
         arrival_ns = t_rx_ns - size_bytes * byte_ns - trailing_ns if t_begin_ns is None else t_begin_ns
         if ticks is None or self._number is not None:

@@ -47,7 +47,7 @@ from tests.support.streams import BEGIN_NS, make_clock, message, rises
 @pytest.mark.parametrize(("age_ns", "rate"), [(0, SLEW_SETTLING), (SETTLED_AFTER_NS + 1, SLEW)])
 def test_the_rate_is_bounded(sign: int, age_ns: int, rate: float) -> None:
     slew = Slew()
-    slew.left_ns = sign * 10.0 * NS_PER_S
+    slew.set(sign * 10.0 * NS_PER_S)
     before = slew.left_ns
     after = slew.advance(10 * NS_PER_MS, age_ns)
     assert before - after == pytest.approx(sign * rate * 10 * NS_PER_MS)
@@ -55,7 +55,7 @@ def test_the_rate_is_bounded(sign: int, age_ns: int, rate: float) -> None:
 
 def test_it_ends_at_nothing() -> None:
     slew = Slew()
-    slew.left_ns = -3.0
+    slew.set(-3.0)
     assert slew.advance(NS_PER_S, SETTLED_AFTER_NS + 1) == 0.0
     assert slew.left_ns == 0.0
 
