@@ -18,6 +18,7 @@ Synchronization: none; one thread.
 """
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from math import hypot
 from typing import Final
 
@@ -89,7 +90,9 @@ class SampleClock:
         sin: TriggerTiming | None = None,
     ) -> None:
         self._device = device
-        self._aiding_of = tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming()
+        self._make_aiding = partial(
+            AidingSources, tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming()
+        )
         self._aiding: AidingSources | None = None
         self._time = DeviceTime(tick_ns, tick_modulus)
         self._number = SampleNumber(tick_modulus) if tick_ns == 0 else None
@@ -225,7 +228,7 @@ class SampleClock:
 
     def _aided(self) -> AidingSources:
         if self._aiding is None:
-            self._aiding = AidingSources(*self._aiding_of)
+            self._aiding = self._make_aiding()
         return self._aiding
 
     # --- state ---------------------------------------------------------------------------------------------------
