@@ -11,9 +11,9 @@ DRIVERS: Table[Driver] = Table(
         "hipnuc-canopen": "imud.devices.hipnuc.canopen.codec:DRIVER",
         "hipnuc-j1939": "imud.devices.hipnuc.j1939.codec:DRIVER",
         "hipnuc-nmea2000": "imud.devices.hipnuc.nmea2000.codec:DRIVER",
-        "imu61x-uart": "imud.devices.imu61x.uart.codec:DRIVER",
-        "imu61x-i2c": "imud.devices.imu61x.i2c.codec:DRIVER",
-        "imu61x-spi": "imud.devices.imu61x.spi.codec:DRIVER",
-        "imu61x-can": "imud.devices.imu61x.can.codec:DRIVER",
+        "imu61x-uart": "imud.devices.imu61x.uart.driver:DRIVER",
+        "imu61x-i2c": "imud.devices.imu61x.i2c.driver:DRIVER",
+        "imu61x-spi": "imud.devices.imu61x.spi.driver:DRIVER",
+        "imu61x-can": "imud.devices.imu61x.can.driver:DRIVER",
     },
 )

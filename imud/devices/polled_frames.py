@@ -1,4 +1,4 @@
-"""Books what is read from a polled device: absent, damaged, the same as before, or a new measurement."""
+"""Decode what is read from a polled device: absent, damaged, stale (the same as before), or a new measurement."""
 
 from collections.abc import Callable, Sequence
 
@@ -24,13 +24,13 @@ class PolledFrameDecoder:
         self._size_bytes = size_bytes
         self._last = b""
 
-    def take(
+    def decode(
         self,
         data: bytes,
         bad: Callable[[bytes], BadReason | None],
         measure: Callable[[bytes], Measured],
     ) -> Sequence[PolledEvent]:
-        """Take one frame; `bad` says why it is damaged, `measure` is asked for new good ones only. Never raises."""
+        """Decode one frame: `bad` says why it is damaged, `measure` is called for new good ones only. Never raises."""
         ledger = self._ledger
         ledger.bytes_in += len(data)
         if len(data) != self._size_bytes or (why := absence(data)):
@@ -59,8 +59,8 @@ class PolledFrameDecoder:
         ledger.frames_not_finite += 1
         return (BadFrame(BadReason.NOT_FINITE, data), measurement)
 
-    def book_reply(self, data: bytes, *, good: bool) -> None:
-        """Count registers that were read besides the samples."""
+    def add_reply(self, data: bytes, *, good: bool) -> None:
+        """Count in the ledger what was read of other registers than those of the samples."""
         ledger = self._ledger
         ledger.bytes_in += len(data)
         if good:
@@ -71,7 +71,7 @@ class PolledFrameDecoder:
             ledger.bytes_skipped += len(data)
 
     def reset(self) -> None:
-        """The next frame is new, whatever it has."""
+        """Forget the frame before: the next one is new, even with the same bytes."""
         self._last = b""
 
 
@@ -80,7 +80,7 @@ _ZEROS = frozenset({0x00})
 
 
 def absence(data: bytes) -> str:
-    """Why these bytes come from no device at all but from a line that nobody drives; empty if they may."""
+    """Why these bytes come from a line that no device drives; empty if they may be of a device."""
     first = data[:1]
     if first not in (b"\xff", b"\x00", b""):
         return ""

@@ -16,8 +16,8 @@ from time import perf_counter_ns
 
 from imud.contracts.codec import CodecEvent, StreamCodec
 from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings, encode_hi91
-from imud.devices.imu61x.uart.codec import DRIVER as IMU61X
 from imud.devices.imu61x.uart.codec import Imu61xCodec
+from imud.devices.imu61x.uart.driver import DRIVER as IMU61X
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from tests.bench.rows import Row, at_most

@@ -13,9 +13,9 @@ from statistics import quantiles
 from imud.contracts.driver import StreamDriver
 from imud.devices.hipnuc.uart.codec import DRIVER as HIPNUC
 from imud.devices.hipnuc.uart.codec import encode_hi91
-from imud.devices.imu61x.uart.codec import DRIVER as IMU61X
 from imud.devices.imu61x.uart.codec import encode_status
 from imud.devices.imu61x.uart.commands import ask_status
+from imud.devices.imu61x.uart.driver import DRIVER as IMU61X
 from imud.devices.imu61x.uart.replies import Status
 from imud.runtime.detection import Search, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S

@@ -20,6 +20,7 @@ from imud.contracts.lines import DeviceLines, LineFactory, ReadySettings
 from imud.contracts.link import LinkType
 from imud.contracts.publisher import Batch
 from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.spi.session import PIPELINE_BYTES
 from imud.links.spi import SpiLink, SpiSettings
 from imud.runtime.polled.bus import Buses
 from imud.runtime.polled.runner import PolledRunner
@@ -46,7 +47,7 @@ class Stub:
 
     def _burst(self, number: int) -> bytes:
         x = 0.001 * number
-        return bytes(spi.PIPELINE_BYTES) + spi.encode_standard(accel_m_s2=(x, -x, 9.8), gyro_rad_s=(x, 0.0, -x))
+        return bytes(PIPELINE_BYTES) + spi.encode_standard(accel_m_s2=(x, -x, 9.8), gyro_rad_s=(x, 0.0, -x))
 
     def ioctl(self, _fd: int, request: int, argument: bytes) -> int:
         """One message; others go well."""

@@ -8,6 +8,7 @@ import pytest
 from imud.contracts.polling import Poll
 from imud.contracts.status import DeviceState
 from imud.devices.imu61x.i2c import codec as device_i2c
+from imud.devices.imu61x.i2c.session import READ_ID
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, physics_holds, registers, vanishes
@@ -60,7 +61,7 @@ FAULTS: dict[str, tuple[dict[str, object], str]] = {
 def test_vanishes_and_is_identified_before_it_is_believed(
     i2c: Bus[I2cTransfer], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    polls = (Poll(device_i2c.READ_BURST), Poll(device_i2c.READ_ID, 10**8))
+    polls = (Poll(device_i2c.READ_BURST), Poll(READ_ID, 10**8))
     if fault == "wrong id":  # otherwise its reading tells of other faults as well, and sooner
         monkeypatch.setattr(device_i2c.Imu61xI2cCodec, "polls", polls)
     device = registers()

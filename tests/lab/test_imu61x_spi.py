@@ -8,6 +8,7 @@ import pytest
 from imud.contracts.polling import Poll
 from imud.contracts.status import DeviceState
 from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.spi.session import READ_STATE
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes
@@ -71,7 +72,7 @@ FAULTS: dict[str, tuple[dict[str, object], str]] = {
 def test_vanishes_and_is_identified_before_it_is_believed(
     bus: tuple[Bus[SpiTransfer], str], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(spi, "_POLLS", {"standard": (spi._POLLS["standard"][0], Poll(spi.READ_STATE, 10**8))})
+    monkeypatch.setattr(spi, "POLLS", {"standard": (spi.POLLS["standard"][0], Poll(READ_STATE, 10**8))})
     far, port = bus
     device = registers()
     far.attach(0, on_spi(device))

@@ -15,7 +15,8 @@ from imud.config import DeviceConfig
 from imud.contracts.lines import DeviceLines, Edge, ResetSettings, SoutSettings, TriggerSettings
 from imud.contracts.status import DeviceState
 from imud.contracts.timing import TriggerStamp
-from imud.devices.imu61x.uart.codec import DRIVER, encode_ahrs
+from imud.devices.imu61x.uart.codec import encode_ahrs
+from imud.devices.imu61x.uart.driver import DRIVER
 from imud.errors import BadArgument, CommandError
 from imud.event import Event, EventKind
 from imud.links.memory import MemoryLink, MemorySettings

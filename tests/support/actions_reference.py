@@ -3,6 +3,8 @@
 import re
 from collections.abc import Iterator
 
+import msgspec
+
 from imud.contracts.action import Action, Actions, parameters_of
 from imud.contracts.driver import Driver
 from imud.devices import DRIVERS
@@ -19,9 +21,21 @@ def cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
+def meanings_of(action: Action) -> dict[str, str]:
+    """The meaning of each argument: description and unit of its annotation, or the docstring of the struct's field."""
+    found = docs_of(action.params)
+    for field in msgspec.structs.fields(action.parameters):
+        info = msgspec.inspect.type_info(field.type)
+        if isinstance(info, msgspec.inspect.Metadata) and info.extra_json_schema:
+            unit = (info.extra or {}).get("unit")
+            meaning = info.extra_json_schema.get("description", "")
+            found[field.name] = meaning[:1].upper() + meaning[1:] + (f" ({unit})" if unit else "")
+    return found
+
+
 def arguments_of(action: Action) -> str:
     """What it takes, one after the other, each with what it can be and what it means."""
-    docs = docs_of(action.params)
+    docs = meanings_of(action)
     words = []
     for parameter in parameters_of(action):
         default = "" if parameter.default is None else f"; default `{parameter.default}`"

@@ -1,14 +1,16 @@
-"""A simulated IMU61x on a serial line in virtual time: listen to it, and hold conversations with it at any rate."""
+"""A simulated IMU61x on a serial line in virtual time, at any baud rate; and one behind the transfers of I2C or SPI."""
 
 from dataclasses import replace
 from math import radians
 from typing import TypeVar
 
 from imud.contracts.codec import CodecEvent, message_of
+from imud.contracts.polling import Transfer
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
 from imud.devices.imu61x.uart.codec import Imu61xCodec
 from imud.ledger import Ledger
 from imud.sample import Measurement
+from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
 from imud.sim.physics.motion import Still
@@ -94,3 +96,13 @@ class Bench:
 def bench(settings: Imu61xSettings | None = None, **hardware: object) -> Bench:
     """A bench with a device at rest that differs in `hardware`."""
     return Bench(settings, replace(STILL, **hardware))  # type: ignore[arg-type]  # names of fields
+
+
+def over_i2c(device: Imu61xRegisters, transfer: Transfer) -> bytes:
+    """One transfer on I2C; returns what is read."""
+    return device.i2c([*transfer.sends, transfer.read_bytes] if transfer.read_bytes else [*transfer.sends])
+
+
+def over_spi(device: Imu61xRegisters, transfer: Transfer) -> bytes:
+    """One transfer on SPI in mode 0; returns what is read."""
+    return b"".join(device.spi(transfer.sends, 0))

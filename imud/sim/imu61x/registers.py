@@ -21,6 +21,7 @@ from imud.devices.imu61x.common import registers
 from imud.devices.imu61x.common.family import FILTER_DEFAULT, product_id_of
 from imud.devices.imu61x.i2c import codec as i2c
 from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.spi.session import PIPELINE_BYTES, PIPELINE_WORDS, write
 from imud.sim.physics.motion import Motion, Truth, swing
 from imud.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
 
@@ -75,7 +76,7 @@ class Imu61xRegisters:
         self._update_ns = update_ns
         self._random = Random(seed)
         self._pointer = 0
-        self._pipeline = deque((0, 0), maxlen=spi.PIPELINE_WORDS)
+        self._pipeline = deque((0, 0), maxlen=PIPELINE_WORDS)
         self._truth = self.motion.at(0.0)
 
     def restart(self) -> None:
@@ -103,7 +104,7 @@ class Imu61xRegisters:
         for at in range(0, len(mosi) - 1, 2):
             word = int.from_bytes(mosi[at : at + 2], "big")
             miso += self._pipeline[0].to_bytes(2, "big")
-            if word == spi.write(registers.BURST, 0) and self.window == _WINDOW_0:
+            if word == write(registers.BURST, 0) and self.window == _WINDOW_0:
                 burst = deque(self._burst_words())
             self._pipeline.append(burst.popleft() if burst and word in (0x8000, 0x0000) else self._answer(word))
         return bytes(miso)
@@ -219,7 +220,7 @@ class Imu61xRegisters:
 
     def _flipped(self, data: bytes) -> bytes:
         """One bit wrong, not in the words of an SPI pipeline, which say nothing."""
-        first = spi.PIPELINE_BYTES if len(data) > spi.PIPELINE_BYTES else 0
+        first = PIPELINE_BYTES if len(data) > PIPELINE_BYTES else 0
         at = self._random.randrange(first, len(data))
         return data[:at] + bytes([data[at] ^ 1 << self._random.randrange(8)]) + data[at + 1 :]
 

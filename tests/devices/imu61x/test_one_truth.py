@@ -4,7 +4,7 @@ No noise and no time passes: the simulated devices are asked for what they measu
 The resolutions are worked out by hand from the manual's layouts; half a step is the most that rounding can cost.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import dist
@@ -14,9 +14,12 @@ import pytest
 from imud.contracts.codec import CodecEvent
 from imud.contracts.polling import PolledCodec, PolledEvent, Transfer, TransferScript, run_transfer_script
 from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings
-from imud.devices.imu61x.common.registers import RegisterSettings
-from imud.devices.imu61x.i2c import codec as i2c
-from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.common.register_driver import RegisterSettings
+from imud.devices.imu61x.i2c.codec import Imu61xI2cCodec
+from imud.devices.imu61x.i2c.driver import DRIVER as I2C
+from imud.devices.imu61x.spi.codec import Imu61xSpiCodec
+from imud.devices.imu61x.spi.driver import DRIVER as SPI
+from imud.devices.imu61x.spi.session import SpiDeviceSettings
 from imud.devices.imu61x.uart.codec import Imu61xCodec
 from imud.ledger import Ledger
 from imud.sample import Measurement
@@ -25,6 +28,7 @@ from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
 from imud.sim.physics.motion import Truth, swing
+from tests.support.imu61x_bench import over_i2c, over_spi
 
 EPOCH_NS = 5_000_000_000
 """Zero of the motion, the same for all devices."""
@@ -95,27 +99,24 @@ def by_can() -> Read:
 
 
 def by_i2c() -> Read:
-    def transfer(device: Imu61xRegisters, one: Transfer) -> bytes:
-        return device.i2c([*one.sends, one.read_bytes] if one.read_bytes else [*one.sends])
-
     settings = RegisterSettings()
-    return by_polls(i2c.DRIVER.set_up(settings), i2c.Imu61xI2cCodec(Ledger(), settings), transfer)
+    return by_polls(I2C.set_up(settings), Imu61xI2cCodec(Ledger(), settings), over_i2c)
 
 
 def by_spi(burst: str) -> Read:
-    def transfer(device: Imu61xRegisters, one: Transfer) -> bytes:
-        return b"".join(device.spi(one.sends, 0))
-
-    settings = spi.SpiDeviceSettings(burst=burst)  # type: ignore[arg-type]  # passed on as given
-    return by_polls(spi.DRIVER.set_up(settings), spi.Imu61xSpiCodec(Ledger(), settings), transfer)
+    settings = SpiDeviceSettings(burst=burst)  # type: ignore[arg-type]  # passed on as given
+    return by_polls(SPI.set_up(settings), Imu61xSpiCodec(Ledger(), settings), over_spi)
 
 
-def by_polls(set_up: TransferScript[Mapping[str, str]], codec: PolledCodec, transfer: object) -> Read:
+def by_polls(
+    set_up: TransferScript[Mapping[str, str]],
+    codec: PolledCodec,
+    transfer: Callable[[Imu61xRegisters, Transfer], bytes],
+) -> Read:
     """Set the device up, then read it at each instant."""
-    assert callable(transfer)
     now_ns = EPOCH_NS
     device = Imu61xRegisters(lambda: now_ns, motion=MOTION)
-    run_transfer_script(set_up, lambda one: bytes(transfer(device, one)))
+    run_transfer_script(set_up, lambda one: transfer(device, one))
     found: dict[int, Measurement] = {}
     for now_ns in INSTANTS:
         found[now_ns] = only(codec.take(0, transfer(device, codec.polls[0].transfer)))

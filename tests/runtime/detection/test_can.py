@@ -4,8 +4,8 @@ from random import Random
 
 import pytest
 
-from imud.devices.imu61x.can.codec import DRIVER as IMU61X
 from imud.devices.imu61x.can.codec import encode_set
+from imud.devices.imu61x.can.driver import DRIVER as IMU61X
 from imud.formats.can import CanFrame
 from imud.runtime.detection import CanFound, CanGaveUp, CanListen, CanSearch, CanStep, CanSurvey
 from imud.runtime.detection.can import DEVICES_MAX, IDENTIFIERS_MAX, LISTEN_NS, PATIENCE_NS

@@ -11,7 +11,7 @@ import pytest
 
 from imud.contracts.polling import Reading
 from imud.contracts.status import DeviceState
-from imud.devices.imu61x.spi.codec import DRIVER
+from imud.devices.imu61x.spi.driver import DRIVER
 from imud.event import EventKind
 from tests.support.polled import device_config
 from tests.support.stage import RATE_HZ, Stage, on_i2c

@@ -5,6 +5,7 @@ import errno
 import pytest
 
 from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.spi.session import READ_STATE, State
 from imud.sim.imu61x.registers import Imu61xRegisters
 
 MS = 1_000_000
@@ -72,10 +73,10 @@ def test_registers_are_latched_and_renewed_in_steps() -> None:
 
 def test_wrong_mode_shifts_the_bits() -> None:
     one, _ = device(modes=frozenset({3}))
-    right = b"".join(one.spi(spi.READ_STATE.sends, 3))
-    wrong = b"".join(one.spi(spi.READ_STATE.sends, 0))
-    assert spi.State(right).product_id == b"\x00\x00IMU614"
-    assert spi.State(wrong).product_id != b"\x00\x00IMU614"
+    right = b"".join(one.spi(READ_STATE.sends, 3))
+    wrong = b"".join(one.spi(READ_STATE.sends, 0))
+    assert State(right).product_id == b"\x00\x00IMU614"
+    assert State(wrong).product_id != b"\x00\x00IMU614"
 
 
 def test_faults_are_what_they_say() -> None:

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from imud.contracts.codec import CodecEvent
-from imud.devices.imu61x.can.codec import DRIVER
+from imud.devices.imu61x.can.driver import DRIVER
 from imud.formats.can import RAW_FRAME
 from imud.ledger import Ledger
 from imud.sample import Measurement

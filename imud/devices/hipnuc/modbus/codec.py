@@ -163,7 +163,7 @@ class HipnucModbusCodec:
             return self._take_serial(data)
         if is_exception(data):
             return self._take_exception(data)
-        return self._book.take(data, self._bad, self._measure)
+        return self._book.decode(data, self._bad, self._measure)
 
     def reset(self) -> None:
         """Another module may be there: nothing is known of its values."""
@@ -174,7 +174,7 @@ class HipnucModbusCodec:
 
     def _take_exception(self, data: bytes) -> Sequence[PolledEvent]:
         if data[2] == ILLEGAL_ADDRESS and self._size == READ_BLOCK.read_bytes:
-            self._book.book_reply(data, good=True)
+            self._book.add_reply(data, good=True)
             self.polls, self._size = _polls(short=True), READ_SHORT_BLOCK.read_bytes
             self._stale_before, self._book = self.stale, PolledFrameDecoder(self.ledger, self._size)
             return (Vanished("this firmware has no register 0x4C: reading without the device's time from now on"),)
@@ -185,7 +185,7 @@ class HipnucModbusCodec:
 
     def _take_serial(self, data: bytes) -> Sequence[PolledEvent]:
         whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)
-        self._book.book_reply(data, good=whole or is_exception(data))
+        self._book.add_reply(data, good=whole or is_exception(data))
         if not whole:  # damaged, or a firmware that does not like this read: nothing is known
             return ()
         serial, before = data[DATA_AT:-CRC_BYTES], self._serial

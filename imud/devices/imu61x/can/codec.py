@@ -30,19 +30,15 @@ whole set says how many samples were lost. The device takes no commands over CAN
 import struct
 from collections.abc import Sequence
 from math import isfinite
-from random import Random
 from typing import Annotated, Final
 
 from msgspec import Meta
 
 from imud.attitude import quat_from_euler_zyx
-from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
-from imud.contracts.driver import SAMPLE_COUNTER, Identity
-from imud.contracts.session import says_nothing
 from imud.contracts.settings import Settings
-from imud.devices.imu61x.common.family import EULER_CONVENTION, M_S2_PER_G, NAVIGATION_FRAME, RAD_S_PER_DEG_S
-from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
+from imud.devices.imu61x.common.family import M_S2_PER_G, RAD_S_PER_DEG_S, scaled
+from imud.formats.can import STANDARD_ID_MAX
 from imud.ledger import Ledger
 from imud.sample import Measurement, Vector3
 from imud.units import RAD_PER_DEG
@@ -206,20 +202,15 @@ class Imu61xCanCodec:
 
 def _measurement(values: Sequence[float], temperature: int, index: int) -> Measurement:
     """A whole set in SI units, without the groups of values of which one is not finite."""
-    euler = _scaled3(values[:3], RAD_PER_DEG)
+    euler = scaled(values[:3], RAD_PER_DEG)
     return Measurement(
         SET.size, 0, index,
-        accel_m_s2=_scaled3(values[6:9], M_S2_PER_G),
-        gyro_rad_s=_scaled3(values[3:6], RAD_S_PER_DEG_S),
+        accel_m_s2=scaled(values[6:9], M_S2_PER_G),
+        gyro_rad_s=scaled(values[3:6], RAD_S_PER_DEG_S),
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
         euler_rad=euler,
         temperature_c=temperature * C_PER_COUNT,
     )  # fmt: skip
-
-
-def _scaled3(values: Sequence[float], factor: float) -> Vector3 | None:
-    x, y, z = values
-    return (x * factor, y * factor, z * factor) if isfinite(x + y + z) else None
 
 
 # --- the device's side ------------------------------------------------------------------------------------------------
@@ -246,50 +237,3 @@ def encode_set(
         index % INDEX_MODULUS,
     )
     return [(base_id + slot, raw[slot * FRAME_BYTES : (slot + 1) * FRAME_BYTES]) for slot in range(SET_FRAMES)]
-
-
-def _example_frames(random: Random) -> list[CanFrame]:
-    """A set with random values."""
-
-    def three(spread: float) -> Vector3:
-        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
-
-    frames = encode_set(
-        index=random.randrange(INDEX_MODULUS),
-        accel_m_s2=three(9.8),
-        gyro_rad_s=three(2),
-        euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
-        temperature_c=random.uniform(-40, 85),
-    )
-    return [CanFrame(can_id, False, data, 0) for can_id, data in frames]
-
-
-def _filters(settings: Imu61xCanSettings) -> list[CanFilter]:
-    """Five identifiers, each by itself: other devices may have those beside them."""
-    return [CanFilter(settings.base_id + slot, STANDARD_ID_MAX, False) for slot in range(SET_FRAMES)]
-
-
-def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
-    """The identifiers as delivered; a device that was given others cannot be told from anything else."""
-    slot = can_id - BASE_ID
-    return BASE_ID if 0 <= slot < SET_FRAMES and not extended and len(data) == FRAME_BYTES else None
-
-
-DRIVER: Final = CanDriver(
-    name="imu61x-can",
-    title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (CAN)",
-    settings=Imu61xCanSettings,
-    make_codec=Imu61xCanCodec,
-    filters=_filters,
-    tick_ns=SAMPLE_COUNTER,
-    tick_modulus=INDEX_MODULUS,
-    euler_convention=EULER_CONVENTION,
-    navigation_frame=NAVIGATION_FRAME,
-    node_of=_node_of,
-    node_settings=lambda base_id: Imu61xCanSettings(base_id=base_id),
-    node_title=lambda base_id: f"base_id {base_id}",
-    identify=lambda _settings: says_nothing(Identity()),
-    read_settings=lambda _settings: says_nothing({}),
-    sample_frames=SET_FRAMES,
-    example_frames=_example_frames,
-)

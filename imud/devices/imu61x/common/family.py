@@ -1,14 +1,19 @@
-"""What the four wire protocols of the Forsense IMU61x share: check value, product ids, filter codes, units.
+"""Constants that the four wire protocols of the Forsense IMU61x share: check value, units, product ids, filter codes.
 
 Manual "IMU61X Interface Protocol and Instructions". Departures from it: the table of its chapter 5 has misprints, and
 it leaves g open; both are settled as the vendor's own programs have them.
 """
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from random import Random
 from types import MappingProxyType
-from typing import Final
+from typing import Annotated, Final, Literal, get_args
 
+from msgspec import Meta
+
+from imud.sample import Vector3
 from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 
 _CRC_START: Final = 0xFFFFFFFE
@@ -30,6 +35,19 @@ def crc32(data: bytes | bytearray | memoryview) -> int:
 M_S2_PER_G: Final = STANDARD_GRAVITY_M_S2
 """1 g of the device is standard gravity (the manual leaves it open; the vendor's own driver takes 9.80665)."""
 RAD_S_PER_DEG_S: Final = RAD_PER_DEG
+
+
+def scaled(values: Sequence[float], factor: float) -> Vector3 | None:
+    """Three 32-bit floats times `factor`; None where one of them is NaN or infinite."""
+    x, y, z = values
+    # three 32-bit floats cannot add up to a 64-bit infinity
+    return (x * factor, y * factor, z * factor) if isfinite(x + y + z) else None
+
+
+def random_vector(random: Random, spread: float) -> Vector3:
+    """Three random numbers around zero, for the examples of the shared property tests."""
+    return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
+
 
 EULER_CONVENTION: Final = (
     "ZYX, assumed (the manual states none): yaw about Z, then pitch about Y, then roll about X; right-handed"
@@ -74,6 +92,8 @@ FILTERS: Final = (
 """Low-pass filters by code 0 … 15: corner frequency of an IIR filter, or number of samples of a moving average."""
 FILTER_DEFAULT: Final = 0xBB
 """47 Hz for both, as delivered."""
+FilterCode = Annotated[int, Meta(ge=0, le=len(FILTERS) - 1, extra={"section": "2.4.2, table 21"})]
+"""An index of FILTERS."""
 
 
 def filter_control(accel: int, gyro: int) -> int:
@@ -90,5 +110,7 @@ def filter_codes(control: int) -> tuple[int, int]:
 
 # --- I2C addresses (parameter 30 of the UART sets it) -----------------------------------------------------------------
 
-I2C_ADDRESSES: Final = (0x18, 0x19, 0x1A, 0x1B)
-"""7-bit addresses a device can have, the one as delivered first."""
+I2cAddress = Literal[0x18, 0x19, 0x1A, 0x1B]
+"""A 7-bit address that a device can have."""
+I2C_ADDRESSES: Final[tuple[I2cAddress, ...]] = get_args(I2cAddress)
+"""All of them, the one as delivered first."""

@@ -11,16 +11,13 @@ The timer counts µs and wraps after 71.6 minutes.
 import struct
 from collections.abc import Sequence
 from math import cos, isfinite, sin
-from random import Random
 from typing import Any, Final
 
 from imud.attitude import quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.contracts.driver import StreamDriver
 from imud.contracts.settings import NoSettings
-from imud.devices.imu61x.common.family import EULER_CONVENTION, M_S2_PER_G, NAVIGATION_FRAME, RAD_S_PER_DEG_S, crc32
-from imud.devices.imu61x.uart.actions import ACTIONS
-from imud.devices.imu61x.uart.commands import AHRS_FRAME_BYTES, BAUD_RATES
+from imud.devices.imu61x.common.family import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, scaled
+from imud.devices.imu61x.uart.commands import AHRS_FRAME_BYTES
 from imud.devices.imu61x.uart.framing import CRC_BYTES, DEVICE_SYNC, HEADER, Frame, FrameFinder, encode_frame
 from imud.devices.imu61x.uart.replies import (
     PARAMETER_FRAME,
@@ -32,10 +29,9 @@ from imud.devices.imu61x.uart.replies import (
     pack_parameters,
     pack_status,
 )
-from imud.devices.imu61x.uart.session import identify, read_settings, wake
 from imud.ledger import Ledger
 from imud.sample import Measurement, Vector3
-from imud.units import NS_PER_US, RAD_PER_DEG
+from imud.units import RAD_PER_DEG
 
 AHRS: Final = struct.Struct("<I10f")
 """timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)."""
@@ -148,20 +144,15 @@ def _finite_measurement(values: Sequence[Any], size: int, trailing: int) -> Meas
 def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
     """The same without the groups of values of which one is NaN or infinite."""
     us, pitch, roll, yaw = values[:4]
-    euler = _scaled3((roll, pitch, yaw), RAD_PER_DEG)
+    euler = scaled((roll, pitch, yaw), RAD_PER_DEG)
     return Measurement(
         size, trailing, us,
-        accel_m_s2=_scaled3(values[4:7], M_S2_PER_G),
-        gyro_rad_s=_scaled3(values[7:10], RAD_S_PER_DEG_S),
+        accel_m_s2=scaled(values[4:7], M_S2_PER_G),
+        gyro_rad_s=scaled(values[7:10], RAD_S_PER_DEG_S),
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
         euler_rad=euler,
         temperature_c=values[10] if isfinite(values[10]) else None,
     )  # fmt: skip
-
-
-def _scaled3(values: Sequence[float], factor: float) -> Vector3 | None:
-    x, y, z = values
-    return (x * factor, y * factor, z * factor) if isfinite(x) and isfinite(y) and isfinite(z) else None
 
 
 # --- the device's side ------------------------------------------------------------------------------------------------
@@ -198,37 +189,3 @@ def encode_parameter(index: int, value: float) -> bytes:
 def encode_acknowledgement(command: int, result: int = RESULT_DONE, frame_id: int = K1_FRAME) -> bytes:
     """A whole K1 frame."""
     return encode_frame(DEVICE_SYNC, frame_id, pack_acknowledgement(command, result))
-
-
-def _example_frame(random: Random) -> bytes:
-    """An AHRS frame with random values."""
-
-    def three(spread: float) -> Vector3:
-        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
-
-    return encode_ahrs(
-        timer_us=random.randrange(TIMER_MODULUS),
-        accel_m_s2=three(9.8),
-        gyro_rad_s=three(2),
-        euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
-        temperature_c=random.uniform(-40, 85),
-    )
-
-
-DRIVER: Final = StreamDriver(
-    name="imu61x-uart",
-    title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (UART)",
-    baud_rates=BAUD_RATES,
-    settings=NoSettings,
-    make_codec=Imu61xCodec,
-    tick_ns=NS_PER_US,
-    tick_modulus=TIMER_MODULUS,
-    euler_convention=EULER_CONVENTION,
-    navigation_frame=NAVIGATION_FRAME,
-    lines=frozenset({"reset"}),
-    actions=ACTIONS,
-    identify=identify,
-    read_settings=read_settings,
-    wake=wake,
-    example_frame=_example_frame,
-)

@@ -2,9 +2,10 @@
 
     55 AA | command u16 | 24 u16 | param1 f32 | 0 f32 | param3 u32 | 0 u32 | 0 i32 | 0 i32 | CRC-32
 
-Each function returns a `Request` and raises BadArgument for what the device would not take: it would silently take a
-default instead. Settings last until power is off unless `save` follows. Whether the device obeys more than
-`output_mode` while it streams stands in no source; `session.py` does not depend on it.
+Each function returns a `Request`. Values are checked where they enter, by the annotations of `actions.py`: for one that
+the device does not have it would silently use a default instead. Settings last until power is off unless `save`
+follows. Whether the device obeys more than `output_mode` while it streams stands in no source; `session.py` does not
+depend on it.
 
 Commands that change something are acknowledged (K1). Its result is not judged here, because its codes stand in no
 source: any K1 for the command ends the reply.
@@ -12,12 +13,11 @@ source: any K1 for the command ends the reply.
 
 from collections.abc import Callable
 from enum import Enum
-from typing import Final
+from typing import Final, Literal, get_args
 
 from imud.contracts.codec import Message
 from imud.contracts.session import Request, never
-from imud.devices.arguments import member, one_of
-from imud.devices.imu61x.common.family import FILTERS, I2C_ADDRESSES, filter_control
+from imud.devices.imu61x.common.family import filter_control
 from imud.devices.imu61x.uart.framing import HOST_SYNC, OVERHEAD_BYTES, encode_frame
 from imud.devices.imu61x.uart.replies import (
     Parameter,
@@ -29,10 +29,14 @@ from imud.devices.imu61x.uart.replies import (
 from imud.errors import BadArgument
 from imud.units import BITS_PER_UART_BYTE, NS_PER_MS, NS_PER_S
 
-BAUD_RATES: Final = (115200, 921600, 460800, 230400, 1500000)
-"""Rates of table 12, the factory default first, then those that people choose for 200 and 400 Hz."""
-RATES_HZ: Final = (1, 10, 50, 100, 200, 400)
-"""AHRS output rates of table 12."""
+BaudRate = Literal[115200, 921600, 460800, 230400, 1500000]
+"""A rate of table 12, bit/s."""
+BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
+"""All of them, the factory default first, then those that people choose for 200 and 400 Hz."""
+RateHz = Literal[1, 10, 50, 100, 200, 400]
+"""An AHRS output rate of table 12."""
+RATES_HZ: Final[tuple[RateHz, ...]] = get_args(RateHz)
+"""All of them."""
 AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + 44
 REPLY_TIMEOUT_NS: Final = 300 * NS_PER_MS
 """A reply of 76 bytes takes 7 ms at 115200 baud, and a USB adapter holds it for 16 ms; the manual gives no time."""
@@ -59,7 +63,7 @@ class Command(Enum):
 
 
 class OutputMode(Enum):
-    """What the device does by itself."""
+    """What the device sends without a request."""
 
     STREAM = 1
     """Sends AHRS frames."""
@@ -68,7 +72,7 @@ class OutputMode(Enum):
 
 
 class BusMode(Enum):
-    """The bus besides the UART (parameter 27)."""
+    """The second bus of the device, next to the UART (parameter 27)."""
 
     UART_ONLY = 0
     SPI = 1
@@ -93,7 +97,6 @@ def ask_ahrs() -> Request:
 
 def read_parameter(parameter: Parameter) -> Request:
     """Ask for a parameter (CMD 6)."""
-    member("parameter", parameter, Parameter)
 
     def is_end(message: Message) -> bool:
         value = parse_parameter(message)
@@ -121,14 +124,11 @@ def ask_installation_status() -> Request:
 
 def output_mode(mode: OutputMode, *, baud: int = 0) -> Request:
     """Stream AHRS frames, or only answer (CMD 3). With `baud`, the line is set to that rate first."""
-    name = f"output mode {member('mode', mode, OutputMode).name}"
-    return _command(Command.OUTPUT_MODE, name, param1=mode.value, baud=baud)
+    return _command(Command.OUTPUT_MODE, f"output mode {mode.name}", param1=mode.value, baud=baud)
 
 
 def reset_heading(heading_deg: float) -> Request:
     """Make the heading of the AHRS 0° … 360° (CMD 4)."""
-    if isinstance(heading_deg, bool) or not isinstance(heading_deg, int | float) or not 0 <= heading_deg <= 360:
-        raise BadArgument(f"heading: expected 0 … 360°, got {heading_deg!r}")
     return _command(Command.HEADING, "heading reset", param1=heading_deg)
 
 
@@ -138,7 +138,7 @@ def save() -> Request:
 
 
 def start_installation_calibration() -> Request:
-    """Begin to measure the mounting error (CMD 7); `ask_installation_status` tells how far it is."""
+    """Begin to measure the mounting error (CMD 7); `ask_installation_status` says how far it is."""
     return _command(Command.CALIBRATE_INSTALLATION, "installation calibration")
 
 
@@ -154,12 +154,11 @@ def calibrate_gyro() -> Request:
 
 def set_baud(baud: int) -> Request:
     """Set the rate of the UART (CMD 14, parameter 3). `session.change_baud` does it without losing the device."""
-    return _set(Parameter.BAUD, one_of("baud rate", baud, BAUD_RATES))
+    return _set(Parameter.BAUD, baud)
 
 
 def set_rate(rate_hz: int, *, baud: int | None = None) -> Request:
-    """Set the AHRS output rate (CMD 14, parameter 21). With `baud`, refuses what does not fit through the line."""
-    one_of("AHRS rate in Hz", rate_hz, RATES_HZ)
+    """Set the AHRS output rate (CMD 14, parameter 21). With `baud`, raises BadArgument if it does not fit."""
     if baud is not None and rate_hz > max_rate_hz(baud):
         raise BadArgument(
             f"AHRS rate: expected at most {max_rate_hz(baud)} Hz at {baud} baud, got {rate_hz} Hz; "
@@ -169,19 +168,17 @@ def set_rate(rate_hz: int, *, baud: int | None = None) -> Request:
 
 
 def set_bus_mode(mode: BusMode) -> Request:
-    """Choose the bus besides the UART (CMD 14, parameter 27)."""
-    return _set(Parameter.BUS_MODE, member("bus mode", mode, BusMode).value)
+    """Choose the second bus, next to the UART (CMD 14, parameter 27)."""
+    return _set(Parameter.BUS_MODE, mode.value)
 
 
 def set_i2c_address(address: int) -> Request:
     """Set the 7-bit I2C address, 0x18 … 0x1B (CMD 14, parameter 30)."""
-    return _set(Parameter.I2C_ADDRESS, one_of("I2C address", address, I2C_ADDRESSES))
+    return _set(Parameter.I2C_ADDRESS, address)
 
 
 def set_filter(accel: int, gyro: int) -> Request:
     """Set the low-pass filters by their codes, indices of `common.FILTERS` (CMD 14, parameter 31)."""
-    for name, code in (("accelerometer", accel), ("gyroscope", gyro)):
-        one_of(f"{name} filter code", code, range(len(FILTERS)))
     return _set(Parameter.FILTER, filter_control(accel, gyro))
 
 

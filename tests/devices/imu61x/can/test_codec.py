@@ -7,7 +7,8 @@ import msgspec
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
-from imud.devices.imu61x.can.codec import DRIVER, Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.devices.imu61x.can.driver import DRIVER
 from imud.ledger import Ledger
 from imud.sample import Measurement
 

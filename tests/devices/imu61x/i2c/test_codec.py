@@ -1,18 +1,15 @@
-"""I2C bursts of the IMU61x: hand-computed bytes, identity, filter."""
+"""I2C bursts of the IMU61x: hand-computed bytes, and replies that show another device or setting."""
 
 import struct
-from collections.abc import Callable
 
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason
-from imud.contracts.polling import Transfer, Vanished, run_transfer_script
-from imud.devices.imu61x.common.registers import RegisterSettings
-from imud.devices.imu61x.i2c import codec as i2c
-from imud.errors import DeviceRefused
+from imud.contracts.polling import Vanished
+from imud.devices.imu61x.common.register_driver import RegisterSettings
+from imud.devices.imu61x.i2c.codec import Imu61xI2cCodec
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.devices.imu61x.spi.test_codec import RAD_S, G, slow_crc
 
 VALUES = bytes.fromhex("00000000 0000003f 0000803f 0000803f 00000000 000080bf 0000c841".replace(" ", ""))
@@ -20,17 +17,8 @@ VALUES = bytes.fromhex("00000000 0000003f 0000803f 0000803f 00000000 000080bf 00
 GOLDEN = VALUES + struct.pack("<I", slow_crc(VALUES))
 
 
-def codec(**settings: int) -> i2c.Imu61xI2cCodec:
-    return i2c.Imu61xI2cCodec(Ledger(), RegisterSettings(**settings))
-
-
-def wire(device: Imu61xRegisters, log: list[Transfer] | None = None) -> Callable[[Transfer], bytes]:
-    def transfer(one: Transfer) -> bytes:
-        if log is not None:
-            log.append(one)
-        return device.i2c([*one.sends, one.read_bytes] if one.read_bytes else [*one.sends])
-
-    return transfer
+def codec(**settings: int) -> Imu61xI2cCodec:
+    return Imu61xI2cCodec(Ledger(), RegisterSettings(**settings))
 
 
 def test_burst_in_si() -> None:
@@ -79,30 +67,3 @@ def test_identity_and_filter_are_watched() -> None:
     for poll, data in ((1, b"\x00\x00IMU61C"), (2, b"\xbb"), (1, b""), (2, b"")):
         assert isinstance(made.take(poll, data)[0], Vanished)
     assert made.ledger.closes()
-
-
-@pytest.mark.parametrize(
-    ("last", "product"), [("2", "IMU612"), ("4", "IMU614"), ("8", "IMU618"), ("A", "IMU6132A"), ("B", "IMU6132B")]
-)
-def test_probe_names_every_product(last: str, product: str) -> None:
-    dialogue = i2c.probe(RegisterSettings())
-    assert next(dialogue) == Transfer((b"\x6a",), 8)
-    with pytest.raises(StopIteration) as end:
-        dialogue.send(b"\x00\x00IMU61" + last.encode())
-    assert end.value.value.product == product
-
-
-def test_set_up_writes_reads_back_and_leaves_alone() -> None:
-    device, log = Imu61xRegisters(lambda: 0), list[Transfer]()
-    transfer = wire(device, log)
-    words = run_transfer_script(i2c.set_up(RegisterSettings(accel_filter=4)), transfer)
-    assert words == {"accel_filter": "10 Hz", "gyro_filter": "47 Hz"}
-    assert [(one.sends[0].hex(), one.read_bytes) for one in log] == [("06", 1), ("064b", 0), ("06", 1)]
-    log.clear()
-    run_transfer_script(i2c.set_up(RegisterSettings()), transfer)
-    assert len(log) == 1
-
-
-def test_filter_that_does_not_take_is_refused() -> None:
-    with pytest.raises(DeviceRefused, match="wrote 0x4b, read back 0xbb"):
-        run_transfer_script(i2c.set_up(RegisterSettings(accel_filter=4)), lambda one: b"\xbb" * one.read_bytes)

@@ -7,13 +7,14 @@ from math import nan
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason
-from imud.contracts.polling import PolledEvent, Transfer, Vanished, run_transfer_script
+from imud.contracts.polling import PolledEvent, Vanished
 from imud.devices.imu61x.common.registers import temperature_c
 from imud.devices.imu61x.spi import codec as spi
-from imud.errors import DeviceRefused, TransferError, Trouble
+from imud.devices.imu61x.spi.session import READ_STATE, SpiDeviceSettings
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.imu61x.registers import Imu61xRegisters
+from tests.support.imu61x_bench import over_spi
 
 PIPELINE = b"\xde\xad\xbe\xef"
 GOLDEN = bytes.fromhex("8000 003e 0000 0000 8000 ffc1  0000 0000 0000 fffb 0000 0005  ffff 0002".replace(" ", ""))
@@ -26,7 +27,7 @@ G = 9.80665
 
 
 def codec(burst: str = "standard", **more: object) -> spi.Imu61xSpiCodec:
-    return spi.Imu61xSpiCodec(Ledger(), spi.SpiDeviceSettings(burst=burst, **more))  # type: ignore[arg-type]  # passed on as given
+    return spi.Imu61xSpiCodec(Ledger(), SpiDeviceSettings(burst=burst, **more))  # type: ignore[arg-type]  # passed on as given
 
 
 def words(data: bytes) -> tuple[int, ...]:
@@ -157,87 +158,18 @@ def test_no_device_is_no_damage(data: bytes) -> None:
 def test_transfers_on_the_wire() -> None:
     assert spi.READ_STANDARD.sends == (b"\x80\x00" + bytes(30),)
     assert spi.READ_EXTENDED.sends == (b"\x80\x00" + bytes(50),)
-    assert [one.hex() for one in spi.READ_STATE.sends] == [
+    assert [one.hex() for one in READ_STATE.sends] == [
         "fe01", "6a00", "6c00", "6e00", "7000", "0600", "0c00", "fe00", "7e00", "7e00", "7e00"
     ]  # fmt: skip
     assert [one.hex() for one in spi.READ_TEMPERATURE.sends] == ["0e00", "1000", "7e00", "7e00"]
     assert [spi.READ_REGISTERS.sends[n].hex() for n in (0, 13)] == ["0e00", "2800"]
 
 
-# --- dialogues -------------------------------------------------------------------------------------------------------
-
-
-class Wire:
-    """A simulated device with a failure at one of its transfers."""
-
-    def __init__(self, *, fail_at: int = -1, deaf: bool = False) -> None:
-        self.device = Imu61xRegisters(lambda: 0)
-        self.sent: list[str] = []
-        self._fail_at = fail_at
-        self._deaf = deaf
-
-    def transfer(self, transfer: Transfer) -> bytes:
-        number = len(self.sent)
-        self.sent.append(" ".join(item.hex() for item in transfer.sends))
-        if number == self._fail_at:
-            self.device.spi(transfer.sends[:3])  # it breaks off in window 1
-            raise TransferError(Trouble.DISTURBED, "by the test")
-        data = b"".join(self.device.spi(transfer.sends))
-        if self._deaf:
-            self.device.filter, self.device.extended = 0xBB, 0
-        return data
-
-
-def test_probe_names_the_product_and_closes_the_window() -> None:
-    wire = Wire()
-    assert run_transfer_script(spi.probe(spi.SpiDeviceSettings()), wire.transfer).product == "IMU614"
-    assert wire.device.window == 0
-    assert len(wire.sent) == 1
-
-
-def test_set_up_writes_what_differs_only() -> None:
-    wire = Wire()
-    words = run_transfer_script(spi.set_up(spi.SpiDeviceSettings()), wire.transfer)
-    assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
-    assert len(wire.sent) == 1
-    settings = spi.SpiDeviceSettings(accel_filter=4, gyro_filter=4, burst="extended")
-    words = run_transfer_script(spi.set_up(settings), wire.transfer)
-    assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
-    assert wire.sent[2] == "fe01 8644 8d01 fe00 7e00 7e00"  # the manual's example of 10 Hz: 0x8644
-    assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
-
-
-@pytest.mark.parametrize("fail_at", [0, 1, 2])
-def test_window_is_closed_after_a_failure(fail_at: int) -> None:
-    wire = Wire(fail_at=fail_at)
-    with pytest.raises(TransferError):
-        run_transfer_script(spi.set_up(spi.SpiDeviceSettings(gyro_filter=1)), wire.transfer)
-    assert wire.sent[-1] == "fe00 7e00 7e00"
-    assert wire.device.window == 0
-
-
-def test_setting_that_does_not_take_is_refused() -> None:
-    with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xb1, read back 0xbb"):
-        run_transfer_script(spi.set_up(spi.SpiDeviceSettings(gyro_filter=1)), Wire(deaf=True).transfer)
-    with pytest.raises(DeviceRefused, match="BURST_CTRL is 0, expected 1"):
-        run_transfer_script(spi.set_up(spi.SpiDeviceSettings(burst="extended")), Wire(deaf=True).transfer)
-
-
-@pytest.mark.parametrize(
-    ("product_id", "why"), [(b"\xff" * 8, "only 0xFF"), (b"\x00" * 8, "only 0x00"), (b"\x00\x00IMU61C", "SPI mode")]
-)
-def test_another_id_is_refused(product_id: bytes, why: str) -> None:
-    wire = Wire()
-    wire.device.faults.product_id = product_id
-    with pytest.raises(DeviceRefused, match=why):
-        run_transfer_script(spi.probe(spi.SpiDeviceSettings()), wire.transfer)
-
-
 def take_state(**changes: int | bytes) -> list[PolledEvent]:
-    wire, made = Wire(), codec(gyro_filter=0xB)
+    device, made = Imu61xRegisters(lambda: 0), codec(gyro_filter=0xB)
     for name, value in changes.items():
-        setattr(wire.device.faults if name == "product_id" else wire.device, name, value)
-    events = made.take(1, wire.transfer(spi.READ_STATE))
+        setattr(device.faults if name == "product_id" else device, name, value)
+    events = made.take(1, over_spi(device, READ_STATE))
     assert made.ledger.closes()
     return list(events)
 

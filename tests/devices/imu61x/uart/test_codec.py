@@ -10,13 +10,13 @@ from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
 from imud.devices.imu61x.common.family import crc32
 from imud.devices.imu61x.uart.codec import (
     AHRS_FRAME,
-    DRIVER,
     Imu61xCodec,
     encode_acknowledgement,
     encode_ahrs,
     encode_parameter,
     encode_status,
 )
+from imud.devices.imu61x.uart.driver import DRIVER
 from imud.devices.imu61x.uart.framing import DEVICE_SYNC, FRAME_BYTES_MAX, PAYLOAD_BYTES_MAX, encode_frame
 from imud.devices.imu61x.uart.replies import Status
 from imud.ledger import Ledger

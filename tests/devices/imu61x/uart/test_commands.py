@@ -1,7 +1,6 @@
-"""Every command of table 12: golden bytes, argument checks, and which message ends its reply."""
+"""Every command of table 12: golden bytes, and which message ends its reply."""
 
 from collections.abc import Callable
-from math import inf, nan
 from typing import Any
 
 import pytest
@@ -92,35 +91,11 @@ def test_one_ahrs_frame_comes_as_a_sample() -> None:
     assert c.ask_ahrs().silent
 
 
-@pytest.mark.parametrize(
-    ("make", "value", "named"),
-    [
-        (c.set_baud, 9600, "115200, 230400, 460800, 921600, 1500000"),
-        (c.set_baud, True, "baud rate"),
-        (c.set_rate, 0, "1, 10, 50, 100, 200, 400"),
-        (c.set_rate, 100.5, "AHRS rate"),
-        (c.set_bus_mode, 1, "BusMode.SPI"),
-        (c.set_i2c_address, 0x1C, "I2C address"),
-        (c.set_i2c_address, "0x18", "I2C address"),
-        (c.output_mode, 1, "OutputMode.STREAM"),
-        (c.read_parameter, 21, "Parameter.AHRS_RATE"),
-        (c.reset_heading, -0.1, "0 … 360°"),
-        (c.reset_heading, 360.1, "0 … 360°"),
-        (c.reset_heading, nan, "0 … 360°"),
-        (c.reset_heading, inf, "0 … 360°"),
-        (c.reset_heading, True, "0 … 360°"),
-        (c.reset_heading, "90", "0 … 360°"),
-    ],
-)
-def test_what_the_device_would_not_take_is_refused(make: Callable[[Any], Request], value: object, named: str) -> None:
-    with pytest.raises(BadArgument, match=named):
+@pytest.mark.parametrize(("make", "value"), [(c.set_bus_mode, 1), (c.output_mode, 1), (c.read_parameter, 21)])
+def test_a_bare_number_is_no_member_of_an_enum(make: Callable[[Any], Request], value: int) -> None:
+    """A type checker refuses it; without one it still makes no frame."""
+    with pytest.raises(AttributeError):
         make(value)
-
-
-@pytest.mark.parametrize("codes", [(16, 0), (0, 16), (-1, 0), (0, True)])
-def test_filter_codes(codes: tuple[int, int]) -> None:
-    with pytest.raises(BadArgument, match="filter code"):
-        c.set_filter(*codes)
 
 
 @pytest.mark.parametrize(("baud", "most_hz"), [(115200, 200), (230400, 400), (460800, 400), (1500000, 400)])

@@ -183,8 +183,6 @@ def test_a_parameter_that_does_not_stick_is_refused(monkeypatch: pytest.MonkeyPa
         (Parameter.GYRO_X_OFF, 0),
         (Parameter.BUS_MODE, 1),
         (Parameter.AHRS_RATE, BusMode.SPI),
-        (Parameter.AHRS_RATE, 99),
-        (Parameter.I2C_ADDRESS, 0x20),
     ],
 )
 def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parameter, value: int | BusMode) -> None:
@@ -270,13 +268,6 @@ def test_the_baud_rate_changes_and_the_device_is_kept(
     assert streams(far)
     far.restart()
     assert streams(far)
-
-
-def test_a_rate_that_the_device_has_not_is_refused_before_anything_is_sent() -> None:
-    far = bench()
-    with pytest.raises(BadArgument):
-        far.hold(session.change_baud(9600, 115200))
-    assert far.asked == []
 
 
 def test_the_line_comes_back_when_the_device_keeps_its_rate(monkeypatch: pytest.MonkeyPatch) -> None:

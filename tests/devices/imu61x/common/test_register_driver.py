@@ -1,19 +1,16 @@
-"""Named actions of an IMU61x on a polled bus, on the simulated one."""
-
-from collections.abc import Callable
+"""The filter action that the drivers on I2C and SPI share, against the simulated device."""
 
 import pytest
 
 from imud.contracts.action import Target
 from imud.contracts.polling import PolledDriver, Transfer, run_transfer_script
-from imud.devices.imu61x.common.registers import RegisterSettings
-from imud.devices.imu61x.i2c import codec as i2c
-from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.common.register_driver import RegisterSettings
+from imud.devices.imu61x.i2c.driver import DRIVER as I2C
+from imud.devices.imu61x.spi.driver import DRIVER as SPI
+from imud.devices.imu61x.spi.session import SpiDeviceSettings
 from imud.errors import BadArgument
 from imud.sim.imu61x.registers import Imu61xRegisters
-
-I2C: PolledDriver = i2c.DRIVER
-SPI: PolledDriver = spi.DRIVER
+from tests.support.imu61x_bench import over_i2c, over_spi
 
 
 class Wires:
@@ -25,19 +22,15 @@ class Wires:
 
     def act(self, driver: PolledDriver, settings: RegisterSettings, **given: object) -> object:
         action = driver.actions["filter"]
-        transfer: Callable[[Transfer], bytes] = self._i2c if driver is I2C else self._spi
+
+        def transfer(one: Transfer) -> bytes:
+            self.transfers += 1
+            return (over_i2c if driver is I2C else over_spi)(self.device, one)
+
         return run_transfer_script(action.script(Target(settings, 0), action.arguments(given)), transfer)
 
-    def _i2c(self, one: Transfer) -> bytes:
-        self.transfers += 1
-        return self.device.i2c([*one.sends, one.read_bytes] if one.read_bytes else [*one.sends])
 
-    def _spi(self, one: Transfer) -> bytes:
-        self.transfers += 1
-        return b"".join(self.device.spi(one.sends))
-
-
-BUSES = [(I2C, RegisterSettings()), (SPI, spi.SpiDeviceSettings())]
+BUSES = [(I2C, RegisterSettings()), (SPI, SpiDeviceSettings())]
 
 
 @pytest.mark.parametrize(("driver", "settings"), BUSES)

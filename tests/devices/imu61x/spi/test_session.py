@@ -1,0 +1,75 @@
+"""Transfer scripts of the IMU61x on SPI: identity, filters and kind of burst, on the simulated device."""
+
+import pytest
+
+from imud.contracts.polling import Transfer, run_transfer_script
+from imud.devices.imu61x.spi.session import SpiDeviceSettings, probe, set_up
+from imud.errors import DeviceRefused, TransferError, Trouble
+from imud.sim.imu61x.registers import Imu61xRegisters
+from tests.support.imu61x_bench import over_spi
+
+
+class Wire:
+    """A simulated device with a failure at one of its transfers."""
+
+    def __init__(self, *, fail_at: int = -1, deaf: bool = False) -> None:
+        self.device = Imu61xRegisters(lambda: 0)
+        self.sent: list[str] = []
+        self._fail_at = fail_at
+        self._deaf = deaf
+
+    def transfer(self, transfer: Transfer) -> bytes:
+        number = len(self.sent)
+        self.sent.append(" ".join(item.hex() for item in transfer.sends))
+        if number == self._fail_at:
+            self.device.spi(transfer.sends[:3])  # it breaks off in window 1
+            raise TransferError(Trouble.DISTURBED, "by the test")
+        data = over_spi(self.device, transfer)
+        if self._deaf:
+            self.device.filter, self.device.extended = 0xBB, 0
+        return data
+
+
+def test_probe_names_the_product_and_closes_the_window() -> None:
+    wire = Wire()
+    assert run_transfer_script(probe(SpiDeviceSettings()), wire.transfer).product == "IMU614"
+    assert wire.device.window == 0
+    assert len(wire.sent) == 1
+
+
+def test_set_up_writes_what_differs_only() -> None:
+    wire = Wire()
+    words = run_transfer_script(set_up(SpiDeviceSettings()), wire.transfer)
+    assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
+    assert len(wire.sent) == 1
+    settings = SpiDeviceSettings(accel_filter=4, gyro_filter=4, burst="extended")
+    words = run_transfer_script(set_up(settings), wire.transfer)
+    assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
+    assert wire.sent[2] == "fe01 8644 8d01 fe00 7e00 7e00"  # the manual's example of 10 Hz: 0x8644
+    assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
+
+
+@pytest.mark.parametrize("fail_at", [0, 1, 2])
+def test_window_is_closed_after_a_failure(fail_at: int) -> None:
+    wire = Wire(fail_at=fail_at)
+    with pytest.raises(TransferError):
+        run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), wire.transfer)
+    assert wire.sent[-1] == "fe00 7e00 7e00"
+    assert wire.device.window == 0
+
+
+def test_setting_that_does_not_take_is_refused() -> None:
+    with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xb1, read back 0xbb"):
+        run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), Wire(deaf=True).transfer)
+    with pytest.raises(DeviceRefused, match="BURST_CTRL is 0, expected 1"):
+        run_transfer_script(set_up(SpiDeviceSettings(burst="extended")), Wire(deaf=True).transfer)
+
+
+@pytest.mark.parametrize(
+    ("product_id", "why"), [(b"\xff" * 8, "only 0xFF"), (b"\x00" * 8, "only 0x00"), (b"\x00\x00IMU61C", "SPI mode")]
+)
+def test_another_id_is_refused(product_id: bytes, why: str) -> None:
+    wire = Wire()
+    wire.device.faults.product_id = product_id
+    with pytest.raises(DeviceRefused, match=why):
+        run_transfer_script(probe(SpiDeviceSettings()), wire.transfer)
