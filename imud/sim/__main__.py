@@ -24,9 +24,9 @@ from typing import Final
 
 from imud.errors import LinkError
 from imud.sim import CAN_SIMULATORS, SIMULATORS
+from imud.sim.can_module import CanModules
 from imud.sim.physics.motion import GRAVITY_M_S2, MOTIONS
 from imud.sim.ports.arrival import BARE_UART, USB_1MS, USB_16MS
-from imud.sim.ports.can_modules import CanModules
 from imud.sim.ports.can_port import CanPort, default_interface
 from imud.sim.ports.faults import Faults, rates_from
 from imud.sim.ports.pin import PinModule

@@ -1,13 +1,21 @@
-"""What a simulated device on a CAN bus is: without I/O, driven by an explicit clock; and its way to the wire."""
+"""Simulated devices on a CAN bus: their contract, their way to the wire, and what several of them have in common.
+
+CanModule           the contract: frames of others in, frames that crossed the wire out
+FrameWire           one frame after the other at the bit rate of the bus
+PeriodicCanModule   a module that only sends, the same frames at every period
+CanModules          several modules on one bus, in the shape of a single one
+"""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from heapq import merge
 from typing import Final, NamedTuple, Protocol
 
 from imud.formats.can import DATA_BYTES_MAX, frame_bits
-from imud.sim.simulator import SimulatorOptions
-from imud.units import NS_PER_S
+from imud.sim.physics.motion import Truth
+from imud.sim.simulator import SensorHardware, SimulatorOptions
+from imud.units import NS_PER_MS, NS_PER_S
 
 STUFF_BITS: Final = 9
 """Of a frame with average data. Frames with fewer than eight bytes take as long here as those with eight."""
@@ -33,7 +41,7 @@ class CanModule(Protocol):
     """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Take a frame that somebody else sent."""
+        """Take a frame that another device sent."""
         ...
 
     def advance(self, now_ns: int) -> list[SentFrame]:
@@ -53,7 +61,7 @@ class CanModule(Protocol):
         ...
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back: what was not saved is gone."""
+        """Restart after a loss of power: what was not saved is gone."""
         ...
 
 
@@ -96,3 +104,124 @@ class FrameWire:
     def next_ns(self) -> int | None:
         """When the next frame is through, None if none waits."""
         return self._waiting[0].due_ns if self._waiting else None
+
+
+class PeriodicCanModule:
+    """A device that samples at whole periods of its own crystal, sends every sample at once, and takes no commands.
+
+    It is powered on when it is made. Synchronization: one thread.
+    """
+
+    def __init__(
+        self,
+        now_ns: int,
+        hardware: SensorHardware,
+        rate_hz: float,
+        bitrate: int,
+        encode: Callable[[int, Truth], Sequence[tuple[int, bytes]]],
+        *,
+        extended: bool = False,
+        first_number: int = 0,
+    ) -> None:
+        """`encode` makes the frames (identifier, data) of a sample from its number and reading. Numbers count from
+        `first_number` after the first power-on, from 0 after a restart."""
+        self.epoch_ns = now_ns
+        self.samples_sent = 0
+        self.frames_sent = 0
+        self._hardware, self._encode, self._extended = hardware, encode, extended
+        self._period_ns = NS_PER_S / rate_hz / (1 + hardware.skew_ppm * 1e-6)
+        self._bitrate = bitrate
+        self._power_on(now_ns, first_number)
+
+    def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
+        """Ignore frames of other devices."""
+
+    def mark(self, now_ns: int) -> None:
+        """Ignore the edge: there is no sync input on this port."""
+
+    def reboot(self, now_ns: int) -> None:
+        """Restart after a loss of power: samples are numbered from 0 again."""
+        self._power_on(now_ns, 0)
+
+    def advance(self, now_ns: int) -> list[SentFrame]:
+        """Return what has crossed the wire since the last call, in order."""
+        while (sample_ns := self._sample_ns()) <= now_ns:
+            reading = self._hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
+            for can_id, data in self._encode(self._first_number + self._sampled, reading):
+                self._wire.send(sample_ns + self._hardware.processing_ns, can_id, self._extended, data, sample_ns)
+                self.frames_sent += 1
+            self._sampled += 1
+            self.samples_sent += 1
+        return self._wire.sent(now_ns)
+
+    def next_ns(self) -> int | None:
+        """When `advance` will have something next."""
+        waiting = self._wire.next_ns()
+        if waiting is not None:
+            return waiting
+        frame_ns = self._wire.extended_ns if self._extended else self._wire.frame_ns
+        return self._sample_ns() + self._hardware.processing_ns + frame_ns
+
+    def counters(self) -> dict[str, int]:
+        """Samples and frames sent."""
+        return {"samples_sent": self.samples_sent, "frames_sent": self.frames_sent}
+
+    def _power_on(self, now_ns: int, first_number: int) -> None:
+        self._begin_ns = now_ns + self._hardware.boot_ms * NS_PER_MS
+        self._first_number = first_number
+        self._sampled = 0
+        self._wire = FrameWire(self._bitrate, self._begin_ns)
+
+    def _sample_ns(self) -> int:
+        return self._begin_ns + round(self._sampled * self._period_ns)
+
+
+class CanModules:
+    """Modules that share a bus, in the shape of a single one (`CanModule`). Synchronization: one thread."""
+
+    def __init__(self, modules: Sequence[CanModule]) -> None:
+        """Raises ValueError without any module."""
+        if not modules:
+            raise ValueError("expected at least one module")
+        self.modules = tuple(modules)
+        self.epoch_ns = modules[0].epoch_ns
+
+    def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
+        """Every module hears it."""
+        for module in self.modules:
+            module.receive(can_id, extended, data, now_ns)
+
+    def advance(self, now_ns: int) -> list[SentFrame]:
+        """What has crossed the wire since the last call; frames of the same moment in the order of the modules."""
+        sent = [module.advance(now_ns) for module in self.modules]
+        for sender, frames in zip(self.modules, sent, strict=True):
+            for frame in frames:
+                self._others_hear(sender, frame, now_ns)
+        return list(merge(*sent, key=lambda frame: frame.due_ns))
+
+    def next_ns(self) -> int | None:
+        """When the first of them will have something next."""
+        return min((due_ns for module in self.modules if (due_ns := module.next_ns()) is not None), default=None)
+
+    def counters(self) -> dict[str, int]:
+        """The sums of what they count."""
+        total: dict[str, int] = {}
+        for module in self.modules:
+            for name, value in module.counters().items():
+                total[name] = total.get(name, 0) + value
+        return total
+
+    def mark(self, now_ns: int) -> None:
+        """The sync inputs of all are wired together."""
+        for module in self.modules:
+            module.mark(now_ns)
+
+    def reboot(self, now_ns: int) -> None:
+        """All of them lose power."""
+        for module in self.modules:
+            module.reboot(now_ns)
+
+    def _others_hear(self, sender: CanModule, frame: SentFrame, now_ns: int) -> None:
+        for module in self.modules:
+            if module is not sender:
+                module.receive(frame.can_id, frame.extended, frame.data, now_ns)

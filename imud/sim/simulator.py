@@ -1,10 +1,14 @@
-"""What a simulated device on a byte stream is: the far end of the wire, without I/O, driven by an explicit clock."""
+"""Contract of simulated devices: options, the sensor inside, and the module at the far end of a byte stream.
+
+Modules do no I/O and read no clock: their owner says what time it is.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, Protocol, TypedDict
 
-from imud.sim.physics.motion import GRAVITY_M_S2
+from imud.sim.physics.motion import GRAVITY_M_S2, MOTIONS, Motion, Truth, swing
+from imud.sim.physics.noise import Noise
 
 
 class Burst(NamedTuple):
@@ -51,13 +55,13 @@ class StreamModule(Protocol):
         ...
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back, or the device was told to: what was not saved is gone."""
+        """Restart after a loss of power or by a command: what was not saved is gone."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatorOptions:
-    """What every simulated device can be told."""
+    """Options that all simulated devices have in common."""
 
     rate_hz: float = 100.0
     """Samples per second of the device's own time."""
@@ -87,6 +91,48 @@ class SimulatorOptions:
     def bitrate(self, common: int) -> int:
         """Bit rate of a CAN device, bit/s: `baud`, or the common one; 0 for frames that take no time."""
         return 0 if self.at_once else self.baud or common
+
+
+class SensorParts(TypedDict):
+    """The fields of `SensorHardware`, to make a device's own hardware from."""
+
+    motion: Motion
+    noise: Noise | None
+    skew_ppm: float
+    boot_ms: int
+    processing_ns: int
+
+
+def sensor_parts(options: SimulatorOptions) -> SensorParts:
+    """The sensor that the options describe. Raises ValueError for a motion that does not exist."""
+    if options.motion not in MOTIONS:
+        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
+    return {
+        "motion": MOTIONS[options.motion](options.gravity_m_s2),
+        "noise": Noise(options.seed) if options.noise == "real" else None,
+        "skew_ppm": options.skew_ppm,
+        "boot_ms": options.boot_ms,
+        "processing_ns": options.processing_ns,
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorHardware:
+    """The part that all simulated devices have: a moved sensor with noise, and a crystal of its own."""
+
+    motion: Motion = field(default_factory=swing)
+    noise: Noise | None = None
+    skew_ppm: float = 20.0
+    """How much faster the crystal runs than the host's."""
+    boot_ms: int = 500
+    """Silence after power-on and restart."""
+    processing_ns: int = 125_000
+    """Time from the instant of measurement to the first bit on the wire."""
+
+    def reading(self, t_s: float) -> Truth:
+        """What the sensor measures at a time of its motion, noise included."""
+        truth = self.motion.at(t_s)
+        return self.noise.add(truth, t_s) if self.noise else truth
 
 
 @dataclass(frozen=True, slots=True)

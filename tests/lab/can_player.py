@@ -21,8 +21,8 @@ from imud.devices.imu61x.can.codec import INDEX_MODULUS, SET_FRAMES
 from imud.formats.can import RAW_FRAME, pack_frame
 from imud.links.can.frame_reader import MessageBuffers, Vector, libc
 from imud.sim import CAN_SIMULATORS
+from imud.sim.can_module import CanModules
 from imud.sim.physics.motion import MOTIONS
-from imud.sim.ports.can_modules import CanModules
 from imud.sim.ports.pty import sharpen_timers
 from imud.sim.simulator import SimulatorOptions
 from tests.lab.can_phase import LOOP_S, Phased

@@ -18,8 +18,8 @@ from imud.links.can.link import SocketCanLink, SocketCanSettings
 from imud.runtime.can.buses import CanBuses
 from imud.runtime.can.runner import CanRunner
 from imud.runtime.detection.can_round import EVERYTHING
+from imud.sim.can_module import CanModules
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
-from imud.sim.ports.can_modules import CanModules
 from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
 

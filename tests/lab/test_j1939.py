@@ -20,9 +20,9 @@ from imud.errors import NoReply
 from imud.links.can.link import SocketCanSettings
 from imud.runtime.can.runner import CanRunner
 from imud.sample import Sample
+from imud.sim.can_module import CanModules
 from imud.sim.hipnuc.j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings
 from imud.sim.hipnuc.nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
-from imud.sim.ports.can_modules import CanModules
 from imud.sim.ports.can_port import CanPort
 from tests.lab.can_interface import CanInterface
 

@@ -15,7 +15,7 @@ device sent with `advance`. What it does, and what of it is assumed because the 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import degrees, pi, radians, remainder
 from typing import Final
 
@@ -27,10 +27,9 @@ from imud.devices.imu61x.uart.replies import PARAMETERS, RESULT_DONE, Status
 from imud.ledger import Ledger
 from imud.sample import Vector3
 from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
-from imud.sim.physics.motion import MOTIONS, Motion, Truth, swing
-from imud.sim.physics.noise import Noise
+from imud.sim.physics.motion import Truth
 from imud.sim.ports.transmitter import Transmitter
-from imud.sim.simulator import Burst, Simulator, SimulatorOptions
+from imud.sim.simulator import Burst, SensorHardware, Simulator, SimulatorOptions, sensor_parts
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US, RAD_PER_DEG
 
 TX_BUFFER_BYTES: Final = 512
@@ -53,16 +52,11 @@ STATUS: Final = Status(
 """What S1 says; model number and units are made up."""
 
 
-@dataclass(frozen=True, slots=True)
-class Imu61xHardware:
-    """What a device is made of, where it is, and how it behaves where the manual is silent."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imu61xHardware(SensorHardware):
+    """One device, and how it behaves where the manual is silent."""
 
     status: Status = STATUS
-    motion: Motion = field(default_factory=swing)
-    noise: Noise | None = None
-    skew_ppm: float = 20.0
-    boot_ms: int = 500
-    processing_ns: int = 125_000
     uptime_us: int = 0
     """Timer at the first power-on, to begin near the end of its range."""
     answers_while_streaming: bool = True
@@ -96,7 +90,7 @@ class Imu61xModule:
         return self._wire.baud
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back, or the device was told to: what was not saved is gone."""
+        """Restart after a loss of power: what was not saved is gone."""
         self._sample(now_ns)
         self._cut_off += self._wire.stopped(now_ns)
         self.settings = self.flash
@@ -113,7 +107,7 @@ class Imu61xModule:
         for frame in self._finder.feed(data):
             if isinstance(frame, Frame) and len(frame.payload) == PARAMETERS.size:
                 self._obey(frame, now_ns)
-            if now_ns < self._ready_ns:  # it was told to restart
+            if now_ns < self._ready_ns:  # a command restarted it
                 return
 
     def advance(self, now_ns: int) -> list[Burst]:
@@ -210,14 +204,12 @@ class Imu61xModule:
 
     def _reading(self, sample_ns: int) -> Truth:
         """What the sensors measure at an instant, noise included."""
-        t_s = (sample_ns - self.epoch_ns) / NS_PER_S
-        truth = self.hardware.motion.at(t_s)
-        return self.hardware.noise.add(truth, t_s) if self.hardware.noise else truth
+        return self.hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
 
     def _say(self, data: bytes, now_ns: int) -> None:
         self._wire.send(now_ns + REPLY_NS, data)
 
-    # --- what it is told ---------------------------------------------------------------------------------------------
+    # --- commands ----------------------------------------------------------------------------------------------------
 
     def _obey(self, frame: Frame, now_ns: int) -> None:
         try:
@@ -326,19 +318,13 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected one of {', '.join(map(str, RATES_HZ))}")
     if options.message.upper() not in ("", "AHRS"):
         raise ValueError(f"message {options.message!r}: expected AHRS")
-    if options.motion not in MOTIONS:
-        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
     rate_hz = int(options.rate_hz)
     baud = options.baud or next(baud for baud in sorted(BAUD_RATES) if max_rate_hz(baud) >= rate_hz)
     if baud not in BAUD_RATES:
         raise ValueError(f"baud {baud}: expected one of {', '.join(map(str, sorted(BAUD_RATES)))}")
     hardware = Imu61xHardware(
         status=replace(STATUS, software_version=options.firmware or STATUS.software_version),
-        motion=MOTIONS[options.motion](options.gravity_m_s2),
-        noise=Noise(options.seed) if options.noise == "real" else None,
-        skew_ppm=options.skew_ppm,
-        boot_ms=options.boot_ms,
-        processing_ns=options.processing_ns,
+        **sensor_parts(options),
     )
     return Imu61xModule(now_ns, Imu61xSettings(baud=baud, rate_hz=rate_hz), hardware)
 

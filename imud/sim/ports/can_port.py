@@ -9,7 +9,7 @@ import ctypes
 import errno
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from imud.errors import LinkError
@@ -25,16 +25,18 @@ class CanPort:
     """One module, or several as one (`CanModules`), on one interface. Synchronization: one thread."""
 
     is_open = True
-    """Somebody may always listen."""
+    """A bus needs no reader."""
 
-    def __init__(self, module: CanModule, interface: str) -> None:
-        """Raises LinkError when there is no such CAN interface, or it is down."""
+    def __init__(
+        self, module: CanModule, interface: str, *, open_socket: Callable[[str], socket.socket] | None = None
+    ) -> None:
+        """`open_socket` is `open_can_socket`, or makes a substitute for tests; what it raises is raised."""
         self.module = module
         self.interface = interface
         self._unplugged_until_ns = 0
         self.frames_refused = 0
         """Frames that the interface's queue did not take."""
-        self._socket = _open(interface)
+        self._socket = (open_socket or open_can_socket)(interface)
 
     def fileno(self) -> int:
         """The descriptor to wait on for frames of others."""
@@ -42,7 +44,7 @@ class CanPort:
 
     @property
     def node(self) -> "CanPort":
-        """What is to be waited on."""
+        """The object to wait on."""
         return self
 
     def unplug(self, now_ns: int, duration_ns: int) -> None:
@@ -51,7 +53,7 @@ class CanPort:
         self.module.reboot(self._unplugged_until_ns)
 
     def step(self, now_ns: int, readable: bool) -> None:
-        """Take what others sent, and send what is due."""
+        """Pass frames of others on, and send what is due."""
         if readable:
             self._receive(now_ns)
         if now_ns >= self._unplugged_until_ns:
@@ -85,7 +87,8 @@ class CanPort:
                 self.module.receive(can_id & EXTENDED_ID_MAX, can_id >= EXTENDED_FLAG, data[:size], now_ns)
 
 
-def _open(interface: str) -> socket.socket:
+def open_can_socket(interface: str) -> socket.socket:
+    """A raw CAN socket on an interface. Raises LinkError where there is none, or it is down."""
     try:
         opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     except OSError as error:

@@ -17,10 +17,9 @@ from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
 from imud.formats.j1939 import split
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.can_module import SentFrame
+from imud.sim.can_module import CanModules, SentFrame
 from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings
 from imud.sim.physics.motion import Still
-from imud.sim.ports.can_modules import CanModules
 from imud.sim.simulator import SimulatorOptions
 
 BEGIN_NS = 5_000_000_000

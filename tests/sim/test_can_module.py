@@ -10,8 +10,7 @@ from imud.formats.can import RAW_FRAME
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim import CAN_SIMULATORS
-from imud.sim.can_module import FrameWire, SentFrame
-from imud.sim.ports.can_modules import CanModules
+from imud.sim.can_module import CanModules, FrameWire, SentFrame
 from imud.sim.ports.can_port import CanPort
 from imud.sim.simulator import SimulatorOptions
 
@@ -85,14 +84,13 @@ def test_a_frame_takes_its_time(extended: bool, bits: int) -> None:
     assert wire.next_ns() == 1000 + bits * 2000
 
 
-def test_nodes_are_told_apart_and_sent_in_one_go(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nodes_are_told_apart_and_sent_in_one_go() -> None:
     made = [
         CAN_SIMULATORS["imu61x-can"].make(SimulatorOptions(boot_ms=0, node=node, at_once=True), 0) for node in (0, 201)
     ]
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with near, far:
-        monkeypatch.setattr("imud.sim.ports.can_port._open", lambda interface: near)
-        port = CanPort(CanModules(made), "vcan0")
+        port = CanPort(CanModules(made), "vcan0", open_socket=lambda interface: near)
         due_ns = port.next_ns(0)
         port.step(due_ns, False)
         raw = [far.recv(64) for _ in range(10)]
