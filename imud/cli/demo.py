@@ -26,7 +26,7 @@ from imud.contracts.polling import PolledDriver
 from imud.devices import DRIVERS
 from imud.errors import ImudError, LinkMissing
 from imud.sim import CAN_SIMULATORS, SIMULATORS
-from imud.sim.__main__ import DEVICE, simulated
+from imud.sim.command_line import DEVICE, simulated
 from imud.sim.ports.can_port import default_interface
 
 START_LIMIT_S = 10.0

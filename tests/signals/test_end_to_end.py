@@ -12,8 +12,7 @@ from imud.sim.hipnuc.uart.hardware import HipnucHardware
 from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings, Output
 from imud.sim.physics.motion import Still
 from imud.sim.ports.faults import FaultRates, Faults
-from imud.sim.ports.pin import Pin
-from imud.sim.ports.pins import PinFaultRates, PinFaults
+from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.source import RmcSettings
 from tests.support.wired import BEGIN_NS, EDGE_LATE_NS, Wired

@@ -14,7 +14,7 @@ from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
 from imud.sim.physics.motion import Still
-from imud.sim.ports.wire import heard
+from imud.sim.ports.uart_wire import heard
 from imud.units import NS_PER_MS
 
 T = TypeVar("T")

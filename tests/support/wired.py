@@ -22,8 +22,7 @@ from imud.sim.hipnuc.uart.settings import ModuleSettings
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.ports.faults import Faults
 from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
-from imud.sim.ports.pin import Pin
-from imud.sim.ports.pins import OnEdge, PinFaults, Pins
+from imud.sim.ports.pins import OnEdge, Pin, PinFaults, Pins
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.source import OnSentence, RmcSettings
 from imud.utc.system_clock import KernelClock

@@ -28,7 +28,7 @@ from imud.ledger import Ledger
 from imud.sample import Vector3
 from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
 from imud.sim.physics.motion import Truth
-from imud.sim.ports.transmitter import Transmitter
+from imud.sim.ports.uart_wire import Transmitter
 from imud.sim.simulator import Burst, SensorHardware, Simulator, SimulatorOptions, sensor_parts
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US, RAD_PER_DEG
 

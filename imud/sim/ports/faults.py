@@ -10,7 +10,7 @@ from enum import StrEnum
 from random import Random
 from typing import Final, NamedTuple
 
-from imud.sim.ports.wire import heard
+from imud.sim.ports.uart_wire import heard
 from imud.sim.simulator import Burst
 from imud.units import NS_PER_MS
 

@@ -1,7 +1,6 @@
-"""Brings the pins of a simulated device to lines: in memory, on a gpio-sim chip, or wherever a function reaches.
+"""Pins of a simulated device, single wires beside its data, and their way to lines, with faults.
 
     module.pins() ──▶ faults ──▶ when it is due: on_edge[pin](due_ns, rising)
-    SIN ──▶ module.mark()
 
 The owner calls `step` right before it moves the bytes of the same device, so that the edge of a pulse is there before
 the frame that follows it.
@@ -11,12 +10,10 @@ from bisect import bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
+from enum import StrEnum
 from random import Random
-from time import sleep
-from typing import Final, Protocol, TextIO
+from typing import Final, NamedTuple, Protocol, TextIO, runtime_checkable
 
-from imud.sim.ports.pin import Pin, PinEdge, PinModule
 from imud.units import NS_PER_MS
 
 OnEdge = Callable[[int, bool], None]
@@ -27,11 +24,38 @@ LOST_MAX: Final = 100_000
 """Lost pulses kept in `PinFaults.lost`; the counts go on."""
 
 
-class MarkedModule(Protocol):
-    """A device with a sync input."""
+class Pin(StrEnum):
+    """Outputs, by the names that lines have in the configuration."""
 
-    def mark(self, now_ns: int) -> None:
-        """A rising edge on its sync input."""
+    SOUT = "sout"
+    """High before each frame; the frame follows the falling edge."""
+    SOUT_DIV = "sout_div"
+    """Every n-th pulse of SOUT."""
+    ALARM = "alarm"
+    """High while an angle is out of range."""
+
+
+class PinEdge(NamedTuple):
+    """One change of a pin's level."""
+
+    due_ns: int
+    """CLOCK_MONOTONIC of the change."""
+    pin: Pin
+    rising: bool
+    sample_ns: int | None = None
+    """CLOCK_MONOTONIC of the measurement whose frame follows; None where none does."""
+
+
+@runtime_checkable
+class PinModule(Protocol):
+    """A simulated device with pins. Its inputs are methods (`mark`), times as in `StreamModule`."""
+
+    def pins(self, now_ns: int) -> list[PinEdge]:
+        """Return the edges since the last call, in order. All pins are low in the beginning."""
+        ...
+
+    def next_pin_ns(self) -> int | None:
+        """When `pins` may have something next, or None while nothing is to come."""
         ...
 
 
@@ -134,58 +158,6 @@ class Pins:
         """Counters by name."""
         faults = self._faults.counts if self._faults else {}
         return {"pin_edges": self.edges} | {f"pin_fault_{kind}": count for kind, count in sorted(faults.items())}
-
-
-class PullFile:
-    """A line of a gpio-sim chip, driven through its `pull` file in sysfs; the kernel stamps the edge as it is written.
-
-    Interface: Documentation/admin-guide/gpio/gpio-sim.rst.
-    """
-
-    def __init__(self, path: Path, settle_s: float = 0.0) -> None:
-        """For so long after a rising edge nothing else is done: an edge that comes before the kernel has told of the
-        last one is not seen, and a frame must not come before its edge. Raises OSError."""
-        self._file = path.open("wb", buffering=0)
-        self._settle_s = settle_s
-
-    def __call__(self, _due_ns: int, rising: bool) -> None:
-        """Drive the line. Raises OSError."""
-        self._file.write(b"pull-up" if rising else b"pull-down")
-        if rising and self._settle_s:
-            sleep(self._settle_s)
-
-    def close(self) -> None:
-        """Let go of the file; the level stays. May be called twice."""
-        self._file.close()
-
-
-class SinFile:
-    """SIN of a device, read from the `value` file of a gpio-sim line that the program under test drives.
-
-    sysfs tells of no change there, so the owner looks as often as it likes; the edge is as late as the look.
-    """
-
-    def __init__(self, path: Path, module: MarkedModule) -> None:
-        self._path, self._module = path, module
-        self._level = True  # a line that is high from the beginning has no edge
-
-    def look(self, now_ns: int) -> None:
-        """Tell the module of a rising edge since the last look. Raises OSError."""
-        level = self._path.read_bytes().strip() == b"1"
-        if level and not self._level:
-            self._module.mark(now_ns)
-        self._level = level
-
-
-def pull_files(text: str, settle_s: float = 0.0) -> dict[Pin, PullFile]:
-    """Files by pin from `sout=PATH,alarm=PATH`. Raises ValueError, OSError."""
-    files: dict[Pin, PullFile] = {}
-    for part in filter(None, text.split(",")):
-        name, _, path = part.partition("=")
-        if name not in set(Pin) or not path:
-            raise ValueError(f"pin {part!r}: expected NAME=PATH with one of {', '.join(Pin)}")
-        files[Pin(name)] = PullFile(Path(path), settle_s)
-    return files
 
 
 def pin_rates(text: str) -> PinFaultRates:

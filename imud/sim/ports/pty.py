@@ -23,7 +23,7 @@ from typing import Final, TextIO
 
 from imud.sim.ports.arrival import ArrivalProfile
 from imud.sim.ports.faults import Faults
-from imud.sim.ports.wire import heard
+from imud.sim.ports.uart_wire import heard
 from imud.sim.simulator import Burst, StreamModule
 from imud.units import NS_PER_MS, NS_PER_S
 

@@ -17,7 +17,7 @@ from imud.runtime.stream.runner import DeviceRunner
 from imud.sample import Sample
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xModule
-from imud.sim.ports.wire import heard
+from imud.sim.ports.uart_wire import heard
 from tests.support.imu61x_bench import STILL
 from tests.support.virtual_time import VirtualClock, run_virtually
 

@@ -1,15 +1,12 @@
-"""Pins reach lines when they are due, lose what they are told to lose, and the same with the same seed."""
+"""Pins reach lines when they are due, lose what a fault loses, and the same with the same seed."""
 
-from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
 from imud.sim.ports.faults import FaultKind, FaultRates, Faults
 from imud.sim.ports.lines import MemoryInput
-from imud.sim.ports.pin import Pin, PinEdge
-from imud.sim.ports.pins import PinFaultRates, PinFaults, Pins, PullFile, SinFile, pull_files
+from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults, Pins
 from imud.units import NS_PER_MS
 from tests.support.hipnuc_bench import FAST, Bench
 
@@ -105,69 +102,6 @@ def test_frames_can_be_lost_whole() -> None:
     assert len(arrived) == len(bursts) - faults.counts[FaultKind.LOSE]
     assert set(arrived) <= set(bursts)
     assert faults.bursts_hit == faults.counts[FaultKind.LOSE]
-
-
-# --- files of gpio-sim ------------------------------------------------------------------------------------------------
-
-
-def test_pull_files_are_written_as_the_kernel_wants(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).write_bytes(b"")
-    files = pull_files(f"sout={tmp_path / 'a'},alarm={tmp_path / 'b'}")
-    assert set(files) == {Pin.SOUT, Pin.ALARM}
-    files[Pin.SOUT](0, True)
-    assert (tmp_path / "a").read_bytes() == b"pull-up"
-    files[Pin.SOUT](0, False)
-    assert (tmp_path / "a").read_bytes() == b"pull-uppull-down"
-    assert (tmp_path / "b").read_bytes() == b""
-    for file in files.values():
-        file.close()
-        file.close()
-
-
-@pytest.mark.parametrize("text", ["led=/tmp/x", "sout", "sout=", "=x"])
-def test_other_pins_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="expected NAME=PATH with one of sout, sout_div, alarm"):
-        pull_files(text)
-
-
-def test_a_file_that_is_missing_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        PullFile(tmp_path / "missing" / "pull")
-
-
-class Marked:
-    """Counts its marks."""
-
-    def __init__(self) -> None:
-        self.marks: list[int] = []
-
-    def mark(self, now_ns: int) -> None:
-        self.marks.append(now_ns)
-
-    def pins(self, now_ns: int) -> list[PinEdge]:
-        raise AssertionError(now_ns)
-
-    def next_pin_ns(self) -> int | None:
-        return None
-
-
-@pytest.fixture
-def value(tmp_path: Path) -> Callable[[int], Path]:
-    def write(level: int) -> Path:
-        (tmp_path / "value").write_text(f"{level}\n")
-        return tmp_path / "value"
-
-    return write
-
-
-def test_sin_marks_on_rising_edges_only(value: Callable[[int], Path]) -> None:
-    module = Marked()
-    sin = SinFile(value(1), module)
-    for number, level in enumerate([1, 0, 0, 1, 1, 0, 1]):
-        value(level)
-        sin.look(number * NS_PER_MS)
-    assert module.marks == [3 * NS_PER_MS, 6 * NS_PER_MS]
 
 
 def test_memory_lines_take_them_as_they_are() -> None:

@@ -20,7 +20,7 @@ from imud.formats.modbus import BROADCAST, CRC_BYTES, SLAVES, frame_gap_ns, fram
 from imud.sim.hipnuc.modbus.slave import NEW_FIRMWARE, Slave, SlaveSettings
 from imud.sim.physics.motion import MOTIONS
 from imud.sim.physics.noise import Noise
-from imud.sim.ports.wire import heard
+from imud.sim.ports.uart_wire import heard
 from imud.sim.simulator import Burst, Simulator, SimulatorOptions
 from imud.units import uart_byte_ns
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from imud.sample import Vector3
 from imud.sim.hipnuc.uart.settings import ModuleSettings
-from imud.sim.ports.pin import Pin, PinEdge
+from imud.sim.ports.pins import Pin, PinEdge
 from imud.units import NS_PER_US
 
 SOUT_HIGH_NS: Final = 80 * NS_PER_US

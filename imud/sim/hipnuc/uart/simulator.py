@@ -31,8 +31,8 @@ from imud.sim.hipnuc.uart.utc import UtcTime
 from imud.sim.physics.motion import MOTIONS, Truth
 from imud.sim.physics.mounting import MountingRotation, frame_of, level_of
 from imud.sim.physics.noise import Noise
-from imud.sim.ports.pin import PinEdge
-from imud.sim.ports.transmitter import Transmitter
+from imud.sim.ports.pins import PinEdge
+from imud.sim.ports.uart_wire import Transmitter
 from imud.sim.simulator import Burst, Simulator, SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S, T_PER_UT
 

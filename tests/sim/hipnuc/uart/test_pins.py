@@ -9,7 +9,7 @@ from imud.devices.hipnuc.uart.commands import AlarmAxis, alarm, sout_divider
 from imud.sim.hipnuc.uart.hardware import HipnucHardware
 from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings, Output
 from imud.sim.physics.motion import Still, swing
-from imud.sim.ports.pin import Pin, PinEdge
+from imud.sim.ports.pins import Pin, PinEdge
 from imud.sim.simulator import Burst
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.hipnuc_bench import BEGIN_NS, FAST, STILL, Bench
