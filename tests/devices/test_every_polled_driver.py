@@ -1,4 +1,4 @@
-"""What every polled driver must do, from its row in DRIVERS alone: damage is told, nothing raises, ledgers close."""
+"""Every polled driver by its row in DRIVERS alone: damage is reported, nothing raises, ledgers close."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,7 +20,7 @@ from imud.sample import Measurement
 
 NAMES = [driver.name for driver in of_kind(DRIVERS.values(), PolledDriver)]
 TRANSFERS_MAX = 20
-"""No dialogue has more, whatever it is answered."""
+"""No script has more transfers, whatever is answered."""
 
 quick = settings(max_examples=60, derandomize=True, deadline=None, database=None)
 every_driver = pytest.mark.parametrize("name", NAMES)
@@ -45,8 +45,8 @@ def take(codec: PolledCodec, poll: int, data: bytes) -> Sequence[PolledEvent]:
     assert before <= ledger.bytes_in <= before + len(data)
     assert ledger.closes(), ledger.snapshot()
     assert min(ledger.values()) >= 0
-    told = sum(isinstance(event, BadFrame) for event in events) - ledger.frames_not_finite
-    assert ledger.frames_bad() - bad == told
+    reported = sum(isinstance(event, BadFrame) for event in events) - ledger.frames_not_finite
+    assert ledger.frames_bad() - bad == reported
     return events
 
 
@@ -67,7 +67,7 @@ def test_good_frames_make_one_measurement_each(name: str, seed: int) -> None:
 @quick
 @given(seed=seeds)
 def test_damage_never_passes_silently(name: str, seed: int) -> None:
-    """One wrong bit, one wrong byte, or a run of them: the same measurement, or none and an event that tells."""
+    """One wrong bit, one wrong byte, or a run of them: the same measurement, or none and an event that says so."""
     driver, random = row(name), Random(seed)
     data = driver.example_reading(random)
     (good,) = make(driver).take(0, data)
@@ -99,7 +99,7 @@ def test_any_bytes_of_any_length_raise_nothing(name: str, data: bytes, poll: int
 
 @every_driver
 @pytest.mark.parametrize("line", [0x00, 0xFF])
-def test_a_line_that_nobody_drives_is_a_device_that_vanished(name: str, line: int) -> None:
+def test_a_line_that_no_device_drives_is_a_device_that_vanished(name: str, line: int) -> None:
     driver = row(name)
     codec = make(driver)
     data = bytes([line]) * len(driver.example_reading(Random(1)))
@@ -126,7 +126,7 @@ def test_the_same_bytes_again_are_counted_and_no_sample(name: str, seed: int) ->
 @every_driver
 @quick
 @given(seed=seeds)
-def test_dialogues_end_whatever_is_answered(name: str, seed: int) -> None:
+def test_scripts_end_whatever_is_answered(name: str, seed: int) -> None:
     """With noise and failures in any order they return, or raise what they may, and never go on without end."""
     driver, random = row(name), Random(seed)
     transfers = 0
@@ -141,10 +141,10 @@ def test_dialogues_end_whatever_is_answered(name: str, seed: int) -> None:
         return random.choice((random.randbytes(size), b"\xff" * size, bytes(size), b""))
 
     options = driver.settings()
-    for dialogue in (driver.probe(options), driver.set_up(options)):
+    for script in (driver.probe(options), driver.set_up(options)):
         transfers = 0
         with suppress(TransferError, DeviceRefused):
-            run_transfer_script(dialogue, transfer)
+            run_transfer_script(script, transfer)
 
 
 @every_driver

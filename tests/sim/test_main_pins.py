@@ -38,15 +38,15 @@ def test_pins_move_in_step_with_frames(start: Start, tmp_path: Path) -> None:
     os.close(fd)
     process_out, problems = process.communicate(timeout=LIMIT_S)
     summary = json.loads(process_out.splitlines()[-1])
-    told = edges(tmp_path)
-    assert len(told) == summary["pin_edges"]
-    rises = [int(edge["sample_ns"]) for edge in told if edge["pin"] == "sout" and edge["level"] == "1"]
+    noted = edges(tmp_path)
+    assert len(noted) == summary["pin_edges"]
+    rises = [int(edge["sample_ns"]) for edge in noted if edge["pin"] == "sout" and edge["level"] == "1"]
     sent = [int(row.split(",")[0]) for row in truth.read_text().splitlines()[2:]]
     assert set(sent) <= set(rises)
-    divided = [int(edge["sample_ns"]) for edge in told if edge["pin"] == "sout_div" and edge["level"] == "1"]
+    divided = [int(edge["sample_ns"]) for edge in noted if edge["pin"] == "sout_div" and edge["level"] == "1"]
     assert divided == rises[7::8]
-    assert all(int(edge["step_ns"]) >= int(edge["due_ns"]) for edge in told)
-    sout = [int(edge["step_ns"]) for edge in told if edge["pin"] == "sout"]
+    assert all(int(edge["step_ns"]) >= int(edge["due_ns"]) for edge in noted)
+    sout = [int(edge["step_ns"]) for edge in noted if edge["pin"] == "sout"]
     assert any(rise_ns < fall_ns for rise_ns, fall_ns in zip(sout[::2], sout[1::2], strict=False))  # each by itself
     assert (tmp_path / "sout").read_bytes().startswith(b"pull-uppull-downpull-up")
     assert problems == ""
@@ -95,7 +95,7 @@ def test_a_rise_on_sin_is_answered(start: Start, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "named"),
     [
         (("--pins", "tx=/tmp/x"), "expected NAME=PATH with one of sout, sout_div, alarm"),
         (("--pins", "sout=/nowhere/pull"), "/nowhere/pull"),
@@ -105,11 +105,11 @@ def test_a_rise_on_sin_is_answered(start: Start, tmp_path: Path) -> None:
         (("--pins", "sout=/dev/null", "--pin-faults", "extra=2"), "expected a probability"),
     ],
 )
-def test_what_cannot_be_is_told(start: Start, arguments: tuple[str, ...], told: str) -> None:
+def test_what_cannot_be_is_named(start: Start, arguments: tuple[str, ...], named: str) -> None:
     process = start(*arguments)
     _, problems = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2
-    assert told in problems
+    assert named in problems
     assert "Traceback" not in problems
 
 

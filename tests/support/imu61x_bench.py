@@ -24,7 +24,7 @@ STEP_MS = 2
 """How often the host looks."""
 
 
-class Bench:
+class Imu61xBench:
     """A device that has booted, the time, and the host's end of the line."""
 
     def __init__(self, settings: Imu61xSettings | None = None, hardware: Imu61xHardware = STILL) -> None:
@@ -77,12 +77,12 @@ class Bench:
                 if outcome is not None:
                     return outcome
 
-    def hold(self, conversation: RequestScript[T]) -> T:
-        """A conversation to its end; returns its value, raises what it raises."""
+    def run(self, script: RequestScript[T]) -> T:
+        """Run a request script to its end; return its value, raise what it raises."""
         try:
-            request = next(conversation)
+            request = next(script)
             while True:
-                request = conversation.send(self.ask(request))
+                request = script.send(self.ask(request))
         except StopIteration as end:
             value: T = end.value
             return value
@@ -93,9 +93,9 @@ class Bench:
         self.wait(self.module.hardware.boot_ms + 1)
 
 
-def bench(settings: Imu61xSettings | None = None, **hardware: object) -> Bench:
+def bench(settings: Imu61xSettings | None = None, **hardware: object) -> Imu61xBench:
     """A bench with a device at rest that differs in `hardware`."""
-    return Bench(settings, replace(STILL, **hardware))  # type: ignore[arg-type]  # names of fields
+    return Imu61xBench(settings, replace(STILL, **hardware))  # type: ignore[arg-type]  # names of fields
 
 
 def over_i2c(device: Imu61xRegisters, transfer: Transfer) -> bytes:

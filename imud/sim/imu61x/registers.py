@@ -37,7 +37,7 @@ class RegisterFaults:
     error: int = 0
     """The errno that every transaction fails with: ENXIO not acknowledged, ETIMEDOUT bus stuck; 0 for none."""
     line: int | None = None
-    """All bytes read are this: 0xFF or 0x00 for a data line that nobody drives."""
+    """All bytes read are this: 0xFF or 0x00 for a data line that no device drives."""
     flips: int = 0
     """So many transactions to come have one wrong bit in what is read."""
     frozen: bool = False

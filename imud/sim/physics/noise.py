@@ -31,7 +31,7 @@ class NoiseLevels:
     mag_bias_t: float = 0.3e-6
     pressure_pa: float = 0.2
     bias_period_s: float = 300.0
-    """Time in which the bias of the first axis comes back to itself; the other axes take a little longer each."""
+    """Time in which the bias of the first axis repeats; the other axes take a little longer each."""
 
 
 class Noise:

@@ -45,7 +45,7 @@ class ArrivalProfile:
     poll_ns: int = 0
     """Longest wait for the bus to ask the adapter, evenly spread."""
     fifo_bytes: float = 0.0
-    """A receive FIFO tells of a tail below its trigger level after so many byte times (16550: 4)."""
+    """A receive FIFO reports a tail below its trigger level after so many byte times (16550: 4)."""
     floor_ns: int = 0
     """Shortest wake-up."""
     wake_ns: int = 0

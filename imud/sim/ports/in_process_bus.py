@@ -67,7 +67,7 @@ class InProcessI2c:
         self.calls.append((address, tuple(parts)))
         device = self.devices.get(address)
         if device is None:
-            raise OSError(errno.ENXIO, "nobody acknowledges")
+            raise OSError(errno.ENXIO, "no device acknowledges")
         return device.i2c(parts)
 
 

@@ -4,7 +4,7 @@
     module ◀───────────── line (rate) ◀────────────── master │
 
 The program's rate is read from the terminal at every write: when it is not the module's, both sides hear garbage. A
-pty keeps nobody's bytes: with no reader, or with one that does not keep up, what does not fit is lost and counted.
+pty keeps few bytes: with no reader, or with one that does not keep up, what does not fit is lost and counted.
 Unplugging closes the pseudo-terminal and removes the link; plugging makes a new one under the same name and powers the
 module on again.
 """
@@ -35,7 +35,7 @@ BOTHER: Final = 0o010000
 CBAUD: Final = 0o010017
 READ_BYTES: Final = 4096
 LOOK_NS: Final = 20 * NS_PER_MS
-"""How often to look whether somebody has opened a port that nobody had open: a pty tells of no such event."""
+"""How often to look whether a program has opened the port: a pty reports no such event."""
 
 
 @dataclass(slots=True)
@@ -44,7 +44,7 @@ class PtyCounters:
 
     bytes_written: int = 0
     bytes_unheard: int = 0
-    """Nobody had the port open."""
+    """No program had the port open."""
     bytes_lost_full: int = 0
     """The reader did not keep up."""
     bursts_wrong_baud: int = 0
@@ -74,7 +74,7 @@ class PtyNode:
             fresh.symlink_to(os.ttyname(slave))
             fresh.rename(self.path)
         finally:
-            os.close(slave)  # from here on POLLHUP says that nobody has it open
+            os.close(slave)  # from here on POLLHUP means that no program has it open
 
     def unplug(self) -> None:
         """Make the terminal disappear; may be called twice."""
@@ -110,7 +110,7 @@ class PtyNode:
         """Send, and return how many bytes fitted."""
         try:
             return os.write(self._master, data)
-        except OSError:  # full, or nobody there
+        except OSError:  # full, or no reader
             return 0
 
 
@@ -136,7 +136,7 @@ class Adapter:
 
 
 class SimulatedPort:
-    """Moves bytes between a module and its terminal. Pure of clocks: the owner says what time it is and waits.
+    """Moves bytes between a module and its terminal. It reads no clock: the owner gives the time and waits.
 
     Synchronization: one thread.
     """
@@ -163,7 +163,7 @@ class SimulatedPort:
         """Do all that is due; with `readable`, look for bytes of the program as well."""
         if self._replug_ns is not None and now_ns >= self._replug_ns:
             self._plug(now_ns)
-        self._take(now_ns)
+        self._receive_from_module(now_ns)
         if readable and self.node.fileno() >= 0:
             self._listen(now_ns)
         self._hand_over(now_ns)
@@ -182,7 +182,7 @@ class SimulatedPort:
         return min(times)
 
     def unplug(self, now_ns: int, duration_ns: int) -> None:
-        """Pull the cable: the node vanishes, the module loses power; both come back after `duration_ns`."""
+        """Pull the cable: the node vanishes, the module loses power; both return after `duration_ns`."""
         self.node.unplug()
         self.counters.unplugs += 1
         self.counters.bytes_unheard += sum(len(burst.data) for burst in self._held)
@@ -207,7 +207,7 @@ class SimulatedPort:
         self.module.reboot(now_ns)
         self.node.plug(self.module.baud)
 
-    def _take(self, now_ns: int) -> None:
+    def _receive_from_module(self, now_ns: int) -> None:
         """Bring what left the module through faults and adapter."""
         faults = self._faults
         for burst in self.module.advance(now_ns):

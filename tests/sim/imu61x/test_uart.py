@@ -26,10 +26,10 @@ from imud.sim.physics.motion import swing
 from imud.sim.physics.noise import Noise
 from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_S
-from tests.support.imu61x_bench import BEGIN_NS, STILL, Bench, bench
+from tests.support.imu61x_bench import BEGIN_NS, STILL, Imu61xBench, bench
 
 
-def acknowledged(far: Bench, request: Request) -> int:
+def acknowledged(far: Imu61xBench, request: Request) -> int:
     """The result of an order."""
     outcome = far.ask(request)
     assert isinstance(outcome, Reply)
@@ -38,7 +38,7 @@ def acknowledged(far: Bench, request: Request) -> int:
     return reply.result
 
 
-def parameter(far: Bench, which: Parameter) -> float:
+def parameter(far: Imu61xBench, which: Parameter) -> float:
     outcome = far.ask(c.read_parameter(which))
     assert isinstance(outcome, Reply)
     value = parse_parameter(outcome.messages[-1])
@@ -82,7 +82,7 @@ def test_what_does_not_fit_the_wire_is_not_sent() -> None:
 def test_the_physics_of_the_truth_come_out() -> None:
     """The rotation of the frame turns the specific force of the truth as the truth's own quaternion does."""
     hardware = replace(STILL, motion=swing())
-    far = Bench(hardware=hardware)
+    far = Imu61xBench(hardware=hardware)
     assert far.samples(40)
     for burst in far.module.advance(far.now_ns + 3 * NS_PER_S):
         assert burst.sample_ns is not None

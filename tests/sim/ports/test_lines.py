@@ -23,7 +23,7 @@ async def test_edges() -> None:
         found.extend(edges)
         calls.append(len(edges))
 
-    line.edge(1, True)  # nobody has the line
+    line.edge(1, True)  # no program has the line
     line.open()
     line.edge(10, False)
     line.drain()

@@ -25,7 +25,7 @@ BEGIN_NS = 77 * NS_PER_S
 QUICK = HipnucHardware(skew_ppm=0, boot_ms=0)
 
 
-class Rig:
+class PluggedPort:
     """A port, a program that may have it open, and the time."""
 
     def __init__(
@@ -70,8 +70,8 @@ class Rig:
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(tmp_path / "tty")
+def rig(tmp_path: Path) -> Iterator[PluggedPort]:
+    rig = PluggedPort(tmp_path / "tty")
     yield rig
     rig.close()
     rig.port.close()
@@ -83,7 +83,7 @@ def frames_of(data: bytes) -> int:
     return sum(isinstance(event, Measurement) for event in (*codec.feed(data), *codec.flush()))
 
 
-def test_a_program_reads_frames_and_gets_answers(rig: Rig) -> None:
+def test_a_program_reads_frames_and_gets_answers(rig: PluggedPort) -> None:
     rig.open(115_200)
     assert frames_of(rig.run(1000)) == pytest.approx(99, abs=1)
     os.write(rig.fd, b"LOG DISABLE\r\nLOG VERSION\r\n")
@@ -93,7 +93,7 @@ def test_a_program_reads_frames_and_gets_answers(rig: Rig) -> None:
     assert rig.run(100) == b""
 
 
-def test_the_terminal_is_raw_and_does_not_echo_frames_into_the_module(rig: Rig) -> None:
+def test_the_terminal_is_raw_and_does_not_echo_frames_into_the_module(rig: PluggedPort) -> None:
     rig.open()
     flags = termios.tcgetattr(rig.fd)
     assert not flags[3] & (termios.ECHO | termios.ICANON)
@@ -101,7 +101,7 @@ def test_the_terminal_is_raw_and_does_not_echo_frames_into_the_module(rig: Rig) 
     assert rig.port.node.read() == b""
 
 
-def test_the_wrong_rate_is_garbage_both_ways(rig: Rig) -> None:
+def test_the_wrong_rate_is_garbage_both_ways(rig: PluggedPort) -> None:
     rig.open(460_800)
     garbage = rig.run(500)
     assert len(garbage) > 1000
@@ -114,12 +114,12 @@ def test_the_wrong_rate_is_garbage_both_ways(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("baud", DRIVER.baud_rates)
-def test_every_rate_of_the_manual_can_be_set_and_seen(rig: Rig, baud: int) -> None:
+def test_every_rate_of_the_manual_can_be_set_and_seen(rig: PluggedPort, baud: int) -> None:
     rig.open(baud)
     assert rig.port.node.baud == baud
 
 
-def test_baud_follows_save_and_reboot(rig: Rig) -> None:
+def test_baud_follows_save_and_reboot(rig: PluggedPort) -> None:
     rig.open(115_200)
     os.write(rig.fd, b"SERIALCONFIG 921600\r\nSAVECONFIG\r\nREBOOT\r\n")
     rig.run(50)
@@ -128,7 +128,7 @@ def test_baud_follows_save_and_reboot(rig: Rig) -> None:
     assert frames_of(rig.run(200)) >= 19
 
 
-def test_with_nobody_listening_bytes_are_lost_and_counted(rig: Rig) -> None:
+def test_with_no_reader_bytes_are_lost_and_counted(rig: PluggedPort) -> None:
     assert rig.run(1000) == b""
     counted = rig.port.summary()
     assert counted["bytes_written"] == 0
@@ -141,17 +141,17 @@ def test_with_nobody_listening_bytes_are_lost_and_counted(rig: Rig) -> None:
     assert rig.port.summary()["bytes_written"] == before
 
 
-def test_a_silent_module_notices_soon_that_somebody_opened_the_port(rig: Rig) -> None:
+def test_a_silent_module_notices_soon_that_a_program_opened_the_port(rig: PluggedPort) -> None:
     rig.module.receive(b"UNLOGALL\r\n", rig.now_ns)
     rig.run(50)
     assert rig.module.next_ns() is None
     assert rig.port.next_ns(rig.now_ns) == rig.now_ns + 20 * NS_PER_MS
     rig.open()
-    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # from now on select tells of its bytes
+    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # from now on select reports its bytes
 
 
 def test_faults_wait_while_the_cable_is_out(tmp_path: Path) -> None:
-    rig = Rig(tmp_path / "tty", faults=Faults(1, FaultRates(flip=0.5)))
+    rig = PluggedPort(tmp_path / "tty", faults=Faults(1, FaultRates(flip=0.5)))
     rig.run(100)
     assert rig.port.summary()["fault_flip"] > 0
     rig.port.unplug(rig.now_ns, NS_PER_S)
@@ -161,7 +161,7 @@ def test_faults_wait_while_the_cable_is_out(tmp_path: Path) -> None:
     rig.port.close()
 
 
-def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: Rig) -> None:
+def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: PluggedPort) -> None:
     rig.open(115_200)
     os.write(rig.fd, b"LOG DISABLE\r\n")
     rig.close()
@@ -171,7 +171,7 @@ def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: Rig) -> None:
 
 
 def test_a_reader_that_stops_blocks_nothing(tmp_path: Path) -> None:
-    rig = Rig(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)))
+    rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)))
     rig.open(921_600)
     rig.read = lambda: b""  # type: ignore[method-assign]  # a program that never reads
     rig.run(2000)
@@ -183,7 +183,7 @@ def test_a_reader_that_stops_blocks_nothing(tmp_path: Path) -> None:
     rig.port.close()
 
 
-def test_unplugging_takes_the_node_away_and_brings_it_back(rig: Rig) -> None:
+def test_unplugging_takes_the_node_away_and_brings_it_back(rig: PluggedPort) -> None:
     rig.open(115_200)
     rig.run(700)
     assert rig.path.is_symlink()
@@ -206,7 +206,7 @@ def test_unplugging_takes_the_node_away_and_brings_it_back(rig: Rig) -> None:
     assert counted["bytes_written"] + counted["bytes_unheard"] == pytest.approx(counted["frames_sent"] * 82, abs=3 * 82)
 
 
-def test_an_exclusive_program_is_no_obstacle(rig: Rig) -> None:
+def test_an_exclusive_program_is_no_obstacle(rig: PluggedPort) -> None:
     rig.open(115_200)
     fcntl.ioctl(rig.fd, termios.TIOCEXCL)
     fcntl.flock(rig.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -214,7 +214,7 @@ def test_an_exclusive_program_is_no_obstacle(rig: Rig) -> None:
 
 
 def test_a_latency_timer_hands_over_in_batches(tmp_path: Path) -> None:
-    rig = Rig(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
+    rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
     rig.open(921_600)
     rig.run(500)
     rows = [tuple(map(int, line.split(","))) for line in rig.truth.getvalue().splitlines()[2:]]
@@ -228,7 +228,7 @@ def test_a_latency_timer_hands_over_in_batches(tmp_path: Path) -> None:
 
 
 def test_what_the_adapter_held_is_lost_with_the_cable(tmp_path: Path) -> None:
-    rig = Rig(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
+    rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
     rig.open(921_600)
     rig.run(16 * 3 + 10)
     rig.port.step(rig.now_ns)
@@ -238,7 +238,7 @@ def test_what_the_adapter_held_is_lost_with_the_cable(tmp_path: Path) -> None:
     rig.port.close()
 
 
-def test_the_truth_log_tells_when_each_frame_was_measured(rig: Rig) -> None:
+def test_the_truth_log_tells_when_each_frame_was_measured(rig: PluggedPort) -> None:
     rig.open(115_200)
     rig.run(300)
     head, names, *rows = rig.truth.getvalue().splitlines()
@@ -253,7 +253,7 @@ def test_the_truth_log_tells_when_each_frame_was_measured(rig: Rig) -> None:
 
 def test_faults_lie_between_module_and_reader(tmp_path: Path) -> None:
     faults = Faults(4, FaultRates(flip=0.2))
-    rig = Rig(tmp_path / "tty", faults=faults)
+    rig = PluggedPort(tmp_path / "tty", faults=faults)
     rig.open(115_200)
     ledger = Ledger()
     codec = DRIVER.make_codec(ledger, DRIVER.settings())
@@ -267,7 +267,7 @@ def test_faults_lie_between_module_and_reader(tmp_path: Path) -> None:
 
 def test_a_fault_can_pull_the_cable(tmp_path: Path) -> None:
     faults = Faults(4, FaultRates(unplug=0.05, unplug_ns=100 * NS_PER_MS))
-    rig = Rig(tmp_path / "tty", faults=faults)
+    rig = PluggedPort(tmp_path / "tty", faults=faults)
     seen = set()
     for _ in range(200):
         rig.run(10)
@@ -279,7 +279,7 @@ def test_a_fault_can_pull_the_cable(tmp_path: Path) -> None:
 
 def test_closing_twice_is_allowed_and_leaves_nothing(tmp_path: Path) -> None:
     before = set(os.listdir("/proc/self/fd"))
-    rig = Rig(tmp_path / "tty")
+    rig = PluggedPort(tmp_path / "tty")
     rig.run(20)
     rig.port.close()
     rig.port.close()

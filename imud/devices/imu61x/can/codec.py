@@ -10,18 +10,18 @@ Five standard frames of eight data bytes make one sample; identifiers are decima
     │ 105 │ accel z      f32  │ temp i16 │ idx u16│  g, 0.01 °C (the manual's "100 °C" is a misprint), counter
     └─────┴───────────────────┴───────────────────┘
 
-105 closes the sample: the 101 … 104 heard since the 105 before belong to it. It alone carries INDEX, which counts
-samples and wraps at 65536. Never are two samples mixed, where it can be known:
+105 closes the sample: the 101 … 104 received since the 105 before belong to it. It alone carries INDEX, which counts
+samples and wraps at 65536. Two samples are never mixed where that can be known:
 
-- An identifier heard again before a 105 says that a 105 was lost: what was held is given up (an exact copy right after
-  the frame itself is the bus repeating it, and is ignored).
+- An identifier received again before a 105 means that a 105 was lost: the frames held are dropped (an exact copy right
+  after the frame itself is a repetition by the bus, and is ignored).
 - A set that came in another order than 101, 102, 103, 104, 105 counts only if INDEX follows that of the 105 before.
-- Where frames are known to be missing (`reset`), what was held is given up.
+- Where frames are known to be missing (`reset`), the frames held are dropped.
 - A set in order whose INDEX does not follow may still be 101 … 103 of one sample and 104, 105 of a later one, what came
-  between having been lost. Time tells: a set takes S from its first frame to its last, and such a mixture at least one
-  period P more. It counts only if it took no more than S + P/2. S and P are learned from sets whose INDEX follows,
-  which cannot be mixed; before SURE_SETS of them every set in order counts. Where a stalled host or adapter has
-  pressed the times of arrival together, nothing can be known this way.
+  between having been lost. The time decides: a set takes S from its first frame to its last, and such a mixture at
+  least one period P more. It counts only if it took no more than S + P/2. S and P are learned from sets whose INDEX
+  follows, which cannot be mixed; before SURE_SETS of them every set in order counts. Where a stalled host or adapter
+  has pressed the times of arrival together, nothing can be known this way.
 
 Frames of a set that stays incomplete are valid and come to nothing (`frames_ignored`); the jump of INDEX to the next
 whole set says how many samples were lost. The device takes no commands over CAN.
@@ -54,9 +54,9 @@ C_PER_COUNT: Final = 0.01
 
 DOWN: Final = 4
 UP: Final = 16
-"""Which part of a difference the learned times follow at once."""
+"""Divisors: the part of a difference that the learned times follow at once."""
 SURE_SETS: Final = 8
-"""So many sets are needed to learn from: fewer, and one that came late says too much."""
+"""Number of sets needed to learn from: with fewer, one that came late has too much weight."""
 _NEVER_NS: Final = 1 << 63
 
 _CLOSING: Final = SET_FRAMES - 1
@@ -65,14 +65,14 @@ _IN_ORDER: Final = (0, 1, 2, 3)
 
 
 class Imu61xCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be configured of the codec."""
+    """Settings of an IMU61x on CAN."""
 
     base_id: Annotated[int, Meta(ge=0, le=STANDARD_ID_MAX - _CLOSING)] = BASE_ID
     """Identifier of the first of the five frames, decimal; the others follow it."""
 
 
 class _Pace:
-    """How long a set takes on the bus, and how long a sample; learned from sets that are surely whole."""
+    """Learns how long a set takes on the bus, and how long a sample, from sets that are surely whole."""
 
     __slots__ = ("_period_ns", "_sets", "_span_ns", "longest_ns")
 
@@ -84,9 +84,9 @@ class _Pace:
         self._sets = 0
 
     def learn(self, span_ns: int, period_ns: int) -> None:
-        """A whole set took `span_ns` from its first frame to its last, and ended `period_ns` after the one before.
+        """Add a whole set: `span_ns` from its first frame to its last, ended `period_ns` after the one before.
 
-        Down quickly and up slowly, by no more than twice at once: too low costs a sample beside a lost one, too high
+        Down quickly and up slowly, by no more than twice at once: too low costs a sample next to a lost one, too high
         could mix two.
         """
         self._span_ns = _moved(self._span_ns, span_ns)
@@ -105,7 +105,7 @@ def _moved(mean_ns: int, new_ns: int) -> int:
 
 
 class Imu61xCanCodec:
-    """Measurements out of the frames of one device. Synchronization: one thread."""
+    """Decodes the frames of one device into measurements. Synchronization: one thread."""
 
     def __init__(self, ledger: Ledger, settings: Imu61xCanSettings) -> None:
         self.ledger = ledger
@@ -123,7 +123,7 @@ class Imu61xCanCodec:
         self._pace = _Pace()
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Take one frame; return what it completed. Never raises for any frame."""
+        """Decode one frame; return what it completed. Never raises for any frame."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         slot = self._slots.get(can_id)
@@ -152,11 +152,11 @@ class Imu61xCanCodec:
         return ()
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Nothing can be said before 105 comes."""
+        """Return nothing: a set is decided by its 105 only."""
         return ()
 
     def reset(self) -> None:
-        """Frames are missing here: what is held is given up."""
+        """Drop the frames held: others are missing after them."""
         held, ledger = self._held, self.ledger
         ledger.frames_ignored += len(held)
         ledger.frames_pending -= len(held)
@@ -164,7 +164,7 @@ class Imu61xCanCodec:
         self._newest = -1
 
     def _close(self, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """105 came: the set is whole, or it is lost."""
+        """Finish the set with its 105: it is whole, or lost."""
         held, ledger, before, pace = self._held, self.ledger, self._index, self._pace
         self._index = index = data[6] | data[7] << 8
         before_ns, self._closed_ns = self._closed_ns, t_rx_ns
@@ -190,7 +190,7 @@ class Imu61xCanCodec:
         return (*self._not_finite(raw), _measurement(values, temperature, index))
 
     def _not_finite(self, raw: bytes) -> list[CodecEvent]:
-        """Tell of the frames with NaN or infinity in them."""
+        """A `BadFrame` for every frame with NaN or infinity in it."""
         events: list[CodecEvent] = []
         for slot, layout in enumerate(_FLOATS):
             data = raw[slot * FRAME_BYTES : (slot + 1) * FRAME_BYTES]

@@ -43,11 +43,11 @@ _ONLY: Final = struct.Struct(f"<{HEADER.size}xI10fI")  # a whole frame: values a
 
 
 class Imu61xCodec:
-    """Measurements and reply frames out of bytes in any split. Synchronization: one thread.
+    """Decodes bytes of any split into measurements and reply frames. Synchronization: one thread.
 
     Frames of an unknown kind are counted (`frames_ignored`) and dropped. Frames of a known kind that are too short are
     bad. A frame with NaN or infinity is delivered without the values concerned, after a `BadFrame` (not-finite) that
-    tells of it; its bytes and itself count as good.
+    reports it; its bytes and itself count as good.
     """
 
     def __init__(self, ledger: Ledger, _settings: NoSettings | None = None) -> None:
@@ -55,23 +55,23 @@ class Imu61xCodec:
         self._finder = FrameFinder(ledger, DEVICE_SYNC)
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Take bytes in the order they came; return what they completed. Never raises for any bytes."""
+        """Decode bytes in the order they came; return what they completed. Never raises for any bytes."""
         if len(data) == AHRS_FRAME_BYTES and data.startswith(_HEAD) and self._finder.idle:
-            only = self._take_only(data)
+            only = self._decode_only(data)
             if only is not None:
                 return (only,)
-        return self._taken(self._finder.feed(data))
+        return self._events(self._finder.feed(data))
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The line is idle: return whole frames that wait inside a longer frame that never came."""
-        return self._taken(self._finder.flush())
+        """Return whole frames that wait inside a longer frame that never came. Called when the line is idle."""
+        return self._events(self._finder.flush())
 
     def reset(self) -> None:
-        """The stream broke: what is pending becomes skipped."""
+        """Skip what is pending: the stream broke."""
         self._finder.reset()
 
-    def _take_only(self, data: bytes) -> Measurement | None:
-        """A read that is one AHRS frame, all values finite, which is what a port gives as a rule."""
+    def _decode_only(self, data: bytes) -> Measurement | None:
+        """Decode a read that is one AHRS frame with finite values, as most reads are; None for any other."""
         *values, crc = _ONLY.unpack(data)
         if crc32(data[:-CRC_BYTES]) != crc or not isfinite(sum(values)):
             return None
@@ -82,17 +82,17 @@ class Imu61xCodec:
         ledger.frames_in_samples += 1
         return _finite_measurement(values, AHRS_FRAME_BYTES, 0)
 
-    def _taken(self, found: Sequence[Frame | BadFrame]) -> list[CodecEvent]:
+    def _events(self, found: Sequence[Frame | BadFrame]) -> list[CodecEvent]:
         events: list[CodecEvent] = []
         for frame in found:
             if isinstance(frame, BadFrame):
                 events.append(frame)
             else:
-                self._take(frame, events)
+                self._add_frame(frame, events)
         return events
 
-    def _take(self, frame: Frame, events: list[CodecEvent]) -> None:
-        """Book a frame whose CRC matches, and say what is in it."""
+    def _add_frame(self, frame: Frame, events: list[CodecEvent]) -> None:
+        """Count a frame whose CRC matches, and add the event that it is."""
         ledger, size = self.ledger, len(frame.raw)
         reply = is_reply(frame.frame_id, frame.payload)
         measured = frame.frame_id == AHRS_FRAME and not reply

@@ -178,7 +178,7 @@ def set_i2c_address(address: int) -> Request:
 
 
 def set_filter(accel: int, gyro: int) -> Request:
-    """Set the low-pass filters by their codes, indices of `common.FILTERS` (CMD 14, parameter 31)."""
+    """Set the low-pass filters by their codes, indices of `FILTERS` (CMD 14, parameter 31)."""
     return _set(Parameter.FILTER, filter_control(accel, gyro))
 
 

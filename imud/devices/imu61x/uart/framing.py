@@ -55,9 +55,9 @@ def encode_frame(sync: bytes, frame_id: int, payload: bytes) -> bytes:
 
 
 class FrameFinder:
-    """Frames of one direction out of bytes in any split. Synchronization: one thread.
+    """Finds the frames of one direction in bytes of any split. Synchronization: one thread.
 
-    Books into the ledger every byte and every damaged frame, but not the frames it returns: only their taker knows
+    Books into the ledger every byte and every damaged frame, but not the frames it returns: only the caller knows
     whether they are good.
     """
 
@@ -75,26 +75,26 @@ class FrameFinder:
         return not (self._tail or self._bad_ahead)
 
     def feed(self, data: bytes) -> Sequence[Frame | BadFrame]:
-        """Take bytes in the order they came; return what they completed. Never raises for any bytes."""
+        """Add bytes in the order they came; return what they completed. Never raises for any bytes."""
         self._ledger.bytes_in += len(data)
         return self._scan(self._tail + data if self._tail else data, 0)
 
     def flush(self) -> Sequence[Frame | BadFrame]:
-        """The line is idle: give up an incomplete frame if a whole one waits inside it; otherwise do nothing."""
+        """Drop an incomplete frame if a whole one waits inside it; no-op otherwise. Called when the line is idle."""
         found: list[Frame | BadFrame] = []
-        while give_up := self._whole_inside():
-            found += self._scan(self._tail, give_up)
+        while drop_before := self._whole_inside():
+            found += self._scan(self._tail, drop_before)
         return found
 
     def reset(self) -> None:
-        """The stream broke: what is pending becomes skipped."""
+        """Skip what is pending: the stream broke."""
         self._ledger.bytes_skipped += len(self._tail)
         self._tail = b""
         self._bad_ahead = 0
         self._ledger.bytes_pending = 0
 
-    def _scan(self, data: bytes, give_up: int) -> list[Frame | BadFrame]:
-        """Take all that is complete in `data`, where incomplete frames that begin before `give_up` are bad."""
+    def _scan(self, data: bytes, drop_before: int) -> list[Frame | BadFrame]:
+        """Find all that is complete in `data`; incomplete frames that begin before `drop_before` are bad."""
         found: list[Frame | BadFrame] = []
         sync, at, total = self._sync, 0, len(data)
         while at < total:
@@ -105,7 +105,7 @@ class FrameFinder:
                 at = end
                 break
             self._skip(at, begin)
-            at, waiting = begin, self._take(data, begin, give_up, found)
+            at, waiting = begin, self._frame_at(data, begin, drop_before, found)
             if at == waiting:
                 break
             at = waiting
@@ -114,11 +114,11 @@ class FrameFinder:
         self._ledger.bytes_pending = total - at
         return found
 
-    def _take(self, data: bytes, at: int, give_up: int, found: list[Frame | BadFrame]) -> int:
-        """Take what begins with the sync word at `at`; return where it ends, or `at` if it is not complete yet."""
+    def _frame_at(self, data: bytes, at: int, drop_before: int, found: list[Frame | BadFrame]) -> int:
+        """Find the frame whose sync word is at `at`; return where it ends, or `at` if it is not complete yet."""
         total = len(data)
         if total - at < HEADER.size:
-            return self._spend_sync(data, at, total, BadReason.CRC, found) if at < give_up else at
+            return self._spend_sync(data, at, total, BadReason.CRC, found) if at < drop_before else at
         frame_id: int
         length: int
         _, frame_id, length = HEADER.unpack_from(data, at)
@@ -126,7 +126,7 @@ class FrameFinder:
         if not 1 <= length <= PAYLOAD_BYTES_MAX:
             return self._spend_sync(data, at, begin, BadReason.LENGTH, found)
         end = begin + length + CRC_BYTES
-        if end > total and at >= give_up:
+        if end > total and at >= drop_before:
             return at
         raw = data[at:end]
         if end > total or not _crc_matches(raw):
@@ -135,13 +135,13 @@ class FrameFinder:
         return end
 
     def _skip(self, at: int, end: int) -> None:
-        """Bytes that belong to no frame; those where a damaged one claimed to be count as its."""
+        """Count bytes that belong to no frame; those that a damaged frame claimed count as its."""
         bad = max(min(self._bad_ahead, end) - at, 0)
         self._ledger.bytes_in_bad_frames += bad
         self._ledger.bytes_skipped += end - at - bad
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, found: list[Frame | BadFrame]) -> int:
-        """What begins at `at` and claims to reach `end` is no frame: spend the sync word only."""
+        """Spend only the sync word of what begins at `at` and claims to reach `end`: it is no frame."""
         ledger = self._ledger
         if reason is BadReason.CRC:
             ledger.frames_bad_crc += 1

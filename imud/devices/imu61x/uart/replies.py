@@ -50,10 +50,10 @@ class Parameter(IntEnum):
     AHRS_RATE = 21
     """AHRS frames per second, Hz."""
     BUS_MODE = 27
-    """Which bus there is besides the UART, see `commands.BusMode`."""
+    """The second bus, next to the UART, see `commands.BusMode`."""
     I2C_ADDRESS = 30
     FILTER = 31
-    """As FILTER_CTRL, see `common.filter_codes`."""
+    """As FILTER_CTRL, see `filter_codes` of `common/family.py`."""
 
 
 @dataclass(frozen=True, slots=True)

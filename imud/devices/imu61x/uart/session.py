@@ -1,13 +1,13 @@
-"""Conversations with a Forsense IMU61x on a UART: who it is, how it is set, and how to change that without losing it.
+"""Request scripts of the Forsense IMU61x on a UART: identity, settings, and changes that keep contact with it.
 
 Manual "IMU61X Interface Protocol and Instructions", sections 1.4 to 1.6. It says that questions belong to command mode
-and leaves open what a device does with them while it streams. Every conversation therefore asks for the status first.
+and leaves open what a device does with them while it streams. Every script therefore asks for the status first.
 An answer means that all else can be asked as it is; no answer, that the device streams and needs command mode for it:
 then that is entered, and streaming is started again at the end, whatever happened. A device that was in command mode
 answers at once and stays there. Where the host's transmit line is not connected nothing is changed and NoReply raised.
 Command mode is never saved: a device that loses its host in the middle streams again after its next power-on. If only
-the conversation is given up, the order to stream is the last that is sent (`Request.undo`). For a device that someone
-saved in command mode there is `wake`.
+the script is stopped, the order to stream is the last that is sent (`Request.undo`). For a device that was saved in
+command mode there is `wake`.
 
 What the codes of acknowledgements mean stands in no source. Changes are confirmed by reading them back where they can
 be; elsewhere result 0 counts as done (assumed), which `done` changes.
@@ -59,15 +59,15 @@ _HEXADECIMAL: Final = (Parameter.I2C_ADDRESS, Parameter.FILTER)
 
 @dataclass(frozen=True, slots=True)
 class BaudChange:
-    """How a change of the baud rate ended well."""
+    """Result of a successful change of the baud rate."""
 
     baud: int
-    """The rate at which the device was heard last; the line has it as well."""
+    """The rate at which the device answered last; the line has it as well."""
     saved: bool
     """Whether the device acknowledged that it saved its parameters."""
 
 
-# --- who it is and how it is set --------------------------------------------------------------------------------------
+# --- identity and settings --------------------------------------------------------------------------------------------
 
 
 def identify() -> RequestScript[Identity]:
@@ -94,7 +94,7 @@ def _identity() -> RequestScript[Identity]:
 
 
 def identity_of(status: Status) -> Identity:
-    """S1 as an identity; which model has which number stands in no source."""
+    """S1 as an identity. The source does not say which model has which number."""
     numbers = {
         name: str(value)
         for name in Status.__dataclass_fields__
@@ -277,7 +277,7 @@ def change_baud(baud: int, present_baud: int) -> RequestScript[BaudChange]:
     Whether the device changes at once or at its next start stands in no source, so it is looked for at both rates. It
     is saved only after it was heard at the new rate, or said at the old one that the new one is set. Ends streaming.
     Raises BadArgument, Rejected where it stays at the old rate (the line too), and NoReply where it is not heard; if
-    nothing was saved, it comes back at the old rate after power-on.
+    nothing was saved, it has the old rate again after power-on.
     """
     return with_undo(_change_baud(baud, present_baud), _STREAM)
 
@@ -353,7 +353,7 @@ def _unheard(what: str, bauds: Sequence[int]) -> str:
     return f"{what}; expected an answer at {rates} baud, got none: is the host's transmit line connected?"
 
 
-# --- one exchange -----------------------------------------------------------------------------------------------------
+# --- steps of a script ------------------------------------------------------------------------------------------------
 
 
 def _in_contact(ask: Callable[[], RequestScript[T]]) -> RequestScript[T]:

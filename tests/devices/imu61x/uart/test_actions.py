@@ -9,13 +9,13 @@ from imud.contracts.action import Target
 from imud.devices.imu61x.uart.actions import ACTIONS
 from imud.devices.imu61x.uart.session import BaudChange
 from imud.errors import BadArgument
-from tests.support.imu61x_bench import Bench, bench
+from tests.support.imu61x_bench import Imu61xBench, bench
 
 
-def act(far: Bench, name: str, **arguments: Any) -> object:
+def act(far: Imu61xBench, name: str, **arguments: Any) -> object:
     """Have the device do it."""
     action = ACTIONS[name]
-    return far.hold(action.script(Target(None, far.line_baud), action.arguments(arguments)))
+    return far.run(action.script(Target(None, far.line_baud), action.arguments(arguments)))
 
 
 def test_stop_and_start() -> None:

@@ -1,4 +1,4 @@
-"""Conversations against a simulated device that answers while it streams, and one that answers in command mode only."""
+"""Request scripts against simulated devices: one answers while it streams, one in command mode only."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,13 +15,13 @@ from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import STATUS
 from imud.sim.physics.motion import Still, swing
 from imud.sim.physics.noise import Noise
-from tests.support.imu61x_bench import Bench, bench
+from tests.support.imu61x_bench import Imu61xBench, bench
 
 either_way = pytest.mark.parametrize("answers", [True, False])
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
 
 
-def streams(far: Bench) -> bool:
+def streams(far: Imu61xBench) -> bool:
     """Whether samples come at the rate of the line."""
     return len(far.samples(100)) >= 5
 
@@ -32,7 +32,7 @@ def streams(far: Bench) -> bool:
 @either_way
 def test_identity_and_the_stream_goes_on(answers: bool) -> None:
     far = bench(answers_while_streaming=answers)
-    identity = far.hold(session.identify())
+    identity = far.run(session.identify())
     assert identity.product == "IMU61x"
     assert identity.serial_number == "003200473133510D33383736"
     assert identity.firmware == "10203"
@@ -45,21 +45,21 @@ def test_identity_and_the_stream_goes_on(answers: bool) -> None:
 
 def test_a_device_that_answers_as_it_is_is_sent_questions_only() -> None:
     far = bench()
-    far.hold(session.identify())
-    far.hold(session.read_settings())
+    far.run(session.identify())
+    far.run(session.read_settings())
     assert all(name == "status" or name.startswith("read parameter") for name in far.asked)
 
 
 def test_a_device_in_command_mode_stays_there() -> None:
     far = bench(QUIET)
-    assert far.hold(session.identify()).serial_number
+    assert far.run(session.identify()).serial_number
     assert far.module.settings.mode is OutputMode.COMMAND
     assert far.samples(1000) == []
 
 
 def test_identity_from_the_shortest_status() -> None:
     short = replace(STATUS, system_status=None)
-    identity = bench(status=short).hold(session.identify())
+    identity = bench(status=short).run(session.identify())
     assert identity.details == {"hardware_version": "2", "model": "614"}
 
 
@@ -73,19 +73,19 @@ def test_without_a_transmit_line_nothing_changes() -> None:
     far = bench()
     far.connected = False
     with pytest.raises(NoReply, match="status: expected a reply, got nothing; is the host's transmit line connected"):
-        far.hold(session.identify())
+        far.run(session.identify())
     assert streams(far)
 
 
 def test_streaming_is_started_again_when_the_answer_fails() -> None:
     """The device obeys and its answers are lost: it must not be left silent."""
     far = bench(answers_while_streaming=False)
-    conversation = session.identify()
-    request = next(conversation)
-    with pytest.raises(NoReply):  # noqa: PT012  # the conversation is driven by hand
+    script = session.identify()
+    request = next(script)
+    with pytest.raises(NoReply):  # noqa: PT012  # the script is driven by hand
         while True:
             far.ask(request)
-            request = conversation.send(Silence(()))
+            request = script.send(Silence(()))
     assert far.asked[-1] == "output mode STREAM"
     assert streams(far)
 
@@ -96,7 +96,7 @@ def test_settings(answers: bool) -> None:
         Imu61xSettings(rate_hz=50, filter_control=0x4B, i2c_address=0x1A, gyro_off_deg_s=(0.5, -0.25, 0.0)),
         answers_while_streaming=answers,
     )
-    assert far.hold(session.read_settings()) == {
+    assert far.run(session.read_settings()) == {
         "BAUD": "115200",
         "GYRO_X_OFF": "0.5",
         "GYRO_Y_OFF": "-0.25",
@@ -118,18 +118,18 @@ def test_settings(answers: bool) -> None:
 @pytest.mark.parametrize("acknowledges", [True, False])
 def test_stream_and_command_mode(acknowledges: bool) -> None:
     far = bench(acknowledges=acknowledges)
-    far.hold(session.stop_streaming())
+    far.run(session.stop_streaming())
     assert far.samples(500) == []
-    assert far.hold(session.start_streaming()) is acknowledges
+    assert far.run(session.start_streaming()) is acknowledges
     assert streams(far)
 
 
 @either_way
 def test_restart_loses_what_was_not_saved(answers: bool) -> None:
     far = bench(answers_while_streaming=answers)
-    far.hold(session.write_parameter(Parameter.AHRS_RATE, 10))
+    far.run(session.write_parameter(Parameter.AHRS_RATE, 10))
     assert far.module.settings.rate_hz == 10
-    assert far.hold(session.restart()).product == "IMU61x"
+    assert far.run(session.restart()).product == "IMU61x"
     assert far.module.settings == far.module.flash == Imu61xSettings()
     assert streams(far)
 
@@ -137,13 +137,13 @@ def test_restart_loses_what_was_not_saved(answers: bool) -> None:
 def test_a_device_that_does_not_come_back_is_no_reply() -> None:
     far = bench(boot_ms=60_000)
     with pytest.raises(NoReply, match="status"):
-        far.hold(session.restart())
+        far.run(session.restart())
 
 
 def test_saved_parameters_stay() -> None:
     far = bench()
-    far.hold(session.write_parameter(Parameter.FILTER, 0x44))
-    assert far.hold(session.save()) is True
+    far.run(session.write_parameter(Parameter.FILTER, 0x44))
+    assert far.run(session.save()) is True
     far.restart()
     assert far.module.settings.filter_control == 0x44
 
@@ -163,7 +163,7 @@ def test_saved_parameters_stay() -> None:
 )
 def test_a_parameter_is_set_and_read_back(answers: bool, parameter: Parameter, value: int, read: int) -> None:
     far = bench(answers_while_streaming=answers)
-    far.hold(session.write_parameter(parameter, value))
+    far.run(session.write_parameter(parameter, value))
     assert far.module.settings.value(parameter) == read
     assert far.module.flash == Imu61xSettings()
     assert streams(far)
@@ -173,7 +173,7 @@ def test_a_parameter_that_does_not_stick_is_refused(monkeypatch: pytest.MonkeyPa
     far = bench()
     monkeypatch.setattr("imud.sim.imu61x.uart.changed", lambda settings, index, value: settings)
     with pytest.raises(Rejected, match="set parameter AHRS_RATE to 200: reads back as 100"):
-        far.hold(session.write_parameter(Parameter.AHRS_RATE, 200))
+        far.run(session.write_parameter(Parameter.AHRS_RATE, 200))
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_a_parameter_that_does_not_stick_is_refused(monkeypatch: pytest.MonkeyPa
 def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parameter, value: int | BusMode) -> None:
     far = bench()
     with pytest.raises(BadArgument):
-        far.hold(session.write_parameter(parameter, value))
+        far.run(session.write_parameter(parameter, value))
     assert far.asked == []
 
 
@@ -199,7 +199,7 @@ def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parame
 def test_gyro_calibration_takes_the_bias_off(answers: bool) -> None:
     far = bench(answers_while_streaming=answers, noise=Noise(3))
     before = far.samples(2000)
-    offsets_deg_s = far.hold(session.calibrate_gyro())
+    offsets_deg_s = far.run(session.calibrate_gyro())
     after = far.samples(2000)
     assert any(abs(offset) > 1e-3 for offset in offsets_deg_s)
     for axis in range(3):
@@ -211,23 +211,23 @@ def test_gyro_calibration_takes_the_bias_off(answers: bool) -> None:
 def test_gyro_calibration_of_a_moving_device_is_refused() -> None:
     far = bench(motion=swing())
     with pytest.raises(Rejected, match=r"gyro calibration: expected result 0 \(done\), got 1"):
-        far.hold(session.calibrate_gyro())
+        far.run(session.calibrate_gyro())
 
 
 def test_what_counts_as_done_can_be_told() -> None:
     far = bench(motion=swing())
-    assert far.hold(session.calibrate_gyro(done=1)) == (0, 0, 0)
+    assert far.run(session.calibrate_gyro(done=1)) == (0, 0, 0)
     with pytest.raises(Rejected):
-        far.hold(session.reset_heading(10, done=1))
+        far.run(session.reset_heading(10, done=1))
 
 
 @either_way
 def test_installation_calibration_ends_with_the_angles(answers: bool) -> None:
     tilted = Still(radians(4), radians(0), radians(0))  # 312: roll about Y, which is pitch in ZYX
     far = bench(answers_while_streaming=answers, motion=tilted)
-    assert far.hold(session.installation_status()) == 0
+    assert far.run(session.installation_status()) == 0
     begun_ns = far.now_ns
-    assert far.hold(session.calibrate_installation()) == pytest.approx((0, 4, 0), abs=1e-5)
+    assert far.run(session.calibrate_installation()) == pytest.approx((0, 4, 0), abs=1e-5)
     assert 3e9 <= far.now_ns - begun_ns < 6e9
     assert streams(far)
 
@@ -236,14 +236,14 @@ def test_installation_calibration_without_end(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("imud.sim.imu61x.uart.CALIBRATION_NS", 10**15)
     far = bench(QUIET)
     with pytest.raises(NoReply, match="expected status 0 within 60 s, got 1"):
-        far.hold(session.calibrate_installation())
+        far.run(session.calibrate_installation())
 
 
 @either_way
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 180.0, 359.0])
 def test_heading_reset(answers: bool, heading_deg: float) -> None:
     far = bench(answers_while_streaming=answers)
-    far.hold(session.reset_heading(heading_deg))
+    far.run(session.reset_heading(heading_deg))
     euler = far.samples(100)[-1].euler_rad
     assert euler is not None
     assert (euler[2] - radians(heading_deg) + 3) % radians(360) == pytest.approx(3, abs=1e-5)
@@ -261,7 +261,7 @@ def test_the_baud_rate_changes_and_the_device_is_kept(
 ) -> None:
     settings = Imu61xSettings(baud=present)
     far = bench(settings, answers_while_streaming=answers, baud_acts_at_start=at_start, acknowledges=acknowledges)
-    change = far.hold(session.change_baud(baud, present))
+    change = far.run(session.change_baud(baud, present))
     assert change.baud == baud == far.line_baud == far.module.baud
     assert far.module.flash.baud == baud
     assert far.module.flash.mode is OutputMode.STREAM
@@ -274,7 +274,7 @@ def test_the_line_comes_back_when_the_device_keeps_its_rate(monkeypatch: pytest.
     far = bench()
     monkeypatch.setattr("imud.sim.imu61x.uart.changed", lambda settings, index, value: settings)
     with pytest.raises(Rejected, match="stays at 115200 baud"):
-        far.hold(session.change_baud(921600, 115200))
+        far.run(session.change_baud(921600, 115200))
     assert far.line_baud == 115200
     assert streams(far)
 
@@ -285,7 +285,7 @@ def test_a_device_that_is_lost_was_not_saved(monkeypatch: pytest.MonkeyPatch) ->
     wrong = lambda settings, index, value: replace(settings, baud=1500000)  # noqa: E731
     monkeypatch.setattr("imud.sim.imu61x.uart.changed", wrong)
     with pytest.raises(NoReply, match="switch its power off and on: nothing was saved"):
-        far.hold(session.change_baud(460800, 115200))
+        far.run(session.change_baud(460800, 115200))
     assert far.line_baud == 115200
     far.restart()
     assert streams(far)
@@ -296,7 +296,7 @@ def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[o
     far = bench()
     far.connected = False
     with pytest.raises(NoReply, match="nothing was changed"):
-        far.hold(change())
+        far.run(change())
     assert far.line_baud == 115200
     assert "factory reset" not in far.asked
     assert not any(name.startswith("set parameter") for name in far.asked)
@@ -309,13 +309,13 @@ def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[o
 def test_factory_reset_and_the_line_follows(answers: bool, at_start: bool, present: int) -> None:
     settings = Imu61xSettings(baud=present, rate_hz=400, filter_control=0)
     far = bench(settings, answers_while_streaming=answers, baud_acts_at_start=at_start)
-    change = far.hold(session.factory_reset(present))
+    change = far.run(session.factory_reset(present))
     assert change.baud == far.line_baud == far.module.baud == 115200
     assert far.module.flash == Imu61xSettings()
     assert streams(far)
 
 
-def test_orders_outside_conversations_are_obeyed_too() -> None:
+def test_orders_outside_scripts_are_obeyed_too() -> None:
     far = bench(QUIET)
     assert far.ask(commands.ask_ahrs())
     assert len(far.samples(50)) == 1
