@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
         stack.callback(port.close)
         with suppress(KeyboardInterrupt):
             print(path, flush=True)
-            StandardInputControl(port, lines).run()
+            StandardInputControl(port, time.monotonic_ns, lines).run()
         print(json.dumps(port.summary() | lines.summary()), flush=True)
     return 0
 
@@ -77,7 +77,7 @@ def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now
     with closing(port):
         with suppress(KeyboardInterrupt):
             print(port.interface, flush=True)
-            StandardInputControl(port).run()
+            StandardInputControl(port, time.monotonic_ns).run()
         print(json.dumps(port.summary()), flush=True)
     return 0
 

@@ -4,7 +4,6 @@ import json
 import os
 import select
 import sys
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -26,10 +25,10 @@ class StandardInputControl:
     def __init__(
         self,
         port: SimulatedPort | CanPort,
+        now_ns: Callable[[], int],
         lines: SimulatedLines | None = None,
-        *,
-        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        """`now_ns` is CLOCK_MONOTONIC."""
         self._port = port
         self._lines = lines
         self._now_ns = now_ns

@@ -24,7 +24,7 @@ def main() -> None:
     with TemporaryDirectory(prefix="imud-bench-") as folder:
         port = SimulatedPort(line, PtyNode(Path(folder) / "line"), Adapter(BARE_UART, now_ns))
         print(port.node.path, flush=True)
-        StandardInputControl(port).run()
+        StandardInputControl(port, time.monotonic_ns).run()
         port.close()
 
 

@@ -214,20 +214,8 @@ def test_reset_never_mixes_what_was_before_with_what_comes(name: str, seed: int)
 
 
 @every_driver
-def test_examples_differ_and_are_the_same_for_a_seed(name: str) -> None:
-    example = DRIVERS[name].example_frames
-    assert example(Random(5)) == example(Random(5)) != example(Random(6))
-
-
-@every_driver
-def test_rows_are_complete(name: str) -> None:
+def test_filters_of_the_row_pass_its_frames(name: str) -> None:
     driver = DRIVERS[name]
-    assert driver.name == name
-    assert driver.title
-    assert driver.navigation_frame
-    assert driver.euler_convention
-    assert driver.tick_ns >= 0
-    assert driver.tick_modulus > 1
     filters = driver.filters(driver.settings())
     assert all(pack_frame(wanted.can_id, wanted.extended, b"") for wanted in filters)
     assert all(is_own(driver, frame) for frame in driver.example_frames(Random(1)))

@@ -148,16 +148,11 @@ def test_scripts_end_whatever_is_answered(name: str, seed: int) -> None:
 
 
 @every_driver
-def test_rows_are_complete(name: str) -> None:
+def test_targets_and_link_of_the_row(name: str) -> None:
     driver = row(name)
-    assert driver.name == name
-    assert driver.title
-    assert driver.euler_convention
-    assert driver.navigation_frame
     assert len(set(driver.targets)) == len(driver.targets) > 0
     assert LINKS[driver.link].polled
     assert LINKS[driver.link].fits(driver)
     assert [link for link in LINKS if LINKS[link].fits(driver)] == [driver.link]
     assert make(driver).polls[0].every_ns == 0
-    assert driver.example_reading(Random(5)) == driver.example_reading(Random(5)) != driver.example_reading(Random(6))
     assert msgspec.structs.fields(driver.settings)
