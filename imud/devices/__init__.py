@@ -1,4 +1,4 @@
-"""Wire protocols, one file each: codecs without I/O, encoders, and the row that names them."""
+"""Wire protocols, a folder each: codec, session, actions, and `driver.py` with the row that names them. No I/O."""
 
 from imud.contracts.driver import Driver
 from imud.contracts.table import Table

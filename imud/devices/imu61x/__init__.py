@@ -1,4 +1,4 @@
-"""Forsense IMU61x: IMU612, IMU614, IMU618, IMU6132A and IMU6132B. One file per wire protocol, what is the same shared.
+"""Forsense IMU61x: IMU612, IMU614, IMU618, IMU6132A and IMU6132B. A folder per wire protocol; `common` is shared.
 
-Source: "IMU61X Interface Protocol and Instructions". Where code departs from it, it says why.
+Source: "IMU61X Interface Protocol and Instructions". Departures of the code from it are stated where they are.
 """

@@ -5,14 +5,18 @@ damaged frames, missing samples and skipped bytes the ledger at the other end mu
 """
 
 from collections import Counter
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
+from inspect import signature
 from random import Random
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from imud.sim.ports.uart_wire import heard
 from imud.sim.simulator import Burst
 from imud.units import NS_PER_MS
+
+R = TypeVar("R")
 
 LOG_MAX: Final = 100_000
 """Faults kept in `Faults.log`; the counts go on."""
@@ -160,14 +164,19 @@ class Faults:
 
 def rates_from(text: str) -> FaultRates:
     """Rates from `flip=0.01,drop=0.002`; names are those of `FaultRates`. Raises ValueError."""
-    known = {field.name: field.type for field in fields(FaultRates)}
+    return parse_rates(FaultRates, text)
+
+
+def parse_rates(kind: Callable[..., R], text: str, where: str = "") -> R:
+    """A dataclass of rates from `name=number,…`; `where` ends the name of a fault in errors. Raises ValueError."""
+    known = list(signature(kind).parameters)
     values: dict[str, float] = {}
     for part in filter(None, text.split(",")):
         name, _, value = part.partition("=")
         if name not in known:
-            raise ValueError(f"fault {name!r}: expected one of {', '.join(known)}")
+            raise ValueError(f"fault {name!r}{where}: expected one of {', '.join(known)}")
         try:
             values[name] = int(value) if name.endswith("_ns") else float(value)
         except ValueError:
-            raise ValueError(f"fault {name}: expected a number, got {value!r}") from None
-    return FaultRates(**values)  # type: ignore[arg-type]  # names and types checked above
+            raise ValueError(f"fault {name}{where}: expected a number, got {value!r}") from None
+    return kind(**values)

@@ -14,6 +14,7 @@ from enum import StrEnum
 from random import Random
 from typing import Final, NamedTuple, Protocol, TextIO, runtime_checkable
 
+from imud.sim.ports.faults import parse_rates
 from imud.units import NS_PER_MS
 
 OnEdge = Callable[[int, bool], None]
@@ -162,17 +163,7 @@ class Pins:
 
 def pin_rates(text: str) -> PinFaultRates:
     """Rates from `lose_pulse=0.1,extra=0.01`; names are those of `PinFaultRates`. Raises ValueError."""
-    known = [field.name for field in fields(PinFaultRates)]
-    values: dict[str, float] = {}
-    for part in filter(None, text.split(",")):
-        name, _, value = part.partition("=")
-        if name not in known:
-            raise ValueError(f"fault {name!r} of pins: expected one of {', '.join(known)}")
-        try:
-            values[name] = float(value)
-        except ValueError:
-            raise ValueError(f"fault {name} of pins: expected a number, got {value!r}") from None
-    return PinFaultRates(**values)
+    return parse_rates(PinFaultRates, text, " of pins")
 
 
 def _due_ns(edge: PinEdge) -> int:

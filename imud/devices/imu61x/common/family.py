@@ -35,6 +35,7 @@ def crc32(data: bytes | bytearray | memoryview) -> int:
 M_S2_PER_G: Final = STANDARD_GRAVITY_M_S2
 """1 g of the device is standard gravity (the manual leaves it open; the vendor's own driver takes 9.80665)."""
 RAD_S_PER_DEG_S: Final = RAD_PER_DEG
+"""1 °/s of the device."""
 
 
 def scaled(values: Sequence[float], factor: float) -> Vector3 | None:

@@ -1,1 +1,1 @@
-"""IMU61x over I2C."""
+"""IMU61x on I2C. To read in order: codec, session, driver."""

@@ -1,1 +1,1 @@
-"""IMU61x over SPI."""
+"""IMU61x on SPI. To read in order: codec, session, driver."""

@@ -1,1 +1,1 @@
-"""IMU61x over a UART."""
+"""IMU61x on a UART. To read in order: framing, codec, replies, commands, session, actions, driver."""
