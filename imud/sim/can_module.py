@@ -14,7 +14,8 @@ from typing import Final, NamedTuple, Protocol
 
 from imud.formats.can import DATA_BYTES_MAX, frame_bits
 from imud.sim.physics.motion import Truth
-from imud.sim.simulator import SensorHardware, SimulatorOptions
+from imud.sim.sensor import SensorHardware
+from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S
 
 STUFF_BITS: Final = 9

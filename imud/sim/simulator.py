@@ -1,14 +1,13 @@
-"""Contract of simulated devices: options, the sensor inside, and the module at the far end of a byte stream.
+"""Contract of simulated devices: their options, and the module at the far end of a byte stream.
 
 Modules do no I/O and read no clock: their owner says what time it is.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol, TypedDict
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
 
-from imud.sim.physics.motion import GRAVITY_M_S2, MOTIONS, Motion, Truth, swing
-from imud.sim.physics.noise import Noise
+from imud.sim.physics.motion import GRAVITY_M_S2
 
 
 class Burst(NamedTuple):
@@ -91,48 +90,6 @@ class SimulatorOptions:
     def bitrate(self, common: int) -> int:
         """Bit rate of a CAN device, bit/s: `baud`, or the common one; 0 for frames that take no time."""
         return 0 if self.at_once else self.baud or common
-
-
-class SensorParts(TypedDict):
-    """The fields of `SensorHardware`, to make a device's own hardware from."""
-
-    motion: Motion
-    noise: Noise | None
-    skew_ppm: float
-    boot_ms: int
-    processing_ns: int
-
-
-def sensor_parts(options: SimulatorOptions) -> SensorParts:
-    """The sensor that the options describe. Raises ValueError for a motion that does not exist."""
-    if options.motion not in MOTIONS:
-        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
-    return {
-        "motion": MOTIONS[options.motion](options.gravity_m_s2),
-        "noise": Noise(options.seed) if options.noise == "real" else None,
-        "skew_ppm": options.skew_ppm,
-        "boot_ms": options.boot_ms,
-        "processing_ns": options.processing_ns,
-    }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SensorHardware:
-    """The part that all simulated devices have: a moved sensor with noise, and a crystal of its own."""
-
-    motion: Motion = field(default_factory=swing)
-    noise: Noise | None = None
-    skew_ppm: float = 20.0
-    """How much faster the crystal runs than the host's."""
-    boot_ms: int = 500
-    """Silence after power-on and restart."""
-    processing_ns: int = 125_000
-    """Time from the instant of measurement to the first bit on the wire."""
-
-    def reading(self, t_s: float) -> Truth:
-        """What the sensor measures at a time of its motion, noise included."""
-        truth = self.motion.at(t_s)
-        return self.noise.add(truth, t_s) if self.noise else truth
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,9 @@ from imud.devices.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
 from imud.devices.hipnuc.j1939.session import LAYOUT, READ, WRITE
 from imud.formats.j1939 import J1939Id, join, split
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
-from imud.sim.physics.motion import Truth
-from imud.sim.simulator import SensorHardware, SimulatorOptions, sensor_parts
+from imud.sim.physics.motion import MOTIONS, Motion, Truth, swing
+from imud.sim.physics.noise import Noise
+from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S
 
 INTERVAL_MS: Final = 100
@@ -51,12 +52,17 @@ class J1939Settings:
     """Physical angles that read as zero."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class J1939Hardware(SensorHardware):
-    """One module, apart from its settings."""
+@dataclass(frozen=True, slots=True)
+class J1939Hardware:
+    """What a module is made of."""
 
     bitrate: int | None = None
     """Of the bus in bit/s, 0 for frames that take no time; None for what it is set to."""
+    motion: Motion = field(default_factory=swing)
+    noise: Noise | None = None
+    skew_ppm: float = 20.0
+    boot_ms: int = 500
+    processing_ns: int = 125_000
     sends_heading_twice: bool = True
     """As newer firmware does."""
 
@@ -143,7 +149,9 @@ class HipnucJ1939Module:
                 self._send(pgn, reading, sample_ns)
 
     def _reading(self, sample_ns: int) -> Truth:
-        return self.hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
+        t_s = (sample_ns - self.epoch_ns) / NS_PER_S
+        truth = self.hardware.motion.at(t_s)
+        return self.hardware.noise.add(truth, t_s) if self.hardware.noise else truth
 
     def _send(self, pgn: int, reading: Truth, sample_ns: int) -> None:
         can_id, data = encode(pgn, self._packed(pgn, reading, sample_ns), self._address)
@@ -263,6 +271,8 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
         raise ValueError(f"message {options.message!r}: expected {' or '.join(filter(None, MESSAGES))}, or none")
     if options.node and options.node not in session.ADDRESSES:
         raise ValueError(f"node {options.node}: expected an address 1 … 128, or 0 for {FACTORY_ADDRESS}")
+    if options.motion not in MOTIONS:
+        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
     pgns = MESSAGES[options.message]
     settings = J1939Settings(
         intervals_ms={pgn: SLOW_MS - SLOW_MS % interval_ms if pgn in SLOW else interval_ms for pgn in pgns},
@@ -270,7 +280,11 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
     )
     hardware = J1939Hardware(
         bitrate=options.bitrate(BITRATE),
-        **sensor_parts(options),
+        motion=MOTIONS[options.motion](options.gravity_m_s2),
+        noise=Noise(options.seed) if options.noise == "real" else None,
+        skew_ppm=options.skew_ppm,
+        boot_ms=options.boot_ms,
+        processing_ns=options.processing_ns,
     )
     return HipnucJ1939Module(now_ns, settings, hardware)
 

@@ -16,7 +16,8 @@ from imud.devices.hipnuc.nmea2000.messages import Reference
 from imud.formats.j1939 import ADDRESS_MAX
 from imud.sim.can_module import CanSimulator, PeriodicCanModule
 from imud.sim.physics.motion import Truth
-from imud.sim.simulator import SensorHardware, SimulatorOptions, sensor_parts
+from imud.sim.sensor import SensorHardware, sensor_of
+from imud.sim.simulator import SimulatorOptions
 
 BITRATE: Final = 250_000
 """Of every NMEA 2000 bus."""
@@ -69,7 +70,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucNmea2000Module:
         message=options.message,
         source=options.node or EXAMPLE_SOURCE,
         bitrate=options.bitrate(BITRATE),
-        **sensor_parts(options),
+        **sensor_of(options),
     )
     return HipnucNmea2000Module(now_ns, hardware)
 

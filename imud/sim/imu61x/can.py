@@ -14,7 +14,8 @@ from imud.devices.imu61x.can.codec import BASE_ID, SET_FRAMES, encode_set
 from imud.formats.can import STANDARD_ID_MAX
 from imud.sim.can_module import BITRATE, CanSimulator, PeriodicCanModule
 from imud.sim.physics.motion import Truth
-from imud.sim.simulator import SensorHardware, SimulatorOptions, sensor_parts
+from imud.sim.sensor import SensorHardware, sensor_of
+from imud.sim.simulator import SimulatorOptions
 
 RATE_MAX_HZ: Final = 400.0
 
@@ -62,7 +63,7 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xCanModule:
         rate_hz=options.rate_hz,
         base_id=options.node or BASE_ID,
         bitrate=options.bitrate(BITRATE),
-        **sensor_parts(options),
+        **sensor_of(options),
     )
     return Imu61xCanModule(now_ns, hardware)
 

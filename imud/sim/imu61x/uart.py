@@ -29,7 +29,8 @@ from imud.sample import Vector3
 from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
 from imud.sim.physics.motion import Truth
 from imud.sim.ports.uart_wire import Transmitter
-from imud.sim.simulator import Burst, SensorHardware, Simulator, SimulatorOptions, sensor_parts
+from imud.sim.sensor import SensorHardware, sensor_of
+from imud.sim.simulator import Burst, Simulator, SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US, RAD_PER_DEG
 
 TX_BUFFER_BYTES: Final = 512
@@ -324,7 +325,7 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
         raise ValueError(f"baud {baud}: expected one of {', '.join(map(str, sorted(BAUD_RATES)))}")
     hardware = Imu61xHardware(
         status=replace(STATUS, software_version=options.firmware or STATUS.software_version),
-        **sensor_parts(options),
+        **sensor_of(options),
     )
     return Imu61xModule(now_ns, Imu61xSettings(baud=baud, rate_hz=rate_hz), hardware)
 

@@ -4,23 +4,24 @@ import pytest
 
 from imud.sim.physics.motion import swing
 from imud.sim.physics.noise import Noise
-from imud.sim.simulator import SensorHardware, SimulatorOptions, sensor_parts
+from imud.sim.sensor import SensorHardware, sensor_of
+from imud.sim.simulator import SimulatorOptions
 
 OPTIONS = SimulatorOptions(gravity_m_s2=9.7, noise="none", skew_ppm=-35.0, boot_ms=7, processing_ns=11)
 
 
 def test_every_option_of_the_sensor_arrives() -> None:
-    sensor = SensorHardware(**sensor_parts(OPTIONS))
+    sensor = SensorHardware(**sensor_of(OPTIONS))
     assert (sensor.skew_ppm, sensor.boot_ms, sensor.processing_ns) == (-35.0, 7, 11)
     assert sensor.noise is None
     assert sensor.reading(1.25) == swing(9.7).at(1.25)
 
 
 def test_noise_is_that_of_the_seed() -> None:
-    sensor = SensorHardware(**sensor_parts(SimulatorOptions(seed=3)))
+    sensor = SensorHardware(**sensor_of(SimulatorOptions(seed=3)))
     assert sensor.reading(0.5) == Noise(3).add(swing().at(0.5), 0.5) != swing().at(0.5)
 
 
 def test_a_motion_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ValueError, match="motion 'dance': expected"):
-        sensor_parts(SimulatorOptions(motion="dance"))
+        sensor_of(SimulatorOptions(motion="dance"))
