@@ -18,8 +18,8 @@ from imud.cli.modbus_line import (
     scan,
 )
 from imud.cli.table import table
-from imud.devices.hipnuc.common.registers import BAUD_RATES, FACTORY_BAUD
 from imud.devices.hipnuc.modbus.frames import FACTORY_ID
+from imud.devices.hipnuc.modbus.registers import BAUD_RATES, FACTORY_BAUD
 from imud.errors import BadArgument
 from imud.formats.modbus import SLAVES
 

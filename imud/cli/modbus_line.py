@@ -9,9 +9,9 @@ import msgspec
 
 from imud.contracts.driver import Identity
 from imud.contracts.polling import Transfer, TransferScript, run_transfer_script
-from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings, probe
+from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings
 from imud.devices.hipnuc.modbus.frames import check_id, randomise_ids, serial_bytes, set_id_by_serial
-from imud.devices.hipnuc.modbus.session import save, set_id
+from imud.devices.hipnuc.modbus.session import probe, save, set_id
 from imud.errors import CommandError, DeviceRefused, TransferError
 from imud.formats.modbus import BROADCAST
 from imud.links.rs485.link import Rs485Link, Rs485Settings

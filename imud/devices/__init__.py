@@ -6,11 +6,11 @@ from imud.contracts.table import Table
 DRIVERS: Table[Driver] = Table(
     "driver",
     {
-        "hipnuc-uart": "imud.devices.hipnuc.uart.codec:DRIVER",
-        "hipnuc-modbus": "imud.devices.hipnuc.modbus.codec:DRIVER",
-        "hipnuc-canopen": "imud.devices.hipnuc.canopen.codec:DRIVER",
-        "hipnuc-j1939": "imud.devices.hipnuc.j1939.codec:DRIVER",
-        "hipnuc-nmea2000": "imud.devices.hipnuc.nmea2000.codec:DRIVER",
+        "hipnuc-uart": "imud.devices.hipnuc.uart.driver:DRIVER",
+        "hipnuc-modbus": "imud.devices.hipnuc.modbus.driver:DRIVER",
+        "hipnuc-canopen": "imud.devices.hipnuc.canopen.driver:DRIVER",
+        "hipnuc-j1939": "imud.devices.hipnuc.j1939.driver:DRIVER",
+        "hipnuc-nmea2000": "imud.devices.hipnuc.nmea2000.driver:DRIVER",
         "imu61x-uart": "imud.devices.imu61x.uart.driver:DRIVER",
         "imu61x-i2c": "imud.devices.imu61x.i2c.driver:DRIVER",
         "imu61x-spi": "imud.devices.imu61x.spi.driver:DRIVER",

@@ -8,7 +8,7 @@ SIMULATORS: Table[Simulator] = Table(
     "simulator",
     {
         "hipnuc-uart": "imud.sim.hipnuc.uart.simulator:SIMULATOR",
-        "hipnuc-modbus": "imud.sim.hipnuc.modbus.simulator:SIMULATOR",
+        "hipnuc-modbus": "imud.sim.hipnuc.modbus:SIMULATOR",
         "imu61x-uart": "imud.sim.imu61x.uart:SIMULATOR",
     },
 )
@@ -17,7 +17,7 @@ SIMULATORS: Table[Simulator] = Table(
 CAN_SIMULATORS: Table[CanSimulator] = Table(
     "simulator on CAN",
     {
-        "hipnuc-canopen": "imud.sim.hipnuc.canopen.simulator:SIMULATOR",
+        "hipnuc-canopen": "imud.sim.hipnuc.canopen:SIMULATOR",
         "hipnuc-j1939": "imud.sim.hipnuc.j1939:SIMULATOR",
         "hipnuc-nmea2000": "imud.sim.hipnuc.nmea2000:SIMULATOR",
         "imu61x-can": "imud.sim.imu61x.can:SIMULATOR",

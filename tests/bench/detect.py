@@ -11,8 +11,8 @@ from random import Random
 from statistics import quantiles
 
 from imud.contracts.driver import StreamDriver
-from imud.devices.hipnuc.uart.codec import DRIVER as HIPNUC
 from imud.devices.hipnuc.uart.codec import encode_hi91
+from imud.devices.hipnuc.uart.driver import DRIVER as HIPNUC
 from imud.devices.imu61x.uart.codec import encode_status
 from imud.devices.imu61x.uart.commands import ask_status
 from imud.devices.imu61x.uart.driver import DRIVER as IMU61X

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from imud.sim.control import StandardInputControl
-from imud.sim.hipnuc.modbus.simulator import ModbusLine, slaves_at
+from imud.sim.hipnuc.modbus import ModbusLine, slaves_at
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, sharpen_timers
 from imud.sim.simulator import SimulatorOptions

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
-from imud.sim.hipnuc.modbus.slave import SlaveSettings
+from imud.sim.hipnuc.modbus import SlaveSettings
 from tests.support.modbus_wire import BAUD, serial_of, slave, wired
 
 ON = ("--baud", str(BAUD), "--reply-ms", "30")

@@ -8,8 +8,7 @@ from imud.contracts.lines import DeviceLines, DividedSettings, InputSettings, Pp
 from imud.event import EventKind
 from imud.sample import Sample, Sync
 from imud.signals.sync_signals import ALARM_STATUS
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings, Output
+from imud.sim.hipnuc.uart.settings import AlarmSetting, HipnucHardware, ModuleSettings, Output
 from imud.sim.physics.motion import Still
 from imud.sim.ports.faults import FaultRates, Faults
 from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.ledger import Ledger
 from imud.sample import Measurement
 

@@ -9,8 +9,7 @@ from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenS
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.hipnuc.canopen.objects import NodeSettings
-from imud.sim.hipnuc.canopen.simulator import HipnucCanopenHardware, HipnucCanopenModule
+from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 
 T = TypeVar("T")
 

@@ -4,8 +4,7 @@ import struct
 from math import radians
 from typing import NamedTuple
 
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.physics.motion import Still
 from imud.sim.simulator import Burst

@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from imud.formats.modbus import SLAVES
-from imud.sim.hipnuc.modbus.simulator import ModbusLine
-from imud.sim.hipnuc.modbus.slave import Slave, SlaveSettings
+from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort
 from imud.units import NS_PER_S

@@ -17,8 +17,7 @@ from imud.runtime import utc_keeper
 from imud.runtime.detection.remembered import Remembered
 from imud.runtime.stream.runner import DeviceRunner
 from imud.sample import Sample
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import ModuleSettings
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.ports.faults import Faults
 from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput

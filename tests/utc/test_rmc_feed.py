@@ -5,12 +5,12 @@ from itertools import pairwise
 import pytest
 
 from imud.contracts.timing import UtcReference
-from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.errors import LinkError
 from imud.formats.rmc import as_gprmc, build, checksum
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
+from imud.sim.hipnuc.uart.settings import HipnucHardware
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.rmc_feed import Refusal, RmcFeed

@@ -2,9 +2,10 @@
 
 Without I/O and without a clock of its own. It samples at whole milliseconds of its own crystal, which runs `skew_ppm`
 fast; messages due in the same millisecond are of one instant and leave back to back, lowest PGN first, `processing_ns`
-later. Requests on PGN EF00 are obeyed at once and answered to 0x55, whoever asked. Assumed, where the manual is silent:
-an unknown register is not answered, a value out of range is answered with the value that stays, an interval applies
-from the next whole multiple of it, the zero concerns the inclinometer only, and the direction is turned after it.
+later. Requests on PGN EF00 are obeyed at once and answered to 0x55, whatever the sender. Assumed, where the manual is
+silent: an unknown register is not answered, a value out of range is answered with the value that stays, an interval
+applies from the next whole multiple of it, the zero concerns the inclinometer only, and the direction is turned after
+it.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,8 +18,8 @@ from imud.devices.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
 from imud.devices.hipnuc.j1939.session import LAYOUT, READ, WRITE
 from imud.formats.j1939 import J1939Id, join, split
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
-from imud.sim.physics.motion import MOTIONS, Motion, Truth, swing
-from imud.sim.physics.noise import Noise
+from imud.sim.physics.motion import Truth
+from imud.sim.sensor import SensorHardware, sensor_of
 from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -52,17 +53,12 @@ class J1939Settings:
     """Physical angles that read as zero."""
 
 
-@dataclass(frozen=True, slots=True)
-class J1939Hardware:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class J1939Hardware(SensorHardware):
     """What a module is made of."""
 
     bitrate: int | None = None
     """Of the bus in bit/s, 0 for frames that take no time; None for what it is set to."""
-    motion: Motion = field(default_factory=swing)
-    noise: Noise | None = None
-    skew_ppm: float = 20.0
-    boot_ms: int = 500
-    processing_ns: int = 125_000
     sends_heading_twice: bool = True
     """As newer firmware does."""
 
@@ -81,12 +77,12 @@ class HipnucJ1939Module:
         self.frames_sent = 0
         self.requests = 0
         self._leaving: list[SentFrame] = []
-        """Frames that were on their way when it was told to restart, the reply to that too."""
+        """Frames that were on their way when the restart was requested, the reply to that too."""
         self._ns_per_ms = NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6)
         self._power_on(now_ns)
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Take a frame that somebody else sent."""
+        """Receive a frame of another node."""
         parts = split(can_id)
         is_request = extended and parts.pgn == session.CONFIGURE and parts.destination == self._address
         if is_request and len(data) == LAYOUT.size and now_ns >= self._begin_ns:
@@ -98,7 +94,7 @@ class HipnucJ1939Module:
         """It has no sync input on this port."""
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back, or it was told to: what was not saved is gone."""
+        """Power was lost and came back, or a restart was requested: what was not saved is lost."""
         self.settings = self.flash
         self._power_on(now_ns)
 
@@ -149,9 +145,7 @@ class HipnucJ1939Module:
                 self._send(pgn, reading, sample_ns)
 
     def _reading(self, sample_ns: int) -> Truth:
-        t_s = (sample_ns - self.epoch_ns) / NS_PER_S
-        truth = self.hardware.motion.at(t_s)
-        return self.hardware.noise.add(truth, t_s) if self.hardware.noise else truth
+        return self.hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
 
     def _send(self, pgn: int, reading: Truth, sample_ns: int) -> None:
         can_id, data = encode(pgn, self._packed(pgn, reading, sample_ns), self._address)
@@ -175,7 +169,7 @@ class HipnucJ1939Module:
         return rows[pgn]()
 
     def _inclination(self, reading: Truth) -> tuple[float, float]:
-        """The angles that FF4A tells."""
+        """The angles that FF4A carries."""
         settings = self.settings
         (x, y), (zero_x, zero_y) = physical_inclination(reading), settings.zero_rad
         return _within_pi(x - zero_x) * (-1) ** settings.x_reversed, _within_pi(y - zero_y) * (
@@ -221,7 +215,7 @@ class HipnucJ1939Module:
             self._next_ms[pgn] = (int(device_ms) // value + 1) * value
         elif register == session.BITRATE and value < len(session.BITRATES):
             self.settings = replace(settings, bitrate_code=value)
-        elif register == session.ADDRESS and value in session.ADDRESSES:
+        elif register == session.ADDRESS and session.ADDRESS_MIN <= value <= session.ADDRESS_MAX:
             self.settings = replace(settings, address=value)
         elif register == session.X_SIGN and value in (0, 1):
             self.settings = replace(settings, x_reversed=value)
@@ -252,7 +246,7 @@ class HipnucJ1939Module:
 
 
 def physical_inclination(reading: Truth) -> tuple[float, float]:
-    """Tilt about the sensor's Y and X as a dual-axis inclinometer tells it: the vertical in the sensor frame."""
+    """Tilt about the sensor's Y and X as a dual-axis inclinometer shows it: the vertical in the sensor frame."""
     roll, pitch, _ = reading.euler_rad
     up_x, up_y, up_z = -cos(pitch) * sin(roll), sin(pitch), cos(pitch) * cos(roll)
     return atan2(-up_x, up_z), atan2(up_y, up_z)
@@ -269,10 +263,8 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {1000 // session.INTERVAL_MIN_MS}")
     if options.message not in MESSAGES:
         raise ValueError(f"message {options.message!r}: expected {' or '.join(filter(None, MESSAGES))}, or none")
-    if options.node and options.node not in session.ADDRESSES:
+    if options.node and not session.ADDRESS_MIN <= options.node <= session.ADDRESS_MAX:
         raise ValueError(f"node {options.node}: expected an address 1 … 128, or 0 for {FACTORY_ADDRESS}")
-    if options.motion not in MOTIONS:
-        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
     pgns = MESSAGES[options.message]
     settings = J1939Settings(
         intervals_ms={pgn: SLOW_MS - SLOW_MS % interval_ms if pgn in SLOW else interval_ms for pgn in pgns},
@@ -280,11 +272,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
     )
     hardware = J1939Hardware(
         bitrate=options.bitrate(BITRATE),
-        motion=MOTIONS[options.motion](options.gravity_m_s2),
-        noise=Noise(options.seed) if options.noise == "real" else None,
-        skew_ppm=options.skew_ppm,
-        boot_ms=options.boot_ms,
-        processing_ns=options.processing_ns,
+        **sensor_of(options),
     )
     return HipnucJ1939Module(now_ns, settings, hardware)
 

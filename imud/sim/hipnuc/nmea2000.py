@@ -11,7 +11,8 @@ from functools import partial
 from typing import Final
 
 from imud.devices.hipnuc.nmea2000 import messages
-from imud.devices.hipnuc.nmea2000.codec import EXAMPLE_SOURCE, encode
+from imud.devices.hipnuc.nmea2000.codec import encode
+from imud.devices.hipnuc.nmea2000.driver import EXAMPLE_SOURCE
 from imud.devices.hipnuc.nmea2000.messages import Reference
 from imud.formats.j1939 import ADDRESS_MAX
 from imud.sim.can_module import CanSimulator, PeriodicCanModule

@@ -18,14 +18,9 @@ from pymodbus.server import ModbusSerialServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from imud.contracts.polling import Vanished, run_transfer_script
-from imud.devices.hipnuc.modbus.codec import (
-    DRIVER,
-    READ_BLOCK,
-    READ_SHORT_BLOCK,
-    HipnucModbusCodec,
-    HipnucModbusSettings,
-    pack_identity,
-)
+from imud.devices.hipnuc.modbus.codec import READ_BLOCK, READ_SHORT_BLOCK, HipnucModbusCodec, HipnucModbusSettings
+from imud.devices.hipnuc.modbus.driver import DRIVER
+from imud.devices.hipnuc.modbus.frames import pack_identity
 from imud.devices.hipnuc.modbus.session import LineMounting, set_heading_mode, set_mounting
 from imud.devices.hipnuc.uart.commands import AttitudeMode
 from imud.ledger import Ledger

@@ -16,8 +16,7 @@ from imud.formats.can import RAW_FRAME, CanFrame
 from imud.links.memory import MemoryCanLink, MemorySettings
 from imud.runtime.can.runner import CanRunner
 from imud.runtime.detection import can as detection
-from imud.sim.hipnuc.canopen.objects import NodeSettings
-from imud.sim.hipnuc.canopen.simulator import HipnucCanopenHardware, HipnucCanopenModule
+from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.units import NS_PER_MS
 
 LIMIT_S = 10.0

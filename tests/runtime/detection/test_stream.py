@@ -6,7 +6,7 @@ from random import Random
 import pytest
 
 from imud.contracts.codec import CodecEvent
-from imud.devices.hipnuc.uart.codec import DRIVER as HIPNUC
+from imud.devices.hipnuc.uart.driver import DRIVER as HIPNUC
 from imud.ledger import Ledger
 from imud.runtime.detection import ASK_TRIES, QUIET_NS, GaveUp, Listen, Search, Step, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S

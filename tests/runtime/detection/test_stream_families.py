@@ -6,7 +6,7 @@ from random import Random
 import pytest
 
 from imud.contracts.driver import StreamDriver
-from imud.devices.hipnuc.uart.codec import DRIVER as HIPNUC
+from imud.devices.hipnuc.uart.driver import DRIVER as HIPNUC
 from imud.devices.imu61x.uart.codec import encode_acknowledgement, encode_status
 from imud.devices.imu61x.uart.commands import ask_status
 from imud.devices.imu61x.uart.driver import DRIVER as IMU61X

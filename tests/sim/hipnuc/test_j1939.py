@@ -231,9 +231,9 @@ def test_zero_and_directions_of_the_inclinometer() -> None:
 
     # X is the roll; Y = atan2(sin 20°, cos 20° · cos 10°) = atan2(0.342020, 0.925417) = 20.28°
     assert shown() == (10.0, 20.28)
-    bench.talk(lambda peer: session.set_direction(peer, session.Y_SIGN, True))
+    bench.talk(lambda peer: session.set_direction(peer, "Y", True))
     assert shown() == (10.0, -20.28)
-    bench.talk(lambda peer: session.set_direction(peer, session.X_SIGN, True))
+    bench.talk(lambda peer: session.set_direction(peer, "X", True))
     assert shown() == (-10.0, -20.28)
     bench.talk(lambda peer: session.zero(peer, session.Zero.HERE))
     assert shown() == (0.0, 0.0)

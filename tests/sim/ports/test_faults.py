@@ -4,7 +4,7 @@ from random import Random
 
 import pytest
 
-from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.ports.faults import Fault, FaultKind, FaultRates, Faults, rates_from

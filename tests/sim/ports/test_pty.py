@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalProfile
 from imud.sim.ports.faults import FaultRates, Faults

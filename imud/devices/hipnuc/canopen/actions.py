@@ -1,123 +1,126 @@
-"""What a HiPNUC module on CANopen can be told by name: every command of section 5.4 of the manual, and NMT."""
+"""Actions of a HiPNUC module on CANopen: every command of section 5.4 of the manual by name, and NMT.
+
+The parameters of each function describe the arguments of its action: type, range, unit and section of the manual.
+"""
 
 from collections.abc import Callable
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.contracts.action import Action, Actions
+from imud.contracts.action import Action, Actions, Target
 from imud.contracts.session import RequestScript
-from imud.contracts.settings import NoSettings, Settings
 from imud.devices.hipnuc.canopen import session
-from imud.devices.hipnuc.canopen.cob_ids import NODE_MAX, NmtCommand
-from imud.devices.hipnuc.canopen.session import InclinometerZero, Transmission
+from imud.devices.hipnuc.canopen.cia301 import NODE_MAX, NmtCommand, TpdoNumber
+from imud.devices.hipnuc.canopen.session import PERIOD_MAX_MS, BitRate, InclinometerZero, Transmission
 
-TpdoNumber = Literal[1, 2, 3, 4, 6, 7]
-
-
-class IntervalParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How often a TPDO is sent by its timer."""
-
-    tpdo: TpdoNumber
-    interval_ms: int
-    """5 … 1000; 0 for never."""
-
-
-class TransmissionParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a TPDO is sent by."""
-
-    tpdo: TpdoNumber
-    by: Literal["timer", "sync"]
-    """SYNC must be sent by something on the bus: `options.sync_hz` makes imud do it."""
-
-
-class BitrateParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A bit rate."""
-
-    bitrate: Literal[1_000_000, 500_000, 250_000, 125_000]
-    """Of the bus, bit/s."""
-
-
-class NodeParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The number of a node."""
-
-    node: Annotated[int, Meta(ge=1, le=NODE_MAX)]
-    """One that no other node of the bus has."""
-
-
-class ZeroParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the inclinometer reads zero."""
-
-    zero: Literal["here", "cancel"]
-
-
-class DirectionParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The signs of the inclinometer."""
-
-    x_reversed: bool
-    y_reversed: bool
-
-
-class NmtParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A command of the network management."""
-
-    command: Literal["start", "stop", "pre_operational", "reset_node", "reset_communication"]
-    """`stop` and `pre_operational` end the samples until `start`."""
-
+Tpdo = Annotated[TpdoNumber, Meta(extra={"section": "5.2"})]
+Reversed = Annotated[bool, Meta(extra={"section": "5.4.1"})]
 
 _ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL}
 _TRANSMISSIONS: Final = {"timer": Transmission.TIMER, "sync": Transmission.SYNC}
 
 
-def _action(
-    words: str, begin: Callable[[int, Any], RequestScript[object]], params: type[Settings] = NoSettings
-) -> Action:
-    return Action(words, lambda target, given: begin(target.settings.node, given), params)
+def _simple(words: str, begin: Callable[[int], RequestScript[None]]) -> Action:
+    """An action without arguments."""
+    return Action(words, lambda target: begin(target.settings.node))
+
+
+def _interval(
+    target: Target,
+    *,
+    tpdo: Tpdo,
+    interval_ms: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=PERIOD_MAX_MS,
+            description="time from one to the next, 5 or more; 0 for never",
+            extra={"unit": "ms", "section": "5.4.1"},
+        ),
+    ],
+) -> RequestScript[None]:
+    return session.set_tpdo_period(target.settings.node, tpdo, interval_ms)
+
+
+def _transmission(
+    target: Target,
+    *,
+    tpdo: Tpdo,
+    by: Annotated[
+        Literal["timer", "sync"],
+        Meta(
+            description="SYNC must be sent by something on the bus: `options.sync_hz` makes imud do it",
+            extra={"section": "5.4.2"},
+        ),
+    ],
+) -> RequestScript[None]:
+    return session.set_tpdo_type(target.settings.node, tpdo, _TRANSMISSIONS[by])
+
+
+def _bitrate(
+    target: Target,
+    *,
+    bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "5.4.1"})],
+) -> RequestScript[None]:
+    return session.set_bit_rate(target.settings.node, bitrate)
+
+
+def _node(
+    target: Target,
+    *,
+    node: Annotated[
+        int, Meta(ge=1, le=NODE_MAX, description="one that no other node of the bus has", extra={"section": "5.4.1"})
+    ],
+) -> RequestScript[None]:
+    return session.set_node_id(target.settings.node, node)
+
+
+def _zero(
+    target: Target, *, zero: Annotated[Literal["here", "cancel"], Meta(extra={"section": "5.4.1"})]
+) -> RequestScript[None]:
+    return session.set_inclinometer_zero(target.settings.node, _ZEROS[zero])
+
+
+def _direction(target: Target, *, x_reversed: Reversed, y_reversed: Reversed) -> RequestScript[None]:
+    return session.set_inclinometer_signs(target.settings.node, invert_x=x_reversed, invert_y=y_reversed)
+
+
+def _nmt(
+    target: Target,
+    *,
+    command: Annotated[
+        Literal["start", "stop", "pre_operational", "reset_node", "reset_communication"],
+        Meta(
+            description="`stop` and `pre_operational` end the samples until `start`",
+            extra={"section": "CiA 301, 7.2.8.2"},
+        ),
+    ],
+) -> RequestScript[bool]:
+    return session.nmt(target.settings.node, NmtCommand[command.upper()])
 
 
 ACTIONS: Final[Actions] = {
-    "save": _action("write all settings to flash", lambda node, _: session.save(node)),
-    "restart": _action("restart it; what was not saved is lost", lambda node, _: session.restart(node)),
-    "factory_reset": _action(
+    "save": _simple("write all settings to flash", session.save),
+    "restart": _simple("restart it; what was not saved is lost", session.restart),
+    "factory_reset": _simple(
         "factory settings, node 8 and 500 kbit/s included, when power comes back: imud then hears it only where bus "
         "and `options.node` are set to that",
-        lambda node, _: session.factory_reset(node),
+        session.factory_reset,
     ),
-    "interval": _action(
-        "how often a TPDO is sent by its timer; at once",
-        lambda node, given: session.set_tpdo_period(node, given.tpdo, given.interval_ms),
-        IntervalParams,
-    ),
-    "transmission": _action(
-        "send a TPDO by its timer, or when SYNC comes; at once",
-        lambda node, given: session.set_tpdo_type(node, given.tpdo, _TRANSMISSIONS[given.by]),
-        TransmissionParams,
-    ),
-    "bitrate": _action(
+    "interval": Action("how often a TPDO is sent by its timer; at once", _interval),
+    "transmission": Action("send a TPDO by its timer, or when SYNC comes; at once", _transmission),
+    "bitrate": Action(
         "set the bit rate, in force after `save` and `restart`: the node is off the bus then, and disturbs it, until "
         "interface and all other nodes have the same",
-        lambda node, given: session.set_bit_rate(node, given.bitrate),
-        BitrateParams,
+        _bitrate,
     ),
-    "node": _action(
+    "node": Action(
         "set its number, in force after `save` and `restart`: imud then hears nothing of it until `options.node` says "
         "the new one; with `driver: auto` it looks again after 15 s",
-        lambda node, given: session.set_node_id(node, given.node),
-        NodeParams,
+        _node,
     ),
-    "zero": _action(
-        "make the present position the inclinometer's zero, or cancel that; at once",
-        lambda node, given: session.set_inclinometer_zero(node, _ZEROS[given.zero]),
-        ZeroParams,
-    ),
-    "direction": _action(
-        "turn the signs of the inclinometer, or leave them as delivered; at once",
-        lambda node, given: session.set_inclinometer_signs(node, invert_x=given.x_reversed, invert_y=given.y_reversed),
-        DirectionParams,
-    ),
-    "nmt": _action(
-        "start or stop its TPDOs, or reset it; of a reset, whether its boot-up message came",
-        lambda node, given: session.nmt(node, NmtCommand[given.command.upper()]),
-        NmtParams,
-    ),
+    "zero": Action("make the present position the inclinometer's zero, or cancel that; at once", _zero),
+    "direction": Action("turn the signs of the inclinometer, or leave them as delivered; at once", _direction),
+    "nmt": Action("start or stop its TPDOs, or reset it; of a reset, whether its boot-up message came", _nmt),
 }

@@ -14,43 +14,35 @@ Standard frames, little-endian, one TPDO per quantity; identifier = function + n
 1 G is what the firmware divides by, 9.8 m/s², not standard gravity. None of them has a counter or a time: how they
 become samples is the rule of `assembly`. Each TPDO is sent by its own timer, or when SYNC (0x080) comes.
 
-Besides: the heartbeat (0x700), whose first is the boot-up message, is a reply when the state changed, or is not
-operational; SDO replies (0x580) are replies; emergencies (0x080 + node) are ignored.
+Other frames of a node: the heartbeat (0x700), whose first is the boot-up message, is a reply when the state changed, or
+is not operational; SDO replies (0x580) are replies; emergencies (0x080 + node) are ignored.
 """
 
 import struct
 from collections.abc import Mapping, Sequence
-from random import Random
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
 from imud.attitude import quat_from_euler312
-from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.contracts.driver import SAMPLE_COUNTER
 from imud.contracts.settings import Settings
-from imud.devices.hipnuc.canopen.actions import ACTIONS, TpdoNumber
-from imud.devices.hipnuc.canopen.cob_ids import (
+from imud.devices.hipnuc.canopen.cia301 import (
     EMERGENCY,
-    FUNCTION_MASK,
     HEARTBEAT,
     NODE_DEFAULT,
-    NODE_MASK,
     NODE_MAX,
+    SDO_BYTES,
     SDO_REPLY,
-    SYNC,
     TPDO_FUNCTIONS,
     NmtState,
+    TpdoNumber,
 )
-from imud.devices.hipnuc.canopen.sdo import SDO_BYTES
-from imud.devices.hipnuc.canopen.session import identify, read_settings
 from imud.devices.hipnuc.common.assembly import Assembly
-from imud.devices.hipnuc.common.packets import M_S2_PER_G
-from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
+from imud.devices.hipnuc.common.raw_units import M_S2_PER_G, QUAT_PER_LSB
 from imud.ledger import Ledger
 from imud.sample import Measurement, Pair, Quaternion, Vector3
-from imud.units import NS_PER_S, NS_PER_US, RAD_PER_DEG
+from imud.units import RAD_PER_DEG
 
 THREE: Final = struct.Struct("<3h")
 FOUR: Final = struct.Struct("<4h")
@@ -62,12 +54,9 @@ LAYOUTS: Final = {1: THREE, 2: THREE, 3: THREE, 4: FOUR, 6: ONE_LONG, 7: TWO_LON
 ACCEL_M_S2_PER_LSB: Final = 0.001 * M_S2_PER_G
 GYRO_RAD_S_PER_LSB: Final = 0.1 * RAD_PER_DEG
 EULER_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
-QUAT_PER_LSB: Final = 0.0001
 INCLI_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
 
 SYNC_HZ_MIN, SYNC_HZ_MAX = 0.01, 200.0
-US_PER_S: Final = NS_PER_S // NS_PER_US
-EULER_CONVENTION: Final = "312 (Z-X-Y): pitch about X, roll about Y, yaw about Z counter-clockwise from above"
 
 
 class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,7 +87,7 @@ class HipnucCanopenCodec:
         self._state = NmtState.OPERATIONAL.value
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Take one frame; return what it completed. Never raises for any frame."""
+        """Add one frame; return what it completed. Never raises for any frame."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         tpdo = self._tpdos.get(can_id)
@@ -109,16 +98,15 @@ class HipnucCanopenCodec:
             return self._bad_length(data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
-        frames = self._assembly.take(number, data, t_rx_ns)
+        frames = self._assembly.add_frame(number, data, t_rx_ns)
         return () if frames is None else (_measurement(dict(frames)),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The next frame tells what is lost; idle time adds nothing to that."""
-        self._assembly.flush()
+        """The bus is idle: no-op, since the next frame shows what is lost."""
         return ()
 
     def reset(self) -> None:
-        """Frames are missing here: what is held is given up."""
+        """Frames are missing here: drop the incomplete sample."""
         self._assembly.reset()
 
     def _other(self, can_id: int, extended: bool, data: bytes) -> Sequence[CodecEvent]:
@@ -138,7 +126,7 @@ class HipnucCanopenCodec:
         return ()
 
     def _is_news(self, state: int) -> bool:
-        """Take a heartbeat: whether the state changed, or is one in which the node sends no TPDOs."""
+        """Note a heartbeat; return whether the state changed, or is one in which the node sends no TPDOs."""
         changed = state != self._state
         self._state = state
         if state == NmtState.BOOT_UP.value:
@@ -211,54 +199,3 @@ def encode_tpdos(
         for number, (vector, factor) in values.items()
         if vector is not None
     }
-
-
-def _example_frames(random: Random) -> list[CanFrame]:
-    """TPDO1 … TPDO4 with random values."""
-    frames = encode_tpdos(
-        accel_m_s2=(random.gauss(0, 5), random.gauss(0, 5), random.gauss(0, 5)),
-        gyro_rad_s=(random.gauss(0, 2), random.gauss(0, 2), random.gauss(0, 2)),
-        euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
-        quat_wxyz=(random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)),
-    )
-    return [CanFrame(TPDO_FUNCTIONS[number] + NODE_DEFAULT, False, data, 0) for number, data in frames.items()]
-
-
-def _filters(settings: HipnucCanopenSettings) -> list[CanFilter]:
-    functions = (*TPDO_FUNCTIONS.values(), SDO_REPLY, HEARTBEAT, EMERGENCY)
-    return [CanFilter(function + settings.node, STANDARD_ID_MAX, False) for function in functions]
-
-
-_SIZES: Final = {function: LAYOUTS[number].size for number, function in TPDO_FUNCTIONS.items()}
-
-
-def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
-    """The sender of what has a TPDO's function and length."""
-    node = can_id & NODE_MASK
-    return node if node and not extended and _SIZES.get(can_id & FUNCTION_MASK) == len(data) else None
-
-
-def _cyclic(settings: HipnucCanopenSettings) -> list[CyclicFrame]:
-    return [CyclicFrame(SYNC, False, b"", round(US_PER_S / settings.sync_hz) * NS_PER_US)] if settings.sync_hz else []
-
-
-DRIVER: Final = CanDriver(
-    name="hipnuc-canopen",
-    title="HiPNUC CH0x0, CH10x, HI14 (CANopen)",
-    settings=HipnucCanopenSettings,
-    make_codec=HipnucCanopenCodec,
-    filters=_filters,
-    tick_ns=SAMPLE_COUNTER,
-    tick_modulus=2,
-    euler_convention=EULER_CONVENTION,
-    navigation_frame="ENU",
-    actions=ACTIONS,
-    node_of=_node_of,
-    node_settings=lambda node: HipnucCanopenSettings(node=node),
-    node_title=lambda node: f"node {node}",
-    identify=lambda settings: identify(settings.node),
-    read_settings=lambda settings: read_settings(settings.node),
-    sample_frames=4,
-    example_frames=_example_frames,
-    cyclic=_cyclic,
-)

@@ -1,31 +1,34 @@
-"""Conversations with a HiPNUC module over CANopen: who it is, how it is set, and every command of its manual.
+"""Request scripts of a HiPNUC module on CANopen: identity, settings, and every command of its manual.
 
 Manual "IMU配置手冊" V1.5.9, section 5.4; objects of CiA 301 where it names none. Settings last until power is off
 unless `save` follows. TPDO rate and type, inclinometer signs and zero apply at once; node number and bit rate need
-`save` and a restart. What is written is read back where the node lets it be read. All raise BadArgument, NoReply, and
-Aborted.
+`save` and a restart. What is written is read back where the node lets it be read. All raise NoReply and Aborted; ranges
+of arguments are those of the actions (`actions.py`), and what no range can express raises BadArgument here.
 """
 
 from collections.abc import Callable, Mapping
 from enum import Enum
-from typing import Final
+from typing import Final, Literal
 
 from imud.contracts.codec import Message, ReplyFrame
 from imud.contracts.driver import Identity
 from imud.contracts.session import Reply, Request, RequestScript, never
-from imud.devices.arguments import member, one_of
-from imud.devices.hipnuc.canopen import sdo
-from imud.devices.hipnuc.canopen.cob_ids import (
+from imud.devices.hipnuc.canopen.cia301 import (
+    FLASH_TIMEOUT_NS,
     HEARTBEAT,
     NMT,
-    NODE_MAX,
     SDO_REQUEST,
+    TIMEOUT_NS,
     TPDO_FUNCTIONS,
+    Aborted,
     NmtCommand,
     NmtState,
+    TpdoNumber,
+    read_object,
     state_name,
+    write_frame,
+    write_object,
 )
-from imud.devices.hipnuc.canopen.sdo import FLASH_TIMEOUT_NS, TIMEOUT_NS, Aborted
 from imud.errors import BadArgument, DeviceRefused
 from imud.formats.can import pack_frame
 from imud.units import NS_PER_MS, NS_PER_S
@@ -46,6 +49,7 @@ INCLI_SIGN_Y: Final = 0x209F
 NODE_ID: Final = 0x20A0
 INCLI_ZERO: Final = 0x20A5
 
+BitRate = Literal[1_000_000, 500_000, 250_000, 125_000]
 BIT_RATES: Final = {1_000_000: 0, 500_000: 2, 250_000: 3, 125_000: 4}
 """Codes of 0x209A by bit/s; 1 is not given."""
 PERIOD_MIN_MS, PERIOD_MAX_MS = 5, 1000
@@ -76,7 +80,7 @@ class InclinometerZero(Enum):
     """Back to the true angles."""
 
 
-# --- asking -----------------------------------------------------------------------------------------------------------
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def identify(node: int) -> RequestScript[Identity]:
@@ -110,7 +114,7 @@ def read_settings(node: int) -> RequestScript[Mapping[str, str]]:
 
 
 def _heartbeat_state(node: int) -> RequestScript[str]:
-    """The state that a node's heartbeat tells while it sends no TPDOs; empty for one that sends, or is not heard."""
+    """State in a node's heartbeat while it sends no TPDOs; empty for one that sends, or is not heard."""
     period = yield from _try_read(node, HEARTBEAT_TIME, 0)
     if period is None or not _number(period):
         return ""
@@ -124,81 +128,75 @@ def _heartbeat_state(node: int) -> RequestScript[str]:
 
 def set_node_id(node: int, new_node: int) -> RequestScript[None]:
     """Give the node another number, 1 … 127; in force after `save` and a restart."""
-    if isinstance(new_node, bool) or not isinstance(new_node, int) or not 1 <= new_node <= NODE_MAX:
-        raise BadArgument(f"node: expected 1 … {NODE_MAX}, got {new_node!r}")
     yield from _set(node, NODE_ID, 0, new_node, 4)
 
 
-def set_bit_rate(node: int, bit_s: int) -> RequestScript[None]:
+def set_bit_rate(node: int, bit_s: BitRate) -> RequestScript[None]:
     """Set the rate of the bus in bit/s; in force after `save` and a restart."""
-    yield from _set(node, BIT_RATE, 0, BIT_RATES[one_of("bit rate", bit_s, BIT_RATES)], 4)
+    yield from _set(node, BIT_RATE, 0, BIT_RATES[bit_s], 4)
 
 
-def set_tpdo_period(node: int, tpdo: int, period_ms: int) -> RequestScript[None]:
-    """Send a TPDO every 5 … 1000 ms by its timer, or never (0); at once."""
-    index = TPDO_OBJECTS[one_of("TPDO", tpdo, TPDO_OBJECTS)]
-    valid = isinstance(period_ms, int) and not isinstance(period_ms, bool)
-    if not valid or not (period_ms == 0 or PERIOD_MIN_MS <= period_ms <= PERIOD_MAX_MS):
-        raise BadArgument(f"period: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS} ms, got {period_ms!r}")
-    yield from _set(node, index, TPDO_TIMER, period_ms, 2)
+def set_tpdo_period(node: int, tpdo: TpdoNumber, period_ms: int) -> RequestScript[None]:
+    """Send a TPDO every 5 … 1000 ms by its timer, or never (0); at once. Raises BadArgument for 1 … 4."""
+    if 0 < period_ms < PERIOD_MIN_MS:
+        raise BadArgument(f"interval_ms: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS}, got {period_ms}")
+    yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TIMER, period_ms, 2)
 
 
-def set_tpdo_type(node: int, tpdo: int, transmission: Transmission) -> RequestScript[None]:
+def set_tpdo_type(node: int, tpdo: TpdoNumber, transmission: Transmission) -> RequestScript[None]:
     """Send a TPDO by its timer, or when SYNC comes; at once."""
-    index = TPDO_OBJECTS[one_of("TPDO", tpdo, TPDO_OBJECTS)]
-    yield from _set(node, index, TPDO_TYPE, member("transmission", transmission, Transmission).value, 1)
+    yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TYPE, transmission.value, 1)
 
 
 def set_inclinometer_signs(node: int, *, invert_x: bool, invert_y: bool) -> RequestScript[None]:
     """Turn the signs of the inclinometer around, or leave them as delivered; at once."""
-    yield from _set(node, INCLI_SIGN_X, 0, int(_flag("invert_x", invert_x)), 4)
-    yield from _set(node, INCLI_SIGN_Y, 0, int(_flag("invert_y", invert_y)), 4)
+    yield from _set(node, INCLI_SIGN_X, 0, int(invert_x), 4)
+    yield from _set(node, INCLI_SIGN_Y, 0, int(invert_y), 4)
 
 
 def set_inclinometer_zero(node: int, zero: InclinometerZero) -> RequestScript[None]:
     """Make the present position the inclinometer's zero, or cancel that; at once."""
-    yield from sdo.write(node, INCLI_ZERO, 0, member("zero", zero, InclinometerZero).value, 4)
+    yield from write_object(node, INCLI_ZERO, 0, zero.value, 4)
 
 
 def save(node: int) -> RequestScript[None]:
     """Write all settings to flash."""
-    yield from sdo.write(node, CONTROL, 0, SAVE, 4, timeout_ns=FLASH_TIMEOUT_NS)
+    yield from write_object(node, CONTROL, 0, SAVE, 4, timeout_ns=FLASH_TIMEOUT_NS)
 
 
 def factory_reset(node: int) -> RequestScript[None]:
-    """Everything as delivered, node number and bit rate included; in force when power comes back."""
-    yield from sdo.write(node, CONTROL, 0, FACTORY_RESET, 4, timeout_ns=FLASH_TIMEOUT_NS)
+    """Everything as delivered, node number and bit rate included; in force after the next power-on."""
+    yield from write_object(node, CONTROL, 0, FACTORY_RESET, 4, timeout_ns=FLASH_TIMEOUT_NS)
 
 
 def restart(node: int) -> RequestScript[None]:
     """Restart, as by power-on. Whether it is confirmed is not stated, so no reply is waited for."""
-    frame = sdo.write_frame(CONTROL, 0, RESTART.to_bytes(4, "little"))
+    frame = write_frame(CONTROL, 0, RESTART.to_bytes(4, "little"))
     payload = pack_frame(SDO_REQUEST + node, False, frame)
     yield Request(payload, f"node {node}, restart", never, never, never, silent=True)
 
 
 def nmt(node: int, command: NmtCommand) -> RequestScript[bool]:
-    """Give a node an NMT command, which it never confirms; for a reset, whether its boot-up message came."""
-    code = member("command", command, NmtCommand).value
+    """Send an NMT command, which no node confirms; for a reset, return whether the boot-up message came."""
     resets = command in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
     ends = _is_heartbeat(node, NmtState.BOOT_UP) if resets else never
-    payload = pack_frame(NMT, False, bytes([code, node]))
+    payload = pack_frame(NMT, False, bytes([command.value, node]))
     outcome = yield Request(payload, f"node {node}, NMT {command.name}", ends, never, never, BOOT_NS, silent=not resets)
     return resets and isinstance(outcome, Reply)
 
 
 def _set(node: int, index: int, sub: int, value: int, size: int) -> RequestScript[None]:
     """Write, and read back where that is possible. Raises DeviceRefused where something else stands there then."""
-    yield from sdo.write(node, index, sub, value, size)
+    yield from write_object(node, index, sub, value, size)
     found = yield from _try_read(node, index, sub)
     if found is not None and _number(found) != value:
         raise DeviceRefused(f"node {node}: expected 0x{index:04X}.{sub} = {value}, reads back {_number(found)}")
 
 
 def _try_read(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
-    """An object's bytes; None where the node has none, or does not give it here. Raises NoReply."""
+    """Bytes of an object; None where the node has none, or refuses to read it. Raises NoReply."""
     try:
-        return (yield from sdo.read(node, index, sub))
+        return (yield from read_object(node, index, sub))
     except Aborted:
         return None
 
@@ -207,14 +205,8 @@ def _number(value: bytes) -> int:
     return int.from_bytes(value, "little")
 
 
-def _flag(name: str, value: bool) -> bool:
-    if not isinstance(value, bool):
-        raise BadArgument(f"{name}: expected true or false, got {value!r}")
-    return value
-
-
 def _is_heartbeat(node: int, state: NmtState | None = None) -> Callable[[Message], bool]:
-    """What holds for a heartbeat of a node, of one state if that is given."""
+    """A test for heartbeats of a node, of one state if that is given."""
     can_id = HEARTBEAT + node
 
     def holds(message: Message) -> bool:

@@ -11,31 +11,30 @@ never mixed.** The rule:
   due in this burst: the fast ones, and those of which the last came m bursts ago (or 2 m, 3 m … where one was lost).
 - It ends when a kind comes that is already held (but an exact repetition right after itself is ignored), or a fast one
   that stands before the newest one held, or any frame later than 3/4 of a period after the first, or when frames are
-  known to be missing (`reset`). Then it is given up, as one lost sample; or, if all it lacks is slower kinds, it is a
+  known to be missing (`reset`). Then it is dropped, as one lost sample; or, if all it lacks is slower kinds, it is a
   sample without them (but not after `reset`, nor for a device with one fast kind, whose next sample is whole already).
-- A frame that does not begin a burst while nothing is held is ignored: what it belongs to is whole, or given up, or
+- A frame that does not begin a burst while nothing is held is ignored: what it belongs to is whole, or dropped, or
   has lost its beginning. A slower kind that is not due is ignored, and shows that its m has to be learned anew.
-- Bursts of which nothing came are told by time (`cadence`): a gap up to 1 s is loss. How a host or a sender that
-  stalls between two bursts lets them come later, back to back, costs nothing.
+- Bursts of which nothing came are counted by time (`burst_timing`): a gap up to 1 s is loss. A host or a sender that
+  stalls between two bursts, which then come later and back to back, costs nothing.
 - A kind that stays away for ten of its periods is taken as switched off; another one that comes, joins. When nothing
   fits any more, everything is learned again.
 
 A kind whose period is no whole multiple of the fastest one's has no place in this and stays ignored. What time alone
-can tell (the end of one burst and the beginning of the next are lost, unknown to the host) needs times of arrival that
+can show (the end of one burst and the beginning of the next are lost, unknown to the host) needs times of arrival that
 are right to 1/4 of a period; those of the kernel are.
 """
 
 from collections.abc import Container, Sequence
 from typing import Final
 
-from imud.devices.hipnuc.common.burst_learning import BurstLearning, Learned
-from imud.devices.hipnuc.common.cadence import Cadence
+from imud.devices.hipnuc.common.burst_timing import BurstLearning, Cadence, Learned
 from imud.ledger import Ledger
 
 AWAY_PERIODS: Final = 10
 """Of a kind, until it is taken as switched off."""
-GIVEN_UP_MAX: Final = 16
-"""Samples given up in a row, until everything is learned again."""
+DROPPED_MAX: Final = 16
+"""Samples dropped in a row, until everything is learned again."""
 STRAYS_MAX: Final = 40
 STRAY_WEIGHT: Final = 2
 """Frames without a place in a burst, twice their number less that of whole samples, until everything is learned again:
@@ -68,7 +67,7 @@ class _Kind:
         return self.every > 0 and since > 0 and since % self.every == 0
 
     def learn(self, since: int) -> bool:
-        """Take the step to one more frame; whether that changed `every`."""
+        """Learn from the step to one more frame; return whether that changed `every`."""
         self.run = self.run + 1 if since == self.step else 1
         self.step = since
         every = self.every
@@ -110,7 +109,7 @@ class Assembly:
         self._first_ns = self._newest_ns = 0
         self._is_whole = False
         """Whether the newest burst became a sample, and nothing came since that has no place."""
-        self._given_up = self._strays = 0
+        self._dropped = self._strays = 0
         self._cadence = Cadence(0, 0)
         self._learning: BurstLearning | None = BurstLearning()
 
@@ -119,8 +118,8 @@ class Assembly:
         """Between two samples; 0 while unknown."""
         return self._cadence.period_ns if self._learning is None else 0
 
-    def take(self, kind: int, data: bytes, t_rx_ns: int) -> Sequence[tuple[int, bytes]] | None:
-        """Take one frame; returns the frames of a sample, in the order they came, when it makes one whole."""
+    def add_frame(self, kind: int, data: bytes, t_rx_ns: int) -> Sequence[tuple[int, bytes]] | None:
+        """Add one frame; return the frames of a sample, in the order they came, when it makes one whole."""
         known = self._kinds.get(kind)
         if self._learning is not None or known is None:
             self._ledger.frames_ignored += 1
@@ -142,13 +141,10 @@ class Assembly:
         self._ledger.frames_pending += 1
         return self._close() if self._due <= held.keys() else done
 
-    def flush(self) -> None:
-        """The bus is idle; what is held is given up by the next frame, since none can come too soon after this."""
-
     def reset(self) -> None:
-        """Frames are missing here: what is held is given up, and what comes until a burst begins is ignored."""
+        """Drop the incomplete sample, since frames are missing here; those until the next burst begins are ignored."""
         if self._held:
-            self._give_up()
+            self._drop_sample()
         self._is_whole = False
 
     def _fits(self, kind: _Kind, t_rx_ns: int) -> bool:
@@ -200,7 +196,7 @@ class Assembly:
         ledger.frames_pending -= len(frames)
         ledger.frames_in_samples += len(frames)
         self._is_whole = True
-        self._given_up = 0
+        self._dropped = 0
         if self._strays:
             self._strays -= 1
         return frames
@@ -211,7 +207,7 @@ class Assembly:
         """Whether a frame of a slower kind has a place in the present burst, or begins the next one."""
         begins = not self._held and self._place[kind.number] < self._place[self._head]
         if not self._held and ((not begins and not self._is_whole) or kind.number == self._newest):
-            return False  # of a burst without beginning, nobody knows of which one; or a repetition
+            return False  # of an unknown burst, whose beginning is lost; or a repetition
         since = self._burst + begins - kind.seen
         is_due = kind.is_due(since)
         in_order = not self._held or self._place[kind.number] > self._place[self._newest]
@@ -233,7 +229,7 @@ class Assembly:
         if self._allowed is not None and kind not in self._allowed:
             return
         if self._learning is not None:
-            learned = self._learning.take(kind, t_rx_ns)
+            learned = self._learning.add_frame(kind, t_rx_ns)
             if learned is not None:
                 self._learn(learned, t_rx_ns)
         elif self._held or self._is_whole:
@@ -264,7 +260,7 @@ class Assembly:
         """The rest of what is held does not come."""
         frames = self._close() if len(self._fast) > 1 and self._fast <= self._held.keys() else None
         if frames is None:
-            self._give_up()
+            self._drop_sample()
         self._is_whole = False
         away = [kind for kind in self._kinds.values() if self._is_away(kind)]
         for kind in away:
@@ -273,13 +269,13 @@ class Assembly:
             self._plan()
         return frames
 
-    def _give_up(self) -> None:
+    def _drop_sample(self) -> None:
         """The sample that was begun stays incomplete."""
         self._drop()
         self._ledger.lost_gap_device += 1
         self._is_whole = False
-        self._given_up += 1
-        if self._given_up >= GIVEN_UP_MAX:
+        self._dropped += 1
+        if self._dropped >= DROPPED_MAX:
             self._relearn()
 
     def _drop(self) -> None:
@@ -302,7 +298,7 @@ class Assembly:
         self._drop()
         self._kinds = {}
         self._is_whole = False
-        self._given_up = self._strays = 0
+        self._dropped = self._strays = 0
         self._learning = BurstLearning()
 
     def _learn(self, learned: Learned, t_rx_ns: int) -> None:

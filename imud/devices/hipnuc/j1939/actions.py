@@ -1,104 +1,104 @@
-"""What a HiPNUC module on J1939 can be told by name: every row of the manual's section 6.2.2, and the one-shot."""
+"""Actions of a HiPNUC module on J1939: every row of the manual's table 6.2.2 by name, and a message sent once.
+
+The parameters of each function describe the arguments of its action: type, range, unit and section of the manual.
+"""
 
 from collections.abc import Callable
-from typing import Any, Final, Literal
+from typing import Annotated, Final, Literal
 
-from imud.contracts.action import Action, Actions
+from msgspec import Meta
+
+from imud.contracts.action import Action, Actions, Target
 from imud.contracts.session import RequestScript
-from imud.contracts.settings import NoSettings, Settings
 from imud.devices.hipnuc.j1939 import session
-from imud.devices.hipnuc.j1939.session import J1939Node, Zero
+from imud.devices.hipnuc.j1939.messages import PgnName
+from imud.devices.hipnuc.j1939.session import (
+    ADDRESS_MAX,
+    ADDRESS_MIN,
+    INTERVAL_MAX_MS,
+    INTERVAL_MIN_MS,
+    BitRate,
+    J1939Node,
+    Zero,
+)
 
-MeasuredName = Literal["FF34", "FF37", "FF3A", "FF3D", "FF41", "FF43", "FF46", "FF4A"]
-"""A message that samples are made of, by the last four digits of its number."""
-PgnName = MeasuredName | Literal["FF2F"]
-"""Any message."""
-
-
-class IntervalParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How often a message is sent."""
-
-    pgn: PgnName
-    """The last four digits of its number."""
-    interval_ms: int
-    """5 … 1000."""
+Pgn = Annotated[PgnName, Meta(description="the last four digits of its number", extra={"section": "6.1"})]
 
 
-class PgnParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A message."""
-
-    pgn: PgnName
-
-
-class BitrateParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A bit rate."""
-
-    bitrate: int
-    """1000000, 800000, 500000, 250000 or 125000 bit/s."""
+def _simple(words: str, begin: Callable[[J1939Node], RequestScript[None]]) -> Action:
+    """An action without arguments."""
+    return Action(words, lambda target: begin(target.settings.peer))
 
 
-class AddressParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An address."""
-
-    address: int
-    """1 … 128, one that no other module of the bus has."""
-
-
-class ZeroParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the angles are zero."""
-
-    zero: Literal["here", "cancel"]
+def _interval(
+    target: Target,
+    *,
+    pgn: Pgn,
+    interval_ms: Annotated[int, Meta(ge=INTERVAL_MIN_MS, le=INTERVAL_MAX_MS, extra={"unit": "ms", "section": "6.2.2"})],
+) -> RequestScript[None]:
+    return session.set_interval(target.settings.peer, int(pgn, 16), interval_ms)
 
 
-class DirectionParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The sign of an angle."""
-
-    axis: Literal["X", "Y"]
-    reversed: bool
+def _send_once(target: Target, *, pgn: Pgn) -> RequestScript[None]:
+    return session.send_once(target.settings.peer, int(pgn, 16))
 
 
-def _action(
-    words: str, begin: Callable[[J1939Node, Any], RequestScript[None]], params: type[Settings] = NoSettings
-) -> Action:
-    return Action(words, lambda target, given: begin(target.settings.peer, given), params)
+def _bitrate(
+    target: Target,
+    *,
+    bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "6.2.2"})],
+) -> RequestScript[None]:
+    return session.set_bitrate(target.settings.peer, bitrate)
 
 
-def _direction(peer: J1939Node, params: DirectionParams) -> RequestScript[None]:
-    return session.set_direction(peer, session.X_SIGN if params.axis == "X" else session.Y_SIGN, params.reversed)
+def _address(
+    target: Target,
+    *,
+    address: Annotated[
+        int,
+        Meta(
+            ge=ADDRESS_MIN,
+            le=ADDRESS_MAX,
+            description="one that no other module of the bus has",
+            extra={"section": "6.2.2"},
+        ),
+    ],
+) -> RequestScript[None]:
+    return session.set_address(target.settings.peer, address)
+
+
+def _zero(
+    target: Target, *, zero: Annotated[Literal["here", "cancel"], Meta(extra={"section": "6.2.2"})]
+) -> RequestScript[None]:
+    return session.zero(target.settings.peer, Zero[zero.upper()])
+
+
+def _direction(
+    target: Target, *, axis: Annotated[Literal["X", "Y"], Meta(extra={"section": "6.2.2"})], reversed: bool
+) -> RequestScript[None]:
+    return session.set_direction(target.settings.peer, axis, reversed)
 
 
 ACTIONS: Final[Actions] = {
-    "save": _action("write all settings to flash", lambda peer, _: session.save(peer)),
-    "restart": _action("restart it; what was not saved is lost", lambda peer, _: session.restart(peer)),
-    "factory_reset": _action(
+    "save": _simple("write all settings to flash", session.save),
+    "restart": _simple("restart it; what was not saved is lost", session.restart),
+    "factory_reset": _simple(
         "factory settings, address 8 and its bit rate included: imud then hears it only where bus and "
         "`options.address` are set to that",
-        lambda peer, _: session.factory_reset(peer),
+        session.factory_reset,
     ),
-    "interval": _action(
-        "how often a message is sent",
-        lambda peer, p: session.set_interval(peer, int(p.pgn, 16), p.interval_ms),
-        IntervalParams,
-    ),
-    "send_once": _action(
-        "send a message once, now", lambda peer, p: session.send_once(peer, int(p.pgn, 16)), PgnParams
-    ),
-    "bitrate": _action(
+    "interval": Action("how often a message is sent", _interval),
+    "send_once": Action("send a message once, now", _send_once),
+    "bitrate": Action(
         "set the bit rate, in force after `save` and `restart`: the module is off the bus then, and disturbs it, until "
         "interface and all others have the same",
-        lambda peer, p: session.set_bitrate(peer, p.bitrate),
-        BitrateParams,
+        _bitrate,
     ),
-    "address": _action(
+    "address": Action(
         "set its address, in force after `save` and `restart`: imud then hears nothing of it until `options.address` "
         "says the new one; with `driver: auto` it looks again after 15 s",
-        lambda peer, p: session.set_address(peer, p.address),
-        AddressParams,
+        _address,
     ),
-    "zero": _action(
-        "make the present position zero, or cancel that",
-        lambda peer, p: session.zero(peer, Zero[p.zero.upper()]),
-        ZeroParams,
-    ),
-    "direction": _action("turn the sign of an angle", _direction, DirectionParams),
+    "zero": Action("make the present position zero, or cancel that", _zero),
+    "direction": Action("turn the sign of an angle", _direction),
 }

@@ -3,32 +3,26 @@
     0CFF3408   priority 3 | PGN FF34 | source 08, the module's address     eight bytes, see `j1939_messages.py`
     0CEF5508   a reply to imud, see `j1939_session.py`
 
-Several modules share a bus, told apart by their addresses; priority means nothing on reception. A module sends each PGN
+Several modules share a bus and have different addresses; priority means nothing on reception. A module sends each PGN
 that is switched on at its own interval, with neither counter nor time: `assembly.py` makes samples of them.
 
-FF2F (UTC) is taken and comes to nothing. It is a calendar time which jumps when the module's receiver finds out what
+FF2F (UTC) is accepted and ignored. It is a calendar time which jumps when the module's receiver finds out what
 time it is, it has an interval of its own, and no source says of which instant it is: no device time for a sample.
 """
 
 from collections.abc import Sequence
-from random import Random
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.attitude import euler312_from_quat, quat_normalized
-from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.contracts.driver import SAMPLE_COUNTER
 from imud.contracts.settings import Settings
 from imud.devices.hipnuc.common.assembly import Assembly
-from imud.devices.hipnuc.j1939 import messages, session
-from imud.devices.hipnuc.j1939.actions import ACTIONS, MeasuredName
-from imud.devices.hipnuc.j1939.session import CONFIGURE, HOST_ADDRESS, J1939Node
-from imud.formats.can import CanFilter, CanFrame
-from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
+from imud.devices.hipnuc.j1939 import messages
+from imud.devices.hipnuc.j1939.messages import MeasuredName
+from imud.devices.hipnuc.j1939.session import HOST_ADDRESS, J1939Node
+from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join
 from imud.ledger import Ledger
-from imud.sample import Vector3
 
 FACTORY_ADDRESS: Final = 8
 Address = Annotated[int, Meta(ge=0, le=ADDRESS_MAX)]
@@ -67,7 +61,7 @@ class HipnucJ1939Codec:
         self._assembly = Assembly(ledger)
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Take one frame; return what it completed. Never raises for any frame."""
+        """Add one frame; return what it completed. Never raises for any frame."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         key = can_id & WITHOUT_PRIORITY
@@ -87,16 +81,15 @@ class HipnucJ1939Codec:
         if pgn == messages.UTC:
             ledger.frames_ignored += 1
             return ()
-        whole = self._assembly.take(pgn, data, t_rx_ns)
+        whole = self._assembly.add_frame(pgn, data, t_rx_ns)
         return () if whole is None else (messages.measurement_of(whole),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The bus is idle: the next frame begins a sample."""
-        self._assembly.flush()
+        """The bus is idle: no-op, since the next frame shows what is lost."""
         return ()
 
     def reset(self) -> None:
-        """Frames are missing here: what is held is given up."""
+        """Frames are missing here: drop the incomplete sample."""
         self._assembly.reset()
 
 
@@ -106,54 +99,3 @@ class HipnucJ1939Codec:
 def encode(pgn: int, data: bytes, address: int = FACTORY_ADDRESS) -> tuple[int, bytes]:
     """A message as (identifier, data)."""
     return join(J1939Id(messages.PRIORITY, pgn, address)), data
-
-
-def _example_frames(random: Random) -> list[CanFrame]:
-    """A sample of the four PGNs that every module sends, with random values."""
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
-    roll, pitch, yaw = euler312_from_quat(quat)
-
-    def three(spread: float) -> Vector3:
-        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
-
-    made = (
-        encode(messages.ACCEL, messages.pack_accel(three(9.8))),
-        encode(messages.GYRO, messages.pack_gyro(three(2))),
-        encode(messages.ROLL_PITCH, messages.pack_roll_pitch(roll, pitch)),
-        encode(messages.HEADING, messages.pack_heading(yaw)),
-    )
-    return [CanFrame(can_id, True, data, 0) for can_id, data in made]
-
-
-def _filters(settings: HipnucJ1939Settings) -> list[CanFilter]:
-    """The messages of one module, and its replies."""
-    wanted = [filter_of(pgn, settings.address) for pgn in (messages.UTC, *settings.measured())]
-    hosts = sorted({settings.host_address, HOST_ADDRESS})
-    return wanted + [filter_of(CONFIGURE, settings.address, host) for host in hosts]
-
-
-def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
-    """The sender of a message that samples are made of."""
-    return sender_of(can_id, extended, data, messages.MEASURED)
-
-
-DRIVER: Final = CanDriver(
-    name="hipnuc-j1939",
-    title="HiPNUC CH0x0, CH10x, HI14 (CAN, SAE J1939)",
-    settings=HipnucJ1939Settings,
-    make_codec=HipnucJ1939Codec,
-    filters=_filters,
-    tick_ns=SAMPLE_COUNTER,
-    tick_modulus=2,
-    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above; "
-    "NaN for an angle that the module does not send",
-    navigation_frame="ENU",
-    actions=ACTIONS,
-    node_of=_node_of,
-    node_settings=lambda address: HipnucJ1939Settings(address=address),
-    node_title=lambda address: f"address {address}",
-    identify=lambda settings: session.identify(settings.peer),
-    read_settings=lambda settings: session.read_settings(settings.peer),
-    sample_frames=4,
-    example_frames=_example_frames,
-)

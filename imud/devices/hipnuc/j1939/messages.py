@@ -24,21 +24,25 @@ Angles stay together in a sample as they are known: where one is absent it is Na
 import struct
 from collections.abc import Callable, Sequence
 from math import hypot, isfinite, nan
-from typing import Final
+from typing import Final, Literal
 
 from imud.attitude import quat_from_euler312
-from imud.devices.hipnuc.common.counts import counts_of
-from imud.devices.hipnuc.common.packets import QUAT_PER_LSB
-from imud.devices.hipnuc.common.registers import (
+from imud.devices.hipnuc.common.raw_units import (
     ACCEL_M_S2_PER_LSB,
     EULER_RAD_PER_LSB,
     GYRO_RAD_S_PER_LSB,
     MAG_T_PER_LSB,
     PRESSURE_PA_PER_LSB,
+    QUAT_PER_LSB,
     TEMPERATURE_C_PER_LSB,
+    counts_of,
 )
 from imud.sample import Measurement, Quaternion, Vector3
 
+MeasuredName = Literal["FF34", "FF37", "FF3A", "FF3D", "FF41", "FF43", "FF46", "FF4A"]
+"""A message that samples are made of, by the last four digits of its number."""
+PgnName = MeasuredName | Literal["FF2F"]
+"""Any message."""
 ACCEL, GYRO, ROLL_PITCH, HEADING, INCLINOMETER = 0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A
 MAG, TEMPERATURE, QUATERNION, UTC = 0xFF3A, 0xFF43, 0xFF46, 0xFF2F
 PGNS: Final = (UTC, ACCEL, GYRO, MAG, ROLL_PITCH, HEADING, TEMPERATURE, QUATERNION, INCLINOMETER)
@@ -73,7 +77,7 @@ def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
     """One sample out of messages of eight bytes (PGN, data) of one instant, each PGN at most once."""
     parts = _Parts()
     for pgn, data in messages:
-        _TAKE[pgn](parts, data)
+        _DECODE[pgn](parts, data)
     euler, quat = parts.euler, parts.quat
     if quat is None and euler is not None and isfinite(sum(euler)):
         quat = quat_from_euler312(euler)
@@ -84,7 +88,7 @@ def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
 
 
 class _Parts:
-    """What the messages of a sample say."""
+    """Values of the messages of one sample."""
 
     __slots__ = ("accel", "gyro", "incli", "mag", "pitch", "pressure_pa", "quat", "roll", "temperature_c", "yaw")
 
@@ -104,32 +108,32 @@ class _Parts:
         roll, pitch, yaw = self.roll, self.pitch, self.yaw
         return (roll, pitch, yaw) if roll == roll or pitch == pitch or yaw == yaw else None  # noqa: PLR0124 - no NaN
 
-    def take_accel(self, data: bytes) -> None:
+    def decode_accel(self, data: bytes) -> None:
         if data != _NOTHING:
             self.accel = _vector(data, ACCEL_M_S2_PER_LSB)
 
-    def take_gyro(self, data: bytes) -> None:
+    def decode_gyro(self, data: bytes) -> None:
         self.gyro = _vector(data, GYRO_RAD_S_PER_LSB)
 
-    def take_mag(self, data: bytes) -> None:
+    def decode_mag(self, data: bytes) -> None:
         if data != _NOTHING and data[:6] != _ZERO_VECTOR:
             self.mag = _vector(data, MAG_T_PER_LSB)
 
-    def take_roll_pitch(self, data: bytes) -> None:
+    def decode_roll_pitch(self, data: bytes) -> None:
         roll, pitch = TWO_ANGLES.unpack(data)
         self.roll, self.pitch = _angle(roll), _angle(pitch)
 
-    def take_heading(self, data: bytes) -> None:
+    def decode_heading(self, data: bytes) -> None:
         clockwise, _ = HEADING_LAYOUT.unpack(data)
         if clockwise <= TURN:
             self.yaw = (-clockwise if clockwise <= HALF_TURN else TURN - clockwise) * EULER_RAD_PER_LSB
 
-    def take_inclinometer(self, data: bytes) -> None:
+    def decode_inclinometer(self, data: bytes) -> None:
         x, y = (_angle(counts) for counts in TWO_ANGLES.unpack(data))
         if isfinite(x) or isfinite(y):
             self.incli = x, y
 
-    def take_temperature(self, data: bytes) -> None:
+    def decode_temperature(self, data: bytes) -> None:
         celsius, _, pressure = TEMPERATURE_LAYOUT.unpack(data)
         celsius, pressure = celsius * TEMPERATURE_C_PER_LSB, pressure * PRESSURE_PA_PER_LSB
         if abs(celsius) <= TEMPERATURE_MOST_C and (celsius or pressure) and data != _NOTHING:
@@ -137,22 +141,22 @@ class _Parts:
         if 0 < pressure <= PRESSURE_MOST_PA:
             self.pressure_pa = pressure
 
-    def take_quaternion(self, data: bytes) -> None:
+    def decode_quaternion(self, data: bytes) -> None:
         w, x, y, z = QUATERNION_LAYOUT.unpack(data)
         k = QUAT_PER_LSB
         if abs(hypot(w, x, y, z) * k - 1) <= UNIT_TOLERANCE:
             self.quat = w * k, x * k, y * k, z * k
 
 
-_TAKE: Final[dict[int, Callable[[_Parts, bytes], None]]] = {
-    ACCEL: _Parts.take_accel,
-    GYRO: _Parts.take_gyro,
-    MAG: _Parts.take_mag,
-    ROLL_PITCH: _Parts.take_roll_pitch,
-    HEADING: _Parts.take_heading,
-    TEMPERATURE: _Parts.take_temperature,
-    QUATERNION: _Parts.take_quaternion,
-    INCLINOMETER: _Parts.take_inclinometer,
+_DECODE: Final[dict[int, Callable[[_Parts, bytes], None]]] = {
+    ACCEL: _Parts.decode_accel,
+    GYRO: _Parts.decode_gyro,
+    MAG: _Parts.decode_mag,
+    ROLL_PITCH: _Parts.decode_roll_pitch,
+    HEADING: _Parts.decode_heading,
+    TEMPERATURE: _Parts.decode_temperature,
+    QUATERNION: _Parts.decode_quaternion,
+    INCLINOMETER: _Parts.decode_inclinometer,
 }
 
 

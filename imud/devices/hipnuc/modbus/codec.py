@@ -17,70 +17,55 @@ together with a pressure of zero, are sensors that the product does not have.
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import atan2, cos, hypot, radians, sin
-from random import Random
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.codec import BadFrame, BadReason
-from imud.contracts.driver import Identity
-from imud.contracts.polling import Poll, PolledDriver, PolledEvent, TransferScript, Vanished
+from imud.contracts.polling import Poll, PolledEvent, Vanished
 from imud.contracts.settings import Settings
-from imud.devices.hipnuc.common.counts import counts_of
-from imud.devices.hipnuc.common.registers import (
+from imud.devices.hipnuc.common.raw_units import (
     ACCEL_M_S2_PER_LSB,
-    BAUD_RATES,
+    EULER_RAD_PER_LSB,
+    GYRO_RAD_S_PER_LSB,
+    MAG_T_PER_LSB,
+    PRESSURE_PA_PER_LSB,
+    QUAT_PER_LSB,
+    TEMPERATURE_C_PER_LSB,
+    counts_of,
+)
+from imud.devices.hipnuc.modbus.frames import (
+    read_registers,
+)
+from imud.devices.hipnuc.modbus.registers import (
     BLOCK_FIRST,
     BLOCK_REGISTERS,
     BY_NAME,
-    EULER_RAD_PER_LSB,
-    GYRO_RAD_S_PER_LSB,
-    IDENTITY_FIRST,
-    IDENTITY_REGISTERS,
     INCLI_DUAL_RAD_PER_LSB,
     INCLI_SINGLE_RAD_PER_LSB,
-    MAG_T_PER_LSB,
-    PRESSURE_PA_PER_LSB,
-    QUAT_NEW_PER_LSB,
     QUAT_OLD_PER_LSB,
     SHORT_BLOCK_REGISTERS,
-    TEMPERATURE_C_PER_LSB,
-)
-from imud.devices.hipnuc.modbus.actions import ACTIONS
-from imud.devices.hipnuc.modbus.frames import (
-    FACTORY_ID,
-    SERIAL_BYTES,
-    read_registers,
-    registers_of,
-    registers_reply,
 )
 from imud.devices.polled_frames import Measured, PolledFrameDecoder, absence
-from imud.errors import DeviceRefused
 from imud.formats.modbus import (
     CRC_BYTES,
     ILLEGAL_ADDRESS,
     READ_HOLDING,
     READ_OVERHEAD_BYTES,
-    SLAVES,
-    framed,
     is_exception,
     is_whole,
 )
 from imud.ledger import Ledger
 from imud.sample import Measurement, Pair, Quaternion, Vector3
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.units import NS_PER_S
 
 BLOCK: Final = struct.Struct(">3h3h3h3ihi4h2h")
 """accel, gyro, mag, roll pitch yaw, temperature, pressure, quaternion wxyz, inclinometer: registers 0x34 … 0x4B."""
 UPTIME: Final = struct.Struct(">I")
 """Registers 0x4C … 0x4D, ms."""
 DATA_AT: Final = 3
-NAME_BYTES: Final = 16
-VERSIONS: Final = struct.Struct(">HH")
-SERIAL_AT: Final = 2 * (BY_NAME["SN"].address - IDENTITY_FIRST)
 CHECK_NS: Final = 10 * NS_PER_S
 """How often the serial number is read again: another module can take a place on the line unnoticed."""
 UNIT_TOLERANCE: Final = 0.02
@@ -90,9 +75,7 @@ PITCHED_RAD: Final = radians(1.0)
 
 READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
 READ_SHORT_BLOCK: Final = read_registers(BLOCK_FIRST, SHORT_BLOCK_REGISTERS)
-READ_IDENTITY: Final = read_registers(IDENTITY_FIRST, IDENTITY_REGISTERS)
 READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
-READ_SETTINGS: Final = read_registers(BY_NAME["UART1_BAUD"].address, 3)
 _SAMPLE: Final = 0
 
 
@@ -109,32 +92,6 @@ class HipnucModbusSettings(Settings, frozen=True, kw_only=True, forbid_unknown_f
 def update_ns(settings: HipnucModbusSettings) -> int:
     """Longest time between two updates of the registers, 0 for not known."""
     return int(NS_PER_S / settings.update_hz) if settings.update_hz else 0
-
-
-def probe(_settings: HipnucModbusSettings) -> TransferScript[Identity]:
-    """Name, versions and serial number. Raises DeviceRefused for what is no HiPNUC module."""
-    words = registers_of((yield READ_IDENTITY), IDENTITY_REGISTERS)
-    return identity_of(struct.pack(f">{len(words)}H", *words))
-
-
-def identity_of(data: bytes) -> Identity:
-    """What registers 0x70 … 0x83 say. Raises DeviceRefused where the name is no text."""
-    name = data[:NAME_BYTES].rstrip(b"\0 ")
-    if not name or any(byte not in range(0x20, 0x7F) for byte in name):
-        raise DeviceRefused(f"expected the name of a product at register 0x70, got {data[:NAME_BYTES].hex(' ')}")
-    firmware, loader = VERSIONS.unpack_from(data, NAME_BYTES)
-    serial = data[SERIAL_AT : SERIAL_AT + SERIAL_BYTES].hex().upper()
-    return Identity(name.decode("ascii"), serial, ".".join(str(firmware)), {"BL_VERSION": str(loader)})
-
-
-def set_up(_settings: HipnucModbusSettings) -> TransferScript[Mapping[str, str]]:
-    """Read baud rate, ID and heading mode; nothing is written. Raises DeviceRefused."""
-    baud, slave, heading = registers_of((yield READ_SETTINGS), 3)
-    return {
-        "baud": str(BAUD_RATES[baud]) if baud < len(BAUD_RATES) else f"code {baud}",
-        "id": str(slave),
-        "heading_mode": {0: "six axes", 1: "nine axes"}.get(heading, f"code {heading}"),
-    }
 
 
 class HipnucModbusCodec:
@@ -218,7 +175,7 @@ class HipnucModbusCodec:
     def _quaternion(self, w: int, x: int, y: int, z: int) -> Quaternion | None:
         if not self._quat_scale:
             length = hypot(w, x, y, z)
-            fitting = [k for k in (QUAT_OLD_PER_LSB, QUAT_NEW_PER_LSB) if abs(length * k - 1) < UNIT_TOLERANCE]
+            fitting = [k for k in (QUAT_OLD_PER_LSB, QUAT_PER_LSB) if abs(length * k - 1) < UNIT_TOLERANCE]
             if not fitting:
                 return None
             self._quat_scale = fitting[0]
@@ -265,7 +222,7 @@ def pack_block(
     pressure_pa: float,
     uptime_ms: int | None,
     incli_counts: tuple[int, int] = (0, 0),
-    quat_per_lsb: float = QUAT_NEW_PER_LSB,
+    quat_per_lsb: float = QUAT_PER_LSB,
 ) -> bytes:
     """Registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
     data = BLOCK.pack(
@@ -279,43 +236,3 @@ def pack_block(
         *incli_counts,
     )
     return data if uptime_ms is None else data + UPTIME.pack(uptime_ms % 2**32)
-
-
-def pack_identity(product: str, firmware: int, loader: int, serial: bytes) -> bytes:
-    """Registers 0x70 … 0x83."""
-    head = product.encode("ascii")[:NAME_BYTES].ljust(NAME_BYTES, b"\0") + VERSIONS.pack(firmware, loader)
-    return (head.ljust(SERIAL_AT, b"\0") + serial).ljust(2 * IDENTITY_REGISTERS, b"\0")
-
-
-def _example_reading(random: Random) -> bytes:
-    """A block with random values."""
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
-
-    def three(spread: float) -> Vector3:
-        return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
-
-    data = pack_block(
-        accel_m_s2=three(9.8), gyro_rad_s=three(2), mag_t=three(5e-5), euler_rad=euler312_from_quat(quat),
-        quat_wxyz=quat, temperature_c=random.uniform(-40, 85), pressure_pa=random.uniform(80_000, 110_000),
-        uptime_ms=random.randrange(2**32),
-    )  # fmt: skip
-    return framed(FACTORY_ID, registers_reply(data))
-
-
-DRIVER: Final = PolledDriver(
-    name="hipnuc-modbus",
-    title="HiPNUC CH0x0, CH10x, HI14 (RS-485, Modbus RTU)",
-    settings=HipnucModbusSettings,
-    tick_ns=NS_PER_MS,
-    tick_modulus=2**32,
-    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
-    navigation_frame="ENU",
-    link="rs485",
-    targets=(FACTORY_ID, *(slave for slave in SLAVES if slave != FACTORY_ID)),
-    probe=probe,
-    set_up=set_up,
-    make_codec=HipnucModbusCodec,
-    update_ns=update_ns,
-    example_reading=_example_reading,
-    actions=ACTIONS,
-)

@@ -13,6 +13,7 @@ import struct
 from typing import Final
 
 from imud.contracts.polling import Transfer
+from imud.devices.hipnuc.modbus.registers import BY_NAME, IDENTITY_FIRST, IDENTITY_REGISTERS
 from imud.errors import BadArgument, DeviceRefused
 from imud.formats.modbus import (
     CRC_BYTES,
@@ -30,6 +31,10 @@ CUSTOM: Final = 0x50
 SET_ID_BY_SERIAL: Final = 0x0031
 RANDOMISE_IDS: Final = 0x0030
 SERIAL_BYTES: Final = 8
+NAME_BYTES: Final = 16
+VERSIONS: Final = struct.Struct(">HH")
+SERIAL_AT: Final = 2 * (BY_NAME["SN"].address - IDENTITY_FIRST)
+"""Name, versions and serial number in registers 0x70 … 0x83."""
 FACTORY_ID: Final = 0x50
 WRITE_REPLY_BYTES: Final = 8
 
@@ -122,3 +127,9 @@ def _check(reply: bytes, function: int, size: int) -> None:
 def registers_reply(data: bytes) -> bytes:
     """A reply to a read, without address and CRC."""
     return bytes([READ_HOLDING, len(data)]) + data
+
+
+def pack_identity(product: str, firmware: int, loader: int, serial: bytes) -> bytes:
+    """Registers 0x70 … 0x83."""
+    head = product.encode("ascii")[:NAME_BYTES].ljust(NAME_BYTES, b"\0") + VERSIONS.pack(firmware, loader)
+    return (head.ljust(SERIAL_AT, b"\0") + serial).ljust(2 * IDENTITY_REGISTERS, b"\0")

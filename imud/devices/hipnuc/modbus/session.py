@@ -1,20 +1,41 @@
-"""Dialogues that change a HiPNUC module on RS-485: what is written is checked before, and read back where it can be.
+"""Transfer scripts of a HiPNUC module on RS-485. What is written is read back where the module lets it be read.
 
 Manual "IMU配置手冊" V1.5.9, section 4.3. Settings are lost at power-off unless `save` follows. A new ID is in force at
 once: what comes next goes to the new address. When a new baud rate is in force the manual does not say; saved and
 restarted, it is. SET_LV and URFR cannot be read: their confirmation is all there is.
 """
 
+import struct
+from collections.abc import Mapping
 from enum import Enum
 from typing import Final
 
+from imud.contracts.driver import Identity
 from imud.contracts.polling import TransferScript
-from imud.devices.arguments import listed, member
-from imud.devices.hipnuc.common.registers import BAUD_RATES, BY_NAME, ID_MAX, Register
-from imud.devices.hipnuc.modbus.frames import check_written, read_registers, registers_of, write_register
+from imud.devices.hipnuc.modbus.frames import (
+    NAME_BYTES,
+    SERIAL_AT,
+    SERIAL_BYTES,
+    VERSIONS,
+    check_written,
+    read_registers,
+    registers_of,
+    write_register,
+)
+from imud.devices.hipnuc.modbus.registers import (
+    BAUD_RATES,
+    BY_NAME,
+    ID_MAX,
+    IDENTITY_FIRST,
+    IDENTITY_REGISTERS,
+    BaudRate,
+    Register,
+)
 from imud.devices.hipnuc.uart.commands import AttitudeMode, LevelReset
 from imud.errors import BadArgument, DeviceRefused, TransferError
 
+READ_IDENTITY: Final = read_registers(IDENTITY_FIRST, IDENTITY_REGISTERS)
+READ_SETTINGS: Final = read_registers(BY_NAME["UART1_BAUD"].address, 3)
 SAVE: Final = 0x0000
 FACTORY_RESET: Final = 0x0001
 RESTART: Final = 0x00FF
@@ -28,6 +49,32 @@ class LineMounting(Enum):
     Y_UP = 2
     X_UP = 3
     X_DOWN = 4
+
+
+def probe(_settings: object) -> TransferScript[Identity]:
+    """Name, versions and serial number. Raises DeviceRefused for what is no HiPNUC module."""
+    words = registers_of((yield READ_IDENTITY), IDENTITY_REGISTERS)
+    return identity_of(struct.pack(f">{len(words)}H", *words))
+
+
+def identity_of(data: bytes) -> Identity:
+    """What registers 0x70 … 0x83 say. Raises DeviceRefused where the name is no text."""
+    name = data[:NAME_BYTES].rstrip(b"\0 ")
+    if not name or any(byte not in range(0x20, 0x7F) for byte in name):
+        raise DeviceRefused(f"expected the name of a product at register 0x70, got {data[:NAME_BYTES].hex(' ')}")
+    firmware, loader = VERSIONS.unpack_from(data, NAME_BYTES)
+    serial = data[SERIAL_AT : SERIAL_AT + SERIAL_BYTES].hex().upper()
+    return Identity(name.decode("ascii"), serial, ".".join(str(firmware)), {"BL_VERSION": str(loader)})
+
+
+def set_up(_settings: object) -> TransferScript[Mapping[str, str]]:
+    """Read baud rate, ID and heading mode; nothing is written. Raises DeviceRefused."""
+    baud, slave, heading = registers_of((yield READ_SETTINGS), 3)
+    return {
+        "baud": str(BAUD_RATES[baud]) if baud < len(BAUD_RATES) else f"code {baud}",
+        "id": str(slave),
+        "heading_mode": {0: "six axes", 1: "nine axes"}.get(heading, f"code {heading}"),
+    }
 
 
 def save() -> TransferScript[None]:
@@ -45,33 +92,34 @@ def restart() -> TransferScript[None]:
     return _write_unheard(BY_NAME["CTRL"], RESTART)
 
 
-def set_baud(baud: int) -> TransferScript[None]:
-    """Set the baud rate. Raises BadArgument, DeviceRefused, TransferError."""
-    if isinstance(baud, bool) or baud not in BAUD_RATES:
-        raise BadArgument(f"UART1_BAUD: expected one of {listed(BAUD_RATES)} baud, got {baud!r}")
+def set_baud(baud: BaudRate) -> TransferScript[None]:
+    """Set the baud rate. Raises DeviceRefused, TransferError."""
     return _write_unheard(BY_NAME["UART1_BAUD"], BAUD_RATES.index(baud))
 
 
 def set_id(new_id: int) -> TransferScript[None]:
-    """Take another address, 1 … 128. It may be confirmed from the old address, the new one, or not at all."""
-    if isinstance(new_id, bool) or new_id not in BY_NAME["MD_ID"].values:
+    """Take another address, 1 … 128. It may be confirmed from the old address, the new one, or not at all.
+
+    Raises BadArgument for an address beyond that, which goes by serial number only; DeviceRefused.
+    """
+    if new_id not in BY_NAME["MD_ID"].values:
         raise BadArgument(f"MD_ID: expected 1 … {ID_MAX}, got {new_id!r}; higher ones go by serial number")
     return _write_unheard(BY_NAME["MD_ID"], new_id)
 
 
 def set_heading_mode(mode: AttitudeMode) -> TransferScript[None]:
     """Six or nine axes."""
-    return _write(BY_NAME["HEADING_MODE"], member("mode", mode, AttitudeMode).value)
+    return _write(BY_NAME["HEADING_MODE"], mode.value)
 
 
 def set_mounting(mounting: LineMounting) -> TransferScript[None]:
     """How the module is mounted."""
-    return _write(BY_NAME["URFR"], member("mounting", mounting, LineMounting).value)
+    return _write(BY_NAME["URFR"], mounting.value)
 
 
 def auto_level(kind: LevelReset) -> TransferScript[None]:
     """Make the present attitude level, or cancel that. The module must be at rest."""
-    return _write(BY_NAME["SET_LV"], member("kind", kind, LevelReset).value)
+    return _write(BY_NAME["SET_LV"], kind.value)
 
 
 def read(register: Register) -> TransferScript[tuple[int, ...]]:

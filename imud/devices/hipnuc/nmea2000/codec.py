@@ -16,29 +16,22 @@ reference that comes first and keeps it. Headings of the other one are ignored. 
 """
 
 from collections.abc import Sequence
-from random import Random
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.attitude import euler312_from_quat, quat_normalized
-from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
-from imud.contracts.driver import SAMPLE_COUNTER, Identity
-from imud.contracts.session import says_nothing
 from imud.contracts.settings import Settings
 from imud.devices.hipnuc.common.assembly import Assembly
 from imud.devices.hipnuc.nmea2000 import messages
 from imud.devices.hipnuc.nmea2000.messages import Reference
-from imud.formats.can import CanFilter, CanFrame
-from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
+from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join
 from imud.ledger import Ledger
 from imud.units import NS_PER_S
 
 SILENT_NS: Final = 3 * NS_PER_S
 """The slowest of the three messages comes once a second by the standard."""
 SID_DOUBTS: Final = 8
-EXAMPLE_SOURCE: Final = 35
 
 _PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in messages.PGNS}
 """By identifier without priority and source."""
@@ -61,11 +54,11 @@ class HipnucNmea2000Codec:
         self.ledger = ledger
         self._fixed = None if settings.source == "auto" else settings.source
         self._wanted_reference = _REFERENCES[settings.heading]
-        self._take_sender(self._fixed)
+        self._set_sender(self._fixed)
         self._heard_ns = 0
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Take one frame; return what it completed. Never raises for any frame."""
+        """Add one frame; return what it completed. Never raises for any frame."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
         pgn = _PGNS.get(can_id & WITHOUT_PRIORITY & ~0xFF) if extended else None
@@ -83,7 +76,7 @@ class HipnucNmea2000Codec:
             ledger.frames_ignored += 1
             return ()
         self._match(sid)
-        whole = self._assembly.take(pgn, data, t_rx_ns)
+        whole = self._assembly.add_frame(pgn, data, t_rx_ns)
         if whole is None:
             return ()
         self._count_sids(whole)
@@ -91,12 +84,11 @@ class HipnucNmea2000Codec:
         return (messages.measurement_of(whole, heading_elsewhere=self._has_heading),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The bus is idle: the next frame begins a sample."""
-        self._assembly.flush()
+        """The bus is idle: no-op, since the next frame shows what is lost."""
         return ()
 
     def reset(self) -> None:
-        """Frames are missing here: what is held is given up."""
+        """Frames are missing here: drop the incomplete sample."""
         self._assembly.reset()
 
     # --- whose frames --------------------------------------------------------------------------------------------
@@ -107,12 +99,12 @@ class HipnucNmea2000Codec:
             if self._fixed is not None or source > ADDRESS_MAX or (self._source is not None and not silent):
                 return False
             self._assembly.reset()
-            self._take_sender(source)
+            self._set_sender(source)
         self._heard_ns = t_rx_ns
         return True
 
-    def _take_sender(self, source: int | None) -> None:
-        """Nothing is known of this one."""
+    def _set_sender(self, source: int | None) -> None:
+        """Begin anew with this sender."""
         self._source = source
         self._assembly = Assembly(self.ledger)
         self._reference = self._wanted_reference
@@ -130,7 +122,7 @@ class HipnucNmea2000Codec:
     # --- what belongs together -----------------------------------------------------------------------------------
 
     def _match(self, sid: int | None) -> None:
-        """Give up frames of another instant."""
+        """Drop the frames of another instant."""
         differs = sid is not None and self._held_sid is not None and sid != self._held_sid
         self._held_sid = sid
         if self._uses_sids and differs and self.ledger.frames_pending:
@@ -156,48 +148,3 @@ class HipnucNmea2000Codec:
 def encode(pgn: int, data: bytes, source: int) -> tuple[int, bytes]:
     """A message as (identifier, data)."""
     return join(J1939Id(messages.PRIORITIES[pgn], pgn, source)), data
-
-
-def _example_frames(random: Random) -> list[CanFrame]:
-    """A sample of all three, with random values."""
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
-    euler = euler312_from_quat(quat)
-    sid = random.randrange(messages.SID_MOST + 1)
-    made = (
-        encode(messages.HEADING, messages.pack_heading(sid, euler[2], Reference.MAGNETIC), EXAMPLE_SOURCE),
-        encode(messages.RATE_OF_TURN, messages.pack_rate_of_turn(sid, random.gauss(0, 0.5)), EXAMPLE_SOURCE),
-        encode(messages.ATTITUDE, messages.pack_attitude(sid, euler, has_yaw=False), EXAMPLE_SOURCE),
-    )
-    return [CanFrame(can_id, True, data, 0) for can_id, data in made]
-
-
-def _filters(settings: HipnucNmea2000Settings) -> list[CanFilter]:
-    """The three messages, of one sender or of any."""
-    source = None if settings.source == "auto" else settings.source
-    return [filter_of(pgn, source) for pgn in messages.PGNS]
-
-
-def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
-    """The sender of one of the messages."""
-    return sender_of(can_id, extended, data, messages.PGNS)
-
-
-DRIVER: Final = CanDriver(
-    name="hipnuc-nmea2000",
-    title="HiPNUC CH0x0, CH10x, HI14, other heading and attitude sensors (CAN, NMEA 2000)",
-    settings=HipnucNmea2000Settings,
-    make_codec=HipnucNmea2000Codec,
-    filters=_filters,
-    tick_ns=SAMPLE_COUNTER,
-    tick_modulus=2,
-    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above, "
-    "0 with the bow to the north of the heading's reference; NaN for an angle that is not sent",
-    navigation_frame="ENU",
-    node_of=_node_of,
-    node_settings=lambda source: HipnucNmea2000Settings(source=source),
-    node_title=lambda source: f"source {source}",
-    identify=lambda _settings: says_nothing(Identity()),
-    read_settings=lambda _settings: says_nothing({}),
-    sample_frames=len(messages.PGNS),
-    example_frames=_example_frames,
-)

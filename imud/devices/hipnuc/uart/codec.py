@@ -12,44 +12,35 @@ commands (`commands.py`), stand between the frames and may be cut by them (`line
 Strategy. A frame whose check fails spends only its sync word, because a real frame may begin inside the false one.
 What follows up to its claimed end counts as part of it unless it turns out to be good. While a claimed frame is
 incomplete everything waits, at most FRAME_BYTES_MAX; `flush` ends the wait when the line went idle.
-At 1 kHz the decoder is on the sample path, so HI91 frames back to back, which is what a stream consists of, are taken
-by `_take_run`: one match finds them, two `iter_unpack` go through them in step, the CRC starts from that of the header,
-and NaN is looked for in the high bytes of all floats of all frames at once. Everything else goes one by
-one. `tests/bench/decode.py` measures it.
+At 1 kHz the decoder is on the sample path, so HI91 frames back to back, which is what a stream consists of, are decoded
+by `_decode_run`: one match finds them, the CRC starts from that of the header, NaN is looked for in the high bytes of
+all floats of all frames at once, and one `iter_unpack` goes through all payloads. Everything else goes one by one.
+`tests/bench/decode.py` measures it.
 """
 
 import re
 import struct
-import sys
 from binascii import crc_hqx as crc16_xmodem  # polynomial 0x1021, not reflected, first `crc` 0, no final XOR
-from collections.abc import Callable, Mapping, Sequence
-from math import isfinite
-from random import Random
-from typing import Any, Final, Literal, ParamSpec
+from collections.abc import Callable, Sequence
+from typing import Final, Literal, ParamSpec
 
-from imud.attitude import euler312_from_quat, quat_normalized
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec
-from imud.contracts.driver import Identity, StreamDriver
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.settings import Settings
 from imud.contracts.timing import TimeBits
-from imud.devices.hipnuc.common.packets import (
+from imud.devices.hipnuc.uart.packets import (
     HI91,
-    M_S2_PER_G,
+    HI91_HIGH_BYTES,
+    HI91_VALUES,
     PACKETS,
-    PPS_STAMP_MODULUS_MS,
     TAG_HI91,
-    decode_finite_hi91,
+    decode_hi91,
+    decode_hi91_run,
     pack_hi91,
     pack_hi92,
 )
-from imud.devices.hipnuc.uart.actions import ACTIONS
-from imud.devices.hipnuc.uart.alarm import alarm_ranges
-from imud.devices.hipnuc.uart.commands import BAUD_RATES
-from imud.devices.hipnuc.uart.session import identify, read_settings
-from imud.devices.hipnuc.uart.text_lines import LINE_CHARACTERS_MAX, LineFinder
+from imud.devices.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.units import NS_PER_MS, RAD_PER_DEG, T_PER_UT
 
 SYNC: Final = b"\x5a\xa5"
 HEADER: Final = struct.Struct("<2sHH")  # sync word, payload length, CRC
@@ -70,16 +61,9 @@ _RUN: Final = re.compile(
 )
 """HI91 frames back to back by header and tag."""
 _RUN_PARTS: Final = struct.Struct(f"<4xH{HI91.size}s")  # CRC and payload
-_RUN_SHIFT: Final = 2  # the run without its first two bytes has every float at a multiple of 4,
-_RUN_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "5xBBbfI16f2x")
-"""Values behind the tag, the word in two bytes: in the machine's own layout `struct` reads a float in half the time."""
-_RUN_HIGH_BYTES: Final = slice(7, None, 4)
-"""High bytes of all floats (and of system_time) in payloads put together, because 76 is a multiple of 4."""
-_ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, None, 4)
-"""The same in one frame."""
 _IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r\n\Z" % LINE_CHARACTERS_MAX)
 """A line right before the port went idle: two characters at least and both characters of the line's end, which the
-device always sends. Less comes by chance inside half a frame, which would then be given up."""
+device always sends. Less comes by chance inside half a frame, which would then be dropped."""
 
 
 class HipnucSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -87,7 +71,7 @@ class HipnucSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
     hi91_word: Literal["auto", "pps", "status"] = "auto"
     """Meaning of bytes 1-2 of HI91: time since the last PPS edge (firmware before 1.6.9) or status bits (since).
-    `auto` decides by the firmware version that the device tells, and takes `pps` until it is known."""
+    `auto` decides by the firmware version that the device reports, `pps` until that is known."""
 
 
 class HipnucCodec:
@@ -95,7 +79,7 @@ class HipnucCodec:
 
     Every sub-packet that is known becomes one `Measurement`, with the size of the whole frame, so that all of a frame
     come to the same time. A sub-packet cut off by the end of the payload makes the whole frame bad. A frame with NaN or
-    infinity is delivered without the values concerned, after a `BadFrame` (not-finite) that tells of it; its bytes and
+    infinity is delivered without the values concerned, after a `BadFrame` (not-finite); its bytes and
     itself count as good.
     """
 
@@ -116,29 +100,30 @@ class HipnucCodec:
             self.word_is_status = app_ver >= STATUS_SINCE_APP_VER
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Take bytes in the order they came; return what they completed. Never raises for any bytes."""
+        """Add bytes in the order they came; return what they completed. Never raises for any bytes."""
         self.ledger.bytes_in += len(data)
         if len(data) == _HI91_FRAME_BYTES and not (self._tail or self._bad_ahead):
-            only = self._take_only(data)
+            only = self._decode_single(data)
             if only is not None:
                 return (only,)
         return self._scan(self._tail + data if self._tail else data, 0)
 
-    def _take_only(self, data: bytes) -> Measurement | None:
+    def _decode_single(self, data: bytes) -> Measurement | None:
         """A read that is one plain HI91 frame, which is what a port at 1 kHz gives: half the cost of `_scan`."""
-        if not data.startswith(_HI91_HEAD) or crc16_xmodem(data[HEADER.size :], _RUN_SEED) != data[4] | data[5] << 8:
+        payload = data[HEADER.size :]
+        if not data.startswith(_HI91_HEAD) or crc16_xmodem(payload, _RUN_SEED) != data[4] | data[5] << 8:
             return None
-        high_bytes = data[_ONLY_HIGH_BYTES]
-        if data[HEADER.size] != TAG_HI91 or 0x7F in high_bytes or 0xFF in high_bytes:  # as in `_take_run`
+        high_bytes = payload[HI91_HIGH_BYTES]
+        if payload[0] != TAG_HI91 or 0x7F in high_bytes or 0xFF in high_bytes:
             return None
         ledger = self.ledger
         ledger.bytes_in_good_frames += _HI91_FRAME_BYTES
         ledger.frames_good += 1
         ledger.frames_in_samples += 1
-        return decode_finite_hi91(data, HEADER.size, self.word_is_status, _HI91_FRAME_BYTES, 0)
+        return decode_hi91(HI91_VALUES.unpack(payload), self.word_is_status, _HI91_FRAME_BYTES, 0)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The line is idle: give up an incomplete frame if something whole waits inside it; otherwise do nothing."""
+        """The line is idle: drop an incomplete frame if something whole waits inside it; no-op otherwise."""
         events: list[CodecEvent] = []
         while give_up := self._whole_inside():
             events += self._scan(self._tail, give_up)
@@ -153,18 +138,18 @@ class HipnucCodec:
         self.ledger.bytes_pending = 0
 
     def _scan(self, data: bytes, give_up: int) -> list[CodecEvent]:
-        """Take all that is complete in `data`, where incomplete frames that begin before `give_up` are bad."""
+        """Decode all that is complete in `data`, where incomplete frames that begin before `give_up` are bad."""
         events: list[CodecEvent] = []
         at, total = 0, len(data)
         while at < total:
             sync = data.find(SYNC, at)
             if sync != at:
                 end = sync if sync >= 0 else total - data.endswith(SYNC[:1], at)
-                events += self._lines.take(data[at:end], max(min(self._bad_ahead, end) - at, 0))
+                events += self._lines.add(data[at:end], max(min(self._bad_ahead, end) - at, 0))
                 at = end
                 if sync < 0:
                     break
-            after = self._take_frame(data, at, give_up, events)
+            after = self._decode_frame(data, at, give_up, events)
             if after == at:
                 break
             at = after
@@ -173,10 +158,10 @@ class HipnucCodec:
         self.ledger.bytes_pending = total - at + self._lines.pending_bytes
         return events
 
-    def _take_frame(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
-        """Take what begins with the sync word at `at`; return where it ends, or `at` if it is not complete yet."""
+    def _decode_frame(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
+        """Decode what begins with the sync word at `at`; return where it ends, or `at` if it is not complete yet."""
         total = len(data)
-        if (run := _RUN.match(data, at)) and (after := self._take_run(data, at, run.end(), events)) > at:
+        if (run := _RUN.match(data, at)) and (after := self._decode_run(data, at, run.end(), events)) > at:
             return after
         if total - at < HEADER.size:
             return self._spend_sync(data, at, total, BadReason.CRC, events) if at < give_up else at
@@ -189,48 +174,35 @@ class HipnucCodec:
             return at
         if end > total or crc16_xmodem(data[begin:end], crc16_xmodem(data[at : at + 4], 0)) != crc:
             return self._spend_sync(data, at, end, BadReason.CRC, events)
-        self._take_payload(data, at, end, events)
+        self._decode_payload(data, at, end, events)
         return end
 
-    def _take_run(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> int:
-        """Take HI91 frames back to back up to the first whose CRC does not match; return where they end."""
-        run, shifted = data[at:end], data[at + _RUN_SHIFT : end] + bytes(_RUN_SHIFT)
-        size, trailing = _HI91_FRAME_BYTES, len(data) - at
+    def _decode_run(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> int:
+        """Decode HI91 frames back to back up to the first whose CRC does not match; return where they end."""
+        size, crc_of, seed = _HI91_FRAME_BYTES, crc16_xmodem, _RUN_SEED
         payloads: list[bytes] = []
-        # local names: a global costs twice as much, and there are thirty of them per frame
-        add, keep, make, crc_of, seed = events.append, payloads.append, Measurement, crc16_xmodem, _RUN_SEED
-        g, rad, tesla, is_status = M_S2_PER_G, RAD_PER_DEG, T_PER_UT, self.word_is_status
-        for (crc, payload), (
-            low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
-        ) in zip(_RUN_PARTS.iter_unpack(run), _RUN_VALUES.iter_unpack(shifted), strict=True):  # fmt: skip
+        keep = payloads.append
+        for crc, payload in _RUN_PARTS.iter_unpack(data[at:end]):
             if crc_of(payload, seed) != crc:
                 break
             keep(payload)
-            trailing -= size
-            add(make(
-                size, trailing, ms,
-                (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
-                (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-                low + 256 * high if is_status else None, None if is_status else low + 256 * high,
-            ))  # fmt: skip
         count = len(payloads)
         end = at + count * size
-        high_bytes = b"".join(payloads)[_RUN_HIGH_BYTES]
-        # an exponent of all ones (NaN, infinity) needs one of these; finite values above 1.7e38 and 9 of every 1193
-        # hours of system time have them too: the general way tells which it is, at three times the cost
-        if 0x7F in high_bytes or 0xFF in high_bytes:
-            del events[len(events) - count :]
+        hi91s = b"".join(payloads)
+        high_bytes = hi91s[HI91_HIGH_BYTES]
+        if 0x7F in high_bytes or 0xFF in high_bytes:  # `_decode_payload` finds out, at three times the cost
             for begin in range(at, end, size):
-                self._take_payload(data, begin, begin + size, events)
+                self._decode_payload(data, begin, begin + size, events)
             return end
+        events += decode_hi91_run(hi91s, self.word_is_status, size, len(data) - at - size)
         ledger = self.ledger
         ledger.bytes_in_good_frames += end - at
         ledger.frames_good += count
         ledger.frames_in_samples += count
         return end
 
-    def _take_payload(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> None:
-        """Take the sub-packets of a frame whose CRC matches, from `at` to `end` with its header."""
+    def _decode_payload(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> None:
+        """Decode the sub-packets of a frame whose CRC matches, from `at` to `end` with its header."""
         ledger = self.ledger
         found: list[Measurement] = []
         finite = True
@@ -240,15 +212,15 @@ class HipnucCodec:
             if packet is None:
                 ledger.unknown_tags += 1
                 break
-            if begin + packet.layout.size > end:
+            if begin + packet.size > end:
                 ledger.frames_bad_content += 1
                 ledger.bytes_in_bad_frames += end - at
                 events.append(BadFrame(BadReason.CONTENT, data[at:end]))
                 return
-            values = packet.layout.unpack_from(data, begin)
-            finite = finite and all(map(isfinite, values))
-            found.append(packet.decode(values, self.word_is_status, end - at, len(data) - end))
-            begin += packet.layout.size
+            measurement, is_finite = packet.decode(data, begin, self.word_is_status, end - at, len(data) - end)
+            finite = finite and is_finite
+            found.append(measurement)
+            begin += packet.size
         ledger.bytes_in_good_frames += end - at
         ledger.frames_good += 1
         if found:
@@ -322,49 +294,3 @@ encode_hi91 = _framed(pack_hi91)
 """A whole HI91 frame from SI values; see `pack_hi91`."""
 encode_hi92 = _framed(pack_hi92)
 """A whole HI92 frame from SI values; see `pack_hi92`."""
-
-
-def _example_frame(random: Random) -> bytes:
-    """HI91 or HI92 with random values; one in four carries both."""
-    quat = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1)))
-    common: Mapping[str, Any] = {
-        "accel_m_s2": (random.gauss(0, 5), random.gauss(0, 5), random.gauss(9.8, 5)),
-        "gyro_rad_s": (random.gauss(0, 2), random.gauss(0, 2), random.gauss(0, 2)),
-        "mag_t": (random.gauss(0, 5e-5), random.gauss(0, 5e-5), random.gauss(0, 5e-5)),
-        "quat_wxyz": quat,
-        "euler_rad": euler312_from_quat(quat),
-        "temperature_c": random.uniform(-40, 85),
-        "pressure_pa": random.uniform(80_000, 110_000),
-    }
-    word = random.randrange(PPS_STAMP_MODULUS_MS)
-    floats = encode_hi91(system_time_ms=random.randrange(2**32), word_1_2=word, **common)
-    integers = encode_hi92(pps_stamp_ms=word, status=random.randrange(2**16), **common)
-    both = encode_frame(floats[HEADER.size :] + integers[HEADER.size :])
-    return random.choice((floats, floats, integers, both))
-
-
-def _apply_identity(codec: StreamCodec, identity: Identity) -> None:
-    version = (identity.details or {}).get("APP_VER", "")
-    if isinstance(codec, HipnucCodec) and version.isdecimal():
-        codec.learn_app_ver(int(version))
-
-
-DRIVER: Final = StreamDriver(
-    name="hipnuc-uart",
-    title="HiPNUC CH0x0, CH10x, HI14 (UART, RS-232, USB)",
-    baud_rates=BAUD_RATES,
-    settings=HipnucSettings,
-    make_codec=HipnucCodec,
-    tick_ns=NS_PER_MS,
-    tick_modulus=2**32,
-    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
-    navigation_frame="ENU",
-    lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
-    alarm_ranges=alarm_ranges,
-    time_bits=TIME_BITS,
-    actions=ACTIONS,
-    identify=identify,
-    read_settings=read_settings,
-    apply_identity=_apply_identity,
-    example_frame=_example_frame,
-)

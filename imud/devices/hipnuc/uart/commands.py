@@ -5,28 +5,31 @@ r"""ASCII commands of HiPNUC modules (replies: `replies.py`). Manual "IMU配置�
                                →   (nothing)     not understood: unknown commands get no reply at all
     LOG VERSION\r\n            →   PNAME=HI14R3\r\n … OK\r\n
 
-Each function returns a `Request` and raises BadArgument for what the device would not take. Settings last until power
-is off unless `save_config` follows; `mounting`, `serial_config` take effect after `save_config` and `reboot`.
+Each function returns a `Request`. Types say what an argument can be; ranges are those of the actions (`actions.py`),
+and what no range can express raises BadArgument here. Settings last until power is off unless `save_config` follows;
+`mounting`, `serial_config` take effect after `save_config` and `reboot`.
 """
 
 from collections.abc import Callable
 from enum import Enum, StrEnum
-from typing import Final
+from typing import Final, Literal, get_args
 
 from imud.attitude import Matrix3, is_rotation
 from imud.contracts.session import Request, of_text
-from imud.devices.arguments import listed, member
+from imud.devices.arguments import listed
 from imud.devices.hipnuc.uart.replies import is_end, is_rejection, is_setting_line, is_version_line
 from imud.errors import BadArgument
 from imud.units import NS_PER_S
 
 LINE_END: Final = "\r\n"
-BAUD_RATES: Final = (115200, 921600, 460800, 256000, 230400, 9600)
+BaudRate = Literal[115200, 921600, 460800, 256000, 230400, 9600]
+BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
 """Rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory default first."""
 REPLY_TIMEOUT_NS: Final = NS_PER_S // 2
 FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S  # erasing a flash page takes longer than a reply; the manual gives no time
 
-RATES_HZ: Final = (1, 2, 5, 10, 20, 50, 100, 200, 250, 500, 1000)
+OutputRate = Literal[0, 1, 2, 5, 10, 20, 50, 100, 200, 250, 500, 1000]
+RATES_HZ: Final[tuple[OutputRate, ...]] = get_args(OutputRate)[1:]
 """Output rates: those of section 2.2.5 and of table 3.7. 5 Hz stands in neither; "and so on" is read to include it."""
 SOUT_DIVIDER_MAX: Final = 64
 PIN_MAX: Final = 9
@@ -71,7 +74,7 @@ class LevelReset(Enum):
 
 
 class YawMode(Enum):
-    """How `yaw` takes its angle."""
+    """What the angle of `yaw` means."""
 
     RELATIVE = 0
     """Added to the present yaw."""
@@ -125,7 +128,7 @@ class Mounting(Enum):
 
 
 class Query(StrEnum):
-    """What can be asked; each reply is lines and then OK."""
+    """Reports that LOG asks for; each reply is lines and then OK."""
 
     VERSION = "VERSION"
     USRCONFIG = "USRCONFIG"
@@ -156,31 +159,28 @@ def unlog_all() -> Request:
     return _command("UNLOGALL")
 
 
-def serial_config(baud: int) -> Request:
+def serial_config(baud: BaudRate) -> Request:
     """Set the baud rate. A module at a rate that the host does not expect is lost: keep contact or roll back."""
-    if baud not in BAUD_RATES:
-        raise BadArgument(f"SERIALCONFIG: expected one of {listed(sorted(BAUD_RATES))} baud, got {baud!r}")
-    return _command(f"SERIALCONFIG {int(baud)}")
+    return _command(f"SERIALCONFIG {baud}")
 
 
 def attitude_mode(mode: AttitudeMode) -> Request:
     """Choose 6-axis or 9-axis (AHRS) mode."""
-    return _command(f"CONFIG ATT MODE {member('mode', mode, AttitudeMode).value}")
+    return _command(f"CONFIG ATT MODE {mode.value}")
 
 
 def level_reset(kind: LevelReset) -> Request:
     """Set or cancel the level."""
-    return _command(f"CONFIG ATT RST {member('kind', kind, LevelReset).value}")
+    return _command(f"CONFIG ATT RST {kind.value}")
 
 
 def yaw(mode: YawMode, angle_deg: float) -> Request:
     """Set yaw, -180° … 180°; lost at power-off."""
-    angle = _degrees("CONFIG YAW", "angle", angle_deg)
-    return _command(f"CONFIG YAW {member('mode', mode, YawMode).value} {angle}")
+    return _command(f"CONFIG YAW {mode.value} {_text(angle_deg)}")
 
 
 def mounting(matrix: Mounting | Matrix3) -> Request:
-    """Set the rotation from new sensor axes to the old ones (URFR): a `Mounting` or any proper rotation."""
+    """Set the rotation from new sensor axes to the old ones (URFR). Raises BadArgument for what is no rotation."""
     rows: Matrix3 = matrix.value if isinstance(matrix, Mounting) else matrix
     if [len(row) for row in rows] != [3, 3, 3] or not is_rotation(rows, ROTATION_TOLERANCE):
         raise BadArgument(
@@ -192,27 +192,25 @@ def mounting(matrix: Mounting | Matrix3) -> Request:
 
 def magnetic_calibration(enabled: bool) -> Request:
     """Turn the calibration of the magnetometer in the background on (the default) or off (section 8.2)."""
-    return _command(f"CONFIG IMU EN_MCAL {_flag('enabled', enabled)}")
+    return _command(f"CONFIG IMU EN_MCAL {int(enabled)}")
 
 
 def pin_function(function: PinFunction, pin: int) -> Request:
     """Give `function` to pin IO1 … IO9. Not every product has every pin."""
-    number = _whole("CONFIG PMUX", "pin", pin, 1, PIN_MAX)
-    return _command(f"CONFIG PMUX{member('function', function, PinFunction).value} IO{number}")
+    return _command(f"CONFIG PMUX{function.value} IO{pin}")
 
 
 def alarm(axis: AlarmAxis, min_deg: float, max_deg: float, enabled: bool) -> Request:
-    """Watch the angle of an axis: the alarm pin is high outside `min_deg` … `max_deg`."""
-    name = "CONFIG PMUX5"
-    low, high = (_degrees(name, what, v) for what, v in (("minimum", min_deg), ("maximum", max_deg)))
+    """Watch the angle of an axis: the alarm pin is high outside `min_deg` … `max_deg`. Raises BadArgument."""
+    name, low, high = "CONFIG PMUX5", _text(min_deg), _text(max_deg)
     if not min_deg < max_deg:
         raise BadArgument(f"{name}: expected the minimum below the maximum, got {low}° and {high}°")
-    return _command(f"{name} {member('axis', axis, AlarmAxis)},{low},{high},0,{_flag('enabled', enabled)}")
+    return _command(f"{name} {axis},{low},{high},0,{int(enabled)}")
 
 
 def sout_divider(divider: int) -> Request:
     """Divide SOUT pulses by 1 … 64 for the SOUT_DIV pin."""
-    return _command(f"CONFIG PMUX4 DIV{_whole('CONFIG PMUX4', 'divider', divider, 1, SOUT_DIVIDER_MAX)}")
+    return _command(f"CONFIG PMUX4 DIV{divider}")
 
 
 def log_enable() -> Request:
@@ -225,11 +223,9 @@ def log_disable() -> Request:
     return _command("LOG DISABLE")
 
 
-def log_ontime(message: OutputMessage, rate_hz: int, baud: int | None = None) -> Request:
-    """Send `message` at one of RATES_HZ, or not at all (0). With `baud`, refuses what does not fit through the line."""
-    name = f"LOG {member('message', message, OutputMessage)} ONTIME"
-    if rate_hz != 0 and rate_hz not in RATES_HZ:
-        raise BadArgument(f"{name}: expected 0 (off) or one of {listed(RATES_HZ)} Hz, got {rate_hz!r}")
+def log_ontime(message: OutputMessage, rate_hz: OutputRate, baud: int | None = None) -> Request:
+    """Send `message` at a rate, or not at all (0). With `baud`, raises BadArgument for more than the line carries."""
+    name = f"LOG {message} ONTIME"
     if baud is not None and rate_hz > max_rate_hz(message, baud):
         raise BadArgument(
             f"{name}: expected at most {max_rate_hz(message, baud)} Hz at {baud} baud, got {rate_hz} Hz; "
@@ -240,19 +236,18 @@ def log_ontime(message: OutputMessage, rate_hz: int, baud: int | None = None) ->
 
 def log_onmark(message: OutputMessage) -> Request:
     """Send `message` once for each pulse on SIN or `log_once`. Turn timed output off first (`unlog_all`)."""
-    return _command(f"LOG {member('message', message, OutputMessage)} ONMARK 1")
+    return _command(f"LOG {message} ONMARK 1")
 
 
 def log_once(message: OutputMessage) -> Request:
     """Send `message` once, as a pulse on SIN would. `log_onmark` comes first."""
-    return _command(f"LOG {member('message', message, OutputMessage)} ONMARK ONCE")
+    return _command(f"LOG {message} ONMARK ONCE")
 
 
 def ask(query: Query) -> Request:
     """Ask for one of the four reports."""
-    kind = member("query", query, Query)
-    is_part = is_version_line if kind is Query.VERSION else is_setting_line
-    return _command(f"LOG {kind}", is_part=is_part, messages_min=2)
+    is_part = is_version_line if query is Query.VERSION else is_setting_line
+    return _command(f"LOG {query}", is_part=is_part, messages_min=2)
 
 
 def max_rate_hz(message: OutputMessage, baud: int) -> int:
@@ -279,28 +274,6 @@ def _command(
     return Request(
         payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min
     )
-
-
-# --- argument checks --------------------------------------------------------------------------------------------------
-
-
-def _flag(name: str, value: bool) -> int:
-    if not isinstance(value, bool):
-        raise BadArgument(f"{name}: expected true or false, got {value!r}")
-    return int(value)
-
-
-def _whole(command: str, name: str, value: int, low: int, high: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise BadArgument(f"{command}: expected a whole {name} of {low} … {high}, got {value!r}")
-    return value
-
-
-def _degrees(command: str, name: str, value: float) -> str:
-    """An angle in text. NaN and infinity are refused too."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not -180 <= value <= 180:
-        raise BadArgument(f"{command}: expected a {name} of -180 … 180°, got {value!r}")
-    return _text(value)
 
 
 def _text(value: float) -> str:

@@ -1,12 +1,19 @@
-"""Conversations with a HiPNUC module: who it is and how it is set. Both only ask."""
+"""Request scripts of a HiPNUC module on a UART: identity, settings, single commands, restart, another baud rate."""
 
 from collections.abc import Mapping
+from typing import Final
 
 from imud.contracts.driver import Identity
-from imud.contracts.session import Outcome, Rejection, RequestScript, Silence
-from imud.devices.hipnuc.uart.commands import Query, ask
+from imud.contracts.session import Outcome, Rejection, Request, RequestScript, Silence, pause
+from imud.devices.hipnuc.uart import commands
+from imud.devices.hipnuc.uart.commands import BaudRate, Query, ask
 from imud.devices.hipnuc.uart.replies import parse_report, parse_version
 from imud.errors import NoReply, Rejected
+from imud.units import NS_PER_S
+
+BOOT_NS: Final = NS_PER_S
+"""From REBOOT until it answers; the manual gives no time."""
+BOOT_TRIES: Final = 5
 
 
 def identify() -> RequestScript[Identity]:
@@ -38,7 +45,7 @@ def read_settings() -> RequestScript[Mapping[str, str]]:
 
 
 def _lines(outcome: Outcome, query: Query) -> tuple[str, ...]:
-    """The lines of a good reply; raises NoReply or Rejected for another outcome."""
+    """Lines of a good reply. Raises NoReply or Rejected for another outcome."""
     if isinstance(outcome, Silence):
         heard = f"got {len(outcome.lines)} lines and no end" if outcome.lines else "got nothing"
         raise NoReply(
@@ -48,3 +55,46 @@ def _lines(outcome: Outcome, query: Query) -> tuple[str, ...]:
     if isinstance(outcome, Rejection):
         raise Rejected(f"LOG {query}: the module refused: {' / '.join(outcome.lines)}")
     return outcome.lines
+
+
+def send(request: Request) -> RequestScript[None]:
+    """Send one command. Raises NoReply (also for a command this firmware does not know) and Rejected."""
+    outcome = yield request
+    if isinstance(outcome, Silence):
+        raise NoReply(f"{request.name}: expected OK, got nothing; is the host's transmit line connected?")
+    if isinstance(outcome, Rejection):
+        raise Rejected(f"{request.name}: the module refused: {' / '.join(outcome.lines)}")
+
+
+def restart() -> RequestScript[Identity]:
+    """Restart and wait until it answers. What was not saved is lost. Raises NoReply."""
+    yield commands.reboot()
+    return (yield from _identify_after_boot(0))
+
+
+def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
+    """Set the baud rate, save, restart, and follow; return the rate. Saves all other settings too.
+
+    Raises NoReply, and Rejected where it answers at the old rate only; the line is then left there.
+    """
+    yield from send(commands.serial_config(baud))
+    yield from send(commands.save_config())
+    yield commands.reboot()
+    try:
+        yield from _identify_after_boot(baud)
+    except NoReply:
+        yield pause(0, baud=present_baud)
+        yield from _identify_after_boot(present_baud)
+        raise Rejected(f"SERIALCONFIG {baud}: the module stays at {present_baud} baud") from None
+    return baud
+
+
+def _identify_after_boot(baud: int) -> RequestScript[Identity]:
+    """Ask until it answers after a restart, at `baud` unless that is 0."""
+    yield pause(BOOT_NS, baud=baud)
+    for _ in range(BOOT_TRIES - 1):
+        try:
+            return (yield from identify())
+        except NoReply:
+            continue
+    return (yield from identify())

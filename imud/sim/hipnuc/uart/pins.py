@@ -6,7 +6,7 @@
 Text (replies) has no pulse. SOUT_DIV repeats every n-th pulse; that it does so with the same 80 µs and begins with the
 n-th after power-on or a change of the divider is assumed. ALARM is high while an angle is below the range's low end or
 above its high end; that the module looks every 10 ms, and that X means the turn about X (pitch) and Y that about Y
-(roll), is assumed: the manual gives no drawing of its axes there. Pins are told by function, whatever IO they are on.
+(roll), is assumed: the manual gives no drawing of its axes there. Pins are named by function, whatever IO they are on.
 """
 
 from bisect import bisect_right, insort
@@ -55,7 +55,7 @@ class HipnucPins:
             self._alarm = active
             self._add(PinEdge(at_ns, Pin.ALARM, active))
 
-    def take(self, now_ns: int) -> list[PinEdge]:
+    def edges(self, now_ns: int) -> list[PinEdge]:
         """Take out what has happened by now."""
         count = bisect_right(self._waiting, now_ns, key=_due_ns)
         done, self._waiting = self._waiting[:count], self._waiting[count:]

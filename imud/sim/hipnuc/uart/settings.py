@@ -1,4 +1,4 @@
-"""Settings of a simulated HiPNUC module: what RAM and flash hold, and how a command changes them.
+"""What a simulated HiPNUC module is made of, what its RAM and flash hold, how a command changes that, its status bits.
 
 IMU configuration manual V1.5.9, chapters 2.2.3 to 2.2.6 and 8.2. The forms of the USRCONFIG and COMCONFIG replies
 beyond `ATT_MODE: 0` are assumed: the manual does not print them.
@@ -11,7 +11,10 @@ from typing import Final
 
 from imud.attitude import Matrix3, is_rotation
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
-from imud.sample import Quaternion
+from imud.sample import Quaternion, Vector3
+from imud.sim.hipnuc.uart.utc import Epoch
+from imud.sim.physics.motion import Truth
+from imud.sim.sensor import SensorHardware
 
 PMUX_FIRMWARE: Final = 155
 """PMUX commands need firmware 1.5.5 (chapter 2.2.4)."""
@@ -189,3 +192,50 @@ _CHANGES: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...
     (re.compile(r"UNLOGALL"), _unlog_all),
 )
 """Commands that change settings and nothing else."""
+
+
+MARK_SPREAD_NS: Final = 15_000
+"""Assumed: the manual (section 1.2.1) gives the mean only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HipnucHardware(SensorHardware):
+    """One module. What commands change is in `ModuleSettings`; `processing_ns` counts from an edge on SIN too."""
+
+    product: str = "HI14R3"
+    build: str = "Oct 15 2024"
+    uuid: str = "043995698D6E1708"
+    firmware: int = 156
+    bootloader: int = 109
+    mark_spread_ns: int = MARK_SPREAD_NS
+    """How much it takes longer or shorter at most after an edge on SIN."""
+    mark_seed: int = 1
+    utc_epoch: Epoch = "unix"
+    """What UTC in ms counts from."""
+    uptime_ms: int = 0
+    """Device time at the first power-on, to begin near the end of a counter's range."""
+    mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
+    """Result of its magnetic calibration; zero: never calibrated."""
+
+
+STATIC_GYRO_RAD_S: Final = 0.02
+GYRO_SETTLED_MS: Final = 5000
+ATTITUDE_SETTLED_MS: Final = 1000
+"""Assumed times after power-on until bias and attitude count as converged."""
+
+GYRO_UNSETTLED, ATTITUDE_UNSETTLED = 1 << 3, 1 << 7
+STATIC, MAG_AIDING, NO_UTC, SYNC_OUT = 1 << 9, 1 << 10, 1 << 11, 1 << 12
+
+
+def main_status(reading: Truth, uptime_ms: int, *, nine_axis: bool, utc: bool) -> int:
+    """MAIN_STATUS (HI91 bytes 1-2 since firmware 1.6.9); a SOUT pulse goes before every frame."""
+    status = SYNC_OUT
+    if not utc:
+        status |= NO_UTC
+    if uptime_ms < GYRO_SETTLED_MS:
+        status |= GYRO_UNSETTLED
+    if uptime_ms < ATTITUDE_SETTLED_MS:
+        status |= ATTITUDE_UNSETTLED
+    if max(map(abs, reading.gyro_rad_s)) < STATIC_GYRO_RAD_S:
+        status |= STATIC
+    return status | MAG_AIDING if nine_axis else status

@@ -9,7 +9,7 @@ module sent with `advance`. What it does as a real one does:
 - Commands are lines of ASCII, obeyed at once; a known one is answered with `OK` or `ERR`, an unknown one not at all.
   URFR and SERIALCONFIG act after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved.
 - SOUT pulses before every frame, a rising edge on SIN sends messages set to ONMARK, the other pins and UTC are in
-  `hipnuc_pins.py` and `hipnuc_utc.py`; `pins` tells of edges as `advance` does of bytes.
+  `pins.py` and `utc.py`; `pins` returns edges as `advance` returns bytes.
 - LOG DISABLE silences frames, not replies, and is forgotten at a reboot (assumed; the manual calls ENABLE the default).
 
 Attitude is the truth in both modes; heading does not start at zero in six-axis mode, as it would in a real module.
@@ -23,16 +23,23 @@ from typing import Final
 
 from imud.devices.hipnuc.uart.codec import encode_hi91, encode_hi92
 from imud.devices.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMessage
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
 from imud.sim.hipnuc.uart.pins import ALARM_PERIOD_MS, SOUT_HIGH_NS, HipnucPins, is_alarming
-from imud.sim.hipnuc.uart.settings import CommandRefused, ModuleSettings, Output, changed, number, rows
-from imud.sim.hipnuc.uart.status import main_status
+from imud.sim.hipnuc.uart.settings import (
+    CommandRefused,
+    HipnucHardware,
+    ModuleSettings,
+    Output,
+    changed,
+    main_status,
+    number,
+    rows,
+)
 from imud.sim.hipnuc.uart.utc import UtcTime
-from imud.sim.physics.motion import MOTIONS, Truth
+from imud.sim.physics.motion import Truth
 from imud.sim.physics.mounting import MountingRotation, frame_of, level_of
-from imud.sim.physics.noise import Noise
 from imud.sim.ports.pins import PinEdge
 from imud.sim.ports.uart_wire import Transmitter
+from imud.sim.sensor import sensor_of
 from imud.sim.simulator import Burst, Simulator, SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S, T_PER_UT
 
@@ -80,7 +87,7 @@ class HipnucModule:
         return self._wire.baud
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back, or the device was told to: what was not saved is gone."""
+        """Power was lost and came back, or REBOOT came: what was not saved is lost."""
         self._sample(now_ns)
         self._before_reboot += self._wire.stopped(now_ns)
         self._pins.power_lost(now_ns)
@@ -97,7 +104,7 @@ class HipnucModule:
                 line, self._line = self._line, bytearray()
                 if len(line) <= COMMAND_BYTES_MAX:
                     self._obey(line.decode("ascii"), now_ns)
-                if now_ns < self._ready_ns:  # it told the module to reboot
+                if now_ns < self._ready_ns:  # the command was REBOOT
                     return
             elif byte in _PRINTABLE:
                 if len(self._line) <= COMMAND_BYTES_MAX:
@@ -134,7 +141,7 @@ class HipnucModule:
     def pins(self, now_ns: int) -> list[PinEdge]:
         """Return the edges on the output pins since the last call, in order."""
         self._sample(now_ns)
-        return self._pins.take(now_ns)
+        return self._pins.edges(now_ns)
 
     def next_pin_ns(self) -> int | None:
         """When `pins` may have something next, or None while nothing is to come."""
@@ -343,7 +350,7 @@ class HipnucModule:
         roll, pitch, _ = attitude.euler_rad
         upside_down = kind == "3" and abs(roll) > pi / 2
         if kind == "3" and max(abs(pitch), pi - abs(roll) if upside_down else abs(roll)) >= NEAR_LEVEL_RAD:
-            raise CommandRefused(kind)  # the manual says it gives up; that it answers ERR is assumed
+            raise CommandRefused(kind)  # the manual says it does nothing; that it answers ERR is assumed
         level = ModuleSettings().level if kind == "5" else level_of(attitude.quat_wxyz, upside_down)
         self.settings = replace(self.settings, level=level, level_accel=kind == "3")
         self._settings_changed(now_ns)
@@ -369,8 +376,6 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
     if options.message.upper() not in ("", *OutputMessage):
         raise ValueError(f"message {options.message!r}: expected {' or '.join(OutputMessage)}")
     message = OutputMessage(options.message.upper() or OutputMessage.HI91)
-    if options.motion not in MOTIONS:
-        raise ValueError(f"motion {options.motion!r}: expected {' or '.join(MOTIONS)}")
     fitting = (b for b, most_hz in MAX_RATE_HZ[message].items() if b >= FACTORY_BAUD and most_hz >= options.rate_hz)
     baud = options.baud or next(fitting)
     if baud not in BAUD_RATES:
@@ -379,11 +384,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
     hi91, hi92 = (output, silent) if message is OutputMessage.HI91 else (silent, output)
     hardware = HipnucHardware(
         firmware=options.firmware or HipnucHardware().firmware,
-        motion=MOTIONS[options.motion](options.gravity_m_s2),
-        noise=Noise(options.seed) if options.noise == "real" else None,
-        skew_ppm=options.skew_ppm,
-        boot_ms=options.boot_ms,
-        processing_ns=options.processing_ns,
+        **sensor_of(options),
         mark_seed=options.seed,
     )
     return HipnucModule(now_ns, ModuleSettings(baud=baud, hi91=hi91, hi92=hi92), hardware)

@@ -6,9 +6,10 @@ import pytest
 
 from imud.contracts.action import Target
 from imud.contracts.session import RequestScript
-from imud.devices.hipnuc.canopen.codec import DRIVER, HipnucCanopenSettings
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.devices.hipnuc.canopen.driver import DRIVER
 from imud.errors import BadArgument
-from imud.sim.hipnuc.canopen.objects import NodeSettings
+from imud.sim.hipnuc.canopen import NodeSettings
 from tests.support.canopen_bench import QUIET, Bench, unpack
 
 
@@ -66,16 +67,23 @@ def test_every_action_is_tried_here() -> None:
     [
         ("node", {"node": 128}),
         ("node", {"node": 0}),
+        ("node", {"node": True}),
         ("bitrate", {"bitrate": 800_000}),
         ("interval", {"tpdo": 5, "interval_ms": 10}),
         ("interval", {"tpdo": 1, "interval_ms": 4}),
+        ("interval", {"tpdo": 1, "interval_ms": 1001}),
+        ("interval", {"tpdo": 1, "interval_ms": -1}),
         ("transmission", {"tpdo": 1, "by": "remote"}),
+        ("transmission", {"tpdo": 1, "by": 1}),
+        ("direction", {"x_reversed": 1, "y_reversed": False}),
         ("zero", {"zero": 2}),
+        ("zero", {"zero": 3}),
         ("nmt", {"command": "sleep"}),
+        ("nmt", {"command": 1}),
     ],
 )
 def test_arguments_that_cannot_be_send_nothing(name: str, given: dict[str, object]) -> None:
-    with pytest.raises(BadArgument):
+    with pytest.raises(BadArgument, match=r"(?i)expected|invalid enum value"):
         next(begun(name, **given))
 
 

@@ -6,7 +6,8 @@ import msgspec
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.devices.hipnuc.canopen.codec import DRIVER, HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
+from imud.devices.hipnuc.canopen.driver import DRIVER
 from imud.formats.can import CyclicFrame
 from imud.ledger import Ledger
 from imud.sample import Measurement

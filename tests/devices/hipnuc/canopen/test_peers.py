@@ -14,15 +14,14 @@ from canopen.objectdictionary import ODRecord, ODVariable, datatypes
 
 from imud.contracts.codec import CodecEvent, ReplyFrame, message_of
 from imud.contracts.session import Outcome, Reply, Request, Session
-from imud.devices.hipnuc.canopen import sdo, session
-from imud.devices.hipnuc.canopen.cob_ids import NmtCommand
+from imud.devices.hipnuc.canopen import cia301, session
+from imud.devices.hipnuc.canopen.cia301 import NmtCommand
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings
 from imud.devices.hipnuc.canopen.session import Transmission
 from imud.errors import NoReply
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.hipnuc.canopen.objects import NodeSettings
-from imud.sim.hipnuc.canopen.simulator import HipnucCanopenHardware, HipnucCanopenModule
+from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from tests.support.canopen_bench import converse, unpack
 
 LIMIT_S = 10.0
@@ -274,10 +273,10 @@ def test_their_long_strings_are_left_alone(local: canopen.LocalNode, host: Host)
 
 def test_their_abort_codes_are_told_in_words(local: canopen.LocalNode, host: Host) -> None:
     assert local.id == NODE
-    with pytest.raises(sdo.Aborted, match="object does not exist"):
-        converse(sdo.read(NODE, 0x3000, 0), host.ask)
-    with pytest.raises(sdo.Aborted, match="sub-index does not exist"):
-        converse(sdo.read(NODE, 0x1800, 9), host.ask)
+    with pytest.raises(cia301.Aborted, match="object does not exist"):
+        converse(cia301.read_object(NODE, 0x3000, 0), host.ask)
+    with pytest.raises(cia301.Aborted, match="sub-index does not exist"):
+        converse(cia301.read_object(NODE, 0x1800, 9), host.ask)
 
 
 def test_nobody_answers_for_another_node(local: canopen.LocalNode, host: Host) -> None:
@@ -294,7 +293,7 @@ def test_their_node_obeys_our_nmt_and_its_heartbeat_is_heard(local: canopen.Loca
     wait_for(lambda: local.nmt.state == "OPERATIONAL")
     converse(session.nmt(NODE, NmtCommand.PRE_OPERATIONAL), host.ask)
     wait_for(lambda: local.nmt.state == "PRE-OPERATIONAL")
-    converse(sdo.write(NODE, 0x1017, 0, 50, 2), host.ask)
+    converse(cia301.write_object(NODE, 0x1017, 0, 50, 2), host.ask)
     identity = converse(session.identify(NODE), host.ask)
     local.nmt.stop_heartbeat()  # type: ignore[no-untyped-call]  # the library has it so
     assert identity.details is not None

@@ -9,7 +9,8 @@ import pytest
 from imud.attitude import quat_normalized
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
 from imud.devices.hipnuc.j1939 import messages
-from imud.devices.hipnuc.j1939.codec import DRIVER, HipnucJ1939Codec, HipnucJ1939Settings, encode
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, encode
+from imud.devices.hipnuc.j1939.driver import DRIVER
 from imud.formats.j1939 import J1939Id, join
 from imud.ledger import Ledger
 from imud.sample import Measurement

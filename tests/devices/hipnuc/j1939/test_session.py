@@ -9,7 +9,8 @@ from imud.contracts.codec import ReplyFrame
 from imud.contracts.driver import Identity
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session, Silence
 from imud.devices.hipnuc.j1939 import session
-from imud.devices.hipnuc.j1939.codec import DRIVER, HipnucJ1939Settings
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.devices.hipnuc.j1939.driver import DRIVER
 from imud.devices.hipnuc.j1939.session import HOST_ADDRESS, X_SIGN, Y_SIGN, J1939Node, Zero
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
@@ -121,25 +122,25 @@ def test_silence_is_told_but_where_it_is_no_failure() -> None:
 
 
 @pytest.mark.parametrize(
-    "begin",
+    ("name", "arguments"),
     [
-        lambda: session.set_interval(PEER, 0xFF34, 4),
-        lambda: session.set_interval(PEER, 0xFF34, 1001),
-        lambda: session.set_interval(PEER, 0xFF34, True),
-        lambda: session.set_interval(PEER, 0xFF35, 10),
-        lambda: session.set_bitrate(PEER, 100_000),
-        lambda: session.set_address(PEER, 0),
-        lambda: session.set_address(PEER, 129),
-        lambda: session.set_direction(PEER, session.BITRATE, True),
-        lambda: session.zero(PEER, 2),  # type: ignore[arg-type]  # a bare number is the point
-        lambda: session.send_once(PEER, 0xFF35),
-        lambda: of_action("interval", pgn="FF35", interval_ms=10),
-        lambda: of_action("zero", zero="there"),
+        ("interval", {"pgn": "FF34", "interval_ms": 4}),
+        ("interval", {"pgn": "FF34", "interval_ms": 1001}),
+        ("interval", {"pgn": "FF34", "interval_ms": True}),
+        ("interval", {"pgn": "FF35", "interval_ms": 10}),
+        ("bitrate", {"bitrate": 100_000}),
+        ("address", {"address": 0}),
+        ("address", {"address": 129}),
+        ("address", {"address": True}),
+        ("direction", {"axis": "Z", "reversed": True}),
+        ("zero", {"zero": 2}),
+        ("zero", {"zero": "there"}),
+        ("send_once", {"pgn": "FF35"}),
     ],
 )
-def test_arguments_are_checked_before_anything_is_sent(begin: Callable[[], RequestScript[None]]) -> None:
-    with pytest.raises(BadArgument):
-        next(begin())
+def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dict[str, object]) -> None:
+    with pytest.raises(BadArgument, match=f"arguments: {next(iter(arguments))} "):
+        next(of_action(name, **arguments))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ import pytest
 
 from imud.contracts.action import Target, parameters_of
 from imud.contracts.polling import run_transfer_script
-from imud.devices.hipnuc.modbus.codec import DRIVER, HipnucModbusSettings
+from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings
+from imud.devices.hipnuc.modbus.driver import DRIVER
 from imud.errors import BadArgument
 from tests.devices.hipnuc.modbus.test_session import Wire
 
@@ -54,11 +55,21 @@ def test_registers_are_read_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [("address", {"address": 129}), ("address", {}), ("baud", {"baud": 256000})]
+    ("name", "given", "names"),
+    [
+        ("address", {"address": 129}, "from 1 to 128"),
+        ("address", {"address": 0}, "from 1 to 128"),
+        ("address", {}, "from 1 to 128"),
+        ("baud", {"baud": 256000}, "4800, 9600"),
+        ("baud", {"baud": True}, "4800, 9600"),
+        ("mounting", {"mounting": 1}, "level"),
+        ("attitude_mode", {"axes": 1}, "6, 9"),
+        ("level", {"level": 3}, "automatic"),
+    ],
 )
-def test_what_a_module_cannot_take_is_not_sent(name: str, given: dict[str, object]) -> None:
+def test_what_a_module_cannot_take_is_not_sent(name: str, given: dict[str, object], names: str) -> None:
     wire = Wire()
-    with pytest.raises(BadArgument):
+    with pytest.raises(BadArgument, match=names):
         act(wire, name, **given)
     assert wire.asked == []
 

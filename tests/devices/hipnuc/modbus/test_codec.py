@@ -6,19 +6,19 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason
 from imud.contracts.polling import Transfer, Vanished, run_transfer_script
-from imud.devices.hipnuc.common.registers import QUAT_NEW_PER_LSB, QUAT_OLD_PER_LSB
+from imud.devices.hipnuc.common.raw_units import QUAT_PER_LSB
 from imud.devices.hipnuc.modbus.codec import (
-    DRIVER,
     READ_BLOCK,
     READ_SERIAL,
     READ_SHORT_BLOCK,
     HipnucModbusCodec,
     HipnucModbusSettings,
     pack_block,
-    probe,
-    set_up,
 )
+from imud.devices.hipnuc.modbus.driver import DRIVER
 from imud.devices.hipnuc.modbus.frames import registers_reply
+from imud.devices.hipnuc.modbus.registers import QUAT_OLD_PER_LSB
+from imud.devices.hipnuc.modbus.session import probe, set_up
 from imud.errors import DeviceRefused
 from imud.formats.modbus import framed
 from imud.ledger import Ledger
@@ -52,7 +52,7 @@ def short(**options: object) -> HipnucModbusCodec:
 def block(
     *,
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    per_lsb: float = QUAT_NEW_PER_LSB,
+    per_lsb: float = QUAT_PER_LSB,
     incli: tuple[int, int] = (0, 0),
     pitch_deg: float = 0.0,
     uptime_ms: int = 5,
@@ -140,7 +140,7 @@ def test_reply_of_another_function_or_count_is_no_block() -> None:
         assert event.reason is BadReason.CONTENT
 
 
-@pytest.mark.parametrize("per_lsb", [QUAT_OLD_PER_LSB, QUAT_NEW_PER_LSB])
+@pytest.mark.parametrize("per_lsb", [QUAT_OLD_PER_LSB, QUAT_PER_LSB])
 def test_scale_of_the_quaternion_is_decided_once(per_lsb: float) -> None:
     made = codec()
     assert measured(made, block(quat=(0, 0, 0, 0), per_lsb=per_lsb)).quat_wxyz is None

@@ -3,7 +3,6 @@
 import pytest
 
 from imud.contracts.polling import Transfer
-from imud.devices.hipnuc.common.registers import BAUD_RATES, BY_NAME, REGISTERS, Access
 from imud.devices.hipnuc.modbus.frames import (
     check_written,
     randomise_ids,
@@ -14,6 +13,7 @@ from imud.devices.hipnuc.modbus.frames import (
     set_id_by_serial,
     write_register,
 )
+from imud.devices.hipnuc.modbus.registers import BAUD_RATES, BY_NAME, REGISTERS, Access
 from imud.devices.hipnuc.modbus.session import (
     LineMounting,
     auto_level,
@@ -90,11 +90,6 @@ def test_requests_to_all() -> None:
         (lambda: randomise_ids(True, 9), "1 … 247"),
         (lambda: next(set_id(129)), "1 … 128"),
         (lambda: next(set_id(0)), "1 … 128"),
-        (lambda: next(set_baud(256000)), "4800, 9600"),
-        (lambda: next(set_baud(True)), "4800, 9600"),
-        (lambda: next(set_mounting(1)), "LineMounting.LEVEL"),  # type: ignore[arg-type]  # the mistake to be caught
-        (lambda: next(set_heading_mode(1)), "AttitudeMode"),  # type: ignore[arg-type]  # the mistake to be caught
-        (lambda: next(auto_level(3)), "LevelReset"),  # type: ignore[arg-type]  # the mistake to be caught
         (lambda: read_registers(0, 126), "1 … 125"),
         (lambda: read_registers(0xFFFF, 2), "0xFFFF"),
         (lambda: write_register(0, 0x10000), "0xFFFF"),

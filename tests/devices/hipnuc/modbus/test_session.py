@@ -5,7 +5,7 @@ from random import Random
 import pytest
 
 from imud.contracts.polling import Transfer, TransferScript, run_transfer_script
-from imud.devices.hipnuc.common.registers import BY_NAME
+from imud.devices.hipnuc.modbus.registers import BY_NAME
 from imud.devices.hipnuc.modbus.session import (
     LineMounting,
     auto_level,
@@ -21,7 +21,7 @@ from imud.devices.hipnuc.modbus.session import (
 from imud.devices.hipnuc.uart.commands import AttitudeMode, LevelReset
 from imud.errors import DeviceRefused, TransferError, Trouble
 from imud.formats.modbus import framed
-from imud.sim.hipnuc.modbus.slave import Slave, SlaveSettings
+from imud.sim.hipnuc.modbus import Slave, SlaveSettings
 
 
 class Wire:

@@ -9,7 +9,8 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.devices.hipnuc.nmea2000 import messages
-from imud.devices.hipnuc.nmea2000.codec import DRIVER, SID_DOUBTS, HipnucNmea2000Codec, HipnucNmea2000Settings, encode
+from imud.devices.hipnuc.nmea2000.codec import SID_DOUBTS, HipnucNmea2000Codec, HipnucNmea2000Settings, encode
+from imud.devices.hipnuc.nmea2000.driver import DRIVER
 from imud.devices.hipnuc.nmea2000.messages import ATTITUDE, HEADING, RATE_OF_TURN, Reference
 from imud.ledger import Ledger
 from imud.sample import Measurement

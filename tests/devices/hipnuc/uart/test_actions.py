@@ -1,5 +1,6 @@
 """What a HiPNUC module can be told by name: what goes over the wire, and what the simulated module does."""
 
+import math
 from typing import Any
 
 import pytest
@@ -60,21 +61,48 @@ def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None
     assert value is None
 
 
+RATES = r"rate_hz \(one of 0, 1, 2, 5, 10, 20, 50, 100, 200, 250, 500, 1000\)"
+HALF_TURN = "a number from -180 to 180"
+
+
 @pytest.mark.parametrize(
-    ("name", "arguments"),
+    ("name", "arguments", "message"),
     [
-        ("output", {"message": "HI91", "rate_hz": 500}),  # more than 115200 baud carry
-        ("output", {"message": "HI93", "rate_hz": 1}),
-        ("mounting", {"turned": [1.0] * 8}),
-        ("mounting", {"turned": [2, 0, 0, 0, 1, 0, 0, 0, 1]}),
-        ("yaw", {"angle_deg": 181}),
-        ("pin", {"function": "sin", "pin": 10}),
-        ("sout_divider", {"divisor": 65}),
-        ("baud", {"baud": 1200}),
+        ("output", {"message": "HI91", "rate_hz": 500}, "expected at most 100 Hz"),  # more than 115200 baud carry
+        ("output", {"message": "HI91", "rate_hz": 300}, RATES),
+        ("output", {"message": "HI91", "rate_hz": -1}, RATES),
+        ("output", {"message": "HI93", "rate_hz": 1}, 'one of "HI91", "HI92"'),
+        ("output", {"message": None, "rate_hz": 10}, 'one of "HI91", "HI92"'),
+        ("output_on_mark", {"message": None}, 'one of "HI91", "HI92"'),
+        ("output_once", {"message": None}, 'one of "HI91", "HI92"'),
+        ("mode", {"axes": 7}, "one of 6, 9"),
+        ("mode", {"axes": None}, "one of 6, 9"),
+        ("level", {"level": None}, '"automatic", "cancel", "relative"'),
+        ("mounting", {"turned": [1.0] * 8}, "length"),
+        ("mounting", {"turned": [1.0] * 10}, "length"),
+        ("mounting", {"turned": [2, 0, 0, 0, 1, 0, 0, 0, 1]}, "expected a rotation"),
+        ("magnetic_calibration", {"enabled": None}, "true or false"),
+        ("yaw", {"angle_deg": 181}, HALF_TURN),
+        ("yaw", {"angle_deg": 180.1}, HALF_TURN),
+        ("yaw", {"angle_deg": math.nan}, HALF_TURN),
+        ("yaw", {"angle_deg": -math.inf}, HALF_TURN),
+        ("yaw", {"angle_deg": True}, HALF_TURN),
+        ("yaw", {"angle_deg": 5, "relative": None}, "true or false"),
+        ("pin", {"function": "sin", "pin": 10}, "a whole number from 1 to 9"),
+        ("pin", {"function": "sin", "pin": 0}, "a whole number from 1 to 9"),
+        ("pin", {"function": None, "pin": 1}, '"sin", "sout"'),
+        ("alarm", {"axis": "X", "min_deg": 5, "max_deg": -5}, "expected the minimum below the maximum"),
+        ("alarm", {"axis": "X", "min_deg": -5, "max_deg": math.inf}, HALF_TURN),
+        ("alarm", {"axis": None, "min_deg": -5, "max_deg": 5}, 'one of "X", "Y"'),
+        ("sout_divider", {"divisor": 0}, "from 1 to 64"),
+        ("sout_divider", {"divisor": 65}, "from 1 to 64"),
+        ("sout_divider", {"divisor": True}, "from 1 to 64"),
+        ("baud", {"baud": 1200}, "one of 9600, 115200, 230400, 256000, 460800, 921600"),
+        ("baud", {"baud": 57600}, "one of 9600, 115200, 230400, 256000, 460800, 921600"),
     ],
 )
-def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any]) -> None:
-    with pytest.raises(BadArgument):
+def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadArgument, match=message):
         sent(name, [], **arguments)
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from imud.contracts.lines import AlarmRange, AlarmRanges
 from imud.devices.hipnuc.uart.alarm import alarm_ranges
-from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.devices.hipnuc.uart.replies import parse_report
 from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings
 

@@ -14,15 +14,8 @@ import pytest
 from imud.attitude import euler312_from_quat
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, TextLine
 from imud.contracts.driver import Identity
-from imud.devices.hipnuc.uart.codec import (
-    DRIVER,
-    HEADER,
-    HipnucCodec,
-    HipnucSettings,
-    encode_frame,
-    encode_hi91,
-    encode_hi92,
-)
+from imud.devices.hipnuc.uart.codec import HEADER, HipnucCodec, HipnucSettings, encode_frame, encode_hi91, encode_hi92
+from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.ledger import Ledger
 from imud.sample import Measurement
 
@@ -117,6 +110,16 @@ def test_manual_hi91_in_a_payload_with_others() -> None:
     m = one(codec.feed(framed(MANUAL_HI91[6:] + b"\x77")))
     check_manual_values(msgspec.structs.replace(m, size_bytes=m.size_bytes - 1))
     assert codec.ledger.unknown_tags == 1
+
+
+@pytest.mark.parametrize("word", ["pps", "status"])
+def test_frames_back_to_back_are_decoded_like_one(word: str) -> None:
+    alone = one(make(hi91_word=word).feed(MANUAL_HI91))
+    check_manual_values(alone)
+    run = make(hi91_word=word).feed(3 * MANUAL_HI91)
+    assert run == [msgspec.structs.replace(alone, trailing_bytes=frames * len(MANUAL_HI91)) for frames in (2, 1, 0)]
+    general = make(hi91_word=word).feed(framed(MANUAL_HI91[HEADER.size :] + b"\x00"))  # an unknown tag behind it
+    assert general == [msgspec.structs.replace(alone, size_bytes=len(MANUAL_HI91) + 1)]
 
 
 def test_manual_crc_is_that_of_the_table() -> None:

@@ -6,8 +6,7 @@ import pytest
 
 from imud.attitude import matrix_from_quat
 from imud.devices.hipnuc.uart import commands
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.physics.motion import Still
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.hipnuc_bench import FAST, STILL, Bench

@@ -6,8 +6,7 @@ from math import degrees, radians
 import pytest
 
 from imud.devices.hipnuc.uart.commands import AlarmAxis, alarm, sout_divider
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings, Output
+from imud.sim.hipnuc.uart.settings import AlarmSetting, HipnucHardware, ModuleSettings, Output
 from imud.sim.physics.motion import Still, swing
 from imud.sim.ports.pins import Pin, PinEdge
 from imud.sim.simulator import Burst

@@ -8,12 +8,11 @@ import pytest
 from imud.contracts.codec import TextLine
 from imud.contracts.driver import Identity
 from imud.contracts.session import Outcome, RequestScript, Session
-from imud.devices.hipnuc.uart.codec import DRIVER
+from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim import SIMULATORS
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule, make
 from imud.sim.physics.motion import Still, swing
 from imud.sim.physics.noise import Noise

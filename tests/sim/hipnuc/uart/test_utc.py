@@ -6,8 +6,7 @@ from itertools import pairwise
 import pytest
 
 from imud.formats.rmc import build
-from imud.sim.hipnuc.uart.hardware import HipnucHardware
-from imud.sim.hipnuc.uart.settings import ModuleSettings
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.physics.motion import Still
 from imud.units import NS_PER_MS, NS_PER_S

@@ -6,12 +6,17 @@ import math
 import pytest
 
 from imud.attitude import euler312_from_quat
-from imud.devices.hipnuc.canopen import sdo, session
-from imud.devices.hipnuc.canopen.cob_ids import NmtCommand
+from imud.devices.hipnuc.canopen import cia301, session
+from imud.devices.hipnuc.canopen.cia301 import NmtCommand
 from imud.devices.hipnuc.canopen.session import InclinometerZero, Transmission
 from imud.sim.can_module import SentFrame
-from imud.sim.hipnuc.canopen.objects import NodeSettings, ObjectDictionary
-from imud.sim.hipnuc.canopen.simulator import SIMULATOR, HipnucCanopenHardware, HipnucCanopenModule
+from imud.sim.hipnuc.canopen import (
+    SIMULATOR,
+    HipnucCanopenHardware,
+    HipnucCanopenModule,
+    NodeSettings,
+    ObjectDictionary,
+)
 from imud.sim.simulator import SimulatorOptions
 from tests.support.canopen_bench import BEGIN_NS, MS, QUIET, Bench
 
@@ -103,7 +108,7 @@ def test_nmt_states() -> None:
     assert bench.hold(session.identify(8)).product == "HI14"  # SDO goes on
     bench.send(0x000, b"\2\0")  # stop all
     bench.heard.clear()
-    bench.send(0x608, sdo.read_frame(0x1000, 0))
+    bench.send(0x608, cia301.read_frame(0x1000, 0))
     bench.run(50 * MS)
     assert bench.heard == []
     bench.send(0x000, b"\1\0")
@@ -133,7 +138,7 @@ def test_saved_settings_survive_and_a_factory_reset_clears_them_at_power_on() ->
     bench.hold(session.restart(8))
     assert bench.module.node == 20
     assert bench.module.objects.settings.periods_ms[2] == 100
-    bench.send(0x614, sdo.write_frame(0x2000, 0, b"\1\0\0\0"))
+    bench.send(0x614, cia301.write_frame(0x2000, 0, b"\1\0\0\0"))
     assert bench.module.node == 20
     bench.module.reboot(bench.now_ns)
     assert bench.module.node == 8

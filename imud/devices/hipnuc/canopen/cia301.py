@@ -1,4 +1,14 @@
-"""Expedited SDO, from the client's side, without I/O: CiA 301, section 7.2.4.3, and manual B V1.5.9, section 5.4.1.
+"""What CiA 301 defines of a node: identifiers, network management (NMT), and expedited SDO from the client's side.
+
+An identifier is a function (upper four bits) plus the node's number; two functions are the whole bus's. Manual
+"IMU配置手冊" V1.5.9, section 5.2:
+
+    NMT 0x000   SYNC 0x080   EMCY 0x080+n   SDO reply 0x580+n   SDO request 0x600+n   heartbeat 0x700+n
+    TPDO1 0x180+n   TPDO2 0x280+n   TPDO3 0x380+n   TPDO4 0x480+n   TPDO6 0x680+n   TPDO7 0x780+n
+
+The last two TPDOs are the vendor's choice; they do not collide with what CiA 301 predefines.
+
+Expedited SDO: CiA 301, section 7.2.4.3, and manual section 5.4.1.
 
     ┌─────────┬───────────┬──────────┬───────────────┐    request  0x600 + node
     │ command │ index u16 │ sub u8   │ data, 4 bytes │    reply    0x580 + node
@@ -8,18 +18,67 @@
     read                     0x40                  →   0x4F 0x4B 0x47 0x43 (1, 2, 3, 4 bytes), 0x42 (no length given)
     abort, both ways         0x80, data: u32 code
 
-A longer value comes in segments (0x41, 0x40); that transfer is aborted, and the value counts as not to be read here.
+A longer value comes in segments (0x41, 0x40); that transfer is aborted, and the value counts as not readable here.
 """
 
 from collections.abc import Callable
-from typing import Final
+from enum import Enum
+from typing import Final, Literal
 
 from imud.contracts.codec import Message, ReplyFrame
 from imud.contracts.session import Outcome, Rejection, Request, RequestScript, Silence, never
-from imud.devices.hipnuc.canopen.cob_ids import SDO_REPLY, SDO_REQUEST
 from imud.errors import NoReply, Rejected
 from imud.formats.can import pack_frame
 from imud.units import NS_PER_S
+
+TpdoNumber = Literal[1, 2, 3, 4, 6, 7]
+NODE_MAX: Final = 127
+NODE_DEFAULT: Final = 8
+NODE_MASK: Final = 0x7F
+FUNCTION_MASK: Final = 0x780
+
+NMT: Final = 0x000
+SYNC: Final = 0x080
+EMERGENCY: Final = 0x080
+SDO_REPLY: Final = 0x580
+SDO_REQUEST: Final = 0x600
+HEARTBEAT: Final = 0x700
+TPDO_FUNCTIONS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
+"""Functions of the TPDOs by their number."""
+
+
+class NmtCommand(Enum):
+    """Commands of the network management; one byte, followed by the node's number (CiA 301, 7.2.8.2)."""
+
+    START = 0x01
+    """Operational: TPDOs are sent."""
+    STOP = 0x02
+    """Only NMT and heartbeat remain."""
+    PRE_OPERATIONAL = 0x80
+    """SDO remains, TPDOs do not."""
+    RESET_NODE = 0x81
+    """Restart, as by power-on."""
+    RESET_COMMUNICATION = 0x82
+    """Restart of the communication with what is saved."""
+
+
+class NmtState(Enum):
+    """States that a heartbeat carries (CiA 301, 7.2.8.3.2.2)."""
+
+    BOOT_UP = 0x00
+    """Sent once after a restart."""
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+def state_name(code: int) -> str:
+    """A state in words, for example `pre-operational`; unknown ones as their number."""
+    try:
+        return NmtState(code).name.lower().replace("_", "-")
+    except ValueError:
+        return f"unknown (0x{code:02X})"
+
 
 SDO_BYTES: Final = 8
 READ: Final = 0x40
@@ -102,7 +161,7 @@ def value_of(data: bytes) -> bytes | None:
     return None if size is None else data[4 : 4 + size]
 
 
-def read(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
+def read_object(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
     """Read an object: its bytes, or None if it has more than four. Raises Aborted, NoReply."""
     name = f"node {node}, read 0x{index:04X}.{sub}"
     ends = _answers(node, index, sub, (*READ_SIZES, *READ_SEGMENTED))
@@ -114,7 +173,7 @@ def read(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
     return value
 
 
-def write(
+def write_object(
     node: int, index: int, sub: int, value: int, size: int, *, timeout_ns: int = TIMEOUT_NS
 ) -> RequestScript[None]:
     """Write an unsigned object of 1 … 4 bytes. Raises Aborted, NoReply."""
@@ -148,7 +207,7 @@ def _reply(name: str, outcome: Outcome) -> bytes:
 
 
 def _answers(node: int, index: int, sub: int, commands: tuple[int, ...]) -> Callable[[Message], bool]:
-    """What holds for a reply of that node about that object with one of these commands."""
+    """A test for replies of that node about that object with one of these commands."""
     can_id, address = SDO_REPLY + node, _address(index, sub)
 
     def holds(message: Message) -> bool:

@@ -1,6 +1,6 @@
 """The layouts of the sub-packets are as long as the manual says."""
 
-from imud.devices.hipnuc.common.packets import HI91, HI92, PPS_STAMP_MODULUS_MS
+from imud.devices.hipnuc.uart.packets import HI91, HI92, PPS_STAMP_MODULUS_MS
 
 
 def test_sizes() -> None:

@@ -1,7 +1,7 @@
 """Registers of HiPNUC modules on Modbus: all of manual "IMU配置手冊" V1.5.9, section 4.2, and those of newer firmware.
 
 Values of two registers have the high word first. Three departures from the table of the manual: the quaternion is
-signed and its scale is 2⁻¹⁵ in older firmware and 0.0001 in newer (`modbus.py` tells them apart); 0.011 of the
+signed and its scale is 2⁻¹⁵ in older firmware and 0.0001 in newer (the codec decides by the values); 0.011 of the
 inclinometer is 360/32768 or 180/32768, by product; MAIN_STATUS, the two of the magnetic calibration and UPTIME are of
 newer firmware, as the vendor's own programs read them.
 """
@@ -9,10 +9,16 @@ newer firmware, as the vendor's own programs read them.
 from dataclasses import dataclass
 from enum import StrEnum
 from math import tau
-from typing import Final
+from typing import Final, Literal, get_args
 
-from imud.devices.hipnuc.common.packets import M_S2_PER_G
-from imud.units import RAD_PER_DEG, T_PER_UT
+from imud.devices.hipnuc.common.raw_units import (
+    ACCEL_M_S2_PER_LSB,
+    EULER_RAD_PER_LSB,
+    GYRO_RAD_S_PER_LSB,
+    MAG_T_PER_LSB,
+    PRESSURE_PA_PER_LSB,
+    TEMPERATURE_C_PER_LSB,
+)
 
 
 class Access(StrEnum):
@@ -43,21 +49,14 @@ class Register:
     """What may be written, where not everything may."""
 
 
-ACCEL_M_S2_PER_LSB: Final = 0.00048828 * M_S2_PER_G
-"""As printed; 16 / 32768 G would be 2.6e-6 more. 1 G = 9.8 m/s²."""
-GYRO_RAD_S_PER_LSB: Final = 0.061035 * RAD_PER_DEG
-MAG_T_PER_LSB: Final = 0.030517 * T_PER_UT
-EULER_RAD_PER_LSB: Final = 0.001 * RAD_PER_DEG
-TEMPERATURE_C_PER_LSB: Final = 0.01
-PRESSURE_PA_PER_LSB: Final = 0.01
 QUAT_OLD_PER_LSB: Final = 2.0**-15
-QUAT_NEW_PER_LSB: Final = 0.0001
 INCLI_SINGLE_RAD_PER_LSB: Final = tau / 32768
 INCLI_DUAL_RAD_PER_LSB: Final = tau / 2 / 32768
 
-BAUD_RATES: Final = (4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
+BaudRate = Literal[4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600]
+BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
 """By their code in UART1_BAUD (section 4.3.2)."""
-FACTORY_BAUD: Final = 115200
+FACTORY_BAUD: Final[BaudRate] = 115200
 ID_MAX: Final = 128
 """Highest ID that register MD_ID takes; more by serial number only."""
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.devices.hipnuc.common.cadence import Cadence
+from imud.devices.hipnuc.common.burst_timing import Cadence
 
 MS = 1_000_000
 

@@ -4,7 +4,7 @@ from math import inf, nan
 
 import pytest
 
-from imud.devices.hipnuc.common.counts import counts_of
+from imud.devices.hipnuc.common.raw_units import counts_of
 
 
 @pytest.mark.parametrize(

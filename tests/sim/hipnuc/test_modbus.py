@@ -10,8 +10,7 @@ from imud.devices.hipnuc.modbus.frames import randomise_ids, read_registers, set
 from imud.formats.modbus import framed, is_exception, is_whole
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.hipnuc.modbus.simulator import ModbusLine, make
-from imud.sim.hipnuc.modbus.slave import Slave
+from imud.sim.hipnuc.modbus import ModbusLine, Slave, make
 from imud.sim.simulator import Burst, SimulatorOptions
 from imud.units import NS_PER_S
 from tests.support.modbus_wire import serial_of, slave

@@ -4,15 +4,15 @@ import pytest
 
 from imud.contracts.codec import ReplyFrame
 from imud.contracts.session import Rejection, Reply, Silence
-from imud.devices.hipnuc.canopen.sdo import (
+from imud.devices.hipnuc.canopen.cia301 import (
     ABORT_TEXTS,
     Aborted,
     abort_frame,
     abort_text,
-    read,
     read_frame,
+    read_object,
     value_of,
-    write,
+    write_object,
 )
 from imud.errors import NoReply
 from tests.support.canopen_bench import unpack
@@ -23,7 +23,7 @@ def frame(text: str, can_id: int = 0x588) -> ReplyFrame:
 
 
 def test_write_and_its_confirmation() -> None:
-    conversation = write(8, 0x20A0, 0, 9, 4)
+    conversation = write_object(8, 0x20A0, 0, 9, 4)
     request = next(conversation)
     assert unpack(request.payload) == (0x608, bytes.fromhex("23 A0 20 00 09 00 00 00"))
     done = frame("60 A0 20 00 00 00 00 00")
@@ -45,7 +45,7 @@ def test_write_and_its_confirmation() -> None:
     ],
 )
 def test_what_is_no_confirmation(other: ReplyFrame | str) -> None:
-    request = next(write(8, 0x20A0, 0, 9, 4))
+    request = next(write_object(8, 0x20A0, 0, 9, 4))
     assert not request.is_end(other)
     assert not request.is_rejection(other)
     assert not request.is_part(other)
@@ -59,12 +59,12 @@ def test_read_frames_of_every_size() -> None:
 
 @pytest.mark.parametrize(("size", "command"), [(1, 0x2F), (2, 0x2B), (3, 0x27), (4, 0x23)])
 def test_write_commands_by_size(size: int, command: int) -> None:
-    _, data = unpack(next(write(8, 0x1800, 5, 10, size)).payload)
+    _, data = unpack(next(write_object(8, 0x1800, 5, 10, size)).payload)
     assert data == bytes([command, 0x00, 0x18, 5, 10, 0, 0, 0])
 
 
 def test_abort_tells_its_reason() -> None:
-    conversation = read(8, 0x2345, 1)
+    conversation = read_object(8, 0x2345, 1)
     request = next(conversation)
     refused = frame("80 45 23 01 00 00 02 06")
     assert request.is_rejection(refused)
@@ -76,14 +76,14 @@ def test_abort_tells_its_reason() -> None:
 
 
 def test_silence_is_no_reply() -> None:
-    conversation = read(8, 0x1000, 0)
+    conversation = read_object(8, 0x1000, 0)
     next(conversation)
     with pytest.raises(NoReply, match=r"node 8, read 0x1000\.0"):
         conversation.send(Silence(()))
 
 
 def test_a_value_in_segments_is_aborted_and_not_read() -> None:
-    conversation = read(8, 0x1008, 0)
+    conversation = read_object(8, 0x1008, 0)
     request = next(conversation)
     announced = frame("41 08 10 00 0A 00 00 00")
     assert request.is_end(announced)

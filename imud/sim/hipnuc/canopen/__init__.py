@@ -1,1 +1,0 @@
-"""A simulated HiPNUC module on CAN, CANopen."""

@@ -1,0 +1,359 @@
+"""HiPNUC modules on one RS-485 line at the far end of a serial port. IMU configuration manual V1.5.9, chapter 4.
+
+Without I/O and without a clock of its own. What the line does as a real one does:
+
+- Every byte takes its time on the wire, in both directions. A frame ends with a silence of 3.5 characters; a module
+  answers `processing_ns` later. With `chunk_bytes` a reply arrives in pieces of so many bytes, each when it is through.
+- Two modules with the same ID answer at the same time: what arrives is the AND of both, as on a line that either pulls.
+- Requests to address 0 are obeyed by all and answered by none. A frame with a wrong CRC is not answered.
+- A new ID is in force at once, a new baud rate too (assumed; the confirmation has the old one). What is not saved is
+  lost at a restart.
+
+Assumed of a module: firmware from 1.6.9 on has MAIN_STATUS, UPTIME and a quaternion of 0.0001 per count, older has not.
+The attitude is the truth; mounting and levelling are confirmed and change nothing.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
+from math import atan2, cos, degrees, sin
+from random import Random
+from typing import Final
+
+from imud.devices.hipnuc.common.raw_units import QUAT_PER_LSB
+from imud.devices.hipnuc.modbus.codec import pack_block
+from imud.devices.hipnuc.modbus.frames import (
+    BY_CHANCE,
+    BY_SERIAL,
+    CUSTOM,
+    FACTORY_ID,
+    RANDOMISE_IDS,
+    READ,
+    SET_ID_BY_SERIAL,
+    pack_identity,
+    registers_reply,
+)
+from imud.devices.hipnuc.modbus.registers import (
+    BAUD_RATES,
+    BLOCK_FIRST,
+    BY_NAME,
+    FACTORY_BAUD,
+    IDENTITY_FIRST,
+    QUAT_OLD_PER_LSB,
+)
+from imud.devices.hipnuc.modbus.session import FACTORY_RESET, RESTART, SAVE
+from imud.formats.modbus import (
+    BROADCAST,
+    CRC_BYTES,
+    EXCEPTION_BIT,
+    ILLEGAL_ADDRESS,
+    READ_HOLDING,
+    REGISTERS_MAX,
+    SLAVES,
+    WRITE_SINGLE,
+    frame_gap_ns,
+    framed,
+    is_whole,
+)
+from imud.sim.physics.motion import Motion, Truth, swing
+from imud.sim.physics.noise import Noise
+from imud.sim.ports.uart_wire import heard
+from imud.sim.sensor import motion_of, noise_of
+from imud.sim.simulator import Burst, Simulator, SimulatorOptions
+from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+
+NEW_FIRMWARE: Final = 169
+ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
+SETTINGS_FIRST: Final = BY_NAME["UART1_BAUD"].address
+STATUS_AT: Final = BY_NAME["MAIN_STATUS"].address
+
+
+@dataclass(frozen=True, slots=True)
+class SlaveSettings:
+    """What CTRL saves."""
+
+    slave: int = FACTORY_ID
+    baud: int = FACTORY_BAUD
+    heading_mode: int = 0
+
+
+@dataclass(slots=True)
+class Slave:
+    """One module. What has to do with its health may be changed at any time."""
+
+    serial: bytes
+    settings: SlaveSettings = field(default_factory=SlaveSettings)
+    product: str = "HI14R2N-485-000"
+    firmware: int = NEW_FIRMWARE
+    loader: int = 107
+    motion: Motion = field(default_factory=swing)
+    noise: Noise | None = None
+    skew_ppm: float = 20.0
+    inclinometer: str = ""
+    """`single`, `dual`, or empty for a product without."""
+    processing_ns: int = 300_000
+    """Time from the end of a request to the beginning of its reply (assumed)."""
+    dead: bool = False
+    bad_crc: int = 0
+    """So many replies to come have a wrong CRC."""
+    mute: int = 0
+    """So many requests to come are not answered."""
+    answered: int = 0
+    flash: SlaveSettings = field(init=False)
+    since_ns: int = field(init=False, default=0)
+    """When it was switched on (CLOCK_MONOTONIC)."""
+
+    def __post_init__(self) -> None:
+        self.flash = self.settings
+
+    def restart(self, now_ns: int) -> None:
+        """What was not saved is gone."""
+        self.settings, self.since_ns = self.flash, now_ns
+
+    def uptime_ms(self, now_ns: int) -> int:
+        """Of its own crystal."""
+        return int((now_ns - self.since_ns) * (1 + self.skew_ppm * 1e-6)) // NS_PER_MS
+
+    def obey(self, request: bytes, now_ns: int, epoch_ns: int, random: Random) -> bytes:
+        """Do what function and data say; the reply without address and CRC."""
+        match request[0]:
+            case function if function == READ_HOLDING and len(request) == READ.size:
+                _, first, count = READ.unpack(request)
+                data = self._read(first, count, now_ns, epoch_ns)
+                return registers_reply(data) if data else self._refusal(function, ILLEGAL_ADDRESS)
+            case function if function == WRITE_SINGLE and len(request) == READ.size:
+                _, register, value = READ.unpack(request)
+                code = self._write(register, value, now_ns)
+                return self._refusal(function, code) if code else request
+            case function if function == CUSTOM:
+                self._custom(request, random)
+                return request
+        return self._refusal(request[0], ILLEGAL_FUNCTION)
+
+    def _refusal(self, function: int, code: int) -> bytes:
+        return bytes([function | EXCEPTION_BIT, code])
+
+    def _read(self, first: int, count: int, now_ns: int, epoch_ns: int) -> bytes:
+        """The registers, or nothing where one of them is not there."""
+        new = self.firmware >= NEW_FIRMWARE
+        settings = self.settings
+        words = [BAUD_RATES.index(settings.baud), settings.slave, settings.heading_mode, 0, 0, 0x0800, 0, 0]
+        low = b"".join(word.to_bytes(2, "big") for word in words)
+        areas = [
+            (SETTINGS_FIRST, low if new else low[: 2 * (STATUS_AT - SETTINGS_FIRST)]),
+            (IDENTITY_FIRST, pack_identity(self.product, self.firmware, self.loader, self.serial)),
+        ]
+        if BLOCK_FIRST <= first < IDENTITY_FIRST:
+            areas.append((BLOCK_FIRST, self._block(now_ns, epoch_ns, new=new)))
+        for start, data in areas:
+            at = 2 * (first - start)
+            if 1 <= count <= REGISTERS_MAX and at >= 0 and at + 2 * count <= len(data):
+                return data[at : at + 2 * count]
+        return b""
+
+    def _block(self, now_ns: int, epoch_ns: int, *, new: bool) -> bytes:
+        t_s = (now_ns - epoch_ns) / NS_PER_S
+        truth = self.motion.at(t_s)
+        accel, gyro, mag, euler, quat, celsius, pascal = self.noise.add(truth, t_s) if self.noise else truth
+        return pack_block(
+            accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat, temperature_c=celsius,
+            pressure_pa=pascal, incli_counts=incli_counts(truth, self.inclinometer),
+            uptime_ms=self.uptime_ms(now_ns) if new else None,
+            quat_per_lsb=QUAT_PER_LSB if new else QUAT_OLD_PER_LSB,
+        )  # fmt: skip
+
+    def _write(self, register: int, value: int, now_ns: int) -> int:
+        """0, or the code of an exception."""
+        known = [one for one in BY_NAME.values() if one.address == register and "W" in one.access]
+        if not known:
+            return ILLEGAL_ADDRESS
+        if value not in known[0].values:
+            return ILLEGAL_VALUE
+        match known[0].name:
+            case "CTRL" if value == SAVE:
+                self.flash = self.settings
+            case "CTRL" if value == FACTORY_RESET:
+                self.flash = SlaveSettings()
+                self.restart(now_ns)
+            case "CTRL" if value == RESTART:
+                self.restart(now_ns)
+            case "UART1_BAUD":
+                self.settings = replace(self.settings, baud=BAUD_RATES[value])
+            case "MD_ID":
+                self.settings = replace(self.settings, slave=value)
+            case "HEADING_MODE":
+                self.settings = replace(self.settings, heading_mode=value)
+        return 0
+
+    def _custom(self, request: bytes, random: Random) -> None:
+        if len(request) == BY_SERIAL.size and request[1:3] == SET_ID_BY_SERIAL.to_bytes(2, "big"):
+            *_, serial, slave = BY_SERIAL.unpack(request)
+            if serial == self.serial:
+                self.settings = replace(self.settings, slave=slave)
+        elif len(request) == BY_CHANCE.size and request[1:3] == RANDOMISE_IDS.to_bytes(2, "big"):
+            *_, low, high, _ = BY_CHANCE.unpack(request)
+            self.settings = replace(self.settings, slave=random.randint(low, high))
+
+
+def incli_counts(truth: Truth, kind: str) -> tuple[int, int]:
+    """INCLI_X and INCLI_Y of a product of that kind: the angles of the vertical as the manual's example has them."""
+    if not kind:
+        return 0, 0
+    roll, pitch, _ = truth.euler_rad
+    x_deg = degrees(roll)
+    if kind == "single":
+        return round(x_deg % 360 / 360 * 32768) % 32768, 0
+    y_deg = degrees(atan2(sin(pitch), cos(pitch) * cos(roll)))
+    return round(x_deg / 180 * 32768), round(y_deg / 180 * 32768)
+
+
+class ModbusLine:
+    """The line and its modules, as a `StreamModule`: what it sends is what the host's port hears."""
+
+    def __init__(
+        self, now_ns: int, slaves: Sequence[Slave], *, echo: bool = False, chunk_bytes: int = 0, seed: int = 1
+    ) -> None:
+        """`echo`: the host's adapter hears what it sends. `chunk_bytes`: 0 for whole frames."""
+        self.slaves = list(slaves)
+        self.epoch_ns = now_ns
+        self.echo, self.chunk_bytes = echo, chunk_bytes
+        self.requests = self.damaged = 0
+        self._baud = slaves[0].settings.baud if slaves else FACTORY_BAUD
+        self._random = Random(seed)
+        self._heard = b""
+        self._heard_ns = now_ns
+        self._free_ns = now_ns
+        self._waiting: list[Burst] = []
+        for slave in self.slaves:
+            slave.since_ns = now_ns
+
+    @property
+    def baud(self) -> int:
+        """Rate of most modules: the first one's. Those of another rate hear and say garbage."""
+        return self._baud
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Take bytes that the host sent."""
+        self._finish(now_ns)
+        begin_ns = max(now_ns, self._heard_ns)
+        self._heard_ns = begin_ns + len(data) * uart_byte_ns(self.baud)
+        self._heard += data
+        if self.echo:
+            self._send(data, begin_ns, None)
+
+    def advance(self, now_ns: int) -> list[Burst]:
+        """Return what has crossed the wire since the last call."""
+        self._finish(now_ns)
+        through = [burst for burst in self._waiting if burst.due_ns <= now_ns]
+        del self._waiting[: len(through)]
+        return through
+
+    def next_ns(self) -> int | None:
+        """When there is something next."""
+        times = [self._waiting[0].due_ns] if self._waiting else []
+        if self._heard:
+            times.append(self._heard_ns + frame_gap_ns(self.baud))
+        return min(times, default=None)
+
+    def counters(self) -> dict[str, int]:
+        """Requests heard whole, damaged ones, and those answered."""
+        answered = sum(slave.answered for slave in self.slaves)
+        return {"requests": self.requests, "damaged": self.damaged, "answered": answered}
+
+    def mark(self, _now_ns: int) -> None:
+        """These modules have no sync input."""
+
+    def reboot(self, now_ns: int) -> None:
+        """All modules lose power."""
+        self._waiting, self._heard, self._free_ns = [], b"", now_ns
+        for slave in self.slaves:
+            slave.restart(now_ns)
+        self._agree()
+
+    def _agree(self) -> None:
+        if self.slaves:
+            self._baud = self.slaves[0].settings.baud
+
+    def _finish(self, now_ns: int) -> None:
+        """A frame has ended if the line was silent for long enough."""
+        end_ns = self._heard_ns + frame_gap_ns(self.baud)
+        if self._heard and now_ns >= end_ns:
+            frame, self._heard = self._heard, b""
+            self._take(frame, end_ns)
+
+    def _take(self, frame: bytes, now_ns: int) -> None:
+        replies: list[tuple[int, bytes]] = []
+        is_good = False
+        for slave in self.slaves:
+            request = heard(frame, self.baud, slave.settings.baud)
+            if not is_whole(request) or len(request) < 2 + CRC_BYTES:
+                continue
+            is_good = True
+            if request[0] not in (BROADCAST, slave.settings.slave) or slave.dead:
+                continue
+            if slave.mute:
+                slave.mute -= 1
+                continue
+            begin_ns = now_ns + slave.processing_ns
+            address, baud = slave.settings.slave, slave.settings.baud
+            reply = framed(address, slave.obey(request[1:-CRC_BYTES], begin_ns, self.epoch_ns, self._random))
+            if request[0] != BROADCAST:
+                replies.append((begin_ns, heard(self._spoilt(slave, reply), baud, self.baud)))
+        self.requests += is_good
+        self.damaged += not is_good
+        if replies:
+            begin_ns = max(begin_ns for begin_ns, _ in replies)
+            self._send(_together(reply for _, reply in replies), begin_ns, begin_ns)
+        self._agree()
+
+    def _spoilt(self, slave: Slave, reply: bytes) -> bytes:
+        slave.answered += 1
+        if slave.bad_crc:
+            slave.bad_crc -= 1
+            return reply[:-1] + bytes([reply[-1] ^ 0x10])
+        return reply
+
+    def _send(self, data: bytes, ready_ns: int, sample_ns: int | None) -> None:
+        byte_ns, begin_ns = uart_byte_ns(self.baud), max(ready_ns, self._free_ns)
+        self._free_ns = begin_ns + len(data) * byte_ns
+        step = self.chunk_bytes or len(data) or 1
+        for at in range(0, len(data), step):
+            end = min(at + step, len(data))
+            last = end == len(data)
+            self._waiting.append(Burst(begin_ns + end * byte_ns, data[at:end], sample_ns if last else None, 0))
+
+
+def _together(replies: Iterable[bytes]) -> bytes:
+    """What is heard when several send at once."""
+    whole = b""
+    for reply in replies:
+        whole = bytes(a & b for a, b in zip_longest(whole or reply, reply, fillvalue=0xFF))
+    return whole
+
+
+def slaves_at(addresses: Iterable[int], options: SimulatorOptions) -> list[Slave]:
+    """Modules with these addresses and consecutive serial numbers."""
+    return [
+        Slave(
+            (0x047D_955F_8D2A_1700 + number).to_bytes(8, "big"),
+            SlaveSettings(address, options.baud or FACTORY_BAUD),
+            firmware=options.firmware or NEW_FIRMWARE,
+            motion=motion_of(options),
+            noise=noise_of(options, number),
+            skew_ppm=options.skew_ppm,
+        )
+        for number, address in enumerate(addresses, 1)
+    ]
+
+
+def make(options: SimulatorOptions, now_ns: int) -> ModbusLine:
+    """A line from the common options: `message` has the addresses of its modules, with commas. Raises ValueError."""
+    if options.baud and options.baud not in BAUD_RATES:
+        raise ValueError(f"baud {options.baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
+    words = options.message.split(",") if options.message else [str(FACTORY_ID)]
+    if not all(word.isdecimal() and int(word) in SLAVES for word in words):
+        raise ValueError(f"message {options.message!r}: expected addresses of modules, for example 1,2,3")
+    return ModbusLine(now_ns, slaves_at(map(int, words), options), seed=options.seed)
+
+
+SIMULATOR = Simulator("hipnuc-modbus", "HiPNUC HI14R2N on an RS-485 line (--message 1,2,3: their addresses)", make)
