@@ -8,8 +8,7 @@ import msgspec
 from imud.cli.command import argument
 from imud.config.keys import choose
 from imud.contracts.driver import Driver
-from imud.contracts.expected import expected, got
-from imud.contracts.settings import Settings
+from imud.contracts.settings import Settings, expected, got
 from imud.errors import BadArgument
 
 

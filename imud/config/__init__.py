@@ -14,9 +14,9 @@ what is there; all that can be found in one pass are reported together.
 """
 
 from imud.config.devices import DEVICE_NAME, DEVICES_MAX
-from imud.config.model import Config, DeviceConfig, DeviceGeneral, Differences, General, differences
+from imud.config.model import Config, DeviceConfig, Differences, differences
 from imud.config.reading import PROBLEMS_SHOWN, load, parse
-from imud.config.tables import TABLES, DriverRow, LinkRow, Row, Tables
+from imud.config.schema import TABLES, DeviceGeneral, DriverRow, General, LinkRow, Row, Tables
 
 __all__ = [
     "DEVICES_MAX",

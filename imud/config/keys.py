@@ -6,11 +6,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from imud.config.tables import Row
+from imud.config.schema import Row
 from imud.config.yaml_tree import Path as KeyPath
 from imud.config.yaml_tree import Problem, YamlTree
-from imud.contracts.expected import expected, got
-from imud.contracts.settings import Settings
+from imud.contracts.settings import Settings, expected, got
 
 S = TypeVar("S", bound=Settings)
 

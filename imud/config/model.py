@@ -2,33 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Annotated, Literal
-
-import msgspec
 
 from imud.contracts.lines import DeviceLines
 from imud.contracts.settings import Settings
 from imud.utc.source import RmcSettings
-
-
-class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys of the daemon itself."""
-
-    log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """What is written to the log: this and what is more severe."""
-    state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
-    """Folder where imud remembers at which rate each device was found. systemd's STATE_DIRECTORY wins over it."""
-
-
-class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys of a device besides its link and the options of its driver."""
-
-    driver: str = "auto"
-    """Which wire protocol the device speaks, or `auto`: listen and see."""
-    enabled: bool = True
-    """Whether imud uses the device; if not, its keys are checked all the same."""
-    identify: bool = True
-    """Whether imud may send queries (nothing that changes the device) to learn product, serial number and firmware."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from typing import Final
 
 from imud.config.devices import DeviceReader
 from imud.config.keys import Keys
-from imud.config.model import Config, General
-from imud.config.tables import TABLES, Tables
+from imud.config.model import Config
+from imud.config.schema import TABLES, General, Tables
 from imud.config.yaml_tree import FILE_BYTES_MAX, Problem, path_text, read_yaml
 from imud.errors import ConfigError
 

@@ -15,7 +15,7 @@ from typing import Final, Protocol, cast
 
 import yaml
 
-from imud.contracts.expected import shown
+from imud.contracts.settings import shown
 
 FILE_BYTES_MAX: Final = 1 << 20
 """256 devices with every key written out take 0.1 MB."""

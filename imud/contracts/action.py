@@ -8,8 +8,7 @@ from typing import Any, cast, get_type_hints
 
 import msgspec
 
-from imud.contracts.expected import expected, shown
-from imud.contracts.settings import NoSettings, Settings
+from imud.contracts.settings import NoSettings, Settings, expected, shown
 from imud.errors import BadArgument
 
 

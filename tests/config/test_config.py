@@ -16,8 +16,7 @@ from msgspec import Meta
 
 from imud import config
 from imud.config import DEVICES_MAX, TABLES, Config, DeviceConfig, Tables
-from imud.contracts.expected import expected, got
-from imud.contracts.settings import NoSettings, Settings
+from imud.contracts.settings import NoSettings, Settings, expected, got
 from imud.devices import DRIVERS
 from imud.errors import ConfigError
 from imud.links import LINKS

@@ -9,9 +9,8 @@ from collections.abc import Iterator
 import msgspec
 
 from imud.config import TABLES, DeviceGeneral, General
-from imud.contracts.expected import expected, shown
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
-from imud.contracts.settings import Settings
+from imud.contracts.settings import Settings, expected, shown
 from imud.utc.source import RmcSettings
 from tests.support.paths import ROOT
 

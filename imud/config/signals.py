@@ -1,15 +1,22 @@
-"""Reads the wires of a device besides its data, and sees to it that no wire is used twice."""
+"""Reads `lines` and `rmc` of a device: its GPIO lines, none of them used twice, and its source of RMC sentences."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, Final
 
 from imud.config.keys import Keys
 from imud.config.model import DeviceConfig
-from imud.config.tables import DriverRow
+from imud.config.schema import DriverRow
 from imud.config.yaml_tree import Path as KeyPath
-from imud.contracts.expected import shown
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineSettings
+from imud.contracts.settings import shown
+from imud.utc.source import RmcSettings
+
+LINK: Final = "uart"
+PULSE: Final = "pps"
+"""What has this line takes its time from a pulse per second and from sentences."""
+TRIGGER: Final = "sin"
+"""The line by which imud drives the input that the pulse would come on."""
 
 
 def read_lines(
@@ -36,13 +43,38 @@ def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
     """Refuse one wire under two keys, of one device or of two."""
     owners: list[tuple[LineSettings, str]] = []
     for device in devices:
-        for name, settings in _lines_of(device):
+        for name, settings in _lines_of_device(device):
             path: KeyPath = ("devices", device.name, "lines", name)
             first = next((place for other, place in owners if _same_wire(other, settings)), None)
             if first is not None:
                 wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
                 keys.problem(path, f"expected a line of its own, got {wire}, which {first} has", at_key=True)
             owners.append((settings, f"{device.name}.lines.{name} (line {keys.tree.key_mark(path).line})"))
+
+
+def read_rmc(
+    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
+) -> RmcSettings | None:
+    """The settings below the key `rmc` of a device; None where it has none."""
+    if "rmc" not in device:
+        return None
+    driver = device.get("driver", "auto")
+    if LINK not in device or (driver != "auto" and PULSE not in _lines_of_driver(drivers, driver)):
+        message = (
+            f"expected rmc only beside the link {LINK} of a device with SIN/PPS, got it with driver {shown(driver)}"
+        )
+        keys.problem(path, message, at_key=True)
+    if driver == "auto":
+        keys.problem(path, "expected rmc only beside a named driver, got it with driver auto", at_key=True)
+    lines = device.get("lines")
+    if isinstance(lines, dict) and TRIGGER in lines:
+        mark = keys.tree.key_mark((*path[:-1], "lines", TRIGGER))
+        message = (
+            "expected a receiver's pulse per second on SIN beside rmc, got imud as what drives it by lines.sin "
+            f"(line {mark.line}): leave one of them out"
+        )
+        keys.problem(path, message, at_key=True)
+    return keys.part(RmcSettings, device["rmc"], path)
 
 
 def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
@@ -71,7 +103,7 @@ def _with_lines(drivers: Mapping[str, DriverRow]) -> Iterator[str]:
                 yield name
 
 
-def _lines_of(device: DeviceConfig) -> Iterator[tuple[str, LineSettings]]:
+def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineSettings]]:
     for name in LINE_SCHEMAS if device.lines is not None else ():
         settings = getattr(device.lines, name)
         if settings is not None:
@@ -82,3 +114,10 @@ def _same_wire(one: LineSettings, other: LineSettings) -> bool:
     """As far as it can be seen here: a name without a chip is on one chip only, whichever that is."""
     chips = {one.chip.removeprefix("/dev/"), other.chip.removeprefix("/dev/")}
     return one.line == other.line and (len(chips) == 1 or "" in chips)
+
+
+def _lines_of_driver(drivers: Mapping[str, DriverRow], driver: object) -> frozenset[str]:
+    try:
+        return drivers[driver].lines if isinstance(driver, str) and driver in drivers else frozenset({PULSE})
+    except ImportError:
+        return frozenset({PULSE})  # it is a problem of its own, as is a driver that is none

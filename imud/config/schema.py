@@ -1,0 +1,78 @@
+"""What a configuration file may say: the keys of the daemon and of a device, and the tables that the rest comes from.
+
+A new row of a table (DRIVERS, LINKS, PUBLISHERS) is configurable without a change here.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal, Protocol
+
+import msgspec
+
+from imud.contracts.settings import Settings
+from imud.devices import DRIVERS
+from imud.links import LINKS
+from imud.publishers import PUBLISHERS
+
+
+class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys of the daemon itself."""
+
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """What is written to the log: this and what is more severe."""
+    state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
+    """Folder where imud remembers at which rate each device was found. systemd's STATE_DIRECTORY wins over it."""
+
+
+class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys of a device besides its link and the options of its driver."""
+
+    driver: str = "auto"
+    """Which wire protocol the device speaks, or `auto`: listen and see."""
+    enabled: bool = True
+    """Whether imud uses the device; if not, its keys are checked all the same."""
+    identify: bool = True
+    """Whether imud may send queries (nothing that changes the device) to learn product, serial number and firmware."""
+
+
+class Row(Protocol):
+    """What the configuration needs to know of a row of a table."""
+
+    @property
+    def settings(self) -> type[Settings]:
+        """The schema of the row's keys."""
+        ...
+
+
+class DriverRow(Row, Protocol):
+    """What the configuration needs to know of a driver besides."""
+
+    @property
+    def lines(self) -> frozenset[str]:
+        """Wires besides its data that such a device can have."""
+        ...
+
+
+class LinkRow(Row, Protocol):
+    """What the configuration needs to know of a link besides."""
+
+    @property
+    def searchable(self) -> bool:
+        """Whether `driver: auto` finds out what talks on it."""
+        ...
+
+    def fits(self, driver: Any) -> bool:
+        """Whether a driver can use such a link."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """The tables that the schema is made from."""
+
+    drivers: Mapping[str, DriverRow]
+    links: Mapping[str, LinkRow]
+    publishers: Mapping[str, Row]
+
+
+TABLES: Final = Tables(DRIVERS, LINKS, PUBLISHERS)
