@@ -1,61 +1,72 @@
-"""The command line: `imud COMMAND`, one file per command, imported only when it is called.
+"""The command line, `imud COMMAND`. Each command is a `CliCommand` in its module, imported when it is called.
 
-Each command file has `add_arguments(parser)` and `run(args) -> int`; the returned number is the exit status:
-0 done, 1 it ran and the answer is no, 2 it could not run.
+Exit status: 0 done, 1 it ran and the answer is no, 2 it could not run.
 """
 
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
-from typing import NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from imud import __version__
 from imud.errors import ImudError
+
+if TYPE_CHECKING:
+    from imud.cli.arguments import CliCommand
 
 
 class Subcommand(NamedTuple):
     """A row of the table of commands."""
 
-    module: str
+    target: str
+    """`module:NAME` of its `CliCommand`."""
     help: str
+
+    def load(self) -> "CliCommand":
+        """The command, its module imported."""
+        module, _, name = self.target.partition(":")
+        return cast("CliCommand", getattr(import_module(module), name))
 
 
 COMMANDS = {
-    "run": Subcommand("imud.cli.run", "own the configured devices and serve their samples"),
-    "demo": Subcommand("imud.cli.demo", "run the daemon on a simulated sensor and show what it does"),
-    "check": Subcommand("imud.cli.check", "check a configuration file without opening any port"),
-    "probe": Subcommand("imud.cli.probe", "list what is attached"),
-    "modbus": Subcommand("imud.cli.modbus", "find modules on an RS-485 line and give them addresses"),
-    "decode": Subcommand("imud.cli.decode", "raw capture in, one JSON object per message out"),
-    "replay": Subcommand("imud.cli.replay", "run a capture through the daemon's whole path"),
-    "devices": Subcommand("imud.cli.devices", "list the devices of the running daemon"),
-    "status": Subcommand("imud.cli.status", "show state, rate, clock and ledger of each device"),
-    "watch": Subcommand("imud.cli.watch", "print samples as they come"),
-    "clock": Subcommand("imud.cli.clock", "show where time stamps come from, how good they are, and what limits them"),
-    "command": Subcommand("imud.cli.command", "list what a device can be told to do, or tell it"),
-    "schema": Subcommand("imud.cli.schema", "list the fields of a sample with units and frames"),
+    "run": Subcommand("imud.cli.run:RUN", "own the configured devices and serve their samples"),
+    "demo": Subcommand("imud.cli.demo.command:DEMO", "run the daemon on a simulated sensor and show what it does"),
+    "check": Subcommand("imud.cli.run:CHECK", "check a configuration file without opening any port"),
+    "probe": Subcommand("imud.cli.probe.command:PROBE", "list what is attached"),
+    "modbus": Subcommand("imud.cli.modbus.command:MODBUS", "find modules on an RS-485 line and give them addresses"),
+    "decode": Subcommand("imud.cli.decode:DECODE", "raw capture in, one JSON object per message out"),
+    "replay": Subcommand("imud.cli.replay:REPLAY", "run a capture through the daemon's whole path"),
+    "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
+    "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
+    "watch": Subcommand("imud.cli.samples:WATCH", "print samples as they come"),
+    "clock": Subcommand(
+        "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"
+    ),
+    "command": Subcommand("imud.cli.devices:COMMAND", "list the actions of a device, or carry one out"),
+    "schema": Subcommand("imud.cli.samples:SCHEMA", "list the fields of a sample with units and frames"),
 }
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of the whole command line; every command's arguments are loaded."""
+def build_parser(only: str = "") -> argparse.ArgumentParser:
+    """The parser of the whole command line; with `only` the arguments of that command alone, which imports no other."""
     parser = argparse.ArgumentParser(prog="imud", description="A daemon for inertial sensors.")
     parser.add_argument("--version", action="version", version=f"imud {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
         sub = commands.add_parser(name, help=command.help, description=command.help.capitalize() + ".")
-        import_module(command.module).add_arguments(sub)
+        if only in ("", name):
+            command.load().add_arguments(sub)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Expected errors are one line on standard error."""
-    args = build_parser().parse_args(argv)
-    run = cast(Callable[[argparse.Namespace], int], import_module(COMMANDS[args.command].module).run)
+    words = sys.argv[1:] if argv is None else argv
+    args = build_parser(words[0] if words and words[0] in COMMANDS else "").parse_args(words)
     try:
-        return run(args)
+        return COMMANDS[args.command].load().run(args)
     except ImudError as error:
         print(f"imud {args.command}: {error}", file=sys.stderr)
         return 2

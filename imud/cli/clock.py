@@ -3,24 +3,34 @@
 import argparse
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from time import monotonic
 from typing import Final
 
 import msgspec
 
-from imud.cli.connect import add_socket, connect, statuses
-from imud.cli.histogram import histogram
-from imud.cli.verdict import verdict
+from imud.cli.arguments import CliCommand, add_socket, connect, statuses
+from imud.cli.output import histogram
 from imud.client import Client
-from imud.contracts.status import DeviceStatus
-from imud.units import NS_PER_S, NS_PER_US
+from imud.contracts.status import ClockStatus, DeviceStatus
+from imud.sample import Sync
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 KEPT: Final = 2000
 """Newest samples of a device that the histogram is made of."""
 REFRESH_S: Final = 1.0
 CLEAR: Final = "\x1b[H\x1b[2J"
+ENOUGH: Final = 20
+"""Fewer arrivals say nothing about their spread."""
+HELD_SHARE: Final = 0.5
+"""An adapter that holds bytes for up to its timer spreads arrivals over most of it."""
+LOADED_NS: Final = NS_PER_MS
+"""Arrivals of a wire and an idle system spread over some ten microseconds."""
+EDGES_ENOUGH: Final = 100
+"""Fewer edges say nothing: the first ones come before it is known which samples they belong to."""
+UNPAIRED_SHARE: Final = 0.1
+"""Noise and losses leave less without their match; another wire or a divided pulse leaves half or more."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +97,7 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
 
 
 def aids(status: DeviceStatus) -> Iterator[tuple[str, str]]:
-    """Name and words of what tells the time besides arrivals, where there is any."""
+    """Name and text of each source of time other than arrivals, as far as the device has them."""
     clock, lines, utc = status.clock, status.lines, status.utc
     if lines is not None and "sout" in lines.edges:
         yield (
@@ -103,3 +113,62 @@ def aids(status: DeviceStatus) -> Iterator[tuple[str, str]]:
         yield "PPS", f"{utc.pulses} pulses, {utc.pulses_ignored} in step with none"
     if clock.reference_error_ns:
         yield "UTC", f"the host knows it to {clock.reference_error_ns / NS_PER_US:.1f} µs (one sigma)"
+
+
+def verdict(clock: ClockStatus, behind_ns: Sequence[int]) -> str:
+    """`behind_ns`: how much later than the time of measurement each of the newest samples was read."""
+    if mistake := miswired(clock):
+        return mistake
+    error = f"{clock.t_err_ns / NS_PER_US:.1f} µs"
+    if clock.sync is Sync.UTC:
+        return f"the device keeps UTC itself; what the host knows of UTC limits: {error}"
+    if clock.sync is Sync.EDGE:
+        return f"limited by the kernel's stamps of the line: {error}"
+    if clock.sync is Sync.ARRIVAL:
+        return f"the device's time is not used, so arrivals are all there is: {error}; wire SOUT if it has one"
+    return _of_arrivals(clock, sorted(behind_ns))
+
+
+def miswired(clock: ClockStatus) -> str:
+    """What the counts since start say of the wires, one sentence; empty when they fit the samples."""
+    edges, most = clock.edges, UNPAIRED_SHARE * clock.edges
+    if edges < EDGES_ENOUGH:
+        return ""
+    if clock.triggers_missed > most:
+        return (
+            f"{clock.triggers_missed} triggers on SIN were not answered: is the wire at SIN, is a message sent on mark "
+            "(`output_on_mark`), can the line carry the rate?"
+        )
+    if clock.edges_unpaired > most:
+        return (
+            f"{clock.edges_unpaired} of {edges} pulses belong to no sample: is the wire at SOUT of this device, "
+            "is its pull-down missing, or are its frames lost?"
+        )
+    if clock.samples_unpaired > most:
+        return (
+            f"{clock.samples_unpaired} samples came without the pulse of theirs, {edges} pulses in all: "
+            "is the wire at SOUT_DIV, which has one for several samples?"
+        )
+    if clock.sync in (Sync.ARRIVAL, Sync.REGRESSION):
+        return (
+            f"{edges} edges came, and none is matched to a sample now: do they still come, is the wire at SOUT of this "
+            "device, or do its bytes come too late for its rate?"
+        )
+    return ""
+
+
+def _of_arrivals(clock: ClockStatus, ordered: Sequence[int]) -> str:
+    """What the spread of arrivals says about the way they come."""
+    if len(ordered) < ENOUGH:
+        return "too few samples to say"
+    spread_ns = ordered[int(0.99 * len(ordered))] - ordered[int(0.01 * len(ordered))]
+    spread = f"arrivals spread over {spread_ns / NS_PER_MS:.1f} ms"
+    if clock.hold_ns and spread_ns >= HELD_SHARE * clock.hold_ns:
+        timer = f"{clock.hold_ns / NS_PER_MS:.0f} ms"
+        return f"{spread}: the USB adapter's latency timer of {timer}; `low_latency: true`, another adapter, or SOUT"
+    if spread_ns > LOADED_NS:
+        return f"{spread}, and no latency timer explains it: a loaded system; give imud a higher priority, or wire SOUT"
+    return f"{spread}; the constant delay between measuring and sending stays unseen without SOUT"
+
+
+CLOCK = CliCommand(add_arguments, run)

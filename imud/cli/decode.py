@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from imud.cli.options import add_option, driver_settings, given_options
+from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
 from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, CodecEvent, ReplyFrame, TextLine
 from imud.contracts.driver import SAMPLE_COUNTER, Driver, StreamDriver
@@ -59,9 +59,9 @@ def open_capture(name: str) -> BinaryIO:
 
 
 def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | None = None) -> Iterator[str]:
-    """JSON lines of everything in `file`; the driver's settings are as delivered unless given.
+    """JSON lines of everything in `file`; `settings` default to the driver's own defaults.
 
-    Raises ImudError for a driver without captures, or a file that is none.
+    Raises ImudError for a driver without captures, or a file that is no capture.
     """
     times = UnwrappedTime(driver)
     for event in events_in(file, driver, ledger, settings or driver.settings()):
@@ -69,7 +69,7 @@ def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | 
 
 
 def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings) -> Iterator[CodecEvent]:
-    """Everything that the driver's codec says of a capture."""
+    """The events of the driver's codec for a capture."""
     if isinstance(driver, StreamDriver):
         codec = driver.make_codec(ledger, settings)
         for _, data in CaptureReader(file):
@@ -123,3 +123,6 @@ class UnwrappedTime:
             self._turns += 1
         self._last = ticks
         return (self._turns * modulus + ticks) * self._tick
+
+
+DECODE = CliCommand(add_arguments, run)

@@ -1,22 +1,29 @@
-"""`imud devices`: one line per device of the running daemon."""
+"""`imud devices`: one line per device of the running daemon; `imud command`: list and carry out actions of one."""
 
 import argparse
+from typing import Final
 
-from imud.cli.connect import add_socket, connect, statuses
-from imud.cli.table import table
+import msgspec
 
-HEAD = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
+from imud.cli.arguments import CliCommand, add_socket, argument, connect, statuses
+from imud.cli.output import table
+from imud.client import Client
+from imud.contracts.action import ActionInfo
+
+HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
+LIMIT_S: Final = 180.0
+"""The longest action, a calibration with its status asked again and again, ends within two minutes."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def devices_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud devices`."""
     add_socket(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def devices(args: argparse.Namespace) -> int:
     """Print the table; 1 when no device is running."""
     with connect(args) as client:
-        devices = statuses(client)
+        found = statuses(client)
     rows = [
         (
             d.name,
@@ -27,7 +34,32 @@ def run(args: argparse.Namespace) -> int:
             d.identity.get("serial_number", "-"),
             d.link,
         )
-        for d in devices
+        for d in found
     ]
     print(table(HEAD, rows))
-    return 0 if any(d.state == "running" for d in devices) else 1
+    return 0 if any(d.state == "running" for d in found) else 1
+
+
+def command_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud command`."""
+    add_socket(parser)
+    parser.add_argument("device", metavar="DEVICE")
+    parser.add_argument("name", nargs="?", metavar="ACTION", help="without it: list the actions of the device")
+    parser.add_argument("arguments", nargs="*", metavar="NAME=VALUE", help="as the list says")
+
+
+def command(args: argparse.Namespace) -> int:
+    """Print the list or the answer. All but the list needs the right `control`."""
+    with Client(args.socket, timeout_s=LIMIT_S) as client:
+        if args.name is None:
+            for action in msgspec.convert(client.call("actions", device=args.device), list[ActionInfo]):
+                print("\n".join([f"{action.name:24} {action.help}", *(f"{'':24}   {p}" for p in action.parameters)]))
+            return 0
+        arguments = dict(map(argument, args.arguments))
+        answer = client.call("command", device=args.device, name=args.name, arguments=arguments)
+    print(msgspec.json.encode(answer).decode() if answer is not None else "done")
+    return 0
+
+
+DEVICES = CliCommand(devices_arguments, devices)
+COMMAND = CliCommand(command_arguments, command)

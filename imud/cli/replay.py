@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from imud import config
-from imud.cli.options import add_option, driver_settings, given_options
+from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
 from imud.cli.run import start_log
 from imud.cli.status import block
 from imud.contracts.can import CanDriver
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check(device: config.DeviceConfig) -> None:
-    """Raises LinkError for a file that cannot be played: the daemon would wait for a better one."""
+    """Raises LinkError for a file that cannot be played: the daemon would retry."""
     row = LINKS[device.link]
     is_can = isinstance(DRIVERS[device.driver], CanDriver)
     link = row.make_can(device.link_settings) if is_can else row.make(device.link_settings)
@@ -67,9 +67,9 @@ async def serve(daemon: Daemon) -> None:
 
 
 def configuration(args: argparse.Namespace) -> str:
-    """The configuration of a daemon that does only this, as text: it takes the same way as a file.
+    """The configuration of a daemon that does only this, as text, read the same way as a file.
 
-    Raises BadArgument for options that the driver does not take.
+    Raises BadArgument for options that the driver does not have.
     """
     driver = DRIVERS[args.driver]
     options = given_options(driver, args.option)
@@ -116,3 +116,6 @@ class Printer:
     def close(self) -> None:
         """Leave nothing in the buffer."""
         sys.stdout.flush()
+
+
+REPLAY = CliCommand(add_arguments, run)

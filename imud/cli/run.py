@@ -1,4 +1,4 @@
-"""`imud run`: the daemon in the foreground, as the service manager starts it."""
+"""`imud run`: the daemon in the foreground, as the service manager starts it; `imud check`: its configuration alone."""
 
 import argparse
 import asyncio
@@ -7,13 +7,14 @@ import os
 from pathlib import Path
 
 from imud import config
+from imud.cli.arguments import CliCommand
 from imud.config import Config
 from imud.daemon import Daemon
 
 DEFAULT_FILE = Path("/etc/imud.yaml")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def run_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud run`."""
     parser.add_argument(
         "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE", help="configuration (default: %(default)s)"
@@ -25,6 +26,19 @@ def run(args: argparse.Namespace) -> int:
     settings = config.load(args.config)
     start_log(settings.log_level)
     asyncio.run(serve(settings, args.config))
+    return 0
+
+
+def check_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud check`."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="configuration file")
+
+
+def check(args: argparse.Namespace) -> int:
+    """Print one line when the file is good; the error with line and column goes to standard error."""
+    settings = config.load(args.file)
+    names = ", ".join(device.name for device in settings.devices) or "none"
+    print(f"{args.file}: good; devices: {names}")
     return 0
 
 
@@ -45,3 +59,7 @@ def start_log(level: str) -> None:
     """Log to standard error; under a service manager the journal adds the time, else we do."""
     stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
     logging.basicConfig(level=level.upper(), format=stamp + "%(levelname)s %(message)s")
+
+
+RUN = CliCommand(run_arguments, run)
+CHECK = CliCommand(check_arguments, check)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import msgspec
 
-from imud.cli.connect import add_socket, connect, statuses
+from imud.cli.arguments import CliCommand, add_socket, connect, statuses
 from imud.contracts.status import DeviceStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.ledger import bytes_open, frames_open
 from imud.units import NS_PER_MS, NS_PER_US
@@ -52,7 +52,7 @@ def block(status: DeviceStatus) -> str:
 
 
 def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
-    """Name and words of what only some devices have."""
+    """Name and text of each row that only some devices have."""
     if status.polling is not None:
         yield "polling", polling(status.polling)
     if status.serial_line is not None:
@@ -69,7 +69,7 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
 
 
 def polling(polls: PollingStatus) -> str:
-    """How the reading of a polled device goes."""
+    """Deadlines and failures of a polled device."""
     return (
         f"{polls.polls} reads, {polls.late} late, {polls.missed} missed, {polls.stale} stale, {polls.failed} failed;"
         f" {polls.late_mean_ns / NS_PER_US:.1f} µs after the deadline, {polls.late_worst_ns / NS_PER_US:.1f} at worst;"
@@ -78,7 +78,7 @@ def polling(polls: PollingStatus) -> str:
 
 
 def serial_line(line: SerialLineCounters) -> str:
-    """What was heard on a shared serial line besides replies."""
+    """Bytes on a shared serial line that are no replies."""
     return (
         f"{line.timeouts} requests unanswered; {line.late_bytes} bytes unasked, {line.strange_bytes} strange;"
         f" {line.echoes} echoes (all devices of the line)"
@@ -109,7 +109,7 @@ def problem_of(lines: LinesStatus, name: str) -> str:
 
 
 def utc(status: UtcStatus) -> str:
-    """How a device is told UTC, and what the host knows of it."""
+    """RMC sentences and pulses for a device, and samples for chronyd."""
     words = []
     if status.source:
         refused = ", ".join(f"{cause} {count}" for cause, count in status.refused.items())
@@ -120,7 +120,7 @@ def utc(status: UtcStatus) -> str:
     if status.pulses or status.pulses_ignored:
         words.append(f"{status.pulses} pulses, {status.pulses_ignored} ignored")
     if status.chrony_sent or status.chrony_refused:
-        words.append(f"chronyd took {status.chrony_sent}, refused {status.chrony_refused}")
+        words.append(f"chronyd accepted {status.chrony_sent}, refused {status.chrony_refused}")
     return ("; ".join(words) or "nothing yet") + (f" ({status.problem})" if status.problem else "")
 
 
@@ -133,3 +133,6 @@ def latency(status: DeviceStatus) -> str:
     """Mean time from measurement to publication."""
     count = sum(status.latency_buckets)
     return f"{status.latency_sum_ns / count / NS_PER_MS:.3f} ms mean over {count} samples" if count else "no samples"
+
+
+STATUS = CliCommand(add_arguments, run)

@@ -1,7 +1,6 @@
 """Reads the keys of one file against schemas, and collects problems with their places instead of stopping at one."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, TypeVar
 
 import msgspec
@@ -9,7 +8,7 @@ import msgspec
 from imud.config.schema import Row
 from imud.config.yaml_tree import Path as KeyPath
 from imud.config.yaml_tree import Problem, YamlTree
-from imud.contracts.settings import Settings, expected, got
+from imud.contracts.settings import Settings, expected, got, unknown_name
 
 S = TypeVar("S", bound=Settings)
 
@@ -37,7 +36,7 @@ class Keys:
         """A problem for each key that is not `known`."""
         for key in keys:
             if key not in known:
-                self.problem((*path, key), choose("a key", key, known), at_key=True)
+                self.problem((*path, key), unknown_name("a key", key, known), at_key=True)
 
     def row(self, table: Mapping[str, Row], name: str, data: object, path: KeyPath | None = None) -> Settings | None:
         """The settings of row `name`; nothing written below a key means its defaults."""
@@ -93,10 +92,3 @@ class Keys:
             self.problem(path, f"expected {expected(field_type)}, got {got(value)}{detail}")
             return False
         return True
-
-
-def choose(what: str, name: str, known: Sequence[str]) -> str:
-    """What to say of a name that is none of the known."""
-    near = get_close_matches(name, known, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]}? " if near else ""
-    return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"

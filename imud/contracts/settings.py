@@ -6,6 +6,7 @@ a field is what docs/configuration.md says of the key; the words are those of er
 """
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import msgspec
@@ -45,6 +46,13 @@ def shown(value: object) -> str:
     """`value` as one would write it into a configuration file, in one line of plain ASCII or printable text."""
     text = msgspec.json.encode(value).decode()
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
+
+
+def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
+    """The error for a name that is not among `known`, with the nearest one. `what`: for example `a driver`."""
+    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]}? " if near else ""
+    return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"
 
 
 def _words(info: inspect.Type) -> str:

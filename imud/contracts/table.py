@@ -1,4 +1,4 @@
-"""A lazy table: name → "module:NAME", imported on first use, so that one missing library costs one row only."""
+"""Table: name → "module:NAME", imported on first use, so that one missing library costs one row only."""
 
 from collections.abc import Iterator, Mapping
 from importlib import import_module

@@ -13,7 +13,7 @@ from time import monotonic, sleep
 
 import msgspec
 
-from imud.cli.connect import statuses
+from imud.cli.arguments import statuses
 from imud.client import Client
 from imud.contracts.status import DeviceStatus
 

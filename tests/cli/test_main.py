@@ -2,12 +2,16 @@
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from pkgutil import walk_packages
 
 import pytest
 
+import imud.cli
 from imud import __version__
 from imud.cli import COMMANDS, main
+from imud.cli.arguments import CliCommand
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -18,10 +22,21 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
     assert f"imud {command}" in capsys.readouterr().out
 
 
-def test_every_command_file_is_in_the_table() -> None:
-    folder = Path(sys.modules["imud.cli"].__path__[0])
-    files = {path.stem for path in folder.glob("*.py") if "def add_arguments" in path.read_text()}
-    assert files == set(COMMANDS)
+def test_the_table_has_every_command_of_every_module() -> None:
+    """A command that is written and has no row, or a row that points at another command, is seen here."""
+    modules = [import_module(name) for _, name, _ in walk_packages(imud.cli.__path__, "imud.cli.")]
+    written = {id(value) for module in modules for value in vars(module).values() if isinstance(value, CliCommand)}
+    loaded = [id(row.load()) for row in COMMANDS.values()]
+    assert len(loaded) == len(set(loaded))
+    assert written == set(loaded)
+
+
+def test_a_command_imports_no_other() -> None:
+    code = (
+        "import sys; from imud.cli import main; main(['check', '/dev/null']); print('imud.cli.replay' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
+    assert done.stdout == "False\n"
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,7 +28,7 @@ def test_every_part_has_its_row() -> None:
         "  pps       60 edges, 0 lost",
         "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, 900.0 at worst",
         "  utc       gpsd at 127.0.0.1:2947: 100 sentences, 90 sent, not sent: stale 7, busy 3;"
-        " 59 pulses, 1 ignored; chronyd took 40, refused 19 (chronyd does not take samples)",
+        " 59 pulses, 1 ignored; chronyd accepted 40, refused 19 (chronyd does not take samples)",
     ]
 
 

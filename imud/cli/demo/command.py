@@ -6,29 +6,37 @@ shows what arrives. At the end it prints rates, latency and the ledger.
 
 import argparse
 import os
+import shlex
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep
 
 import msgspec
 
-from imud.cli.connect import statuses
-from imud.cli.demo_view import View
+from imud.cli.arguments import SOCKET_VARIABLE, CliCommand, statuses
+from imud.cli.demo.view import View
 from imud.cli.status import block, closes
 from imud.client import Client
 from imud.contracts.can import CanDriver
 from imud.contracts.polling import PolledDriver
 from imud.devices import DRIVERS
 from imud.errors import ImudError, LinkMissing
+from imud.formats.ring import ring_path
 from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.command_line import DEVICE, simulated
 from imud.sim.ports.can_port import default_interface
 
+Devices = dict[str, dict[str, object]]
+"""The configuration of each device by its name."""
+
+METRICS_ADDRESS = "127.0.0.1"
+METRICS_PORT = 9321
 START_LIMIT_S = 10.0
 STOP_LIMIT_S = 5.0
 FOUND_LIMIT_S = 10.0
@@ -40,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device",
         action="append",
-        type=shown,
+        type=wanted_device,
         metavar="NAME[:NODE]",
         help=f"what to simulate ({DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
         "several times for several devices on one CAN interface; "
@@ -72,12 +80,11 @@ def run(args: argparse.Namespace) -> int:
         stack.enter_context(simulator(folder, wanted, args.rate, interface))
         names = ["demo"] if len(wanted) == 1 else [f"{name}-{node}" if node else name for name, node in wanted]
         found = (device(folder, name, interface, node) for name, node in wanted)
-        stack.enter_context(daemon(folder, dict(zip(names, found, strict=True))))
-        return show(folder / "imud.sock", args)
+        return watch_daemon(stack, folder, dict(zip(names, found, strict=True)), args)
 
 
-def shown(text: str) -> tuple[str, int]:
-    """Name and node of what is to be shown. Raises ArgumentTypeError."""
+def wanted_device(text: str) -> tuple[str, int]:
+    """Name and node of a device for `--device`. Raises ArgumentTypeError."""
     return (text, 0) if bus_of(text) else simulated(text)
 
 
@@ -98,14 +105,47 @@ def run_on_bus(wanted: list[tuple[str, int]], args: argparse.Namespace) -> int:
         raise ImudError(f"{name} is not simulated: say where a real one is, for example {example}")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-demo-")))
-        stack.enter_context(daemon(folder, {"demo": {"driver": name, bus: {key: value, "rate_hz": args.rate}}}))
-        return show(folder / "imud.sock", args)
+        real: dict[str, object] = {"driver": name, bus: {key: value, "rate_hz": args.rate}}
+        return watch_daemon(stack, folder, {"demo": real}, args)
+
+
+def watch_daemon(stack: ExitStack, folder: Path, devices: Devices, args: argparse.Namespace) -> int:
+    """Start the daemon, say how other programs reach it, and show its samples. Returns the exit status."""
+    port = free_port()
+    stack.enter_context(daemon(folder, devices, port))
+    path = folder / "imud.sock"
+    print(f"daemon at {path}; in another terminal:\n{commands(folder, next(iter(devices)), port)}\n", flush=True)
+    return show(path, args)
+
+
+def commands(folder: Path, device: str, port: int) -> str:
+    """Lines to paste into another terminal: they reach this daemon from any directory."""
+    python = shlex.quote(sys.executable)
+    beside = Path(sys.executable).with_name("imud")
+    imud = shlex.quote(str(beside)) if beside.exists() else f"{python} -m imud"
+    ring = f'from imud.client import Ring; print(Ring("{ring_path(str(folder), device)}").latest())'
+    lines = [
+        f"export {SOCKET_VARIABLE}={shlex.quote(str(folder / 'imud.sock'))}",
+        f"{imud} status",
+        f"{imud} watch --rate 5",
+        f"{imud} clock",
+        f"{python} -c {shlex.quote(ring)}",
+        f"curl http://{METRICS_ADDRESS}:{port}/metrics",
+    ]
+    return "\n".join(f"  {line}" for line in lines)
+
+
+def free_port() -> int:
+    """The documented port of metrics, or another one that is free."""
+    for port in (METRICS_PORT, 0):
+        with suppress(OSError), socket.create_server((METRICS_ADDRESS, port)) as server:
+            return int(server.getsockname()[1])
+    return 0
 
 
 def show(path: Path, args: argparse.Namespace) -> int:
-    """Watch until the time is over or someone interrupts, then give account."""
+    """Show samples until the time is over or a signal ends it, then print the account. Returns the exit status."""
     view = View(sys.stdout, live=not args.plain and sys.stdout.isatty())
-    print(f"daemon at {path}; in another terminal: imud watch --socket {path}", flush=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with Client(str(path), timeout_s=FOUND_LIMIT_S) as client:
@@ -161,14 +201,14 @@ def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, 
 
 
 @contextmanager
-def daemon(folder: Path, devices: dict[str, dict[str, object]]) -> Iterator[None]:
+def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
     """`imud run` on the simulated devices, with everything it needs below `folder`."""
     tree = {
         "log_level": "error",
         "state_dir": str(folder),
         "socket": {"path": str(folder / "imud.sock")},
         "shm": {"directory": str(folder)},
-        "metrics": {"port": 0},
+        "metrics": {"address": METRICS_ADDRESS, "port": port},
         "devices": devices,
     }
     file = folder / "imud.yaml"
@@ -200,3 +240,6 @@ def child(argv: list[str], name: str, **options: int) -> Iterator[subprocess.Pop
             except subprocess.TimeoutExpired:
                 process.kill()
                 print(f"{name} had to be killed", file=sys.stderr)
+
+
+DEMO = CliCommand(add_arguments, run)

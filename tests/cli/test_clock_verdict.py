@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.cli.verdict import EDGES_ENOUGH, ENOUGH, verdict
+from imud.cli.clock import EDGES_ENOUGH, ENOUGH, verdict
 from imud.contracts.status import ClockStatus
 from imud.sample import Sync
 from imud.units import NS_PER_MS

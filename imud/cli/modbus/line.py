@@ -1,4 +1,4 @@
-"""Finding and numbering the modules of an RS-485 line: what `imud modbus` does, without words for people."""
+"""Finds the modules of an RS-485 line and sets their addresses."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 TRIES: Final = 3
 SETTLE_S: Final = 0.3
-"""Time that modules get to take new addresses; the manual gives none."""
+"""Time for modules to apply new addresses; the manual gives none."""
 
 
 class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -37,7 +37,7 @@ class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
 
 @contextmanager
 def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
-    """A line of one's own. Raises LinkError."""
+    """The line, opened for this program alone. Raises LinkError."""
     link = Rs485Link(Rs485Settings(line=port, baud=baud, reply_ms=reply_ms))
     link.open()
     try:
@@ -47,44 +47,44 @@ def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
 
 
 def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[FoundModule]:
-    """Ask at every address who is there. Raises LinkError."""
+    """Ask at every address which module is there. Raises LinkError."""
     found = (_look(link, baud, address) for address in addresses)
     return [one for one in found if one is not None]
 
 
 def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int) -> FoundModule:
-    """Have the module with this serial number take an address. Raises CommandError, LinkError."""
+    """Set the address of the module with this serial number. Raises CommandError, LinkError."""
     wanted = serial_bytes(serial_number).hex().upper()
     order = set_id_by_serial(serial_number, new_id)
     _check_free(link, new_id, wanted)
-    _to_all(link, order)
+    _broadcast(link, order)
     return _expect(link, baud, new_id, wanted)
 
 
 def assign_by_address(link: Rs485Link, baud: int, address: int, new_id: int) -> FoundModule:
-    """Have the module at one address take another. Raises CommandError, LinkError."""
+    """Change the address of the module at one address. Raises CommandError, LinkError."""
     check_id("address", address)
-    dialogue = set_id(new_id)
+    script = set_id(new_id)
     before = _identity(link, address)
     if before is None:
-        raise CommandError(f"nobody answers at address {address}")
+        raise CommandError(f"no module answers at address {address}")
     _check_free(link, new_id, before.serial_number)
     try:
-        _hold(link, address, dialogue)
+        _run(link, address, script)
     except DeviceRefused as error:
         raise CommandError(f"address {address}: {error}") from error
     return _expect(link, baud, new_id, before.serial_number)
 
 
 def randomise(link: Rs485Link, lowest: int, highest: int) -> None:
-    """Have every module take a random address of a range. Raises BadArgument, LinkError."""
-    _to_all(link, randomise_ids(lowest, highest))
+    """Make every module choose a random address of a range. Raises BadArgument, LinkError."""
+    _broadcast(link, randomise_ids(lowest, highest))
 
 
 def keep(link: Rs485Link, found: FoundModule) -> None:
-    """Have a module save its settings. Raises CommandError, LinkError."""
+    """Make a module save its settings. Raises CommandError, LinkError."""
     try:
-        _hold(link, found.address, save())
+        _run(link, found.address, save())
     except (TransferError, DeviceRefused) as error:
         raise CommandError(f"address {found.address}: not saved: {error}") from error
 
@@ -92,7 +92,7 @@ def keep(link: Rs485Link, found: FoundModule) -> None:
 def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
     strange = link.heard.strange
     try:
-        who = _hold(link, address, probe(HipnucModbusSettings()))
+        who = _run(link, address, probe(HipnucModbusSettings()))
     except DeviceRefused as error:
         return FoundModule(baud, address, problem=f"{error}; are there two modules with this address?")
     except TransferError as error:
@@ -101,11 +101,11 @@ def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
 
 
 def _identity(link: Rs485Link, address: int) -> Identity | None:
-    """Who is at an address; None for nobody. Raises CommandError for something that cannot be understood."""
+    """Identity of the module at an address; None where none answers. Raises CommandError for invalid replies."""
     problem: Exception | None = None
     for _ in range(TRIES):
         try:
-            return _hold(link, address, probe(HipnucModbusSettings()))
+            return _run(link, address, probe(HipnucModbusSettings()))
         except TransferError:
             continue
         except DeviceRefused as error:
@@ -125,7 +125,7 @@ def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> Fou
     there = _identity(link, address)
     if there is None:
         raise CommandError(
-            f"nobody answers at address {address}: is a module with serial number {serial_number} on this line, at "
+            f"no module answers at address {address}: is a module with serial number {serial_number} on this line, at "
             f"{baud} baud, and does its firmware know function 0x50?"
         )
     if there.serial_number != serial_number:
@@ -133,12 +133,12 @@ def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> Fou
     return FoundModule(baud, address, there.product, there.serial_number, there.firmware)
 
 
-def _to_all(link: Rs485Link, order: Transfer) -> None:
+def _broadcast(link: Rs485Link, order: Transfer) -> None:
     link.select(BROADCAST)
     link.transfer(order)
     sleep(SETTLE_S)
 
 
-def _hold(link: Rs485Link, address: int, dialogue: TransferScript[T]) -> T:
+def _run(link: Rs485Link, address: int, script: TransferScript[T]) -> T:
     link.select(address)
-    return run_transfer_script(dialogue, link.transfer)
+    return run_transfer_script(script, link.transfer)

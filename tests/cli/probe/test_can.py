@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import pytest
 
-from imud.cli import probe, probe_can
-from imud.cli.probe_report import ProbeReport, row
+from imud.cli.probe import can as probe_can
+from imud.cli.probe import command as probe
+from imud.cli.probe.report import ProbeReport, row
 from imud.contracts.driver import Driver
 from imud.contracts.link import LinkType, OnBusNews, OnEnd, OnFrames
 from imud.devices import DRIVERS

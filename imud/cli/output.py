@@ -1,16 +1,23 @@
-"""A histogram in plain characters."""
+"""Plain text for people: tables and histograms."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import floor, log10
 from typing import Final
 
 WIDTH: Final = 40
 """Characters of the longest bar."""
 BARS: Final = 12
-"""Most lines."""
+"""Most lines of a histogram."""
 STEPS: Final = (1, 2, 5, 10, 20)
 TAIL: Final = 0.005
-"""What lies beyond this share on either side goes into the outermost bars, so that one stray value hides nothing."""
+"""What lies beyond this share on either side is in the outermost bars, so that one stray value hides nothing."""
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Columns as wide as their widest cell, numbers right-aligned, two spaces between; ends without a line end."""
+    cells = [[str(cell) for cell in head], *([_word(cell) for cell in row] for row in rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
+    return "\n".join(_line(line, widths) for line in cells)
 
 
 def histogram(values: Sequence[float], unit: str) -> list[str]:
@@ -39,3 +46,16 @@ def bar_width(span: float) -> float:
         return 1.0
     power = 10.0 ** floor(log10(span / BARS))
     return next(step * power for step in STEPS if step * power * (BARS - 1) >= span)
+
+
+def _word(cell: object) -> str:
+    return f"{cell:.1f}" if isinstance(cell, float) else str(cell)
+
+
+def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
+    padded = (c.rjust(w) if _is_number(c) else c.ljust(w) for c, w in zip(cells, widths, strict=True))
+    return "  ".join(padded).rstrip()
+
+
+def _is_number(cell: str) -> bool:
+    return cell.replace(".", "", 1).replace("-", "", 1).isdecimal()

@@ -7,7 +7,7 @@ from subprocess import PIPE, Popen
 import pytest
 
 from imud.cli import main
-from imud.cli.command import argument
+from imud.cli.arguments import argument
 from imud.errors import BadArgument
 from tests.support.running import RunningDaemon, running_daemon
 

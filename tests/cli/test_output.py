@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.cli.histogram import BARS, WIDTH, bar_width, histogram
+from imud.cli.output import BARS, WIDTH, bar_width, histogram
 
 
 def test_nothing_for_no_values() -> None:

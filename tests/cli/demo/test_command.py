@@ -1,14 +1,18 @@
 """`imud demo`: three real processes, and the account at the end."""
 
 import io
+import itertools
 import re
+import subprocess
+import sys
 from pathlib import Path
+from urllib.request import urlopen
 
 import msgspec
 import pytest
 
 from imud.cli import main
-from imud.cli.demo_view import View
+from imud.cli.demo.view import View
 from imud.sample import Sample, Sync
 
 
@@ -24,6 +28,35 @@ def test_samples_flow_and_the_ledger_closes(device: str, product: str, capfd: py
     folder = re.search(r"daemon at (\S+)/imud.sock", out)
     assert folder is not None
     assert not Path(folder[1]).exists()
+
+
+def test_the_commands_it_prints_reach_it_from_another_directory() -> None:
+    argv = [sys.executable, "-m", "imud", "demo", "--plain"]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as demo:
+        try:
+            assert demo.stdout is not None
+            assert demo.stdout.readline().startswith("daemon at ")
+            export, status, watch, clock, ring, scrape = (line.strip() for line in itertools.islice(demo.stdout, 6))
+            reached = pasted(export, f"{watch} --count 3")
+            assert reached.count("demo ") == 3
+            assert "demo: running" in pasted(export, status)
+            assert clock.endswith("imud clock")
+            assert "verdict" in pasted(export, f"{clock} --duration 0.1")
+            assert "accel_m_s2=" in pasted(ring)
+            with urlopen(scrape.removeprefix("curl ")) as answer:
+                assert b'imud_samples_total{device="demo"}' in answer.read()
+        finally:
+            demo.terminate()
+            demo.communicate(timeout=10)
+    assert demo.returncode == 0
+
+
+def pasted(*lines: str) -> str:
+    """What a shell prints that knows nothing of this directory and this environment."""
+    script = "\n".join(["set -e", *lines])
+    return subprocess.run(
+        ["/bin/sh", "-c", script], cwd="/", env={}, capture_output=True, text=True, timeout=30, check=True
+    ).stdout
 
 
 def test_a_can_device_needs_an_interface(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""`imud modbus`: find the modules of an RS-485 line and give them addresses. It sends, so the port must be named.
+"""`imud modbus`: find the modules of an RS-485 line and set their addresses. It sends, so the port must be named.
 
 Stop the daemon first, or take the line out of its configuration: a line has one master.
 """
@@ -8,7 +8,8 @@ from functools import partial
 
 import msgspec
 
-from imud.cli.modbus_line import (
+from imud.cli.arguments import CliCommand
+from imud.cli.modbus.line import (
     FoundModule,
     assign_by_address,
     assign_by_serial,
@@ -17,7 +18,7 @@ from imud.cli.modbus_line import (
     randomise,
     scan,
 )
-from imud.cli.table import table
+from imud.cli.output import table
 from imud.devices.hipnuc.modbus.frames import FACTORY_ID
 from imud.devices.hipnuc.modbus.registers import BAUD_RATES, FACTORY_BAUD
 from imud.errors import BadArgument
@@ -29,21 +30,21 @@ HEAD = ("BAUD", "ADDRESS", "PRODUCT", "SERIAL NUMBER", "FIRMWARE", "")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud modbus`."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    scanning = actions.add_parser("scan", help="ask at every address who is there")
+    scanning = actions.add_parser("scan", help="list the module at every address")
     scanning.add_argument("port", metavar="PORT", help="port of the line, for example /dev/ttyUSB0")
     scanning.add_argument("--baud", default=str(FACTORY_BAUD), help="bit/s, or all for every rate (%(default)s)")
     scanning.add_argument(
-        "--addresses", type=addresses, default=SLAVES, metavar="FIRST-LAST", help="where to ask (1-247)"
+        "--addresses", type=addresses, default=SLAVES, metavar="FIRST-LAST", help="addresses to ask (1-247)"
     )
     _common(scanning)
-    giving = actions.add_parser("assign", help="give a module an address, or all modules random ones")
+    giving = actions.add_parser("assign", help="set the address of a module, or random ones of all modules")
     giving.add_argument("port", metavar="PORT", help="port of the line")
     giving.add_argument("--baud", type=int, default=FACTORY_BAUD, help="bit/s (%(default)s)")
     which = giving.add_mutually_exclusive_group(required=True)
     which.add_argument("--serial", metavar="SN", help="the module with this serial number (16 hexadecimal digits)")
     which.add_argument("--from", type=int, metavar="ADDRESS", dest="address", help="the module at this address")
     which.add_argument(
-        "--random", type=addresses, metavar="FIRST-LAST", help="every module takes a random address of this range"
+        "--random", type=addresses, metavar="FIRST-LAST", help="every module chooses a random address of this range"
     )
     giving.add_argument("--id", type=int, metavar="ADDRESS", help="the new address, with --serial and --from")
     giving.add_argument("--no-save", action="store_true", help="until power-off only")
@@ -51,9 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--reply-ms", type=int, default=20, metavar="MS", help="how long a module may think (%(default)s)"
-    )
+    parser.add_argument("--reply-ms", type=int, default=20, metavar="MS", help="longest time to a reply (%(default)s)")
     parser.add_argument("--json", action="store_true", help="one JSON object per module")
 
 
@@ -127,3 +126,6 @@ def _show(found: list[FoundModule], *, as_json: bool) -> None:
         print(table(HEAD, rows))
     else:
         print("no module answers: is the line wired and terminated, are A and B right, is the baud rate another one?")
+
+
+MODBUS = CliCommand(add_arguments, run)

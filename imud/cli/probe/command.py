@@ -9,9 +9,10 @@ import contextlib
 
 import msgspec
 
-from imud.cli.probe_can import examine_bus
-from imud.cli.probe_report import HEAD, ProbeReport, row
-from imud.cli.table import table
+from imud.cli.arguments import CliCommand
+from imud.cli.output import table
+from imud.cli.probe.can import examine_bus
+from imud.cli.probe.report import HEAD, ProbeReport, row
 from imud.config import DeviceConfig
 from imud.contracts.codec import message_of
 from imud.contracts.driver import Identity
@@ -60,7 +61,7 @@ async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]
 
 
 async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
-    """Open a serial port, find what talks there, ask it who it is if that is allowed."""
+    """Open a serial port, find what talks there, ask for its identity if that is permitted."""
     settings = msgspec.convert({"port": port, "baud": "auto"}, LINKS["uart"].settings)
     config = DeviceConfig("probe", "auto", None, may_ask, "uart", settings)
     link = LINKS["uart"].make(settings)
@@ -93,7 +94,7 @@ async def find(config: DeviceConfig, link: StreamLink) -> Finding:
 
 
 async def ask(found: Finding, link: StreamLink) -> Identity:
-    """Who it is; nothing when it does not answer."""
+    """The identity of a device; empty when it does not answer."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
     exchange = Exchange(ledger, link.write, link.set_baud)
@@ -107,3 +108,6 @@ async def ask(found: Finding, link: StreamLink) -> Identity:
     with contextlib.suppress(CommandError):
         return await exchange.run(found.driver.identify())
     return Identity()
+
+
+PROBE = CliCommand(add_arguments, run)

@@ -30,7 +30,7 @@ class View:
         self._latencies_ns: deque[int] = deque(maxlen=LATENCIES_KEPT)
 
     def add(self, sample: Sample) -> None:
-        """Take one sample as it arrives."""
+        """Count and draw one sample as it arrives."""
         now_ns = monotonic_ns()
         if self._last is None:
             self._first_ns = sample.t_ns

@@ -1,4 +1,4 @@
-"""CAN interfaces for `imud probe`: everybody who is heard on a bus. Sends nothing but queries that were asked for."""
+"""Lists the devices heard on a CAN interface, for `imud probe`; sends nothing but permitted queries."""
 
 import asyncio
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import msgspec
 
-from imud.cli.probe_report import ProbeReport
+from imud.cli.probe.report import ProbeReport
 from imud.contracts.can import CanDriver
 from imud.contracts.codec import message_of
 from imud.contracts.driver import Identity, of_kind
@@ -45,7 +45,7 @@ async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
 
 
 async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
-    """One round of detection: who is heard, and what is to be said if nobody is. Raises LinkError."""
+    """One round of detection: the devices heard, and the reason if there is none. Raises LinkError."""
     search = CanSearch(of_kind(DRIVERS.values(), CanDriver), link.title)
     finder = CanFinder(search, Ledger(), lambda device: None)
     ended = asyncio.get_running_loop().create_future()
@@ -78,7 +78,7 @@ async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -
 
 
 async def ask(device: CanDevice, link: CanLink) -> Identity:
-    """Who it is; nothing when it does not answer."""
+    """The identity of a device; empty when it does not answer."""
     driver, settings = device.driver, device.driver.node_settings(device.node)
     ledger = Ledger()
     codec = driver.make_codec(ledger, settings)

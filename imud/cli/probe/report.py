@@ -1,4 +1,4 @@
-"""What `imud probe` says of one device, or of a port without one."""
+"""Table: what `imud probe` says of one device, or of a port without one, and the columns of its output."""
 
 import msgspec
 

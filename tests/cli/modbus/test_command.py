@@ -17,7 +17,7 @@ PATIENT = ("--baud", str(BAUD), "--reply-ms", "400")
 @pytest.fixture(autouse=True)
 def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated modules need no time for a new address."""
-    monkeypatch.setattr("imud.cli.modbus_line.SETTLE_S", 0.0)
+    monkeypatch.setattr("imud.cli.modbus.line.SETTLE_S", 0.0)
 
 
 def scanned(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, list[dict[str, object]]]:
@@ -89,13 +89,13 @@ def test_by_address_and_not_saved(tmp_path: Path) -> None:
     ("words", "why"),
     [
         (("--from", "1", "--id", "2"), "address 2 is taken by HI14R2N-485-000"),
-        (("--from", "5", "--id", "6"), "nobody answers at address 5"),
+        (("--from", "5", "--id", "6"), "no module answers at address 5"),
         (("--from", "1", "--id", "200"), "1 … 128"),
         (("--from", "0", "--id", "9"), "1 … 247"),
         (("--from", "1"), "--id"),
         (("--random", "1-9", "--id", "1"), "--id"),
         (("--random", "9"), "lowest below the highest"),
-        (("--serial", serial_of(9).hex(), "--id", "9"), "nobody answers at address 9"),
+        (("--serial", serial_of(9).hex(), "--id", "9"), "no module answers at address 9"),
         (("--serial", serial_of(9).hex(), "--id", "2"), "address 2 is taken"),
         (("--serial", "12", "--id", "9"), "16 hexadecimal digits"),
         (("--from", "1", "--id", "9", "--reply-ms", "0"), "--reply-ms"),

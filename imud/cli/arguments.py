@@ -1,0 +1,96 @@
+"""What commands share: the type of a row, the daemon's socket, and values written as `NAME=VALUE`."""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+
+from imud.client import Client
+from imud.client.connection import default_path
+from imud.contracts.driver import Driver
+from imud.contracts.settings import Settings, expected, got, unknown_name
+from imud.contracts.status import DeviceStatus
+from imud.errors import BadArgument
+
+SOCKET_VARIABLE: Final = "IMUD_SOCKET"
+"""Environment variable with the path of the daemon's socket."""
+
+
+class CliCommand(NamedTuple):
+    """One command of the command line."""
+
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    """Adds its arguments to its parser."""
+    run: Callable[[argparse.Namespace], int]
+    """Carries it out and returns the exit status. Raises ImudError."""
+
+
+# --- the running daemon ---------------------------------------------------------------------------------------------
+
+
+def add_socket(parser: argparse.ArgumentParser) -> None:
+    """`--socket PATH`, with the environment variable IMUD_SOCKET as its default."""
+    parser.add_argument(
+        "--socket",
+        default=default_path(),
+        metavar="PATH",
+        help="the daemon's socket (default: $IMUD_SOCKET or %(default)s)",
+    )
+
+
+def connect(args: argparse.Namespace) -> Client:
+    """A connection to the daemon. Raises LinkMissing, LinkDenied, ServerError with what to look at."""
+    return Client(args.socket)
+
+
+def statuses(client: Client) -> list[DeviceStatus]:
+    """The state of every device."""
+    return msgspec.convert(client.status()["devices"], list[DeviceStatus])
+
+
+# --- NAME=VALUE -----------------------------------------------------------------------------------------------------
+
+
+def argument(text: str) -> tuple[str, object]:
+    """`name=value`: numbers, true, false, null and lists as in JSON, everything else text. Raises BadArgument."""
+    name, sign, value = text.partition("=")
+    if not name or not sign:
+        raise BadArgument(f"expected NAME=VALUE, got {text!r}")
+    try:
+        return name, msgspec.json.decode(value)
+    except msgspec.DecodeError:
+        return name, value
+
+
+def add_option(parser: argparse.ArgumentParser) -> None:
+    """The argument, which may be given several times."""
+    parser.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting of the driver, as below `options` in the configuration; may be given several times",
+    )
+
+
+def given_options(driver: Driver, words: Sequence[str]) -> dict[str, object]:
+    """The options by name, each checked. Raises BadArgument naming what was expected."""
+    options = dict(map(argument, words))
+    fields = {field.name: field for field in msgspec.structs.fields(driver.settings)}
+    for name, value in options.items():
+        if name not in fields:
+            raise BadArgument(f"--option {name}: {unknown_name(f'an option of {driver.name}', name, list(fields))}")
+        try:
+            msgspec.convert(value, fields[name].type)
+        except msgspec.ValidationError:
+            raise BadArgument(f"--option {name}: expected {expected(fields[name].type)}, got {got(value)}") from None
+    return options
+
+
+def driver_settings(driver: Driver, options: Mapping[str, object]) -> Settings:
+    """The driver's settings with these options. Raises BadArgument for some that do not go together."""
+    try:
+        return msgspec.convert(options, driver.settings)
+    except msgspec.ValidationError as error:
+        raise BadArgument(f"--option: {error}") from None
