@@ -1,6 +1,7 @@
 # make demo   one simulated sensor through the real daemon          make test   everything that needs no lab
 # make lab    tests on a booted kernel          make soak   ten minutes at 1 kHz
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
+# make pictures   the pictures of README.md, into docs/pictures
 SHELL := /bin/sh
 PYTHON ?= python3
 VENV := .venv
@@ -8,7 +9,7 @@ BIN := $(VENV)/bin
 ARGS ?=
 LAB_OPTIONS ?= --steady
 
-.PHONY: all demo test lint check bench soak clean lab lab-deps
+.PHONY: all demo test lint check bench soak pictures clean lab lab-deps
 
 all: check
 
@@ -36,6 +37,9 @@ bench: $(VENV)/made
 
 soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)
+
+pictures: $(VENV)/made
+	$(BIN)/python -m tests.support.pictures
 
 lab-deps:
 	tests/lab/deps

@@ -9,13 +9,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 import pytest
 
 from imud import config
 from imud.cli import COMMANDS, build_parser
 from imud.devices import DRIVERS
-from tests.support import actions_reference, shm_reference
+from tests.support import actions_reference, pictures, shm_reference
 from tests.support.running import LIMIT_S, running_daemon
 from tests.test_daemon import cable, device
 
@@ -92,15 +93,34 @@ def test_c_reads_from_a_running_daemon(tmp_path: Path) -> None:
     (example,) = examples("c")
     source = tmp_path / "reader.c"
     source.write_text(example.text.replace('"bow")', f'"{tmp_path}/imud.bow")'))
-    program = tmp_path / "reader"
-    argv = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", f"-I{ROOT / 'imud' / 'include'}"]
-    subprocess.run([*argv, str(source), "-o", str(program)], check=True, timeout=LIMIT_S)
+    (tmp_path / "imud").symlink_to(ROOT / "imud")
+    lines = [line for block in examples("sh") for line in block.text.splitlines()]
+    (compile_line,) = [line for line in lines if line.startswith("cc ")]
+    argv = [*shlex.split(compile_line), "-Werror"]
+    subprocess.run(argv, check=True, timeout=LIMIT_S, cwd=tmp_path)
+    assert "./reader" in lines
     with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
         daemon.wait_for("bow", "searching")
         port.send(1)
         daemon.wait_for("bow", "running")
-        done = subprocess.run([program], capture_output=True, text=True, timeout=LIMIT_S, check=True)
+        done = subprocess.run([tmp_path / "reader"], capture_output=True, text=True, timeout=LIMIT_S, check=True)
     assert re.fullmatch(r"\d+ ns: 9\.800000 m/s2\n", done.stdout)
+
+
+@pytest.mark.parametrize("file", sorted(pictures.FOLDER.glob("*.svg")), ids=lambda file: file.name)
+def test_pictures_are_well_formed_and_shown(file: Path) -> None:
+    root = ElementTree.parse(file).getroot()
+    assert root.tag.endswith("svg")
+    assert root[0].text
+    assert f"(docs/pictures/{file.name})" in (ROOT / "README.md").read_text()
+
+
+def test_the_picture_of_time_stamps_shows_what_the_readme_says() -> None:
+    samples = pictures.stamps()
+    assert 7 < min(s.arrival_ms for s in samples) < max(s.arrival_ms for s in samples) < 24
+    assert sum(abs(s.off_ms) <= 2 * s.error_ms for s in samples) >= 0.95 * len(samples)
+    assert samples[-1].error_ms < samples[100].error_ms / 2
+    assert pictures.time_stamps(samples).count("<path") > 10
 
 
 def test_tables_of_the_readme_name_every_command_and_driver() -> None:

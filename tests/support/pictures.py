@@ -1,0 +1,184 @@
+"""Draws the pictures of README.md into docs/pictures: `python -m tests.support.pictures` (`make pictures`).
+
+`terminal.svg` is what the commands print, run on a simulated module; `time_stamps.svg` is a simulation whose truth is
+known: a module at 100 Hz behind a USB adapter that holds bytes for up to 16 ms.
+"""
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+
+from imud.cli.demo.command import daemon, device, simulator
+from imud.client import Client
+from imud.sim.ports.arrival import USB_16MS, ArrivalModel, Crystal
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.clock import run
+from tests.support.paths import ROOT
+
+FOLDER = ROOT / "docs/pictures"
+NAMES = "font-family='DejaVu Sans, Verdana, sans-serif'"
+RATE_HZ, SECONDS, SEED = 100, 60, 7
+COMMANDS = ("devices", "status", "watch --rate 5 --count 6")
+"""What the terminal shows."""
+
+
+def svg(width: int, height: int, title: str, parts: Sequence[str]) -> str:
+    """A whole picture."""
+    head = f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width} {height}' width='{width}' height='{height}'>"
+    return "\n".join([head, f"<title>{escape(title)}</title>", *parts, "</svg>", ""])
+
+
+def text(x: float, y: float, words: str, more: str = "") -> str:
+    """A line of text that begins at a point."""
+    return f"<text x='{x:.1f}' y='{y:.1f}' {NAMES} font-size='13' fill='#333' {more}>{escape(words)}</text>"
+
+
+# --- the terminal -----------------------------------------------------------------------------------------------------
+
+
+def terminal(lines: Sequence[str]) -> str:
+    """A terminal window with these lines; those that begin with `$ ` are what was typed."""
+    step, left, top = 17, 14, 42
+    width, height = left * 2 + round(max(map(len, lines)) * 7.25), top + step * len(lines)
+    parts = [f"<rect width='{width}' height='{height}' rx='8' fill='#1d2430'/>"]
+    parts += [
+        f"<circle cx='{18 + 18 * i}' cy='16' r='5.5' fill='{fill}'/>"
+        for i, fill in enumerate(("#ec6a5e", "#f4be4f", "#61c454"))
+    ]
+    for number, line in enumerate(lines):
+        fill = "#8fd18f" if line.startswith("$ ") else "#dde3ec"
+        parts.append(
+            f"<text x='{left}' y='{top + step * number}' xml:space='preserve' fill='{fill}' font-size='12' "
+            f"font-family='DejaVu Sans Mono, Menlo, Consolas, monospace'>{escape(line)}</text>"
+        )
+    return svg(width, height, "imud devices, status and watch in a terminal", parts)
+
+
+def session() -> list[str]:
+    """What is typed and printed while the daemon runs on a simulated module."""
+    lines: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="imud-") as name:
+        folder = Path(name)
+        with (
+            simulator(folder, [("hipnuc-uart", 0)], RATE_HZ, ""),
+            daemon(folder, {"bow": device(folder, "hipnuc-uart", "")}, 0),
+        ):
+            path = str(folder / "imud.sock")
+            with Client(path, timeout_s=20) as client:
+                for _ in zip(client.watch(), range(20 * RATE_HZ), strict=False):
+                    pass
+            for words in COMMANDS:
+                argv = [sys.executable, "-m", "imud", *words.split(), "--socket", path]
+                done = subprocess.run(argv, capture_output=True, text=True, timeout=30, check=True)
+                lines += [
+                    f"$ imud {words}",
+                    *done.stdout.replace(str(folder / "port"), "/dev/ttyUSB0").splitlines(),
+                    "",
+                ]
+    return lines[:-1]
+
+
+# --- the error of time stamps -------------------------------------------------------------------------------------
+
+
+class Stamp(NamedTuple):
+    """One sample beside its truth, ms."""
+
+    t_s: float
+    """Since the first sample."""
+    arrival_ms: float
+    """Arrival of its last byte - truth."""
+    off_ms: float
+    """`t_ns` - truth."""
+    error_ms: float
+    """`t_err_ns`."""
+
+
+def stamps(seconds: int = SECONDS) -> list[Stamp]:
+    """The samples of a simulation."""
+    model = ArrivalModel(USB_16MS, RATE_HZ, SEED, Crystal(50.0), 115_200)
+    arrivals = list(model.run(seconds * RATE_HZ))
+    points = run(ArrivalModel(USB_16MS, RATE_HZ, SEED, Crystal(50.0), 115_200), seconds * RATE_HZ)
+    begin = arrivals[0].t_ns
+    return [
+        Stamp(
+            (a.t_ns - begin) / NS_PER_S,
+            (a.t_rx_ns - a.t_ns) / NS_PER_MS,
+            p.off_ns / NS_PER_MS,
+            p.t_err_ns / NS_PER_MS,
+        )
+        for a, p in zip(arrivals, points, strict=True)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A diagram of milliseconds over seconds."""
+
+    top: float
+    low_ms: float
+    high_ms: float
+    step_ms: float
+    left: float = 60.0
+    width: float = 680.0
+    height: float = 190.0
+    seconds: float = SECONDS
+
+    def x(self, t_s: float) -> float:
+        """Where an instant is."""
+        return self.left + self.width * t_s / self.seconds
+
+    def y(self, value_ms: float) -> float:
+        """Where a value is, at the edge where it lies outside."""
+        inside = min(max(value_ms, self.low_ms), self.high_ms)
+        return self.top + self.height * (self.high_ms - inside) / (self.high_ms - self.low_ms)
+
+    def axes(self, title: str) -> Iterator[str]:
+        """Frame, grid, numbers and title."""
+        yield text(self.left, self.top - 10, title, "font-weight='bold'")
+        for number in range(round((self.high_ms - self.low_ms) / self.step_ms) + 1):
+            value = self.low_ms + number * self.step_ms
+            dark = "#888" if value == 0 else "#ddd"
+            yield self._line(self.left, self.y(value), self.left + self.width, self.y(value), dark)
+            yield text(self.left - 8, self.y(value) + 4, f"{value:g} ms", "text-anchor='end'")
+        for t_s in range(0, round(self.seconds) + 1, 10):
+            yield text(self.x(t_s), self.top + self.height + 18, f"{t_s} s", "text-anchor='middle'")
+
+    def dots(self, points: Sequence[tuple[float, float]], fill: str) -> str:
+        """One dot per point."""
+        moves = "".join(f"M{self.x(t):.1f} {self.y(v):.1f}h0" for t, v in points)
+        return f"<path d='{moves}' stroke='{fill}' stroke-width='1.7' stroke-linecap='round'/>"
+
+    def band(self, points: Sequence[tuple[float, float]], fill: str) -> str:
+        """The area within plus and minus a value."""
+        upper = [f"{self.x(t):.1f} {self.y(v):.1f}" for t, v in points]
+        lower = [f"{self.x(t):.1f} {self.y(-v):.1f}" for t, v in reversed(points)]
+        return f"<path d='M{' L'.join([*upper, *lower])}z' fill='{fill}'/>"
+
+    def _line(self, x1: float, y1: float, x2: float, y2: float, stroke: str) -> str:
+        return f"<path d='M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}' stroke='{stroke}' stroke-width='1'/>"
+
+
+def time_stamps(samples: Sequence[Stamp]) -> str:
+    """Arrivals above, the stamps that imud makes of them below, both against the truth."""
+    above, below = Panel(top=40, low_ms=0, high_ms=25, step_ms=5), Panel(top=300, low_ms=-4, high_ms=4, step_ms=2)
+    drawn = samples[::3]  # a file of 80 kB; not in step with the timer
+    parts = [
+        "<rect width='760' height='540' fill='#fff'/>",
+        *above.axes("Arrival of a sample's last byte: 7 to 24 ms after the measurement"),
+        above.dots([(s.t_s, s.arrival_ms) for s in drawn], "#c0392b"),
+        *below.axes("Error of the time stamp t_ns (dots), and the error that imud states, ±t_err_ns (band)"),
+        below.band([(s.t_s, s.error_ms) for s in samples[::10]], "#cfe3f7"),
+        below.dots([(s.t_s, s.off_ms) for s in drawn], "#1f5fa8"),
+    ]
+    return svg(760, 540, "Error of time stamps behind a USB adapter with a latency timer of 16 ms", parts)
+
+
+if __name__ == "__main__":
+    (FOLDER / "terminal.svg").write_text(terminal(session()))
+    (FOLDER / "time_stamps.svg").write_text(time_stamps(stamps()))
