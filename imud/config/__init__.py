@@ -1,4 +1,4 @@
-"""The configuration file: read and checked whole, before any port is opened. Loading touches nothing but the file.
+"""The configuration file: it is read and checked as a whole before any port is opened. Loading opens only that file.
 
     log_level, state_dir          keys of the daemon (`General`)
     socket, shm, metrics, …       one key per row of PUBLISHERS, with that row's settings
@@ -6,11 +6,11 @@
       NAME:
         driver, identify, enabled, options        (`DeviceGeneral`; options are the driver's settings)
         lines                     GPIO lines (`imud.contracts.lines.DeviceLines`), as far as the driver has them
-        rmc                       what tells the device UTC (`imud.utc.source.RmcSettings`), as far as it has SIN/PPS
+        rmc                       source of RMC sentences (`imud.utc.source.RmcSettings`), for devices with SIN/PPS
         uart | replay | …         one key per row of LINKS, with that row's settings
 
 A new row of a table is configurable without a change here. Errors name file, line and column, what was expected and
-what is there; all that can be found in one pass are reported together.
+what is there; all that one pass finds are reported together.
 """
 
 from imud.config.devices import DEVICE_NAME, DEVICES_MAX

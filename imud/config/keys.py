@@ -14,7 +14,7 @@ S = TypeVar("S", bound=Settings)
 
 
 class Keys:
-    """The keys of a file, and the problems found with them so far."""
+    """The keys of a file and the problems found with them so far."""
 
     def __init__(self, tree: YamlTree) -> None:
         self.tree = tree
@@ -79,7 +79,7 @@ class Keys:
             return None
 
     def problem(self, path: KeyPath, message: str, *, at_key: bool = False) -> None:
-        """Something is wrong at `path`, with its value or with the key itself."""
+        """Add a problem at `path`, with its value or with the key itself."""
         mark = self.tree.key_mark(path) if at_key else self.tree.mark(path)
         self.problems.append(Problem(mark, path, message))
 

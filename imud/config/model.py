@@ -22,11 +22,11 @@ class DeviceConfig:
     """A name in LINKS."""
     link_settings: Settings
     line: int = 0
-    """Line of its name in the file; says nothing about the device."""
+    """Line of its name in the file; no property of the device."""
     lines: DeviceLines | None = None
-    """Its wires besides its data; None where it has none."""
+    """Its GPIO lines; None where it has none."""
     rmc: RmcSettings | None = None
-    """Where the RMC sentences come from that it is fed; None for none."""
+    """Source of the RMC sentences that are sent to it; None for none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Reads and checks a whole file, before any port is opened. Loading touches nothing but the file."""
+"""Reads and checks a whole file and makes a `Config` of it."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -25,7 +25,7 @@ class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys of a device besides its link and the options of its driver."""
+    """Keys of a device itself, as opposed to those of its link and its driver."""
 
     driver: str = "auto"
     """Which wire protocol the device speaks, or `auto`: listen and see."""
@@ -45,20 +45,20 @@ class Row(Protocol):
 
 
 class DriverRow(Row, Protocol):
-    """What the configuration needs to know of a driver besides."""
+    """What the configuration needs to know of a driver."""
 
     @property
     def lines(self) -> frozenset[str]:
-        """Wires besides its data that such a device can have."""
+        """GPIO lines that such a device can have."""
         ...
 
 
 class LinkRow(Row, Protocol):
-    """What the configuration needs to know of a link besides."""
+    """What the configuration needs to know of a link."""
 
     @property
     def searchable(self) -> bool:
-        """Whether `driver: auto` finds out what talks on it."""
+        """Whether `driver: auto` can identify the device on it."""
         ...
 
     def fits(self, driver: Any) -> bool:

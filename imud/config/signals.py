@@ -14,7 +14,7 @@ from imud.utc.source import RmcSettings
 
 LINK: Final = "uart"
 PULSE: Final = "pps"
-"""What has this line takes its time from a pulse per second and from sentences."""
+"""A device with this line synchronises to a pulse per second and RMC sentences."""
 TRIGGER: Final = "sin"
 """The line by which imud drives the input that the pulse would come on."""
 
@@ -22,7 +22,7 @@ TRIGGER: Final = "sin"
 def read_lines(
     keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
 ) -> DeviceLines | None:
-    """The wires below the key `lines` of a device; None where it has none."""
+    """The GPIO lines below the key `lines` of a device; None where it has none."""
     if "lines" not in device:
         return None
     found = keys.mapping(path, device["lines"])
@@ -40,12 +40,12 @@ def read_lines(
 
 
 def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
-    """Refuse one wire under two keys, of one device or of two."""
+    """Refuse a GPIO line that is used twice, by one device or by two."""
     owners: list[tuple[LineSettings, str]] = []
     for device in devices:
         for name, settings in _lines_of_device(device):
             path: KeyPath = ("devices", device.name, "lines", name)
-            first = next((place for other, place in owners if _same_wire(other, settings)), None)
+            first = next((place for other, place in owners if _same_line(other, settings)), None)
             if first is not None:
                 wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
                 keys.problem(path, f"expected a line of its own, got {wire}, which {first} has", at_key=True)
@@ -78,7 +78,7 @@ def read_rmc(
 
 
 def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
-    """Refuse what no device has, and what this driver's devices have not."""
+    """Refuse lines that no device has, and those that devices of this driver do not have."""
     keys.unknown_keys(path, found, list(LINE_SCHEMAS))
     if driver == "auto":
         message = "expected lines only beside a named driver, got them with driver auto; drivers that have lines"
@@ -88,7 +88,7 @@ def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, dr
     try:
         lines = drivers[driver].lines
     except ImportError:
-        return  # it is a problem of its own
+        return  # reported elsewhere: the driver cannot be imported
     for name in found:
         if name in LINE_SCHEMAS and name not in lines:
             known = ", ".join(key for key in LINE_SCHEMAS if key in lines) or "none"
@@ -110,8 +110,8 @@ def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineSettings]]
             yield name, settings
 
 
-def _same_wire(one: LineSettings, other: LineSettings) -> bool:
-    """As far as it can be seen here: a name without a chip is on one chip only, whichever that is."""
+def _same_line(one: LineSettings, other: LineSettings) -> bool:
+    """Whether both are the same line, as far as names show: a line name without a chip is taken as on any chip."""
     chips = {one.chip.removeprefix("/dev/"), other.chip.removeprefix("/dev/")}
     return one.line == other.line and (len(chips) == 1 or "" in chips)
 
@@ -120,4 +120,4 @@ def _lines_of_driver(drivers: Mapping[str, DriverRow], driver: object) -> frozen
     try:
         return drivers[driver].lines if isinstance(driver, str) and driver in drivers else frozenset({PULSE})
     except ImportError:
-        return frozenset({PULSE})  # it is a problem of its own, as is a driver that is none
+        return frozenset({PULSE})  # reported elsewhere, as is an unknown driver

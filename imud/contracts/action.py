@@ -1,4 +1,4 @@
-"""What a device can be told to do by name, besides sending samples: calibrate, save, restart, another baud rate."""
+"""Contract of an action: a command that a device executes by name, for example calibrate, save, restart, baud rate."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ class Target:
 class Action:
     """A row of a driver's actions.
 
-    An action's arguments are described once: by the keyword-only parameters of `begin`. Their annotations give type
+    Its arguments are described once, by the keyword-only parameters of `begin`. Their annotations give type
     and bounds (`msgspec.Meta`), their names the unit, their defaults what may be left out.
     """
 
     help: str
-    """What it does, one sentence."""
+    """Its effect, one sentence."""
     begin: Callable[..., Any]
     """`begin(target, *, name: type = default, …)` makes the request script, or a polled driver's transfer script.
 

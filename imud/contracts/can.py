@@ -1,4 +1,4 @@
-"""What a driver for a CAN bus promises: the codec that takes its frames, and the row that its folder ends with."""
+"""Contract of a driver for a CAN bus: the codec of its frames, and the row of the table of drivers."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,15 +26,15 @@ class CanCodec(Protocol):
     ledger: Ledger
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Take one frame that arrived then (CLOCK_MONOTONIC); return what it completed. Never raises for any frame."""
+        """Decode one frame that arrived at `t_rx_ns` (CLOCK_MONOTONIC); return what it completed. Never raises."""
         ...
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The bus is idle: return what need not wait any longer."""
+        """The bus is idle: return what waits for frames that will not come."""
         ...
 
     def reset(self) -> None:
-        """Frames are missing here (overrun, bus gone): frames that wait for the rest of their sample are given up."""
+        """Frames are missing here (overrun, bus down): discard those that wait for the rest of their sample."""
         ...
 
 
@@ -49,7 +49,7 @@ class CanDriver(Driver):
     node_of: Callable[[int, bool, bytes], int | None]
     """Which device of this protocol would send such a frame (identifier, 29 bits or not, data): its number, or None.
 
-    A frame that carries samples only; what this says is a guess that a codec must confirm."""
+    Only for frames that carry samples; the codec must confirm it."""
     node_settings: Callable[[int], Any]
     """Settings for the device of that number, the rest at its default."""
     node_title: Callable[[int], str]
@@ -59,7 +59,7 @@ class CanDriver(Driver):
     read_settings: Callable[[Any], RequestScript[Mapping[str, str]]]
     """Reads back the own settings of the device with these settings, by its own names, and leaves it as it was."""
     apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
-    """Tells the codec what is known of the device, where what it sends depends on that."""
+    """Passes the identity to the codec, where the frames depend on it."""
     sample_frames: int
     """Frames that make one sample."""
     example_frames: Callable[[Random], Sequence[CanFrame]]

@@ -1,4 +1,4 @@
-"""What a codec is: bytes in, events out, no I/O. The answer to bad bytes is `BadFrame`, never an exception."""
+"""Contract of a codec: bytes in, events out, no I/O. Invalid bytes become `BadFrame`, never an exception."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -24,7 +24,7 @@ class BadReason(StrEnum):
 
 
 class BadFrame(msgspec.Struct, frozen=True, gc=False):
-    """Bytes that looked like a frame and were none, or (reason NOT_FINITE) a good frame that lacks some values."""
+    """Bytes that began like a frame and are not one, or (reason NOT_FINITE) a good frame that lacks some values."""
 
     reason: BadReason
     raw: bytes
@@ -66,7 +66,7 @@ class StreamCodec(Protocol):
     ledger: Ledger
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Take bytes in the order they came; return what they completed. Never raises for any bytes."""
+        """Decode the next bytes of the stream; return the events they completed. Never raises for any bytes."""
         ...
 
     def flush(self) -> Sequence[CodecEvent]:

@@ -1,4 +1,4 @@
-"""The row a device file ends with: everything the rest of imud needs to know about one wire protocol."""
+"""Contract of a driver: everything the rest of imud needs to know about one wire protocol."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -47,9 +47,9 @@ class Driver:
     navigation_frame: str
     """The frame that `quat_wxyz` turns into, for example `ENU`."""
     actions: Actions = field(default_factory=dict)
-    """What the device can be told to do, by name."""
+    """Commands that the device executes, by name."""
     lines: frozenset[str] = frozenset()
-    """Lines that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
+    """GPIO lines that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
     alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
     """Reads from the device's settings what its ALARM line indicates; None if they do not say."""
     time_bits: TimeBits = NO_TIME_BITS
@@ -69,7 +69,7 @@ class StreamDriver(Driver):
     read_settings: Callable[[], RequestScript[Mapping[str, str]]]
     """Reads back the device's own settings, by the device's own names, and leaves it as it was."""
     apply_identity: Callable[[StreamCodec, Identity], None] = lambda _codec, _identity: None
-    """Tells the codec what is known of the device, where the meaning of a field depends on the firmware."""
+    """Passes the identity to the codec, where the meaning of a field depends on the firmware."""
     wake: Callable[[], RequestScript[bool]] | None = None
     """Makes a device send samples that answers and sends none, and says whether it acknowledged; nothing is saved.
     Raises NoReply where nothing answers. None for devices that cannot be silent."""

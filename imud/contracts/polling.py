@@ -1,8 +1,8 @@
-"""What a polled device is: transfers out, bytes in, no I/O. The host decides when to ask, on I2C, SPI or a shared line.
+"""Contract of a polled device: transfers out, bytes in, no I/O. The host decides when to read, on I2C, SPI or RS-485.
 
-What needs several transfers (who are you, set a filter) is a generator, a `TransferScript`: it yields a `Transfer`, and
-is sent the bytes read or thrown the `TransferError`. What is read over and over is a `Poll`, whose bytes go to a
-`PolledCodec`. The same generators and codecs are run by the daemon's bus threads and by tests.
+An exchange of several transfers (identify, set a filter) is a generator, a `TransferScript`: it yields a `Transfer` and
+is sent the bytes read or thrown the `TransferError`. Cyclic reads are `Poll`s, whose bytes go to a `PolledCodec`. The
+daemon's bus threads and tests run the same generators and codecs.
 """
 
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -33,12 +33,12 @@ class Transfer:
 
 
 TransferScript = Generator[Transfer, bytes, T]
-"""A conversation by transfers. It may catch TransferError to clean up, and lets DeviceRefused out."""
+"""A script of transfers. It may catch TransferError to clean up; DeviceRefused passes through it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Poll:
-    """A transfer that is made again and again."""
+    """A transfer that is repeated."""
 
     transfer: Transfer
     every_ns: int = 0
@@ -46,7 +46,7 @@ class Poll:
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):
-    """What came of one poll."""
+    """The result of one poll."""
 
     poll: int
     """Its index in the codec's `polls`."""
@@ -60,7 +60,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
 
 
 class Vanished(msgspec.Struct, frozen=True):
-    """The bytes show that the device is gone, or is not as it was set up: it must be identified again."""
+    """The bytes show that the device is absent or has lost its settings: it must be identified again."""
 
     why: str
 
@@ -81,7 +81,7 @@ class PolledCodec(Protocol):
         ...
 
     def take(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Take the bytes of one transfer. Never raises for any bytes, of any length."""
+        """Decode the bytes of one transfer. Never raises for any bytes, of any length."""
         ...
 
     def reset(self) -> None:
@@ -91,7 +91,7 @@ class PolledCodec(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolledDriver(Driver):
-    """A device that speaks only when it is asked. It sends no time and no messages: the host's deadlines date it."""
+    """A device that sends only on request, without time or messages: its samples are dated by the host's deadlines."""
 
     tick_ns: int = SAMPLE_COUNTER
     tick_modulus: int = 2
@@ -100,9 +100,9 @@ class PolledDriver(Driver):
     targets: tuple[int, ...]
     """Where to look for it when the link says `auto`, most likely first: I2C addresses, SPI modes."""
     probe: Callable[[Any], TransferScript[Identity]]
-    """Asks the device what it is; given the settings. Raises DeviceRefused for another device. Changes nothing."""
+    """Reads the identity of a device with these settings. Raises DeviceRefused for another device. Changes nothing."""
     set_up: Callable[[Any], TransferScript[Mapping[str, str]]]
-    """Makes the device what the settings say, reads back, returns its settings by its own names; DeviceRefused."""
+    """Writes the settings to the device, reads them back, returns them by the device's names. Raises DeviceRefused."""
     make_codec: Callable[[Ledger, Any], PolledCodec]
     """Makes a codec that counts into the ledger, from an instance of `settings`."""
     update_ns: Callable[[Any], int]
@@ -111,21 +111,21 @@ class PolledDriver(Driver):
     """Bytes of the first poll with random values, for the shared property tests and for fault injection."""
 
 
-def run_transfer_script(dialogue: TransferScript[T], transfer: Callable[[Transfer], bytes]) -> T:
-    """Run a dialogue to its end. Raises what it raises, and LinkError from `transfer`."""
+def run_transfer_script(script: TransferScript[T], transfer: Callable[[Transfer], bytes]) -> T:
+    """Run a script to its end and return its result. Raises what it raises, and LinkError from `transfer`."""
     try:
-        wanted = next(dialogue)
+        wanted = next(script)
         while True:
-            wanted = step(dialogue, wanted, transfer)
+            wanted = step(script, wanted, transfer)
     except StopIteration as end:
         value: T = end.value
         return value
 
 
-def step(dialogue: TransferScript[Any], wanted: Transfer, transfer: Callable[[Transfer], bytes]) -> Transfer:
+def step(script: TransferScript[Any], wanted: Transfer, transfer: Callable[[Transfer], bytes]) -> Transfer:
     """Make the wanted transfer and return the next one. Raises StopIteration with the value at the end."""
     try:
         data = transfer(wanted)
     except TransferError as error:
-        return dialogue.throw(error)
-    return dialogue.send(data)
+        return script.throw(error)
+    return script.send(data)

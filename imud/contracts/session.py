@@ -1,8 +1,7 @@
-"""Request and reply over a link that also carries samples, without I/O: messages in, outcomes out, time as an argument.
+"""Contract of requests and replies on a link that also carries samples: messages in, outcomes out; no I/O, no clock.
 
-A message is a line of text or a reply frame. A dialogue of several requests is a generator (`RequestScript`): it yields
-a `Request` and is sent the `Outcome`. The same generator is driven by the daemon's event loop, by a blocking probe, and
-by a test.
+A message is a line of text or a reply frame. A request script is a generator (`RequestScript`): it yields a `Request`
+and is sent the `Outcome`. The daemon's event loop, a blocking probe and tests run the same generator.
 """
 
 from collections import deque
@@ -20,42 +19,42 @@ T = TypeVar("T")
 REPLY_MESSAGES_MAX = 256
 """No reply of any manual has more than some dozens of messages; more means that its end was lost."""
 LATE_WINDOW_NS = 5 * NS_PER_S
-"""What comes up to this long after a time-out is taken for the late reply to the request that timed out."""
+"""A matching message up to this long after a time-out counts as the late reply to the request that timed out."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One command, ready to send, with what its reply looks like."""
+    """One request: the bytes to send, and how to recognise the reply."""
 
     payload: bytes
     """Bytes for the link; empty sends nothing."""
     name: str
-    """The command as people write it, for error messages."""
+    """The command as written in the manual, for error messages."""
     is_end: Callable[[Message], bool]
-    """Whether this message ends the reply well."""
+    """Whether this message ends a positive reply."""
     is_rejection: Callable[[Message], bool]
-    """Whether this message ends the reply badly."""
+    """Whether this message ends a negative reply."""
     is_part: Callable[[Message], bool]
-    """Whether this message can belong to the reply; others are of some other origin."""
+    """Whether this message can be part of the reply; others are unsolicited."""
     timeout_ns: int = NS_PER_S // 2
     silent: bool = False
-    """The device never answers this one (it reboots, say): it is done once sent."""
+    """The device never answers this request (it reboots, for example): the request is complete once sent."""
     messages_min: int = 1
-    """Fewest messages of a good reply, its end included: an end that comes sooner is that of an earlier, late reply."""
+    """Fewest messages of a positive reply, its end included: an earlier end belongs to a late reply."""
     baud: int = 0
-    """Rate in bit/s that the line must have from this request on; 0 for as it is. Serial lines only."""
+    """Bit rate of the line from this request on, bit/s; 0 leaves it unchanged. Serial lines only."""
     undo: bytes = b""
-    """What is sent if the conversation is given up at this request (cancelled, its owner ends) while the link is still
-    there: a generator that is closed can send nothing by itself. Nothing waits for a reply to it."""
+    """Bytes to send if the script is cancelled at this request while the link is open: a closed generator cannot send.
+    No reply is awaited."""
 
 
 def never(_message: Message) -> bool:
-    """Holds for no message."""
+    """False for every message."""
     return False
 
 
 def of_text(holds: Callable[[str], bool]) -> Callable[[Message], bool]:
-    """What holds for a message that is text for which `holds` does."""
+    """A predicate that is true for messages that are text for which `holds` is."""
     return lambda message: isinstance(message, str) and holds(message)
 
 
@@ -64,17 +63,17 @@ def pause(duration_ns: int, *, baud: int = 0) -> Request:
     return Request(b"", "pause", never, never, never, duration_ns, baud=baud)
 
 
-def with_undo(conversation: "RequestScript[T]", undo: bytes) -> "RequestScript[T]":
-    """The same conversation, of which every request has `undo`."""
+def with_undo(script: "RequestScript[T]", undo: bytes) -> "RequestScript[T]":
+    """The same script with `undo` in every request."""
     try:
-        request = next(conversation)
+        request = next(script)
         while True:
-            request = conversation.send((yield replace(request, undo=undo)))
+            request = script.send((yield replace(request, undo=undo)))
     except StopIteration as end:
         value: T = end.value
         return value
     finally:
-        conversation.close()
+        script.close()
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,17 +93,17 @@ class _Messages:
 
 @dataclass(frozen=True, slots=True)
 class Reply(_Messages):
-    """The device answered: the messages, the one that ends the reply last."""
+    """Positive reply: its messages, the one that ends it last."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rejection(_Messages):
-    """The device refused: the messages, the refusing one last."""
+    """Negative reply: its messages, the refusal last."""
 
 
 @dataclass(frozen=True, slots=True)
 class Silence(_Messages):
-    """No complete reply came before the deadline; `messages` is the part that did."""
+    """No complete reply before the deadline; `messages` is the part that arrived."""
 
 
 Outcome = Reply | Rejection | Silence
@@ -112,17 +111,17 @@ RequestScript = Generator[Request, Outcome, T]
 
 
 def says_nothing(value: T) -> RequestScript[T]:
-    """The conversation with a device that cannot be asked: no request, and `value` as its end."""
+    """The script for a device that answers nothing: no request, and `value` as its result."""
     return value
     yield  # makes it a generator
 
 
 class Session:
-    """One outstanding request at a time; late replies are told from fresh ones and counted.
+    """One outstanding request at a time; distinguishes late replies from current ones and counts them.
 
     Devices answer in the order they were asked. A message is late when it can belong to the request that timed out and
     not to the outstanding one, or when it ends a reply whose messages were late. Two requests whose replies are the
-    same single message cannot be told apart: there the first one counts for the outstanding request.
+    same single message cannot be distinguished: the first message counts for the outstanding request.
 
     Synchronization: one thread. The owner sends `start()`'s bytes, passes every message to `on_message()`, and calls
     `on_time()` at `deadline_ns`.
@@ -155,7 +154,7 @@ class Session:
         return request.payload
 
     def on_message(self, message: Message, now_ns: int) -> Outcome | None:
-        """Take one message; return the outcome when it ends the outstanding request."""
+        """Process one message; return the outcome when it ends the outstanding request."""
         request = self._request
         if request is None or not self._belongs(request, message) or self._ends_late(request, message, now_ns):
             self._count_stray(message, now_ns)
@@ -172,14 +171,14 @@ class Session:
         """Return `Silence` when the deadline has passed."""
         if self._request is None or self.deadline_ns is None or now_ns < self.deadline_ns:
             return None
-        if self._request.payload:  # nothing can come late that was never asked for
+        if self._request.payload:  # no request, no late reply
             self._timed_out, self._timed_out_ns = self._request, now_ns
             self._late_messages = len(self._messages)
         self._request = self.deadline_ns = None
         return Silence(tuple(self._messages))
 
     def cancel(self) -> None:
-        """Forget the outstanding request: the link is gone."""
+        """Discard the outstanding request: the link is closed."""
         self._request = self.deadline_ns = None
         self._messages.clear()
 

@@ -33,7 +33,7 @@ def test_each_source() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rmc", "told"),
+    ("rmc", "said"),
     [
         ("{}", "expected the key source"),
         ("{source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
@@ -45,8 +45,8 @@ def test_each_source() -> None:
         ("{source: gpsd, speed: 1}", "speed"),
     ],
 )
-def test_what_is_wrong_is_told(rmc: str, told: str) -> None:
-    assert told in errors(device(rmc))
+def test_what_is_wrong_is_said(rmc: str, said: str) -> None:
+    assert said in errors(device(rmc))
 
 
 @pytest.mark.parametrize(
@@ -70,9 +70,9 @@ def test_a_device_that_imud_triggers_has_no_pulse_per_second() -> None:
       sin: {line: GPIO17}
     rmc: {source: gpsd}
 """
-    told = errors(text)
-    assert "f:7:" in told
-    assert "by lines.sin (line 6): leave one of them out" in told
+    said = errors(text)
+    assert "f:7:" in said
+    assert "by lines.sin (line 6): leave one of them out" in said
     assert read(text.replace("sin:", "pps:")) == RmcSettings(source="gpsd")
 
 

@@ -162,7 +162,7 @@ PLAIN_DATA = st.recursive(
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(data=PLAIN_DATA)
 def test_json_reads_as_itself(data: Any) -> None:
-    """JSON is YAML: the command line makes configurations by msgspec, and they come back unchanged."""
+    """JSON is YAML: the command line makes configurations by msgspec, and they are read unchanged."""
     tree = read_yaml(msgspec.json.encode(data))
     assert tree.problems == []
     assert tree.data == data

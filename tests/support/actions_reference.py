@@ -53,8 +53,8 @@ def table(actions: Actions) -> Iterator[str]:
 
 
 def part(driver: Driver) -> list[str]:
-    """Title and table of a driver, or that there is nothing."""
-    lines = list(table(driver.actions)) if driver.actions else ["Nothing: such a device cannot be told anything here."]
+    """Title and table of a driver."""
+    lines = list(table(driver.actions)) if driver.actions else ["No actions."]
     return [f"### `{driver.name}`: {driver.title}", "", *lines, ""]
 
 

@@ -1,4 +1,4 @@
-"""`imud probe` on CAN interfaces: everybody who is heard, silence, and a query only where it is allowed."""
+"""`imud probe` on CAN interfaces: all devices that are heard, silence, and queries only where they are permitted."""
 
 import asyncio
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from tests.support.fake_can import fake_can_driver, fake_frame
 
 
 class Bus(MemoryCanLink):
-    """Says the same to everybody who begins to listen."""
+    """Sends the same frames to each new listener."""
 
     frames: Sequence[CanFrame] = ()
     problem = ""
@@ -88,7 +88,7 @@ def test_why_nobody_is_listed(bus: type[Bus]) -> None:
     assert examined() == [ProbeReport("can0", problem="can0 is down: set its bit rate")]
 
 
-def test_a_bus_that_ends_is_told(bus: type[Bus], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_that_ends_is_reported(bus: type[Bus], monkeypatch: pytest.MonkeyPatch) -> None:
     def start(self: Bus, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         on_end(LinkError("can0 was taken down"))
 
