@@ -1,6 +1,11 @@
-"""Imports go left only, type-only imports included; device files name no I/O module; there is no cycle."""
+"""What holds for the whole tree: direction of imports, sizes of files and folders, names, and where clocks are read.
+
+Imports go from a layer to those above it in LAYERS, type-only imports included, and there is no cycle. A `STILL_…` list
+names what does not hold a rule yet: an entry is removed when its module does, none is added.
+"""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -27,6 +32,41 @@ IO_MODULES = {
     "time",
 }  # fmt: skip
 
+STILL_SHORT = frozenset({
+    "imud.clock.coast", "imud.clock.corridor", "imud.clock.jump", "imud.clock.marks", "imud.clock.number",
+    "imud.clock.pulses", "imud.clock.slew", "imud.clock.tracker",
+    "imud.contracts.batch", "imud.event", "imud.notify", "imud.permissions",
+    "imud.devices.arguments", "imud.devices.hipnuc.canopen.cob_ids", "imud.devices.hipnuc.common.counts",
+    "imud.devices.hipnuc.uart.session", "imud.devices.imu61x.common.register_actions",
+    "imud.formats.checksum", "imud.formats.fields",
+    "imud.links.bus_node", "imud.links.port_owner", "imud.links.replay.file", "imud.links.rs485.direction",
+    "imud.links.uart.low_latency", "imud.links.uart.tty_counters",
+    "imud.publishers.metrics.clients", "imud.publishers.metrics.polling", "imud.publishers.socket.waker",
+    "imud.runtime.can.buses", "imud.runtime.detection.can_round", "imud.runtime.detection.round",
+    "imud.runtime.known_identity", "imud.runtime.polled.round_robin",
+    "imud.signals.alarm_line", "imud.signals.driving", "imud.signals.gpio", "imud.signals.line_actions",
+    "imud.signals.line_events",
+    "imud.sim.hipnuc.uart.hardware", "imud.sim.hipnuc.uart.status", "imud.sim.ports.can_modules", "imud.sim.ports.pin",
+    "imud.sim.ports.transmitter", "imud.sim.ports.wire",
+    "imud.utc.nmea_port", "imud.utc.reconnecting", "imud.utc.retry", "imud.utc.splitter",
+})  # fmt: skip
+STILL_LARGE = {"clock": 20}
+STILL_TWICE = frozenset({
+    "AddressParams", "BaudParams", "BitrateParams", "DirectionParams", "FilterParams", "IntervalParams", "LevelParams",
+    "ModeParams", "MountingParams", "ZeroParams",
+})  # fmt: skip
+STILL_READ_CLOCKS = (
+    "imud.runtime", "imud.signals", "imud.sim.ports.lines",
+    "imud.utc.adjtimex", "imud.utc.gpsd", "imud.utc.rmc_feed", "imud.utc.system_clock",
+)  # fmt: skip
+STILL_WRITE_PRIVATE = frozenset({
+    "lab/test_imu61x_spi.py", "links/can/test_link.py", "links/test_inotify.py", "links/test_spi.py",
+    "publishers/metrics/test_scrape_server.py", "publishers/shm/test_publisher.py",
+    "runtime/polled/test_data_ready.py", "runtime/polled/test_runner.py", "runtime/stream/test_wake.py",
+    "runtime/test_device_reset.py", "runtime/test_utc_keeper.py", "sim/ports/test_can_modules.py",
+    "utc/test_system_clock.py",
+})  # fmt: skip
+
 
 def modules() -> dict[str, Path]:
     """Every module of the package by name."""
@@ -40,10 +80,16 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
 def imports(path: Path) -> set[str]:
     """Full names of everything that a module imports, at any depth of its code."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -105,3 +151,140 @@ def test_there_is_no_import_cycle() -> None:
 
 def test_only_one_module_imports_gpiod() -> None:
     assert {m for m in MODULES if "gpiod" in imports(MODULES[m])} <= {"imud.signals.gpio.chips"}
+
+
+# --- what files and names look like -----------------------------------------------------------------------------------
+
+LINES_MIN, LINES_MAX, MODULES_MAX = 60, 500, 15
+REASON = ("Contract", "Table")
+"""First word of a module shorter than LINES_MIN: what one promises, or rows, may be short."""
+
+
+def first_word(path: Path) -> str:
+    """First word of a module's docstring, without punctuation."""
+    return ((ast.get_docstring(tree_of(path)) or "-").split() or ["-"])[0].strip(":.,s")
+
+
+def own_modules() -> dict[str, Path]:
+    """Modules that are files of their own: neither a package's `__init__` nor the entry point of a program."""
+    return {name: path for name, path in MODULES.items() if path.name not in ("__init__.py", "__main__.py")}
+
+
+@pytest.mark.parametrize("module", own_modules())
+def test_size_of_a_module(module: str) -> None:
+    path = MODULES[module]
+    lines = len(path.read_text().splitlines())
+    assert lines <= LINES_MAX, f"{module} has {lines} lines"
+    if module not in STILL_SHORT:
+        assert lines >= LINES_MIN or first_word(path) in REASON, (
+            f"{module} has {lines} lines: merge it with what is read together, or begin its docstring with one of "
+            f"{', '.join(REASON)} and why it stands alone"
+        )
+
+
+@pytest.mark.parametrize("folder", sorted({path.parent for path in MODULES.values()}), ids=str)
+def test_size_of_a_folder(folder: Path) -> None:
+    held = [path for path in own_modules().values() if path.parent == folder]
+    assert len(held) <= STILL_LARGE.get(folder.relative_to(PACKAGE).as_posix(), MODULES_MAX), f"{folder}: {len(held)}"
+
+
+def test_public_class_names_stand_once() -> None:
+    owners: dict[str, list[str]] = {}
+    for module, path in MODULES.items():
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                owners.setdefault(node.name, []).append(module)
+    twice = {name: where for name, where in owners.items() if len(where) > 1 and name not in STILL_TWICE}
+    assert not twice, twice
+
+
+# --- time is an argument ----------------------------------------------------------------------------------------------
+
+CLOCKS = {
+    "clock_gettime", "clock_gettime_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "time",
+    "time_ns",
+}  # fmt: skip
+NOW = {"now", "today", "utcnow"}
+MAY_READ_CLOCKS = (
+    "imud.daemon",
+    "imud.cli",  # programs of their own, as are the client and the simulator's process
+    "imud.client",
+    "imud.sim.__main__",
+    "imud.links",  # in the callback that reads, and in waits for the wire
+)
+
+
+def clock_uses(path: Path) -> list[str]:
+    """Every place that reads a clock, or names a clock function as a default."""
+    found = []
+    tree = tree_of(path)
+    named = {
+        alias.asname or alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module == "time"
+        for alias in node.names
+        if alias.name in CLOCKS
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and node.id in named:
+            found.append(f"{node.lineno}: {node.id}")
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name | ast.Call):
+            owner = ast.unparse(node.value)
+            if (owner == "time" and node.attr in CLOCKS) or (owner.endswith("datetime") and node.attr in NOW):
+                found.append(f"{node.lineno}: {owner}.{node.attr}")
+            elif node.attr == "time" and "loop" in owner:
+                found.append(f"{node.lineno}: {owner}.time")
+    return found
+
+
+def may_read_clocks(module: str) -> bool:
+    """Whether the module, or a package that it is in, may."""
+    return any(module == name or module.startswith(name + ".") for name in (*MAY_READ_CLOCKS, *STILL_READ_CLOCKS))
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if not may_read_clocks(m)])
+def test_time_is_an_argument(module: str) -> None:
+    uses = clock_uses(MODULES[module])
+    assert not uses, f"{module} reads a clock: {', '.join(uses)}"
+
+
+def test_the_search_for_clocks_finds_them(tmp_path: Path) -> None:
+    file = tmp_path / "module.py"
+    file.write_text(
+        "import asyncio, time\nfrom datetime import datetime\nfrom time import monotonic_ns as now\n"
+        "a = time.time_ns()\nb = now()\nc = datetime.now()\nd = asyncio.get_running_loop().time()\n"
+        "def f(now_ns=time.monotonic_ns): time.sleep(1); return now_ns()\n"
+    )
+    lines = sorted(int(use.partition(":")[0]) for use in clock_uses(file))
+    assert lines == [4, 5, 6, 7, 8]
+
+
+# --- tests ------------------------------------------------------------------------------------------------------------
+
+
+def private_writes(path: Path) -> list[str]:
+    """Every place where a test sets an underscore member of another object, or patches one by name."""
+    found = []
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            attributes = [target for target in targets if isinstance(target, ast.Attribute)]
+            others = [a for a in attributes if is_private(a.attr) and ast.unparse(a.value) != "self"]
+            found += [f"{node.lineno}: {ast.unparse(a)}" for a in others]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr"):
+            words = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            found += [f"{node.lineno}: {word}" for word in words if is_private(word.rpartition(".")[2])]
+    return found
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__")
+
+
+TESTS = Path(__file__).parent
+
+
+@pytest.mark.parametrize("file", sorted(TESTS.rglob("*.py")), ids=lambda file: file.relative_to(TESTS).as_posix())
+def test_tests_write_no_private_members(file: Path) -> None:
+    if file.relative_to(TESTS).as_posix() not in STILL_WRITE_PRIVATE:
+        assert not (writes := private_writes(file)), f"{file}: {', '.join(writes)}"
