@@ -15,6 +15,8 @@ from imud.errors import BadArgument
 
 SOCKET_VARIABLE: Final = "IMUD_SOCKET"
 """Environment variable with the path of the daemon's socket."""
+SHM_VARIABLE: Final = "IMUD_SHM"
+"""Environment variable with the directory of the rings."""
 
 
 class CliCommand(NamedTuple):

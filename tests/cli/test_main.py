@@ -53,25 +53,6 @@ def test_no_daemon_is_one_line(command: str, tmp_path: Path, capsys: pytest.Capt
     assert "is imud running?" in error
 
 
-def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shipped = Path(__file__).parents[2] / "etc" / "imud.yaml"
-    assert main(["check", str(shipped)]) == 0
-    assert "good" in capsys.readouterr().out
-    bad = tmp_path / "bad.yaml"
-    bad.write_text("devices:\n  bow:\n    uart:\n      port: /dev/ttyUSB0\n      baut: 9600\n")
-    assert main(["check", str(bad)]) == 2
-    error = capsys.readouterr().err
-    assert "bad.yaml:5:" in error
-    assert "baud" in error
-
-
-def test_schema_names_every_field_with_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["schema"]) == 0
-    text = capsys.readouterr().out
-    for word in ("accel_m_s2", "m/s²", "gyro_rad_s", "rad/s", "hipnuc-uart", "ENU"):
-        assert word in text
-
-
 def test_reader_of_the_output_that_goes_away_is_no_error(tmp_path: Path) -> None:
     capture = tmp_path / "noise"
     capture.write_bytes(b"A\r\n" * 100_000)

@@ -19,7 +19,7 @@ from time import monotonic, sleep
 
 import msgspec
 
-from imud.cli.arguments import SOCKET_VARIABLE, CliCommand, statuses
+from imud.cli.arguments import SHM_VARIABLE, SOCKET_VARIABLE, CliCommand, statuses
 from imud.cli.demo.view import View
 from imud.cli.status import block, closes
 from imud.client import Client
@@ -125,7 +125,7 @@ def commands(folder: Path, device: str, port: int) -> str:
     imud = shlex.quote(str(beside)) if beside.exists() else f"{python} -m imud"
     ring = f'from imud.client import Ring; print(Ring("{ring_path(str(folder), device)}").latest())'
     lines = [
-        f"export {SOCKET_VARIABLE}={shlex.quote(str(folder / 'imud.sock'))}",
+        f"export {SOCKET_VARIABLE}={shlex.quote(str(folder / 'imud.sock'))} {SHM_VARIABLE}={shlex.quote(str(folder))}",
         f"{imud} status",
         f"{imud} watch --rate 5",
         f"{imud} clock",

@@ -1,0 +1,70 @@
+"""`imud watch` prints samples as text and as JSON; `imud schema` says what their fields mean."""
+
+import json
+from pathlib import Path
+from threading import Event, Thread
+
+import msgspec
+import pytest
+
+from imud.cli import main
+from imud.cli.samples import as_json, as_text
+from imud.sample import Sample, Sync
+from tests.support.socket_rig import Daemon, batch, daemon
+
+ONE = Sample("bow", 7, 12_345_678_900, 250_000, Sync.EDGE, 12_350_000_000, 0)
+
+
+def test_a_line_for_people_has_people_s_units() -> None:
+    whole = msgspec.structs.replace(
+        ONE, euler_rad=(0.1, -0.2, 3.0), gyro_rad_s=(1.0, 0.0, -1.0), accel_m_s2=(0.0, 0.5, 9.8)
+    )
+    assert as_text(whole) == (
+        "bow               12.345679 s ± 0.250 ms edge        rpy    5.730  -11.459  171.887 °  "
+        "gyro   57.296    0.000  -57.296 °/s  accel   0.000   0.500   9.800 m/s²"
+    )
+
+
+def test_absent_fields_are_left_out() -> None:
+    assert as_text(ONE).endswith(" ms edge      ")
+    assert json.loads(as_json(ONE)) == {
+        "device": "bow", "seq": 7, "t_ns": 12_345_678_900, "t_err_ns": 250_000, "sync": "edge",
+        "t_rx_ns": 12_350_000_000, "utc_ns": 0,
+    }  # fmt: skip
+
+
+def send(served: Daemon, seq: int) -> None:
+    served.do(lambda server: server.publish(batch("imu0", seq)))
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_watch_ends_after_count_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: list[str]) -> None:
+    with daemon(tmp_path) as served:
+        ended = Event()
+
+        def publish() -> None:
+            seq = 0
+            while not ended.wait(0.01):
+                seq += 1
+                send(served, seq)
+
+        sender = Thread(target=publish)
+        sender.start()
+        try:
+            assert main(["watch", "--socket", str(served.path), "--count", "3", *form, "imu0"]) == 0
+        finally:
+            ended.set()
+            sender.join()
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3
+    assert all("imu0" in line for line in lines)
+    if form:
+        seqs = [json.loads(line)["seq"] for line in lines]
+        assert seqs == [seqs[0], seqs[0] + 1, seqs[0] + 2]
+
+
+def test_schema_names_every_field_with_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["schema"]) == 0
+    text = capsys.readouterr().out
+    for word in ("accel_m_s2", "m/s²", "gyro_rad_s", "rad/s", "hipnuc-uart", "ENU"):
+        assert word in text
