@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).parent.parent / "imud"
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud", "imud.units"),
     ("imud.sample", "imud.errors", "imud.ledger", "imud.event"),
-    ("imud.attitude", "imud.permissions", "imud.worker", "imud.notify"),
+    ("imud.attitude", "imud.permissions", "imud.worker", "imud.notify", "imud.host_clock"),
     ("imud.formats",),
     ("imud.contracts",),
     ("imud.devices", "imud.clock", "imud.links", "imud.publishers", "imud.utc"),
@@ -207,6 +207,7 @@ CLOCKS = {
 NOW = {"now", "today", "utcnow"}
 MAY_READ_CLOCKS = (
     "imud.daemon",
+    "imud.host_clock",
     "imud.cli",  # programs of their own, as are the client and the simulator's process
     "imud.client",
     "imud.sim.__main__",
