@@ -1,5 +1,6 @@
 """Every example in README.md and docs/ is run or read by what it is meant for; every link leads somewhere."""
 
+import os
 import re
 import select
 import shlex
@@ -71,13 +72,13 @@ def test_configurations_are_good(example: Example) -> None:
 
 @pytest.mark.parametrize("example", [e for e in examples("python") if e.page.name == "README.md"], ids=name)
 def test_python_reads_from_a_running_daemon(example: Example, tmp_path: Path) -> None:
-    text = example.text.replace("Client()", f"Client({str(tmp_path / 'imud.sock')!r})")
-    text = text.replace('Ring("bow")', f"Ring({str(tmp_path / 'imud.bow')!r})")
+    places = {"IMUD_SOCKET": str(tmp_path / "imud.sock"), "IMUD_SHM": str(tmp_path)}
     with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
         daemon.wait_for("bow", "searching")
         port.send(1)
         daemon.wait_for("bow", "running")
-        with subprocess.Popen([sys.executable, "-u", "-c", text], stdout=subprocess.PIPE, text=True) as process:
+        argv = [sys.executable, "-u", "-c", example.text]
+        with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=os.environ | places) as process:
             assert process.stdout is not None
             feeding = True
             while feeding:  # until the example prints its first line

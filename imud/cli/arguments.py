@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -12,11 +12,6 @@ from imud.contracts.driver import Driver
 from imud.contracts.settings import Settings, expected, got, unknown_name
 from imud.contracts.status import DeviceStatus
 from imud.errors import BadArgument
-
-SOCKET_VARIABLE: Final = "IMUD_SOCKET"
-"""Environment variable with the path of the daemon's socket."""
-SHM_VARIABLE: Final = "IMUD_SHM"
-"""Environment variable with the directory of the rings."""
 
 
 class CliCommand(NamedTuple):

@@ -49,7 +49,7 @@ def command_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def command(args: argparse.Namespace) -> int:
-    """Print the list or the answer. All but the list needs the right `control`."""
+    """Print the list or the answer. All but the list needs permission to control."""
     with Client(args.socket, timeout_s=LIMIT_S) as client:
         if args.name is None:
             for action in msgspec.convert(client.call("actions", device=args.device), list[ActionInfo]):

@@ -19,7 +19,7 @@ from time import monotonic, sleep
 
 import msgspec
 
-from imud.cli.arguments import SHM_VARIABLE, SOCKET_VARIABLE, CliCommand, statuses
+from imud.cli.arguments import CliCommand, statuses
 from imud.cli.demo.view import View
 from imud.cli.status import block, closes
 from imud.client import Client
@@ -27,7 +27,6 @@ from imud.contracts.can import CanDriver
 from imud.contracts.polling import PolledDriver
 from imud.devices import DRIVERS
 from imud.errors import ImudError, LinkMissing
-from imud.formats.ring import ring_path
 from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.command_line import DEVICE, simulated
 from imud.sim.ports.can_port import default_interface
@@ -123,9 +122,9 @@ def commands(folder: Path, device: str, port: int) -> str:
     python = shlex.quote(sys.executable)
     beside = Path(sys.executable).with_name("imud")
     imud = shlex.quote(str(beside)) if beside.exists() else f"{python} -m imud"
-    ring = f'from imud.client import Ring; print(Ring("{ring_path(str(folder), device)}").latest())'
+    ring = f'from imud.client import Ring; print(Ring("{device}").latest())'
     lines = [
-        f"export {SOCKET_VARIABLE}={shlex.quote(str(folder / 'imud.sock'))} {SHM_VARIABLE}={shlex.quote(str(folder))}",
+        f"export IMUD_SOCKET={shlex.quote(str(folder / 'imud.sock'))} IMUD_SHM={shlex.quote(str(folder))}",
         f"{imud} status",
         f"{imud} watch --rate 5",
         f"{imud} clock",

@@ -42,7 +42,7 @@ def test_the_commands_it_prints_reach_it_from_another_directory() -> None:
             assert "demo: running" in pasted(export, status)
             assert clock.endswith("imud clock")
             assert "verdict" in pasted(export, f"{clock} --duration 0.1")
-            assert "accel_m_s2=" in pasted(ring)
+            assert "accel_m_s2=" in pasted(export, ring)
             with urlopen(scrape.removeprefix("curl ")) as answer:
                 assert b'imud_samples_total{device="demo"}' in answer.read()
         finally:
