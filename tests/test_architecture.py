@@ -33,8 +33,6 @@ IO_MODULES = {
 }  # fmt: skip
 
 STILL_SHORT = frozenset({
-    "imud.clock.coast", "imud.clock.corridor", "imud.clock.jump", "imud.clock.marks", "imud.clock.number",
-    "imud.clock.pulses", "imud.clock.slew", "imud.clock.tracker",
     "imud.event",
     "imud.devices.arguments", "imud.devices.hipnuc.canopen.cob_ids", "imud.devices.hipnuc.common.counts",
     "imud.devices.hipnuc.uart.session", "imud.devices.imu61x.common.register_actions",
@@ -43,7 +41,7 @@ STILL_SHORT = frozenset({
     "imud.sim.hipnuc.uart.hardware", "imud.sim.hipnuc.uart.status", "imud.sim.ports.can_modules", "imud.sim.ports.pin",
     "imud.sim.ports.transmitter", "imud.sim.ports.wire",
 })  # fmt: skip
-STILL_LARGE = {"clock": 20}
+STILL_LARGE: dict[str, int] = {}
 STILL_TWICE = frozenset({
     "AddressParams", "BaudParams", "BitrateParams", "DirectionParams", "FilterParams", "IntervalParams", "LevelParams",
     "ModeParams", "MountingParams", "ZeroParams",
