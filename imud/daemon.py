@@ -1,7 +1,7 @@
 """The daemon: one event loop that owns every configured device and every output.
 
 Device ──Batch──▶ Publisher ×n              (publish: a plain loop)
-tick, 10 Hz ──▶ runners, publishers         SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
+tick, 10 Hz ──▶ devices, publishers         SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
 """
 
 import asyncio
@@ -11,29 +11,21 @@ import signal
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from time import monotonic_ns
 from typing import Any, cast
 
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.contracts.action import ActionInfo, described
-from imud.contracts.can import CanDriver
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import Batch, Publisher, PublisherContext, PublisherSettings
 from imud.contracts.status import DeviceState, DeviceStatus
-from imud.devices import DRIVERS
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
-from imud.links import LINKS
+from imud.host_clock import HostClock
 from imud.notify import notify, watchdog_interval_s
 from imud.publishers import PUBLISHERS
-from imud.runtime.can.buses import CanBuses
-from imud.runtime.can.runner import CanRunner
-from imud.runtime.detection.remembered import Remembered
 from imud.runtime.device import Device
-from imud.runtime.polled.bus import Buses
-from imud.runtime.polled.runner import PolledRunner
-from imud.runtime.stream.runner import DeviceRunner
+from imud.runtime.device_factory import DeviceFactory
 from imud.signals.gpio import GPIO_LINES
 from imud.units import NS_PER_S
 
@@ -46,8 +38,8 @@ class Daemon:
     """Runs one configuration. Synchronization: all in the event loop's thread.
 
     `file` is read again on SIGHUP; `state_dir` is where found devices are remembered (None remembers nothing);
-    `extra` are publishers besides the configured ones; `until_finished` ends the run with the last replay; `lines`
-    makes the devices' lines.
+    `extra` are publishers in addition to the configured ones; `until_finished` ends the run with the last replay;
+    `lines` makes the devices' GPIO lines.
     """
 
     def __init__(
@@ -62,16 +54,15 @@ class Daemon:
     ) -> None:
         self.config = config
         self._file = file
-        self._remembered = Remembered(state_dir)
-        self._context = PublisherContext(self.status, secrets.randbits(63) | 1, monotonic_ns, self.actions, self.act)
+        host = HostClock()
+        self._now_ns = host.now_ns
+        self._factory = DeviceFactory(self._publish, self._send_event, host, state_dir=state_dir, lines=lines)
+        self._context = PublisherContext(self.status, secrets.randbits(63) | 1, host.now_ns, self.actions, self.act)
         self._extra = dict(extra or {})
         self._until_finished = until_finished
-        self._lines = lines
         self._publishers: dict[str, Publisher] = {}
-        self._runners: dict[str, Device] = {}
+        self._devices: dict[str, Device] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._buses = Buses()
-        self._can_buses = CanBuses()
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
         self._failure: BaseException | None = None
@@ -112,7 +103,7 @@ class Daemon:
     @property
     def finished(self) -> bool:
         """Whether every device is a replay that came to its end."""
-        return all(runner.state is DeviceState.FINISHED for runner in self._runners.values())
+        return all(device.state is DeviceState.FINISHED for device in self._devices.values())
 
     # --- reload ----------------------------------------------------------------------------------------------------
 
@@ -120,12 +111,14 @@ class Daemon:
         """Read the configuration file again and change what differs; a bad file leaves everything as it is."""
         if self._file is None:
             return
-        notify(f"RELOADING=1\nMONOTONIC_USEC={monotonic_ns() // 1000}")
+        notify(f"RELOADING=1\nMONOTONIC_USEC={self._now_ns() // 1000}")
         try:
             new = configuration.load(self._file)
         except ConfigError as error:
             log.error("the configuration stays as it was: %s", error)
-            self._tell(Event(monotonic_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}"))
+            self._send_event(
+                Event(self._now_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}")
+            )
         else:
             self._change_to(new)
         notify("READY=1")
@@ -137,10 +130,10 @@ class Daemon:
         for name in (*change.devices_removed, *change.devices_changed):
             self._stop_device(name)
         problems = [self._restart_publisher(name, old) for name in change.publishers_changed]
-        problems += [self._try_device(device) for device in new.devices if device.name not in self._runners]
+        problems += [self._try_device(device) for device in new.devices if device.name not in self._devices]
         words = "; ".join([f"configuration read again: {change}", *filter(None, problems)])
         log.info("%s", words)
-        self._tell(Event(monotonic_ns(), "", EventKind.CONFIGURATION, words))
+        self._send_event(Event(self._now_ns(), "", EventKind.CONFIGURATION, words))
 
     def _restart_publisher(self, name: str, old: Config) -> str:
         """With its new settings, or with the old ones if those cannot be used; returns what is wrong, if anything."""
@@ -166,17 +159,17 @@ class Daemon:
     # --- devices and outputs ----------------------------------------------------------------------------------------
 
     def status(self) -> list[DeviceStatus]:
-        """The state of every device now."""
-        return [runner.status() for runner in self._runners.values()]
+        """Return the state of every device."""
+        return [device.status() for device in self._devices.values()]
 
     def actions(self, device: str) -> list[ActionInfo]:
-        """What a device can be told to do."""
-        return described(self._runners[device].actions)
+        """Return the actions of a device."""
+        return described(self._devices[device].actions)
 
     async def act(self, device: str, name: str, arguments: Mapping[str, Any]) -> object:
-        """Have a device do something. Raises ImudError."""
-        log.info("%s: told to %s %s", device, name, dict(arguments) or "")
-        return await self._runners[device].act(name, arguments)
+        """Run an action of a device. Raises ImudError."""
+        log.info("%s: run %s %s", device, name, dict(arguments) or "")
+        return await self._devices[device].act(name, arguments)
 
     def _start_configured(self, name: str) -> None:
         settings = self.config.publishers[name]
@@ -184,33 +177,24 @@ class Daemon:
             self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
 
     def _start_publisher(self, name: str, publisher: Publisher) -> None:
-        for device, runner in self._runners.items():
-            publisher.add_device(device, runner.device_id)
+        for device_name, device in self._devices.items():
+            publisher.add_device(device_name, device.device_id)
         publisher.start()
         self._publishers[name] = publisher
 
-    def _start_device(self, device: DeviceConfig) -> None:
-        device_id = self._ids.setdefault(device.name, len(self._ids))
+    def _start_device(self, config: DeviceConfig) -> None:
+        device_id = self._ids.setdefault(config.name, len(self._ids))
         for publisher in self._publishers.values():
-            publisher.add_device(device.name, device_id)
-        runner = self._new_runner(device, device_id)
-        self._runners[device.name] = runner
-        task = asyncio.create_task(runner.run(), name=device.name)
+            publisher.add_device(config.name, device_id)
+        device = self._factory.make(config, device_id)
+        self._devices[config.name] = device
+        task = asyncio.create_task(device.run(), name=config.name)
         task.add_done_callback(self._on_done)
-        self._tasks[device.name] = task
-
-    def _new_runner(self, device: DeviceConfig, device_id: int) -> Device:
-        """The kind of runner that the device's link needs."""
-        link, publish, tell = LINKS[device.link], self._publish, self._tell
-        if link.polled:
-            return PolledRunner(device, device_id, publish, tell, self._buses, self._lines)
-        if link.frames_only or isinstance(DRIVERS.get(device.driver), CanDriver):
-            return CanRunner(device, device_id, publish, tell, self._can_buses, self._remembered)
-        return DeviceRunner(device, device_id, publish, tell, self._remembered, self._lines)
+        self._tasks[config.name] = task
 
     def _stop_device(self, name: str) -> None:
         self._tasks.pop(name).cancel()
-        self._runners.pop(name).close()
+        self._devices.pop(name).close()
         for publisher in self._publishers.values():
             publisher.remove_device(name)
 
@@ -233,7 +217,7 @@ class Daemon:
         for publisher in self._publishers.values():
             publisher.publish(batch)
 
-    def _tell(self, event: Event) -> None:
+    def _send_event(self, event: Event) -> None:
         for publisher in self._publishers.values():
             publisher.event(event)
 
@@ -241,9 +225,9 @@ class Daemon:
 
     async def _tick_until_stopped(self) -> None:
         while not self._stop.is_set():
-            now_ns = monotonic_ns()
-            for runner in self._runners.values():
-                runner.tick(now_ns)
+            now_ns = self._now_ns()
+            for device in self._devices.values():
+                device.tick(now_ns)
             for publisher in self._publishers.values():
                 publisher.tick(now_ns)
             self._feed_watchdog(now_ns)
@@ -262,9 +246,9 @@ class Daemon:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        for runner in self._runners.values():
-            runner.close()
-        self._buses.end()
+        for device in self._devices.values():
+            device.close()
+        self._factory.close()
         for publisher in self._publishers.values():
-            publisher.tick(monotonic_ns())
+            publisher.tick(self._now_ns())
             publisher.close()

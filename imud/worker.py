@@ -16,23 +16,23 @@ END_LIMIT_S = 5.0
 """A transfer on a bus that hangs ends with the controller's own time-out, of one second at most."""
 
 Round = Callable[[], int]
-"""Does what is due and returns how many ns may pass before it is called again; 0 for none."""
+"""Does what is due, and returns after how many ns it is to be called again; 0 for at once."""
 
 
 class Worker(Protocol):
     """Calls a `Round` again and again, one call at a time."""
 
     def ring(self) -> None:
-        """There is something new to do: end the present sleep, or skip the next. From any thread."""
+        """End the present sleep, or skip the next: there is something to do. From any thread."""
         ...
 
     def end(self) -> None:
-        """Call it no more. Returns when the present call is over."""
+        """Stop calling; return when the present call is over."""
         ...
 
 
 StartWorker = Callable[[str, Round, Callable[[BaseException], None]], Worker]
-"""Starts a worker: name, what it calls, and who is told of an exception, which ends it."""
+"""Starts a worker: its name, what it calls, and what is called with an exception, which ends it."""
 
 
 class WakeEvent:
@@ -57,24 +57,24 @@ class BusThread:
 
     def __init__(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
         self._work, self._failed = work, failed
-        self._alarm = WakeEvent()
+        self._wake = WakeEvent()
         self._ended = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def ring(self) -> None:
-        """There is something new to do. From any thread."""
-        self._alarm.ring()
+        """End the present sleep, or skip the next. From any thread."""
+        self._wake.ring()
 
     def end(self) -> None:
         """Stop after the present transfer; may be called twice."""
         self._ended = True
-        self._alarm.ring()
+        self._wake.ring()
         self._thread.join(END_LIMIT_S)
 
     def _run(self) -> None:
         _sharpen_timer()
-        work, wait = self._work, self._alarm.wait
+        work, wait = self._work, self._wake.wait
         try:
             while not self._ended:
                 rest_ns = work()

@@ -1,9 +1,8 @@
-"""Drives conversations with one device: sends requests over the link, feeds it what comes back."""
+"""Runs request scripts with one device: sends their requests over the link, feeds them what comes back."""
 
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
-from time import monotonic_ns
 from typing import TypeVar
 
 from imud.contracts.codec import Message
@@ -16,48 +15,53 @@ T = TypeVar("T")
 
 
 class Exchange:
-    """One conversation at a time with one device. Synchronization: the event loop's thread only."""
+    """Runs one request script at a time. Synchronization: the event loop's thread only."""
 
     def __init__(
-        self, ledger: Ledger, write: Callable[[bytes], None], set_baud: Callable[[int], None] | None = None
+        self,
+        ledger: Ledger,
+        write: Callable[[bytes], None],
+        now_ns: Callable[[], int],
+        set_baud: Callable[[int], None] | None = None,
     ) -> None:
-        """`set_baud` changes the rate of the link; None where it has none."""
+        """`now_ns` reads CLOCK_MONOTONIC; `set_baud` changes the rate of the link, None where it has none."""
         self._session = Session(ledger)
         self._write = write
+        self._now_ns = now_ns
         self._set_baud = set_baud
         self._lock = asyncio.Lock()
         self._outcome: asyncio.Future[Outcome] | None = None
 
-    async def run(self, conversation: RequestScript[T]) -> T:
-        """Run `conversation` to its end and return its value. Raises what it raises, and LinkError when unplugged.
+    async def run(self, script: RequestScript[T]) -> T:
+        """Run `script` to its end and return its value. Raises what it raises, and LinkError when unplugged.
 
-        Given up in the middle, cancelled for example, it leaves the device as the request's `undo` makes it.
+        Cancelled or failed in the middle of a request, it sends that request's `undo`.
         """
         async with self._lock:
             undo = b""
             try:
-                request = next(conversation)
+                request = next(script)
                 while True:
                     undo = request.undo
                     outcome = await self._ask(request)
                     undo = b""
-                    request = conversation.send(outcome)
+                    request = script.send(outcome)
             except StopIteration as end:
                 value: T = end.value
                 return value
             finally:
-                conversation.close()
+                script.close()
                 if undo:
-                    with suppress(LinkError):  # it is gone: there is nothing to leave in order
+                    with suppress(LinkError):  # the device is gone, and its state with it
                         self._write(undo)
 
     @property
     def busy(self) -> bool:
-        """Whether a conversation is going on."""
+        """Whether a script is running."""
         return self._lock.locked()
 
     def on_message(self, message: Message, t_rx_ns: int) -> None:
-        """Take one line of text or one reply frame from the codec."""
+        """Pass on one line of text or one reply frame from the codec."""
         self._settle(self._session.on_message(message, t_rx_ns))
 
     async def _ask(self, request: Request) -> Outcome:
@@ -66,7 +70,7 @@ class Exchange:
         loop = asyncio.get_running_loop()
         timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
         try:
-            payload = self._session.start(request, monotonic_ns())
+            payload = self._session.start(request, self._now_ns())
             if payload:
                 self._write(payload)
             if request.silent:
@@ -86,7 +90,7 @@ class Exchange:
     def _expire(self) -> None:
         deadline_ns = self._session.deadline_ns
         if deadline_ns is not None:  # the loop's timer may fire a little early against CLOCK_MONOTONIC
-            self._settle(self._session.on_time(max(monotonic_ns(), deadline_ns)))
+            self._settle(self._session.on_time(max(self._now_ns(), deadline_ns)))
 
     def _settle(self, outcome: Outcome | None) -> None:
         if outcome is not None and self._outcome is not None and not self._outcome.done():

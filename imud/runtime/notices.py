@@ -1,4 +1,4 @@
-"""Turns counters into events at a bounded rate: a line full of noise must not flood those who listen for events."""
+"""Turns counters into events at a bounded rate: a line full of noise must not flood the subscribers."""
 
 import logging
 from collections.abc import Callable
@@ -19,10 +19,11 @@ LEVELS = {EventKind.UP: logging.INFO, EventKind.MARK: logging.DEBUG}
 
 
 class Notices:
-    """Events of one device. `tick` sends what has gathered; `tell` sends at once."""
+    """Events of one device: `raise_event` sends one at once, `tick` those of counters."""
 
     def __init__(self, device: str, ledger: Ledger, send: Callable[[Event], None]) -> None:
-        self._device = device
+        self.device = device
+        """Name in the configuration."""
         self._ledger = ledger
         self._send = send
         self._due_ns = 0
@@ -31,10 +32,12 @@ class Notices:
         self._last_bad: BadFrame | None = None
         self._sync: Sync | None = None
 
-    def tell(self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None) -> None:
+    def raise_event(
+        self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None
+    ) -> None:
         """Send one event, and log it."""
-        log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self._device, message)
-        self._send(Event(now_ns, self._device, kind, message, detail))
+        log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self.device, message)
+        self._send(Event(now_ns, self.device, kind, message, detail))
 
     def bad_frame(self, frame: BadFrame) -> None:
         """Note a damaged frame; the newest one is shown in the next event."""
@@ -43,18 +46,20 @@ class Notices:
     def tick(self, now_ns: int, sync: Sync | None) -> None:
         """Send what has gathered since the last interval."""
         if sync is not None and sync is not self._sync:
-            self._changed_sync(now_ns, sync)
+            self._report_sync(now_ns, sync)
         if now_ns < self._due_ns:
             return
         ledger = self._ledger
         troubled = ledger.frames_bad() + ledger.frames_not_finite
         lost, bad = ledger.lost() - self._lost, troubled - self._bad
         if lost:
-            self.tell(now_ns, EventKind.LOSS, f"{lost} samples lost", **self._causes())
+            self.raise_event(now_ns, EventKind.LOSS, f"{lost} samples lost", **self._causes())
         if bad and self._last_bad is not None:
             frame = self._last_bad
             shown = frame.raw[:RAW_SHOWN_BYTES].hex(" ")
-            self.tell(now_ns, EventKind.BAD_FRAME, f"{bad} bad frames, the last by {frame.reason}: {shown}", count=bad)
+            self.raise_event(
+                now_ns, EventKind.BAD_FRAME, f"{bad} bad frames, the last by {frame.reason}: {shown}", count=bad
+            )
         self._lost, self._bad = ledger.lost(), troubled
         if lost or bad:
             self._due_ns = now_ns + INTERVAL_NS
@@ -68,8 +73,8 @@ class Notices:
             "queue": ledger.lost_queue,
         }
 
-    def _changed_sync(self, now_ns: int, sync: Sync) -> None:
+    def _report_sync(self, now_ns: int, sync: Sync) -> None:
         before, self._sync = self._sync, sync
         if before is not None:
-            self._send(Event(now_ns, self._device, EventKind.SYNC, f"time stamps by {sync}, were by {before}",
+            self._send(Event(now_ns, self.device, EventKind.SYNC, f"time stamps by {sync}, were by {before}",
                              {"sync": str(sync), "before": str(before)}))  # fmt: skip

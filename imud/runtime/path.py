@@ -6,74 +6,90 @@ Synchronization: the event loop's thread only.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from time import monotonic_ns, time_ns
-from typing import Any
+from dataclasses import dataclass
 
 from imud.clock import SampleClock
+from imud.config import DeviceConfig
 from imud.contracts.can import CanCodec
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, Message, ReplyFrame, StreamCodec, TextLine
+from imud.contracts.driver import Driver
 from imud.contracts.publisher import Batch
 from imud.formats.can import CanFrame
+from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.runtime.meters import LatencyMeter, LossMeter
 from imud.sample import Measurement, Sample
+from imud.units import NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class PathContext:
+    """What every sample path of one device needs in addition to its codec and clock."""
+
+    device: str
+    """Name in the configuration."""
+    device_id: int
+    ledger: Ledger
+    publish: Callable[[Batch], None]
+    on_message: Callable[[Message, int], None]
+    """Called with a text line or reply frame, and CLOCK_MONOTONIC of its arrival."""
+    on_bad_frame: Callable[[BadFrame], None]
+    overruns: Callable[[], int]
+    """Overruns that the kernel counted since the link was opened."""
+    host: HostClock
 
 
 class SamplePath(ABC):
-    """Turns what one device says into published samples; how it says it is its subclasses' part."""
+    """Turns what one device sends into published samples; how it arrives is the subclass's part."""
 
-    def __init__(
-        self,
-        name: str,
-        device_id: int,
-        clock: SampleClock,
-        ledger: Ledger,
-        publish: Callable[[Batch], None],
-        on_message: Callable[[Message, int], None],
-        on_bad: Callable[[BadFrame], None],
-        overruns: Callable[[], int],
-    ) -> None:
+    def __init__(self, clock: SampleClock, context: PathContext) -> None:
         self.clock = clock
-        self.drain: Callable[[], None] | None = None
-        """Called before what was read is fed: edges of lines come to the clock before the frames that follow them."""
         self.latency = LatencyMeter()
+        self.loss = LossMeter(context.ledger)
         self.newest: Sample | None = None
         self.begun_ns = 0
         """CLOCK_MONOTONIC when the link was last given to this path."""
         self.last_data_ns = 0
         self.last_sample_ns = 0
-        self._begun_samples = ledger.samples
-        self._name = name
-        self._device_id = device_id
-        self._ledger = ledger
-        self._publish = publish
-        self._on_message = on_message
-        self._on_bad = on_bad
-        self._overruns = overruns
-        self.loss = LossMeter(ledger)
+        self._begun_samples = context.ledger.samples
+        self._device = context.device
+        self._device_id = context.device_id
+        self._ledger = context.ledger
+        self._publish = context.publish
+        self._on_message = context.on_message
+        self._on_bad_frame = context.on_bad_frame
+        self._overruns = context.overruns
+        self._now_ns = context.host.now_ns
+        self._utc_offset_ns = context.host.utc_offset_ns
 
     @property
     def fresh(self) -> bool:
         """Whether a sample came since the link was last given to this path."""
         return self._ledger.samples > self._begun_samples
 
+    @property
+    def period_ns(self) -> int:
+        """Expected time between two samples, ns; 0 while it is not known."""
+        expected_hz = self.clock.expected_rate_hz
+        return int(NS_PER_S / expected_hz) if expected_hz else 0
+
     def begin(self, now_ns: int) -> None:
-        """The link is open and found: what comes from now on is fresh."""
+        """Start on a link whose device is found: what comes from now on is fresh."""
         self.begun_ns = self.last_data_ns = now_ns
         self._begun_samples = self._ledger.samples
 
     @abstractmethod
     def flush(self, now_ns: int) -> None:
-        """Nothing came for a while: take what waits for something that will not come."""
+        """Process what waits for a rest that did not come: the link is idle."""
 
     @abstractmethod
     def reset(self) -> None:
-        """The link ended: what is pending stays incomplete."""
+        """Discard what is incomplete: the link ended."""
 
-    def take(self, events: Sequence[CodecEvent], t_rx_ns: int) -> None:
-        """Take what a codec made of something that came at `t_rx_ns`; publish the samples in it as one batch."""
+    def publish_events(self, events: Sequence[CodecEvent], t_rx_ns: int) -> None:
+        """Publish the samples in what a codec made of something that came at `t_rx_ns`, as one batch."""
         samples: list[Sample] = []
-        self._sort(events, t_rx_ns, time_ns() - monotonic_ns(), samples)
+        self._sort(events, t_rx_ns, self._utc_offset_ns(t_rx_ns), samples)
         if samples:
             self._finish(samples, t_rx_ns)
 
@@ -85,7 +101,7 @@ class SamplePath(ABC):
         samples: list[Sample],
         t_begin_ns: int | None = None,
     ) -> None:
-        """Each event where it belongs; samples are appended. `t_begin_ns` as `SampleClock.sample` takes it."""
+        """Pass each event to where it belongs; append samples. `t_begin_ns` is that of `SampleClock.sample`."""
         clock, loss = self.clock, self.loss
         for event in events:
             if type(event) is Measurement:
@@ -100,14 +116,14 @@ class SamplePath(ABC):
             elif type(event) is BadFrame:
                 if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
                     loss.bad_frames += 1
-                self._on_bad(event)
+                self._on_bad_frame(event)
 
     def _finish(self, samples: list[Sample], t_rx_ns: int) -> None:
         self._ledger.samples += len(samples)
         self.newest = samples[-1]
         self.last_sample_ns = t_rx_ns
-        self._publish(Batch(self._name, self._device_id, samples))
-        now_ns = monotonic_ns()
+        self._publish(Batch(self._device, self._device_id, samples))
+        now_ns = self._now_ns()
         add = self.latency.add
         for sample in samples:
             add(now_ns - sample.t_ns)
@@ -116,51 +132,60 @@ class SamplePath(ABC):
 class StreamPath(SamplePath):
     """The path of a device that sends bytes."""
 
-    def __init__(self, codec: StreamCodec, *parts: Any) -> None:
-        """`parts` are those of `SamplePath`."""
-        super().__init__(*parts)
+    def __init__(
+        self,
+        codec: StreamCodec,
+        clock: SampleClock,
+        context: PathContext,
+        drain_edges: Callable[[], None] | None = None,
+    ) -> None:
+        """`drain_edges` gives the clock the edges of lines that precede the bytes; called before they are decoded."""
+        super().__init__(clock, context)
         self.codec = codec
+        self._drain_edges = drain_edges
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
-        """Take bytes as read, with CLOCK_MONOTONIC right after the read."""
+        """Process bytes as read, with CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
-        if self.drain is not None:
-            self.drain()
+        if self._drain_edges is not None:
+            self._drain_edges()
         events = self.codec.feed(data)
         if events:
-            self.take(events, t_rx_ns)
+            self.publish_events(events, t_rx_ns)
 
     def flush(self, now_ns: int) -> None:
-        """Take whole frames that wait inside a longer one that never came."""
+        """Process whole frames that wait inside a longer one that never came."""
         if self._ledger.bytes_pending:
             events = self.codec.flush()
             if events:
-                self.take(events, now_ns)
+                self.publish_events(events, now_ns)
 
     def reset(self) -> None:
-        """Bytes that wait for the rest of their frame become skipped."""
+        """Count bytes that wait for the rest of their frame as skipped."""
         self.codec.reset()
 
 
 class CanPath(SamplePath):
     """The path of a device on a CAN bus."""
 
-    def __init__(self, codec: CanCodec, *parts: Any) -> None:
-        """`parts` are those of `SamplePath`."""
-        super().__init__(*parts)
+    def __init__(self, codec: CanCodec, clock: SampleClock, context: PathContext) -> None:
+        super().__init__(clock, context)
         self.codec = codec
-        self.frame_ns = 0
-        """Shortest time of a frame on the wire, ns."""
+        self._frame_ns = 0
         self._first_ns = 0
 
+    def set_frame_time(self, frame_ns: int) -> None:
+        """Set the shortest time of a frame on the wire, ns; 0 where the bit rate is not known."""
+        self._frame_ns = frame_ns
+
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
-        """Take frames as read in one go, each with its own time of arrival.
+        """Process frames as read in one go, each with its own time of arrival.
 
         What a device measured at one instant begins to arrive with the first frame that waits for others; frames of
         other devices come between them.
         """
         feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
-        utc_offset_ns = time_ns() - monotonic_ns()
+        utc_offset_ns = self._utc_offset_ns(self._now_ns())
         t_rx_ns = self.last_data_ns
         for can_id, extended, data, t_rx_ns, after_loss in frames:
             if after_loss:
@@ -170,7 +195,7 @@ class CanPath(SamplePath):
                 self._first_ns = t_rx_ns
             events = feed(can_id, extended, data, t_rx_ns)
             if events:
-                self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self.frame_ns)
+                self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self._frame_ns)
             if pending and ledger.frames_pending == 1:  # what waited is over, and this frame waits for others now
                 self._first_ns = t_rx_ns
         self.last_data_ns = t_rx_ns
@@ -178,11 +203,31 @@ class CanPath(SamplePath):
             self._finish(samples, t_rx_ns)
 
     def flush(self, now_ns: int) -> None:
-        """Take what need not wait for frames that did not come."""
+        """Process what need not wait for frames that did not come."""
         events = self.codec.flush()
         if events:
-            self.take(events, now_ns)
+            self.publish_events(events, now_ns)
 
     def reset(self) -> None:
-        """Frames that wait for the rest of their sample are given up."""
+        """Drop frames that wait for the rest of their sample."""
         self.codec.reset()
+
+
+def make_clock(
+    config: DeviceConfig, driver: Driver, before: SampleClock | None, *, byte_ns: int = 0, hold_ns: int = 0
+) -> SampleClock:
+    """Return the clock of a device that `driver` decodes; it continues the numbers and stamps of the one before."""
+    lines = config.lines
+    clock = SampleClock(
+        config.name,
+        tick_ns=driver.tick_ns,
+        tick_modulus=driver.tick_modulus,
+        byte_ns=byte_ns,
+        hold_ns=hold_ns,
+        bits=driver.time_bits,
+        sout=lines.sout.timing if lines is not None and lines.sout is not None else None,
+        sin=lines.sin.timing if lines is not None and lines.sin is not None else None,
+    )
+    if before is not None:
+        clock.continue_from(before)
+    return clock

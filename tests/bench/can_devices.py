@@ -15,9 +15,10 @@ from imud.contracts.publisher import Batch
 from imud.devices import DRIVERS
 from imud.formats.can import RAW_FRAME, CanFilter
 from imud.formats.slot import encode_slot
+from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.links.can.frame_reader import FrameReader
-from imud.runtime.path import CanPath
+from imud.runtime.path import CanPath, PathContext
 from tests.bench.rows import Row, at_most
 from tests.lab.can_player import loop
 from tests.lab.can_traffic import Module, fleet
@@ -49,9 +50,10 @@ class Device:
         self.ledger = Ledger()
         clock = SampleClock(module.name, tick_ns=driver.tick_ns, tick_modulus=driver.tick_modulus, byte_ns=0, hold_ns=0)
         codec = driver.make_codec(self.ledger, options)
-        self.path = CanPath(
-            codec, module.name, 1, clock, self.ledger, _publish, lambda *_: None, lambda _bad: None, lambda: 0
+        context = PathContext(
+            module.name, 1, self.ledger, _publish, lambda *_: None, lambda _bad: None, lambda: 0, HostClock()
         )
+        self.path = CanPath(codec, clock, context)
 
     def take(self, times_ns: list[int]) -> int:
         """Read and take what was sent, as if it had come at these times; return the CPU time, ns."""

@@ -21,9 +21,9 @@ from imud.contracts.link import LinkType
 from imud.contracts.publisher import Batch
 from imud.devices.imu61x.spi import codec as spi
 from imud.devices.imu61x.spi.session import PIPELINE_BYTES
+from imud.host_clock import HostClock
 from imud.links.spi import SpiLink, SpiSettings
-from imud.runtime.polled.bus import Buses
-from imud.runtime.polled.runner import PolledRunner
+from imud.runtime.device_factory import DeviceFactory
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.lines import MemoryOutput
 from tests.bench.ready_line import PipeInput
@@ -83,9 +83,9 @@ async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: boo
     settings = SpiSettings(port=str(port), rate_hz=RATE_HZ, speed_hz=2_000_000, mode=0)
     lines = DeviceLines(data_ready=ReadySettings(line="Y")) if by_edges else None
     config = DeviceConfig("imu", "imu61x-spi", None, True, "spi", settings, lines=lines)
-    buses = Buses()
     maker = LineFactory(lambda *_: PipeInput(round(1e9 / RATE_HZ)), lambda *_: MemoryOutput())
-    runner = PolledRunner(config, 0, publish, lambda _event: None, buses, maker)
+    factory = DeviceFactory(publish, lambda _event: None, HostClock(), lines=maker)
+    runner = factory.make(config, 0)
     task = asyncio.create_task(runner.run())
     while samples < RATE_HZ / 4:
         await asyncio.sleep(0.01)
@@ -99,7 +99,7 @@ async def _measured(port: Path, seconds: float, busy_ms: float, *, by_edges: boo
     polling, cpu_s = runner.status().polling, time.process_time() - cpu_s - used_s
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    buses.end()
+    factory.close()
     assert before is not None
     assert polling is not None
     polls = polling.polls - before.polls

@@ -7,7 +7,7 @@ from time import monotonic_ns
 from imud.event import EventKind
 from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.lab.wire import I2cTransfer, Refuse, SpiTransfer
-from tests.support.polled import Rig
+from tests.support.device_rig import DeviceRig
 
 LIMIT_S = 40.0
 """The guest's processor is emulated."""
@@ -43,7 +43,7 @@ def registers(**more: object) -> Imu61xRegisters:
     return Imu61xRegisters(monotonic_ns, **more)  # type: ignore[arg-type]  # passed on as given
 
 
-def physics_holds(rig: Rig, device: Imu61xRegisters, resolution_m_s2: float) -> None:
+def physics_holds(rig: DeviceRig, device: Imu61xRegisters, resolution_m_s2: float) -> None:
     """Time rises, and each sample is the truth of some instant within three sigma of its stamp."""
     stamps = [sample.t_ns for sample in rig.samples]
     assert stamps == sorted(set(stamps))
@@ -57,7 +57,7 @@ def physics_holds(rig: Rig, device: Imu61xRegisters, resolution_m_s2: float) -> 
         assert off < resolution_m_s2, off
 
 
-async def vanishes(rig: Rig, why: str) -> None:
+async def vanishes(rig: DeviceRig, why: str) -> None:
     """It is reported as gone, with its cause."""
 
     def told() -> bool:
@@ -66,7 +66,7 @@ async def vanishes(rig: Rig, why: str) -> None:
     await rig.until(told, why, LIMIT_S)
 
 
-async def comes_back(rig: Rig) -> None:
+async def comes_back(rig: DeviceRig) -> None:
     """It streams again, and each DOWN has its UP."""
     await rig.until_samples(5, LIMIT_S)
     flow = [kind for kind in rig.kinds if kind in (EventKind.UP, EventKind.DOWN)]

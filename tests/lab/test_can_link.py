@@ -12,12 +12,12 @@ from imud.config import DeviceConfig
 from imud.contracts.status import DeviceState
 from imud.errors import LinkMissing
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
+from imud.host_clock import HostClock
 from imud.links.can.cyclic_sender import KernelSender, LoopSender
 from imud.links.can.frame_reader import FrameReader
 from imud.links.can.link import SocketCanLink, SocketCanSettings
-from imud.runtime.can.buses import CanBuses
-from imud.runtime.can.runner import CanRunner
-from imud.runtime.detection.can_round import EVERYTHING
+from imud.runtime.detection.rounds import EVERYTHING
+from imud.runtime.device_factory import DeviceFactory
 from imud.sim.can_module import CanModules
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
@@ -135,7 +135,7 @@ def test_filters_hold_from_the_moment_they_are_set(vcan: CanInterface) -> None:
 
 def test_a_device_is_found_by_listening_and_again_after_the_bus_was_down(vcan: CanInterface) -> None:
     config = DeviceConfig("mast", "auto", None, True, "socketcan", SocketCanSettings(interface=vcan.name))
-    runner = CanRunner(config, 1, lambda batch: None, lambda event: None, CanBuses())
+    runner = DeviceFactory(lambda batch: None, lambda event: None, HostClock()).make(config, 1)
 
     async def story() -> None:
         now_ns = monotonic_ns()

@@ -18,9 +18,10 @@ from imud.contracts.status import DeviceState
 from imud.devices.imu61x.can.codec import Imu61xCanSettings, encode_set
 from imud.event import Event, EventKind
 from imud.formats.can import pack_frame
+from imud.host_clock import HostClock
 from imud.links.can.frame_reader import FrameReader
 from imud.links.can.link import SocketCanSettings, pack_filters
-from imud.runtime.can.runner import CanRunner
+from imud.runtime.device_factory import DeviceFactory
 from imud.sample import Sample
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
@@ -40,7 +41,9 @@ class Rig:
         config = DeviceConfig("mast", "imu61x-can", Imu61xCanSettings(base_id=base_id), True, "socketcan", settings)
         self.samples: list[Sample] = []
         self.events: list[Event] = []
-        self.runner = CanRunner(config, 1, lambda batch: self.samples.extend(batch.samples), self.events.append)
+        self.runner = DeviceFactory(
+            lambda batch: self.samples.extend(batch.samples), self.events.append, HostClock()
+        ).make(config, 1)
         self.far = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         self.far.bind((far,))
 

@@ -14,7 +14,7 @@ from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, physics_holds, registers, vanishes
 from tests.lab.register_device import RegisterDevice
 from tests.lab.wire import I2cTransfer
-from tests.support.polled import device_config, running
+from tests.support.device_rig import device_config, running
 
 RESOLUTION_M_S2 = 0.02
 ADDRESS = 0x1A
@@ -31,7 +31,7 @@ def test_found_by_its_id_and_streams_the_truth(i2c: Bus[I2cTransfer]) -> None:
     async def body() -> None:
         async with running(config) as (rig,):
             await rig.until_samples(20, LIMIT_S)
-            status = rig.runner.status()
+            status = rig.device.status()
             assert status.identity == {"product": "IMU6132B"}
             assert status.link == "/dev/i2c-0, address 0x1a"
             assert status.settings == {"accel_filter": "2 Hz", "gyro_filter": "47 Hz"}
@@ -93,7 +93,7 @@ def test_unplugged_and_plugged(i2c: Bus[I2cTransfer]) -> None:
             await vanishes(rig, "no acknowledgement")
             i2c.attach(0x1B, on_i2c(device))  # its address was changed meanwhile
             await comes_back(rig)
-            assert rig.runner.status().link == "/dev/i2c-0, address 0x1b"
+            assert rig.device.status().link == "/dev/i2c-0, address 0x1b"
 
     asyncio.run(body())
 
@@ -108,10 +108,10 @@ def test_repeated_bytes_are_counted_and_no_samples(i2c: Bus[I2cTransfer]) -> Non
             await rig.until_samples(3, LIMIT_S)
             device.faults.frozen = True
             await rig.until(lambda: rig.state is DeviceState.SILENT, "silent", LIMIT_S)
-            polling = rig.runner.status().polling
+            polling = rig.device.status().polling
             assert polling is not None
             assert polling.stale > 5
-            assert rig.runner.ledger.frames_ignored == polling.stale
+            assert rig.device.ledger.frames_ignored == polling.stale
             device.faults.frozen = False
             await comes_back(rig)
 
@@ -128,7 +128,7 @@ def test_two_devices_on_one_bus_are_found_by_themselves(i2c: Bus[I2cTransfer]) -
         async with running(*configs) as (a, b):
             await a.until_samples(5, LIMIT_S)
             await b.until_samples(5, LIMIT_S)
-            links = {rig.runner.status().link for rig in (a, b)}
+            links = {rig.device.status().link for rig in (a, b)}
             assert links == {"/dev/i2c-0, address 0x18", "/dev/i2c-0, address 0x19"}
 
     asyncio.run(body())

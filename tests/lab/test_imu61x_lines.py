@@ -24,7 +24,7 @@ from tests.lab.imu61x_bus import LIMIT_S, on_i2c, on_spi, registers
 from tests.lab.tool import running as tool_running
 from tests.lab.waiting import wait_until
 from tests.lab.wire import I2cTransfer
-from tests.support.polled import Rig, device_config, running
+from tests.support.device_rig import DeviceRig, device_config, running
 from tests.support.running import LIMIT_S as TASK_LIMIT_S
 
 INTERRUPTS = Path("/proc/interrupts")
@@ -139,7 +139,7 @@ def stepped(request: pytest.FixtureRequest, gpio_chip: GpioChip) -> tuple[Steppe
     return it, replace(config, lines=DeviceLines(data_ready=ReadySettings(line="SOUT")))
 
 
-async def first(rig: Rig) -> None:
+async def first(rig: DeviceRig) -> None:
     """The values that it has before any edge."""
     await rig.until(lambda: rig.samples, "the first", LIMIT_S)
     assert rig.samples[0].sync is Sync.ARRIVAL
@@ -157,8 +157,8 @@ def test_every_edge_is_one_sample(stepped: tuple[Stepped, DeviceConfig]) -> None
             assert [sample.edge_seq for sample in rig.samples[1:]] == list(range(1, EDGES + 1))
             for sample in rig.samples[1:]:
                 it.has(sample)
-            assert rig.runner.ledger.lost_queue == 0
-            polling = rig.runner.status().polling
+            assert rig.device.ledger.lost_queue == 0
+            polling = rig.device.status().polling
             assert polling is not None
             mean_us, worst_us = polling.late_mean_ns / 1e3, polling.late_worst_ns / 1e3
             print(f"edge to read: {mean_us:.0f} us on average, {worst_us:.0f} us at worst")
@@ -175,7 +175,7 @@ def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple
             await first(rig)
             it.renew()
             await rig.until(lambda: len(rig.samples) == 2, "the first edge", LIMIT_S)
-            seen = rig.runner.status().lines
+            seen = rig.device.status().lines
             assert seen is not None
             for _ in range(5):
                 for _ in range(3):
@@ -187,8 +187,8 @@ def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple
                 it.has(sample)
             missed = sum(b - a - 1 for a, b in pairwise(numbers))
             assert missed >= 5
-            rig.runner.tick(monotonic_ns())
-            assert rig.runner.ledger.lost_queue == missed
+            rig.device.tick(monotonic_ns())
+            assert rig.device.ledger.lost_queue == missed
             assert len(numbers) + missed == numbers[-1] == len(it.stamps_ns)
 
     asyncio.run(body())
@@ -210,7 +210,7 @@ def test_edges_stop_and_come_back(stepped: tuple[Stepped, DeviceConfig]) -> None
                 assert monotonic_ns() < end_ns
                 it.renew()
                 await asyncio.sleep(0.05)
-                rig.runner.tick(monotonic_ns())
+                rig.device.tick(monotonic_ns())
             await rig.until(lambda: rig.samples[-1].edge_seq == len(it.stamps_ns), "the newest", LIMIT_S)
             it.has(rig.samples[-1])
 

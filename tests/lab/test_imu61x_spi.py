@@ -13,7 +13,7 @@ from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes
 from tests.lab.wire import SpiTransfer
-from tests.support.polled import Rig, device_config, running
+from tests.support.device_rig import DeviceRig, device_config, running
 
 RESOLUTION_M_S2 = 0.02
 PORTS = {"spi8": "/dev/spidev0.0", "spi16": "/dev/spidev1.0"}
@@ -37,7 +37,7 @@ def test_streams_the_truth(bus: tuple[Bus[SpiTransfer], str], burst: str) -> Non
     async def body() -> None:
         async with running(config) as (rig,):
             await rig.until_samples(20, LIMIT_S)
-            status = rig.runner.status()
+            status = rig.device.status()
             assert status.identity == {"product": "IMU614"}
             assert status.link == f"{port}, mode 3"
             assert status.settings["gyro_filter"] == "5 Hz"
@@ -88,7 +88,7 @@ def test_vanishes_and_is_identified_before_it_is_believed(
             device.faults = type(device.faults)()
             device.restart()
             await comes_back(rig)
-            assert rig.runner.status().polling.vanished >= 1  # type: ignore[union-attr]  # this runner has it
+            assert rig.device.status().polling.vanished >= 1  # type: ignore[union-attr]  # this runner has it
             assert device.window == 0
 
     asyncio.run(body())
@@ -99,9 +99,9 @@ def test_damaged_bytes_cost_their_sample_only(spi8: Bus[SpiTransfer]) -> None:
     spi8.attach(0, on_spi(device))
     config = device_config("imu", "imu61x-spi", "spi", {"port": PORTS["spi8"], "rate_hz": 20})
 
-    async def damage(rig: Rig) -> None:
+    async def damage(rig: DeviceRig) -> None:
         device.faults.flips = 1
-        await rig.until(lambda: rig.runner.ledger.frames_bad_crc >= 1, "the damage is seen", LIMIT_S)
+        await rig.until(lambda: rig.device.ledger.frames_bad_crc >= 1, "the damage is seen", LIMIT_S)
 
     async def body() -> None:
         async with running(config) as (rig,):
@@ -109,7 +109,7 @@ def test_damaged_bytes_cost_their_sample_only(spi8: Bus[SpiTransfer]) -> None:
             await damage(rig)
             await rig.until_samples(5, LIMIT_S)
             assert rig.state is DeviceState.RUNNING
-            assert rig.runner.ledger.lost_crc == 1
+            assert rig.device.ledger.lost_crc == 1
             physics_holds(rig, device, RESOLUTION_M_S2)
 
     asyncio.run(body())
@@ -127,7 +127,7 @@ def test_absent_device_does_not_hold_up_its_neighbour(spi8: Bus[SpiTransfer]) ->
         async with running(*configs) as (absent, there):
             await there.until_samples(30, LIMIT_S)
             assert absent.state is DeviceState.SEARCHING
-            await absent.until(lambda: "only 0x00" in absent.runner.status().problem, "the reason", LIMIT_S)
+            await absent.until(lambda: "only 0x00" in absent.device.status().problem, "the reason", LIMIT_S)
 
     asyncio.run(body())
 

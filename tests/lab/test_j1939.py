@@ -17,8 +17,9 @@ from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.devices.hipnuc.nmea2000.codec import HipnucNmea2000Settings
 from imud.errors import NoReply
+from imud.host_clock import HostClock
 from imud.links.can.link import SocketCanSettings
-from imud.runtime.can.runner import CanRunner
+from imud.runtime.device_factory import DeviceFactory
 from imud.sample import Sample
 from imud.sim.can_module import CanModules
 from imud.sim.hipnuc.j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings
@@ -53,7 +54,9 @@ class Rig:
     def __init__(self, interface: str, driver: str, options: Settings) -> None:
         config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanSettings(interface=interface))
         self.samples: list[Sample] = []
-        self.runner = CanRunner(config, 1, lambda batch: self.samples.extend(batch.samples), lambda _event: None)
+        self.runner = DeviceFactory(
+            lambda batch: self.samples.extend(batch.samples), lambda _event: None, HostClock()
+        ).make(config, 1)
 
     async def until(self, condition: Callable[[], object], what: str, step: Callable[[], None] = lambda: None) -> None:
         end = monotonic() + LIMIT_S

@@ -18,27 +18,20 @@ from imud.contracts.timing import TriggerStamp
 from imud.devices.imu61x.uart.codec import encode_ahrs
 from imud.devices.imu61x.uart.driver import DRIVER
 from imud.errors import BadArgument, CommandError
-from imud.event import Event, EventKind
-from imud.links.memory import MemoryLink, MemorySettings
-from imud.runtime.detection.remembered import Remembered
-from imud.runtime.stream.runner import DeviceRunner
-from imud.sample import Measurement, Sample, Sync
+from imud.event import EventKind
+from imud.links.memory import MemorySettings
+from imud.runtime.path import make_clock
+from imud.sample import Measurement, Sync
+from imud.signals.sync_signals import SyncSignals
 from imud.sim.ports.lines import MemoryLines, MemoryOutput
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.polled import Rig
+from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.stage import Stage
 from tests.support.virtual_time import VirtualClock, run_virtually
 
 LINES = DeviceLines(reset=ResetSettings(line="R"))
 BOOT_S = 2.9
 """A little less than the manual says."""
-UNTOLD = (
-    "imud.runtime.device",
-    "imud.runtime.path",
-    "imud.runtime.stream.runner",
-    "imud.runtime.detection.round",
-    "imud.runtime.exchange",
-)
 
 
 @pytest.fixture
@@ -46,25 +39,28 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
     return Stage(tmp_path, monkeypatch, VirtualClock())
 
 
-def on_release(line: MemoryOutput, boot: Callable[[], None]) -> None:
-    """Let the device boot after each pulse."""
+def reset_line(lines: MemoryLines, now_ns: Callable[[], int], boot: Callable[[], None]) -> MemoryOutput:
+    """The line of a device that boots after each pulse."""
 
     def changed(_t_ns: int, active: bool) -> None:
         if not active:
             asyncio.get_running_loop().call_later(BOOT_S, boot)
 
-    line._on_change = changed
+    line = lines.outputs["imu reset"] = MemoryOutput("imu reset", now_ns=now_ns, on_change=changed)
+    return line
 
 
 class Scene:
     """A polled device that hangs, and the line that helps."""
 
-    def __init__(self, rig: Rig, stage: Stage) -> None:
-        self.rig, self.stage = rig, stage
-        self.line = stage.lines.outputs["imu reset"]
+    rig: DeviceRig
+
+    def __init__(self, stage: Stage) -> None:
+        self.line = reset_line(stage.lines, stage.clock.now_ns, self.boot)
         self.device = stage.registers()
+        self.dead = False
+        """Whether it does not even boot."""
         stage.spi.device = self.device.spi
-        on_release(self.line, self.boot)
 
     def hang(self) -> None:
         """It answers no more."""
@@ -72,6 +68,8 @@ class Scene:
 
     def boot(self) -> None:
         """It works again, its settings forgotten."""
+        if self.dead:
+            return
         self.device.restart()
         self.device.faults.line = None
 
@@ -90,8 +88,9 @@ async def polled(stage: Stage, **more: Any) -> AsyncIterator[Scene]:
     config = replace(
         stage.on_spi(burst="extended", gyro_filter=2), lines=DeviceLines(reset=ResetSettings(line="R", **more))
     )
-    async with stage.running(config) as (rig,):
-        yield Scene(rig, stage)
+    scene = Scene(stage)
+    async with stage.running(config) as (scene.rig,):
+        yield scene
 
 
 def test_a_device_that_hangs_is_reset_and_set_up_again(stage: Stage) -> None:
@@ -133,12 +132,11 @@ def test_a_device_that_is_not_there_is_reset_once_a_minute(stage: Stage) -> None
     async def body() -> None:
         async with polled(stage) as it:
             it.device.faults.line = 0
-            it.boot = lambda: None  # type: ignore[method-assign]  # it never does
-            on_release(it.line, it.boot)
+            it.dead = True
             await it.rig.until(lambda: it.pulses == 3, "three", 200)
             times_ns = [t_ns for t_ns, active in it.line.history if active]
             assert all(60e9 <= b - a < 61e9 for a, b in pairwise(times_ns))
-            assert "only 0x00" in it.rig.runner.status().problem
+            assert "only 0x00" in it.rig.device.status().problem
 
     stage.run(body())
 
@@ -148,7 +146,7 @@ def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(stage: Stage) -> 
         async with polled(stage, hold_ms=500) as it:
             await it.rig.until_samples(5)
             begin_ns = stage.clock.now_ns()
-            task = asyncio.create_task(it.rig.runner.act("reset", {}))
+            task = asyncio.create_task(it.rig.device.act("reset", {}))
             await it.rig.until(lambda: it.line.active, "active")
             await it.rig.until(lambda: it.rig.state is DeviceState.SEARCHING, "left")
             asked = it.device.transactions
@@ -169,16 +167,16 @@ def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(stage: Stage) -> 
 def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(stage: Stage) -> None:
     async def body() -> None:
         async with stage.running(stage.on_spi()) as (rig,):
-            assert "reset" not in rig.runner.actions
+            assert "reset" not in rig.device.actions
             with pytest.raises(BadArgument, match="no action 'reset'"):
-                await rig.runner.act("reset", {})
+                await rig.device.act("reset", {})
         async with polled(stage) as it:
             it.hang()
-            await it.rig.until(lambda: "only 0xFF" in it.rig.runner.status().problem, "searching")
+            await it.rig.until(lambda: "only 0xFF" in it.rig.device.status().problem, "searching")
             with pytest.raises(BadArgument, match="hard"):
-                await it.rig.runner.act("reset", {"hard": True})
+                await it.rig.device.act("reset", {"hard": True})
             await it.rig.until(lambda: it.line.is_open, "open")
-            assert await it.rig.runner.act("reset", {}) is None
+            assert await it.rig.device.act("reset", {}) is None
             assert it.pulses == 1
             await it.rig.until_samples(5)
             assert it.told == []
@@ -191,11 +189,11 @@ def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_shown(st
         async with polled(stage) as it:
             await it.rig.until_samples(1)
             assert it.line.is_open
-            status = it.rig.runner.status()
+            status = it.rig.device.status()
             assert status.lines is not None
             assert status.lines.problems == {}
         assert not it.line.is_open
-        it.rig.runner.tick(stage.clock.now_ns())
+        it.rig.device.tick(stage.clock.now_ns())
         assert not it.line.is_open
         assert it.line.history == []
 
@@ -209,54 +207,46 @@ def frame(timer_us: int) -> bytes:
 
 
 class Uart:
-    """A runner on a line whose device sends nothing until it is reset."""
+    """A line whose device sends nothing until it is reset."""
 
     def __init__(self, clock: VirtualClock, lines: DeviceLines, **link: Any) -> None:
         self.clock, self.wires = clock, MemoryLines(clock.now_ns)
-        self.samples: list[Sample] = []
-        self.events: list[Event] = []
+        reset_line(self.wires, clock.now_ns, self._boot)
+        self.rigs = DeviceRigs(clock.host, lines=self.wires.maker)
         config = DeviceConfig("imu", "imu61x-uart", None, False, "memory", MemorySettings(**link), lines=lines)
-        publish = lambda batch: self.samples.extend(batch.samples)  # noqa: E731  # one line of glue
-        self.runner = DeviceRunner(config, 0, publish, self.events.append, Remembered(None), self.wires.maker)
-        assert isinstance(self.runner.link, MemoryLink)
-        self.link = self.runner.link
+        self.rig = self.rigs.add(config)
+        self.device, self.link, self.events = self.rig.device, self.rig.link, self.rig.events
         self.streams = False
 
     async def until(self, condition: Callable[[], object], limit_s: float = 100) -> None:
         """Let time pass until it holds."""
-        end_ns = self.clock.now_ns() + round(limit_s * 1e9)
-        while not condition():
-            assert self.clock.now_ns() < end_ns, self.runner.status()
-            await asyncio.sleep(0.01)
-            if self.streams and self.link.baud == 115200:
-                self.link.feed(frame(self.clock.now_ns() // 1000), self.clock.now_ns())
-            self.runner.tick(self.clock.now_ns())
+        await self.rig.until(condition, limit_s=limit_s, step=self._send, step_s=0.01)
 
     async def play(self, story: Callable[["Uart"], Any]) -> None:
-        """With the runner at work."""
-        running = asyncio.create_task(self.runner.run())
-        try:
+        """With the device at work."""
+        async with self.rigs.at_work():
             await story(self)
-        finally:
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
-            self.runner.close()
+
+    def _boot(self) -> None:
+        self.streams = True
+
+    def _send(self) -> None:
+        if self.streams and self.link.baud == 115200:
+            self.link.feed(frame(self.clock.now_ns() // 1000), self.clock.now_ns())
 
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
-def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(baud: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(baud: Any) -> None:
     clock = VirtualClock()
-    clock.stand_for_monotonic(monkeypatch, *UNTOLD)
 
     async def story(it: Uart) -> None:
-        on_release(it.wires.outputs["imu reset"], lambda: setattr(it, "streams", True))
-        await it.until(lambda: it.runner.state is DeviceState.RUNNING and it.clock.now_ns() > 1015e9)
+        await it.until(lambda: it.device.state is DeviceState.RUNNING and it.clock.now_ns() > 1015e9)
         assert [active for _, active in it.wires.outputs["imu reset"].history] == [True, False]
         assert sum(e.message.endswith("reset by its line") for e in it.events) == 1
         it.streams = False
-        await it.until(lambda: it.runner.state is DeviceState.SILENT)
+        await it.until(lambda: it.device.state is DeviceState.SILENT)
         it.streams = True
-        await it.until(lambda: it.runner.state is DeviceState.RUNNING)
+        await it.until(lambda: it.device.state is DeviceState.RUNNING)
         assert len(it.wires.outputs["imu reset"].history) == 2
 
     async def body() -> None:
@@ -265,9 +255,8 @@ def test_a_uart_on_which_nothing_is_heard_has_its_device_reset(baud: Any, monkey
     run_virtually(clock, body())
 
 
-def test_a_uart_on_which_something_is_heard_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_uart_on_which_something_is_heard_is_left_alone() -> None:
     clock = VirtualClock()
-    clock.stand_for_monotonic(monkeypatch, *UNTOLD)
 
     async def story(it: Uart) -> None:
         for _ in range(60):
@@ -284,20 +273,17 @@ def test_a_uart_on_which_something_is_heard_is_left_alone(monkeypatch: pytest.Mo
 
 def test_a_trigger_is_offered_where_imud_drives_sin(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = VirtualClock()
-    clock.stand_for_monotonic(monkeypatch, *UNTOLD)
 
     async def body() -> None:
         it = Uart(clock, DeviceLines(sin=TriggerSettings(line="S")), baud=115200)
-        assert list(it.runner.actions) == ["trigger"]
+        assert list(it.device.actions) == ["trigger"]
         once: list[str] = []
-        wires = it.runner._wires
-        assert wires is not None
-        monkeypatch.setattr(type(wires), "trigger_once", lambda _self: once.append("edge"))
-        assert await it.runner.act("trigger", {}) is None
+        monkeypatch.setattr(SyncSignals, "trigger_once", lambda _self: once.append("edge"))
+        assert await it.device.act("trigger", {}) is None
         assert once == ["edge"]
         monkeypatch.undo()
         with pytest.raises(CommandError, match="trigger"):
-            await it.runner.act("trigger", {})
+            await it.device.act("trigger", {})
 
     run_virtually(clock, body())
 
@@ -306,8 +292,8 @@ def test_where_the_measurement_is_reaches_the_clock() -> None:
     lines = DeviceLines(
         sout=SoutSettings(line="O", offset_us=-7, bias_us=2, width_us=90), sin=TriggerSettings(line="I", offset_us=9)
     )
-    runner = Uart(VirtualClock(), lines, baud=115200).runner
-    by_sout, by_sin = runner._new_clock(DRIVER), runner._new_clock(DRIVER)
+    config = DeviceConfig("imu", "imu61x-uart", None, False, "memory", MemorySettings(baud=115200), lines=lines)
+    by_sout, by_sin = make_clock(config, DRIVER, None), make_clock(config, DRIVER, None)
     for i in range(200):
         at_ns = NS_PER_S + i * 10 * NS_PER_MS
         by_sout.on_sout_edges([Edge(at_ns + 90_000, False, 2 * i + 2)])  # the rising edge is counted back

@@ -1,7 +1,8 @@
-"""Conversations over a line that is also used by others: in order, one at a time, late and missing replies apart."""
+"""Request scripts over a line that is also used by others: in order, one at a time, late and missing replies apart."""
 
 import asyncio
 from dataclasses import replace
+from time import monotonic_ns
 
 import pytest
 
@@ -36,7 +37,7 @@ def ask(*requests: Request) -> RequestScript[list[Outcome]]:
 def test_requests_go_out_one_after_the_other() -> None:
     async def story() -> None:
         written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append)
+        exchange = Exchange(Ledger(), written.append, monotonic_ns)
         task = asyncio.create_task(exchange.run(ask(request("A"), request("B"))))
         await asyncio.sleep(0)
         assert written == [b"A\r\n"]
@@ -56,7 +57,7 @@ def test_requests_go_out_one_after_the_other() -> None:
 def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
     async def story() -> None:
         ledger = Ledger()
-        exchange = Exchange(ledger, lambda data: None)
+        exchange = Exchange(ledger, lambda data: None, monotonic_ns)
         assert await exchange.run(ask(request("A", timeout_ns=1))) == [Silence(())]
         exchange.on_message("A=1", 0)
         exchange.on_message("OK", 0)
@@ -69,13 +70,13 @@ def test_silence_ends_a_request_and_a_late_reply_is_counted() -> None:
 
 def test_request_without_reply_is_done_once_sent() -> None:
     async def story() -> None:
-        exchange = Exchange(Ledger(), lambda data: None)
+        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
         assert await exchange.run(ask(request("REBOOT", silent=True))) == [Reply(())]
 
     asyncio.run(story())
 
 
-def test_link_that_is_gone_ends_the_conversation_and_the_next_one_works() -> None:
+def test_link_that_is_gone_ends_the_script_and_the_next_one_works() -> None:
     async def story() -> None:
         gone = True
 
@@ -83,7 +84,7 @@ def test_link_that_is_gone_ends_the_conversation_and_the_next_one_works() -> Non
             if gone:
                 raise LinkMissing("pulled out")
 
-        exchange = Exchange(Ledger(), write)
+        exchange = Exchange(Ledger(), write, monotonic_ns)
         with pytest.raises(LinkMissing):
             await exchange.run(ask(request("A")))
         gone = False
@@ -92,10 +93,10 @@ def test_link_that_is_gone_ends_the_conversation_and_the_next_one_works() -> Non
     asyncio.run(story())
 
 
-def test_second_conversation_waits_for_the_first() -> None:
+def test_second_script_waits_for_the_first() -> None:
     async def story() -> None:
         written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append)
+        exchange = Exchange(Ledger(), written.append, monotonic_ns)
         first = asyncio.create_task(exchange.run(ask(request("A"))))
         second = asyncio.create_task(exchange.run(ask(request("B"))))
         for _ in range(5):
@@ -112,9 +113,9 @@ def test_second_conversation_waits_for_the_first() -> None:
     asyncio.run(story())
 
 
-def test_cancelled_conversation_leaves_the_line_free() -> None:
+def test_cancelled_script_leaves_the_line_free() -> None:
     async def story() -> None:
-        exchange = Exchange(Ledger(), lambda data: None)
+        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
         task = asyncio.create_task(exchange.run(ask(request("A"))))
         await asyncio.sleep(0)
         task.cancel()
@@ -126,11 +127,11 @@ def test_cancelled_conversation_leaves_the_line_free() -> None:
 
 def test_device_that_never_answers_is_no_reply() -> None:
     async def story() -> None:
-        exchange = Exchange(Ledger(), lambda data: None)
+        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
         driver = DRIVERS["hipnuc-uart"]
         assert isinstance(driver, StreamDriver)
-        conversation = driver.identify()
-        task = asyncio.create_task(exchange.run(conversation))
+        script = driver.identify()
+        task = asyncio.create_task(exchange.run(script))
         with pytest.raises(NoReply, match="LOG VERSION"):
             await asyncio.wait_for(task, 5)
 
@@ -140,7 +141,7 @@ def test_device_that_never_answers_is_no_reply() -> None:
 def test_a_request_can_change_the_rate_before_it_goes_out() -> None:
     async def story() -> None:
         happened: list[object] = []
-        exchange = Exchange(Ledger(), happened.append, happened.append)
+        exchange = Exchange(Ledger(), happened.append, monotonic_ns, happened.append)
         await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), baud=9600)))
         assert happened == [b"A\r\n", 9600, b"B\r\n"]
 
@@ -150,7 +151,7 @@ def test_a_request_can_change_the_rate_before_it_goes_out() -> None:
 def test_a_rate_without_a_line_is_an_error() -> None:
     async def story() -> None:
         written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append)
+        exchange = Exchange(Ledger(), written.append, monotonic_ns)
         with pytest.raises(CommandError, match="9600 baud"):
             await exchange.run(ask(replace(request("A"), baud=9600)))
         assert written == []
@@ -168,7 +169,7 @@ def test_a_pause_writes_nothing() -> None:
 
 
 def exchange_of(written: list[bytes]) -> Exchange:
-    return Exchange(Ledger(), written.append)
+    return Exchange(Ledger(), written.append, monotonic_ns)
 
 
 def test_a_frame_is_an_answer() -> None:
@@ -186,7 +187,7 @@ def test_a_frame_is_an_answer() -> None:
 
 
 @pytest.mark.parametrize("is_there", [True, False])
-def test_a_conversation_given_up_is_undone_if_the_link_is_there(is_there: bool) -> None:
+def test_a_script_given_up_is_undone_if_the_link_is_there(is_there: bool) -> None:
     async def story() -> None:
         written: list[bytes] = []
 
@@ -195,7 +196,7 @@ def test_a_conversation_given_up_is_undone_if_the_link_is_there(is_there: bool) 
                 raise LinkMissing("gone")
             written.append(data)
 
-        exchange = Exchange(Ledger(), write)
+        exchange = Exchange(Ledger(), write, monotonic_ns)
         task = asyncio.create_task(exchange.run(with_undo(ask(request("A"), request("B")), b"UNDO")))
         await asyncio.sleep(0)
         task.cancel()
@@ -206,7 +207,7 @@ def test_a_conversation_given_up_is_undone_if_the_link_is_there(is_there: bool) 
     asyncio.run(story())
 
 
-def test_a_conversation_that_comes_to_its_end_is_not_undone() -> None:
+def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
     """Whether it returns or raises: it had its turn to leave the device in order."""
 
     def failing() -> RequestScript[None]:
@@ -215,7 +216,7 @@ def test_a_conversation_that_comes_to_its_end_is_not_undone() -> None:
 
     async def story() -> None:
         written: list[bytes] = []
-        exchange = Exchange(Ledger(), written.append)
+        exchange = Exchange(Ledger(), written.append, monotonic_ns)
         assert await exchange.run(with_undo(ask(request("A", timeout_ns=1)), b"UNDO")) == [Silence(())]
         with pytest.raises(NoReply):
             await exchange.run(with_undo(failing(), b"UNDO"))

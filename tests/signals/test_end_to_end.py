@@ -54,7 +54,7 @@ def test_every_sample_has_its_edge(monkeypatch: pytest.MonkeyPatch) -> None:
             assert abs(off_ns(wired, sample)) < 2 * sample.t_err_ns
         (event,) = [event for event in wired.of_kind(EventKind.SYNC) if event.detail["sync"] == "edge"]
         assert event.detail["before"] in ("arrival", "regression")
-        status = wired.runner.status()
+        status = wired.device.status()
         assert status.lines is not None
         assert 0 <= max(wired.pulses(Pin.SOUT)) - status.lines.edges["sout"] <= 1  # one may wait for the loop
         assert (status.lines.problems, status.clock.samples_unpaired) == ({}, 0)
@@ -163,7 +163,7 @@ def test_an_alarm_is_an_event_and_shown_in_the_samples(monkeypatch: pytest.Monke
         assert any(message.startswith("alarm") for message in messages)
         assert any(message.startswith("no alarm any more") for message in messages)
         assert not any("line alarm" in message for message in messages)
-        status = wired.runner.status()
+        status = wired.device.status()
         assert status.settings["ALARM_Y"] == "-5,5,0,1"
         assert status.lines is not None
         assert status.lines.alarms > 2
@@ -187,11 +187,11 @@ def test_an_alarm_wire_that_is_cut_is_reported(monkeypatch: pytest.MonkeyPatch) 
         await wired.wait(5)
         (event,) = wired.of_kind(EventKind.ALARM)
         assert "is the wire connected" in event.message
-        status = wired.runner.status()
+        status = wired.device.status()
         assert status.lines is not None
         assert status.lines.problems == {"alarm": event.message.removeprefix("line alarm: ")}
-        await wired.runner.act("alarm", {"axis": "Y", "min_deg": -60, "max_deg": 60})
-        status = wired.runner.status()
+        await wired.device.act("alarm", {"axis": "Y", "min_deg": -60, "max_deg": 60})
+        status = wired.device.status()
         assert status.lines is not None
         assert status.lines.problems == {}  # what it is set to is not known any more
 
@@ -215,7 +215,7 @@ def test_frames_answer_the_triggers_on_sin(monkeypatch: pytest.MonkeyPatch) -> N
             assert sample.sync is Sync.EDGE
             assert sample.edge_seq is not None
             assert sample.t_ns == pytest.approx(rising[sample.edge_seq - 1], abs=FEW_US)
-        status = wired.runner.status()
+        status = wired.device.status()
         assert status.lines is not None
         assert status.lines.triggers == len(rising)
         assert status.clock.triggers_missed > 10
@@ -254,7 +254,7 @@ def test_a_module_that_is_fed_utc_is_on_utc_and_stays_in_time(
         on_utc = [sample for sample in wired.samples if sample.sync is Sync.UTC]
         assert on_utc
         assert wired.samples[-1].sync is Sync.UTC
-        status = wired.runner.status()
+        status = wired.device.status()
         assert status.utc is not None
         assert status.utc.sent > 20
         assert status.utc.pulses == 30

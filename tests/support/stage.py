@@ -10,19 +10,18 @@ import pytest
 
 from imud.config import DeviceConfig
 from imud.contracts.link import LinkType
+from imud.host_clock import HostClock
 from imud.links.i2c import I2cLink, I2cSettings
 from imud.links.spi import SpiLink, SpiSettings
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.in_process_bus import InProcessI2c, InProcessSpi
 from imud.sim.ports.lines import MemoryLines
-from tests.support.polled import Rig, device_config, running
-from tests.support.virtual_time import VirtualClock, run_virtually, virtual_buses
+from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, running
+from tests.support.virtual_time import LoopWorker, VirtualClock, run_virtually
 
 RATE_HZ = 250.0
 TRANSFER_NS = 160_000
 """What every transfer takes: 32 bytes at 1.6 Mbit/s."""
-UNTOLD = ("imud.runtime.device", "imud.runtime.path")
-"""Modules that take the time themselves."""
 
 
 class Stage:
@@ -39,8 +38,8 @@ class Stage:
         """A device is put on it by `spi.device = …`."""
         self.i2c = InProcessI2c({})
         self.lines = MemoryLines(self.clock.now_ns)
-        if clock is not None:
-            clock.stand_for_monotonic(monkeypatch, *UNTOLD)
+        self.before_next_time: Callable[[], None] | None = None
+        """What happens right before a device or its bus looks at the time again."""
         monkeypatch.setattr("imud.links.spi.LINK", LinkType("spi", SpiSettings, make_polled=self._make_spi))
         monkeypatch.setattr("imud.links.i2c.LINK", LinkType("i2c", I2cSettings, make_polled=self._make_i2c))
 
@@ -48,9 +47,10 @@ class Stage:
         """A device in the time of the stage."""
         return Imu61xRegisters(self.clock.now_ns, **more)
 
-    def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[Rig]]:
-        """Runners at work."""
-        return running(*configs, buses=virtual_buses(self.clock), lines=self.lines.maker)
+    def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[DeviceRig]]:
+        """Devices at work."""
+        host = HostClock(self._time, self.clock.realtime_ns)
+        return running(*configs, rigs=DeviceRigs(host, lines=self.lines.maker, start_worker=LoopWorker))
 
     def run(self, body: Coroutine[Any, Any, None]) -> None:
         """The body of a test, to its end."""
@@ -59,6 +59,12 @@ class Stage:
     def on_spi(self, rate_hz: float = RATE_HZ, **options: Any) -> DeviceConfig:
         """A device on the SPI bus, as configured."""
         return device_config("imu", "imu61x-spi", "spi", {"port": str(self.node), "rate_hz": rate_hz}, **options)
+
+    def _time(self) -> int:
+        before, self.before_next_time = self.before_next_time, None
+        if before is not None:
+            before()
+        return self.clock.now_ns()
 
     def _make_spi(self, settings: SpiSettings) -> SpiLink:
         bus = self.spi

@@ -11,14 +11,16 @@ import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-import pytest
-
-from imud.runtime.polled.bus import Buses
+from imud.host_clock import HostClock
+from imud.runtime.polled.bus import PolledBuses
 from imud.units import NS_PER_S
 from imud.worker import Round
 
 DESCRIPTOR_LIMIT_S = 10.0
 """How long, in real time, a loop that waits for nothing but descriptors may wait."""
+
+
+UTC_AHEAD_NS = 1_795_000_000 * NS_PER_S
 
 
 class VirtualClock:
@@ -36,10 +38,14 @@ class VirtualClock:
         assert duration_ns >= 0
         self._now_ns += duration_ns
 
-    def stand_for_monotonic(self, monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
-        """Take the place of `monotonic_ns` in modules that are not given a clock."""
-        for module in modules:
-            monkeypatch.setattr(f"{module}.monotonic_ns", self.now_ns)
+    def realtime_ns(self) -> int:
+        """As `time.time_ns`."""
+        return self._now_ns + UTC_AHEAD_NS
+
+    @property
+    def host(self) -> HostClock:
+        """Both clocks of the host."""
+        return HostClock(self.now_ns, self.realtime_ns)
 
 
 class _JumpingSelector(selectors.DefaultSelector):
@@ -103,9 +109,9 @@ class LoopWorker:
         self._next = self._loop.call_later(rest_ns / NS_PER_S, self._run)
 
 
-def virtual_buses(clock: VirtualClock) -> Buses:
+def virtual_buses(clock: VirtualClock) -> PolledBuses:
     """Buses without threads, in virtual time."""
-    return Buses(clock.now_ns, LoopWorker)
+    return PolledBuses(clock.now_ns, LoopWorker)
 
 
 def run_virtually(clock: VirtualClock, body: Coroutine[Any, Any, None]) -> None:

@@ -9,13 +9,10 @@ import pytest
 
 from imud.config import DeviceConfig
 from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings
-from imud.contracts.publisher import Batch
 from imud.event import Event, EventKind
 from imud.formats.rmc import build
-from imud.links.memory import MemoryLink, MemorySettings
+from imud.links.memory import MemorySettings
 from imud.runtime import utc_keeper
-from imud.runtime.detection.remembered import Remembered
-from imud.runtime.stream.runner import DeviceRunner
 from imud.sample import Sample
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
 from imud.sim.hipnuc.uart.simulator import HipnucModule
@@ -25,6 +22,7 @@ from imud.sim.ports.pins import OnEdge, Pin, PinFaults, Pins
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.source import OnSentence, RmcSettings
 from imud.utc.system_clock import KernelClock
+from tests.support.device_rig import DeviceRigs
 from tests.support.virtual_time import LoopWorker, VirtualClock, run_virtually
 
 BEGIN_NS = 1000 * NS_PER_S + 123_456_789
@@ -34,12 +32,6 @@ WAKE_NS = 30_000
 """From the last byte to the program that reads it."""
 EDGE_LATE_NS = 45_000
 """From the measurement to the rising edge: 125 µs to the frame, of which 80 µs are the pulse."""
-CLOCKED = (
-    "imud.runtime.device",
-    "imud.runtime.stream.runner",
-    "imud.runtime.path",
-    "imud.runtime.exchange",
-)
 
 
 class FakeSource:
@@ -81,8 +73,6 @@ class Wired:
         self.memory = MemoryLines(self.clock.now_ns)
         self.cut: set[Pin] = set()
         """Pins whose wire is cut now."""
-        self.samples: list[Sample] = []
-        self.events: list[Event] = []
         self.instants: dict[int, int] = {}
         """Instant of measurement by device time (ms) of the frames that arrived."""
         self.frames: list[int] = []
@@ -90,6 +80,7 @@ class Wired:
         self._config = DeviceConfig(
             "bow", "hipnuc-uart", None, identify, "memory", MemorySettings(baud=BAUD), lines=lines, rmc=rmc
         )
+        self._rigs = DeviceRigs(self.clock.host, lines=LineFactory(self.memory.input, self._output, LoopWorker))
         self._settings, self._hardware = settings, hardware
         self._frame_faults, self._pin_faults = frame_faults, pin_faults
         self._pulses: dict[Pin, dict[int, int]] = {pin: {} for pin in Pin}
@@ -99,35 +90,36 @@ class Wired:
     def play(self, monkeypatch: pytest.MonkeyPatch, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run the device during the story; at the end the ledger closes and the lines are released."""
         clock = self.clock
-        clock.stand_for_monotonic(monkeypatch, *CLOCKED)
         monkeypatch.setattr(utc_keeper, "RMC_SOURCES", {"gpsd": lambda _settings, _context: self.source})
         monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 0, 0))
         run_virtually(clock, self._play(story))
 
     async def _play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        factory = LineFactory(self.memory.input, self._output, LoopWorker)
-        self.runner = DeviceRunner(self._config, 7, self._publish, self.events.append, Remembered(None), lines=factory)
-        assert isinstance(self.runner.link, MemoryLink)
-        self.link = self.runner.link
+        self.rig = self._rigs.add(self._config)
+        self.device, self.link = self.rig.device, self.rig.link
         self.power_on()
-        tasks = [asyncio.create_task(self.runner.run()), asyncio.create_task(self._tick())]
+        ticking = asyncio.create_task(self._tick())
         try:
-            await asyncio.sleep(0.3)
-            self.run_module()
-            await story()
+            async with self._rigs.at_work():
+                await asyncio.sleep(0.3)
+                self.run_module()
+                await story()
         finally:
             if self._timer is not None:
                 self._timer.cancel()
-            for task in tasks:
-                task.cancel()
-            ends = await asyncio.gather(*tasks, return_exceptions=True)
-            self.runner.close()
-        for end in ends:
-            if not isinstance(end, asyncio.CancelledError):
-                raise AssertionError(end) from end
-        assert self.runner.ledger.closes()
+            ticking.cancel()
         lines: Sequence[MemoryInput | MemoryOutput] = [*self.memory.inputs.values(), *self.memory.outputs.values()]
         assert not any(line.is_open for line in lines)
+
+    @property
+    def samples(self) -> list[Sample]:
+        """All that came."""
+        return self.rig.samples
+
+    @property
+    def events(self) -> list[Event]:
+        """All that were raised."""
+        return self.rig.events
 
     # --- what a story may do -----------------------------------------------------------------------------------------
 
@@ -222,10 +214,7 @@ class Wired:
             self.module.mark(now_ns)
             self.run_module()
 
-    def _publish(self, batch: Batch) -> None:
-        self.samples += batch.samples
-
     async def _tick(self) -> None:
         while True:
-            self.runner.tick(self.clock.now_ns())
+            self.device.tick(self.clock.now_ns())
             await asyncio.sleep(TICK_S)

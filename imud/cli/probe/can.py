@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Sequence
 from contextlib import suppress
+from time import monotonic_ns
 
 import msgspec
 
@@ -19,9 +20,9 @@ from imud.links import LINKS
 from imud.links.can.bus_state import ControllerState
 from imud.links.can.netlink import can_details
 from imud.runtime.detection import CanDevice, CanSearch
-from imud.runtime.detection.can_round import EVERYTHING, CanFinder
+from imud.runtime.detection.rounds import EVERYTHING, CanRound
 from imud.runtime.exchange import Exchange
-from imud.runtime.known_identity import identity_words
+from imud.runtime.identity import identity_words
 
 
 async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
@@ -47,10 +48,10 @@ async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
 async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
     """One round of detection: the devices heard, and the reason if there is none. Raises LinkError."""
     search = CanSearch(of_kind(DRIVERS.values(), CanDriver), link.title)
-    finder = CanFinder(search, Ledger(), lambda device: None)
+    finder = CanRound(search, Ledger(), lambda found: None, monotonic_ns)
     ended = asyncio.get_running_loop().create_future()
     problems = [""]
-    link.start(finder.take, lambda news, problem: problems.append(problem), ended.set_result)
+    link.start(finder.on_frames, lambda news, problem: problems.append(problem), ended.set_result)
     finder.start()
     searching = asyncio.ensure_future(finder.finished())
     await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
@@ -82,7 +83,7 @@ async def ask(device: CanDevice, link: CanLink) -> Identity:
     driver, settings = device.driver, device.driver.node_settings(device.node)
     ledger = Ledger()
     codec = driver.make_codec(ledger, settings)
-    exchange = Exchange(ledger, link.write)
+    exchange = Exchange(ledger, link.write, monotonic_ns)
 
     def take(frames: Sequence[CanFrame]) -> None:
         for frame in frames:

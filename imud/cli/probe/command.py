@@ -6,6 +6,7 @@ Listens only; sends a query only to ports and buses named with `--active`.
 import argparse
 import asyncio
 import contextlib
+from time import monotonic_ns
 
 import msgspec
 
@@ -22,9 +23,10 @@ from imud.ledger import Ledger
 from imud.links import LINKS
 from imud.links.can.netlink import can_interfaces
 from imud.links.uart.port_list import list_ports
-from imud.runtime.detection.stream_round import Finder, Finding
+from imud.runtime.detection import StreamFound
+from imud.runtime.detection.rounds import StreamRound
 from imud.runtime.exchange import Exchange
-from imud.runtime.known_identity import identity_words
+from imud.runtime.identity import identity_words
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,12 +78,12 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
         link.close()
 
 
-async def find(config: DeviceConfig, link: StreamLink) -> Finding:
+async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
     """One round of detection. Raises NothingHeard and LinkError."""
-    findings: list[Finding] = []
-    finder = Finder(config, link, Ledger(), None, findings.append, may_ask=config.identify)
+    findings: list[StreamFound] = []
+    finder = StreamRound(config, link, Ledger(), None, findings.append, monotonic_ns, may_ask=config.identify)
     ended = asyncio.get_running_loop().create_future()
-    link.start(finder.take, ended.set_result)
+    link.start(finder.on_data, ended.set_result)
     finder.start()
     searching = asyncio.ensure_future(finder.finished())
     await asyncio.wait({searching, ended}, return_when=asyncio.FIRST_COMPLETED)
@@ -93,11 +95,11 @@ async def find(config: DeviceConfig, link: StreamLink) -> Finding:
     return findings[0]
 
 
-async def ask(found: Finding, link: StreamLink) -> Identity:
+async def ask(found: StreamFound, link: StreamLink) -> Identity:
     """The identity of a device; empty when it does not answer."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
-    exchange = Exchange(ledger, link.write, link.set_baud)
+    exchange = Exchange(ledger, link.write, monotonic_ns, link.set_baud)
 
     def take(data: bytes, t_rx_ns: int) -> None:
         for event in codec.feed(data):

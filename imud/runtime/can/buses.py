@@ -1,4 +1,8 @@
-"""What the devices of one CAN bus must know of each other: whose frames are whose, and who sends what cyclically."""
+"""Shared by the devices of one daemon: which frames of a CAN bus belong to which device, and who sends what cyclically.
+
+A device that searches must not choose one that is configured by another name, and two devices must not have the same
+frame sent: receivers would get it twice per period.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -19,15 +23,15 @@ class CanBuses:
         self._members: dict[str, _Member] = {}
 
     def join(self, name: str, bus: str, filters: Sequence[CanFilter], cyclic: Sequence[CyclicFrame]) -> None:
-        """A device stands on a bus: the frames it hears, and those it wants to be sent."""
+        """Add a device to a bus: the frames it hears, and those that it needs to be sent."""
         self._members[name] = _Member(bus, filters, cyclic)
 
     def leave(self, name: str) -> None:
-        """It does no longer; nothing happens when it never did."""
+        """Remove the device; no-op if absent."""
         self._members.pop(name, None)
 
     def claimed(self, name: str, bus: str) -> Callable[[int, bool], bool]:
-        """Tells of an identifier (and 29 bits or not) whether another device of the bus hears such frames."""
+        """Return a test of an identifier (and 29 bits or not): whether another device of the bus hears such frames."""
 
         def is_claimed(can_id: int, extended: bool) -> bool:
             return any(
@@ -39,10 +43,10 @@ class CanBuses:
 
         return is_claimed
 
-    def rivalry(self, name: str) -> str:
-        """Who has a frame sent already that this device wants to be sent, one sentence; empty when nobody has.
+    def conflict(self, name: str) -> str:
+        """Return which other device has a frame sent that this one needs, one sentence; empty if none has.
 
-        Of two, the one that joined first may.
+        Of two, the one that joined first may send.
         """
         mine = self._members.get(name)
         wanted = {(frame.can_id, frame.extended) for frame in mine.cyclic} if mine else set()

@@ -1,15 +1,14 @@
-"""Finds out what talks on a link, without I/O: on a line of bytes, and on a CAN bus."""
+"""Finds out which device is on a link: searches without I/O, and the rounds that do their I/O."""
 
-from imud.runtime.detection.can import CanDevice, CanFound, CanGaveUp, CanListen, CanSearch, CanStep, CanSurvey
-from imud.runtime.detection.stream import ASK_TRIES, QUIET_NS, GaveUp, Listen, Search, Step, StreamFound
+from imud.runtime.detection.can import CanDevice, CanFound, CanSearch, CanStep, CanSurvey
+from imud.runtime.detection.steps import GaveUp, Listen
+from imud.runtime.detection.stream import ASK_TRIES, QUIET_NS, Search, Step, StreamFound
 
 __all__ = [
     "ASK_TRIES",
     "QUIET_NS",
     "CanDevice",
     "CanFound",
-    "CanGaveUp",
-    "CanListen",
     "CanSearch",
     "CanStep",
     "CanSurvey",

@@ -1,13 +1,13 @@
 """Which devices exchange on a CAN bus: listens and sends nothing, without I/O or clock of its own.
 
-Strategy. `node_of` of every driver says whose frame it may be. Each (driver, node) named so gets a codec on trial with
-`node_settings(node)`, which is fed with all frames that its filters take. A device is believed after LOCK_SAMPLES
+Strategy. `node_of` of every driver says whose frame it may be. Each (driver, node) named so gets a trial codec with
+`node_settings(node)`, which is fed with all frames that its filters take. A device is accepted after LOCK_SAMPLES
 measurements, more than it had damaged frames. A round lasts LISTEN_NS, so that all devices of the bus have been heard
 before one is chosen; while there are candidates in doubt it goes on, PATIENCE_NS at most: a device at 1 Hz whose sample
 is made of several frames needs some of its periods.
 
 One device is found when it is the only one that no other configured device of the bus has. A device that was found
-before is taken as soon as it is believed, whatever else is heard.
+before is chosen as soon as it is accepted, whatever else is heard.
 
 A device that sends only when it is asked (CANopen TPDOs by SYNC, J1939 on request) is not heard; it must be named.
 """
@@ -20,6 +20,7 @@ from imud.contracts.can import CanDriver
 from imud.contracts.codec import CodecEvent
 from imud.formats.can import CanFrame
 from imud.ledger import Ledger
+from imud.runtime.detection.steps import GaveUp, Listen
 from imud.sample import Measurement
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -28,9 +29,9 @@ LISTEN_NS: Final = 1500 * NS_PER_MS
 """1 Hz, the slowest rate that the manuals name for a single frame, is heard once."""
 PATIENCE_NS: Final = 6 * NS_PER_S
 DEVICES_MAX: Final = 128
-"""Candidates on trial; a bus that names more carries noise or somebody else's protocol."""
+"""Candidates on trial; a bus that names more carries noise or another protocol."""
 IDENTIFIERS_MAX: Final = 4096
-"""Identifiers kept; more on one bus are somebody's test."""
+"""Identifiers kept; more on one bus are a test."""
 SHOWN_MAX: Final = 8
 
 Identifier = tuple[int, bool]
@@ -39,13 +40,13 @@ Claimed = Callable[[int, bool], bool]
 """Whether a configured device has frames with this identifier (and 29 bits or not) already."""
 
 
-def nobody_claims(_can_id: int, _extended: bool) -> bool:
-    """Where no other device is configured."""
+def none_claimed(_can_id: int, _extended: bool) -> bool:
+    """Return False: no other device is configured."""
     return False
 
 
 class CanDevice(NamedTuple):
-    """A device of a bus as its driver tells it from others."""
+    """One device of a bus, as its driver numbers them."""
 
     driver: CanDriver
     node: int
@@ -57,32 +58,17 @@ class CanDevice(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class CanListen:
-    """Pass on what comes, call `on_time` at `until_ns`."""
-
-    until_ns: int
-
-
-@dataclass(frozen=True, slots=True)
 class CanFound:
     """The one device there is."""
 
     device: CanDevice
 
 
-@dataclass(frozen=True, slots=True)
-class CanGaveUp:
-    """A round found none, or several."""
-
-    summary: str
-    """What was heard, and what to do, for people."""
-
-
-CanStep = CanListen | CanFound | CanGaveUp
+CanStep = Listen | CanFound | GaveUp
 
 
 class CanSurvey:
-    """Everybody who is heard on a bus. Synchronization: one thread."""
+    """The devices heard on a bus. Synchronization: one thread."""
 
     def __init__(self, drivers: Sequence[CanDriver]) -> None:
         self._drivers = tuple(drivers)
@@ -90,8 +76,8 @@ class CanSurvey:
         self._listeners: dict[Identifier, tuple[_Trial, ...]] = {}
         """Whose filters take which frames; every identifier heard is a key."""
 
-    def take(self, frames: Sequence[CanFrame]) -> None:
-        """Frames in the order they came."""
+    def on_frames(self, frames: Sequence[CanFrame]) -> None:
+        """Process frames in the order they came."""
         for frame in frames:
             if frame.after_loss:
                 for trial in self._trials.values():
@@ -101,25 +87,25 @@ class CanSurvey:
                 trial.count(trial.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
 
     def flush(self) -> None:
-        """The bus is idle, or the round ends."""
+        """Process what waits: the bus is idle, or the round ends."""
         for trial in self._trials.values():
             trial.count(trial.codec.flush())
 
-    def devices(self, claimed: Claimed = nobody_claims) -> list[CanDevice]:
-        """Devices that yield measurements and are not claimed, in the order they were heard."""
-        return [trial.device for trial in self._trials.values() if trial.believed and not trial.has_any(claimed)]
+    def devices(self, claimed: Claimed = none_claimed) -> list[CanDevice]:
+        """Return devices that yield measurements and are not claimed, in the order they were heard."""
+        return [trial.device for trial in self._trials.values() if trial.accepted and not trial.has_any(claimed)]
 
-    def doubtful(self, claimed: Claimed = nobody_claims) -> list[CanDevice]:
-        """Candidates that yield no measurements (yet) though nobody who does has sent their frames."""
-        known = {i for trial in self._trials.values() if trial.believed for i in trial.identifiers}
+    def doubtful(self, claimed: Claimed = none_claimed) -> list[CanDevice]:
+        """Return candidates without measurements (yet) whose frames are not those of a device that has some."""
+        known = {i for trial in self._trials.values() if trial.accepted for i in trial.identifiers}
         return [
             trial.device
             for trial in self._trials.values()
-            if not trial.believed and not trial.has_any(claimed) and not trial.identifiers <= known
+            if not trial.accepted and not trial.has_any(claimed) and not trial.identifiers <= known
         ]
 
-    def others(self, claimed: Claimed = nobody_claims) -> list[str]:
-        """Identifiers that belong to no candidate and are not claimed, for people: three or eight digits."""
+    def others(self, claimed: Claimed = none_claimed) -> list[str]:
+        """Return identifiers, for people, that belong to no candidate and are not claimed: three or eight digits."""
         free = (i for i, trials in self._listeners.items() if not trials and not claimed(*i))
         return [f"0x{can_id:08X}" if extended else f"0x{can_id:03X}" for can_id, extended in sorted(free)]
 
@@ -138,7 +124,7 @@ class CanSurvey:
     def _begin(self, device: CanDevice) -> "_Trial":
         trial = self._trials[device.driver.name, device.node] = _Trial(device)
         for identifier, trials in self._listeners.items():
-            if trial.takes(identifier):
+            if trial.hears(identifier):
                 self._listeners[identifier] = (*trials, trial)
         return trial
 
@@ -146,7 +132,7 @@ class CanSurvey:
         identifier = (frame.can_id, frame.extended)
         trials = self._listeners.get(identifier)
         if trials is None:
-            trials = tuple(trial for trial in self._trials.values() if trial.takes(identifier))
+            trials = tuple(trial for trial in self._trials.values() if trial.hears(identifier))
             if len(self._listeners) < IDENTIFIERS_MAX:
                 self._listeners[identifier] = trials
         return trials
@@ -160,7 +146,7 @@ class CanSearch:
         drivers: Sequence[CanDriver],
         where: str,
         *,
-        claimed: Claimed = nobody_claims,
+        claimed: Claimed = none_claimed,
         remembered: tuple[str, int] | None = None,
     ) -> None:
         """`where` is the bus for people; `remembered` is (driver name, node) of the last success.
@@ -173,14 +159,14 @@ class CanSearch:
         self._remembered = remembered
         self._begun_ns = self._until_ns = 0
 
-    def start(self, now_ns: int) -> CanListen:
-        """The first step."""
+    def start(self, now_ns: int) -> Listen:
+        """Return the first step."""
         self._begun_ns = now_ns
         return self._listen(now_ns)
 
     def on_frames(self, frames: Sequence[CanFrame]) -> CanFound | None:
-        """Take frames as they come; None means go on."""
-        self.survey.take(frames)
+        """Process frames as they come; return None to go on."""
+        self.survey.on_frames(frames)
         if self._remembered is None:
             return None
         for device in self.survey.devices(self._claimed):
@@ -189,14 +175,14 @@ class CanSearch:
         return None
 
     def on_time(self, now_ns: int) -> CanStep | None:
-        """`until_ns` of the last CanListen has come; None when it has not."""
+        """`until_ns` of the last Listen has come; None when it has not."""
         if now_ns < self._until_ns:
             return None
         self.survey.flush()
         devices = self.survey.devices(self._claimed)
         if self.survey.doubtful(self._claimed) and now_ns - self._begun_ns < PATIENCE_NS:
             return self._listen(now_ns)
-        return CanFound(devices[0]) if len(devices) == 1 else CanGaveUp(self.summary())
+        return CanFound(devices[0]) if len(devices) == 1 else GaveUp(self.summary())
 
     def summary(self) -> str:
         """Why no device was chosen."""
@@ -213,9 +199,9 @@ class CanSearch:
             return f"only frames of other configured devices come on {where}: is the device powered?"
         return f"nothing is heard on {where}: is the bit rate right, is the bus terminated, is the device powered?"
 
-    def _listen(self, now_ns: int) -> CanListen:
+    def _listen(self, now_ns: int) -> Listen:
         self._until_ns = now_ns + LISTEN_NS
-        return CanListen(self._until_ns)
+        return Listen(self._until_ns)
 
 
 class _Trial:
@@ -232,7 +218,7 @@ class _Trial:
         self._samples = 0
 
     @property
-    def believed(self) -> bool:
+    def accepted(self) -> bool:
         """Whether it is a device."""
         return self._samples >= LOCK_SAMPLES and self._samples > self.ledger.frames_bad()
 
@@ -241,12 +227,12 @@ class _Trial:
         for event in events:
             self._samples += isinstance(event, Measurement)
 
-    def takes(self, identifier: Identifier) -> bool:
+    def hears(self, identifier: Identifier) -> bool:
         """Whether its codec needs such frames."""
         return any(wanted.takes(*identifier) for wanted in self._filters)
 
     def has_any(self, claimed: Claimed) -> bool:
-        """Whether somebody else has frames of it."""
+        """Whether another device is configured for frames of it."""
         return any(claimed(*identifier) for identifier in self.identifiers)
 
 

@@ -21,6 +21,7 @@ from imud.contracts.codec import CodecEvent, StreamCodec, message_of
 from imud.contracts.driver import StreamDriver
 from imud.contracts.session import Request
 from imud.ledger import Ledger
+from imud.runtime.detection.steps import GaveUp, Listen
 from imud.units import NS_PER_MS, uart_byte_ns
 
 LOCK_FRAMES: Final = 2
@@ -49,33 +50,15 @@ ASK_TRIES: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Listen:
-    """Set the rate if it is another, send `send` if there is any, pass on what comes, call `on_time` at `until_ns`."""
-
-    baud: int
-    until_ns: int
-    send: bytes = b""
-
-
-@dataclass(frozen=True, slots=True)
 class StreamFound:
-    """A device: feed `chunks` to its own codec, so that every byte gets into its ledger."""
+    """A device, and the bytes that its own codec has to be fed so that every byte gets into its ledger."""
 
     driver: StreamDriver
     baud: int
-    chunks: tuple[tuple[bytes, int], ...]
+    chunks: tuple[tuple[bytes, int], ...] = ()
     """What was heard at that rate in the last visit, with the time of each read."""
-    wasted_bytes: int
+    wasted_bytes: int = 0
     """Bytes heard before, in visits that found nothing: the ledger's `bytes_skipped`."""
-
-
-@dataclass(frozen=True, slots=True)
-class GaveUp:
-    """A full round found nothing."""
-
-    summary: str
-    """What was heard at which rate and what to look at, for people."""
-    wasted_bytes: int
 
 
 Step = Listen | StreamFound | GaveUp
@@ -117,16 +100,16 @@ class Search:
         self._visit = _Visit(self._bauds[0], 0)
 
     def start(self, now_ns: int) -> Step:
-        """The first step."""
+        """Return the first step."""
         self._started_ns = now_ns
         return self._next(now_ns)
 
     def on_data(self, data: bytes, t_rx_ns: int) -> Step | None:
-        """Take bytes read at the present rate; None means go on as you are."""
+        """Process bytes read at the present rate; return None to go on."""
         visit = self._visit
         self._heard_bytes += len(data)
         before = visit.good_frames()
-        visit.take(data, t_rx_ns)
+        visit.on_data(data, t_rx_ns)
         if found := self._found():
             return found
         if visit.size > VISIT_BYTES_MAX:
@@ -205,7 +188,7 @@ class Search:
             return GaveUp(self._summary(), self._heard_bytes)
         self._visit = visit
         visit.begin(self._trials(visit.baud), now_ns, now_ns + self._dwell_ns(visit.dwell_ns))
-        return Listen(visit.baud, visit.until_ns, visit.question.payload if visit.question else b"")
+        return Listen(visit.until_ns, visit.baud, visit.question.payload if visit.question else b"")
 
     def _trials(self, baud: int) -> list["_Trial"]:
         fitting = [driver for driver in self._drivers if baud in driver.baud_rates]
@@ -219,7 +202,7 @@ class Search:
         if until_ns == self._visit.until_ns:
             return None
         self._visit.until_ns = until_ns
-        return Listen(self._visit.baud, until_ns)
+        return Listen(until_ns, self._visit.baud)
 
     # --- results -------------------------------------------------------------------------------------------------
 
@@ -301,7 +284,7 @@ class _Visit:
     def begin(self, trials: list[_Trial], now_ns: int, until_ns: int) -> None:
         self.trials, self.started_ns, self.until_ns = trials, now_ns, until_ns
 
-    def take(self, data: bytes, t_rx_ns: int) -> None:
+    def on_data(self, data: bytes, t_rx_ns: int) -> None:
         self.chunks.append((data, t_rx_ns))
         self.size += len(data)
         for trial in self.trials:

@@ -1,73 +1,94 @@
 """The data-ready line of a polled device: an edge has the bus's thread read at once, and is the time of what was read.
 
-    edge ──kernel stamp──▶ loop ──ReadySchedule.seen──▶ bus's thread: read ──▶ loop: drain, ReadyEdges.match ──▶ clock
+    edge ──kernel stamp──▶ loop ──ReadySchedule.on_edge──▶ bus's thread: read
+    read ──▶ loop: drain, ReadyEdges.match ──▶ clock
 
-The edges up to the end of a read are taken from the kernel before it is said which of them the read is of.
+The edges up to the end of a read are drained from the kernel before one of them is assigned to the read.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 
+from imud.clock import SampleClock
 from imud.contracts.lines import Edge, LineFactory, ReadySettings
 from imud.contracts.polling import Poll
 from imud.contracts.status import LinesStatus
 from imud.event import EventKind
 from imud.runtime.notices import Notices
-from imud.runtime.polled.bus import Member
-from imud.runtime.polled.ready_schedule import ReadySchedule
-from imud.runtime.polled.schedule import Deadlines
+from imud.runtime.polled.bus import BusMember
+from imud.runtime.polled.schedule import Deadlines, ReadySchedule
+from imud.sample import Sample
 from imud.signals.ready_edges import ReadyEdges
 from imud.signals.watched_line import WatchedLine
 from imud.units import NS_PER_S
 
 
 class DataReady:
-    """Owns the line of one device. Synchronization: the loop's thread only."""
+    """Owns the line of one device: an attachment of it. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, device: str, settings: ReadySettings, maker: LineFactory, rate_hz: float, notices: Notices
+        self,
+        device: str,
+        settings: ReadySettings,
+        lines: LineFactory,
+        rate_hz: float,
+        notices: Notices,
+        now_ns: Callable[[], int],
     ) -> None:
-        """`rate_hz` is that of the reads while no edges come."""
+        """`lines` makes the line; `rate_hz` is that of the reads while no edges come."""
         self._rate_hz = rate_hz
         self._notices = notices
-        self._now_ns = 0
-        line = maker.make_input(_rising(settings), f"{device} data_ready", True)
-        self.watched = WatchedLine(line, self._on_edges, _ignore, self._complain, lambda: self._now_ns)
+        self._now_ns = now_ns
+        line = lines.make_input(_rising(settings), f"{device} data_ready", True)
+        self._watched = WatchedLine(line, self._on_edges, _ignore, self._report, now_ns)
         self.edges = ReadyEdges(settings, round(NS_PER_S / rate_hz))
-        self._member: Member | None = None
+        """The edges, for the path that dates reads by them."""
+        self._member: BusMember | None = None
         self._schedule: ReadySchedule | None = None
-        self._told_by_edges = True
+        self._reported_by_edges = True
         self._closed = False
 
-    def start(self, member: Member, polls: Sequence[Poll], counts: Deadlines, now_ns: int) -> None:
-        """The device is found: read it."""
-        self.watched.tick(now_ns)
+    # --- the attachment ----------------------------------------------------------------------------------------------
+
+    def start(self, clock: SampleClock) -> None:
+        """No-op: `read` begins the reads."""
+
+    def tick(self, now_ns: int, _newest: Sample | None) -> None:
+        """Open the line if it is due, and report when edges stopped or came back."""
+        if not self._closed:
+            self._watched.tick(now_ns)
+        by_edges = self._schedule.by_edges if self._schedule is not None else self._reported_by_edges
+        if by_edges is not self._reported_by_edges:
+            self._reported_by_edges = by_edges
+            message = "edges are back: read at them" if by_edges else f"no edges: read at {self._rate_hz:g} Hz instead"
+            self._raise_event(message, by_edges=by_edges)
+
+    def stop(self) -> None:
+        """Edges cause no more reads; may be called twice."""
+        self._member = self._schedule = None
+
+    def close(self) -> None:
+        """Release the line; may be called twice."""
+        self.stop()
+        self._closed = True
+        self._watched.close()
+
+    # --- reads -------------------------------------------------------------------------------------------------------
+
+    def read(self, member: BusMember, polls: Sequence[Poll], counts: Deadlines, now_ns: int) -> None:
+        """Read the device at its edges from now on; how that succeeds is counted in `counts`."""
+        self._watched.tick(now_ns)
         self.edges.restart()
         self._member = member
         self._schedule = ReadySchedule(self._rate_hz, now_ns, counts)
         member.start(polls, self._schedule)
 
-    def close(self) -> None:
-        """Let go of the line for good; may be called twice."""
-        self.rest()
-        self._closed = True
-        self.watched.close()
+    def drain(self) -> None:
+        """Process the edges that the kernel has."""
+        self._watched.drain()
 
-    def rest(self) -> None:
-        """It is read no more."""
-        self._member = self._schedule = None
-
-    def tick(self, now_ns: int) -> None:
-        """Ten times a second: open the line if it is due, and say when edges stopped or came back."""
-        self._now_ns = now_ns
-        if not self._closed:
-            self.watched.tick(now_ns)
-        by_edges = self._schedule.by_edges if self._schedule is not None else self._told_by_edges
-        if by_edges is not self._told_by_edges:
-            self._told_by_edges = by_edges
-            message = "edges are back: read at them" if by_edges else f"no edges: read at {self._rate_hz:g} Hz instead"
-            self._tell(message, by_edges=by_edges)
+    # --- what it looks like ------------------------------------------------------------------------------------------
 
     @property
     def expected_rate_hz(self) -> float:
@@ -75,9 +96,9 @@ class DataReady:
         by_edges = self._schedule is not None and self._schedule.by_edges
         return NS_PER_S / self.edges.interval_ns if by_edges else self._rate_hz
 
-    def told(self, lines: LinesStatus) -> LinesStatus:
-        """The status of the device's lines with this one."""
-        watched = self.watched
+    def add_status(self, lines: LinesStatus) -> LinesStatus:
+        """Return the status of the device's lines with this one."""
+        watched = self._watched
         return msgspec.structs.replace(
             lines,
             problems={**lines.problems, "data_ready": watched.problem} if watched.problem else lines.problems,
@@ -90,21 +111,22 @@ class DataReady:
         member, schedule = self._member, self._schedule
         if member is not None and schedule is not None:
             t_ns, interval_ns = edges[-1].t_ns, self.edges.interval_ns
-            member.command(lambda: schedule.seen(t_ns, interval_ns))
+            member.command(lambda: schedule.on_edge(t_ns, interval_ns))
 
-    def _complain(self, problem: str) -> None:
-        self._tell(problem)
+    def _report(self, problem: str) -> None:
+        self._raise_event(problem)
 
-    def _tell(self, message: str, **detail: bool) -> None:
-        self._notices.tell(self._now_ns, EventKind.LINK, f"line data_ready: {message}", line="data_ready", **detail)
+    def _raise_event(self, message: str, **detail: bool) -> None:
+        words = f"line data_ready: {message}"
+        self._notices.raise_event(self._now_ns(), EventKind.LINK, words, line="data_ready", **detail)
 
 
 def _rising(settings: ReadySettings) -> ReadySettings:
-    """The line with the wanted edge as its rising one: of that alone the kernel tells the direction for certain."""
+    """Return settings whose rising edge is the wanted one: of that alone the kernel reports the direction reliably."""
     if settings.edge == "rising":
         return settings
     return msgspec.structs.replace(settings, active_low=not settings.active_low, edge="rising")
 
 
 def _ignore(_active: bool | None) -> None:
-    """The level says nothing that the edges do not."""
+    """Ignore the level: it adds nothing to the edges."""

@@ -6,15 +6,16 @@ With a data-ready line it is the edge that the read belongs to.
 Synchronization: the event loop's thread only.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import sqrt
-from time import time_ns
-from typing import Any, Final
+from typing import Final
 
+from imud.clock import SampleClock
 from imud.contracts.codec import BadFrame, BadReason
 from imud.contracts.polling import PolledCodec, Reading, Vanished
 from imud.errors import Trouble
-from imud.runtime.path import SamplePath
+from imud.runtime.path import PathContext, SamplePath
 from imud.sample import Measurement, Sample
 from imud.signals.ready_edges import ReadyEdges, Stamp
 
@@ -24,67 +25,76 @@ SIGMA_OF_AGE: Final = 1 / sqrt(3)
 """Root mean square of an age that is anything from 0 to its bound."""
 
 
+@dataclass(frozen=True, slots=True)
+class PollTiming:
+    """What is known of the time of reads."""
+
+    period_ns: int
+    """Time between two reads."""
+    update_ns: int
+    """Longest time between two updates of the device's registers; 0 where it is not known."""
+    edges: ReadyEdges | None
+    """Those of the data-ready line; None without one."""
+
+
 class PolledPath(SamplePath):
-    """The path of a device that is asked."""
+    """The path of a device that is polled."""
 
-    def __init__(
-        self, codec: PolledCodec, period_ns: int, update_ns: int, now_ns: Callable[[], int], *parts: Any
-    ) -> None:
-        """`update_ns`: longest time between two updates of the device's registers, 0 for not known.
-
-        `now_ns` is CLOCK_MONOTONIC, `parts` are those of `SamplePath`.
-        """
-        super().__init__(*parts)
+    def __init__(self, codec: PolledCodec, timing: PollTiming, clock: SampleClock, context: PathContext) -> None:
+        super().__init__(clock, context)
         self.codec = codec
         self.failed = 0
         """Transfers that failed."""
-        self.edges: ReadyEdges | None = None
-        """Those of the data-ready line, if there is one."""
-        self._period_ns = period_ns
-        self._update_ns = update_ns
-        self._now_ns = now_ns
+        self._period_ns = timing.period_ns
+        self._update_ns = timing.update_ns
+        self._edges = timing.edges
         self._before_ns = 0
         self._faults = 0
 
+    @property
+    def period_ns(self) -> int:
+        """Time between two reads, ns."""
+        return self._period_ns
+
     def begin(self, now_ns: int) -> None:
-        """The device was identified and set up: what comes from now on is its own."""
+        """Start: the device was identified and set up, what comes from now on is its own."""
         super().begin(now_ns)
         self.reset()
 
     def flush(self, now_ns: int) -> None:
-        """Nothing waits: what is asked for comes whole or not at all."""
+        """No-op: what is read comes whole or not at all."""
 
     def reset(self) -> None:
-        """What comes next is not compared with what came before."""
+        """Compare what comes next with nothing that came before."""
         self.codec.reset()
         self._before_ns = 0
         self._faults = 0
 
     def on_readings(self, readings: Sequence[Reading]) -> str:
-        """Take readings, oldest first; return why the device must be identified again, or an empty string."""
-        utc_offset_ns = time_ns() - self._now_ns()
+        """Process readings, oldest first; return why the device must be identified again, or an empty string."""
+        utc_offset_ns = self._utc_offset_ns(self._now_ns())
         samples: list[Sample] = []
         gone = ""
-        edges = self.edges
+        edges = self._edges
         for reading in readings:
             if gone:
-                self.disbelieve(reading)
+                self.skip(reading)
                 continue
             stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None and reading.poll == 0 else None
             if reading.error is not None:
                 gone = self._failed(reading)
             else:
-                gone = self._take(reading, stamp, utc_offset_ns, samples)
+                gone = self._decode(reading, stamp, utc_offset_ns, samples)
         if samples:
             self._finish(samples, samples[-1].t_rx_ns)
         return gone
 
-    def disbelieve(self, reading: Reading) -> None:
-        """Count bytes of a device that is not known to be the right one."""
+    def skip(self, reading: Reading) -> None:
+        """Count bytes of a device that is not identified as skipped."""
         self._ledger.bytes_in += len(reading.data)
         self._ledger.bytes_skipped += len(reading.data)
 
-    def _take(self, reading: Reading, stamp: Stamp | None, utc_offset_ns: int, samples: list[Sample]) -> str:
+    def _decode(self, reading: Reading, stamp: Stamp | None, utc_offset_ns: int, samples: list[Sample]) -> str:
         gone = ""
         for event in self.codec.take(reading.poll, reading.data):
             if type(event) is Measurement:
@@ -95,7 +105,7 @@ class PolledPath(SamplePath):
             elif type(event) is Vanished:
                 gone = event.why
             elif type(event) is BadFrame:
-                self._on_bad(event)
+                self._on_bad_frame(event)
                 if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
                     self._ledger.lost_crc += 1
                     gone = gone or self._fault(f"{FAULTS_MAX} damaged frames in a row, the last by {event.reason}")

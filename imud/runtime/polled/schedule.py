@@ -1,18 +1,23 @@
-"""When a device is read: at absolute deadlines, so that nothing drifts; deadlines that were not kept are counted.
+"""When a device is read: at absolute deadlines, in turns with others, or at the edges of its data-ready line.
 
-Turns (`round_robin`) or data-ready edges (`ready_schedule`) can take the place of deadlines: all are a `Timetable`.
+Deadlines (`Schedule`) do not drift; those that were not kept are counted. Turns (`RoundRobin`) are for a line that
+several devices share and that is to be used as much as it allows. Edges (`ReadySchedule`) fall back to deadlines:
+
+    edges ──none for QUIET_NS, and for three intervals──▶ deadlines ──two within QUIET_NS──▶ edges
 """
 
-from typing import Protocol
+from typing import Final, Protocol
 
+from imud.signals.ready_edges import QUIET_NS
 from imud.units import NS_PER_S
 
-LATE_SHARE = 4
+LATE_SHARE: Final = 4
 """A read that begins later than a quarter of its period counts as late."""
+QUIET_INTERVALS: Final = 3
 
 
 class Deadlines:
-    """How deadlines were kept, over all schedules of a device. Written by the bus's thread, read by any."""
+    """How deadlines were kept, over all schedules of a device. Written by the bus's thread, read by any thread."""
 
     __slots__ = ("late", "missed", "polls", "sum_late_ns", "worst_ns")
 
@@ -26,6 +31,14 @@ class Deadlines:
         self.sum_late_ns = 0
         """Time from deadline to read, summed over `polls`."""
         self.worst_ns = 0
+        """Longest time from deadline to read."""
+
+    def served(self, late_ns: int, limit_ns: int) -> None:
+        """Count a read that begins so long after its deadline; longer than `limit_ns` is late."""
+        self.polls += 1
+        self.sum_late_ns += late_ns
+        self.late += late_ns > limit_ns
+        self.worst_ns = max(self.worst_ns, late_ns)
 
 
 class Timetable(Protocol):
@@ -35,11 +48,11 @@ class Timetable(Protocol):
     """CLOCK_MONOTONIC; the lowest on a bus comes first."""
 
     def begun(self, start_ns: int, /) -> None:
-        """That read begins."""
+        """Count the read that begins."""
         ...
 
     def done(self, now_ns: int, /) -> None:
-        """It is over: `due_ns` is that of the next."""
+        """Set `due_ns` to that of the next read: one is over."""
         ...
 
 
@@ -56,18 +69,99 @@ class Schedule:
         """The next deadline (CLOCK_MONOTONIC)."""
 
     def begun(self, start_ns: int) -> None:
-        """The read for the present deadline begins."""
-        counts, late_ns = self.counts, start_ns - self.due_ns
-        counts.polls += 1
-        counts.sum_late_ns += late_ns
-        counts.late += late_ns > self._late_ns
-        counts.worst_ns = max(counts.worst_ns, late_ns)
+        """Count the read for the present deadline."""
+        self.counts.served(start_ns - self.due_ns, self._late_ns)
 
     def done(self, now_ns: int) -> None:
-        """It is over: go to the next deadline that can still be kept, and count those passed over."""
+        """Go to the next deadline that can still be kept, and count those passed over."""
         due_ns, period_ns = self.due_ns + self.period_ns, self.period_ns
         if due_ns + period_ns <= now_ns:  # less late than a period, the next is still worth reading
             passed = (now_ns - due_ns) // period_ns
             self.counts.missed += passed
             due_ns += passed * period_ns
         self.due_ns = due_ns
+
+
+class RoundRobin:
+    """Turns instead of deadlines: every device is due at once, the one that waited longest comes first. Nothing is late
+    or missed. Synchronization: the bus's thread."""
+
+    __slots__ = ("counts", "due_ns", "period_ns")
+
+    def __init__(self, begin_ns: int, counts: Deadlines) -> None:
+        self.period_ns = 0
+        """There is none."""
+        self.counts = counts
+        self.due_ns = begin_ns
+        """When its last turn was over (CLOCK_MONOTONIC): the lowest of all members is next."""
+
+    def begun(self, _start_ns: int) -> None:
+        """Count the turn that begins."""
+        self.counts.polls += 1
+
+    def done(self, now_ns: int) -> None:
+        """Go behind all others: the turn is over."""
+        self.due_ns = now_ns
+
+
+class ReadySchedule:
+    """Edges instead of deadlines. The first read is at once: a line that stays active until it is read makes no edge
+    before that. Synchronization: the bus's thread; `by_edges` is read by any thread."""
+
+    __slots__ = ("_deadlines", "_edge_ns", "_interval_ns", "_pending", "_start_ns", "by_edges", "counts", "due_ns")
+
+    def __init__(self, rate_hz: float, begin_ns: int, counts: Deadlines) -> None:
+        """`rate_hz` is that of the deadlines."""
+        self._deadlines = Schedule(rate_hz, begin_ns, counts)
+        self._interval_ns = self._deadlines.period_ns
+        self._edge_ns = begin_ns
+        """The newest edge, or the beginning."""
+        self._start_ns = 0
+        """When the newest read began."""
+        self._pending = True
+        """Whether the newest edge was not read yet."""
+        self.counts = counts
+        self.by_edges = True
+        """False while deadlines take the place of edges."""
+        self.due_ns = begin_ns
+        """The edge that is to be read, or the deadline (CLOCK_MONOTONIC)."""
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two reads, as it is now."""
+        return self._interval_ns if self.by_edges else self._deadlines.period_ns
+
+    def on_edge(self, t_ns: int, interval_ns: int) -> None:
+        """Note the newest edge, and the time between it and the one before."""
+        if not self.by_edges and t_ns - self._edge_ns > QUIET_NS:  # one alone may be a disturbance
+            self._edge_ns = t_ns
+            return
+        self.by_edges = True
+        self._edge_ns, self._interval_ns = t_ns, interval_ns
+        if t_ns > self._start_ns:
+            self._pending, self.due_ns = True, t_ns
+        else:
+            self._wait()
+
+    def begun(self, start_ns: int) -> None:
+        """Count a read that begins: of the newest edge, or since there is none."""
+        self._start_ns = start_ns
+        if self.by_edges and not self._pending:
+            self.by_edges = False
+            self._deadlines.due_ns = start_ns
+        if not self.by_edges:
+            self._deadlines.begun(start_ns)
+            return
+        self.counts.served(start_ns - self.due_ns, self._interval_ns // LATE_SHARE)
+
+    def done(self, now_ns: int) -> None:
+        """Wait for the next edge or deadline."""
+        if self.by_edges:
+            self._wait()
+        else:
+            self._deadlines.done(now_ns)
+            self.due_ns = self._deadlines.due_ns
+
+    def _wait(self) -> None:
+        self._pending = False
+        self.due_ns = self._edge_ns + max(QUIET_NS, QUIET_INTERVALS * self._interval_ns)

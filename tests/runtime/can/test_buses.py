@@ -30,9 +30,9 @@ def test_of_two_that_want_the_same_cyclic_frame_the_second_is_refused_with_both_
     buses.join("rear", "can0", (), [CyclicFrame(0x80, False, b"", 20_000_000)])
     buses.join("other", "can1", (), [SYNC])
     buses.join("far", "can0", (), [CyclicFrame(0x80, True, b"", 1_000_000)])
-    assert [buses.rivalry(name) for name in ("front", "other", "far", "nobody")] == [""] * 4
-    assert buses.rivalry("rear") == "front and rear would both send 0x080 on can0: let one of them do it"
+    assert [buses.conflict(name) for name in ("front", "other", "far", "nobody")] == [""] * 4
+    assert buses.conflict("rear") == "front and rear would both send 0x080 on can0: let one of them do it"
     buses.join("more", "can0", (), [CyclicFrame(0x80, True, b"", 1_000_000)])
-    assert "far and more would both send 0x00000080" in buses.rivalry("more")
+    assert "far and more would both send 0x00000080" in buses.conflict("more")
     buses.leave("front")
-    assert buses.rivalry("rear") == ""
+    assert buses.conflict("rear") == ""

@@ -14,12 +14,12 @@ from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.errors import CommandError
 from imud.formats.can import RAW_FRAME, CanFrame
 from imud.links.memory import MemoryCanLink, MemorySettings
-from imud.runtime.can.runner import CanRunner
 from imud.runtime.detection import can as detection
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.units import NS_PER_MS
+from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.device_rig import play as play_rigs
 
-LIMIT_S = 10.0
 NODE = 9
 
 
@@ -27,10 +27,11 @@ class Bench:
     """A runner, and a simulated module of node 9 at the other end of its bus."""
 
     def __init__(self, driver: str, options: Settings | None) -> None:
-        config = DeviceConfig("bow", driver, options, False, "memory", MemorySettings(name="can0"))
-        self.runner = CanRunner(config, 1, lambda batch: None, lambda event: None)
-        assert isinstance(self.runner.link, MemoryCanLink)
-        self.link = self.runner.link
+        settings = MemorySettings(name="can0")
+        config = DeviceConfig("bow", driver, options, False, "memory", settings)
+        self.rigs = DeviceRigs()
+        self.rig = self.rigs.add(config, MemoryCanLink(settings))
+        self.link = self.rig.can_link
         hardware = HipnucCanopenHardware(factory=NodeSettings(node=NODE), boot_ms=0, skew_ppm=0)
         self.module = HipnucCanopenModule(monotonic_ns(), hardware)
         self.deaf = False
@@ -49,36 +50,24 @@ class Bench:
         frames = [CanFrame(f.can_id, f.extended, f.data, now_ns) for f in self.module.advance(now_ns)]
         if frames:
             self.link.feed(frames)
-        self.runner.tick(now_ns)
 
     async def until(self, condition: Callable[[], object]) -> None:
-        end = asyncio.get_running_loop().time() + LIMIT_S
-        while not condition():
-            assert asyncio.get_running_loop().time() < end, self.runner.status()
-            self.exchange()
-            await asyncio.sleep(0.001)
+        await self.rig.until(condition, step=self.exchange, step_s=0.001)
 
     async def act(self, name: str, **arguments: object) -> object:
         """Tell it, and keep the bus going until it answered."""
-        task = asyncio.create_task(self.runner.act(name, arguments))
+        task = asyncio.create_task(self.rig.device.act(name, arguments))
         await self.until(task.done)
         return await task
 
 
 def play(bench: Bench, story: Coroutine[Any, Any, None]) -> None:
-    async def both() -> None:
-        task = asyncio.create_task(bench.runner.run())
-        try:
-            await bench.until(lambda: bench.link.listening)
-            await bench.until(lambda: bench.runner.state is DeviceState.RUNNING)
-            await story
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-            bench.runner.close()
-        assert bench.runner.ledger.closes()
+    async def told(_rigs: list[DeviceRig]) -> None:
+        await bench.until(lambda: bench.link.listening)
+        await bench.until(lambda: bench.rig.state is DeviceState.RUNNING)
+        await story
 
-    asyncio.run(both())
+    play_rigs(bench.rigs, told)
 
 
 @pytest.mark.parametrize(("driver", "options"), [("auto", None), ("hipnuc-canopen", HipnucCanopenSettings(node=NODE))])

@@ -7,7 +7,7 @@ import pytest
 from imud.devices.imu61x.can.codec import encode_set
 from imud.devices.imu61x.can.driver import DRIVER as IMU61X
 from imud.formats.can import CanFrame
-from imud.runtime.detection import CanFound, CanGaveUp, CanListen, CanSearch, CanStep, CanSurvey
+from imud.runtime.detection import CanFound, CanSearch, CanStep, CanSurvey, GaveUp, Listen
 from imud.runtime.detection.can import DEVICES_MAX, IDENTIFIERS_MAX, LISTEN_NS, PATIENCE_NS
 from tests.support.fake_can import BASE, fake_can_driver, fake_frame
 
@@ -45,7 +45,7 @@ class Round:
     def end(self) -> CanStep:
         """What is said at the end of the round."""
         step = self.search.on_time(self.until_ns)
-        while isinstance(step, CanListen):
+        while isinstance(step, Listen):
             self.until_ns = step.until_ns
             step = self.search.on_time(self.until_ns)
         assert step is not None
@@ -60,7 +60,7 @@ class Round:
     def complaint(self) -> str:
         """What is said when none was."""
         step = self.end()
-        assert isinstance(step, CanGaveUp), step
+        assert isinstance(step, GaveUp), step
         return step.summary
 
 
@@ -89,7 +89,7 @@ def test_of_several_every_one_is_named() -> None:
 def test_one_measurement_is_too_few_and_waited_for() -> None:
     heard = Round().hear(*imu61x(1))
     step = heard.search.on_time(heard.until_ns)
-    assert isinstance(step, CanListen)
+    assert isinstance(step, Listen)
     heard.until_ns = step.until_ns
     heard.hear(*imu61x(2))
     assert heard.found() == "imu61x-can base_id 101"
@@ -155,7 +155,7 @@ def test_two_protocols_that_both_understand_are_both_named() -> None:
     search.start(0)
     search.on_frames([fake_frame(8, 1), fake_frame(8, 2)])
     step = search.on_time(LISTEN_NS)
-    assert isinstance(step, CanGaveUp)
+    assert isinstance(step, GaveUp)
     assert "twin node 8, fake-can node 8" in step.summary
 
 
@@ -170,6 +170,6 @@ def test_a_bus_full_of_noise_costs_bounded_memory(extended: bool) -> None:
     survey, random = CanSurvey([fake_can_driver(base=0), FAKE]), Random(3)
     most = 0x1FFF_FFFF if extended else 0x7FF
     for _ in range(IDENTIFIERS_MAX + 500):
-        survey.take([CanFrame(random.randint(0, most), extended, random.randbytes(8), 0)])
+        survey.on_frames([CanFrame(random.randint(0, most), extended, random.randbytes(8), 0)])
     assert len(survey.others()) <= IDENTIFIERS_MAX
     assert len(survey.devices()) + len(survey.doubtful()) <= DEVICES_MAX

@@ -1,9 +1,10 @@
-"""The thread of a bus: dialogues get their turn, devices come and go, nothing is left behind."""
+"""The thread of a bus: scripts get their turn, devices come and go, nothing is left behind."""
 
 import asyncio
 import threading
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from time import monotonic_ns
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from imud.contracts.polling import Poll, Reading, Transfer, TransferScript
 from imud.contracts.status import KernelCounters
 from imud.errors import DeviceRefused, LinkError, TransferError, Trouble
-from imud.runtime.polled.bus import Buses, Member
+from imud.runtime.polled.bus import BusMember, PolledBuses
 from imud.runtime.polled.schedule import Deadlines
 from tests.support.virtual_time import VirtualClock, run_virtually, virtual_buses
 
@@ -73,7 +74,7 @@ class Sink:
             self.enough.set()
 
 
-def joined(buses: Buses, wire: Wire, sink: Sink) -> Member:
+def joined(buses: PolledBuses, wire: Wire, sink: Sink) -> BusMember:
     return buses.get(wire.bus).join(wire, Deadlines(), sink.take)
 
 
@@ -99,7 +100,7 @@ def refusing() -> TransferScript[None]:
 
 def run(body: Any) -> None:
     async def whole() -> None:
-        buses = Buses()
+        buses = PolledBuses(monotonic_ns)
         try:
             await asyncio.wait_for(body(buses), 10)
         finally:
@@ -110,20 +111,20 @@ def run(body: Any) -> None:
     asyncio.run(whole())
 
 
-def test_dialogues_return_raise_and_catch() -> None:
-    async def body(buses: Buses) -> None:
+def test_scripts_return_raise_and_catch() -> None:
+    async def body(buses: PolledBuses) -> None:
         wire = Wire()
         member = joined(buses, wire, Sink())
-        assert await member.talk(three(), 1) == 1 + 2 + 3
+        assert await member.run(three(), 1) == 1 + 2 + 3
         with pytest.raises(DeviceRefused):
-            await member.talk(refusing(), 1)
+            await member.run(refusing(), 1)
         wire.fail = TransferError(Trouble.ABSENT, "no")
-        assert await member.talk(stubborn(), 1) == "after absent"
+        assert await member.run(stubborn(), 1) == "after absent"
         with pytest.raises(TransferError):
-            await member.talk(three(), 1)
+            await member.run(three(), 1)
         wire.fail = LinkError("gone")
         with pytest.raises(LinkError):
-            await member.talk(stubborn(), 1)
+            await member.run(stubborn(), 1)
         assert wire.threads == {"wire"}
 
     run(body)
@@ -152,20 +153,20 @@ def test_readings_come_in_order_with_their_times() -> None:
     run_virtually(clock, body())
 
 
-def test_dialogue_has_its_turn_on_a_bus_that_is_never_idle() -> None:
-    async def body(buses: Buses) -> None:
+def test_script_has_its_turn_on_a_bus_that_is_never_idle() -> None:
+    async def body(buses: PolledBuses) -> None:
         wire, sink = Wire(), Sink()
         wire.rate_hz = 1e6
         member = joined(buses, wire, sink)
         member.start((Poll(ASK),))
         await sink.enough.wait()
-        assert await member.talk(three(), 1) > 0
+        assert await member.run(three(), 1) > 0
 
     run(body)
 
 
 def test_end_of_the_bus_is_told_once_and_reading_stops() -> None:
-    async def body(buses: Buses) -> None:
+    async def body(buses: PolledBuses) -> None:
         wire, sink = Wire(), Sink()
         member = joined(buses, wire, sink)
         wire.fail = LinkError("gone")
@@ -173,7 +174,7 @@ def test_end_of_the_bus_is_told_once_and_reading_stops() -> None:
         await sink.enough.wait()
         wire.fail = None
         count = wire.count
-        assert await member.talk(three(), 1) == 3 * count + 6  # nothing else was transferred meanwhile
+        assert await member.run(three(), 1) == 3 * count + 6  # nothing else was transferred meanwhile
         assert str(sink.problem) == "gone"
         assert sink.calls == 1
 
@@ -181,7 +182,7 @@ def test_end_of_the_bus_is_told_once_and_reading_stops() -> None:
 
 
 def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread() -> None:
-    async def body(buses: Buses) -> None:
+    async def body(buses: PolledBuses) -> None:
         wire, sink, other = Wire(), Sink(), Wire()
         member, stays = joined(buses, wire, sink), joined(buses, other, Sink())
         member.start((Poll(ASK),))
@@ -189,7 +190,7 @@ def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread() -
         member.leave()
         member.leave()
         calls = sink.calls
-        await stays.talk(three(), 1)
+        await stays.run(three(), 1)
         assert sink.calls == calls
         assert wire.closed == 1
         assert other.closed == 0
@@ -198,7 +199,7 @@ def test_device_that_left_hears_nothing_and_its_link_is_closed_by_the_thread() -
 
 
 def test_targets_are_taken_once() -> None:
-    async def body(buses: Buses) -> None:
+    async def body(buses: PolledBuses) -> None:
         a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
         assert a.claim(0x18)
         assert a.claim(0x18)

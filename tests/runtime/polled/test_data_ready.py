@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
-from imud.contracts.lines import DeviceLines, ReadySettings
+from imud.contracts.lines import DeviceLines, OnEdges, OnLineEnd, ReadySettings
 from imud.contracts.status import DeviceState
 from imud.errors import LinkMissing
 from imud.event import EventKind
@@ -20,7 +20,7 @@ from imud.sample import Sample, Sync
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.lines import MemoryInput
 from imud.units import NS_PER_S
-from tests.support.polled import Rig
+from tests.support.device_rig import DeviceRig
 from tests.support.stage import Stage
 from tests.support.virtual_time import VirtualClock
 
@@ -49,9 +49,11 @@ class Signal:
         epoch_ns = self._device.epoch_ns
         return epoch_ns + (self._stage.clock.now_ns() - epoch_ns) // EVERY_NS * EVERY_NS
 
-    def at_once(self, t_ns: int) -> None:
-        """An edge with that stamp, which the kernel has."""
+    def at_once(self, t_ns: int, *, heard: bool = True) -> None:
+        """An edge with that stamp, which the kernel has; the loop hears of it now, or only who drains the line."""
         self.line.edge(t_ns, True)
+        if heard:
+            asyncio.get_running_loop().call_soon(self.line.drain)
         if self.line.is_open:
             self.stamps.append(t_ns)
 
@@ -67,7 +69,7 @@ class Signal:
 class Scene:
     """A device with its line, and its runner."""
 
-    def __init__(self, rig: Rig, signal: Signal, device: Imu61xRegisters, stage: Stage) -> None:
+    def __init__(self, rig: DeviceRig, signal: Signal, device: Imu61xRegisters, stage: Stage) -> None:
         self.rig, self.signal, self.device, self.stage = rig, signal, device, stage
 
     def told(self, words: str) -> Callable[[], bool]:
@@ -76,7 +78,7 @@ class Scene:
 
     @property
     def missed(self) -> int:
-        polling = self.rig.runner.status().polling
+        polling = self.rig.device.status().polling
         assert polling is not None
         return polling.missed
 
@@ -119,7 +121,7 @@ def test_every_edge_is_a_sample_of_its_own_instant(stage: Stage) -> None:
     async def body() -> None:
         async with scene(stage) as it:
             await it.rig.until_samples(200)
-            status = it.rig.runner.status()
+            status = it.rig.device.status()
             assert status.expected_rate_hz == 500
             assert status.clock.sync is Sync.EDGE
             assert status.lines is not None
@@ -128,7 +130,7 @@ def test_every_edge_is_a_sample_of_its_own_instant(stage: Stage) -> None:
             numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
             assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
             assert all(sample.t_err_ns < 62_000 for sample in it.rig.samples[1:])  # 100 µs / √3 and 3 µs
-            assert it.missed == it.rig.runner.ledger.lost_queue == 0
+            assert it.missed == it.rig.device.ledger.lost_queue == 0
             assert EventKind.LINK not in it.rig.kinds
 
     stage.run(body())
@@ -169,36 +171,44 @@ def test_the_edges_of_a_loop_that_stalls_are_missed(stage: Stage) -> None:
             assert gaps == [newest + 10]
             lost = numbers[-1] - numbers[0] + 1 - len(numbers)
             assert lost in (9, 10)
-            assert it.missed == it.rig.runner.ledger.lost_queue == lost
+            assert it.missed == it.rig.device.ledger.lost_queue == lost
             await it.rig.until(lambda: EventKind.LOSS in it.rig.kinds, "told")
 
     stage.run(body())
 
 
+class Unheard(MemoryInput):
+    """A line whose edges the loop is not woken for."""
+
+    def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
+        super().start(on_edges, on_end, watch=False)
+
+
 def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(stage: Stage) -> None:
     """It is in the kernel when the read for the edge before begins; it is not read a second time."""
+
+    def make(_settings: Any, purpose: str, rising_only: bool = False) -> MemoryInput:
+        return stage.lines.inputs.setdefault(purpose, Unheard(purpose, rising_only))
+
+    stage.lines.maker = replace(stage.lines.maker, make_input=make)
 
     async def body() -> None:
         async with scene(stage) as it:
             await it.rig.until_samples(20)
             it.signal.quiet = True
             await asyncio.sleep(0.01)
-            before = it.rig.runner.status().polling
-            member = it.rig.runner._member
-            assert member is not None
+            before = it.rig.device.status().polling
             stamp_ns = it.signal.newest_ns
 
-            def at_the_beginning_of_the_read() -> int:
-                member._now_ns = stage.clock.now_ns
+            def at_the_beginning_of_the_read() -> None:
                 stage.clock.advance(EVERY_NS)
-                it.signal.line._watch = False  # only who drains the line hears of it
-                it.signal.at_once(stamp_ns + EVERY_NS)
-                return stage.clock.now_ns()
+                it.signal.at_once(stamp_ns + EVERY_NS, heard=False)
 
-            member._now_ns = at_the_beginning_of_the_read
             it.signal.at_once(stamp_ns)
+            stage.before_next_time = at_the_beginning_of_the_read
             await asyncio.sleep(0.01)
-            after = it.rig.runner.status().polling
+            assert stage.before_next_time is None
+            after = it.rig.device.status().polling
             assert before is not None
             assert after is not None
             assert it.dated(it.rig.samples[-1]) == len(it.signal.stamps)
@@ -216,7 +226,7 @@ def test_no_edges_any_more_and_edges_again(stage: Stage) -> None:
             await it.rig.until(it.told("no edges: read at 100 Hz instead"), "told")
             count = len(it.rig.samples)
             await it.rig.until_samples(50)
-            assert it.rig.runner.status().expected_rate_hz == RATE_HZ
+            assert it.rig.device.status().expected_rate_hz == RATE_HZ
             by_deadlines = it.rig.samples[count + 1 :]
             assert {sample.sync for sample in by_deadlines} == {Sync.ARRIVAL}
             assert {sample.edge_seq for sample in by_deadlines} == {None}
@@ -245,7 +255,7 @@ def test_without_the_line_deadlines_serve_until_it_comes(stage: Stage) -> None:
             await it.rig.until(it.told("line data_ready: no such line"), "told")
             await it.rig.until(it.told("no edges"), "told")
             await it.rig.until_samples(20)
-            status = it.rig.runner.status()
+            status = it.rig.device.status()
             assert status.lines is not None
             assert status.lines.problems == {"data_ready": "no such line"}
             it.signal.line.open_error = None
@@ -277,7 +287,7 @@ def test_the_line_is_let_go_of_at_the_end(stage: Stage) -> None:
         async with scene(stage) as it:
             await it.rig.until_samples(3)
             rig = it.rig
-        rig.runner.tick(stage.clock.now_ns())
+        rig.device.tick(stage.clock.now_ns())
         assert not it.signal.line.is_open
 
     stage.run(body())

@@ -1,8 +1,13 @@
-"""Deadlines: no drift, lateness counted, missed ones passed over and counted."""
+"""When a device is read: deadlines without drift, turns on a line that is never idle, edges of a data-ready line."""
 
-from imud.runtime.polled.schedule import Deadlines, Schedule
+from imud.contracts.polling import Poll
+from imud.runtime.polled.bus import PolledBuses
+from imud.runtime.polled.schedule import Deadlines, ReadySchedule, RoundRobin, Schedule
+from imud.signals.ready_edges import QUIET_NS
+from tests.runtime.polled.test_bus import ASK, Sink, Wire, run
 
 MS = 1_000_000
+BEGIN = 1000 * MS
 
 
 def schedule(rate_hz: float = 1000.0, begin_ns: int = 5 * MS) -> Schedule:
@@ -55,3 +60,135 @@ def test_counts_go_on_over_schedules() -> None:
         one.begun(0)
         one.done(1)
     assert counts.polls == 2
+
+
+# --- turns ------------------------------------------------------------------------------------------------------------
+
+
+def test_all_take_turns_whatever_a_turn_takes() -> None:
+    counts = [Deadlines() for _ in range(3)]
+    turns = [RoundRobin(100, one) for one in counts]
+    now_ns, order = 100, []
+    for number in range(30):
+        first = min(turns, key=lambda turn: turn.due_ns)
+        assert first.due_ns <= now_ns  # always due
+        order.append(turns.index(first))
+        first.begun(now_ns)
+        now_ns += 1000 if number % 7 else 500_000
+        first.done(now_ns)
+    assert order == [0, 1, 2] * 10
+    assert [one.polls for one in counts] == [10] * 3
+    assert [one.late + one.missed + one.worst_ns for one in counts] == [0] * 3
+
+
+def test_who_comes_back_waits_for_its_turn() -> None:
+    busy, back = RoundRobin(0, Deadlines()), RoundRobin(50, Deadlines())
+    busy.done(49)
+    assert busy.due_ns < back.due_ns
+    busy.done(60)
+    assert back.due_ns < busy.due_ns
+
+
+def test_on_a_bus_every_reading_is_handed_over_at_once() -> None:
+    """Something is always due there, so that no idle moment comes to do it in."""
+
+    async def body(buses: PolledBuses) -> None:
+        wires = [Wire(), Wire()]
+        sinks = [Sink(), Sink()]
+        for wire, sink in zip(wires, sinks, strict=True):
+            wire.rate_hz = 0.0
+            buses.get("wire").join(wire, Deadlines(), sink.take).start((Poll(ASK),))
+        for sink in sinks:
+            await sink.enough.wait()
+        for sink in sinks:
+            assert sink.calls == len(sink.readings) > 20
+
+    run(body)
+
+
+# --- edges ------------------------------------------------------------------------------------------------------------
+
+
+def by_edges(rate_hz: float = 100.0) -> ReadySchedule:
+    """One whose first read, which waits for nothing, is over at once."""
+    made = ReadySchedule(rate_hz, BEGIN, Deadlines())
+    assert made.due_ns == BEGIN
+    read(made, BEGIN, 0)
+    return made
+
+
+def read(made: ReadySchedule, start_ns: int, takes_ns: int = MS // 5) -> None:
+    made.begun(start_ns)
+    made.done(start_ns + takes_ns)
+
+
+def test_an_edge_is_due_at_once_and_nothing_without_one() -> None:
+    made = by_edges()
+    assert made.due_ns == BEGIN + QUIET_NS
+    for number in range(1, 100):
+        t_ns = BEGIN + number * MS
+        made.on_edge(t_ns, MS)
+        assert (made.due_ns, made.period_ns) == (t_ns, MS)
+        read(made, t_ns + 100_000)
+        assert made.due_ns == t_ns + QUIET_NS
+    assert (made.counts.polls, made.counts.late, made.counts.missed) == (100, 0, 0)
+    assert made.counts.sum_late_ns == 99 * 100_000
+    assert made.counts.worst_ns == 100_000
+
+
+def test_later_than_a_quarter_of_the_interval_is_late() -> None:
+    made = by_edges()
+    for number, late_ns in enumerate((250_000, 250_001, 900_000), 1):
+        made.on_edge(BEGIN + number * MS, MS)
+        read(made, BEGIN + number * MS + late_ns, 0)
+    assert made.counts.late == 2
+
+
+def test_an_edge_that_was_read_already_is_not_read_again() -> None:
+    """It was told late: a read that began after it had its values."""
+    made = by_edges()
+    made.on_edge(BEGIN + MS, MS)
+    read(made, BEGIN + 2 * MS + 100_000)
+    made.on_edge(BEGIN + 2 * MS, MS)
+    assert made.due_ns == BEGIN + 2 * MS + QUIET_NS
+    made.on_edge(BEGIN + 2 * MS + 100_001, MS)
+    assert made.due_ns == BEGIN + 2 * MS + 100_001
+
+
+def test_without_edges_deadlines_come_again() -> None:
+    made = by_edges(100.0)
+    at_ns = made.due_ns + 7
+    read(made, at_ns)
+    assert not made.by_edges
+    for number in range(1, 5):
+        assert made.due_ns == at_ns + number * 10 * MS
+        read(made, made.due_ns)
+    assert made.period_ns == 10 * MS
+    assert made.counts.polls == 6
+    assert made.counts.worst_ns == 0
+
+
+def test_rare_edges_are_waited_for_longer() -> None:
+    made = by_edges()
+    made.on_edge(BEGIN + 400 * MS, 400 * MS)
+    read(made, BEGIN + 400 * MS)
+    assert made.due_ns == BEGIN + 1600 * MS
+
+
+def test_one_edge_is_no_return_two_are() -> None:
+    made = by_edges()
+    read(made, made.due_ns)
+    t_ns = made.due_ns + 3 * MS
+    deadline_ns = made.due_ns
+    made.on_edge(t_ns, QUIET_NS)
+    assert (made.by_edges, made.due_ns) == (False, deadline_ns)
+    made.on_edge(t_ns + QUIET_NS + 1, QUIET_NS)
+    assert not made.by_edges
+    made.on_edge(t_ns + QUIET_NS + MS, MS)
+    assert (made.by_edges, made.due_ns) == (True, t_ns + QUIET_NS + MS)
+
+
+def test_deadlines_without_a_read_are_missed() -> None:
+    made = by_edges(100.0)
+    read(made, made.due_ns, 35 * MS)
+    assert made.counts.missed == 2

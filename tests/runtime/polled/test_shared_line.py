@@ -12,8 +12,8 @@ from imud.config import DeviceConfig
 from imud.contracts.status import DeviceState
 from imud.event import EventKind
 from imud.units import NS_PER_MS
+from tests.support.device_rig import device_config, running
 from tests.support.modbus_wire import BAUD, serial_of, slave, wired
-from tests.support.polled import device_config, running
 
 
 def run(body: Coroutine[Any, Any, None]) -> None:
@@ -23,7 +23,7 @@ def run(body: Coroutine[Any, Any, None]) -> None:
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search takes less long than in life."""
-    monkeypatch.setattr("imud.runtime.polled.runner.RETRY_S", 0.02)
+    monkeypatch.setattr("imud.runtime.polled.transport.RETRY_S", 0.02)
 
 
 def on(path: Path, address: int | str, **more: Any) -> DeviceConfig:
@@ -41,15 +41,15 @@ def test_several_modules_take_turns(tmp_path: Path) -> None:
                 for rig in rigs:
                     await rig.until_samples(30)
                 for rig, module in zip(rigs, modules, strict=True):
-                    status = rig.runner.status()
+                    status = rig.device.status()
                     assert status.identity["serial_number"] == module.serial.hex().upper()
                     assert status.settings["id"] == str(module.settings.slave)
                     assert status.polling is not None
                     assert status.polling.missed == status.polling.late == 0
                     assert status.expected_rate_hz == 0
-                counts = [rig.runner.status().polling.polls for rig in rigs]  # type: ignore[union-attr]  # seen above
+                counts = [rig.device.status().polling.polls for rig in rigs]  # type: ignore[union-attr]  # seen above
                 await rigs[0].until_samples(30)
-                more = [rig.runner.status().polling.polls - n for rig, n in zip(rigs, counts, strict=True)]  # type: ignore[union-attr]  # seen above
+                more = [rig.device.status().polling.polls - n for rig, n in zip(rigs, counts, strict=True)]  # type: ignore[union-attr]  # seen above
                 assert max(more) - min(more) <= 2
                 for rig, module in zip(rigs, modules, strict=True):
                     for sample in rig.samples[-10:]:
@@ -57,7 +57,7 @@ def test_several_modules_take_turns(tmp_path: Path) -> None:
                         instants = range(sample.t_ns - line.epoch_ns, sample.t_rx_ns - line.epoch_ns, 500_000)
                         truths = [module.motion.at(instant / 1e9).accel_m_s2 for instant in instants]
                         assert min(dist(sample.accel_m_s2, truth) for truth in truths) < 0.02
-                assert rigs[1].runner.ledger.frames_in_replies >= 1  # the exception that told of old firmware
+                assert rigs[1].device.ledger.frames_in_replies >= 1  # the exception that told of old firmware
                 assert [rig.samples[-1].incli_rad is None for rig in rigs] == [True, True, False]
                 assert [rig.kinds.count(EventKind.UP) for rig in rigs] == [1, 1, 1]
 
@@ -73,9 +73,9 @@ def test_a_dead_module_does_not_stall_the_others(tmp_path: Path) -> None:
                     await rig.until_samples(10)
                 gone.dead = True
                 await rigs[1].until(lambda: rigs[1].state is DeviceState.SEARCHING, "given up")
-                assert rigs[1].runner.status().problem.startswith("no reply from address 2")
-                assert rigs[1].runner.ledger.lost_gap_device == 3
-                line = rigs[0].runner.status().serial_line  # of all its devices, also those that answer
+                assert rigs[1].device.status().problem.startswith("no reply from address 2")
+                assert rigs[1].device.ledger.lost_gap_device == 3
+                line = rigs[0].device.status().serial_line  # of all its devices, also those that answer
                 assert line is not None
                 assert line.timeouts >= 3
                 assert line.late_bytes == line.strange_bytes == line.echoes == 0
@@ -97,9 +97,9 @@ def test_noise_costs_one_sample_and_no_more(tmp_path: Path) -> None:
             async with running(on(path, 1)) as (rig,):
                 await rig.until_samples(10)
                 module.bad_crc = 1
-                await rig.until(lambda: rig.runner.ledger.lost_crc == 1, "damage counted")
+                await rig.until(lambda: rig.device.ledger.lost_crc == 1, "damage counted")
                 module.mute = 1
-                await rig.until(lambda: rig.runner.ledger.lost_gap_device == 1, "silence counted")
+                await rig.until(lambda: rig.device.ledger.lost_gap_device == 1, "silence counted")
                 await rig.until_samples(10)
                 assert rig.kinds.count(EventKind.DOWN) == 0
 
@@ -113,8 +113,8 @@ def test_module_is_told_something_while_it_is_read(tmp_path: Path) -> None:
             async with running(on(path, 1), on(path, 2)) as rigs:
                 for rig in rigs:
                     await rig.until_samples(5)
-                await rigs[0].runner.act("attitude_mode", {"axes": 9})
-                assert await rigs[0].runner.act("read", {"register": "HEADING_MODE"}) == (1,)
+                await rigs[0].device.act("attitude_mode", {"axes": 9})
+                assert await rigs[0].device.act("read", {"register": "HEADING_MODE"}) == (1,)
                 assert (module.settings.heading_mode, other.settings.heading_mode) == (1, 0)
                 await rigs[0].until_samples(5)
                 assert rigs[0].kinds.count(EventKind.DOWN) == 0
@@ -127,7 +127,7 @@ def test_module_at_an_unknown_address_is_found(tmp_path: Path) -> None:
         with wired(tmp_path, slave(4)) as (path, _):
             async with running(on(path, "auto", reply_ms=20)) as (rig,):
                 await rig.until_samples(5)
-                assert rig.runner.status().link == f"{path}, address 4"
+                assert rig.device.status().link == f"{path}, address 4"
 
     run(body())
 
@@ -140,11 +140,11 @@ def test_module_exchanged_for_another_at_the_same_address(tmp_path: Path, monkey
         with wired(tmp_path, module) as (path, _):
             async with running(on(path, 1)) as (rig,):
                 await rig.until_samples(10)
-                await rig.until(lambda: rig.runner.ledger.frames_in_replies > 1, "serial number read")
+                await rig.until(lambda: rig.device.ledger.frames_in_replies > 1, "serial number read")
                 module.serial = serial_of(77)
                 await rig.until(lambda: EventKind.CONFIGURATION in rig.kinds, "told of another module")
                 await rig.until_samples(5)
-                assert rig.runner.status().identity["serial_number"] == serial_of(77).hex().upper()
+                assert rig.device.status().identity["serial_number"] == serial_of(77).hex().upper()
 
     run(body())
 
@@ -154,6 +154,6 @@ def test_fixed_rate_on_a_line(tmp_path: Path) -> None:
         with wired(tmp_path, slave(1)) as (path, _):
             async with running(on(path, 1, rate_hz=20)) as (rig,):
                 await rig.until_samples(5)
-                assert rig.runner.status().expected_rate_hz == 20
+                assert rig.device.status().expected_rate_hz == 20
 
     run(body())

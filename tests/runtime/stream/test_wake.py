@@ -10,33 +10,26 @@ import pytest
 from imud.config import DeviceConfig
 from imud.contracts.status import DeviceState
 from imud.devices.imu61x.uart.commands import OutputMode
-from imud.event import Event, EventKind
+from imud.event import EventKind
 from imud.links.memory import MemoryLink, MemorySettings
-from imud.runtime.detection.remembered import Remembered
-from imud.runtime.stream.runner import DeviceRunner
-from imud.sample import Sample
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xModule
 from imud.sim.ports.uart_wire import heard
+from tests.support.device_rig import DeviceRigs
 from tests.support.imu61x_bench import STILL
 from tests.support.virtual_time import VirtualClock, run_virtually
 
 STEP_S = 0.001
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
-UNTOLD = (
-    "imud.runtime.device",
-    "imud.runtime.path",
-    "imud.runtime.stream.runner",
-    "imud.runtime.detection.round",
-    "imud.runtime.exchange",
-)
 
 
 class Line(MemoryLink):
     """A line with a device at its far end."""
 
-    module: Imu61xModule
-    clock: VirtualClock
+    def __init__(self, settings: MemorySettings, module: Imu61xModule, clock: VirtualClock) -> None:
+        super().__init__(settings)
+        self.module = module
+        self.clock = clock
 
     def write(self, data: bytes) -> None:
         super().write(data)
@@ -52,23 +45,18 @@ class Line(MemoryLink):
 
 
 class Bench:
-    """One runner on the line."""
+    """One device on the line."""
 
     def __init__(self, clock: VirtualClock, settings: Imu61xSettings, hardware: dict[str, Any], **link: Any) -> None:
         self.clock = clock
-        self.samples: list[Sample] = []
-        self.events: list[Event] = []
-        config = DeviceConfig(
-            "bow", link.pop("driver", "imu61x-uart"), None, link.pop("identify", True), "memory",
-            MemorySettings(**{"baud": 115200, **link}),
-        )  # fmt: skip
-        publish = lambda batch: self.samples.extend(batch.samples)  # noqa: E731  # one line of glue
-        self.runner = DeviceRunner(config, 0, publish, self.events.append, Remembered(None))
+        driver, identify = link.pop("driver", "imu61x-uart"), link.pop("identify", True)
+        memory = MemorySettings(**{"baud": 115200, **link})
         self.module = Imu61xModule(clock.now_ns(), settings, replace(STILL, **hardware))
-        self.line = Line(MemorySettings(**{"baud": 115200, **link}))
-        self.line.module, self.line.clock = self.module, clock
-        self.runner.link = self.line
-        self.runner._exchange._write = self.line.write
+        self.line = Line(memory, self.module, clock)
+        self.rigs = DeviceRigs(clock.host)
+        self.rig = self.rigs.add(DeviceConfig("bow", driver, None, identify, "memory", memory), self.line)
+        self.device = self.rig.device
+        self.samples, self.events = self.rig.samples, self.rig.events
 
     @property
     def woken(self) -> list[str]:
@@ -77,18 +65,14 @@ class Bench:
 
     async def until(self, condition: Callable[[], object], limit_s: float = 30.0) -> None:
         """Let time pass until it holds."""
-        end_ns = self.clock.now_ns() + int(limit_s * 1e9)
-        while not condition():
-            assert self.clock.now_ns() < end_ns, (self.runner.status(), self.line.written)
-            await asyncio.sleep(0.01)
-            self.runner.tick(self.clock.now_ns())
+        await self.rig.until(condition, str(self.line.written), limit_s, step_s=0.01)
 
 
 Play = Callable[..., Bench]
 
 
 @pytest.fixture
-def play(monkeypatch: pytest.MonkeyPatch) -> Play:
+def play() -> Play:
     """Runs a story with a runner at work, which is cancelled at its end."""
 
     def run(
@@ -98,23 +82,18 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Play:
         **link: Any,
     ) -> Bench:
         clock = VirtualClock()
-        clock.stand_for_monotonic(monkeypatch, *UNTOLD)
         benches: list[Bench] = []
 
         async def both() -> None:
             bench = Bench(clock, settings, hardware or {}, **link)
             benches.append(bench)
             carrying = asyncio.create_task(bench.line.carry())
-            running = asyncio.create_task(bench.runner.run())
             try:
-                await story(bench)
+                async with bench.rigs.at_work():
+                    await story(bench)
             finally:
-                running.cancel()
-                await asyncio.gather(running, return_exceptions=True)
-                bench.runner.close()
                 carrying.cancel()
                 await asyncio.gather(carrying, return_exceptions=True)
-            assert bench.runner.ledger.closes()
 
         run_virtually(clock, both())
         return benches[0]
@@ -126,9 +105,9 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Play:
 def test_device_saved_in_command_mode_is_made_to_stream(play: Play, link: dict[str, Any]) -> None:
     async def story(bench: Bench) -> None:
         await bench.until(lambda: bench.woken and len(bench.samples) > 20)
-        assert bench.runner.state is DeviceState.RUNNING
+        assert bench.device.state is DeviceState.RUNNING
         assert bench.woken == ["it answered and sent no samples: told to stream, which is not saved"]
-        assert bench.runner.status().identity["serial_number"] == "003200473133510D33383736"
+        assert bench.device.status().identity["serial_number"] == "003200473133510D33383736"
 
     bench = play(story, hardware={"boot_ms": 0}, **link)
     assert bench.module.flash.mode is OutputMode.COMMAND
@@ -186,12 +165,12 @@ def test_device_that_acknowledges_and_stays_silent_is_told_of_once(play: Play) -
 
 def test_device_that_was_told_to_be_silent_is_left_so(play: Play) -> None:
     async def story(bench: Bench) -> None:
-        await bench.until(lambda: len(bench.samples) > 20 and bench.runner.status().settings)
-        await bench.runner.act("stop_streaming", {})
+        await bench.until(lambda: len(bench.samples) > 20 and bench.device.status().settings)
+        await bench.device.act("stop_streaming", {})
         count = len(bench.samples)
         with pytest.raises(AssertionError):
             await bench.until(lambda: len(bench.samples) > count + 5, 10)
-        assert bench.runner.state is DeviceState.SILENT
+        assert bench.device.state is DeviceState.SILENT
 
     bench = play(story, Imu61xSettings())
     assert bench.woken == []
@@ -212,11 +191,11 @@ def test_a_link_that_is_gone_needs_nothing(play: Play) -> None:
     async def story(bench: Bench) -> None:
         await bench.until(lambda: bench.module.settings.mode is OutputMode.COMMAND)
         bench.line.disappear()
-        await bench.until(lambda: bench.runner.state is DeviceState.MISSING)
+        await bench.until(lambda: bench.device.state is DeviceState.MISSING)
         count = len(bench.line.written)
         bench.line.appear()
         await bench.until(lambda: len(bench.line.written) > count)
         await bench.until(lambda: len(bench.samples) > 20)  # asked again, which begins with what it is in
-        assert bench.runner.state is DeviceState.RUNNING
+        assert bench.device.state is DeviceState.RUNNING
 
     play(story, Imu61xSettings(), {"answers_while_streaming": False})

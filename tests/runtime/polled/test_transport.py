@@ -4,16 +4,13 @@ import asyncio
 import errno
 from math import dist, sqrt
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import pytest
 
-from imud.contracts.polling import Reading
 from imud.contracts.status import DeviceState
-from imud.devices.imu61x.spi.driver import DRIVER
 from imud.event import EventKind
-from tests.support.polled import device_config
+from tests.support.device_rig import device_config
 from tests.support.stage import RATE_HZ, Stage, on_i2c
 from tests.support.virtual_time import VirtualClock
 
@@ -46,7 +43,7 @@ def test_spi_samples_are_the_truth_of_the_latched_instant(
     async def body() -> None:
         async with stage.running(stage.on_spi(burst=burst, update_hz=1000)) as (rig,):
             await rig.until_samples(60)
-            status = rig.runner.status()
+            status = rig.device.status()
             assert status.identity == {"product": "IMU614"}
             assert status.link == f"{stage.node}, mode 3"
             assert status.settings["burst"] == ("extended" if burst == "extended" else "standard")
@@ -137,22 +134,35 @@ def test_vanished_device_is_not_believed_before_it_is_identified(stage: Stage, f
     stage.run(body())
 
 
-def test_readings_on_their_way_when_it_vanished_are_not_believed(stage: Stage) -> None:
-    """The thread may have read more before it hears that the device is gone."""
+def test_readings_on_their_way_when_it_vanished_are_not_decoded(stage: Stage) -> None:
+    """On a bus that is never idle the thread has read more before it hears that the device is gone."""
     device = stage.registers()
-    stage.spi.device = device.spi
+    armed, gone_ns, good_after = False, 0, 0
+
+    def answer(selections: Any, mode: int) -> list[bytes]:
+        nonlocal gone_ns, good_after
+        stage.clock.advance(2_000_000)
+        miso = device.spi(selections, mode)
+        if not armed or selections[0][:1] != b"\x80":
+            return miso
+        if gone_ns:
+            good_after += 1
+            return miso
+        gone_ns = stage.clock.now_ns()
+        return [b"\xff" * 32]
+
+    stage.spi.device = answer
 
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
-            await rig.until_samples(3)
-            now_ns = stage.clock.now_ns()
-            good = DRIVER.example_reading(Random(1))
-            gone = [Reading(0, b"\xff" * 32, None, now_ns, now_ns), Reading(0, good, None, now_ns, now_ns)]
-            before, count = rig.runner.ledger.bytes_skipped, len(rig.samples)
-            rig.runner._take(gone, None)
-            rig.runner._take(gone[1:], None)
-            assert len(rig.samples) == count
-            assert rig.runner.ledger.bytes_skipped == before + 28 + 32 + 32
+        nonlocal armed
+        async with stage.running(stage.on_spi(rate_hz=1000)) as (rig,):
+            await rig.until_samples(20)
+            before, armed = rig.ledger.bytes_skipped, True
+            await rig.until(lambda: EventKind.DOWN in rig.kinds, "down")
+            assert max(sample.t_rx_ns for sample in rig.samples) < gone_ns
+            assert good_after > 1
+            armed = False
+            await rig.until(lambda: rig.ledger.bytes_skipped == before + 28 + 32 * good_after, "all counted", 1)
             await rig.until_samples(3)
 
     stage.run(body())
@@ -167,9 +177,9 @@ def test_single_damage_costs_its_sample_and_nothing_else(stage: Stage) -> None:
             await rig.until_samples(5)
             for number in (1, 2):
                 device.faults.flips = 1
-                await rig.until(lambda wanted=number: rig.runner.ledger.frames_bad_crc == wanted, "seen")  # type: ignore[misc]  # bound per round
+                await rig.until(lambda wanted=number: rig.device.ledger.frames_bad_crc == wanted, "seen")  # type: ignore[misc]  # bound per round
                 await rig.until_samples(5)
-            assert rig.runner.ledger.lost_crc == 2
+            assert rig.device.ledger.lost_crc == 2
             assert EventKind.DOWN not in rig.kinds
             assert EventKind.BAD_FRAME in rig.kinds
 
@@ -189,8 +199,8 @@ def test_restarted_device_is_set_up_again(stage: Stage) -> None:
             device.restart()
             await rig.until(lambda: device.filter == 0xB2, "set up again", 11)
             await rig.until_samples(3)
-            assert rig.runner.status().polling.vanished == 1  # type: ignore[union-attr]  # a polled device has it
-            assert rig.runner.ledger.frames_in_replies > 2
+            assert rig.device.status().polling.vanished == 1  # type: ignore[union-attr]  # a polled device has it
+            assert rig.device.ledger.frames_in_replies > 2
 
     stage.run(body())
 
@@ -208,7 +218,7 @@ def test_setting_that_does_not_take_keeps_it_from_running(stage: Stage, monkeypa
 
     async def body() -> None:
         async with stage.running(config) as (rig,):
-            await rig.until(lambda: "read back 0xbb" in rig.runner.status().problem, "told")
+            await rig.until(lambda: "read back 0xbb" in rig.device.status().problem, "told")
             assert rig.state is DeviceState.SEARCHING
             assert not rig.samples
 
@@ -223,17 +233,17 @@ def test_auto_finds_driver_and_address_and_does_not_take_one_twice(stage: Stage)
 
             def settled() -> bool:
                 for rig in rigs:
-                    rig.runner.tick(stage.clock.now_ns())
-                return all(rig.state is DeviceState.RUNNING or rig.runner.status().problem for rig in rigs)
+                    rig.device.tick(stage.clock.now_ns())
+                return all(rig.state is DeviceState.RUNNING or rig.device.status().problem for rig in rigs)
 
             await rigs[0].until(settled, "settled")
             there = [rig for rig in rigs if rig.state is DeviceState.RUNNING]
-            assert {rig.runner.status().link for rig in there} == {
+            assert {rig.device.status().link for rig in there} == {
                 "/dev/i2c-1, address 0x19", "/dev/i2c-1, address 0x1b"
             }  # fmt: skip
             (left,) = (rig for rig in rigs if rig not in there)
-            await left.until(lambda: "another device of this configuration" in left.runner.status().problem, "told")
-            assert {rig.runner.status().identity["product"] for rig in there} == {"IMU612", "IMU618"}
+            await left.until(lambda: "another device of this configuration" in left.device.status().problem, "told")
+            assert {rig.device.status().identity["product"] for rig in there} == {"IMU612", "IMU618"}
 
     stage.run(body())
 
@@ -246,11 +256,11 @@ def test_vanished_device_does_not_hold_up_the_others(stage: Stage) -> None:
     async def body() -> None:
         async with stage.running(on_i2c("there", address=0x18), on_i2c("gone", address=0x19)) as (good, bad):
             await good.until_samples(100)
-            polling = good.runner.status().polling
+            polling = good.device.status().polling
             assert polling is not None
             assert (polling.missed, polling.late) == (0, 0)
             assert bad.state is DeviceState.SEARCHING
-            assert "no acknowledgement at address 0x19" in bad.runner.status().problem
+            assert "no acknowledgement at address 0x19" in bad.device.status().problem
             gone.faults.error = 0
             await bad.until_samples(3)
 
@@ -266,7 +276,7 @@ def test_repeated_values_are_stale_and_then_silence(stage: Stage) -> None:
             await rig.until_samples(3)
             device.faults.frozen = True
             await rig.until(lambda: rig.state is DeviceState.SILENT, "silent")
-            polling, ledger = rig.runner.status().polling, rig.runner.ledger
+            polling, ledger = rig.device.status().polling, rig.device.ledger
             assert polling is not None
             assert polling.stale == ledger.frames_ignored > 10
             assert ledger.lost() == 0
@@ -285,7 +295,7 @@ def test_device_slower_than_its_polls_gives_each_value_once(stage: Stage) -> Non
             await rig.until_samples(20)
         values = [sample.accel_m_s2 for sample in rig.samples]
         assert len(set(values)) == len(values)
-        polling = rig.runner.status().polling
+        polling = rig.device.status().polling
         assert polling is not None
         assert polling.stale > 2 * len(values)
         steps = [b.t_ns - a.t_ns for a, b in zip(rig.samples[5:], rig.samples[6:], strict=False)]
@@ -314,7 +324,7 @@ def test_missing_bus_is_waited_for_and_lost_again(stage: Stage) -> None:
             device.faults.error = 0
             plug()
             await rig.until_samples(3)
-            assert rig.runner.status().connects == 2
+            assert rig.device.status().connects == 2
 
     stage.run(body())
 
@@ -325,7 +335,7 @@ def test_bus_that_may_not_be_opened_fails_with_the_reason(stage: Stage) -> None:
     async def body() -> None:
         async with stage.running(stage.on_spi()) as (rig,):
             await rig.until(lambda: rig.state is DeviceState.FAILED, "failed")
-            assert "in use" in rig.runner.status().problem
+            assert "in use" in rig.device.status().problem
             stage.spi.open_error = 0
             stage.spi.device = stage.registers().spi
             await rig.until_samples(1)
@@ -346,13 +356,13 @@ def test_slow_transfers_miss_deadlines_which_are_lost_samples(stage: Stage, capl
         async with stage.running(stage.on_spi(rate_hz=1000)) as (rig,):
             await rig.until_samples(10)
             await rig.until(lambda: EventKind.LOSS in rig.kinds, "told")
-            polling = rig.runner.status().polling
+            polling = rig.device.status().polling
             assert polling is not None
             # a transfer takes 5.16 ms, the first read has three: as many deadlines as ms pass, kept or missed
             assert polling.polls + polling.missed == pytest.approx(5.16 * (polling.polls + 2), abs=1.5)
             assert polling.late > 0.5 * polling.polls
             assert polling.late_sum_ns // polling.polls == polling.late_mean_ns > 0
             assert "no value of it is new" not in caplog.text  # it was not asked for long enough to say so
-            assert rig.runner.ledger.lost_queue == polling.missed >= 30
+            assert rig.device.ledger.lost_queue == polling.missed >= 30
 
     stage.run(body())

@@ -1,0 +1,255 @@
+"""A CAN bus: the driver of the device is named, or found by listening; its frames are those of its filters."""
+
+from collections.abc import Sequence
+from random import Random
+
+from imud.contracts.action import Action, Target
+from imud.contracts.can import CanCodec, CanDriver
+from imud.contracts.driver import Identity, of_kind
+from imud.contracts.link import CanLink, OnEnd
+from imud.contracts.settings import Settings
+from imud.contracts.status import DeviceState, DeviceStatus
+from imud.devices import DRIVERS
+from imud.errors import LinkError
+from imud.formats.can import CanFrame, frame_bits
+from imud.runtime.can.buses import CanBuses
+from imud.runtime.detection import CanFound, CanSearch
+from imud.runtime.detection.remembered import Remembered, RememberedDevice
+from imud.runtime.detection.rounds import EVERYTHING, CanRound
+from imud.runtime.exchange import Exchange
+from imud.runtime.path import CanPath, SamplePath
+from imud.runtime.search_loop import SearchLoop
+from imud.runtime.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext
+from imud.units import NS_PER_S
+
+
+class CanTransport:
+    """Brings the frames of one device on a CAN bus. Synchronization: the event loop's thread only."""
+
+    def __init__(self, context: DeviceContext, link: CanLink, buses: CanBuses, remembered: Remembered) -> None:
+        """`buses` is what the devices of a daemon share. Raises LinkError for a driver that is none for CAN."""
+        self.link = link
+        self.driver: CanDriver | None = None
+        self.path: CanPath | None = None
+        self._config = context.config
+        self._context = context
+        self._health = context.health
+        self._now_ns = context.host.now_ns
+        self._buses = buses
+        self._remembered = remembered
+        self._exchange = Exchange(context.ledger, link.write, self._now_ns)
+        self._search = SearchLoop(context.health, context.attachments, context.host, self._begin_search, self._ask)
+        self._round: CanRound | None = None
+        """The search that frames go to; None while they go to the path."""
+        self._options: Settings | None = None
+        self._codec: CanCodec | None = None
+        self._node: int | None = None
+        """The device that was found, as its driver numbers them; None for a driver that is named."""
+        self._joined = False
+        if not self._searchable:
+            driver = DRIVERS[self._config.driver]
+            if not isinstance(driver, CanDriver):
+                raise LinkError(f"{self._config.name}: expected a driver for CAN, got {driver.name}")
+            self._set_up(driver, self._config.options or driver.settings())
+
+    # --- the bus's life ----------------------------------------------------------------------------------------------
+
+    async def wait_present(self) -> None:
+        """Return when the bus is up. Raises LinkError where another device sends the frames that this one needs."""
+        if not self._searchable and not self._joined:
+            self._join()
+        self._refuse_conflict()
+        if reason := self.link.absence():
+            self._health.down(self._now_ns(), DeviceState.MISSING, reason)
+        await self.link.wait_present()
+
+    def start(self, on_end: OnEnd) -> None:
+        """Deliver frames from now on, and begin the search."""
+        self._search.start()
+        self.link.start(self._on_frames, self._on_news, on_end)
+
+    async def work(self) -> None:
+        """Find the device and ask it, as often as needed; ends only with the link."""
+        await self._search.run()
+
+    def stop(self) -> None:
+        """End the search and close the link; may be called twice."""
+        self._search.stop()
+        if self._searchable:
+            self._leave()
+        self.link.close()
+
+    def close(self) -> None:
+        """Stop, and leave the bus; may be called twice."""
+        self.stop()
+        self._leave()
+
+    # --- the search --------------------------------------------------------------------------------------------------
+
+    def _begin_search(self) -> CanRound | None:
+        """Listen to the whole bus, until a single device that no other configuration has is heard."""
+        if not self._searchable:
+            self._begin()
+            return None
+        name, link, last = self._config.name, self.link, self._remembered.get(self._config.name)
+        self._leave()
+        if self.path is not None:
+            self.path.reset()
+            self.path.begin(self._now_ns())
+        link.filters = EVERYTHING
+        search = CanSearch(
+            of_kind(DRIVERS.values(), CanDriver),
+            self.where,
+            claimed=self._buses.claimed(name, link.bus),
+            remembered=(last.driver, last.node) if last and last.node is not None else None,
+        )
+        self._round = CanRound(search, self._context.ledger, self._on_found, self._now_ns)
+        self._round.start()
+        return self._round
+
+    def _on_found(self, found: CanFound) -> None:
+        """Go on with the device that was found."""
+        driver, node = found.device
+        if driver is not self.driver or node != self._node:
+            self._node = node
+            self._set_up(driver, driver.node_settings(node))
+        self._join()
+        self._remembered.put(self._config.name, RememberedDevice(driver.name, 0, node))
+        self._begin()
+
+    def _set_up(self, driver: CanDriver, options: Settings) -> None:
+        """Make codec, clock and path for a device."""
+        if self.path is not None:
+            self.path.reset()
+        context = self._context
+        clock = context.new_clock(driver, self.path)
+        self.driver = driver
+        self._options = options
+        self._codec = driver.make_codec(context.ledger, options)
+        self.path = CanPath(self._codec, clock, context.path_context(self.link, self._exchange.on_message))
+
+    def _begin(self) -> None:
+        """Give frames that come from now on to the device's codec."""
+        link, path, driver = self.link, self.path, self.driver
+        assert driver is not None
+        assert path is not None
+        self._round = None
+        link.filters = driver.filters(self._options)
+        path.clock.restart()
+        first = driver.example_frames(Random(0))[0]
+        bits = frame_bits(first.extended, len(first.data))
+        path.set_frame_time(bits * NS_PER_S // link.bitrate if link.bitrate else 0)
+        path.loss.link_opened()
+        path.begin(self._now_ns())
+        self._context.attachments.start(path.clock)
+
+    # --- what devices of one bus know of each other ------------------------------------------------------------------
+
+    def _join(self) -> None:
+        driver, options = self.driver, self._options
+        assert driver is not None
+        cyclic = driver.cyclic(options) if self.link.writable else ()
+        self._buses.join(self._config.name, self.link.bus, driver.filters(options), cyclic)
+        self._joined = True
+
+    def _leave(self) -> None:
+        if self._joined:
+            self._joined = False
+            self._buses.leave(self._config.name)
+
+    def _refuse_conflict(self) -> None:
+        if conflict := self._buses.conflict(self._config.name):
+            raise LinkError(conflict)
+
+    # --- asking ------------------------------------------------------------------------------------------------------
+
+    async def _ask(self) -> None:
+        """Have the link send what the device needs, and ask for identity and settings where that is allowed.
+
+        Raises LinkError where another device sends it already.
+        """
+        self._refuse_conflict()
+        driver, options = self.driver, self._options
+        if driver is None or not self.link.writable:
+            return
+        if frames := driver.cyclic(options):
+            self.link.send_cyclic(frames)
+        if self._config.identify:
+            await self._context.identity.ask(
+                self._exchange, lambda: driver.identify(options), lambda: driver.read_settings(options), self._apply
+            )
+
+    def _apply(self, identity: Identity) -> None:
+        if self.driver is not None and self._codec is not None:
+            self.driver.apply_identity(self._codec, identity)
+
+    async def run_action(self, action: Action, params: Settings) -> object:
+        """Run an action of the driver on the device that is heard: one that was found has a number of its own."""
+        return await self._exchange.run(action.script(Target(self._options, self.bit_rate), params))
+
+    # --- the flow ----------------------------------------------------------------------------------------------------
+
+    def _on_frames(self, frames: Sequence[CanFrame]) -> None:
+        if self._round is not None:
+            self._round.on_frames(frames)
+        elif self.path is not None:
+            self.path.on_frames(frames)
+
+    def _on_news(self, news: str, problem: str) -> None:
+        """Show trouble of the bus, or its end."""
+        self._health.on_link_news(self._now_ns(), news, problem)
+
+    def tick(self, now_ns: int) -> None:
+        """No-op: frames come by themselves."""
+
+    def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
+        """Report what is heard instead, and search anew after a long silence."""
+        health, driver = self._health, self.driver
+        since_ns = health.silent_since_ns if health.state is DeviceState.SILENT else path.begun_ns
+        if self._searchable and now_ns - since_ns > SILENT_SEARCH_NS:
+            self._search.search_again()
+        if health.state is not DeviceState.SEARCHING or driver is None or now_ns - path.begun_ns <= UNHEARD_NS:
+            return
+        if path.last_data_ns > path.begun_ns:
+            health.report(f"frames of {driver.name} come on {self.where}, but no whole sample")
+        else:
+            health.report(f"nothing of {driver.name} is heard on {self.where}: is its identifier right?")
+
+    def on_reset(self) -> None:
+        """No-op: the device sends again by itself."""
+
+    # --- what it looks like ------------------------------------------------------------------------------------------
+
+    @property
+    def where(self) -> str:
+        """The bus and its rate, for people."""
+        return f"{self.link.title} at {self.link.bitrate // 1000} kbit/s" if self.link.bitrate else self.link.title
+
+    @property
+    def bit_rate(self) -> int:
+        """Rate of the bus in bit/s; 0 where it is not known."""
+        return self.link.bitrate
+
+    @property
+    def receiving(self) -> bool:
+        """Whether frames go to the device's codec."""
+        return self._round is None
+
+    @property
+    def hears_replies(self) -> bool:
+        """Whether a codec hears replies: that of a named driver does, so that a device that sends nothing can be set
+        to send."""
+        return self.path is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request script is running."""
+        return self._exchange.busy
+
+    def add_status(self, status: DeviceStatus) -> DeviceStatus:
+        """Return the status as it is."""
+        return status
+
+    @property
+    def _searchable(self) -> bool:
+        return self._config.driver == "auto"

@@ -1,0 +1,75 @@
+"""The state of a device and what is wrong with it: shown in its status, logged, raised as events UP and DOWN.
+
+Trouble of a link that goes on (a CAN bus that is error-passive) stays shown while samples flow, and explains why none
+come.
+"""
+
+import logging
+
+from imud.contracts.status import DeviceState
+from imud.event import EventKind
+from imud.runtime.notices import Notices
+
+log = logging.getLogger(__name__)
+
+STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
+
+
+class Health:
+    """State and problem of one device; all times are CLOCK_MONOTONIC in ns. Synchronization: the loop's thread only."""
+
+    def __init__(self, notices: Notices) -> None:
+        self.state = DeviceState.MISSING
+        self.problem = ""
+        """What is wrong, one sentence; empty for nothing."""
+        self.silent_since_ns = 0
+        """CLOCK_MONOTONIC when the state became SILENT."""
+        self.link_problem = ""
+        """What is wrong with the link though it goes on; empty for nothing."""
+        self._notices = notices
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the device was found and its link is there."""
+        return self.state in STREAMING
+
+    def link_opened(self) -> None:
+        """Clear the problem: the link is open."""
+        self.problem = self.link_problem = ""
+
+    def searching(self) -> None:
+        """Enter SEARCHING; what is wrong stays shown until something is found."""
+        self.state = DeviceState.SEARCHING
+
+    def finished(self) -> None:
+        """Enter FINISHED: a replay came to its end."""
+        self.state, self.problem = DeviceState.FINISHED, ""
+
+    def up(self, now_ns: int, driver: str, where: str, bit_rate: int) -> None:
+        """Enter RUNNING: samples of `driver` come on the link `where`."""
+        self.state, self.problem = DeviceState.RUNNING, self.link_problem
+        self._notices.raise_event(now_ns, EventKind.UP, f"{driver} on {where}", driver=driver, baud=bit_rate)
+
+    def down(self, now_ns: int, state: DeviceState, problem: str) -> None:
+        """Enter a state in which no samples come, for the reason `problem`."""
+        if state is DeviceState.SILENT:
+            problem = self.link_problem or problem
+            self.silent_since_ns = now_ns
+        was_up, changed = self.streaming, state is not self.state or problem != self.problem
+        self.state, self.problem = state, problem
+        if was_up:
+            self._notices.raise_event(now_ns, EventKind.DOWN, problem, state=str(state))
+        elif changed:
+            log.warning("%s: %s", self._notices.device, problem)
+
+    def report(self, problem: str) -> None:
+        """Show what is wrong while the state stays; trouble of the link takes precedence."""
+        problem = self.link_problem or problem
+        if problem != self.problem:
+            log.warning("%s: %s", self._notices.device, problem)
+        self.problem = problem
+
+    def on_link_news(self, now_ns: int, news: str, problem: str) -> None:
+        """Raise an event: the state of the link changed, and `problem` is what is wrong with it from now on."""
+        self.link_problem = self.problem = problem
+        self._notices.raise_event(now_ns, EventKind.LINK, news, problem=problem)

@@ -1,0 +1,82 @@
+"""Who a device is and how it is set: asked for, kept, and compared with what it said before.
+
+A device that was unplugged and comes back may be another one, or have other settings.
+"""
+
+import logging
+from collections.abc import Callable, Mapping
+
+from imud.contracts.driver import Identity
+from imud.contracts.session import RequestScript
+from imud.errors import CommandError
+from imud.event import EventKind
+from imud.runtime.exchange import Exchange
+from imud.runtime.notices import Notices
+
+log = logging.getLogger(__name__)
+
+IDENTIFY_TRIES = 3
+
+
+def ignore_settings(_settings: Mapping[str, str]) -> None:
+    """Where nothing depends on the settings of the device."""
+
+
+class KnownIdentity:
+    """Identity and settings of one device as read back last. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self,
+        notices: Notices,
+        now_ns: Callable[[], int],
+        on_settings: Callable[[Mapping[str, str]], None] = ignore_settings,
+    ) -> None:
+        """`on_settings` is called with settings as they are read back."""
+        self.identity = Identity()
+        self.settings: Mapping[str, str] = {}
+        self._notices = notices
+        self._now_ns = now_ns
+        self._on_settings = on_settings
+
+    async def ask(
+        self,
+        exchange: Exchange,
+        identify: Callable[[], RequestScript[Identity]],
+        read_settings: Callable[[], RequestScript[Mapping[str, str]]],
+        apply: Callable[[Identity], None],
+    ) -> None:
+        """Ask for identity and settings; `apply` gets the identity. A device that does not answer is left as it is."""
+        for attempt in range(1, IDENTIFY_TRIES + 1):
+            try:
+                identity = await exchange.run(identify())
+                apply(identity)
+                self.update(identity, await exchange.run(read_settings()))
+                return
+            except CommandError as error:
+                log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, IDENTIFY_TRIES)
+
+    def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
+        """Keep what the device said; raise an event for what differs from before."""
+        now_ns, before, known = self._now_ns(), self.identity, self.settings
+        if before.serial_number and identity.serial_number != before.serial_number:
+            message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
+            serial_number = identity.serial_number
+            self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, serial_number=serial_number)
+        changed = {name: value for name, value in settings.items() if known.get(name, value) != value}
+        if changed:
+            words = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
+            message = f"settings of the device changed: {words}"
+            self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, **changed)
+        self.identity, self.settings = identity, settings
+        self._on_settings(settings)
+
+
+def identity_words(identity: Identity) -> dict[str, str]:
+    """Return an identity as the flat mapping of `DeviceStatus`, empty members left out."""
+    words = {
+        "product": identity.product,
+        "serial_number": identity.serial_number,
+        "firmware": identity.firmware,
+        **(identity.details or {}),
+    }
+    return {name: value for name, value in words.items() if value}

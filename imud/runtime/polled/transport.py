@@ -1,0 +1,307 @@
+"""A bus that is polled: the device is identified and set up before it is read, and again whenever it vanished.
+
+MISSING ──bus appears──▶ SEARCHING ──identified, set up, samples──▶ RUNNING ──same bytes for a while──▶ SILENT
+   ▲                        ▲                                          │                                   │
+   └──────── bus gone ──────┴──── no answer, wrong id, bad frames ─────┴───────────────────────────────────┘
+
+Readings are decoded only between an identification and the first sign that the device is not there any more.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from imud.contracts.action import Action, Target
+from imud.contracts.codec import Message
+from imud.contracts.driver import Identity, of_kind
+from imud.contracts.link import OnEnd, PolledLink
+from imud.contracts.polling import PolledDriver, Reading
+from imud.contracts.settings import Settings
+from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
+from imud.devices import DRIVERS
+from imud.errors import CommandError, DeviceRefused, LinkError, TransferError, Trouble
+from imud.links import LINKS
+from imud.runtime.path import SamplePath
+from imud.runtime.polled.bus import BusMember, PolledBuses
+from imud.runtime.polled.data_ready import DataReady
+from imud.runtime.polled.path import PolledPath, PollTiming
+from imud.runtime.polled.schedule import Deadlines
+from imud.runtime.transport import UNHEARD_NS, DeviceContext
+from imud.units import NS_PER_MS, NS_PER_S
+
+RETRY_S = 0.5
+"""Pause between two rounds of search."""
+TURNS_PERIOD_NS = 200 * NS_PER_MS
+"""Time between two reads of a device that is read in turns with others: five of them are no silence."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifiedDevice:
+    """A device that answered on the bus."""
+
+    driver: PolledDriver
+    options: Settings
+    target: int
+    identity: Identity
+
+
+class PolledTransport:
+    """Reads one device on a polled bus. Synchronization: the event loop's thread only."""
+
+    def __init__(self, context: DeviceContext, link: PolledLink, buses: PolledBuses, ready: DataReady | None) -> None:
+        """`buses` is what the devices of a daemon share; `ready` is the device's data-ready line, if it has one."""
+        self.link = link
+        self.driver: PolledDriver | None = None
+        self.path: PolledPath | None = None
+        self._config = context.config
+        self._context = context
+        self._health = context.health
+        self._now_ns = context.host.now_ns
+        self._buses = buses
+        self._ready = ready
+        self._member: BusMember | None = None
+        self._deadlines = Deadlines()
+        self._device: IdentifiedDevice | None = None
+        """The device that was read last."""
+        self._identified = False
+        """Whether what is read is that of the identified device."""
+        self._gone: asyncio.Future[str] | None = None
+        """Completes with why the device must be identified again."""
+        self._on_end: OnEnd | None = None
+        self._vanished = 0
+        self._lost_counted = 0
+
+    # --- the bus's life ----------------------------------------------------------------------------------------------
+
+    async def wait_present(self) -> None:
+        """Return when the bus is there."""
+        await self.link.wait_present()
+
+    def start(self, on_end: OnEnd) -> None:
+        """Join the bus."""
+        self._on_end = on_end
+        self._health.searching()
+        self._member = self._buses.get(self.link.bus).join(self.link, self._deadlines, self._on_readings)
+
+    async def work(self) -> None:
+        """Find, set up, read; and again. Ends only with the bus."""
+        member, attachments = self._member, self._context.attachments
+        assert member is not None
+        while True:
+            await attachments.reset_settled()
+            device = await self._find(member)
+            if device is not None and await self._set_up(member, device):
+                await self._read(member, device)
+                continue
+            await asyncio.sleep(RETRY_S)
+            await attachments.device_not_found(self._now_ns())
+
+    def stop(self) -> None:
+        """Leave the bus, whose thread closes the link; may be called twice."""
+        member, self._member = self._member, None
+        self._identified = False
+        if member is not None:
+            member.leave()
+
+    def close(self) -> None:
+        """Stop; may be called twice."""
+        self.stop()
+
+    # --- the search --------------------------------------------------------------------------------------------------
+
+    async def _find(self, member: BusMember) -> IdentifiedDevice | None:
+        """Try all places once; return None when no device is there."""
+        problems: list[str] = []
+        for driver in self._candidates():
+            options = self._config.options or driver.settings()
+            for target in self._targets(driver):
+                place = self.link.place(target)
+                if not member.claim(target):
+                    problems.append(f"{place}: another device of this configuration")
+                    continue
+                try:
+                    return IdentifiedDevice(driver, options, target, await member.run(driver.probe(options), target))
+                except (TransferError, DeviceRefused) as error:
+                    member.release()
+                    problems.append(f"{place}: {error}")
+                    if isinstance(error, TransferError) and error.trouble is Trouble.STUCK:
+                        break  # another try would hold up the other devices of the bus
+        self._health.report("; ".join(dict.fromkeys(problems)))
+        return None
+
+    async def _set_up(self, member: BusMember, device: IdentifiedDevice) -> bool:
+        """Make the device what the configuration says; return False when that failed."""
+        try:
+            settings = await member.run(device.driver.set_up(device.options), device.target)
+        except (TransferError, DeviceRefused) as error:
+            member.release()
+            self._health.report(f"{self.link.place(device.target)}: {error}")
+            return False
+        self._context.identity.update(device.identity, settings)
+        return True
+
+    async def _read(self, member: BusMember, device: IdentifiedDevice) -> None:
+        """Read until the device is gone. Raises LinkError when its bus is."""
+        gone = self._gone = asyncio.get_running_loop().create_future()
+        path, ready = self._begin(device), self._ready
+        if ready is not None:
+            ready.read(member, path.codec.polls, self._deadlines, self._now_ns())
+        else:
+            member.start(path.codec.polls)
+        try:
+            why = await gone
+        finally:
+            self._identified = False
+            if ready is not None:
+                ready.stop()
+            member.stop()
+            member.release()
+        self._vanished += 1
+        self._health.down(self._now_ns(), DeviceState.SEARCHING, why)
+
+    def _begin(self, device: IdentifiedDevice) -> PolledPath:
+        path = self.path
+        if path is None or device.driver is not self.driver:
+            path = self._new_path(device)
+        path.clock.restart()
+        self._device = device
+        path.begin(self._now_ns())
+        self._identified = True
+        self._context.attachments.start(path.clock)
+        return path
+
+    def _new_path(self, device: IdentifiedDevice) -> PolledPath:
+        context, driver, rate_hz = self._context, device.driver, self.link.rate_hz
+        clock = context.new_clock(driver, self.path)
+        codec = driver.make_codec(context.ledger, device.options)
+        timing = PollTiming(
+            round(NS_PER_S / rate_hz) if rate_hz else TURNS_PERIOD_NS,
+            driver.update_ns(device.options),
+            self._ready.edges if self._ready is not None else None,
+        )
+        self.driver = driver
+        self.path = PolledPath(codec, timing, clock, context.path_context(self.link, _ignore_message))
+        return self.path
+
+    def _candidates(self) -> list[PolledDriver]:
+        named = self._config.driver != "auto"
+        drivers = of_kind([DRIVERS[self._config.driver]] if named else DRIVERS.values(), PolledDriver)
+        return [driver for driver in drivers if LINKS[self._config.link].fits(driver)]
+
+    def _targets(self, driver: PolledDriver) -> Sequence[int]:
+        """Return where to look, beginning where the device was."""
+        if self.link.target is not None:
+            return (self.link.target,)
+        last = (self._device.target,) if self._device is not None else ()
+        return tuple(dict.fromkeys((*last, *driver.targets)))
+
+    async def run_action(self, action: Action, params: Settings) -> object:
+        """Run an action of the driver between two reads."""
+        member, device = self._member, self._device
+        if member is None or device is None:
+            raise CommandError(f"{self._config.name} is not there")
+        options = self._config.options or device.driver.settings()
+        return await member.run(action.script(Target(options, self.bit_rate), params), device.target)
+
+    # --- the flow ----------------------------------------------------------------------------------------------------
+
+    def _on_readings(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
+        """Decode what the bus's thread hands over."""
+        path, why = self.path, ""
+        if self._ready is not None:
+            self._ready.drain()  # all edges before the end of a read are needed to say which of them it belongs to
+        if path is not None and self._identified:
+            why = path.on_readings(readings)
+        elif path is not None:
+            for reading in readings:
+                path.skip(reading)
+        if why or problem is not None:
+            self._identified = False
+        if problem is not None and self._on_end is not None:
+            self._on_end(problem)
+        elif why:
+            self._identify_again(why)
+
+    def _identify_again(self, why: str) -> None:
+        """Stop reading until the device is identified again."""
+        self._identified = False
+        if self._gone is not None and not self._gone.done():
+            self._gone.set_result(why)
+
+    def tick(self, _now_ns: int) -> None:
+        """Count deadlines and edges without a read as lost samples."""
+        lost = self._missed
+        self._context.ledger.lost_queue += lost - self._lost_counted
+        self._lost_counted = lost
+
+    def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
+        """Report that the device answers, where no sample came since the beginning."""
+        if self._health.state is DeviceState.SEARCHING and now_ns - path.begun_ns > UNHEARD_NS:
+            self._health.report("the device answers, but no value of it is new: is it held in reset?")
+
+    def on_reset(self) -> None:
+        """Identify the device again: its settings are lost."""
+        self._identify_again("reset by its line")
+
+    # --- what it looks like ------------------------------------------------------------------------------------------
+
+    @property
+    def where(self) -> str:
+        """The bus and the place of the device on it, for people."""
+        return f"{self.link.title}, {self.link.place(self._device.target)}" if self._device else self.link.title
+
+    @property
+    def bit_rate(self) -> int:
+        """0: the rate of a bus is set for all of its devices."""
+        return 0
+
+    @property
+    def receiving(self) -> bool:
+        """Whether what is read is decoded."""
+        return self._identified
+
+    @property
+    def hears_replies(self) -> bool:
+        """Whether there is a device to talk to before the first sample: before it is identified, there is not."""
+        return False
+
+    @property
+    def busy(self) -> bool:
+        """False: scripts and reads take turns."""
+        return False
+
+    def add_status(self, status: DeviceStatus) -> DeviceStatus:
+        """Return the status with how reading goes."""
+        ready, lines = self._ready, status.lines
+        return msgspec.structs.replace(
+            status,
+            expected_rate_hz=ready.expected_rate_hz if ready is not None else self.link.rate_hz,
+            polling=self._polling_status(),
+            serial_line=self.link.serial_line(),
+            lines=ready.add_status(lines) if ready is not None and lines is not None else lines,
+        )
+
+    @property
+    def _missed(self) -> int:
+        """Deadlines and data-ready edges for which nothing was read."""
+        return self._deadlines.missed + (self._ready.edges.missed if self._ready is not None else 0)
+
+    def _polling_status(self) -> PollingStatus:
+        path, deadlines = self.path, self._deadlines
+        return PollingStatus(
+            polls=deadlines.polls,
+            late=deadlines.late,
+            missed=self._missed,
+            stale=path.codec.stale if path else 0,
+            failed=path.failed if path else 0,
+            vanished=self._vanished,
+            late_mean_ns=deadlines.sum_late_ns // deadlines.polls if deadlines.polls else 0,
+            late_worst_ns=deadlines.worst_ns,
+            late_sum_ns=deadlines.sum_late_ns,
+        )
+
+
+def _ignore_message(_message: Message, _t_rx_ns: int) -> None:
+    """Ignore what no polled codec makes: it answers to transfers."""

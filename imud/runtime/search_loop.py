@@ -1,0 +1,96 @@
+"""Finds the device on a link, asks it, and searches again when that is wanted: the same for streams and CAN buses.
+
+    begin ──round──▶ found ──▶ ask ──▶ wait until `search_again`
+      ▲                │ nothing: report, reset line          │
+      └────────────────┴──────────────────────────────────────┘
+
+Where driver and rate are configured there is no round: `begin` has set up the device at once.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Protocol
+
+from imud.errors import NothingHeard
+from imud.host_clock import HostClock
+from imud.runtime.attachments import Attachments
+from imud.runtime.health import Health
+
+
+class BegunRound(Protocol):
+    """One round that has begun, on a stream or a CAN bus."""
+
+    async def finished(self) -> None:
+        """Return when a device was found. Raises NothingHeard with what was heard instead, and LinkError."""
+        ...
+
+    def cancel(self) -> None:
+        """Stop searching; may be called twice."""
+        ...
+
+
+class SearchLoop:
+    """Drives the rounds of search of one link. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self,
+        health: Health,
+        attachments: Attachments,
+        host: HostClock,
+        begin: Callable[[], BegunRound | None],
+        ask: Callable[[], Awaitable[None]],
+    ) -> None:
+        """`begin` starts a round, or sets up the configured device and returns None; `ask` is called after each."""
+        self._health = health
+        self._attachments = attachments
+        self._host = host
+        self._begin = begin
+        self._ask = ask
+        self._round: BegunRound | None = None
+        self._again = asyncio.Event()
+
+    @property
+    def requested(self) -> bool:
+        """Whether another search was requested and has not begun."""
+        return self._again.is_set()
+
+    def start(self) -> None:
+        """Begin a search, in place of one that goes on."""
+        self.stop()
+        self._again.clear()
+        self._health.searching()
+        self._round = self._begin()
+
+    def search_again(self) -> None:
+        """Request another search."""
+        self._again.set()
+
+    def stop(self) -> None:
+        """Cancel the search; may be called twice."""
+        if self._round is not None:
+            self._round.cancel()
+            self._round = None
+
+    async def run(self) -> None:
+        """Search and ask, again and again; the first search has begun. Ends only by an error of the link."""
+        while True:
+            searched = self._round is not None
+            await self._finish_search()
+            await self._ask()
+            await self._again.wait()
+            if not searched:
+                await self._report_absence()
+            self.start()
+
+    async def _finish_search(self) -> None:
+        while self._round is not None:
+            try:
+                await self._round.finished()
+                self._round = None
+            except NothingHeard as error:
+                self._health.report(str(error))
+                await self._report_absence()
+                self.start()
+
+    async def _report_absence(self) -> None:
+        await self._attachments.device_not_found(self._host.now_ns())

@@ -1,0 +1,215 @@
+"""The life of a device on a CAN bus inside the process: streams, loses frames by cause, bus down and up."""
+
+from collections.abc import Callable, Coroutine, Sequence
+from random import Random
+from time import monotonic_ns
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.can import CanDriver
+from imud.contracts.settings import Settings
+from imud.contracts.status import DeviceState, KernelCounters
+from imud.devices import DRIVERS
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.devices.imu61x.can.codec import Imu61xCanSettings, encode_set
+from imud.event import EventKind
+from imud.formats.can import CanFrame
+from imud.links.memory import MemorySettings
+from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.device_rig import play as play_rigs
+
+MS = 1_000_000
+
+
+def configured(
+    driver: str = "imu61x-can", settings: Settings | None = None, *, base_id: int = 101, bitrate: int = 0
+) -> DeviceConfig:
+    """A device on a bus inside the process."""
+    link = MemorySettings(baud=bitrate, name="can0")
+    return DeviceConfig("mast", driver, settings or Imu61xCanSettings(base_id=base_id), True, "memory", link)
+
+
+class Frames:
+    """Samples of a module, whose frames are 1 ms apart."""
+
+    def __init__(self) -> None:
+        self._now_ns = monotonic_ns()
+
+    def of(self, index: int, *, base_id: int = 101, lost: Sequence[int] = ()) -> list[CanFrame]:
+        """The frames of one sample."""
+        self._now_ns = max(self._now_ns, monotonic_ns() - 10 * MS)
+        made = []
+        for place, (can_id, data) in enumerate(
+            encode_set(
+                index=index, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), euler_rad=(0, 0, 0), temperature_c=20,
+                base_id=base_id,
+            )
+        ):  # fmt: skip
+            self._now_ns += MS
+            if place not in lost:
+                made.append(CanFrame(can_id, False, data, self._now_ns))
+        return made
+
+
+class Bench:
+    """One device, and the module at the other end of its bus."""
+
+    def __init__(self, rig: DeviceRig) -> None:
+        self.rig = rig
+        self.link = rig.can_link
+        self.frames = Frames().of
+
+    def feed(self, *indices: int) -> None:
+        """Whole samples, in one read."""
+        assert self.link.feed([frame for index in indices for frame in self.frames(index)])
+
+
+def play(story: Callable[[Bench], Coroutine[Any, Any, None]], config: DeviceConfig | None = None) -> DeviceRig:
+    """Run the device while the story is told; at the end the ledger closes and the link is released."""
+    rigs = DeviceRigs()
+    rig = rigs.add(config or configured())
+
+    async def told(_made: list[DeviceRig]) -> None:
+        await rig.turn(lambda: rig.can_link.listening)
+        await story(Bench(rig))
+
+    play_rigs(rigs, told)
+    assert rig.ledger.frames_pending == 0
+    return rig
+
+
+def test_samples_of_one_read_are_one_batch_with_their_own_times() -> None:
+    async def story(bench: Bench) -> None:
+        bench.feed(1, 2, 3)
+        bench.rig.tick()
+        assert bench.rig.is_in(DeviceState.RUNNING)
+
+    rig = play(story, configured(bitrate=500_000))
+    assert rig.batches == 1
+    assert [s.seq for s in rig.samples] == [1, 2, 3]
+    # measured before its first frame was complete (111 bits at 500 kbit/s), known when the fifth was
+    assert all(4 * MS + 222_000 <= s.t_rx_ns - s.t_ns < 4 * MS + 500_000 for s in rig.samples)
+    assert [b.t_rx_ns - a.t_rx_ns for a, b in zip(rig.samples, rig.samples[1:], strict=False)] == [5 * MS] * 2
+    assert rig.device.status().link == "can0 at 500 kbit/s"
+    assert rig.events[0].kind is EventKind.UP
+    assert rig.can_link.written == []
+
+
+def delay_ns(name: str, settings: Settings, bitrate: int) -> int:
+    """From the time of a sample to its arrival; four frames, 0.3 ms apart, every 10 ms."""
+    driver = DRIVERS[name]
+    assert isinstance(driver, CanDriver)
+    burst = driver.example_frames(Random(1))
+
+    async def story(bench: Bench) -> None:
+        begin_ns = monotonic_ns() - 300 * MS
+        for number in range(20):
+            t_ns = begin_ns + number * 10 * MS
+            assert bench.link.feed([f._replace(t_rx_ns=t_ns + place * 300_000) for place, f in enumerate(burst)])
+
+    rig = play(story, configured(name, settings, bitrate=bitrate))
+    assert len(rig.samples) > 10
+    return rig.samples[-1].t_rx_ns - rig.samples[-1].t_ns
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "bits"),
+    [("hipnuc-canopen", HipnucCanopenSettings(), 95), ("hipnuc-j1939", HipnucJ1939Settings(), 131)],
+)
+def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Settings, bits: int) -> None:
+    """TPDO1 has six bytes; a 29-bit identifier makes a frame 20 bits longer."""
+    taken_ns = delay_ns(name, settings, 500_000) - delay_ns(name, settings, 0)
+    assert taken_ns == pytest.approx(bits * 2000, abs=2000)
+
+
+def test_only_own_identifiers_pass() -> None:
+    async def story(bench: Bench) -> None:
+        bench.link.feed(bench.frames(1) + bench.frames(1, base_id=300))
+
+    rig = play(story, configured(base_id=300))
+    assert len(rig.samples) == 1
+    assert rig.ledger.bytes_in == 40
+
+
+def test_losses_by_cause() -> None:
+    async def story(bench: Bench) -> None:
+        bench.feed(1, 2)
+        bench.link.feed(bench.frames(3, lost=[2]))  # nobody says why
+        bench.feed(4)
+        bench.link.counters = KernelCounters(overrun=7)
+        after = bench.frames(6)
+        bench.link.feed([after[0]._replace(after_loss=True), *after[1:]])  # 5 is the kernel's
+        damaged = bench.frames(7)
+        bench.link.feed([*damaged[:4], damaged[4]._replace(data=b"\0" * 7)])
+        bench.feed(8)
+        bench.rig.tick()
+
+    rig = play(story)
+    ledger = rig.ledger
+    assert (ledger.lost_gap_device, ledger.lost_overrun, ledger.lost_crc) == (1, 1, 1)
+    assert (ledger.frames_bad_length, ledger.frames_ignored) == (1, 4 + 4)
+    assert ledger.samples == 5
+    assert EventKind.LOSS in [event.kind for event in rig.events]
+
+
+def test_frames_from_before_a_loss_are_not_mixed_with_those_after() -> None:
+    async def story(bench: Bench) -> None:
+        first, second = bench.frames(1), bench.frames(2)
+        second[2] = second[2]._replace(after_loss=True)
+        bench.link.feed(first[:2] + second[2:])
+
+    rig = play(story)
+    assert rig.samples == []
+
+
+def test_bus_down_and_up() -> None:
+    async def story(bench: Bench) -> None:
+        bench.feed(1, 2)
+        bench.link.feed(bench.frames(3)[:3])
+        bench.rig.tick()
+        bench.link.disappear()
+        await bench.rig.turn(lambda: bench.rig.state is DeviceState.MISSING)
+        await bench.rig.turn(lambda: "is down" in bench.rig.problem)
+        assert bench.rig.ledger.frames_pending == 0
+        bench.link.appear()
+        await bench.rig.turn(lambda: bench.link.listening)
+        bench.feed(10)
+        bench.rig.tick()
+        assert bench.rig.is_in(DeviceState.RUNNING)
+
+    rig = play(story)
+    assert [event.kind for event in rig.events] == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+    assert rig.ledger.lost() == 0
+    assert rig.device.status().connects == 2
+
+
+def test_trouble_of_the_bus_is_shown_while_it_lasts() -> None:
+    async def story(bench: Bench) -> None:
+        bench.link.news("can0 is error-passive: x", "can0 is error-passive: x")
+        bench.feed(1)
+        bench.rig.tick()
+        assert bench.rig.is_in(DeviceState.RUNNING)
+        assert bench.rig.problem == "can0 is error-passive: x"
+        bench.link.news("can0 is bus-off: y", "can0 is bus-off: y")
+        bench.rig.tick(ahead_ns=3000 * MS)
+        assert bench.rig.is_in(DeviceState.SILENT)
+        assert bench.rig.problem == "can0 is bus-off: y"
+        bench.link.news("can0 is error-active again", "")
+        assert bench.rig.problem == ""
+
+    rig = play(story)
+    assert [e.message for e in rig.events if e.kind is EventKind.LINK][-1] == "can0 is error-active again"
+
+
+@pytest.mark.parametrize(("lost", "words"), [([], "nothing of imu61x-can is heard"), ([4], "no whole sample")])
+def test_silence_says_what_is_heard(lost: list[int], words: str) -> None:
+    async def story(bench: Bench) -> None:
+        if lost:
+            bench.link.feed(bench.frames(1, lost=lost))
+        bench.rig.tick(ahead_ns=3000 * MS)
+        assert words in bench.rig.problem
+
+    play(story)

@@ -1,0 +1,341 @@
+"""The life of a device on a link inside the process: found, asked, lost, back, silent, never crashing."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from functools import partial
+from time import monotonic_ns
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.action import Action
+from imud.contracts.session import Request, RequestScript, never
+from imud.contracts.status import DeviceState, KernelCounters
+from imud.devices.hipnuc.uart import codec
+from imud.errors import LinkBusy, LinkError
+from imud.event import EventKind
+from imud.links.memory import MemoryLink, MemorySettings
+from imud.runtime import device as device_module
+from imud.runtime.detection.remembered import RememberedDevice
+from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.device_rig import play as play_rigs
+from tests.support.hi91 import hi91
+
+MS = 1_000_000
+LIMIT_S = 5.0
+VERSION = b"PNAME=HI14R3\r\nBUILD=Oct 15 2024\r\nUUID=%s\r\nAPP_VER=156\r\nBL_VER=109\r\nOK\r\n"
+
+
+Story = Callable[[DeviceRig], Coroutine[Any, Any, None]]
+
+
+def configured(*, identify: bool = False, baud: Any = 115200, driver: str = "hipnuc-uart", **link: Any) -> DeviceConfig:
+    """A device on a link inside the process."""
+    return DeviceConfig("bow", driver, None, identify, "memory", MemorySettings(baud=baud, **link))
+
+
+def feed(rig: DeviceRig, data: bytes) -> None:
+    """Bytes come now."""
+    assert rig.link.feed(data, monotonic_ns())
+
+
+def play(story: Story, config: DeviceConfig | None = None, link: MemoryLink | None = None) -> None:
+    """Run the device while the story is told; at the end the ledger closes and the link is released."""
+    rigs = DeviceRigs()
+    rigs.add(config or configured(), link)
+
+    async def told(made: list[DeviceRig]) -> None:
+        await made[0].turn(lambda: made[0].state is not DeviceState.MISSING)
+        await story(made[0])
+
+    play_rigs(rigs, told)
+
+
+@pytest.fixture(autouse=True)
+def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_module, "RETRY_S", 0.0)
+
+
+def test_samples_flow_and_the_device_is_up() -> None:
+    async def story(rig: DeviceRig) -> None:
+        assert rig.is_in(DeviceState.SEARCHING)
+        for i in range(5):
+            feed(rig, hi91(1000 + 10 * i))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        assert [s.seq for s in rig.samples] == [1, 2, 3, 4, 5]
+        assert [s.t_dev_ns for s in rig.samples] == [(1000 + 10 * i) * MS for i in range(5)]
+        assert rig.kinds == [EventKind.UP]
+        status = rig.device.status()
+        assert (status.newest_seq, status.driver, status.connects) == (5, "hipnuc-uart", 1)
+        assert sum(status.latency_buckets) == 5
+        assert status.temperature_c == 20.0
+
+    play(story)
+
+
+def test_unplugged_and_back_the_count_goes_on_and_time_rises() -> None:
+    async def story(rig: DeviceRig) -> None:
+        for i in range(5):
+            feed(rig, hi91(5000 + 10 * i))
+        feed(rig, hi91(5050)[:40])  # the cable goes in the middle of a frame
+        rig.tick()
+        rig.link.disappear()
+        await rig.turn(lambda: rig.state is DeviceState.MISSING)
+        assert rig.ledger.bytes_pending == 0
+        assert rig.ledger.bytes_skipped == 40
+        assert "gone" in rig.problem
+        rig.link.appear()
+        await rig.turn(lambda: rig.state is not DeviceState.MISSING)
+        for i in range(3):
+            feed(rig, hi91(10 * i))  # the device was without power: its clock starts again
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        assert [s.seq for s in rig.samples] == list(range(1, 9))
+        times = [s.t_ns for s in rig.samples]
+        assert times == sorted(set(times))
+        assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+        assert rig.device.status().connects == 2
+        assert rig.ledger.lost() == 0
+
+    play(story)
+
+
+def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> None:
+    async def answer(rig: DeviceRig, mode: bytes, uuid: bytes = b"043995698D6E1708") -> None:
+        done = 0
+        while done < 4:
+            await rig.turn(partial(lambda seen: len(rig.link.written) > seen, done))
+            request = rig.link.written[done]
+            done += 1
+            if b"VERSION" in request:
+                feed(rig, VERSION % uuid)
+            elif b"USRCONFIG" in request:
+                feed(rig, b"ATT_MODE: " + mode + b"\r\nOK\r\n")
+            elif b"MAGCONFIG" in request:
+                feed(rig, b"MB=14.14, -2.08, -8.75\r\nOK\r\n")
+            else:
+                feed(rig, b"COM1=115200\r\nOK\r\n")
+        rig.link.written.clear()
+
+    async def story(rig: DeviceRig) -> None:
+        await answer(rig, b"0")
+        await rig.turn(lambda: rig.device.status().settings)
+        assert rig.device.status().identity["product"] == "HI14R3"
+        assert rig.device.status().identity["serial_number"] == "043995698D6E1708"
+        rig.link.disappear()
+        await rig.turn(lambda: rig.state is DeviceState.MISSING)
+        rig.link.appear()
+        await answer(rig, b"1", b"0000000000000001")
+        await rig.turn(lambda: EventKind.CONFIGURATION in rig.kinds)
+        await rig.turn(lambda: len(rig.events) >= 2)
+        messages = [event.message for event in rig.events]
+        assert any("another device: serial number 0000000000000001" in message for message in messages)
+        assert any("is 1, was 0" in message for message in messages)
+
+    play(story, configured(identify=True))
+
+
+def test_device_that_does_not_answer_streams_all_the_same(caplog: pytest.LogCaptureFixture) -> None:
+    async def story(rig: DeviceRig) -> None:
+        await rig.turn(lambda: rig.link.written)
+        feed(rig, hi91(10) + hi91(20))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        assert len(rig.samples) == 2
+
+    play(story, configured(identify=True))
+
+
+def test_device_that_falls_silent_is_told_once_and_comes_up_again() -> None:
+    async def story(rig: DeviceRig) -> None:
+        for i in range(3):
+            feed(rig, hi91(10 * i))
+        rig.tick()
+        rig.tick(ahead_ns=1500 * MS)
+        rig.tick(ahead_ns=1600 * MS)
+        assert rig.is_in(DeviceState.SILENT)
+        assert rig.kinds == [EventKind.UP, EventKind.DOWN]
+        feed(rig, hi91(1_500))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+
+    play(story)
+
+
+def test_port_that_is_busy_is_tried_again_and_says_why() -> None:
+    class Busy(MemoryLink):
+        def open(self) -> None:
+            if len(self.bauds) < 3:
+                self.bauds.append(0)
+                raise LinkBusy("memory is in use by minicom (pid 4711)")
+            super().open()
+
+    async def story(rig: DeviceRig) -> None:
+        await rig.turn(lambda: rig.state is DeviceState.FAILED)
+        assert rig.problem == "memory is in use by minicom (pid 4711)"
+        await rig.turn(lambda: rig.link.listening)
+        feed(rig, hi91(10))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+
+    play(story, link=Busy(MemorySettings(baud=115200)))
+
+
+def test_end_of_a_replay_finishes_the_runner() -> None:
+    async def story() -> None:
+        rig = DeviceRigs().add(configured(writable=False))
+        task = asyncio.create_task(rig.device.run())
+        await rig.turn(lambda: rig.link.listening)
+        feed(rig, hi91(10))
+        rig.link.end(None)
+        await asyncio.wait_for(task, LIMIT_S)
+        assert rig.is_in(DeviceState.FINISHED)
+        assert len(rig.samples) == 1
+
+    asyncio.run(story())
+
+
+def test_missing_samples_are_put_to_their_cause() -> None:
+    async def story(rig: DeviceRig) -> None:
+        for i in range(20):
+            feed(rig, hi91(10 * i))
+        damaged = bytearray(hi91(200))
+        damaged[50] ^= 1
+        feed(rig, bytes(damaged))
+        feed(rig, hi91(210))
+        assert rig.ledger.lost_crc == 1
+        rig.link.counters = KernelCounters(overrun=1)
+        feed(rig, hi91(240))  # 220 and 230 are missing
+        assert rig.ledger.lost_overrun == 2
+        feed(rig, hi91(260))
+        assert rig.ledger.lost_gap_device == 1
+        rig.tick()
+        assert EventKind.LOSS in rig.kinds
+        assert EventKind.BAD_FRAME in rig.kinds
+
+    play(story)
+
+
+def test_frame_held_by_a_lying_length_is_delivered_when_the_line_is_idle() -> None:
+    async def story(rig: DeviceRig) -> None:
+        feed(rig, b"\x5a\xa5\xff\x01" + hi91(10))
+        assert rig.samples == []
+        rig.tick(ahead_ns=100 * MS)
+        assert len(rig.samples) == 1
+
+    play(story)
+
+
+def test_detection_locks_counts_every_byte_and_is_remembered() -> None:
+    async def story(rig: DeviceRig) -> None:
+        noise = bytes(range(200, 250))
+        feed(rig, noise)
+        first = rig.link.baud
+        await rig.turn(lambda: rig.link.bauds and rig.link.baud != first)
+        right = rig.link.baud
+        stream = hi91(10) + hi91(20) + hi91(30)
+        feed(rig, stream[:100])
+        feed(rig, stream[100:])
+        await rig.turn(lambda: rig.ledger.frames_good)
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        assert len(rig.samples) == 3
+        assert rig.ledger.bytes_in == len(noise) + len(stream)
+        assert rig.ledger.bytes_skipped == len(noise)
+        rig.link.disappear()
+        await rig.turn(lambda: rig.state is DeviceState.MISSING)
+        rig.link.appear()
+        await rig.turn(lambda: rig.state is not DeviceState.MISSING)
+        feed(rig, hi91(1000) + hi91(1010))
+        await rig.turn(lambda: len(rig.samples) == 5)
+        assert rig.link.baud == right
+
+    play(story, configured(baud="auto", driver="auto"))
+
+
+def test_nothing_heard_says_what_to_look_at() -> None:
+    async def story(rig: DeviceRig) -> None:
+        rig.tick(ahead_ns=3000 * MS)
+        assert rig.problem.startswith("nothing is heard on memory at 115200 baud")
+        rig.device.tick(monotonic_ns())
+
+    play(story)
+
+
+def test_a_device_that_has_just_been_opened_is_given_time() -> None:
+    async def story(rig: DeviceRig) -> None:
+        rig.tick()
+        assert rig.problem == ""
+
+    play(story)
+
+
+def test_bytes_without_frames_say_so() -> None:
+    async def story(rig: DeviceRig) -> None:
+        later_ns = monotonic_ns() + 2500 * MS
+        rig.link.feed(b"\x00" * 100, later_ns)
+        rig.device.tick(later_ns + 100 * MS)
+        assert rig.problem.startswith("bytes come on memory at 115200 baud, but no valid frame")
+
+    play(story)
+
+
+def test_error_of_the_link_is_a_failed_device_and_tried_again() -> None:
+    async def story(rig: DeviceRig) -> None:
+        rig.link.end(LinkError("input/output error: the adapter stopped answering"))
+        await rig.turn(lambda: rig.device.status().connects == 2)
+        feed(rig, hi91(10))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+
+    play(story)
+
+
+def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    def at_921600(_target: object, _params: object) -> RequestScript[None]:
+        yield Request(b"?", "?", never, never, never, silent=True, baud=921600)
+
+    monkeypatch.setattr(codec, "DRIVER", replace(codec.DRIVER, actions={"rate": Action("set it", at_921600)}))
+
+    async def story(rigs: DeviceRigs, rig: DeviceRig) -> None:
+        for ms in range(0, 400, 10):
+            feed(rig, hi91(ms))
+        rig.tick()
+        await rig.device.act("rate", {})
+        assert rig.link.baud == 921600
+        assert rig.link.written[-1] == b"?"
+        assert rigs.factory.remembered.get("bow") == RememberedDevice("hipnuc-uart", 921600)
+        feed(rig, hi91(400))
+        assert len(rig.samples) == 41
+
+    rigs = DeviceRigs()
+    rigs.add(configured(baud="auto"))
+
+    async def told(made: list[DeviceRig]) -> None:
+        await made[0].turn(lambda: made[0].link.listening)
+        await story(rigs, made[0])
+
+    play_rigs(rigs, told)
+
+
+def test_a_device_that_is_back_counts_as_found_by_its_new_samples_only() -> None:
+    """While a line is searched, samples of before do not make it run."""
+
+    async def story(rig: DeviceRig) -> None:
+        for ms in range(0, 400, 10):
+            feed(rig, hi91(ms))
+        rig.tick()
+        assert rig.is_in(DeviceState.RUNNING)
+        rig.link.disappear()
+        await rig.turn(lambda: rig.state is DeviceState.MISSING)
+        rig.link.appear()
+        await rig.turn(lambda: rig.state is DeviceState.SEARCHING)
+        rig.tick()
+        assert rig.is_in(DeviceState.SEARCHING)
+        assert rig.kinds == [EventKind.UP, EventKind.DOWN]
+
+    play(story, configured(baud="auto"))

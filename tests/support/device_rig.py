@@ -1,0 +1,208 @@
+"""Devices with all that came out of them, on links inside the process or real ones, in real or virtual time.
+
+`DeviceRigs` has what devices of one daemon share; `running` has them at work until the end of a block.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from imud.config import DeviceConfig
+from imud.contracts.lines import LineFactory
+from imud.contracts.publisher import Batch
+from imud.contracts.status import DeviceState
+from imud.devices import DRIVERS
+from imud.event import Event, EventKind
+from imud.host_clock import HostClock
+from imud.ledger import Ledger
+from imud.links import LINKS
+from imud.links.memory import MemoryCanLink, MemoryLink
+from imud.runtime.device import Device
+from imud.runtime.device_factory import DeviceFactory
+from imud.sample import Sample
+from imud.signals.gpio import GPIO_LINES
+from imud.worker import BusThread, StartWorker
+
+LIMIT_S = 10.0
+STEP_S = 0.002
+
+
+class DeviceRig:
+    """One device with what came out of it."""
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self.samples: list[Sample] = []
+        self.batches = 0
+        self.events: list[Event] = []
+        self.now_ns = now_ns
+        self.device: Device
+
+    @property
+    def ledger(self) -> Ledger:
+        """Its ledger."""
+        return self.device.ledger
+
+    @property
+    def kinds(self) -> list[EventKind]:
+        """Kinds of the events so far."""
+        return [event.kind for event in self.events]
+
+    @property
+    def state(self) -> DeviceState:
+        """State now."""
+        return self.device.state
+
+    def is_in(self, state: DeviceState) -> bool:
+        """Whether that is the state; a call, so that the type checker does not take it for constant."""
+        return self.device.state is state
+
+    @property
+    def problem(self) -> str:
+        """What is wrong now."""
+        return self.device.status().problem
+
+    @property
+    def link(self) -> MemoryLink:
+        """Its link of bytes inside the process."""
+        assert isinstance(self.device.link, MemoryLink)
+        return self.device.link
+
+    @property
+    def can_link(self) -> MemoryCanLink:
+        """Its CAN link inside the process."""
+        assert isinstance(self.device.link, MemoryCanLink)
+        return self.device.link
+
+    def tick(self, ahead_ns: int = 0) -> None:
+        """Let the device look at its state, as if so much later."""
+        self.device.tick(self.now_ns() + ahead_ns)
+
+    async def until(
+        self,
+        holds: Callable[[], object],
+        what: str = "the condition",
+        limit_s: float = LIMIT_S,
+        *,
+        step: Callable[[], object] = lambda: None,
+        step_s: float = STEP_S,
+    ) -> None:
+        """Tick until a condition holds, with `step` each time; the ledger closes all the while."""
+        end_ns = self.now_ns() + int(limit_s * 1e9)
+        while not holds():
+            assert self.now_ns() < end_ns, f"not within {limit_s} s: {what}; {self.device.status()}"
+            await asyncio.sleep(step_s)
+            step()
+            self.tick()
+            assert self.ledger.closes(), self.ledger.snapshot()
+
+    async def turn(self, holds: Callable[[], object]) -> None:
+        """Let the loop turn until a condition holds, without ticks."""
+        end = asyncio.get_running_loop().time() + LIMIT_S
+        while not holds():
+            assert asyncio.get_running_loop().time() < end, f"does not come true: {self.device.status()}"
+            await asyncio.sleep(0)
+
+    async def until_samples(self, more: int, limit_s: float = LIMIT_S) -> None:
+        """Wait for more samples, and until the state says so."""
+        wanted = len(self.samples) + more
+        await self.until(
+            lambda: len(self.samples) >= wanted and self.state is DeviceState.RUNNING, f"{more} more samples", limit_s
+        )
+
+
+class DeviceRigs:
+    """Makes devices that share time, buses and lines, and keeps apart what comes out of them."""
+
+    def __init__(
+        self,
+        host: HostClock | None = None,
+        *,
+        state_dir: Path | None = None,
+        lines: LineFactory = GPIO_LINES,
+        start_worker: StartWorker = BusThread,
+    ) -> None:
+        """Time, lines and workers are the real ones unless given."""
+        self.host = host or HostClock()
+        self.rigs: dict[str, DeviceRig] = {}
+        self.factory = DeviceFactory(
+            self._publish, self._send_event, self.host, state_dir=state_dir, lines=lines, start_worker=start_worker
+        )
+
+    def add(self, config: DeviceConfig, link: MemoryLink | MemoryCanLink | None = None) -> DeviceRig:
+        """A device as configured; on `link` in place of the configured one if it is given."""
+        rig = self.rigs[config.name] = DeviceRig(self.host.now_ns)
+        number = len(self.rigs) - 1
+        if link is None:
+            rig.device = self.factory.make(config, number)
+        else:
+            factory = self.factory
+            transport = factory.on_stream(link) if isinstance(link, MemoryLink) else factory.on_can(link)
+            rig.device = factory.make_on(config, number, transport)
+        return rig
+
+    @asynccontextmanager
+    async def at_work(self) -> AsyncIterator[list[DeviceRig]]:
+        """All devices at work; at the end they are closed, and their ledgers close."""
+        mistakes: list[object] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _loop, context: mistakes.append(context))
+        rigs = list(self.rigs.values())
+        tasks = [asyncio.create_task(rig.device.run()) for rig in rigs]
+        try:
+            yield rigs
+        finally:
+            for task in tasks:
+                task.cancel()
+            ended = await asyncio.gather(*tasks, return_exceptions=True)
+            for rig in rigs:
+                rig.device.close()
+            self.factory.close()
+        assert all(one is None or isinstance(one, asyncio.CancelledError) for one in ended), ended
+        assert not mistakes, mistakes
+        assert all(rig.ledger.closes() for rig in rigs), [rig.ledger.snapshot() for rig in rigs]
+
+    def _publish(self, batch: Batch) -> None:
+        rig = self.rigs[batch.device]
+        assert batch.device_id == rig.device.device_id
+        rig.batches += 1
+        rig.samples += batch.samples
+
+    def _send_event(self, event: Event) -> None:
+        self.rigs[event.device].events.append(event)
+
+
+def device_config(name: str, driver: str, link: str, settings: dict[str, Any], **options: Any) -> DeviceConfig:
+    """A device of the configuration."""
+    row = DRIVERS.get(driver)
+    made = msgspec.convert(options, row.settings) if row is not None and options else None
+    return DeviceConfig(name, driver, made, True, link, msgspec.convert(settings, LINKS[link].settings))
+
+
+@asynccontextmanager
+async def running(
+    *configs: DeviceConfig, lines: LineFactory = GPIO_LINES, rigs: DeviceRigs | None = None
+) -> AsyncIterator[list[DeviceRig]]:
+    """Devices as configured at work, in real time unless `rigs` are given; all closed at the end."""
+    rigs = rigs or DeviceRigs(lines=lines)
+    for config in configs:
+        rigs.add(config)
+    async with rigs.at_work() as made:
+        yield made
+
+
+def play(rigs: DeviceRigs, story: Callable[[list[DeviceRig]], Coroutine[Any, Any, None]]) -> None:
+    """Run the devices of `rigs` while a story is told; afterwards no link inside the process is open."""
+
+    async def whole() -> None:
+        async with rigs.at_work() as made:
+            await story(made)
+        assert not any(link.is_open for link in _memory_links(made))
+
+    asyncio.run(whole())
+
+
+def _memory_links(rigs: Iterable[DeviceRig]) -> list[MemoryLink | MemoryCanLink]:
+    return [rig.device.link for rig in rigs if isinstance(rig.device.link, MemoryLink | MemoryCanLink)]
