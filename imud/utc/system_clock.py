@@ -10,7 +10,6 @@ import ctypes
 import os
 from collections.abc import Callable
 from math import sqrt
-from time import monotonic_ns, time_ns
 from typing import Final, NamedTuple
 
 from imud.contracts.timing import UtcReference
@@ -20,8 +19,6 @@ from imud.utc.source import OnSentence, RmcSettings, SourceContext
 
 STA_UNSYNC: Final = 0x40
 TIME_ERROR: Final = 5
-READINGS: Final = 5
-"""Readings of both clocks, of which the shortest counts."""
 AFTER_NS: Final = 200 * NS_PER_MS
 """Delay of a sentence after the instant it names: more than the allowed error of the clock (60 ms, three sigma), so
 that it never precedes the pulse of its second."""
@@ -78,18 +75,6 @@ def kernel_clock(ask: Callable[[Timex], int] = ask_kernel) -> KernelClock:
         return KernelClock(False, 0, 0)
     synchronised = state != TIME_ERROR and not timex.status & STA_UNSYNC
     return KernelClock(synchronised, max(timex.esterror, 0), max(timex.maxerror, 0))
-
-
-def realtime_offset_ns(_just_now_ns: int = 0) -> int:
-    """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, as `SourceContext.utc_offset_ns`."""
-    best_ns, offset_ns = 1 << 63, 0
-    for _ in range(READINGS):
-        before_ns = monotonic_ns()
-        real_ns = time_ns()
-        after_ns = monotonic_ns()
-        if after_ns - before_ns < best_ns:
-            best_ns, offset_ns = after_ns - before_ns, real_ns - (before_ns + after_ns) // 2
-    return offset_ns
 
 
 def system_reference(clock: KernelClock, offset_ns: int) -> UtcReference | None:

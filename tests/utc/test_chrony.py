@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from imud.host_clock import HostClock
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.chrony import ChronyFeed, encode
-from imud.utc.system_clock import realtime_offset_ns
 
 UTC_S = 1_795_000_000
 LIMIT_S = 20.0
@@ -64,7 +64,7 @@ def test_a_pulse_alone_gives_the_nearest_second(receiver: socket.socket, ahead_n
 
 
 def test_a_missing_socket_is_counted_and_the_next_sample_tried(tmp_path: Path) -> None:
-    chrony = ChronyFeed(str(tmp_path / "sock"), realtime_offset_ns)
+    chrony = ChronyFeed(str(tmp_path / "sock"), HostClock().utc_offset_ns)
     assert not chrony.send_pulse(time.monotonic_ns())
     assert chrony.refused == 1
     assert "is it running" in chrony.problem
@@ -133,11 +133,12 @@ def sources(folder: Path) -> dict[str, list[str]]:
 @pytest.mark.skipif(bool(NO_CHRONY), reason=NO_CHRONY)
 def test_chronyd_takes_the_samples_and_sees_the_offset(chronyd: Path) -> None:
     offset_ns = 123 * NS_PER_MS  # UTC by the pulses is so much ahead of the system clock
-    chrony = ChronyFeed(str(chronyd / "imud.sock"), realtime_offset_ns)
+    utc_offset_ns = HostClock().utc_offset_ns
+    chrony = ChronyFeed(str(chronyd / "imud.sock"), utc_offset_ns)
     limit_s = time.monotonic() + LIMIT_S
     while True:
         now_ns = time.monotonic_ns()
-        utc_ns = now_ns + realtime_offset_ns() + offset_ns
+        utc_ns = now_ns + utc_offset_ns(now_ns) + offset_ns
         chrony.send_pulse(now_ns - utc_ns % NS_PER_S, utc_ns // NS_PER_S)
         source = sources(chronyd).get("IMUD")
         if source and source[5] != "0" and float(source[7]):

@@ -6,6 +6,7 @@ import time
 import pytest
 
 from imud.formats.rmc import Rmc, parse
+from imud.host_clock import HostClock
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.source import RmcSettings
 from imud.utc.system_clock import (
@@ -15,7 +16,6 @@ from imud.utc.system_clock import (
     SystemClockSource,
     Timex,
     kernel_clock,
-    realtime_offset_ns,
     system_reference,
 )
 from tests.support.in_loop import in_loop
@@ -54,7 +54,7 @@ def test_a_kernel_that_may_not_be_asked_vouches_for_nothing() -> None:
 
 
 def test_the_offset_joins_both_clocks() -> None:
-    offset_ns = realtime_offset_ns()
+    offset_ns = HostClock().utc_offset_ns(time.monotonic_ns())
     assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the machine may stall in between
 
 
@@ -155,7 +155,7 @@ def test_it_runs_in_the_loop_and_stops() -> None:
     async def scene() -> None:
         sentences = Sentences()
         source = SystemClockSource(
-            RmcSettings(source="system", rate_hz=10), time.monotonic_ns, realtime_offset_ns, lambda: GOOD
+            RmcSettings(source="system", rate_hz=10), time.monotonic_ns, HostClock().utc_offset_ns, lambda: GOOD
         )
         source.start(sentences)
         await sentences.until(lambda: len(sentences.got) >= 2)
