@@ -1,4 +1,4 @@
-"""What happens to a device besides samples: told to event subscribers and to the log."""
+"""Contract: events of a device other than samples, delivered to subscribers and to the log."""
 
 from enum import StrEnum
 from typing import Protocol

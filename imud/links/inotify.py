@@ -29,7 +29,7 @@ EVENT_BUFFER_BYTES: Final = 4096
 LINKS_MAX: Final = 40
 """Symbolic links followed, as the kernel does (path_resolution(7))."""
 
-_libc = ctypes.CDLL(None, use_errno=True)
+libc = ctypes.CDLL(None, use_errno=True)
 
 
 class DirectoryWatch:
@@ -37,7 +37,7 @@ class DirectoryWatch:
 
     def __init__(self) -> None:
         """Raises LinkError when the user's inotify instances are used up."""
-        self._fd: int = _libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._fd: int = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise LinkError(
                 f"inotify: {os.strerror(ctypes.get_errno())}; look at /proc/sys/fs/inotify/max_user_instances"
@@ -45,7 +45,7 @@ class DirectoryWatch:
 
     def add(self, directory: Path) -> bool:
         """Watch a directory; False when it is gone or may not be read."""
-        return int(_libc.inotify_add_watch(self._fd, os.fsencode(directory), WATCH_MASK)) >= 0
+        return int(libc.inotify_add_watch(self._fd, os.fsencode(directory), WATCH_MASK)) >= 0
 
     async def changed(self) -> None:
         """Return when something happened in a watched directory since it was added, or since the last call."""

@@ -134,7 +134,7 @@ def test_no_instance_left_is_an_error(tmp_path: Path, monkeypatch: pytest.Monkey
         def inotify_init1(self, flags: int) -> int:
             return -1
 
-    monkeypatch.setattr(inotify, "_libc", Exhausted())
+    monkeypatch.setattr(inotify, "libc", Exhausted())
     with pytest.raises(LinkError, match="max_user_instances"):
         asyncio.run(wait_until(tmp_path / "tty", (tmp_path / "tty").exists))
 

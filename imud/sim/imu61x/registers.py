@@ -42,6 +42,8 @@ class RegisterFaults:
     """So many transactions to come have one wrong bit in what is read."""
     frozen: bool = False
     """The registers are not renewed."""
+    ignores_writes: bool = False
+    """Settings that are written have no effect."""
     product_id: bytes = b""
     """What another device has in its place."""
 
@@ -174,7 +176,7 @@ class Imu61xRegisters:
             return False
         if part:
             self._pointer = part[0]
-        if part[1:] and self._pointer == registers.FILTER_CTRL:
+        if part[1:] and self._pointer == registers.FILTER_CTRL and not self.faults.ignores_writes:
             self.filter = part[1]
         return True
 

@@ -64,6 +64,8 @@ class Imu61xHardware(SensorHardware):
     """Whether it obeys more than CMD 3 in stream mode."""
     baud_acts_at_start: bool = False
     """Whether a new baud rate waits for the next start."""
+    changes_mode: bool = True
+    """Whether it obeys the output mode it acknowledges."""
     acknowledges: bool = True
     """Whether it sends K1 at all."""
 
@@ -275,7 +277,8 @@ class Imu61xModule:
     def _set_mode(self, mode: float, now_ns: int) -> None:
         if mode not in [known.value for known in OutputMode]:
             raise ParameterRefused(f"mode {mode}")
-        self.settings = replace(self.settings, mode=OutputMode(int(mode)))
+        if self.hardware.changes_mode:
+            self.settings = replace(self.settings, mode=OutputMode(int(mode)))
         self._schedule(now_ns)
 
     def _set_heading(self, heading_deg: float, now_ns: int) -> None:

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from time import monotonic_ns
 
 from imud.contracts.lines import Edge, InputSettings, LineFactory, OnEdges, OnLineEnd, OutputSettings
 from imud.errors import LinkError
@@ -101,10 +100,13 @@ class MemoryOutput:
         self,
         title: str = "memory line",
         *,
-        now_ns: Callable[[], int] = monotonic_ns,
+        now_ns: Callable[[], int] = lambda: 0,
         on_change: Callable[[int, bool], None] | None = None,
     ) -> None:
-        """`on_change` is the device: called with the time and the new level, in the thread that drives the line."""
+        """`now_ns` dates changes; without it, all are at 0.
+
+        `on_change` is the device: called with the time and the new level, in the thread that drives the line.
+        """
         self.title = title
         self.open_error: LinkError | None = None
         """What `open` raises."""
@@ -148,7 +150,7 @@ class MemoryOutput:
 class MemoryLines:
     """Makes lines inside the process and keeps them by their purpose, for example `bow sout`."""
 
-    def __init__(self, now_ns: Callable[[], int] = monotonic_ns) -> None:
+    def __init__(self, now_ns: Callable[[], int]) -> None:
         self.inputs: dict[str, MemoryInput] = {}
         self.outputs: dict[str, MemoryOutput] = {}
         self._now_ns = now_ns

@@ -13,7 +13,7 @@ from imud.config import DeviceConfig
 from imud.contracts.action import Action
 from imud.contracts.session import Request, RequestScript, never
 from imud.contracts.status import DeviceState, KernelCounters
-from imud.devices.hipnuc.uart import codec
+from imud.devices.hipnuc.uart import driver
 from imud.errors import LinkBusy, LinkError
 from imud.event import EventKind
 from imud.links.memory import MemoryLink, MemorySettings
@@ -299,7 +299,7 @@ def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch
     def at_921600(_target: object, _params: object) -> RequestScript[None]:
         yield Request(b"?", "?", never, never, never, silent=True, baud=921600)
 
-    monkeypatch.setattr(codec, "DRIVER", replace(codec.DRIVER, actions={"rate": Action("set it", at_921600)}))
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, actions={"rate": Action("set it", at_921600)}))
 
     async def story(rigs: DeviceRigs, rig: DeviceRig) -> None:
         for ms in range(0, 400, 10):

@@ -155,12 +155,11 @@ def test_where_nothing_answers_nothing_is_told(play: Play) -> None:
 
 def test_device_that_acknowledges_and_stays_silent_is_told_of_once(play: Play) -> None:
     async def story(bench: Bench) -> None:
-        bench.module._set_mode = lambda mode, now_ns: None  # type: ignore[method-assign]  # it only says so
         with pytest.raises(AssertionError):
             await bench.until(lambda: bench.samples, 10)
         assert len(bench.woken) == 1
 
-    play(story, hardware={"boot_ms": 0})
+    play(story, hardware={"boot_ms": 0, "changes_mode": False})
 
 
 def test_device_that_was_told_to_be_silent_is_left_so(play: Play) -> None:

@@ -16,7 +16,6 @@ from typing import Final, Literal, get_args
 
 from imud.attitude import Matrix3, is_rotation
 from imud.contracts.session import Request, of_text
-from imud.devices.arguments import listed
 from imud.devices.hipnuc.uart.replies import is_end, is_rejection, is_setting_line, is_version_line
 from imud.errors import BadArgument
 from imud.units import NS_PER_S
@@ -254,7 +253,8 @@ def max_rate_hz(message: OutputMessage, baud: int) -> int:
     """Highest output rate of `message` at `baud` (table 3.7). Raises BadArgument for a rate the table does not have."""
     rates = MAX_RATE_HZ[message]
     if baud not in rates:
-        raise BadArgument(f"baud rate: expected one of {listed(sorted(rates))}, got {baud!r}")
+        known = ", ".join(map(str, sorted(rates)))
+        raise BadArgument(f"baud rate: expected one of {known}, got {baud!r}")
     return rates[baud]
 
 
