@@ -290,7 +290,7 @@ async def test_a_mistake_of_ours_comes_up_in_the_loop() -> None:
 
 @in_loop
 async def test_on_a_real_thread() -> None:
-    line, enough, found = MemoryOutput(), asyncio.Event(), list[TriggerStamp]()
+    line, enough, found = MemoryOutput(now_ns=monotonic_ns), asyncio.Event(), list[TriggerStamp]()
     line.open()
 
     def on_stamps(stamps: Sequence[TriggerStamp]) -> None:
