@@ -1,7 +1,6 @@
 """What every CAN codec must do, from its row in DRIVERS alone: foreign, missing, repeated and random frames."""
 
 from collections.abc import Iterable, Sequence
-from math import isnan
 from random import Random
 
 import pytest
@@ -10,18 +9,18 @@ from hypothesis import strategies as st
 
 from imud import devices
 from imud.contracts.can import CanCodec, CanDriver
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
+from imud.contracts.codec import CodecEvent
 from imud.contracts.driver import of_kind
 from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame, pack_frame
 from imud.ledger import Ledger
 from imud.sample import Measurement
+from tests.support.codec_invariants import feed_frames as feed_checked
+from tests.support.codec_invariants import finite
 
 quick = settings(max_examples=40, derandomize=True, deadline=None, database=None)
 DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), CanDriver)}
 every_driver = pytest.mark.parametrize("name", list(DRIVERS))
 seeds = st.integers(0, 2**32)
-PENDING_FRAMES_MAX = 16
-"""No sample is made of more frames."""
 PERIOD_NS = 10_000_000
 FRAME_NS = 250_000
 LEARNING_SETS = 10
@@ -61,27 +60,6 @@ def foreign(driver: CanDriver, random: Random) -> CanFrame:
         frame = CanFrame(can_id, extended, random.randbytes(random.randint(0, 8)), 0)
         if not is_own(driver, frame):
             return frame
-
-
-def feed_checked(codec: CanCodec, frames: Iterable[CanFrame]) -> list[CodecEvent]:
-    """Feed frames, checking after each that the ledger closes and memory is bounded."""
-    events: list[CodecEvent] = []
-    fed = 0
-    for frame in frames:
-        new = codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
-        events += new
-        fed += len(frame.data)
-        ledger = codec.ledger
-        assert ledger.bytes_in == fed
-        assert ledger.closes(), ledger.snapshot()
-        assert min(ledger.values()) >= 0
-        assert ledger.frames_pending <= PENDING_FRAMES_MAX
-    ledger = codec.ledger
-    bad = [event for event in events if isinstance(event, BadFrame)]
-    assert ledger.frames_bad() == sum(event.reason is not BadReason.NOT_FINITE for event in bad)
-    assert ledger.frames_not_finite == sum(event.reason is BadReason.NOT_FINITE for event in bad)
-    assert ledger.frames_in_replies == sum(isinstance(event, ReplyFrame) for event in events)
-    return events
 
 
 def measurements(events: Iterable[CodecEvent]) -> list[Measurement]:
@@ -181,18 +159,6 @@ def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
     assert codec.ledger.closes()
     partial = "NaN" in driver.euler_convention  # some devices send one angle without the others
     assert all(finite(event, partial) for event in measurements(events))
-
-
-def finite(measurement: Measurement, partial: bool) -> bool:
-    """Whether all numbers are; `partial`: but for those of a vector that has others."""
-    values = (measurement.accel_m_s2, measurement.gyro_rad_s, measurement.euler_rad, measurement.quat_wxyz)
-    for vector in values:
-        if vector is None:
-            continue
-        known = [number for number in vector if not isnan(number)] if partial else vector
-        if not known or not all(-1e40 < number < 1e40 for number in known):
-            return False
-    return True
 
 
 @every_driver

@@ -1,6 +1,5 @@
 """Every polled driver by its row in DRIVERS alone: damage is reported, nothing raises, ledgers close."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 from random import Random
 
@@ -9,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imud.contracts.codec import BadFrame
 from imud.contracts.driver import of_kind
-from imud.contracts.polling import PolledCodec, PolledDriver, PolledEvent, Transfer, Vanished, run_transfer_script
+from imud.contracts.polling import PolledCodec, PolledDriver, Transfer, Vanished, run_transfer_script
 from imud.devices import DRIVERS
 from imud.errors import DeviceRefused, TransferError, Trouble
 from imud.ledger import Ledger
 from imud.links import LINKS
 from imud.sample import Measurement
+from tests.support.codec_invariants import take_polled as take
 
 NAMES = [driver.name for driver in of_kind(DRIVERS.values(), PolledDriver)]
 TRANSFERS_MAX = 20
@@ -35,19 +34,6 @@ def row(name: str) -> PolledDriver:
 
 def make(driver: PolledDriver) -> PolledCodec:
     return driver.make_codec(Ledger(), driver.settings())
-
-
-def take(codec: PolledCodec, poll: int, data: bytes) -> Sequence[PolledEvent]:
-    """Take checked: every byte is in the ledger, and it closes."""
-    ledger = codec.ledger
-    before, bad = ledger.bytes_in, ledger.frames_bad()
-    events = codec.take(poll, data)
-    assert before <= ledger.bytes_in <= before + len(data)
-    assert ledger.closes(), ledger.snapshot()
-    assert min(ledger.values()) >= 0
-    reported = sum(isinstance(event, BadFrame) for event in events) - ledger.frames_not_finite
-    assert ledger.frames_bad() - bad == reported
-    return events
 
 
 @every_driver

@@ -3,19 +3,18 @@
 from collections.abc import Iterable, Sequence
 from random import Random
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imud import devices
-from imud.contracts.codec import BadFrame, CodecEvent, ReplyFrame, StreamCodec, TextLine
+from imud.contracts.codec import CodecEvent, StreamCodec, TextLine
 from imud.contracts.driver import StreamDriver, of_kind
 from imud.ledger import Ledger
 from imud.sample import Measurement
+from tests.support.codec_invariants import cut, untimed
+from tests.support.codec_invariants import feed_stream as feed_checked
 
-PENDING_BYTES_MAX = 2048
-"""No protocol has frames above 1 KiB or lines above 256 characters."""
 IDLE = 2000
 """So many zero bytes complete any frame that is only claimed."""
 
@@ -29,49 +28,8 @@ def make(driver: StreamDriver) -> StreamCodec:
     return driver.make_codec(Ledger(), driver.settings())
 
 
-def untimed(events: Iterable[CodecEvent]) -> list[CodecEvent]:
-    """Events without what depends on the split: how many bytes of the same read follow."""
-    return [
-        msgspec.structs.replace(event, trailing_bytes=0) if isinstance(event, Measurement) else event
-        for event in events
-    ]
-
-
 def measurements(events: Iterable[CodecEvent]) -> list[CodecEvent]:
     return [event for event in untimed(events) if isinstance(event, Measurement)]
-
-
-def feed_checked(codec: StreamCodec, parts: Iterable[bytes]) -> list[CodecEvent]:
-    """Feed `parts`, checking after each that the ledger closes and memory is bounded."""
-    events: list[CodecEvent] = []
-    fed = 0
-    for part in parts:
-        ledger = codec.ledger
-        there = ledger.bytes_pending + len(part)
-        new = codec.feed(part)
-        events += new
-        fed += len(part)
-        assert ledger.bytes_in == fed
-        assert ledger.closes(), ledger.snapshot()
-        assert 0 <= ledger.bytes_pending <= PENDING_BYTES_MAX
-        assert min(ledger.values()) >= 0
-        taken = [event for event in new if isinstance(event, Measurement)]
-        assert all(event.trailing_bytes >= 0 and event.size_bytes + event.trailing_bytes <= there for event in taken)
-    ledger = codec.ledger
-    assert ledger.frames_bad() == sum(isinstance(event, BadFrame) for event in events)
-    assert ledger.frames_in_replies == sum(isinstance(event, TextLine | ReplyFrame) for event in events)
-    return events
-
-
-def cut(data: bytes, random: Random) -> list[bytes]:
-    """`data` in parts of random sizes, from single bytes to all of it."""
-    longest = random.choice((1, 3, 20, 100, 1000, len(data) + 1))
-    parts: list[bytes] = []
-    while data:
-        size = random.randint(1, longest)
-        parts.append(data[:size])
-        data = data[size:]
-    return parts
 
 
 def noise(driver: StreamDriver, random: Random) -> bytes:

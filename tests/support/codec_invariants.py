@@ -1,0 +1,111 @@
+"""What holds for every codec after every piece of input: the ledger closes, memory is bounded, events are counted."""
+
+from collections.abc import Iterable, Sequence
+from math import isnan
+from random import Random
+from typing import Final
+
+import msgspec
+
+from imud.contracts.can import CanCodec
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame, StreamCodec, TextLine
+from imud.contracts.polling import PolledCodec, PolledEvent
+from imud.formats.can import CanFrame
+from imud.ledger import Ledger
+from imud.sample import Measurement
+
+PENDING_BYTES_MAX: Final = 2048
+"""No protocol has frames above 1 KiB or lines above 256 characters."""
+PENDING_FRAMES_MAX: Final = 16
+"""No sample is made of more CAN frames."""
+
+
+def untimed(events: Iterable[CodecEvent]) -> list[CodecEvent]:
+    """Events without what depends on the split: how many bytes of the same read follow."""
+    return [
+        msgspec.structs.replace(event, trailing_bytes=0) if isinstance(event, Measurement) else event
+        for event in events
+    ]
+
+
+def cut(data: bytes, random: Random) -> list[bytes]:
+    """`data` in parts of random sizes, from single bytes to all of it."""
+    longest = random.choice((1, 3, 20, 100, 1000, len(data) + 1))
+    parts: list[bytes] = []
+    while data:
+        size = random.randint(1, longest)
+        parts.append(data[:size])
+        data = data[size:]
+    return parts
+
+
+def feed_stream(codec: StreamCodec, parts: Iterable[bytes]) -> list[CodecEvent]:
+    """Feed `parts`, checking after each that the ledger closes and memory is bounded."""
+    events: list[CodecEvent] = []
+    fed = 0
+    for part in parts:
+        ledger = codec.ledger
+        there = ledger.bytes_pending + len(part)
+        new = codec.feed(part)
+        events += new
+        fed += len(part)
+        assert ledger.bytes_in == fed
+        check_closed(ledger)
+        assert 0 <= ledger.bytes_pending <= PENDING_BYTES_MAX
+        taken = [event for event in new if isinstance(event, Measurement)]
+        assert all(event.trailing_bytes >= 0 and event.size_bytes + event.trailing_bytes <= there for event in taken)
+    check_counted(codec.ledger, events)
+    return events
+
+
+def feed_frames(codec: CanCodec, frames: Iterable[CanFrame]) -> list[CodecEvent]:
+    """Feed frames, checking after each that the ledger closes and memory is bounded."""
+    events: list[CodecEvent] = []
+    fed = 0
+    for frame in frames:
+        events += codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
+        fed += len(frame.data)
+        ledger = codec.ledger
+        assert ledger.bytes_in == fed
+        check_closed(ledger)
+        assert ledger.frames_pending <= PENDING_FRAMES_MAX
+    check_counted(codec.ledger, events)
+    return events
+
+
+def take_polled(codec: PolledCodec, poll: int, data: bytes) -> Sequence[PolledEvent]:
+    """Take one transfer, checking that every byte is in the ledger and that it closes."""
+    ledger = codec.ledger
+    before, bad = ledger.bytes_in, ledger.frames_bad()
+    events = codec.take(poll, data)
+    assert before <= ledger.bytes_in <= before + len(data)
+    check_closed(ledger)
+    damaged = [e for e in events if isinstance(e, BadFrame) and e.reason is not BadReason.NOT_FINITE]
+    assert ledger.frames_bad() - bad == len(damaged)
+    return events
+
+
+def check_closed(ledger: Ledger) -> None:
+    """Fail unless every byte and frame is accounted for, and no counter is negative."""
+    assert ledger.closes(), ledger.snapshot()
+    assert min(ledger.values()) >= 0, ledger.snapshot()
+
+
+def check_counted(ledger: Ledger, events: Sequence[CodecEvent]) -> None:
+    """Fail unless `events`, all since the ledger's start, are those that it counts."""
+    bad = [event for event in events if isinstance(event, BadFrame)]
+    assert ledger.frames_bad() == sum(event.reason is not BadReason.NOT_FINITE for event in bad)
+    assert ledger.frames_not_finite == sum(event.reason is BadReason.NOT_FINITE for event in bad)
+    assert ledger.frames_in_replies == sum(isinstance(event, TextLine | ReplyFrame) for event in events)
+
+
+def finite(measurement: Measurement, partial: bool) -> bool:
+    """Whether all numbers are; `partial`: but for those of a vector that has others."""
+    values = (measurement.accel_m_s2, measurement.gyro_rad_s, measurement.euler_rad, measurement.quat_wxyz)
+    for vector in values:
+        if vector is None:
+            continue
+        known = [number for number in vector if not isnan(number)] if partial else vector
+        if not known or not all(-1e40 < number < 1e40 for number in known):
+            return False
+    return True
