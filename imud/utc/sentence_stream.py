@@ -32,7 +32,7 @@ class SentenceSplitter:
         if len(tail) > LINE_BYTES_MAX:
             tail, self._skipping = b"", True
         self._tail = b"" if self._skipping else tail
-        return [sentence for line in lines if (sentence := _rmc_in(line))]
+        return [sentence for line in lines if len(line) <= LINE_BYTES_MAX and (sentence := _rmc_in(line))]
 
     def clear(self) -> None:
         """Drop the buffered bytes: the stream begins again."""
