@@ -125,8 +125,19 @@ class Renderer:
     def render(self, snapshot: Snapshot, accept: str) -> HttpResponse:
         """The metrics in the format that the Accept header asks for."""
         self._collector.show(snapshot)
-        encode, content_type = choose_encoder(accept)
+        encode, content_type = encoder_for(accept)
         return HttpResponse("200 OK", encode(self._registry), content_type)
+
+
+def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]:
+    """The encoder for an Accept header, and its content type; the default where prometheus_client cannot read it.
+
+    `choose_encoder` raises for a `version` that is no number (seen with 0.26).
+    """
+    try:
+        return choose_encoder(accept)
+    except (TypeError, ValueError):
+        return choose_encoder("")
 
 
 class MetricsPublisher:
