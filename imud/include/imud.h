@@ -398,7 +398,7 @@ static inline imud_health_state imud_health(const imud_ring *ring, int64_t now_n
     const uint32_t *state = (const uint32_t *)(const void *)(ring->base + offsetof(imud_header, state));
     if (__atomic_load_n(state, __ATOMIC_ACQUIRE) != IMUD_STATE_LIVE)
         return IMUD_HEALTH_CLOSED;
-    return now_ns - heartbeat_ns < IMUD_HEARTBEAT_LIMIT_NS ? IMUD_HEALTH_LIVE : IMUD_HEALTH_STALE;
+    return heartbeat_ns > now_ns - IMUD_HEARTBEAT_LIMIT_NS ? IMUD_HEALTH_LIVE : IMUD_HEALTH_STALE;
 }
 
 /* Maps the ring of a restarted daemon. Returns 1 if there is a new one (its samples come from the first on, with those
