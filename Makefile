@@ -2,6 +2,7 @@
 # make lab    tests on a booted kernel          make soak   ten minutes at 1 kHz
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 # make pictures   the pictures of README.md, into docs/pictures
+# make fuzz   every decoder of foreign bytes, 60 s each, with a table
 SHELL := /bin/sh
 PYTHON ?= python3
 VENV := .venv
@@ -9,7 +10,7 @@ BIN := $(VENV)/bin
 ARGS ?=
 LAB_OPTIONS ?= --steady
 
-.PHONY: all demo test lint check bench soak pictures clean lab lab-deps
+.PHONY: all demo test lint check bench soak pictures fuzz fuzz-deps clean lab lab-deps
 
 all: check
 
@@ -40,6 +41,18 @@ soak: $(VENV)/made
 
 pictures: $(VENV)/made
 	$(BIN)/python -m tests.support.pictures
+
+# Coverage-guided fuzzing: ARGS="--seconds 10" in CI, ARGS="--seconds 3600 --target stream/" by hand.
+$(VENV)/made-fuzz: $(VENV)/made
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev,fuzz]' || echo "atheris cannot be installed"
+	@touch $@
+
+fuzz: $(VENV)/made-fuzz
+	$(BIN)/python -m tests.fuzz $(ARGS)
+
+# the compiler for the fuzzer of imud.h
+fuzz-deps:
+	apt-get install --yes --no-install-recommends clang libclang-rt-14-dev
 
 lab-deps:
 	tests/lab/deps

@@ -1,0 +1,168 @@
+"""`make fuzz`: every target for some seconds, two at a time, and a table; exit status 1 if something was found.
+
+make fuzz                                            60 s each with atheris, else with hypothesis
+make fuzz ARGS="--seconds 3600 --target stream/"     an hour for each target whose name has this in it
+make fuzz ARGS="--replay FILE --target shm/ring"     one input, with its traceback
+make fuzz ARGS="--corpus"                            writes tests/fuzz/corpus anew from the targets' seeds
+"""
+
+import argparse
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from tests.fuzz import c_header, corpus
+from tests.fuzz.groups import all_names, load
+
+BUILD: Final = Path("build/fuzz")
+SECONDS: Final = 60.0
+JOBS: Final = 2
+NICE: Final = 10
+STARTING_S: Final = 120.0
+"""A target that is not done so long after its time hangs."""
+
+_COVERAGE: Final = re.compile(r"cov: (\d+) ft: (\d+) corp: (\d+)")
+_RUNS: Final = re.compile(r"stat::number_of_executed_units: *(\d+)|^#(\d+)", re.MULTILINE)
+_HEADINGS: Final = (
+    f"{'target':24} {'engine':10} {'executions':>11} {'per s':>8} {'edges':>6} {'features':>8} {'corpus':>6}  findings"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What came of one target."""
+
+    target: str
+    engine: str
+    executions: int
+    seconds: float
+    edges: str
+    features: str
+    inputs: str
+    findings: tuple[Path, ...]
+    failed: bool
+    """Whether the process ended with an error."""
+
+    def __str__(self) -> str:
+        """One line of the table."""
+        per_s = self.executions / self.seconds if self.seconds else 0
+        found = ", ".join(map(str, self.findings)) or (f"FAILED, see {_log(self.target)}" if self.failed else "none")
+        return (
+            f"{self.target:24} {self.engine:10} {self.executions:11} {per_s:8.0f} {self.edges:>6} {self.features:>8} "
+            f"{self.inputs:>6}  {found}"
+        )
+
+
+def fuzz(target: str, engine: str, seconds: float) -> Result:
+    """Fuzz one target in a process of its own."""
+    folder = BUILD / target.replace("/", "-")
+    grown = folder / "corpus"
+    grown.mkdir(parents=True, exist_ok=True)
+    seeds = corpus.folder_of(target)
+    command = [sys.executable, "-m", "tests.fuzz.worker", engine, target, str(seconds), str(folder)]
+    if engine == "clang":
+        command = c_header.command(folder, seconds)
+    before = _artifacts(folder)
+    begin_s = time.monotonic()
+    with _log(target).open("wb") as log:
+        status = _run([*command, str(grown), *([str(seeds)] if seeds.is_dir() else [])], log.fileno(), seconds)
+    text = _log(target).read_text(errors="replace")
+    coverage = _COVERAGE.findall(text)
+    edges, features, inputs = coverage[-1] if coverage else ("-", "-", "-")
+    runs = max((int(a or b) for a, b in _RUNS.findall(text)), default=0)
+    took_s = min(time.monotonic() - begin_s, seconds)
+    findings = tuple(sorted(_artifacts(folder) - before))
+    return Result(target, engine, runs, took_s, edges, features, inputs, findings, status != 0)
+
+
+def _run(command: Sequence[str], log: int, seconds: float) -> int:
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, check=False, timeout=seconds + STARTING_S,
+            env=c_header.environment(), preexec_fn=_be_nice,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return 1
+    return done.returncode
+
+
+def _be_nice() -> None:
+    os.nice(NICE)
+
+
+def _artifacts(folder: Path) -> set[Path]:
+    return {path for kind in ("crash", "timeout", "oom", "leak") for path in folder.glob(f"{kind}-*")}
+
+
+def _log(target: str) -> Path:
+    return BUILD / f"{target.replace('/', '-')}.log"
+
+
+def plan(wanted: Sequence[str], engine: str) -> list[tuple[str, str]]:
+    """Targets with their engines; says what is left out, and why."""
+    chosen = [name for name in all_names() if not wanted or any(part in name for part in wanted)]
+    if engine == "auto":
+        engine = "atheris" if importlib.util.find_spec("atheris") else "hypothesis"
+        if engine == "hypothesis":
+            print("atheris cannot be imported: hypothesis fuzzes in its place, not guided by coverage")
+    found = [(name, engine) for name in chosen]
+    if not wanted or any(part in c_header.TARGET for part in wanted):
+        problem = c_header.build(BUILD)
+        if problem:
+            print(f"{c_header.TARGET} is left out: {problem}")
+        else:
+            found.append((c_header.TARGET, "clang"))
+    return found
+
+
+def replay(path: Path, wanted: Sequence[str]) -> int:
+    """Run one input through every target that is wanted."""
+    for name in all_names():
+        if any(part in name for part in wanted):
+            print(f"{name}: {path}", flush=True)
+            load(name).run(path.read_bytes())
+    return 0
+
+
+def main() -> int:
+    """Run as `python -m tests.fuzz`."""
+    parser = argparse.ArgumentParser(prog="make fuzz")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="for each target (default %(default)s)")
+    parser.add_argument("--target", action="append", default=[], help="part of a target's name; may be given again")
+    parser.add_argument("--jobs", type=int, default=JOBS, help="targets at a time (default %(default)s)")
+    parser.add_argument("--engine", choices=("auto", "atheris", "hypothesis"), default="auto")
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="run one input through --target")
+    parser.add_argument("--corpus", action="store_true", help="write the corpus in the tree anew")
+    parser.add_argument("--list", action="store_true", help="print the targets")
+    args = parser.parse_args()
+    if args.list:
+        print("\n".join([*all_names(), c_header.TARGET]))
+        return 0
+    if args.corpus:
+        return corpus.write_all()
+    if args.replay:
+        return replay(args.replay, args.target)
+    BUILD.mkdir(parents=True, exist_ok=True)
+    print(_HEADINGS, flush=True)
+    with ThreadPoolExecutor(args.jobs) as pool:
+        running = [pool.submit(fuzz, name, engine, args.seconds) for name, engine in plan(args.target, args.engine)]
+        results = []
+        for each in running:
+            results.append(each.result())
+            print(results[-1], flush=True)
+    found = sum(result.failed or bool(result.findings) for result in results)
+    total = sum(result.executions for result in results)
+    print(f"{len(results)} targets, {total} executions, {found} with findings; logs in {BUILD}")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,53 @@
+"""Builds and runs the fuzzer of imud.h: libFuzzer with AddressSanitizer and UndefinedBehaviorSanitizer."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Final
+
+from tests.fuzz.shm import base
+from tests.support.paths import ROOT
+
+TARGET: Final = "c-header"
+SOURCE: Final = ROOT / "tests/fuzz/ring.c"
+INCLUDE: Final = ROOT / "imud/include"
+INPUT_BYTES_MAX: Final = 512
+INPUT_S_MAX: Final = 10
+_PROGRAM: Final = "c-header-fuzzer"
+_BASE: Final = "ring.base"
+
+
+def build(folder: Path) -> str:
+    """Compile the fuzzer into `folder`; returns why it cannot be, empty if it was."""
+    clang = shutil.which("clang")
+    if clang is None:
+        return "there is no clang (apt-get install clang libclang-rt-14-dev)"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / _BASE).write_bytes(base())
+    options = ["-std=c99", "-g", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{INCLUDE}"]
+    sanitizers = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
+    command = [clang, *options, *sanitizers, str(SOURCE), "-o", str(folder / _PROGRAM)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return f"it does not compile: {done.stderr.strip()}" if done.returncode else ""
+
+
+def command(folder: Path, seconds: float) -> list[str]:
+    """The command that fuzzes; the corpora are to be appended."""
+    return [
+        str(folder.parent / _PROGRAM), f"-max_total_time={max(int(seconds), 1)}", f"-max_len={INPUT_BYTES_MAX}",
+        f"-timeout={INPUT_S_MAX}", f"-artifact_prefix={folder}/", "-print_final_stats=1",
+    ]  # fmt: skip
+
+
+def run_once(folder: Path, inputs: list[Path]) -> subprocess.CompletedProcess[str]:
+    """Run inputs through the fuzzer that `build` put into `folder`, once each."""
+    return subprocess.run(
+        [str(folder / _PROGRAM), *map(str, inputs)], capture_output=True, text=True, check=False,
+        env=environment(folder),
+    )  # fmt: skip
+
+
+def environment(folder: Path = Path("build/fuzz")) -> dict[str, str]:
+    """What the fuzzer needs: the ring that programs change."""
+    return {**os.environ, "IMUD_FUZZ_RING": str(folder / _BASE)}

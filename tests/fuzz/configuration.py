@@ -1,0 +1,65 @@
+"""The configuration: any bytes as a file give a configuration, or one ConfigError whose text is safe to log."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from imud.config import PROBLEMS_SHOWN, differences, parse
+from imud.errors import ConfigError
+from tests.fuzz.target import Target, check_printable
+from tests.support.paths import ROOT
+
+FILENAME: Final = "imud.yaml"
+MESSAGE_BYTES_MAX: Final = 64 * 1024
+"""An error is for people: a log line of a megabyte is none."""
+
+
+def names() -> Sequence[str]:
+    """The one target."""
+    return ["yaml"]
+
+
+def make(_name: str) -> Target:
+    """`parse`, which `load` gives the bytes of a file to."""
+    return Target(run, seeds, words=words, bytes_max=16384)
+
+
+def run(data: bytes) -> None:
+    """Parse; what is accepted is the same when it is read again."""
+    try:
+        config = parse(data, FILENAME)
+    except ConfigError as error:
+        _check_message(str(error))
+        return
+    assert len({device.name for device in config.devices}) == len(config.devices)
+    same = differences(config, parse(data, FILENAME))
+    assert not any(getattr(same, name) for name in same.__dataclass_fields__)
+
+
+def _check_message(message: str) -> None:
+    lines = message.split("\n")
+    assert 1 <= len(lines) <= PROBLEMS_SHOWN + 1
+    for line in lines:
+        check_printable(line)
+    assert len(message.encode()) <= MESSAGE_BYTES_MAX
+
+
+def seeds() -> list[bytes]:
+    """The shipped file, as it is and with its settings switched on in turn, and the examples of the documents."""
+    shipped = (ROOT / "etc/imud.yaml").read_text()
+    plain = "\n".join(line for line in re.sub(r" +#.*", "", shipped).split("\n") if line.strip())
+    settings = re.sub(r"^( *)#(?=[a-z_0-9]+:)", r"\1", shipped, flags=re.MULTILINE)
+    examples = [block for path in sorted((ROOT / "docs").glob("*.md")) for block in _yaml_blocks(path)]
+    odd = ["devices: {}\n", "", "a: &x 1\nb: *x\n", "[[[[[[[[", "devices: {a: {uart: {port: 1:20}}}\n", "? [a]\n: 1\n"]
+    return [text.encode() for text in (shipped, plain, settings, *examples, *odd)]
+
+
+def words() -> list[bytes]:
+    """Every word of the shipped file that could be a key or a value."""
+    text = re.sub(r"^ *# .*", "", (ROOT / "etc/imud.yaml").read_text(), flags=re.MULTILINE)
+    return sorted({word.encode() for word in re.findall(r"[a-z_0-9/.-]{2,24}:?", text)})
+
+
+def _yaml_blocks(path: Path) -> list[str]:
+    return re.findall(r"```yaml\n(.*?)```", path.read_text(), flags=re.DOTALL)

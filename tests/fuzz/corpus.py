@@ -1,0 +1,41 @@
+"""The corpus in the tree: for each target the seeds that its encoders make, and inputs that were findings once.
+
+A seed's file is named by its hash, an input that was added by hand begins with `finding-`.
+"""
+
+from hashlib import sha1
+from pathlib import Path
+from typing import Final
+
+from tests.fuzz.groups import all_names, load
+
+ROOT: Final = Path(__file__).parent / "corpus"
+BY_HAND: Final = "finding-"
+
+
+def folder_of(target: str) -> Path:
+    """Where the inputs of a target are; the C readers run the programs of the Python reader."""
+    return ROOT / target.replace("/", "-").replace("c-header", "shm-ring")
+
+
+def inputs_of(target: str) -> list[Path]:
+    """The inputs of a target."""
+    return sorted(folder_of(target).glob("*"))
+
+
+def write_all() -> int:
+    """Write the seeds of all targets anew; inputs that were added by hand stay."""
+    total = 0
+    for target in all_names():
+        folder = folder_of(target)
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in inputs_of(target):
+            if not old.name.startswith(BY_HAND):
+                old.unlink()
+        for seed in load(target).seeds():
+            (folder / sha1(seed, usedforsecurity=False).hexdigest()[:16]).write_bytes(seed)
+        size = sum(path.stat().st_size for path in inputs_of(target))
+        total += size
+        print(f"{target:24} {len(inputs_of(target)):4} files {size:8} bytes")
+    print(f"{total} bytes in all")
+    return 0

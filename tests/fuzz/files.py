@@ -1,0 +1,142 @@
+"""Files of captures: raw and stamped ones, and logs of candump. What is read is in the file, whatever the file is."""
+
+import io
+import zlib
+from collections.abc import Sequence
+from random import Random
+from typing import Final
+
+from imud.contracts.can import CanDriver
+from imud.contracts.driver import StreamDriver
+from imud.errors import ImudError
+from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX
+from imud.formats.candump import CandumpReader
+from imud.formats.capture import MAGIC, RECORD, RECORD_BYTES_MAX, CaptureReader, Chunk
+from tests.fuzz.drivers import row
+from tests.fuzz.target import Target, check_printable
+from tests.support.captures import CaptureWriter, candump_line
+
+BEGIN_NS: Final = 1_763_717_507_000_000_000
+PERIOD_NS: Final = 10_000_000
+
+
+class ShortReads(io.RawIOBase):
+    """A file that gives fewer bytes than are asked for, as pipes do."""
+
+    def __init__(self, data: bytes, random: Random) -> None:
+        self._data = data
+        self._random = random
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def readinto(self, buffer: bytearray) -> int:  # type: ignore[override]  # any writable buffer
+        """Up to so many bytes."""
+        size = self._random.randint(1, max(len(buffer), 1))
+        part, self._data = self._data[:size], self._data[size:]
+        buffer[: len(part)] = part
+        return len(part)
+
+
+def names() -> Sequence[str]:
+    """The formats."""
+    return ["capture", "candump"]
+
+
+def make(name: str) -> Target:
+    """The reader of one format."""
+    if name == "capture":
+        return Target(run_capture, capture_seeds, words=lambda: [MAGIC, b"driver=", b"baud=", b"hold_ns=", b"1 "])
+    return Target(run_candump, candump_seeds, words=lambda: [b"can0 ", b"##", b"#R", b"(0.0)", b" T\n", b"_9"])
+
+
+def run_capture(data: bytes) -> None:
+    """The chunks are bytes of the file in its order, the same from a pipe; times do not run back."""
+    whole = _chunks(io.BytesIO(data))
+    piped = _chunks(ShortReads(data, Random(zlib.crc32(data))))
+    if whole is None or piped is None:
+        assert whole is piped is None
+        return
+    content = b"".join(chunk.data for chunk in whole)
+    assert content == b"".join(chunk.data for chunk in piped)
+    assert len(content) <= len(data)
+    assert all(len(chunk.data) <= RECORD_BYTES_MAX for chunk in whole)
+    if not data.startswith(MAGIC):
+        assert content == data
+        return
+    assert whole == piped
+    times = [chunk.t_ns for chunk in whole if chunk.t_ns is not None]
+    assert times == sorted(times)
+
+
+def _chunks(file: io.BytesIO | io.RawIOBase) -> list[Chunk] | None:
+    """What a reader gives; None where it refuses the file."""
+    try:
+        reader = CaptureReader(file)  # type: ignore[arg-type]  # a raw file has what is used of BinaryIO
+    except ImudError as error:
+        check_printable(str(error))
+        return None
+    chunks = list(reader)
+    check_printable(reader.problem)
+    assert 0 <= reader.baud < 10**19
+    assert 0 <= reader.hold_ns < 10**19
+    return chunks
+
+
+def run_candump(data: bytes) -> None:
+    """Frames are valid CAN frames, their times do not run back, and each line is counted at most once."""
+    reader = CandumpReader(io.BytesIO(data))
+    newest_ns, count = 0, 0
+    for frame in reader:
+        count += 1
+        assert newest_ns <= frame.t_rx_ns
+        assert 0 <= frame.can_id <= (EXTENDED_ID_MAX if frame.extended else STANDARD_ID_MAX)
+        assert len(frame.data) <= 8
+        newest_ns = frame.t_rx_ns
+    assert count + reader.passed_over + reader.bad_lines <= len(data)
+    assert bool(reader.problem) == bool(reader.bad_lines)
+    check_printable(reader.problem)
+
+
+def capture_seeds() -> list[bytes]:
+    """Captures of a stream, raw and stamped, whole, cut short and damaged."""
+    random = Random(1)
+    driver = row("hipnuc-uart", StreamDriver)
+    found = [driver.example_frame(random) * count for count in (1, 3, 60)]
+    for count in range(4):
+        file = io.BytesIO()
+        details: dict[str, str | int] = {"start_utc_ns": BEGIN_NS, "hold_ns": 1000, "note": "100 % ±"}
+        writer = CaptureWriter(file, driver=driver.name, baud=115200, details=details if count % 2 else None)
+        for number in range(count * 3):
+            writer.write(driver.example_frame(random), BEGIN_NS + number * PERIOD_NS)
+        found += [file.getvalue(), file.getvalue()[:-5]]
+    head = MAGIC + b"1 baud=%s\n" % (b"9" * 30)
+    record = RECORD.pack(5, 3) + b"abc"
+    return [
+        *found,
+        MAGIC,
+        MAGIC + b"2\n",
+        head + record,
+        head + record + RECORD.pack(4, 0),
+        head + RECORD.pack(0, 1 << 31),
+    ]
+
+
+def candump_seeds() -> list[bytes]:
+    """Logs of two drivers, and lines that are no data frame."""
+    random = Random(1)
+    logs = []
+    for name in ("imu61x-can", "hipnuc-j1939"):
+        for count in (1, 4):
+            frames = [frame for _ in range(count) for frame in row(name, CanDriver).example_frames(random)]
+            timed = (frame._replace(t_rx_ns=BEGIN_NS + n * PERIOD_NS) for n, frame in enumerate(frames))
+            logs.append("".join(map(candump_line, timed)))
+    lines = [
+        "(0.0) can0 123#", "(1.5) can0 123#R", "(1.5) can0 123#R8", "(1.5) can0 123##1001122",
+        "(2.0) can0 20000004#0000",
+        "(2.0) vcan0 1F334455#1122334455667788 R", "(2.0) can0 123#1122334455667788_9 T",
+        "(1.0) can0 7FF#00", "nonsense",
+        "(2.0) can0 FFF#00", "(999999999999999999.999999999) c 000#", "(1.0)  can0   123#00   ",
+    ]  # fmt: skip
+    return [text.encode() for text in (*logs, *(line + "\n" for line in lines), "\n".join(lines), "(" * 600)]

@@ -1,0 +1,36 @@
+"""Table: the groups of fuzz targets. A target's name is `group/name`; drivers come from their rows in DRIVERS."""
+
+from importlib import import_module
+from typing import Final, cast
+
+from tests.fuzz.target import Target, TargetGroup
+
+GROUPS: Final = {
+    "stream": "tests.fuzz.streams",
+    "can": "tests.fuzz.can",
+    "polled": "tests.fuzz.polled",
+    "script": "tests.fuzz.scripts",
+    "config": "tests.fuzz.configuration",
+    "socket": "tests.fuzz.rpc",
+    "file": "tests.fuzz.files",
+    "shm": "tests.fuzz.shm",
+    "utc": "tests.fuzz.utc",
+    "http": "tests.fuzz.scrape",
+}
+"""Module of each group; imported when one of its targets is used, so that only its code is instrumented."""
+
+
+def group(name: str) -> TargetGroup:
+    """The module of a group."""
+    return cast(TargetGroup, import_module(GROUPS[name]))
+
+
+def all_names() -> list[str]:
+    """Every target that runs in Python, as `group/name`."""
+    return [f"{kind}/{name}" for kind in GROUPS for name in group(kind).names()]
+
+
+def load(name: str) -> Target:
+    """The target `group/name`."""
+    kind, _, rest = name.partition("/")
+    return group(kind).make(rest)

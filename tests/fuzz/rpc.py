@@ -1,0 +1,182 @@
+"""The UNIX socket: one line through `parse_request`, and all that a client sends through a server with two devices."""
+
+import asyncio
+import atexit
+import grp
+import json
+import os
+import socket
+import tempfile
+from collections.abc import Coroutine, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from imud.contracts.action import described
+from imud.contracts.publisher import PublisherContext
+from imud.devices import DRIVERS
+from imud.errors import Rejected
+from imud.event import Event, EventKind
+from imud.formats.jsonrpc import RpcError, encode_error, encode_result, parse_object, parse_request
+from imud.publishers.socket.publisher import SocketServer, SocketSettings
+from imud.sample import SAMPLE_FIELDS
+from tests.fuzz.target import Target
+from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, batch, device_status
+
+T = TypeVar("T")
+
+ANSWER_S: Final = 5.0
+REPLIES_PER_LINE_MAX: Final = 1
+ERROR_CHARACTERS_MAX: Final = 1024
+METHODS: Final = (
+    "devices", "status", "schema", "watch", "unwatch", "poll", "events", "notify", "actions", "command",
+)  # fmt: skip
+ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
+
+
+def names() -> Sequence[str]:
+    """A line, and a connection."""
+    return ["line", "connection"]
+
+
+def make(name: str) -> Target:
+    """The target of that name."""
+    return Target({"line": run_line, "connection": run_connection}[name], seeds, words=words, bytes_max=8192)
+
+
+def run_line(data: bytes) -> None:
+    """A request that can be answered, or an error that can be sent."""
+    try:
+        request = parse_request(data)
+    except RpcError as error:
+        _check_error(error)
+        return
+    assert parse_object(encode_result(request.request_id, {}))["id"] == request.request_id
+
+
+def run_connection(data: bytes) -> None:
+    """A client sends this and ends its side: each line is answered at most once, and the server stays."""
+    rig = _rig()
+    rig.do(rig.serve(data))
+
+
+def _own_group() -> str:
+    return grp.getgrgid(os.getgid()).gr_name
+
+
+def _check_error(error: RpcError) -> None:
+    assert parse_object(encode_error(error))["error"]["code"] == error.code
+    assert len(str(error)) < ERROR_CHARACTERS_MAX
+
+
+class _Rig:
+    """A server, whose loop runs while a client is served."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(lambda _loop, context: self._strays.append(context))
+        self._strays: list[dict[str, Any]] = []
+        self._folder = tempfile.TemporaryDirectory(prefix="imud-fuzz-")
+        self.server = self.do(self._start())
+        atexit.register(self._close)
+
+    def do(self, work: Coroutine[Any, Any, T]) -> T:
+        """Run `work` in the loop; raises for whatever the loop had to catch."""
+        result = self._loop.run_until_complete(asyncio.wait_for(work, ANSWER_S))
+        strays, self._strays = self._strays, []
+        for stray in strays:
+            raise AssertionError(stray["message"]) from stray.get("exception")
+        return result
+
+    def _close(self) -> None:
+        self.server.close()
+        self._loop.close()
+        self._folder.cleanup()
+
+    async def _start(self) -> SocketServer:
+        statuses = [device_status(*item) for item in DEVICES.items()]
+        context = PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, lambda _device: described(ACTIONS), _act)
+        server = SocketServer(SocketSettings(path=str(Path(self._folder.name, "s")), group=_own_group()), context)
+        server.start()
+        for name, number in DEVICES.items():
+            server.add_device(name, number)
+        server.publish(batch())
+        return server
+
+    async def serve(self, data: bytes) -> None:
+        """Connect, send, end the own side, and read to the end, while samples and events go on."""
+        received = await self._talk(data)
+        await asyncio.sleep(0)
+        assert not self.server.hub.connections
+        _check_received(received, data)
+
+    async def _talk(self, data: bytes) -> bytes:
+        loop = asyncio.get_running_loop()
+        received = bytearray()
+        with socket.socket(socket.AF_UNIX) as peer:
+            peer.setblocking(False)
+            await loop.sock_connect(peer, self.server.hub.path)
+            try:
+                await loop.sock_sendall(peer, data)
+                await asyncio.sleep(0)
+                self.server.publish(batch(first=2))
+                self.server.event(Event(NOW_NS, "imu0", EventKind.UP, "found"))
+                peer.shutdown(socket.SHUT_WR)
+                while part := await loop.sock_recv(peer, 1 << 16):
+                    received += part
+            except ConnectionError:  # ended by the server before all was read
+                return b""
+        return bytes(received)
+
+
+@cache
+def _rig() -> _Rig:
+    return _Rig()
+
+
+async def _act(device: str, name: str, arguments: Mapping[str, Any]) -> object:
+    """Check the arguments of an action as the daemon does; no device is there."""
+    if name not in ACTIONS:
+        raise Rejected(f"{device} has no such action")
+    ACTIONS[name].arguments(arguments)
+    return {"done": name}
+
+
+def _check_received(received: bytes, data: bytes) -> None:
+    """Every message up to the first frame is one JSON object, and there are no more replies than lines."""
+    if b"binary" in data:  # frames may follow
+        return
+    replies = 0
+    for line in received.split(b"\n"):
+        if line:
+            message = json.loads(line)
+            assert message["jsonrpc"] == "2.0"
+            replies += "method" not in message
+    lines = [line for line in data.split(b"\n") if line.strip()]
+    assert replies <= REPLIES_PER_LINE_MAX * len(lines)
+
+
+def seeds() -> list[bytes]:
+    """Each method, with and without parameters; notifications; what is no request."""
+    requests = [{"jsonrpc": "2.0", "id": number, "method": method} for number, method in enumerate(METHODS)]
+    arguments = {"rate_hz": 100}
+    params: list[tuple[str, dict[str, Any]]] = [
+        ("watch", {"devices": ["imu0"], "fields": ["seq", "accel_m_s2"], "rate_hz": 10}),
+        ("watch", {"encoding": "binary"}),
+        ("poll", {"devices": ["imu1"], "fields": ["t_ns"]}),
+        ("events", {"devices": ["imu0"], "enable": False}),
+        ("notify", {"device": "imu0"}),
+        ("actions", {"device": "imu0"}),
+        *(("command", {"device": "imu0", "name": name, "arguments": arguments}) for name in ACTIONS),
+    ]
+    requests += [{"jsonrpc": "2.0", "id": "a", "method": method, "params": given} for method, given in params]
+    lines = [json.dumps(request).encode() + b"\n" for request in requests]
+    odd = [b"{}\n", b"[]\n", b"\n\r\n \n", b"[" * 200 + b"\n", b'{"jsonrpc":"2.0","method":"poll"}\n', b"x" * 70_000]
+    return [*lines, b"".join(lines[:12]), b"".join(lines), *odd]
+
+
+def words() -> list[bytes]:
+    """Names of members, methods, devices, fields and actions."""
+    own = ["jsonrpc", "2.0", "id", "method", "params", "devices", "fields", "rate_hz", "encoding", "binary", "json"]
+    known = [*own, "enable", "device", "name", "arguments", *METHODS, *DEVICES, *SAMPLE_FIELDS, *ACTIONS]
+    return [json.dumps(word).encode() for word in known]

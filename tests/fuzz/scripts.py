@@ -1,0 +1,129 @@
+"""Request scripts of stream and CAN drivers, answered by any bytes: they end, and raise nothing but what is documented.
+
+The first byte of an input chooses the script: `identify`, `read_settings`, `wake`, or an action that needs no
+arguments. The rest is what the device sends, as in `streams` and `can`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+from imud.contracts.action import Target as ActionTarget
+from imud.contracts.can import CanDriver
+from imud.contracts.codec import CodecEvent, Message, message_of
+from imud.contracts.driver import Driver, StreamDriver
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
+from imud.errors import BadArgument, CommandError, DeviceRefused
+from imud.ledger import Ledger
+from tests.fuzz import can, streams
+from tests.fuzz.drivers import mender, names_of, row
+from tests.fuzz.target import FRAMES_BYTES_MAX, Target
+
+REQUESTS_MAX = 500
+"""No script asks more often, whatever it is answered."""
+BAUD = 115200
+
+Script = Callable[[], RequestScript[Any]]
+
+
+def names() -> Sequence[str]:
+    """The stream and CAN drivers that ask anything."""
+    drivers = [*names_of(StreamDriver), *names_of(CanDriver)]
+    return [name for name in drivers if any(map(_asks, _scripts(row(name, Driver))))]
+
+
+def _asks(begin: Script) -> bool:
+    return next(begin(), None) is not None
+
+
+def make(name: str) -> Target:
+    """The scripts of one driver."""
+    driver = row(name, Driver)
+    messages = _stream_messages(driver) if isinstance(driver, StreamDriver) else _can_messages(row(name, CanDriver))
+    scripts = _scripts(driver)
+    mend = mender(name)
+
+    def run(data: bytes) -> None:
+        if data:
+            _answer(scripts[data[0] % len(scripts)], messages(data[1:]))
+
+    def seeds() -> list[bytes]:
+        if isinstance(driver, StreamDriver):
+            replies = streams.seeds(driver)
+        else:
+            replies = can.seeds(row(name, CanDriver), can.own_identifiers(row(name, CanDriver)))
+        return [bytes([number % len(scripts)]) + replies[number % len(replies)] for number in range(24)]
+
+    return Target(run, seeds, lambda data, random: data[:1] + mend(data[1:], random), bytes_max=FRAMES_BYTES_MAX)
+
+
+def _scripts(driver: Driver) -> list[Script]:
+    settings = driver.settings()
+    found: list[Script] = []
+    if isinstance(driver, StreamDriver):
+        found = [driver.identify, driver.read_settings, *([driver.wake] if driver.wake else [])]
+    elif isinstance(driver, CanDriver):
+        found = [lambda: driver.identify(settings), lambda: driver.read_settings(settings)]
+    target = ActionTarget(settings, BAUD)
+    for action in driver.actions.values():
+        try:
+            arguments = action.arguments({})
+        except BadArgument:
+            continue
+        found.append(partial(action.script, target, arguments))
+    return found
+
+
+def _stream_messages(driver: StreamDriver) -> Callable[[bytes], Iterator[Message]]:
+    def messages(data: bytes) -> Iterator[Message]:
+        codec = driver.make_codec(Ledger(), driver.settings())
+        yield from _messages([*codec.feed(data), *codec.flush()])
+
+    return messages
+
+
+def _can_messages(driver: CanDriver) -> Callable[[bytes], Iterator[Message]]:
+    own = can.own_identifiers(driver)
+
+    def messages(data: bytes) -> Iterator[Message]:
+        codec = driver.make_codec(Ledger(), driver.settings())
+        for frame in can.decoded(data, own):
+            yield from _messages(codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
+
+    return messages
+
+
+def _messages(events: Sequence[CodecEvent]) -> Iterator[Message]:
+    return (message for message in map(message_of, events) if message is not None)
+
+
+def _answer(begin: Script, messages: Iterator[Message]) -> None:
+    """Run a script with the messages as they come; when none is left, each request times out."""
+    session = Session(Ledger())
+    now_ns = 0
+    try:
+        script = begin()
+        request = next(script)
+        for _ in range(REQUESTS_MAX):
+            outcome, now_ns = _outcome(session, request, messages, now_ns)
+            request = script.send(outcome)
+    except StopIteration:
+        return
+    except (CommandError, DeviceRefused):
+        return
+    raise AssertionError(f"more than {REQUESTS_MAX} requests")
+
+
+def _outcome(session: Session, request: Request, messages: Iterator[Message], now_ns: int) -> tuple[Outcome, int]:
+    session.start(request, now_ns)
+    if request.silent:
+        return Reply(()), now_ns
+    for message in messages:
+        now_ns += 1_000_000
+        outcome = session.on_message(message, now_ns) or session.on_time(now_ns)
+        if outcome is not None:
+            return outcome, now_ns
+    now_ns = session.deadline_ns or now_ns
+    silence = session.on_time(now_ns)
+    assert silence is not None
+    return silence, now_ns

@@ -1,0 +1,245 @@
+"""Readers of shared memory: one slot, and a ring whose file changes in any way while it is read.
+
+An input for a ring is a program. Byte 0: how many steps come before the reader opens the file; byte 1: how many times
+CUT_BYTES are missing at the file's end. A step is a byte, of which the low three bits count:
+
+    0 read  1 latest  2 ledger  3 health  7 the file is replaced by a copy, and reopened
+    4 write: offset u16, modulo the size; length u8, modulo 32; bytes    5 slot's CRC-32 made right: number u8
+    6 ledger's CRC-32 made right
+
+`ring.c` runs the same programs on imud.h.
+"""
+
+import atexit
+import os
+import shutil
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Final
+
+from imud.client.ring import Ring
+from imud.errors import ServerError
+from imud.formats.ring import (
+    HEADER_BYTES,
+    LEDGER_BLOCK_BYTES,
+    LEDGER_BLOCK_OFFSET,
+    LEDGER_CRC_OFFSET,
+    OFFSETS,
+    RingHeader,
+    encode_header,
+    encode_ledger_block,
+)
+from imud.formats.slot import CRC_OFFSET, SLOT_BYTES, SYNC_CODES, decode_slot, encode_slot
+from imud.ledger import LEDGER_FIELDS
+from tests.fuzz.target import Target, check_printable
+from tests.support.rings import DEVICE, START_NS, make_sample
+
+SLOTS: Final = 8
+NEWEST: Final = 20
+PID: Final = 4242
+BYTES: Final = HEADER_BYTES + SLOTS * SLOT_BYTES
+CUT_BYTES: Final = 64
+WRITE_BYTES_MAX: Final = 31
+READ, LATEST, LEDGER, HEALTH, WRITE, MEND_SLOT, MEND_LEDGER, REPLACE = range(8)
+
+
+def names() -> Sequence[str]:
+    """A slot, and a ring."""
+    return ["slot", "ring"]
+
+
+def make(name: str) -> Target:
+    """The target of that name."""
+    if name == "slot":
+        return Target(run_slot, slot_seeds, mend_slot, bytes_max=2 * SLOT_BYTES)
+    return Target(run_ring, ring_seeds, bytes_max=512)
+
+
+# --- a slot -----------------------------------------------------------------------------------------------------------
+
+
+def run_slot(data: bytes) -> None:
+    """ValueError, or a sample that gives the same sample when it is encoded again."""
+    try:
+        sample = decode_slot(data, DEVICE)
+    except ValueError:
+        return
+    again = encode_slot(sample, 3)
+    assert repr(decode_slot(again, DEVICE)) == repr(sample)  # NaN is equal by its name
+
+
+def mend_slot(data: bytes, _random: Random) -> bytes:
+    """A slot of the right size with a right CRC."""
+    body = data[:CRC_OFFSET].ljust(CRC_OFFSET, b"\0")
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+def slot_seeds() -> list[bytes]:
+    """Slots of several samples, and damaged ones."""
+    slots = [encode_slot(make_sample(seq), 3) for seq in (1, 2, 1 << 40, (1 << 64) - 1)]
+    random = Random(1)
+    bodies = [random.randbytes(62) + bytes([code]) + random.randbytes(189) for code in (*range(len(SYNC_CODES)), 9)]
+    return [*slots, slots[0][:-1], slots[0] + b"\0", b"", *(mend_slot(body, random) for body in bodies)]
+
+
+# --- a ring -----------------------------------------------------------------------------------------------------------
+
+
+@cache
+def base() -> bytes:
+    """A ring in the middle of its work: eight slots, twenty samples."""
+    header = encode_header(RingHeader(77, PID, 1, DEVICE, 3, SLOTS, NEWEST, 1, START_NS))
+    image = bytearray(header + bytes(SLOTS * SLOT_BYTES))
+    block = encode_ledger_block(5, "hipnuc-uart", dict.fromkeys(LEDGER_FIELDS, 7))
+    image[LEDGER_BLOCK_OFFSET : LEDGER_BLOCK_OFFSET + LEDGER_BLOCK_BYTES] = block
+    for seq in range(NEWEST - SLOTS + 1, NEWEST + 1):
+        at = _slot_at(seq)
+        image[at : at + SLOT_BYTES] = encode_slot(make_sample(seq), 3)
+    return bytes(image)
+
+
+def _slot_at(number: int) -> int:
+    return HEADER_BYTES + number % SLOTS * SLOT_BYTES
+
+
+class RingFile:
+    """The file that a program writes."""
+
+    def __init__(self, path: Path, size_bytes: int) -> None:
+        self.path = path
+        self.image = bytearray(base()[:size_bytes])
+        path.write_bytes(self.image)
+        self._fd = os.open(path, os.O_RDWR)
+
+    def write(self, at: int, data: bytes) -> None:
+        """Overwrite bytes; what would lie behind the end is left out."""
+        data = data[: max(len(self.image) - at, 0)]
+        self.image[at : at + len(data)] = data
+        os.pwrite(self._fd, data, at)
+
+    def mend_slot(self, number: int) -> None:
+        """Make the CRC of a slot right."""
+        at = _slot_at(number)
+        self.write(at + CRC_OFFSET, zlib.crc32(self.image[at : at + CRC_OFFSET]).to_bytes(4, "little"))
+
+    def mend_ledger(self) -> None:
+        """Make the CRC of the ledger block right."""
+        block = self.image[LEDGER_BLOCK_OFFSET:LEDGER_CRC_OFFSET]
+        self.write(LEDGER_CRC_OFFSET, zlib.crc32(block).to_bytes(4, "little"))
+
+    def replace(self) -> None:
+        """Put a copy in its place, as a restarted daemon does."""
+        other = self.path.with_suffix(".new")
+        other.write_bytes(self.image)
+        os.replace(other, self.path)
+        os.close(self._fd)
+        self._fd = os.open(self.path, os.O_RDWR)
+
+    def close(self) -> None:
+        """Close the descriptor."""
+        os.close(self._fd)
+
+
+def run_ring(data: bytes) -> None:
+    """Run a program: only ServerError, samples in order, never more of them than slots."""
+    if len(data) < 2:
+        return
+    file = RingFile(_folder() / f"imud.{DEVICE}", max(BYTES - data[1] * CUT_BYTES, 0))
+    ring: Ring | None = None
+    try:
+        at, steps = 2, 0
+        while at < len(data):
+            if ring is None and steps >= data[0]:
+                ring = Ring(file.path, now_ns=lambda: START_NS)
+            at = _step(file, ring, data, at)
+            steps += 1
+    except ServerError as error:
+        check_printable(str(error))
+    finally:
+        file.close()
+        if ring is not None:
+            ring.close()
+
+
+def _step(file: RingFile, ring: Ring | None, data: bytes, at: int) -> int:
+    """Do the step at `at`; return where the next one is."""
+    kind = data[at] % 8
+    if kind == WRITE:
+        if at + 4 > len(data):
+            return len(data)
+        (offset,) = struct.unpack_from("<H", data, at + 1)
+        end = at + 4 + data[at + 3] % (WRITE_BYTES_MAX + 1)
+        file.write(offset % BYTES, data[at + 4 : end])
+        return end
+    if kind == MEND_SLOT:
+        file.mend_slot(data[at + 1] if at + 1 < len(data) else 0)
+        return at + 2
+    if kind == MEND_LEDGER:
+        file.mend_ledger()
+    elif kind == REPLACE:
+        file.replace()
+    if ring is not None and kind in _READINGS:
+        _READINGS[kind](ring)
+    return at + 1
+
+
+def _read(ring: Ring) -> None:
+    before = ring.missed
+    found = ring.read()
+    numbers = [sample.seq for sample in found.samples]
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) <= ring.header.slot_count
+    assert found.missed >= 0
+    assert ring.missed == before + found.missed
+
+
+def _latest(ring: Ring) -> None:
+    sample = ring.latest()
+    assert sample is None or sample.seq == ring.newest_seq
+
+
+_READINGS: Final[dict[int, Callable[[Ring], object]]] = {
+    READ: _read,
+    LATEST: _latest,
+    LEDGER: Ring.ledger,
+    HEALTH: lambda ring: ring.alive(START_NS),
+    REPLACE: Ring.reopen,
+}
+
+
+@cache
+def _folder() -> Path:
+    parent = Path("/dev/shm")
+    folder = tempfile.mkdtemp(prefix="imud-fuzz-", dir=parent if os.access(parent, os.W_OK) else None)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def ring_seeds() -> list[bytes]:
+    """Programs: plain readings, each field of the header at its bounds before and after opening, torn slots."""
+    readings = bytes([READ, LATEST, LEDGER, HEALTH, REPLACE, READ])
+    plain = [bytes([0, 0]) + readings, bytes([0, 1]) + readings, bytes([0, 97]) + readings]
+    found = [*plain, bytes([0, 0, REPLACE, READ, LATEST])]
+    fields = {"slot_count": 4, "ledger_count": 4, "state": 4, "newest_seq": 8, "first_seq": 8, "heartbeat_ns": 8}
+    for name, size in fields.items():
+        for value in (0, 1, 0x80 << (8 * size - 8), (1 << (8 * size)) - 1):
+            write = written(OFFSETS[name], value.to_bytes(size, "little"))
+            found.append(bytes([1, 0]) + write + readings + readings)
+            found.append(bytes([0, 0]) + bytes([READ]) + write + readings + bytes([READ]))
+    newer = written(_slot_at(NEWEST + 1), encode_slot(make_sample(NEWEST + 1), 3)[:WRITE_BYTES_MAX])
+    newest = written(OFFSETS["newest_seq"], (NEWEST + 1).to_bytes(8, "little"))
+    mended = bytes([MEND_SLOT, (NEWEST + 1) % SLOTS])
+    found.append(bytes([0, 0, READ]) + newer + newest + bytes([READ]) + mended + readings)
+    found.append(bytes([0, 0, READ]) + newer + mended + newest + readings)
+    found.append(bytes([1, 0]) + written(OFFSETS["device"], b"\xff\x1b[31m\n") + bytes([MEND_LEDGER]) + readings)
+    return found
+
+
+def written(at: int, data: bytes) -> bytes:
+    """The step that writes `data` at `at`."""
+    return struct.pack("<BHB", WRITE, at, len(data)) + data

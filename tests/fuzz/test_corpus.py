@@ -1,0 +1,44 @@
+"""Every input of the corpus, once through its target; no fuzzing engine is needed."""
+
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from imud.contracts.can import CanDriver
+from imud.contracts.driver import StreamDriver
+from imud.contracts.polling import PolledDriver
+from imud.devices import DRIVERS
+from tests.fuzz import c_header, corpus
+from tests.fuzz.groups import all_names, load
+
+NAMES = all_names()
+CORPUS_BYTES_MAX = 2_000_000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_corpus(name: str) -> None:
+    target = load(name)
+    inputs = corpus.inputs_of(name)
+    assert inputs, f"{name} has no corpus: make fuzz ARGS=--corpus"
+    for data in {*(path.read_bytes() for path in inputs), *target.seeds()}:  # seeds as the encoders make them now
+        target.run(data)
+        target.run(target.mend(data, Random(1)))
+
+
+def test_every_driver_has_a_target() -> None:
+    kinds = {StreamDriver: "stream", CanDriver: "can", PolledDriver: "polled"}
+    for name, driver in DRIVERS.items():
+        assert f"{kinds[type(driver)]}/{name}" in NAMES
+
+
+def test_no_folder_without_a_target_and_small_in_all() -> None:
+    assert {folder.name for folder in corpus.ROOT.iterdir()} == {corpus.folder_of(name).name for name in NAMES}
+    assert sum(path.stat().st_size for path in corpus.ROOT.rglob("*")) <= CORPUS_BYTES_MAX
+
+
+def test_corpus_of_rings_through_the_c_header(tmp_path: Path) -> None:
+    if problem := c_header.build(tmp_path):
+        pytest.skip(problem)
+    done = c_header.run_once(tmp_path, corpus.inputs_of(c_header.TARGET))
+    assert done.returncode == 0, done.stderr

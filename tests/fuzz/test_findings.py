@@ -1,0 +1,40 @@
+"""What fuzzing found, one test each."""
+
+from pathlib import Path
+
+import pytest
+
+from imud.formats.ring import OFFSETS
+from imud.publishers.metrics.publisher import encoder_for
+from imud.utc.sentence_stream import LINE_BYTES_MAX, SentenceSplitter
+from tests.fuzz import c_header
+from tests.fuzz.shm import HEALTH, written
+
+SENTENCE = b"$GPRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,A*57\r\n"
+
+
+@pytest.mark.parametrize("size", [100, LINE_BYTES_MAX, 3 * LINE_BYTES_MAX])
+def test_a_line_that_is_too_long_is_skipped_in_any_split(size: int) -> None:
+    """utc/sentences: read at once it was searched for a sentence, read in parts it was not."""
+    stream = b"x" * LINE_BYTES_MAX + SENTENCE + SENTENCE
+    splitter = SentenceSplitter()
+    parts = [stream[at : at + size] for at in range(0, len(stream), size)]
+    assert [found for part in parts for found in splitter.feed(part)] == [SENTENCE]
+
+
+@pytest.mark.parametrize("version", ["x", "1.x", "", "1.0.0"])
+def test_a_scrape_with_any_version_is_answered(version: str) -> None:
+    """http/request: prometheus_client raised TypeError for a version that is no number, and nothing was answered."""
+    _, content_type = encoder_for(f"application/openmetrics-text; version={version}")
+    assert content_type.startswith(("text/plain", "application/openmetrics-text"))
+
+
+def test_heartbeat_at_the_end_of_its_range_is_no_undefined_behaviour(tmp_path: Path) -> None:
+    """c-header: `now_ns - heartbeat_ns` overflowed in imud_health."""
+    if problem := c_header.build(tmp_path):
+        pytest.skip(problem)
+    program = tmp_path / "program"
+    heartbeat = (1 << 63).to_bytes(8, "little")
+    program.write_bytes(bytes([0, 0]) + written(OFFSETS["heartbeat_ns"], heartbeat) + bytes([HEALTH]))
+    done = c_header.run_once(tmp_path, [program])
+    assert done.returncode == 0, done.stderr

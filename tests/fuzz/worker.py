@@ -1,0 +1,143 @@
+"""Fuzzes one target in this process: `python -m tests.fuzz.worker ENGINE TARGET SECONDS FOLDER CORPUS...`.
+
+Started by `tests.fuzz.__main__` for each target, because atheris instruments a module when it is imported, and ends
+the process at a finding. The last lines say what was done, in the words of libFuzzer for both engines.
+"""
+
+import importlib
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from hashlib import sha1
+from pathlib import Path
+from random import Random
+from typing import Final, Protocol, cast
+
+from tests.fuzz.groups import load
+from tests.fuzz.target import Target
+
+INPUT_S_MAX: Final = 10
+"""An input that takes longer is a finding."""
+MEMORY_MB_MAX: Final = 1024
+"""A process that takes more is a finding."""
+MEND_SHARE: Final = 0.5
+"""One in so many mutations gets right check values."""
+
+
+class Atheris(Protocol):
+    """What is used of atheris, which has no type hints."""
+
+    def instrument_imports(self, include: Sequence[str]) -> AbstractContextManager[None]:
+        """Count coverage of the packages that are imported inside."""
+        ...
+
+    def Setup(
+        self, args: Sequence[str], run: Callable[[bytes], None],
+        custom_mutator: Callable[[bytes, int, int], bytes],
+    ) -> object:  # fmt: skip
+        """Take the options of libFuzzer."""
+        ...
+
+    def Fuzz(self) -> None:
+        """Fuzz; ends the process."""
+        ...
+
+    def Mutate(self, data: bytes, size: int) -> bytes:
+        """libFuzzer's own mutation."""
+        ...
+
+
+def fuzz_with_atheris(name: str, seconds: float, folder: Path, corpora: Sequence[str]) -> None:
+    """Fuzz, guided by the coverage of the package `imud`."""
+    atheris = cast(Atheris, importlib.import_module("atheris"))
+    with atheris.instrument_imports(include=["imud", "prometheus_client"]):
+        target = load(name)
+
+    def mutated(data: bytes, size: int, seed: int) -> bytes:
+        found, random = atheris.Mutate(data, len(data)), Random(seed)
+        return target.mend(found, random)[:size] if random.random() < MEND_SHARE else found
+
+    options = [
+        f"-max_total_time={max(int(seconds), 1)}", f"-max_len={target.bytes_max}", f"-timeout={INPUT_S_MAX}",
+        f"-rss_limit_mb={MEMORY_MB_MAX}", f"-artifact_prefix={folder}/", "-print_final_stats=1", "-len_control=0",
+        *_dictionary(target, folder),
+    ]  # fmt: skip
+    atheris.Setup([sys.argv[0], *options, *corpora], target.run, custom_mutator=mutated)
+    atheris.Fuzz()
+
+
+def _dictionary(target: Target, folder: Path) -> list[str]:
+    """The option that names a file of the target's words; none for a target without words."""
+    words = target.words()
+    file = folder / "words.dict"
+    file.write_text("".join(f'"{_escaped(word)}"\n' for word in words))
+    return [f"-dict={file}"] if words else []
+
+
+def fuzz_with_hypothesis(name: str, seconds: float, folder: Path, corpora: Sequence[str]) -> int:
+    """Fuzz with mutations of the corpus, not guided by coverage. Returns the status of the process."""
+    from hypothesis import HealthCheck, find, settings
+    from hypothesis import strategies as st
+    from hypothesis.errors import NoSuchExample
+
+    target = load(name)
+    known = [path.read_bytes() for corpus in corpora for path in sorted(Path(corpus).iterdir())] or [b""]
+    inputs = st.one_of(
+        st.binary(max_size=256),
+        st.builds(
+            lambda data, at, cut, put, seed: _changed(target, data, at, cut, put, seed),
+            st.sampled_from(known), st.integers(0, 1 << 16), st.integers(0, 64), st.binary(max_size=64),
+            st.integers(0, 1 << 32),
+        ),
+    )  # fmt: skip
+    end_s, runs = time.monotonic() + seconds, 0
+    failure: list[Exception] = []
+
+    def fails(data: bytes) -> bool:
+        nonlocal runs
+        runs += 1
+        try:
+            target.run(data)
+        except Exception as error:  # noqa: BLE001  # whatever is raised is a finding
+            failure[:] = [error]
+            return True
+        return False
+
+    quick = settings(max_examples=200, database=None, deadline=None, suppress_health_check=list(HealthCheck))
+    random = Random(0)
+    while time.monotonic() < end_s:
+        try:
+            found = find(inputs, fails, settings=quick, random=Random(random.getrandbits(64)))
+        except NoSuchExample:
+            continue
+        path = folder / f"crash-{sha1(found, usedforsecurity=False).hexdigest()}"
+        path.write_bytes(found)
+        fails(found)
+        print(f"{type(failure[0]).__name__}: {failure[0]}\nartifact: {path}\nstat::number_of_executed_units: {runs}")
+        return 1
+    print(f"stat::number_of_executed_units: {runs}")
+    return 0
+
+
+def _changed(target: Target, data: bytes, at: int, cut: int, put: bytes, seed: int) -> bytes:
+    at %= len(data) + 1
+    data = data[:at] + put + data[at + cut :]
+    return (target.mend(data, Random(seed)) if seed % 2 else data)[: target.bytes_max]
+
+
+def _escaped(word: bytes) -> str:
+    return "".join(chr(byte) if chr(byte).isalnum() else f"\\x{byte:02X}" for byte in word)
+
+
+def main() -> int:
+    """Run as `python -m tests.fuzz.worker`."""
+    engine, name, seconds, folder, *corpora = sys.argv[1:]
+    if engine == "atheris":
+        fuzz_with_atheris(name, float(seconds), Path(folder), corpora)
+        return 0
+    return fuzz_with_hypothesis(name, float(seconds), Path(folder), corpora)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
