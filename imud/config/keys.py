@@ -1,5 +1,6 @@
 """Reads the keys of one file against schemas, and collects problems with their places instead of stopping at one."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -11,6 +12,8 @@ from imud.config.yaml_tree import Problem, YamlTree
 from imud.contracts.settings import Settings, expected, got, unknown_name
 
 S = TypeVar("S", bound=Settings)
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
 class Keys:
@@ -91,4 +94,15 @@ class Keys:
             detail = f" ({error})" if inside else ""
             self.problem(path, f"expected {expected(field_type)}, got {got(value)}{detail}")
             return False
-        return True
+        text = _controlling(value)
+        if text is not None:
+            self.problem(path, f"expected text without control characters, got {got(text)}")
+        return text is None
+
+
+def _controlling(value: object) -> str | None:
+    """A text in `value` that has control characters (no path or name has any, the kernel refuses NUL); else None."""
+    if isinstance(value, str):
+        return value if _CONTROL.search(value) else None
+    parts = value if isinstance(value, list) else value.values() if isinstance(value, dict) else ()
+    return next((text for text in map(_controlling, parts) if text is not None), None)

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
 from imud.config import PROBLEMS_SHOWN, differences, parse
 from imud.errors import ConfigError
 from tests.fuzz.target import Target, check_printable
@@ -13,6 +15,10 @@ from tests.support.paths import ROOT
 FILENAME: Final = "imud.yaml"
 MESSAGE_BYTES_MAX: Final = 64 * 1024
 """An error is for people: a log line of a megabyte is none."""
+
+
+_CONTROL: Final = re.compile(r"\\x[0189][0-9a-f]|\\x7f|\\[nrt]|\\u202[89]")
+"""Control characters as `repr` writes them."""
 
 
 def names() -> Sequence[str]:
@@ -32,6 +38,7 @@ def run(data: bytes) -> None:
     except ConfigError as error:
         _check_message(str(error))
         return
+    assert not _CONTROL.search(str(msgspec.to_builtins(config, enc_hook=str)).replace("\\\\", ""))
     assert len({device.name for device in config.devices}) == len(config.devices)
     same = differences(config, parse(data, FILENAME))
     assert not any(getattr(same, name) for name in same.__dataclass_fields__)
@@ -52,6 +59,7 @@ def seeds() -> list[bytes]:
     settings = re.sub(r"^( *)#(?=[a-z_0-9]+:)", r"\1", shipped, flags=re.MULTILINE)
     examples = [block for path in sorted((ROOT / "docs").glob("*.md")) for block in _yaml_blocks(path)]
     odd = ["devices: {}\n", "", "a: &x 1\nb: *x\n", "[[[[[[[[", "devices: {a: {uart: {port: 1:20}}}\n", "? [a]\n: 1\n"]
+    odd += ['devices: {a: {uart: {port: "/dev/tty\\0"}}}', 'state_dir: "/var/\\n/\\x9b"\ndevices: {}']
     return [text.encode() for text in (shipped, plain, settings, *examples, *odd)]
 
 

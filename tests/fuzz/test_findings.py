@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from imud import config
+from imud.errors import ConfigError
 from imud.formats.ring import OFFSETS
 from imud.publishers.metrics.publisher import encoder_for
 from imud.utc.sentence_stream import LINE_BYTES_MAX, SentenceSplitter
@@ -27,6 +29,23 @@ def test_a_scrape_with_any_version_is_answered(version: str) -> None:
     """http/request: prometheus_client raised TypeError for a version that is no number, and nothing was answered."""
     _, content_type = encoder_for(f"application/openmetrics-text; version={version}")
     assert content_type.startswith(("text/plain", "application/openmetrics-text"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'devices: {a: {uart: {port: "/dev/tty\\0"}}}',
+        'devices: {a: {driver: hipnuc-canopen, socketcan: {interface: "can0\\n"}}}',
+        'socket: {path: "/run/\\x7f/s"}\ndevices: {}',
+        'shm: {group: "a\\eb"}\ndevices: {}',
+        'state_dir: "/var/\\Lx"\ndevices: {}',
+    ],
+)
+def test_text_with_control_characters_is_refused(text: str) -> None:
+    """config/yaml: an escape in quotes gave a path with NUL, whose opening ended the daemon with a ValueError."""
+    with pytest.raises(ConfigError, match="expected text without control characters, got") as refused:
+        config.parse(text, "imud.yaml")
+    assert str(refused.value).isprintable()
 
 
 def test_heartbeat_at_the_end_of_its_range_is_no_undefined_behaviour(tmp_path: Path) -> None:
