@@ -1,0 +1,46 @@
+"""The engines themselves: what fails is found, saved and reported; what holds is not."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz import __main__ as runner
+from tests.fuzz import worker
+from tests.fuzz.target import Target
+from tests.support.paths import ROOT
+
+
+def fails_on_a_bracket(data: bytes) -> None:
+    assert b"[" not in data
+
+
+@pytest.mark.parametrize(("run", "status"), [(fails_on_a_bracket, 1), (bytes, 0)])
+def test_hypothesis_saves_what_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], run: object, status: int
+) -> None:
+    corpus = tmp_path / "corpus"
+    corpus.mkdir()
+    (corpus / "seed").write_bytes(b"a[b")
+    monkeypatch.setattr(worker, "load", lambda _name: Target(run, list))  # type: ignore[arg-type]
+    assert worker.fuzz_with_hypothesis("any", 0.2, tmp_path, [str(corpus)]) == status
+    found = list(tmp_path.glob("crash-*"))
+    assert [path.read_bytes() for path in found] == ([b"["] if status else [])
+    assert "stat::number_of_executed_units: " in capsys.readouterr().out
+
+
+def test_atheris_runs_where_it_is_installed(tmp_path: Path) -> None:
+    pytest.importorskip("atheris")
+    command = [sys.executable, "-m", "tests.fuzz.worker", "atheris", "utc/rmc", "1", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "stat::number_of_executed_units: " in done.stderr
+    assert not list(tmp_path.glob("crash-*"))
+
+
+def test_a_result_shows_its_findings() -> None:
+    good = runner.Result("utc/rmc", "atheris", 1000, 10.0, "82", "145", "22", (), failed=False)
+    assert str(good).split() == ["utc/rmc", "atheris", "1000", "100", "82", "145", "22", "none"]
+    bad = runner.Result("utc/rmc", "atheris", 1, 1.0, "-", "-", "-", (Path("build/fuzz/utc-rmc/crash-1"),), failed=True)
+    assert str(bad).endswith("build/fuzz/utc-rmc/crash-1")
