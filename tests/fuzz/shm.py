@@ -12,6 +12,7 @@ CUT_BYTES are missing at the file's end. A step is a byte, of which the low thre
 
 import atexit
 import os
+import re
 import shutil
 import struct
 import tempfile
@@ -36,6 +37,7 @@ from imud.formats.ring import (
 )
 from imud.formats.slot import CRC_OFFSET, SLOT_BYTES, SYNC_CODES, decode_slot, encode_slot
 from imud.ledger import LEDGER_FIELDS
+from imud.sample import Sample
 from tests.fuzz.target import Target, check_printable
 from tests.support.rings import DEVICE, START_NS, make_sample
 
@@ -70,7 +72,12 @@ def run_slot(data: bytes) -> None:
     except ValueError:
         return
     again = encode_slot(sample, 3)
-    assert repr(decode_slot(again, DEVICE)) == repr(sample)  # NaN is equal by its name
+    assert _comparable(decode_slot(again, DEVICE)) == _comparable(sample)
+
+
+def _comparable(sample: Sample) -> str:
+    """A sample in words: NaN is equal to itself there. A zero may lose its sign."""
+    return re.sub(r"-0\.0\b", "0.0", repr(sample))
 
 
 def mend_slot(data: bytes, _random: Random) -> bytes:
