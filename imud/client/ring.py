@@ -7,13 +7,18 @@
             ring.wait(wake_fd, timeout_s=1.0)       # a descriptor of one's own, from `imud.client.Client.notify`
 
 Nothing here waits busily: a slot that is not whole yet is given by a later call. A daemon that restarts makes a new
-file; `read` and `latest` change over to it by themselves as soon as the old one is closed or its heartbeat is stale.
+file, and so does one whose file was removed or cut; `read` and `latest` change over to it by themselves as soon as the
+old one is closed, cut, or its heartbeat is stale. Each call looks at the file's size first, because reading a page that
+was cut off ends the process by SIGBUS; only root and the daemon's user can cut it between that and the copy.
 """
 
 import mmap
 import os
+import re
 import select
+import stat
 import time
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -21,7 +26,6 @@ from typing import NamedTuple, Self
 
 from imud.errors import LinkMissing, ServerError
 from imud.formats.ring import (
-    DIRECTORY,
     FILE_PREFIX,
     FIRST_WORD,
     HEADER_BYTES,
@@ -31,12 +35,14 @@ from imud.formats.ring import (
     LEDGER_BLOCK_OFFSET,
     LEDGER_UPDATE_WORD,
     NEWEST_WORD,
+    OPEN_FLAGS,
     STATE_HALF_WORD,
     STATE_LIVE,
     LedgerBlock,
     RingHeader,
     decode_header,
     decode_ledger_block,
+    default_directories,
     ring_path,
 )
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, decode_slot
@@ -46,6 +52,8 @@ _ATTEMPTS = 3
 """The writer may overtake one copy, hardly three in a row."""
 _DRAIN_BYTES = 4096
 """Far more than wait in a descriptor of the daemon's, so that one read takes all."""
+_NAME = re.compile(r"[\w-]{1,63}", re.ASCII)
+_SHOWN_MAX = 32
 
 
 class RingRead(NamedTuple):
@@ -65,17 +73,15 @@ class Ring:
     ) -> None:
         """Open by device name, or by path if there is a '/' in it; `read` gives the samples that come from now on.
 
-        A name is looked up in `directory`, by default the one that `default_directory` gives.
+        A name is looked up in `directory`, by default as `default_directory` says.
         Raises ServerError: no such ring, not permitted, or of another layout.
         """
         text = str(device_or_path)
-        self.path = Path(text) if "/" in text else ring_path(directory or default_directory(), text)
+        self.path = Path(text) if "/" in text else ring_path(directory or default_directory(text), text)
         self.missed = 0
         """Samples missed since opening."""
         self._now_ns = now_ns
-        self._torn = (0, 0)
-        self._header, self._memory, self._inode = _map(self.path)
-        self._views()
+        self._change_to(_RingFile.open(self.path))
         self._next = self.newest_seq + 1
 
     @property
@@ -90,18 +96,20 @@ class Ring:
 
     @property
     def newest_seq(self) -> int:
-        """Sequence number of the newest sample, 0 before the first."""
-        return self._words[NEWEST_WORD]
+        """Sequence number of the newest sample, 0 before the first or when the file was cut."""
+        return self._newest() if self._whole() else 0
 
     def alive(self, now_ns: int) -> bool:
         """Whether a daemon writes this ring, at `now_ns` of CLOCK_MONOTONIC."""
-        return self._halves[STATE_HALF_WORD] == STATE_LIVE and now_ns - self._words[HEARTBEAT_WORD] < HEARTBEAT_LIMIT_NS
+        return self._whole() and self._live(now_ns)
 
     def latest(self) -> Sample | None:
         """The newest sample, None before the first. Does not move `read`. Raises as `reopen`."""
-        self._change_over()
+        whole = self._whole()
+        if not (whole and self._live(self._now_ns())) and not self.reopen() and not whole:
+            return None
         for _ in range(_ATTEMPTS):
-            newest = self.newest_seq
+            newest = self._newest()
             sample = self._slot(newest) if newest else None
             if sample is not None:
                 return sample
@@ -109,14 +117,17 @@ class Ring:
 
     def read(self) -> RingRead:
         """All samples since the `read` before. Raises as `reopen`."""
-        found = self._collect()
-        if not found.samples and not found.missed and self._change_over():
+        whole = self._whole()
+        found = self._collect() if whole else RingRead([], 0)
+        if not found.samples and not found.missed and not (whole and self._live(self._now_ns())) and self.reopen():
             found = self._collect()
         self.missed += found.missed
         return found
 
     def ledger(self) -> LedgerBlock | None:
-        """The ledger and the driver in use; None before the first or while it is being written."""
+        """The ledger and the driver in use; None before the first, while it is written, and when the file was cut."""
+        if not self._whole():
+            return None
         words, at = self._words, LEDGER_BLOCK_OFFSET
         for _ in range(_ATTEMPTS):
             before = words[LEDGER_UPDATE_WORD]
@@ -126,27 +137,28 @@ class Ring:
         return None
 
     def reopen(self) -> bool:
-        """Change to the ring of a restarted daemon, if there is one; False if not.
+        """Change to the new ring of this device, if there is one; False if not.
 
-        Its samples come from the first on; those it no longer holds count as missed. Raises ServerError when there is
-        a file that cannot be used, for example one of another layout version.
+        Samples come from the first on, or where the same daemon goes on with its numbers, from the last one read on;
+        those that the ring no longer holds count as missed. Raises ServerError when there is a file that cannot be
+        used, for example one of another layout version.
         """
         try:
-            status = self.path.stat()
+            status = self.path.lstat()
         except OSError:
             return False
         if (status.st_dev, status.st_ino) == self._inode:
             return False
         try:
-            header, memory, inode = _map(self.path)
+            file = _RingFile.open(self.path)
         except ServerError:
-            if self.path.exists():
+            if os.path.lexists(self.path):
                 raise
             return False  # removed since
+        continued = file.header.epoch == self.epoch and file.header.first_seq >= self._next
+        self._next = self._next if continued else 1
         self.close()
-        self._header, self._memory, self._inode = header, memory, inode
-        self._views()
-        self._next, self._torn = 1, (0, 0)
+        self._change_to(file)
         return True
 
     def wait(self, fd: int, timeout_s: float | None = None) -> bool:
@@ -170,6 +182,7 @@ class Ring:
         for view in (self._words, self._halves):
             view.release()
         self._memory.close()
+        self._close_descriptor()
 
     def __enter__(self) -> Self:
         return self
@@ -179,16 +192,29 @@ class Ring:
     ) -> None:
         self.close()
 
-    def _views(self) -> None:
+    def _change_to(self, file: "_RingFile") -> None:
+        self._header, self._memory, self._fd, self._inode = file
+        self._close_descriptor = weakref.finalize(self, os.close, self._fd)  # also for a ring that nobody closes
         with memoryview(self._memory) as view:
             self._words, self._halves = view.cast("Q"), view.cast("I")
+        self._torn = (0, 0)
+        self._size_bytes = len(self._memory)
 
-    def _change_over(self) -> bool:
-        return not self.alive(self._now_ns()) and self.reopen()
+    def _whole(self) -> bool:
+        """Whether the file still has every page that is mapped."""
+        return os.lseek(self._fd, 0, os.SEEK_END) >= self._size_bytes
+
+    def _newest(self) -> int:
+        return self._words[NEWEST_WORD]
+
+    def _live(self, now_ns: int) -> bool:
+        if self._halves[STATE_HALF_WORD] != STATE_LIVE:
+            return False
+        return abs(now_ns - self._words[HEARTBEAT_WORD]) < HEARTBEAT_LIMIT_NS  # far in the future is no sign of life
 
     def _collect(self) -> RingRead:
-        newest, missed = self.newest_seq, 0
-        if newest + 1 < self._next:  # the numbers began anew in the same ring
+        newest, missed = self._newest(), 0
+        if 0 < newest < self._next - 1:  # the numbers began anew in the same ring
             self._next = self._oldest(newest)
         samples: list[Sample] = []
         while self._next <= newest:
@@ -204,7 +230,7 @@ class Ring:
                     break
                 missed += 1
             else:
-                newest = self.newest_seq
+                newest = self._newest()
                 continue
             self._next += 1
         return RingRead(samples, missed)
@@ -213,9 +239,9 @@ class Ring:
         return self._memory[at : at + size_bytes]
 
     def _oldest(self, newest: int) -> int:
-        """The oldest sample the ring can hold when `newest` is its newest."""
+        """The oldest sample the ring can hold when `newest` is its newest; `newest` + 1 when it holds none."""
         kept, first = max(newest - self._header.slot_count + 1, 1), self._words[FIRST_WORD]
-        return first if kept < first <= newest else kept  # `first` may be seen before the `newest` it belongs to
+        return first if kept < first <= newest + 1 else kept  # `first` may be seen before the `newest` it belongs to
 
     def _slot(self, seq: int) -> Sample | None:
         """Sample `seq` if its slot is whole and still its own."""
@@ -232,11 +258,11 @@ class Ring:
 
     def _overtaken(self) -> bool:
         """Whether the writer has meanwhile begun to use the slot of `_next` anew."""
-        return self._oldest(self.newest_seq) > self._next
+        return self._oldest(self._newest()) > self._next
 
     def _never_whole(self) -> bool:
         """Whether `_next`, not whole before, still is not although newer samples were finished: it never will be."""
-        newest = self.newest_seq
+        newest = self._newest()
         seq, newest_then = self._torn
         if seq != self._next:
             self._torn = (self._next, newest)
@@ -244,29 +270,65 @@ class Ring:
         return newest > newest_then
 
 
-def default_directory() -> str:
-    """The directory of rings: the environment variable IMUD_SHM; where that is not set or empty, /dev/shm."""
-    return os.environ.get("IMUD_SHM") or DIRECTORY
+def default_directory(device: str = "") -> str:
+    """The directory where a ring is looked up by name: the environment variable IMUD_SHM, if that is set.
+
+    Otherwise /run/imud/shm, or $XDG_RUNTIME_DIR/imud/shm if the ring of `device` is only there.
+    """
+    named = os.environ.get("IMUD_SHM")
+    if named:
+        return named
+    first, *others = default_directories(os.environ)
+    if device and not os.path.lexists(ring_path(first, device)):
+        return next((other for other in others if os.path.lexists(ring_path(other, device))), first)
+    return first
 
 
-def _map(path: Path) -> tuple[RingHeader, mmap.mmap, tuple[int, int]]:
-    try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            header = decode_header(file.read(HEADER_BYTES), str(path))
-            expected_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
-            if status.st_size < expected_bytes:
-                raise ServerError(f"{path}: expected {expected_bytes} bytes, found {status.st_size}; the file was cut")
-            memory = mmap.mmap(file.fileno(), expected_bytes, prot=mmap.PROT_READ)
-    except FileNotFoundError:
-        raise ServerError(f"{path}: no such ring; {_what_there_is(path)}") from None
-    except PermissionError as error:
-        raise ServerError(f"{path} may not be read; is this user in the group that `ls -l {path}` shows?") from error
-    except OSError as error:
-        raise ServerError(f"{path} cannot be read: {error.strerror}") from error
-    return header, memory, (status.st_dev, status.st_ino)
+class _RingFile(NamedTuple):
+    """A ring's file, open and mapped."""
+
+    header: RingHeader
+    memory: mmap.mmap
+    descriptor: int
+    inode: tuple[int, int]
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Raises ServerError for anything but a ring that may be read."""
+        try:
+            descriptor = os.open(path, OPEN_FLAGS)
+        except FileNotFoundError:
+            raise ServerError(f"{path}: no such ring; {_what_there_is(path)}") from None
+        except PermissionError as error:
+            raise ServerError(
+                f"{path} may not be read; is this user in the group that `ls -l {path}` shows?"
+            ) from error
+        except OSError as error:
+            raise ServerError(f"{path} cannot be read: {error.strerror}") from error
+        try:
+            return cls._mapped(descriptor, path)
+        except OSError as error:
+            os.close(descriptor)
+            raise ServerError(f"{path} cannot be read: {error.strerror}") from error
+        except ServerError:
+            os.close(descriptor)
+            raise
+
+    @classmethod
+    def _mapped(cls, descriptor: int, path: Path) -> Self:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            kind = stat.filemode(status.st_mode)[0]
+            raise ServerError(f"{path} is no ring of imud: expected a regular file (-), found another kind ({kind})")
+        header = decode_header(os.pread(descriptor, HEADER_BYTES, 0), str(path))
+        expected_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
+        if status.st_size < expected_bytes:
+            raise ServerError(f"{path}: expected {expected_bytes} bytes, found {status.st_size}; the file was cut")
+        memory = mmap.mmap(descriptor, expected_bytes, prot=mmap.PROT_READ)
+        return cls(header, memory, descriptor, (status.st_dev, status.st_ino))
 
 
 def _what_there_is(path: Path) -> str:
     names = sorted(file.name.removeprefix(FILE_PREFIX) for file in path.parent.glob(FILE_PREFIX + "*"))
-    return f"there are rings for: {', '.join(names)}" if names else "there are none: is imud running, with shm enabled?"
+    shown = [name for name in names if _NAME.fullmatch(name)][:_SHOWN_MAX]  # in a shared directory: anybody's
+    return f"there are rings for: {', '.join(shown)}" if shown else "there are none: is imud running, with shm enabled?"

@@ -1,6 +1,6 @@
 """The shared-memory ring of one device: a header page, then slots of `imud.formats.slot`, all little-endian.
 
-The file is `/dev/shm/imud.<device>`. `HEADER_FIELDS` is the one table of the header; the writer, the Python reader
+The file is `/run/imud/shm/imud.<device>`. `HEADER_FIELDS` is the one table of the header; the writer, the Python reader
 and the check of the C header are made from it. Three cache lines hold what does not change (but for `state`), one what
 changes with every sample, and the block from 256 to 771 what changes at most ten times a second.
 
@@ -21,6 +21,7 @@ Rules for a reader, because the writer has no memory fence:
 - `newest_seq`, `first_seq`, `heartbeat_ns`, `state` and every `seq` are aligned and written by one store each.
 """
 
+import os
 import struct
 import zlib
 from collections.abc import Mapping
@@ -32,8 +33,11 @@ from imud.errors import ServerError
 from imud.formats.slot import SLOT_BYTES, SLOT_LAYOUT_VERSION, SlotField
 from imud.ledger import LEDGER_FIELDS
 
-DIRECTORY: Final = "/dev/shm"
+DIRECTORY: Final = "/run/imud/shm"
+"""Where only imud may make names: in /dev/shm any user may put a FIFO or a forged ring into its way."""
 FILE_PREFIX: Final = "imud."
+OPEN_FLAGS: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+"""For a file that another may have put there: an open that follows no link and does not wait for a FIFO's writer."""
 
 MAGIC: Final = b"imudshm\0"
 RING_LAYOUT_VERSION: Final = 1
@@ -126,6 +130,15 @@ class LedgerBlock:
     driver: str
     """Empty until the device is found."""
     ledger: dict[str, int]
+
+
+def default_directories(environment: Mapping[str, str]) -> list[str]:
+    """Directories of rings where none is named: the system's, then the user's own in XDG_RUNTIME_DIR, if that is set.
+
+    A daemon uses the first in which it may make files; a reader the first that has the ring.
+    """
+    own = environment.get("XDG_RUNTIME_DIR", "")
+    return [DIRECTORY, f"{own}/imud/shm"] if own.startswith("/") else [DIRECTORY]
 
 
 def ring_path(directory: str, device: str) -> Path:

@@ -1,7 +1,7 @@
 /* imud.h - reads the shared-memory rings of imud, the inertial sensor daemon. One header, C99 or C++, libc only.
  *
  *   imud_ring ring;
- *   int error = imud_open(&ring, "imu0");             // or a path: "/dev/shm/imud.imu0"
+ *   int error = imud_open(&ring, "imu0");             // or a path: "/run/imud/shm/imud.imu0"
  *   if (error) { fprintf(stderr, "%s\n", imud_strerror(error)); return 1; }
  *   for (;;) {
  *       imud_slot sample;
@@ -9,7 +9,7 @@
  *       while (imud_next(&ring, &sample, &missed) == 1)   // `missed`: samples lost right before this one
  *           use(sample.accel_m_s2, sample.present & IMUD_HAS_ACCEL);
  *       if (imud_health(&ring, imud_now_ns()) != IMUD_HEALTH_LIVE)
- *           imud_reopen(&ring);                           // a restarted daemon has a new ring
+ *           imud_reopen(&ring);                           // a new ring: restarted, or the old one removed or cut
  *       if (imud_wait(wake_fd, 100) == IMUD_E_ENDED)      // wake_fd: `notify` of imud's UNIX socket gives it
  *           wake_fd = ask_for_another();                  // the daemon has ended; -1 only waits
  *   }
@@ -20,6 +20,12 @@
  * The writer has no memory fence, so a slot is trusted only if its sequence number before the copy, its CRC-32, and its
  * sequence number after the copy agree. Nothing here waits busily: a slot that is not whole yet is given by a later call.
  * Synchronization: a ring belongs to one thread; several threads or processes may each open their own.
+ *
+ * A ring is looked up by name in the directory of the environment variable IMUD_SHM; where that is not set, in
+ * /run/imud/shm, then in $XDG_RUNTIME_DIR/imud/shm.
+ *
+ * Reading a page that was cut off the file raises SIGBUS. Only root and the daemon's user can cut it; the daemon
+ * restores the size with its next sample, at the latest a tenth of a second later; imud_health looks at the size first.
  *
  * With -std=c99 (no GNU extensions) include it before other headers, or compile with -D_POSIX_C_SOURCE=200809L.
  * SPDX-License-Identifier: Apache-2.0
@@ -37,6 +43,7 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
@@ -190,7 +197,7 @@ enum {
 
 typedef enum imud_health_state {
     IMUD_HEALTH_LIVE = 0,
-    IMUD_HEALTH_CLOSED = 1, /* the daemon ended the ring on purpose */
+    IMUD_HEALTH_CLOSED = 1, /* the daemon ended the ring, or someone cut its file */
     IMUD_HEALTH_STALE = 2   /* no heartbeat for IMUD_HEARTBEAT_LIMIT_NS: the daemon died or hangs */
 } imud_health_state;
 
@@ -206,6 +213,7 @@ typedef struct imud_ring {
     uint64_t torn_newest;  /* ... the newest sequence number then */
     dev_t dev;
     ino_t ino;
+    int fd; /* of the mapped file, to look at its size */
     char path[256];
     uint32_t crc_table[256];
 } imud_ring;
@@ -284,22 +292,25 @@ static inline int imud_read_slot_(const imud_ring *ring, uint64_t seq, imud_slot
     return imud_copy_(ring, slot, out, IMUD_SLOT_BYTES, offsetof(imud_slot, crc32)) && out->seq == seq;
 }
 
-/* Oldest sample the ring can still hold when `newest` is its newest. */
+/* Oldest sample the ring can still hold when `newest` is its newest; newest + 1 when it holds none. */
 static inline uint64_t imud_oldest_(const imud_ring *ring, uint64_t newest)
 {
     uint64_t first = imud_load_(ring->base + offsetof(imud_header, first_seq));
     uint64_t kept = newest > ring->mask ? newest - ring->mask : 1;
-    return first > kept && first <= newest ? first : kept; /* `first` may be seen before the newest it belongs to */
+    /* newest + 1: it holds none yet. Above that, `first` is seen before the newest it belongs to. */
+    return first > kept && first - 1 <= newest ? first : kept;
 }
 
 static inline int imud_errno_(void)
 {
     if (errno == ENOENT)
         return IMUD_E_MISSING;
+    if (errno == ELOOP || errno == ENXIO) /* a symbolic link, a socket */
+        return IMUD_E_FORMAT;
     return errno == EACCES || errno == EPERM ? IMUD_E_DENIED : IMUD_E_SYSTEM;
 }
 
-static inline int imud_check_(const imud_header *header, size_t size_bytes)
+static inline int imud_check_(const imud_header *header, uint64_t size_bytes)
 {
     uint64_t count = header->slot_count;
     if (memcmp(header->magic, IMUD_MAGIC, 8) != 0)
@@ -308,48 +319,86 @@ static inline int imud_check_(const imud_header *header, size_t size_bytes)
         header->header_bytes != IMUD_HEADER_BYTES || header->slot_bytes != IMUD_SLOT_BYTES)
         return IMUD_E_VERSION;
     if (count == 0 || (count & (count - 1)) || header->ledger_count > IMUD_LEDGER_ROOM ||
+        count > (SIZE_MAX - IMUD_HEADER_BYTES) / IMUD_SLOT_BYTES ||
         size_bytes < IMUD_HEADER_BYTES + count * IMUD_SLOT_BYTES)
         return IMUD_E_FORMAT;
     return 0;
 }
 
-/* Maps the file at ring->path into ring; leaves ring as it was on error. */
+/* Reads the header of an open file and checks it against the file's type and size. The mapped one is not used for that:
+ * a writer that means harm could change it between the check and its use. */
+static inline int imud_look_(int fd, imud_header *header, struct stat *status)
+{
+    ssize_t length;
+    if (fstat(fd, status) != 0)
+        return imud_errno_();
+    if (!S_ISREG(status->st_mode) || status->st_size < (off_t)IMUD_HEADER_BYTES)
+        return IMUD_E_FORMAT;
+    length = pread(fd, header, sizeof *header, 0);
+    if (length < 0)
+        return imud_errno_();
+    return length == (ssize_t)sizeof *header ? imud_check_(header, (uint64_t)status->st_size) : IMUD_E_FORMAT;
+}
+
+/* Maps the file at ring->path into ring; leaves ring as it was on error. Follows no symbolic link and does not wait for
+ * the writer of a FIFO. */
 static inline int imud_map_(imud_ring *ring)
 {
     struct stat status;
+    imud_header header;
+    size_t size_bytes;
     void *base;
-    int error, fd = open(ring->path, O_RDONLY | O_CLOEXEC);
+    int error, fd = open(ring->path, O_RDONLY | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK);
     if (fd < 0)
         return imud_errno_();
-    if (fstat(fd, &status) != 0) {
+    error = imud_look_(fd, &header, &status);
+    if (error) {
+        close(fd);
+        return error;
+    }
+    size_bytes = IMUD_HEADER_BYTES + (size_t)header.slot_count * IMUD_SLOT_BYTES;
+    base = mmap(NULL, size_bytes, PROT_READ, MAP_SHARED, fd, 0);
+    if (base == MAP_FAILED) {
         error = imud_errno_();
         close(fd);
         return error;
     }
-    if (!S_ISREG(status.st_mode) || (size_t)status.st_size < IMUD_HEADER_BYTES) {
-        close(fd);
-        return IMUD_E_FORMAT;
-    }
-    base = mmap(NULL, (size_t)status.st_size, PROT_READ, MAP_SHARED, fd, 0);
-    error = base == MAP_FAILED ? imud_errno_() : 0;
-    close(fd);
-    if (error)
-        return error;
-    error = imud_check_((const imud_header *)base, (size_t)status.st_size);
-    if (error) {
-        munmap(base, (size_t)status.st_size);
-        return error;
-    }
-    if (ring->base)
+    if (ring->base) {
         munmap((void *)(uintptr_t)ring->base, ring->size_bytes);
+        close(ring->fd);
+    }
     ring->base = (const unsigned char *)base;
-    ring->size_bytes = (size_t)status.st_size;
-    ring->mask = ((const imud_header *)base)->slot_count - 1;
-    ring->epoch = ((const imud_header *)base)->epoch;
+    ring->size_bytes = size_bytes;
+    ring->mask = header.slot_count - 1u;
+    ring->epoch = header.epoch;
     ring->torn_seq = 0;
     ring->dev = status.st_dev;
     ring->ino = status.st_ino;
+    ring->fd = fd;
     return 0;
+}
+
+/* Sets ring->path to that of a device in a directory, and maps it. */
+static inline int imud_map_in_(imud_ring *ring, const char *directory, const char *rest, const char *device)
+{
+    int length = snprintf(ring->path, sizeof ring->path, "%s%s/imud.%s", directory, rest, device);
+    return length < 0 || (size_t)length >= sizeof ring->path ? IMUD_E_NAME : imud_map_(ring);
+}
+
+/* Looks a device up in the directories where rings may be. */
+static inline int imud_find_(imud_ring *ring, const char *device)
+{
+    const char *named = getenv("IMUD_SHM"), *own = getenv("XDG_RUNTIME_DIR");
+    int error;
+    if (named && *named)
+        return imud_map_in_(ring, named, "", device);
+    error = imud_map_in_(ring, "/run/imud/shm", "", device);
+    if (error != IMUD_E_MISSING || !own || *own != '/')
+        return error;
+    error = imud_map_in_(ring, own, "/imud/shm", device);
+    if (error == IMUD_E_MISSING || error == IMUD_E_NAME)
+        error = imud_map_in_(ring, "/run/imud/shm", "", device); /* the path that a message should name */
+    return error;
 }
 
 /* ---- what you call ------------------------------------------------------------------------------------------- */
@@ -370,14 +419,18 @@ static inline uint64_t imud_newest_seq(const imud_ring *ring)
  * call. Returns 0 or IMUD_E_...; after an error the ring is closed. */
 static inline int imud_open(imud_ring *ring, const char *device_or_path)
 {
-    int length, error;
-    const char *prefix = strchr(device_or_path, '/') ? "" : "/dev/shm/imud.";
+    size_t length = strlen(device_or_path);
+    int error;
     memset(ring, 0, sizeof *ring);
-    length = snprintf(ring->path, sizeof ring->path, "%s%s", prefix, device_or_path);
-    if (length < 0 || (size_t)length >= sizeof ring->path || !*device_or_path)
+    if (length == 0 || length >= sizeof ring->path)
         return IMUD_E_NAME;
     imud_crc_init_(ring->crc_table);
-    error = imud_map_(ring);
+    if (strchr(device_or_path, '/')) {
+        memcpy(ring->path, device_or_path, length + 1);
+        error = imud_map_(ring);
+    } else {
+        error = imud_find_(ring, device_or_path);
+    }
     if (!error)
         ring->next_seq = imud_newest_seq(ring) + 1;
     return error;
@@ -386,36 +439,46 @@ static inline int imud_open(imud_ring *ring, const char *device_or_path)
 /* Releases the ring; may be called twice. */
 static inline void imud_close(imud_ring *ring)
 {
-    if (ring->base)
+    if (ring->base) {
         munmap((void *)(uintptr_t)ring->base, ring->size_bytes);
+        close(ring->fd);
+    }
     ring->base = NULL;
 }
 
-/* Whether there is a daemon behind the ring. `now_ns` is imud_now_ns(). */
+/* Whether there is a daemon behind the ring. `now_ns` is imud_now_ns(). One system call. */
 static inline imud_health_state imud_health(const imud_ring *ring, int64_t now_ns)
 {
-    int64_t heartbeat_ns = (int64_t)imud_load_(ring->base + offsetof(imud_header, heartbeat_ns));
     const uint32_t *state = (const uint32_t *)(const void *)(ring->base + offsetof(imud_header, state));
+    uint64_t age_ns;
+    if (lseek(ring->fd, 0, SEEK_END) < (off_t)ring->size_bytes)
+        return IMUD_HEALTH_CLOSED;
     if (__atomic_load_n(state, __ATOMIC_ACQUIRE) != IMUD_STATE_LIVE)
         return IMUD_HEALTH_CLOSED;
-    return heartbeat_ns > now_ns - IMUD_HEARTBEAT_LIMIT_NS ? IMUD_HEALTH_LIVE : IMUD_HEALTH_STALE;
+    age_ns = (uint64_t)now_ns - imud_load_(ring->base + offsetof(imud_header, heartbeat_ns));
+    /* Either way round: it may have come after `now_ns` was read; but one far in the future is no sign of life. */
+    if (age_ns + IMUD_HEARTBEAT_LIMIT_NS - 1 < 2u * IMUD_HEARTBEAT_LIMIT_NS - 1)
+        return IMUD_HEALTH_LIVE;
+    return IMUD_HEALTH_STALE;
 }
 
-/* Maps the ring of a restarted daemon. Returns 1 if there is a new one (its samples come from the first on, with those
- * it no longer holds counted as missed), 0 if the mapped one is still the one there is, IMUD_E_... if there is none;
- * the old one stays mapped then. */
+/* Maps the ring that has the path now. Returns 1 if it is a new one, 0 if the mapped one is still the one there is,
+ * IMUD_E_... if there is none; the old one stays mapped then. Samples of a new ring come from the first on, or where
+ * the same daemon goes on with its numbers, from the last one read on; those it no longer holds count as missed. */
 static inline int imud_reopen(imud_ring *ring)
 {
     struct stat status;
+    uint64_t epoch = ring->epoch;
     int error;
-    if (stat(ring->path, &status) != 0)
+    if (lstat(ring->path, &status) != 0)
         return imud_errno_();
     if (status.st_dev == ring->dev && status.st_ino == ring->ino)
         return 0;
     error = imud_map_(ring);
     if (error)
         return error;
-    ring->next_seq = 1;
+    if (ring->epoch != epoch || imud_load_(ring->base + offsetof(imud_header, first_seq)) < ring->next_seq)
+        ring->next_seq = 1;
     return 1;
 }
 
@@ -438,7 +501,7 @@ static inline int imud_next(imud_ring *ring, imud_slot *out, uint64_t *missed)
 {
     uint64_t newest = imud_newest_seq(ring), oldest, lost = 0;
     int got = 0;
-    if (newest + 1 < ring->next_seq) /* the numbers began anew in the same ring */
+    if (newest && newest + 1 < ring->next_seq) /* the numbers began anew in the same ring */
         ring->next_seq = imud_oldest_(ring, newest);
     while (!got && newest >= ring->next_seq) {
         oldest = imud_oldest_(ring, newest);

@@ -73,7 +73,7 @@ def test_directory_without_the_environment(monkeypatch: pytest.MonkeyPatch, valu
     monkeypatch.delenv("IMUD_SHM", raising=False)
     if value is not None:
         monkeypatch.setenv("IMUD_SHM", value)
-    assert default_directory() == "/dev/shm"
+    assert default_directory() == "/run/imud/shm"
 
 
 def test_no_ring_but_a_file(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_no_ring_but_a_file(tmp_path: Path) -> None:
 
 
 def test_directory_instead_of_a_ring(tmp_path: Path) -> None:
-    with pytest.raises(ServerError, match="cannot be read: Is a directory"):
+    with pytest.raises(ServerError, match=r"no ring of imud: expected a regular file \(-\), found another kind \(d\)"):
         Ring(tmp_path)
 
 
@@ -91,7 +91,7 @@ def test_permission(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(ServerError, match="is this user in the group"):
         Ring(board.path)
 
@@ -284,6 +284,7 @@ def test_restart_after_a_clean_end(board: Board, ring: Ring, tmp_path: Path) -> 
 def test_restart_after_a_daemon_that_died(board: Board, ring: Ring, tmp_path: Path) -> None:
     board.publish([1, 2])
     assert numbers(ring) == ([1, 2], 0)
+    board.die()
     successor = Board(tmp_path, epoch=78)
     successor.publish(range(1, SLOTS + 4))
     board.now_ns = START_NS + 999_999_999

@@ -126,7 +126,7 @@ def test_ledger_values_that_do_not_fit() -> None:
 
 
 def test_ring_path() -> None:
-    assert str(ring_path("/dev/shm", "imu0")) == "/dev/shm/imud.imu0"
+    assert str(ring_path("/run/imud/shm", "imu0")) == "/run/imud/shm/imud.imu0"
 
 
 @pytest.mark.parametrize("device", ["", "a/b", "../x", "a\0b", "x" * 64, "ü" * 32])

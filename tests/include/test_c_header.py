@@ -77,6 +77,10 @@ class Reader:
             [program, "commands", str(ring)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=files
         )
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
     def ask(self, command: str) -> list[str]:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -229,6 +233,9 @@ def test_gap_in_the_numbers_is_missed(board: Board, reader: Reader) -> None:
 def test_health(board: Board, reader: Reader) -> None:
     assert reader.ask(f"health {START_NS + 999_999_999}") == ["health", "0"]
     assert reader.ask(f"health {START_NS + 1_000_000_000}") == ["health", "2"]
+    assert reader.ask(f"health {START_NS - 999_999_999}") == ["health", "0"]
+    assert reader.ask(f"health {START_NS - 1_000_000_000}") == ["health", "2"]  # a heartbeat from the future
+    assert reader.ask(f"health {-(1 << 63)}") == ["health", "2"]
     board.publisher.close()
     assert reader.ask(f"health {START_NS}") == ["health", "1"]
 
@@ -244,6 +251,91 @@ def test_restarted_daemon(board: Board, reader: Reader, tmp_path: Path) -> None:
     assert reader.ask("reopen") == ["reopen", "1", "78"]
     assert reader.next() == (3, 2)
     successor.publisher.close()
+
+
+def test_removed_ring(board: Board, reader: Reader) -> None:
+    """The same daemon goes on with its numbers in a new file: nothing is counted as missed that was read."""
+    board.publish([1, 2])
+    assert reader.next() == (1, 0)
+    board.path.unlink()
+    board.tick()
+    board.publish([3, 4])
+    assert reader.ask(f"health {board.now_ns}") == ["health", "1"]
+    assert [reader.next(), reader.next()] == [(2, 0), (0, 0)]
+    assert reader.ask("reopen") == ["reopen", "1", "77"]
+    assert [reader.next(), reader.next(), reader.next()] == [(3, 0), (4, 0), (0, 0)]
+    board.path.unlink()
+    board.publish([5])
+    board.tick()
+    board.publish([6])
+    assert reader.ask("reopen") == ["reopen", "1", "77"]
+    assert reader.next() == (6, 1)
+
+
+@pytest.mark.parametrize("size_bytes", [0, 1, HEADER_BYTES, HEADER_BYTES + SLOT_BYTES])
+def test_cut_ring(board: Board, reader: Reader, size_bytes: int) -> None:
+    """`health` says so before a page is touched that is not there."""
+    board.publish([1])
+    os.truncate(board.path, size_bytes)
+    assert reader.ask(f"health {board.now_ns}") == ["health", "1"]
+    board.publish([2])
+    assert reader.ask(f"health {board.now_ns}") == ["health", "1"]
+    assert reader.next() == (0, 0)
+    board.tick()
+    board.publish([3])
+    assert reader.ask("reopen") == ["reopen", "1", "77"]
+    assert reader.ask(f"health {board.now_ns}") == ["health", "0"]
+    assert [reader.next(), reader.next()] == [(3, 2), (0, 0)]
+
+
+def test_descriptors_of_reopened_rings(board: Board, reader: Reader) -> None:
+    def count() -> int:
+        return len(os.listdir(f"/proc/{reader.pid}/fd"))
+
+    before = count()
+    for _ in range(10):
+        board.path.unlink()
+        board.tick()
+        assert reader.ask("reopen") == ["reopen", "1", "77"]
+    assert count() == before
+
+
+def test_directories_of_names(build: Build, tmp_path: Path) -> None:
+    """IMUD_SHM alone where it is set, else the user's own directory where the system's has no such ring."""
+    own = tmp_path / "imud" / "shm"
+    own.mkdir(parents=True)
+    device = "no-such-device-of-the-tests"
+    program = str(build(READER, "c99"))
+
+    def opened(**environment: str) -> str:
+        done = subprocess.run(
+            [program, "commands", device], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+            env=environment, timeout=10,
+        )  # fmt: skip
+        return done.stdout.split(" ", 2)[1] if done.returncode else "open"
+
+    assert opened(XDG_RUNTIME_DIR=str(tmp_path)) == "-1"
+    header = encode_header(RingHeader(1, 2, 1, device, 0, SLOTS))
+    (own / f"imud.{device}").write_bytes(header + bytes(SLOTS * SLOT_BYTES))
+    assert opened(XDG_RUNTIME_DIR=str(tmp_path)) == "open"
+    assert opened(XDG_RUNTIME_DIR=str(tmp_path), IMUD_SHM="") == "open"
+    assert opened(IMUD_SHM=str(own)) == "open"
+    assert opened(XDG_RUNTIME_DIR=str(tmp_path), IMUD_SHM="/nowhere") == "-1"
+    assert opened(XDG_RUNTIME_DIR="relative") == "-1"
+    assert opened(XDG_RUNTIME_DIR="/" + "x" * 300) == "-1"
+    assert opened(IMUD_SHM="/" + "x" * 300) == "-6"
+
+
+def test_no_wait_for_a_fifo(build: Build, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "link").symlink_to("fifo")
+    (tmp_path / "directory").mkdir()
+    for name in ("fifo", "link", "directory"):
+        command = [str(build(READER, "c99")), "commands", str(tmp_path / name)]
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=10
+        )
+        assert done.stdout.startswith("error -3 "), name
 
 
 def test_ledger(board: Board, reader: Reader) -> None:

@@ -59,6 +59,12 @@ class Board:
         """A number of the header, as it is in the file."""
         return int.from_bytes(self.path.read_bytes()[OFFSETS[name] :][:size_bytes], "little")
 
+    def die(self) -> None:
+        """Leave the directory as a daemon that was killed: its ring as it was, unlocked, and nobody to write it."""
+        copy = self.path.with_name("copy")
+        copy.write_bytes(self.path.read_bytes())
+        copy.rename(self.path)
+
     def poke(self, at: int, data: bytes) -> None:
         """Overwrite bytes of the file, as a writer that was interrupted leaves them."""
         with self.path.open("r+b") as file:

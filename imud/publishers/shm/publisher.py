@@ -1,13 +1,16 @@
-"""Shared memory: one ring of slots per device, `/dev/shm/imud.<device>`, for readers that want no system call.
+"""Shared memory: one ring of slots per device, `/run/imud/shm/imud.<device>`, for readers that want no system call.
 
 Readers are `imud.client.ring` and `imud/include/imud.h`; the layout is `imud.formats.ring`. A reader may be as slow
-as it likes: the ring never waits for it.
+as it likes: the ring never waits for it. A ring that cannot be made, or that is removed or cut, is made anew as soon as
+that is possible; the daemon and its other outputs go on meanwhile.
 """
 
 import grp
 import logging
 import os
-from typing import Annotated
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Final
 
 import msgspec
 
@@ -16,10 +19,14 @@ from imud.contracts.settings import Settings
 from imud.errors import ServerError
 from imud.event import Event
 from imud.formats.ring import DIRECTORY, STATE_LIVE, RingHeader, ring_path
-from imud.publishers.shm.ring import ShmRing, refuse_second_writer
+from imud.publishers.shm.directory import RingDirectory, open_directory
+from imud.publishers.shm.ring import ShmRing
 
 log = logging.getLogger(__name__)
 
+RETRY_NS: Final = 1_000_000_000
+"""A ring that cannot be made is tried again once a second: a full memory is not filled any faster."""
+OTHERS_WRITE: Final = 0o022
 SLOTS_MIN, SLOTS_MAX = 64, 1 << 20
 """64 slots are one 16 kB ring; 2²⁰ are 256 MB, more than a gateway should give to one device."""
 
@@ -30,13 +37,14 @@ class ShmSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     enabled: bool = True
     """Whether there are rings at all."""
     directory: str = DIRECTORY
-    """Where the files are. Readers look into /dev/shm, or where their environment variable IMUD_SHM says."""
+    """Where the files are; $XDG_RUNTIME_DIR/imud/shm instead of the default for a daemon that may not use that. Readers
+    look into both; another directory is named by their environment variable IMUD_SHM."""
     slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
     """Samples a ring holds, a power of two, 256 bytes each: 4096 are four seconds at 1 kHz and 1 MB per device."""
     group: str = "imud"
     """Group that may read, if it exists and imud may give files to it."""
     mode: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o640
-    """File mode: what the owner, the group and all others may do."""
+    """File mode: what the owner, the group and all others may do; only the owner may write."""
 
     def __post_init__(self) -> None:
         """Raise ValueError, which the configuration reports with its line, for what no type can say."""
@@ -45,6 +53,19 @@ class ShmSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError(f"slots: expected a power of two, found {self.slots}; near it are {below} and {2 * below}")
         if not self.directory.startswith("/"):
             raise ValueError(f"directory: expected an absolute path, found {self.directory!r}")
+        if self.mode & OTHERS_WRITE:
+            raise ValueError(f"mode: expected none that lets group or others write the rings, found {self.mode:#o}")
+
+
+@dataclass(slots=True)
+class _Place:
+    """A device of the configuration, and why it has no ring."""
+
+    device_id: int
+    newest: int = 0
+    """Sequence number of its newest sample while it had no ring."""
+    problem: str = ""
+    retry_ns: int = 0
 
 
 class ShmPublisher:
@@ -53,35 +74,40 @@ class ShmPublisher:
     def __init__(self, settings: ShmSettings, context: PublisherContext) -> None:
         self._settings = settings
         self._context = context
+        self._directory: RingDirectory | None = None
+        self._places: dict[str, _Place] = {}
         self._rings: dict[str, ShmRing] = {}
         self._group_id: int | None = None
+        self._started = False
+        self._directory_problem = ""
 
     def start(self) -> None:
-        """Check the directory and find the group. Raises ServerError when files cannot be made in the directory."""
-        directory = self._settings.directory
-        if not os.path.isdir(directory):
-            raise ServerError(f"{directory}: expected a directory for shared memory; is it mounted?")
-        if not os.access(directory, os.W_OK | os.X_OK):
-            who = f"user {os.geteuid()}"
-            raise ServerError(f"{directory}: {who} may not make files there; `ls -ld {directory}` shows who may")
+        """Open the directory and find the group. Raises ServerError when files cannot be made in the directory."""
+        if sys.byteorder != "little":
+            raise ServerError("shared memory is little-endian and this machine is not: set `shm: {enabled: false}`")
+        self._opened_directory()
         self._group_id = self._find_group()
+        self._started = True
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Make the device's ring. Raises ServerError when it does not fit or another daemon writes it."""
+        """Make the device's ring; where that fails, log why and go on trying.
+
+        Raises ServerError when another daemon writes it, or when the directory cannot be used.
+        """
         self.remove_device(name)
-        context, settings = self._context, self._settings
-        path = ring_path(settings.directory, name)
-        now_ns = context.now_ns()
-        refuse_second_writer(path, now_ns)
-        header = RingHeader(
-            context.epoch, os.getpid(), STATE_LIVE, name, device_id, settings.slots, heartbeat_ns=now_ns
-        )  # fmt: skip
-        ring = self._rings[name] = ShmRing(path, header, settings.mode, self._group_id)
-        if self._group_id is not None and not ring.group_given:
-            self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
+        try:
+            directory = self._opened_directory()
+            directory.refuse_second_writer(ring_path(directory.path, name).name)
+        except ServerError:
+            if not self._started:  # it will not be: leave nothing open
+                self.close()
+            raise
+        self._places[name] = _Place(device_id)
+        self._make(name, directory, self._context.now_ns())
 
     def remove_device(self, name: str) -> None:
         """Close the device's ring and remove its file; no-op if absent."""
+        self._places.pop(name, None)
         ring = self._rings.pop(name, None)
         if ring is not None:
             ring.close()
@@ -91,12 +117,32 @@ class ShmPublisher:
         ring = self._rings.get(batch.device)
         if ring is not None:
             ring.write(batch.samples, batch.slots())
+        elif batch.device in self._places:
+            self._places[batch.device].newest = batch.samples[-1].seq
 
     def event(self, event: Event) -> None:
         """Nothing: shared memory carries samples only."""
 
     def tick(self, now_ns: int) -> None:
-        """Refresh ledgers and heartbeats."""
+        """Make rings anew that were removed or cut; refresh ledgers and heartbeats."""
+        directory = self._current_directory()
+        for name, place in self._places.items():
+            ring = self._rings.get(name)
+            if (ring is None or not ring.is_intact(directory)) and now_ns >= place.retry_ns:
+                self._make_anew(name, directory, now_ns)
+        self._show(now_ns)
+
+    def close(self) -> None:
+        """Show the final ledgers, then close every ring; may be called twice."""
+        if self._rings:
+            self._show(self._context.now_ns())
+        for name in list(self._places):
+            self.remove_device(name)
+        if self._directory is not None:
+            self._directory.close()
+            self._directory = None
+
+    def _show(self, now_ns: int) -> None:
         for status in self._context.status():
             ring = self._rings.get(status.name)
             if ring is not None:
@@ -104,12 +150,63 @@ class ShmPublisher:
         for ring in self._rings.values():
             ring.beat(now_ns)
 
-    def close(self) -> None:
-        """Show the final ledgers, then close every ring; may be called twice."""
-        if self._rings:
-            self.tick(self._context.now_ns())
-        for name in list(self._rings):
-            self.remove_device(name)
+    def _opened_directory(self) -> RingDirectory:
+        if self._directory is None:
+            self._directory = open_directory(self._settings.directory, os.environ)
+        return self._directory
+
+    def _current_directory(self) -> RingDirectory:
+        """The directory that is at its path now; where none is there that can be used, the one that was."""
+        directory = self._opened_directory()
+        if directory.current:
+            return directory
+        try:
+            self._directory = open_directory(self._settings.directory, os.environ)
+        except ServerError as error:
+            if str(error) != self._directory_problem:
+                log.error("shm: %s; trying again", error)
+            self._directory_problem = str(error)
+            return directory
+        self._directory_problem = ""
+        directory.close()
+        return self._directory
+
+    def _make_anew(self, name: str, directory: RingDirectory, now_ns: int) -> None:
+        """Replace a ring that was removed or cut, or make the one that could not be made."""
+        old = self._rings.get(name)
+        if old is None or not old.is_named(directory):
+            try:
+                directory.refuse_second_writer(ring_path(directory.path, name).name)
+            except ServerError as error:
+                self._put_off(name, error, now_ns)
+                return
+        if self._make(name, directory, now_ns):
+            log.warning("shm: the ring of %s was missing or cut; it is made anew", name)
+            if old is not None:
+                old.close()
+
+    def _make(self, name: str, directory: RingDirectory, now_ns: int) -> bool:
+        """Make the device's ring, which goes on from the number where the one before ended."""
+        context, settings, place, old = self._context, self._settings, self._places[name], self._rings.get(name)
+        newest = place.newest if old is None else old.newest
+        header = RingHeader(
+            context.epoch, os.getpid(), STATE_LIVE, name, place.device_id, settings.slots, newest, newest + 1, now_ns
+        )  # fmt: skip
+        try:
+            ring = self._rings[name] = ShmRing(directory, header, settings.mode, self._group_id)
+        except ServerError as error:
+            self._put_off(name, error, now_ns)
+            return False
+        place.problem = ""
+        if self._group_id is not None and not ring.group_given:
+            self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
+        return True
+
+    def _put_off(self, name: str, error: ServerError, now_ns: int) -> None:
+        place = self._places[name]
+        if str(error) != place.problem:
+            log.error("shm: no ring for %s: %s; trying again every second", name, error)
+        place.problem, place.retry_ns = str(error), now_ns + RETRY_NS
 
     def _find_group(self) -> int | None:
         try:

@@ -1,17 +1,22 @@
 import errno
+import fcntl
 import grp
 import logging
+import mmap
 import os
+import re
 import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 import pytest
 
+from imud.client.ring import Ring
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.errors import ServerError
 from imud.event import Event, EventKind
@@ -32,6 +37,7 @@ from imud.ledger import LEDGER_FIELDS
 from imud.publishers import PUBLISHERS
 from imud.publishers.shm import ring
 from imud.publishers.shm.publisher import PUBLISHER, ShmPublisher, ShmSettings
+from tests.support.paths import ROOT
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 
 
@@ -59,7 +65,7 @@ def test_row() -> None:
 
 def test_defaults() -> None:
     settings = ShmSettings()
-    assert (settings.enabled, settings.directory, settings.slots) == (True, "/dev/shm", 4096)
+    assert (settings.enabled, settings.directory, settings.slots) == (True, "/run/imud/shm", 4096)
     assert (settings.group, settings.mode) == ("imud", 0o640)
 
 
@@ -70,6 +76,8 @@ def test_defaults() -> None:
         ({"slots": 32}, ">= 64"),
         ({"slots": 1 << 21}, "<= 1048576"),
         ({"mode": 640}, "<= 511"),
+        ({"mode": 0o660}, "mode: expected none that lets group or others write the rings, found 0o660"),
+        ({"mode": 0o602}, "found 0o602"),
         ({"directory": "shm"}, "absolute path"),
         ({"slotz": 64}, "slotz"),
     ],
@@ -94,10 +102,11 @@ def test_ring_is_whole_before_it_appears(tmp_path: Path, monkeypatch: pytest.Mon
     seen: list[tuple[bool, RingHeader, int]] = []
     rename = os.rename
 
-    def spy(source: Path, target: Path) -> None:
-        mode = stat.S_IMODE(source.stat().st_mode)
-        seen.append((target.exists(), decode_header(source.read_bytes()[:HEADER_BYTES], "x"), mode))
-        rename(source, target)
+    def spy(source: str, target: str, **directories: int) -> None:
+        file = tmp_path / source
+        mode = stat.S_IMODE(file.stat().st_mode)
+        seen.append(((tmp_path / target).exists(), decode_header(file.read_bytes()[:HEADER_BYTES], "x"), mode))
+        rename(source, target, **directories)
 
     monkeypatch.setattr(os, "rename", spy)
     board = Board(tmp_path)
@@ -130,32 +139,52 @@ def test_gap_in_the_numbers_moves_the_first(board: Board) -> None:
     assert (board.word("first_seq"), board.word("newest_seq")) == (7, 8)
 
 
+Notes = list[tuple[int, int, object]]
+
+
 class Spy:
     """Stands before a memoryview and notes what is written where, in bytes."""
 
-    def __init__(self, target: memoryview, notes: list[tuple[int, int, object]]) -> None:
+    def __init__(self, target: memoryview, notes: Notes) -> None:
         self.target, self.notes = target, notes
 
     def cast(self, code: Any) -> "Spy":
         return Spy(self.target.cast(code), self.notes)
 
-    def __setitem__(self, at: int | slice, value: Any) -> None:
-        if isinstance(at, slice):
-            self.notes.append((at.start, at.stop - at.start, bytes(value)))
-        else:
-            width = self.target.itemsize
-            self.notes.append((at * width, width, value))
+    def __setitem__(self, at: int, value: Any) -> None:
+        width = self.target.itemsize
+        self.notes.append((at * width, width, value))
         self.target[at] = value
 
     def release(self) -> None:
         self.target.release()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.target.release()
+
+
+class SpyMap(mmap.mmap):
+    """Notes the slices that are written."""
+
+    notes: Notes | None = None
+
+    def __setitem__(self, at: Any, value: Any) -> None:
+        assert self.notes is not None
+        self.notes.append((at.start, at.stop - at.start, bytes(value)))
+        super().__setitem__(at, value)
+
 
 def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    notes: list[tuple[int, int, object]] = []
+    notes: Notes = []
     with monkeypatch.context() as patch:
         patch.setattr(ring, "memoryview", lambda memory: Spy(memoryview(memory), notes), raising=False)
+        patch.setattr(SpyMap, "notes", notes)
+        patch.setattr(mmap, "mmap", SpyMap)
         board = Board(tmp_path)
+    monkeypatch.setattr(SpyMap, "notes", notes)
     board.publish([1])
     slot = encode_slot(make_sample(1), 3)
     assert notes == [
@@ -251,10 +280,69 @@ def other_writer(path: Path, pid: int, *, heartbeat_ns: int = START_NS - 1, stat
     path.write_bytes(encode_header(header))
 
 
+OTHER_DAEMON = """
+import sys, time
+from pathlib import Path
+from tests.support.paths import ROOT
+from tests.support.rings import Board
+board = Board(Path(sys.argv[1]))
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+@contextmanager
+def other_daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that has a ring in `folder`; killed at the end."""
+    command = [sys.executable, "-c", OTHER_DAEMON, str(folder)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            yield process
+        finally:
+            process.kill()
+
+
 def test_second_daemon_is_refused(tmp_path: Path) -> None:
-    other_writer(tmp_path / f"imud.{DEVICE}", os.getppid())
-    with pytest.raises(ServerError, match=f"another imud, process {os.getppid()}"):
-        Board(tmp_path)
+    with other_daemon(tmp_path) as other:
+        with pytest.raises(ServerError, match=f"another imud, process {other.pid}: stop that one first"):
+            Board(tmp_path, now_ns=START_NS + 60_000_000_000)  # whatever its heartbeat
+        other.kill()
+        other.wait()
+        Board(tmp_path).publisher.close()  # at once
+
+
+def test_ring_that_another_daemon_has_taken_over_is_left_to_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    board = Board(tmp_path)
+    board.path.unlink()
+    with other_daemon(tmp_path) as other:
+        inode = board.path.stat().st_ino
+        for _ in range(30):
+            board.tick()
+        assert board.path.stat().st_ino == inode
+        board.publish([1])
+        assert [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR] == [
+            f"shm: no ring for {DEVICE}: {board.path} is written by another imud, process {other.pid}:"
+            " stop that one first; trying again every second"
+        ]
+        other.kill()
+        other.wait()
+        board.tick(1_000_000_000)
+    assert (board.path.stat().st_ino == inode, board.word("newest_seq"), board.word("first_seq")) == (False, 1, 2)
+    board.publisher.close()
+
+
+def test_reader_cannot_pose_as_a_daemon(tmp_path: Path) -> None:
+    """A lock that read access is enough for is none."""
+    first = Board(tmp_path)
+    first.die()
+    with first.path.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        Board(tmp_path, epoch=78).publisher.close()
+    first.publisher.close()
 
 
 def dead_pid() -> int:
@@ -267,7 +355,8 @@ def dead_pid() -> int:
     "leave",
     [
         lambda path: other_writer(path, dead_pid()),  # killed and restarted at once
-        lambda path: other_writer(path, os.getppid(), heartbeat_ns=START_NS - 1_000_000_000),  # number in use again
+        lambda path: other_writer(path, os.getppid()),  # number in use again: no proof
+        lambda path: other_writer(path, 1, heartbeat_ns=1 << 62),
         lambda path: other_writer(path, os.getppid(), state=STATE_CLOSED),
         lambda path: path.write_bytes(b"of another version"),
     ],
@@ -285,14 +374,42 @@ def test_file_of_an_earlier_daemon_is_replaced(tmp_path: Path, leave: Callable[[
         board.publisher.close()
 
 
-def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """The daemon runs without the ring, says so once, and makes the ring as soon as there is room."""
+
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
-    with pytest.raises(ServerError, match=r"imud.imu0 cannot be made, 20480 bytes: No space left .* fewer `slots`"):
-        Board(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "posix_fallocate", refuse)
+        board = Board(tmp_path)
+        for _ in range(25):
+            board.tick()
+        board.publish([1, 2, 3])
+    [record] = (record for record in caplog.records if record.levelno == logging.ERROR)
+    assert re.search(r"imud.imu0 cannot be made, 20480 bytes: No space left .* fewer `slots`", record.getMessage())
     assert not list(tmp_path.iterdir())
+    board.tick(1_000_000_000)
+    with Ring(board.path, now_ns=lambda: board.now_ns) as reader:
+        board.publish([4])
+        assert [s.seq for s in reader.read().samples] == [4]
+        assert reader.missed == 0
+    board.publisher.close()
+
+
+def test_failed_ring_is_tried_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tries: list[int] = []
+
+    def refuse(*_: object) -> None:
+        tries.append(board.now_ns if tries else START_NS)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    board = Board(tmp_path)
+    for _ in range(30):
+        board.tick()
+    assert [(at - START_NS) // 1_000_000 for at in tries] == [0, 1000, 2000, 3000]
+    board.publisher.close()
 
 
 def test_directory_that_is_not_there(tmp_path: Path) -> None:
@@ -301,14 +418,17 @@ def test_directory_that_is_not_there(tmp_path: Path) -> None:
 
 
 def test_directory_that_is_not_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "access", lambda *_, **__: False)
     with pytest.raises(ServerError, match="may not make files there"):
         make(tmp_path).start()
 
 
-def test_file_that_cannot_be_made() -> None:
-    with pytest.raises(ServerError, match="may imud write to /proc"):
-        make(Path("/proc")).add_device(DEVICE, 0)
+def test_file_that_cannot_be_made(caplog: pytest.LogCaptureFixture) -> None:
+    publisher = make(Path("/proc"))
+    publisher.add_device(DEVICE, 0)
+    assert "may imud write to /proc" in caplog.text
+    publisher.publish(Batch(DEVICE, 0, [make_sample(1)]))
+    publisher.close()
 
 
 def test_group_that_does_not_exist(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
