@@ -288,6 +288,16 @@ def test_cut_ring(board: Board, reader: Reader, size_bytes: int) -> None:
     assert [reader.next(), reader.next()] == [(3, 2), (0, 0)]
 
 
+def test_new_ring_before_its_first_sample(board: Board, reader: Reader) -> None:
+    board.publish([1, 2])
+    os.truncate(board.path, 0)
+    board.tick()
+    assert reader.ask("reopen") == ["reopen", "1", "77"]
+    assert [reader.next(), reader.next()] == [(0, 2), (0, 0)]
+    board.publish([3])
+    assert reader.next() == (3, 0)
+
+
 def test_descriptors_of_reopened_rings(board: Board, reader: Reader) -> None:
     def count() -> int:
         return len(os.listdir(f"/proc/{reader.pid}/fd"))

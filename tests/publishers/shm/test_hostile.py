@@ -302,6 +302,17 @@ def test_cut_ring_is_made_anew(tmp_path: Path, size_bytes: int, first: str) -> N
     board.publisher.close()
 
 
+def test_new_ring_before_its_first_sample(board: Board) -> None:
+    """What was lost with the old one is missed at once, not waited for."""
+    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
+        board.publish([1, 2])
+        os.truncate(board.path, 0)
+        board.tick()
+        assert ring.read() == ([], 2)
+        board.publish([3])
+        assert ring.read() == ([make_sample(3)], 0)
+
+
 def test_ring_cut_by_a_byte(board: Board) -> None:
     """Every sample is read or missed."""
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
