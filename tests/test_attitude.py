@@ -22,7 +22,7 @@ from imud.attitude import (
     quat_normalized,
 )
 from imud.sample import Quaternion, Vector3
-from tests.support.paths import SHARED
+from tests.support.files import SHARED
 
 RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
 HALF = math.sqrt(0.5)

@@ -18,8 +18,8 @@ import msgspec
 import pytest
 
 from imud.client import Ring
-from tests.support.hi91 import hi91
-from tests.support.running import RunningDaemon, running_daemon, wait_until, write_config
+from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
+from tests.support.files import hi91
 
 
 class Cable:

@@ -17,8 +17,8 @@ import pytest
 from imud import config
 from imud.cli import COMMANDS, build_parser
 from imud.devices import DRIVERS
-from tests.support import actions_reference, pictures, shm_reference
-from tests.support.running import LIMIT_S, running_daemon
+from tests.support import pictures, references
+from tests.support.daemon_process import LIMIT_S, running_daemon
 from tests.test_daemon import cable, device
 
 ROOT = Path(__file__).parents[1]
@@ -138,16 +138,18 @@ def test_make_targets_of_the_readme_exist() -> None:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
-def test_layout_tables_are_those_of_the_code() -> None:
-    text = shm_reference.PAGE.read_text()
-    assert "| 0 | `uint64_t` | `seq` |" in text
-    assert shm_reference.filled(text) == text, "run python -m tests.support.shm_reference"
+@pytest.mark.parametrize("page", references.PAGES)
+def test_generated_parts_are_those_of_the_code(page: str) -> None:
+    assert references.generated(page) == references.current(page), "run python -m tests.support.references"
+
+
+def test_layout_tables_have_their_fields() -> None:
+    assert "| 0 | `uint64_t` | `seq` |" in references.current("docs/shm.md")
 
 
 def test_tables_of_actions_are_those_of_the_drivers() -> None:
-    text = actions_reference.FILE.read_text()
+    text = references.current("docs/commands.md")
     assert text.count("\n### `") == len(DRIVERS)
     for driver in DRIVERS.values():
         for action in driver.actions:
             assert f"\n| `{action}` | " in text, action
-    assert actions_reference.whole(text) == text, "run python -m tests.support.actions_reference"

@@ -14,8 +14,8 @@ import pytest
 from imud.client import Ring
 from imud.devices.hipnuc.uart.codec import encode_hi91
 from imud.sample import Sample
-from tests.support.paths import SHARED
-from tests.support.running import running_daemon, wait_until
+from tests.support.daemon_process import running_daemon, wait_until
+from tests.support.files import SHARED
 
 RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
 G = 9.8

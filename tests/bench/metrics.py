@@ -14,7 +14,7 @@ from threading import Event, Thread
 from imud.publishers.metrics.family import Snapshot
 from imud.publishers.metrics.publisher import Renderer
 from tests.bench.rows import Row, at_most
-from tests.support.device_status import client, equipped
+from tests.support.metrics import client, equipped
 
 STALL_MS_MAX = 1.0
 """A sample every millisecond: a stall below this delays one wake-up and loses nothing."""

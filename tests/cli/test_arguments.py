@@ -7,7 +7,7 @@ import pytest
 
 from imud.cli import main
 from tests.cli.test_decode import MANUAL_FRAME
-from tests.support.can_logs import imu61x_log
+from tests.support.files import imu61x_log
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ import pytest
 from imud.cli import main
 from imud.cli.clock import aids, block
 from imud.contracts.status import ClockStatus
-from tests.support.device_status import LINES, device, equipped
-from tests.support.hi91 import hi91
+from tests.support.daemon_process import RunningDaemon, running_daemon
+from tests.support.files import hi91
+from tests.support.metrics import LINES, device, equipped
 from tests.support.pty_port import PtyPort
-from tests.support.running import RunningDaemon, running_daemon
 
 
 @pytest.fixture

@@ -61,7 +61,7 @@ def test_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_log_of_a_can_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from tests.support.can_logs import imu61x_log
+    from tests.support.files import imu61x_log
 
     log = tmp_path / "drive.log"
     log.write_text(imu61x_log([65535, 65536]) + "(1.0) can0 7FF#00\nnoise\n")

@@ -9,7 +9,7 @@ import pytest
 from imud.cli import main
 from imud.cli.arguments import argument
 from imud.errors import BadArgument
-from tests.support.running import RunningDaemon, running_daemon
+from tests.support.daemon_process import RunningDaemon, running_daemon
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
-from tests.support.hi91 import hi91
+from tests.support.files import hi91
 
 
 def capture(file: Path, count: int) -> Path:
@@ -40,7 +40,7 @@ def test_missing_capture_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_log_of_a_can_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from tests.support.can_logs import imu61x_log
+    from tests.support.files import imu61x_log
 
     log = tmp_path / "drive.log"
     log.write_text(imu61x_log([*range(65500, 65580), *range(65583, 65600)]))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 
 
 def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from imud.cli.status import block, driven, parts, utc, watched
 from imud.contracts.status import LinesStatus, UtcStatus
-from tests.support.device_status import LINES, POLLING, UTC, device, equipped
+from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 
 
 def test_a_device_without_parts_has_no_rows_of_them() -> None:

@@ -26,7 +26,7 @@ from tests.bench.line_runs import (
     sout_clock,
     steepest,
 )  # fmt: skip
-from tests.support.streams import BEGIN_NS, feed, make_clock, rises, steady
+from tests.support.clock_feed import BEGIN_NS, feed, make_clock, rises, steady
 
 # --- unwrapping -------------------------------------------------------------------------------------------------------
 

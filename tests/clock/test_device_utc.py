@@ -20,7 +20,7 @@ from tests.bench.line_runs import (
     steepest,
     syncs,
 )  # fmt: skip
-from tests.support.streams import BEGIN_NS, rises
+from tests.support.clock_feed import BEGIN_NS, rises
 
 UNIX = 1 << 32
 DAY = DAY_NS // NS_PER_MS

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from imud.clock import SampleClock
 from imud.sample import Measurement, Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.streams import BEGIN_NS, MODULUS, Point, feed, make_clock, message, rises, steady
+from tests.support.clock_feed import BEGIN_NS, MODULUS, Point, feed, make_clock, message, rises, steady
 
 # --- samples that arrive ----------------------------------------------------------------------------------------------
 

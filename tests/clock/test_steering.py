@@ -38,7 +38,7 @@ from tests.bench.line_runs import (
     syncs,
     with_sout,
 )  # fmt: skip
-from tests.support.streams import BEGIN_NS, make_clock, message, rises
+from tests.support.clock_feed import BEGIN_NS, make_clock, message, rises
 
 # --- slewing ----------------------------------------------------------------------------------------------------------
 

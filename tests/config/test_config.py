@@ -21,8 +21,8 @@ from imud.devices import DRIVERS
 from imud.errors import ConfigError
 from imud.links import LINKS
 from imud.publishers import PUBLISHERS
-from tests.support import config_reference
-from tests.support.paths import ROOT
+from tests.support import references
+from tests.support.files import ROOT
 
 SHIPPED = ROOT / "etc/imud.yaml"
 
@@ -355,18 +355,13 @@ def test_shipped_file_has_every_key() -> None:
 
     tree = read_yaml(uncommented(SHIPPED.read_text()).encode())
     present = {tuple("NAME" if i == 1 and p[0] == "devices" else part for i, part in enumerate(p)) for p in tree.keys}
-    for _title, path, schema in config_reference.parts():
+    for _title, path, schema in references.settings_parts():
         for field in schema.__struct_fields__:
             assert (*path.split(".")[:-1], field) in present, f"{path}{field} is missing in etc/imud.yaml"
 
 
-def test_documentation_is_made_from_the_settings() -> None:
-    page = config_reference.FILE.read_text()
-    assert config_reference.whole(page) == page, "run python -m tests.support.config_reference"
-
-
 def test_every_row_is_configurable() -> None:
-    titles = {path for _title, path, _schema in config_reference.parts()}
+    titles = {path for _title, path, _schema in references.settings_parts()}
     assert {f"{name}." for name in PUBLISHERS} | {f"devices.NAME.{name}." for name in LINKS} <= titles
     assert TABLES.drivers is DRIVERS
 

@@ -7,7 +7,7 @@ import pytest
 
 from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
 from imud.formats.candump import CandumpReader
-from tests.support.captures import candump_line
+from tests.support.files import candump_line
 
 US = 1000
 LOG = b"""\

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from imud.errors import ImudError
 from imud.formats.capture import MAGIC, RAW_CHUNK_BYTES, RECORD_BYTES_MAX, CaptureReader
-from tests.support.captures import CaptureWriter
+from tests.support.files import CaptureWriter
 
 GOLDEN = (
     b"#imud-capture 1 driver=hipnuc-uart baud=115200\n"

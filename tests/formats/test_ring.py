@@ -19,7 +19,7 @@ from imud.formats.ring import (
     ring_path,
 )
 from imud.ledger import LEDGER_FIELDS
-from tests.support.layouts import check_layout
+from tests.support.rings import check_layout
 
 HEADER = RingHeader(0x0102_0304_0506_0708, 4711, STATE_LIVE, "front-imu", 3, 4096, 10, 2, -5)
 LEDGER = {name: 100 + i for i, name in enumerate(LEDGER_FIELDS)}

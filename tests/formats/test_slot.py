@@ -18,7 +18,7 @@ from imud.formats.slot import (
     slot_is_whole,
 )
 from imud.sample import Sample, Sync
-from tests.support.layouts import check_layout
+from tests.support.rings import check_layout
 
 FULL = Sample(
     "imu0", 258, 1_000_000_001, 250_000, Sync.EDGE, 1_000_400_000, 0x17A1_B2C3_D4E5_F607,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.fuzz.shm import base
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 
 TARGET: Final = "c-header"
 SOURCE: Final = ROOT / "tests/fuzz/ring.c"

@@ -10,7 +10,7 @@ import msgspec
 from imud.config import PROBLEMS_SHOWN, differences, parse
 from imud.errors import ConfigError
 from tests.fuzz.target import Target, check_printable
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 
 FILENAME: Final = "imud.yaml"
 MESSAGE_BYTES_MAX: Final = 64 * 1024

@@ -14,7 +14,7 @@ from imud.formats.candump import CandumpReader
 from imud.formats.capture import MAGIC, RECORD, RECORD_BYTES_MAX, CaptureReader, Chunk
 from tests.fuzz.drivers import row
 from tests.fuzz.target import Target, check_printable
-from tests.support.captures import CaptureWriter, candump_line
+from tests.support.files import CaptureWriter, candump_line
 
 BEGIN_NS: Final = 1_763_717_507_000_000_000
 PERIOD_NS: Final = 10_000_000

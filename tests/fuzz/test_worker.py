@@ -9,7 +9,7 @@ import pytest
 from tests.fuzz import __main__ as runner
 from tests.fuzz import worker
 from tests.fuzz.target import Target
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 
 
 def fails_on_a_bracket(data: bytes) -> None:

@@ -13,7 +13,7 @@ from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.sample import Sample
 from tests.lab.can_interface import CanInterface
 from tests.lab.can_traffic import Against, Module, fleet, traffic
-from tests.support.running import RunningDaemon, running_daemon
+from tests.support.daemon_process import RunningDaemon, running_daemon
 
 SECONDS = float(os.environ.get("IMUD_LAB_SECONDS", "6"))
 RATE_HZ = float(os.environ.get("IMUD_LAB_RATE_HZ", "20"))

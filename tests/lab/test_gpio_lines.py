@@ -22,7 +22,7 @@ from imud.units import NS_PER_S
 from tests.lab.gpio_chip import GpioChip, simulated_chip
 from tests.lab.tool import running, tool
 from tests.lab.waiting import wait_until
-from tests.support.in_loop import in_loop
+from tests.support.event_loops import in_loop
 
 INTERRUPTS = Path("/proc/interrupts")
 LIMIT_S = 30

@@ -24,7 +24,7 @@ from tests.lab.imu_process import Pulse, running_imu, tell, tty
 from tests.lab.test_gpio_lines import INTERRUPTS, rising_edges
 from tests.lab.tool import running, tool
 from tests.lab.waiting import wait_until
-from tests.support.running import RunningDaemon, running_daemon
+from tests.support.daemon_process import RunningDaemon, running_daemon
 
 pytestmark = pytest.mark.timeout(600)
 

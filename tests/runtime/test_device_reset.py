@@ -26,8 +26,8 @@ from imud.signals.sync_signals import SyncSignals
 from imud.sim.ports.lines import MemoryLines, MemoryOutput
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
-from tests.support.stage import Stage
-from tests.support.virtual_time import VirtualClock, run_virtually
+from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.polled_bus_bench import PolledBusBench
 
 LINES = DeviceLines(reset=ResetSettings(line="R"))
 BOOT_S = 2.9
@@ -35,8 +35,8 @@ BOOT_S = 2.9
 
 
 @pytest.fixture
-def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    return Stage(tmp_path, monkeypatch, VirtualClock())
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
+    return PolledBusBench(tmp_path, monkeypatch, VirtualClock())
 
 
 def reset_line(lines: MemoryLines, now_ns: Callable[[], int], boot: Callable[[], None]) -> MemoryOutput:
@@ -55,12 +55,12 @@ class Scene:
 
     rig: DeviceRig
 
-    def __init__(self, stage: Stage) -> None:
-        self.line = reset_line(stage.lines, stage.clock.now_ns, self.boot)
-        self.device = stage.registers()
+    def __init__(self, bench: PolledBusBench) -> None:
+        self.line = reset_line(bench.lines, bench.clock.now_ns, self.boot)
+        self.device = bench.registers()
         self.dead = False
         """Whether it does not even boot."""
-        stage.spi.device = self.device.spi
+        bench.spi.device = self.device.spi
 
     def hang(self) -> None:
         """It answers no more."""
@@ -84,21 +84,21 @@ class Scene:
 
 
 @asynccontextmanager
-async def polled(stage: Stage, **more: Any) -> AsyncIterator[Scene]:
+async def polled(bench: PolledBusBench, **more: Any) -> AsyncIterator[Scene]:
     config = replace(
-        stage.on_spi(burst="extended", gyro_filter=2), lines=DeviceLines(reset=ResetSettings(line="R", **more))
+        bench.on_spi(burst="extended", gyro_filter=2), lines=DeviceLines(reset=ResetSettings(line="R", **more))
     )
-    scene = Scene(stage)
-    async with stage.running(config) as (scene.rig,):
+    scene = Scene(bench)
+    async with bench.running(config) as (scene.rig,):
         yield scene
 
 
-def test_a_device_that_hangs_is_reset_and_set_up_again(stage: Stage) -> None:
+def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with polled(stage) as it:
+        async with polled(bench) as it:
             await it.rig.until_samples(5)
             it.hang()
-            down_ns = stage.clock.now_ns()
+            down_ns = bench.clock.now_ns()
             await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
             await it.rig.until_samples(5, 20)
             assert it.pulses == 1
@@ -108,14 +108,14 @@ def test_a_device_that_hangs_is_reset_and_set_up_again(stage: Stage) -> None:
             assert it.told == ["not found for 4 s: reset by its line"]
             assert it.rig.kinds.count(EventKind.UP) == 2
             assert (it.device.extended, it.device.filter & 0x0F) == (1, 2)
-            assert stage.clock.now_ns() - up_ns < 4e9
+            assert bench.clock.now_ns() - up_ns < 4e9
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_a_device_that_comes_back_by_itself_is_not_reset(stage: Stage) -> None:
+def test_a_device_that_comes_back_by_itself_is_not_reset(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with polled(stage) as it:
+        async with polled(bench) as it:
             for _ in range(5):
                 await it.rig.until_samples(5, 20)
                 it.hang()
@@ -125,12 +125,12 @@ def test_a_device_that_comes_back_by_itself_is_not_reset(stage: Stage) -> None:
             assert it.pulses == 0
             assert it.rig.kinds.count(EventKind.UP) == 6
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_a_device_that_is_not_there_is_reset_once_a_minute(stage: Stage) -> None:
+def test_a_device_that_is_not_there_is_reset_once_a_minute(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with polled(stage) as it:
+        async with polled(bench) as it:
             it.device.faults.line = 0
             it.dead = True
             await it.rig.until(lambda: it.pulses == 3, "three", 200)
@@ -138,14 +138,14 @@ def test_a_device_that_is_not_there_is_reset_once_a_minute(stage: Stage) -> None
             assert all(60e9 <= b - a < 61e9 for a, b in pairwise(times_ns))
             assert "only 0x00" in it.rig.device.status().problem
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(stage: Stage) -> None:
+def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with polled(stage, hold_ms=500) as it:
+        async with polled(bench, hold_ms=500) as it:
             await it.rig.until_samples(5)
-            begin_ns = stage.clock.now_ns()
+            begin_ns = bench.clock.now_ns()
             task = asyncio.create_task(it.rig.device.act("reset", {}))
             await it.rig.until(lambda: it.line.active, "active")
             await it.rig.until(lambda: it.rig.state is DeviceState.SEARCHING, "left")
@@ -155,22 +155,22 @@ def test_nothing_is_asked_while_the_line_is_active_and_for_3_s(stage: Stage) -> 
             await it.rig.until(task.done, "over")
             assert it.device.transactions - asked <= 1  # the transfer that was under way
             assert await task is None
-            assert stage.clock.now_ns() - begin_ns == pytest.approx(3.5e9, abs=10e6)
+            assert bench.clock.now_ns() - begin_ns == pytest.approx(3.5e9, abs=10e6)
             await it.rig.until_samples(5)
             assert len(it.rig.samples) > samples
             assert it.pulses == 1
             assert [e.message for e in it.rig.events if e.kind is EventKind.DOWN] == ["reset by its line"]
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(stage: Stage) -> None:
+def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
+        async with bench.running(bench.on_spi()) as (rig,):
             assert "reset" not in rig.device.actions
             with pytest.raises(BadArgument, match="no action 'reset'"):
                 await rig.device.act("reset", {})
-        async with polled(stage) as it:
+        async with polled(bench) as it:
             it.hang()
             await it.rig.until(lambda: "only 0xFF" in it.rig.device.status().problem, "searching")
             with pytest.raises(BadArgument, match="hard"):
@@ -181,23 +181,23 @@ def test_reset_is_offered_with_a_line_only_and_also_while_no_device_is_found(sta
             await it.rig.until_samples(5)
             assert it.told == []
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_shown(stage: Stage) -> None:
+def test_the_line_is_held_from_the_beginning_to_the_end_and_its_trouble_shown(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with polled(stage) as it:
+        async with polled(bench) as it:
             await it.rig.until_samples(1)
             assert it.line.is_open
             status = it.rig.device.status()
             assert status.lines is not None
             assert status.lines.problems == {}
         assert not it.line.is_open
-        it.rig.device.tick(stage.clock.now_ns())
+        it.rig.device.tick(bench.clock.now_ns())
         assert not it.line.is_open
         assert it.line.history == []
 
-    stage.run(body())
+    bench.run(body())
 
 
 def frame(timer_us: int) -> bytes:

@@ -16,7 +16,7 @@ from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.chrony import ChronyFeed
 from imud.utc.source import RmcSettings
 from imud.utc.system_clock import KernelClock
-from tests.support.wired import FakeSource
+from tests.support.rmc_sources import FakeSource
 
 UTC_S = 1_795_000_000
 BEGIN_NS = 1000 * NS_PER_S
@@ -44,7 +44,7 @@ class FakeChrony:
         self.closed = True
 
 
-class Bench:
+class KeeperBench:
     """A keeper and all around it."""
 
     def __init__(self, *, source: bool = True, system: UtcReference | None = None) -> None:
@@ -76,11 +76,11 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def bench() -> KeeperBench:
+    return KeeperBench()
 
 
-def test_sentences_go_to_the_device_and_make_pulses_utc(bench: Bench) -> None:
+def test_sentences_go_to_the_device_and_make_pulses_utc(bench: KeeperBench) -> None:
     for number in range(6):
         bench.second(number)
     assert len(bench.written) == 6
@@ -95,7 +95,7 @@ def test_sentences_go_to_the_device_and_make_pulses_utc(bench: Bench) -> None:
     assert status.chrony_sent == len(bench.chrony.pulses) > 1
 
 
-def test_a_sentence_for_a_busy_or_wrong_second_is_refused_and_counted(bench: Bench) -> None:
+def test_a_sentence_for_a_busy_or_wrong_second_is_refused_and_counted(bench: KeeperBench) -> None:
     for number in range(4):
         bench.second(number)
     bench.busy = True
@@ -107,14 +107,14 @@ def test_a_sentence_for_a_busy_or_wrong_second_is_refused_and_counted(bench: Ben
     assert len(bench.written) == 4
 
 
-def test_before_anything_is_known_of_utc_the_pulse_says_what_is_too_late(bench: Bench) -> None:
+def test_before_anything_is_known_of_utc_the_pulse_says_what_is_too_late(bench: KeeperBench) -> None:
     bench.second(0, sentence=False)
     bench.now_ns = BEGIN_NS + NS_PER_S - 25 * NS_PER_MS  # 6 ms on the wire, and 20 ms before the next second at least
     bench.source.give(build(UTC_S * NS_PER_S), bench.now_ns)
     assert bench.keeper.status().refused == {"stale": 1}
 
 
-def test_the_better_of_two_references_counts(bench: Bench) -> None:
+def test_the_better_of_two_references_counts(bench: KeeperBench) -> None:
     good, bad = UtcReference(OFFSET_NS + 77, 10), UtcReference(OFFSET_NS + 55, 10**9)
     bench.system = bad
     bench.second(0)
@@ -135,7 +135,7 @@ def test_the_better_of_two_references_counts(bench: Bench) -> None:
 
 
 def test_the_reference_is_updated_once_a_second_and_dropped_when_there_is_none() -> None:
-    bench = Bench(source=False, system=UtcReference(5, 5))
+    bench = KeeperBench(source=False, system=UtcReference(5, 5))
     bench.keeper.tick(BEGIN_NS, None)
     assert bench.clock.utc_reference == UtcReference(5, 5)
     bench.system = None
@@ -146,7 +146,7 @@ def test_the_reference_is_updated_once_a_second_and_dropped_when_there_is_none()
 
 
 def test_a_clock_has_the_reference_from_its_start_and_none_after_the_end_of_the_link() -> None:
-    bench = Bench(source=False, system=UtcReference(5, 5))
+    bench = KeeperBench(source=False, system=UtcReference(5, 5))
     bench.keeper.tick(BEGIN_NS, None)
     other = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
     bench.keeper.start(other)
@@ -161,7 +161,7 @@ def test_a_clock_has_the_reference_from_its_start_and_none_after_the_end_of_the_
 
 
 def test_close_releases_source_and_socket_and_nothing_starts_again() -> None:
-    bench = Bench()
+    bench = KeeperBench()
     bench.keeper.close()
     bench.keeper.close()
     assert bench.source.closed
@@ -180,7 +180,7 @@ def test_a_keeper_that_was_closed_before_its_first_tick_starts_no_source() -> No
     assert source.started == 0
 
 
-def test_problems_of_source_and_chrony_show(bench: Bench) -> None:
+def test_problems_of_source_and_chrony_show(bench: KeeperBench) -> None:
     assert bench.keeper.status().problem == ""
     bench.chrony.problem = "no chronyd"
     assert bench.keeper.status().problem == "no chronyd"

@@ -14,7 +14,7 @@ from imud.sim.ports.faults import FaultRates, Faults
 from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.source import RmcSettings
-from tests.support.wired import BEGIN_NS, EDGE_LATE_NS, Wired
+from tests.support.wired_device import BEGIN_NS, EDGE_LATE_NS, WiredDevice
 
 SOUT = DeviceLines(sout=SoutSettings(line="A"))
 FEW_US = 4_000
@@ -22,11 +22,11 @@ STEP_NS = 20_000
 """By how much the error of time may change from one sample to the next: 500 ppm of slewing in 10 ms, and noise."""
 
 
-def off_ns(wired: Wired, sample: Sample) -> int:
+def off_ns(wired: WiredDevice, sample: Sample) -> int:
     return sample.t_ns - wired.instant(sample)
 
 
-def check_pairs(wired: Wired, samples: list[Sample]) -> int:
+def check_pairs(wired: WiredDevice, samples: list[Sample]) -> int:
     """Every sample that names an edge names its own; returns how many do."""
     pulses = wired.pulses(Pin.SOUT)
     named = [sample for sample in samples if sample.edge_seq is not None]
@@ -41,7 +41,7 @@ def rises(samples: list[Sample]) -> bool:
 
 
 def test_every_sample_has_its_edge(monkeypatch: pytest.MonkeyPatch) -> None:
-    wired = Wired(SOUT)
+    wired = WiredDevice(SOUT)
 
     async def story() -> None:
         await wired.wait(3)
@@ -63,7 +63,7 @@ def test_every_sample_has_its_edge(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_edges_that_stop_and_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    wired = Wired(SOUT)
+    wired = WiredDevice(SOUT)
 
     async def story() -> None:
         await wired.wait(5)
@@ -96,7 +96,7 @@ def test_edges_that_stop_and_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pairing_is_right_under_loss(
     monkeypatch: pytest.MonkeyPatch, edges: float, frames: float, rate_hz: int
 ) -> None:
-    wired = Wired(
+    wired = WiredDevice(
         SOUT,
         ModuleSettings(hi91=Output(1000 // rate_hz)),
         frame_faults=Faults(3, FaultRates(lose=frames)),
@@ -119,7 +119,7 @@ def test_pairing_is_right_under_loss(
 
 def test_marks_name_the_samples_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = replace_line(SOUT, sout_div=DividedSettings(line="B", divisor=8))
-    wired = Wired(lines, frame_faults=Faults(5, FaultRates(lose=0.05)))
+    wired = WiredDevice(lines, frame_faults=Faults(5, FaultRates(lose=0.05)))
 
     async def story() -> None:
         await wired.wait(10)
@@ -155,7 +155,7 @@ RANGE = ModuleSettings(alarm_y=AlarmSetting(-5, 5, True))
 
 def test_an_alarm_is_an_event_and_shown_in_the_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """The motion swings by 25°."""
-    wired = Wired(ALARM, RANGE, identify=True)
+    wired = WiredDevice(ALARM, RANGE, identify=True)
 
     async def story() -> None:
         samples = await wired.wait(10)
@@ -180,7 +180,7 @@ def test_an_alarm_is_an_event_and_shown_in_the_samples(monkeypatch: pytest.Monke
 
 def test_an_alarm_wire_that_is_cut_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     tilted = HipnucHardware(motion=Still(roll_rad=0.3))
-    wired = Wired(ALARM, RANGE, tilted, identify=True)
+    wired = WiredDevice(ALARM, RANGE, tilted, identify=True)
     wired.cut.add(Pin.ALARM)
 
     async def story() -> None:
@@ -199,7 +199,7 @@ def test_an_alarm_wire_that_is_cut_is_reported(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_frames_answer_the_triggers_on_sin(monkeypatch: pytest.MonkeyPatch) -> None:
-    wired = Wired(
+    wired = WiredDevice(
         DeviceLines(sin=TriggerSettings(line="D", rate_hz=50)),
         ModuleSettings(hi91=Output(on_mark=True)),
         frame_faults=Faults(6, FaultRates(lose=0.05)),
@@ -237,7 +237,7 @@ def test_a_module_that_is_fed_utc_is_on_utc_and_stays_in_time(
     monkeypatch: pytest.MonkeyPatch, lines: DeviceLines, skew_ppm: float
 ) -> None:
     hardware = HipnucHardware(skew_ppm=skew_ppm)
-    wired = Wired(lines, None, hardware, rmc=RmcSettings(source="gpsd"))
+    wired = WiredDevice(lines, None, hardware, rmc=RmcSettings(source="gpsd"))
 
     async def seconds(first: int, last: int) -> None:
         for second in range(first, last):

@@ -11,9 +11,8 @@ from imud.signals.reset import AGAIN_NS, ResetLine, make_reset, reset
 from imud.signals.watched_line import RETRY_NS
 from imud.sim.ports.lines import MemoryOutput
 from imud.units import NS_PER_S
-from tests.support.in_loop import in_loop
+from tests.support.event_loops import in_loop, run_virtually
 from tests.support.signal_bench import DEVICE, SignalBench
-from tests.support.virtual_time import run_virtually
 
 SETTINGS = ResetSettings(line="RESET", hold_ms=20)
 

@@ -20,7 +20,7 @@ from imud.sample import Measurement
 from imud.signals.sync_signals import ALARM_STATUS, SyncSignals
 from imud.signals.watched_line import RETRY_NS
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.in_loop import in_loop
+from tests.support.event_loops import in_loop
 from tests.support.signal_bench import DEVICE, SignalBench
 
 ALL = DeviceLines(
@@ -32,7 +32,7 @@ ALL = DeviceLines(
 )
 
 
-class Bench(SignalBench):
+class SyncBench(SignalBench):
     """SyncSignals on a device's clock."""
 
     def __init__(self, lines: DeviceLines = ALL) -> None:
@@ -61,7 +61,7 @@ def sample_clock() -> SampleClock:
 
 @in_loop
 async def test_lines_are_watched_before_there_is_a_clock_and_delivered_to_it_afterwards() -> None:
-    bench = Bench()
+    bench = SyncBench()
     assert not any(line.is_open for line in bench.memory.inputs.values())
     bench.tick()
     assert all(line.is_open for line in bench.memory.inputs.values())
@@ -87,7 +87,7 @@ async def test_lines_are_watched_before_there_is_a_clock_and_delivered_to_it_aft
 
 @in_loop
 async def test_the_alarm_is_in_the_samples_of_whatever_clock() -> None:
-    bench = Bench(DeviceLines(alarm=InputSettings(line="D")))
+    bench = SyncBench(DeviceLines(alarm=InputSettings(line="D")))
     bench.start()
     assert bench.status_of_sample(None) is None
     assert bench.status_of_sample(5) == 5
@@ -113,7 +113,7 @@ async def test_the_alarm_is_in_the_samples_of_whatever_clock() -> None:
 
 @in_loop
 async def test_one_edge_by_command() -> None:
-    bench = Bench()
+    bench = SyncBench()
     assert bench.signals.can_trigger
     with pytest.raises(CommandError, match="trigger: bow sin is not driven"):
         bench.signals.trigger_once()
@@ -137,7 +137,7 @@ async def test_one_edge_by_command() -> None:
 
 @in_loop
 async def test_without_sin_there_is_nothing_to_trigger() -> None:
-    bench = Bench(DeviceLines(sout=SoutSettings(line="A")))
+    bench = SyncBench(DeviceLines(sout=SoutSettings(line="A")))
     assert not bench.signals.can_trigger
     with pytest.raises(CommandError, match="expected the key sin"):
         bench.signals.trigger_once()
@@ -146,7 +146,7 @@ async def test_without_sin_there_is_nothing_to_trigger() -> None:
 
 @in_loop
 async def test_sin_that_cannot_be_had_is_reported_once_and_tried_again() -> None:
-    bench = Bench()
+    bench = SyncBench()
     bench.output("sin").open_error = LinkBusy("line 5 is in use")
     bench.start()
     bench.tick(RETRY_NS - 1)
@@ -162,7 +162,7 @@ async def test_sin_that_cannot_be_had_is_reported_once_and_tried_again() -> None
 
 @in_loop
 async def test_sin_that_breaks_while_driven_is_driven_again() -> None:
-    bench = Bench()
+    bench = SyncBench()
     bench.start()
     output = bench.output("sin")
     output.set_error = LinkError("SIN is gone")
@@ -182,7 +182,7 @@ async def test_sin_that_breaks_while_driven_is_driven_again() -> None:
 
 @in_loop
 async def test_at_the_end_of_the_link_sin_is_released_and_edges_are_dropped() -> None:
-    bench = Bench()
+    bench = SyncBench()
     bench.start()
     bench.signals.stop()
     assert not bench.output("sin").is_open
@@ -200,7 +200,7 @@ async def test_at_the_end_of_the_link_sin_is_released_and_edges_are_dropped() ->
 @in_loop
 async def test_closed_lines_stay_closed() -> None:
     """A replay that came to its end is ticked ten times a second as before."""
-    bench = Bench()
+    bench = SyncBench()
     bench.start()
     bench.signals.close()
     bench.signals.close()
@@ -211,7 +211,7 @@ async def test_closed_lines_stay_closed() -> None:
 
 @in_loop
 async def test_marks_are_raised_with_their_samples() -> None:
-    bench = Bench(DeviceLines(sout_div=DividedSettings(line="B")))
+    bench = SyncBench(DeviceLines(sout_div=DividedSettings(line="B")))
     bench.start()
     for i in range(60):
         bench.clock.advance(10 * NS_PER_MS)

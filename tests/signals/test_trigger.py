@@ -11,7 +11,7 @@ from imud.errors import LinkError, LinkMissing
 from imud.signals.trigger import IDLE_NS, PULSE_NS, STAMPS_MAX, SquareWave, Trigger, TriggerCounts
 from imud.sim.ports.lines import MemoryOutput
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.in_loop import in_loop
+from tests.support.event_loops import in_loop
 from tests.support.signal_bench import SignalBench
 
 LIMIT_S = 10
@@ -30,7 +30,7 @@ class Time:
         return self.t_ns
 
 
-class Bench:
+class SquareWaveBench:
     """A square wave on a line in memory."""
 
     def __init__(self, rate_hz: float, pulse_ns: int = PULSE_NS) -> None:
@@ -55,7 +55,7 @@ class Bench:
 
 
 def test_the_period_is_kept_without_drift() -> None:
-    bench = Bench(300.0)
+    bench = SquareWaveBench(300.0)
     bench.run(10 * NS_PER_S, late_ns=60_000)
     rises_ns = bench.rises_ns
     assert len(rises_ns) in (3000, 3001)
@@ -66,7 +66,7 @@ def test_the_period_is_kept_without_drift() -> None:
 
 @pytest.mark.parametrize(("rate_hz", "pulse_ns"), [(1.0, NS_PER_MS), (400.0, NS_PER_MS), (1000.0, NS_PER_MS // 2)])
 def test_a_pulse_is_a_millisecond_or_half_a_period(rate_hz: float, pulse_ns: int) -> None:
-    bench = Bench(rate_hz)
+    bench = SquareWaveBench(rate_hz)
     bench.run(int(3 * NS_PER_S / rate_hz))
     history = bench.line.history
     widths_ns = [down - up for (up, _), (down, _) in zip(history[::2], history[1::2], strict=False)]
@@ -75,7 +75,7 @@ def test_a_pulse_is_a_millisecond_or_half_a_period(rate_hz: float, pulse_ns: int
 
 
 def test_a_stamp_is_the_middle_of_the_call_and_says_how_long_it_was() -> None:
-    bench = Bench(100.0)
+    bench = SquareWaveBench(100.0)
 
     class Slow(MemoryOutput):
         def set(self, active: bool) -> None:
@@ -96,7 +96,7 @@ def test_a_stamp_is_the_middle_of_the_call_and_says_how_long_it_was() -> None:
 
 
 def test_stamps_are_numbered() -> None:
-    bench = Bench(100.0)
+    bench = SquareWaveBench(100.0)
     bench.run(NS_PER_S)
     assert [stamp.number for stamp in bench.wave.stamps] == list(range(1, len(bench.rises_ns) + 1))
     assert [stamp.t_ns - CALL_NS // 2 - bench.begin_ns for stamp in bench.wave.stamps] == bench.rises_ns
@@ -105,7 +105,7 @@ def test_stamps_are_numbered() -> None:
 @pytest.mark.parametrize("stall_ms", [7.0, 12.0, 25.0, 33.0, 1000.0])
 def test_deadlines_that_cannot_be_kept_are_counted_and_the_grid_stays(stall_ms: float) -> None:
     """At 100 Hz an edge is made up to 2.5 ms late."""
-    bench = Bench(100.0)
+    bench = SquareWaveBench(100.0)
     bench.run(15 * NS_PER_MS)
     bench.time.t_ns += int(stall_ms * NS_PER_MS)
     bench.run(2 * NS_PER_S)
@@ -119,7 +119,7 @@ def test_deadlines_that_cannot_be_kept_are_counted_and_the_grid_stays(stall_ms: 
 
 
 def test_a_pulse_that_lasted_too_long_gets_its_pause() -> None:
-    bench = Bench(1000.0)
+    bench = SquareWaveBench(1000.0)
     bench.wave.work()
     bench.time.t_ns += 1_150_000  # asleep over the next deadline
     bench.run(5 * NS_PER_MS)
@@ -130,7 +130,7 @@ def test_a_pulse_that_lasted_too_long_gets_its_pause() -> None:
 
 
 def test_without_a_rate_there_are_only_the_edges_requested() -> None:
-    bench = Bench(0.0)
+    bench = SquareWaveBench(0.0)
     assert bench.wave.work() > IDLE_NS - NS_PER_MS
     bench.wave.once()
     bench.wave.once()
@@ -142,7 +142,7 @@ def test_without_a_rate_there_are_only_the_edges_requested() -> None:
 
 
 def test_a_single_edge_between_those_of_the_rate() -> None:
-    bench = Bench(10.0)
+    bench = SquareWaveBench(10.0)
     bench.run(50 * NS_PER_MS)
     bench.time.t_ns = bench.begin_ns + 50 * NS_PER_MS
     bench.wave.once()
@@ -153,7 +153,7 @@ def test_a_single_edge_between_those_of_the_rate() -> None:
 
 
 def test_stamps_that_are_not_fetched_are_dropped_oldest_first() -> None:
-    bench = Bench(1000.0)
+    bench = SquareWaveBench(1000.0)
     bench.run((STAMPS_MAX + 50) * NS_PER_MS)
     assert len(bench.wave.stamps) == STAMPS_MAX
     assert bench.wave.stamps[-1].number == bench.counts.edges > STAMPS_MAX
@@ -162,7 +162,7 @@ def test_stamps_that_are_not_fetched_are_dropped_oldest_first() -> None:
 # --- the thread and the loop ------------------------------------------------------------------------------------------
 
 
-class Rig:
+class TriggerBench:
     """A trigger whose thread the test runs."""
 
     def __init__(self, rate_hz: float) -> None:
@@ -188,7 +188,7 @@ class Rig:
 
 @in_loop
 async def test_the_loop_is_woken_for_many_stamps_at_a_time() -> None:
-    rig = Rig(200.0)
+    rig = TriggerBench(200.0)
     rig.start()
     await rig.run(NS_PER_S)
     numbers = [stamp.number for batch in rig.batches for stamp in batch]
@@ -200,7 +200,7 @@ async def test_the_loop_is_woken_for_many_stamps_at_a_time() -> None:
 
 @in_loop
 async def test_drain_delivers_at_once_and_each_stamp_once() -> None:
-    rig = Rig(1.0)
+    rig = TriggerBench(1.0)
     rig.trigger.drain()
     rig.start()
     rig.workers[0].work()
@@ -213,7 +213,7 @@ async def test_drain_delivers_at_once_and_each_stamp_once() -> None:
 
 @in_loop
 async def test_a_single_edge_is_delivered_without_waiting_for_more() -> None:
-    rig = Rig(0.0)
+    rig = TriggerBench(0.0)
     with pytest.raises(LinkError, match="is not driven"):
         rig.trigger.once()
     rig.start()
@@ -226,7 +226,7 @@ async def test_a_single_edge_is_delivered_without_waiting_for_more() -> None:
 
 @in_loop
 async def test_stop_leaves_the_line_inactive_and_delivers_the_rest() -> None:
-    rig = Rig(100.0)
+    rig = TriggerBench(100.0)
     rig.start()
     rig.workers[0].work()
     assert rig.line.active
@@ -245,7 +245,7 @@ async def test_stop_leaves_the_line_inactive_and_delivers_the_rest() -> None:
 
 @in_loop
 async def test_a_line_that_vanishes_ends_the_trigger_once() -> None:
-    rig = Rig(100.0)
+    rig = TriggerBench(100.0)
     rig.start()
     await rig.run(15 * NS_PER_MS)
     gone = rig.line.set_error = LinkMissing("pulled out")
@@ -262,7 +262,7 @@ async def test_a_line_that_vanishes_ends_the_trigger_once() -> None:
 
 @in_loop
 async def test_a_failure_of_an_earlier_start_does_not_stop_a_new_start() -> None:
-    rig = Rig(100.0)
+    rig = TriggerBench(100.0)
     rig.start()
     rig.line.set_error = LinkMissing("pulled out")
     rig.workers[0].work()
@@ -278,7 +278,7 @@ async def test_a_failure_of_an_earlier_start_does_not_stop_a_new_start() -> None
 
 @in_loop
 async def test_a_mistake_of_ours_comes_up_in_the_loop() -> None:
-    rig, found = Rig(100.0), list[object]()
+    rig, found = TriggerBench(100.0), list[object]()
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: found.append(context["exception"]))
     rig.start()
     mistake = ValueError("by the test")

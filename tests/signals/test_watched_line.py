@@ -6,8 +6,7 @@ from imud.contracts.lines import Edge
 from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.signals.watched_line import RETRY_NS, WatchedLine
 from imud.sim.ports.lines import MemoryInput
-from tests.support.in_loop import in_loop
-from tests.support.virtual_time import VirtualClock
+from tests.support.event_loops import VirtualClock, in_loop
 
 BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
 

@@ -18,7 +18,7 @@ from imud.client import Client
 from imud.sim.ports.arrival import USB_16MS, ArrivalModel, Crystal
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import run
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 
 FOLDER = ROOT / "docs/pictures"
 NAMES = "font-family='DejaVu Sans, Verdana, sans-serif'"

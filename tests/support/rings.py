@@ -1,11 +1,13 @@
-"""A shared-memory publisher on a folder of its own, with a clock and a ledger that the test moves."""
+"""Shared memory in a folder of its own, written by a publisher whose clock and ledger the test moves."""
 
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.formats.ring import OFFSETS
+from imud.formats.slot import SlotField
 from imud.ledger import Ledger
 from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.sample import Sample, Sync
@@ -70,3 +72,14 @@ class Board:
         with self.path.open("r+b") as file:
             file.seek(at)
             file.write(data)
+
+
+def check_layout(fields: Iterable[SlotField], size_bytes: int) -> None:
+    """Each field begins where the one before it ends, on a multiple of its size; together they fill the record."""
+    at = 0
+    for field in fields:
+        assert field.offset == at, field.name
+        size = struct.calcsize("<" + field.code)
+        assert field.offset % size == 0, f"{field.name} is not aligned to its size"
+        at += size * field.count
+    assert at == size_bytes

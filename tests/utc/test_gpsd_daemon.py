@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from imud.formats.rmc import Rmc, parse
-from tests.support.running import running_daemon
+from tests.support.daemon_process import running_daemon
 from tests.utc.test_gpsd_real import LIMIT_S, NO_GPSD, Receiver, free_port, gpsd, receiver
 
 __all__ = ["receiver"]

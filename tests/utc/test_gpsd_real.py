@@ -18,7 +18,7 @@ from imud.units import NS_PER_S
 from imud.utc.receivers import GpsdSource
 from imud.utc.sentence_stream import Retry
 from imud.utc.source import RmcSettings
-from tests.support.sentences import Sentences
+from tests.support.rmc_sources import Sentences
 
 UTC_S = 1_795_000_000
 LIMIT_S = 30.0

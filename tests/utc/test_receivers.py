@@ -13,7 +13,7 @@ from imud.units import NS_PER_S
 from imud.utc.receivers import GpsdSource, NmeaPortSource, make_nmea
 from imud.utc.sentence_stream import FIRST_PAUSE_S, Retry
 from imud.utc.source import RmcSettings, SourceContext
-from tests.support.sentences import LIMIT_S, Sentences, soon
+from tests.support.rmc_sources import LIMIT_S, Sentences, soon
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 VERSION = b'{"class":"VERSION","release":"3.22","rev":"3.22","proto_major":3,"proto_minor":14}\r\n'

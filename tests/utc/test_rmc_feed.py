@@ -23,7 +23,7 @@ WIRE_115200_NS = 70 * 10 * NS_PER_S // 115_200
 GOOD = UtcReference(OFFSET_NS, NS_PER_MS)
 
 
-class Bench:
+class FeedBench:
     """A feed whose port and clock are the test's."""
 
     def __init__(self, rate_hz: int = 1, reference: UtcReference | None = GOOD, baud: int = 115_200) -> None:
@@ -51,7 +51,7 @@ class Bench:
 
 
 def test_a_sentence_is_passed_on_at_once() -> None:
-    bench = Bench()
+    bench = FeedBench()
     assert bench.give(0, 0.1) == ""
     assert bench.sent == [build(UTC_S * NS_PER_S)]
     status = bench.feed.status()
@@ -59,7 +59,7 @@ def test_a_sentence_is_passed_on_at_once() -> None:
 
 
 def test_another_talker_is_made_gp() -> None:
-    bench = Bench()
+    bench = FeedBench()
     body = build(UTC_S * NS_PER_S)[1:-5].replace(b"GP", b"GN")
     assert bench.give(0, 0.1, b"$%b*%02X\r\n" % (body, checksum(body))) == ""
     assert bench.sent[0].startswith(b"$GPRMC,")
@@ -77,7 +77,7 @@ def test_another_talker_is_made_gp() -> None:
     ],
 )
 def test_bad_sentences_are_refused(sentence: bytes, refusal: Refusal) -> None:
-    bench = Bench()
+    bench = FeedBench()
     assert bench.give(0, 0.1, sentence or b"\x00") == refusal
     assert bench.sent == []
     assert bench.feed.status().refused == {refusal.value: 1}
@@ -100,7 +100,7 @@ REFERENCES = [GOOD, UtcReference(OFFSET_NS, 0), None]
 def test_it_has_to_be_through_before_the_next_second(
     reference: UtcReference | None, named_s: float, at_s: float, refusal: str
 ) -> None:
-    bench = Bench(reference=reference)
+    bench = FeedBench(reference=reference)
     if reference is None:
         bench.feed.on_pulse(BEGIN_NS)
         refusal = Refusal.STALE if refusal is Refusal.AHEAD else refusal  # by pulses alone, of the second before
@@ -109,36 +109,36 @@ def test_it_has_to_be_through_before_the_next_second(
 
 @pytest.mark.parametrize("at_s", [1.05, 1.5, 3.2, -0.02])
 def test_a_reference_finds_sentences_of_another_second(at_s: float) -> None:
-    assert Bench().give(0, at_s) == (Refusal.AHEAD if at_s < 0 else Refusal.STALE)
+    assert FeedBench().give(0, at_s) == (Refusal.AHEAD if at_s < 0 else Refusal.STALE)
 
 
 def test_a_slow_port_leaves_less_time() -> None:
-    assert Bench(baud=9600).give(0, 0.9) == ""
-    assert Bench(baud=9600).give(0, 0.92) == Refusal.STALE  # 73 ms on the wire
+    assert FeedBench(baud=9600).give(0, 0.9) == ""
+    assert FeedBench(baud=9600).give(0, 0.92) == Refusal.STALE  # 73 ms on the wire
 
 
 def test_a_sentence_that_waited_is_judged_by_the_time_it_is_sent() -> None:
-    assert Bench().give(0, 0.1, waited_s=0.8) == ""
-    assert Bench().give(0, 0.1, waited_s=0.9) == Refusal.STALE
-    assert Bench(reference=None).give(0, 0.1, waited_s=1.0) == Refusal.STALE
+    assert FeedBench().give(0, 0.1, waited_s=0.8) == ""
+    assert FeedBench().give(0, 0.1, waited_s=0.9) == Refusal.STALE
+    assert FeedBench(reference=None).give(0, 0.1, waited_s=1.0) == Refusal.STALE
 
 
 def test_a_poor_reference_and_an_old_pulse_are_not_asked() -> None:
-    assert Bench(reference=UtcReference(OFFSET_NS, 90 * NS_PER_MS)).give(0, 1.5) == ""
-    bench = Bench(reference=None)
+    assert FeedBench(reference=UtcReference(OFFSET_NS, 90 * NS_PER_MS)).give(0, 1.5) == ""
+    bench = FeedBench(reference=None)
     bench.feed.on_pulse(BEGIN_NS)
     assert bench.give(1, 1.99) == ""
 
 
 def test_no_more_than_the_device_is_to_have() -> None:
-    bench = Bench(rate_hz=2)
+    bench = FeedBench(rate_hz=2)
     refusals = [bench.give(tenth / 10, tenth / 10 + 0.05) for tenth in range(30)]
     assert [n for n, refusal in enumerate(refusals) if not refusal] == [0, 5, 10, 15, 20, 25]
     assert set(refusals) == {"", Refusal.TOO_MANY}
 
 
 def test_no_request_script_is_interrupted_and_a_refused_one_is_not_counted_as_sent() -> None:
-    bench = Bench()
+    bench = FeedBench()
     bench.busy = True
     assert bench.give(0, 0.1) == Refusal.BUSY
     bench.busy, bench.broken = False, True
@@ -150,7 +150,7 @@ def test_no_request_script_is_interrupted_and_a_refused_one_is_not_counted_as_se
 
 def test_a_module_that_is_fed_shows_utc() -> None:
     module = HipnucModule(BEGIN_NS - 3 * NS_PER_S, hardware=HipnucHardware(skew_ppm=30.0))
-    bench = Bench()
+    bench = FeedBench()
     codec = DRIVER.make_codec(Ledger(), DRIVER.settings())
     ticks: list[int] = []
     for second in range(8):

@@ -18,8 +18,8 @@ from imud.utc.system_clock import (
     kernel_clock,
     system_reference,
 )
-from tests.support.in_loop import in_loop
-from tests.support.sentences import Sentences
+from tests.support.event_loops import in_loop
+from tests.support.rmc_sources import Sentences
 
 GOOD = KernelClock(True, 500, 1000)
 OFFSET_NS = 1_795_000_000 * NS_PER_S + 123_456_789
@@ -80,7 +80,7 @@ def test_a_clock_that_nothing_keeps_is_no_reference() -> None:
 # --- sentences --------------------------------------------------------------------------------------------------------
 
 
-class Bench:
+class SystemClockBench:
     """A source with a clock of the test's. Its timer does not run, as the tests do not wait."""
 
     def __init__(self, rate_hz: int = 1, clock: KernelClock = GOOD) -> None:
@@ -105,7 +105,7 @@ class Bench:
 @pytest.mark.parametrize("rate_hz", range(1, 11))
 @in_loop
 async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz: int) -> None:
-    bench = Bench(rate_hz)
+    bench = SystemClockBench(rate_hz)
     bench.go(20 * rate_hz)
     assert len(bench.got) >= 18
     for sentence, t_rx_ns in bench.got:
@@ -122,7 +122,7 @@ async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz
 
 @in_loop
 async def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
-    bench = Bench()
+    bench = SystemClockBench()
     bench.go(1, late_ns=-1000)
     assert bench.got == []
     bench.go(1)
@@ -141,7 +141,7 @@ async def test_woken_early_it_waits_and_woken_late_it_leaves_out() -> None:
 )
 @in_loop
 async def test_a_clock_that_is_not_good_enough_gives_none_and_says_why(clock: KernelClock, problem: str) -> None:
-    bench = Bench(clock=clock)
+    bench = SystemClockBench(clock=clock)
     bench.go(3)
     assert bench.got == []
     assert problem in bench.source.problem

@@ -7,7 +7,7 @@ import pytest
 
 from imud.cli import main
 from imud.sim.hipnuc.modbus import SlaveSettings
-from tests.support.modbus_wire import BAUD, serial_of, slave, wired
+from tests.support.pty_port import BAUD, serial_of, slave, wired
 
 ON = ("--baud", str(BAUD), "--reply-ms", "30")
 PATIENT = ("--baud", str(BAUD), "--reply-ms", "400")

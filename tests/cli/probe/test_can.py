@@ -19,7 +19,7 @@ from imud.links.can.netlink import CanDetails
 from imud.links.memory import MemoryCanLink, MemorySettings
 from imud.runtime.detection import can as detection
 from imud.units import NS_PER_MS
-from tests.support.fake_can import fake_can_driver, fake_frame
+from tests.support.fake_drivers import fake_can_driver, fake_can_frame
 
 
 class Bus(MemoryCanLink):
@@ -62,7 +62,7 @@ def examined(*, ask: bool = False) -> list[ProbeReport]:
 
 
 def test_every_device_of_the_bus_is_listed(bus: type[Bus]) -> None:
-    bus.frames = [fake_frame(node, number) for number in (1, 2) for node in (8, 9)]
+    bus.frames = [fake_can_frame(node, number) for number in (1, 2) for node in (8, 9)]
     reports = examined()
     assert [(r.port, r.driver, r.device, r.baud, r.title, r.identity) for r in reports] == [
         ("can0", "fake-can", "node 8", 500_000, "error-active", {}),
@@ -74,7 +74,7 @@ def test_every_device_of_the_bus_is_listed(bus: type[Bus]) -> None:
 
 
 def test_a_query_where_it_is_allowed(bus: type[Bus]) -> None:
-    bus.frames = [fake_frame(8, number) for number in (1, 2)]
+    bus.frames = [fake_can_frame(8, number) for number in (1, 2)]
     assert [report.identity for report in examined(ask=True)] == [{"product": "FAKE"}]
 
 

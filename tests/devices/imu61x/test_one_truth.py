@@ -28,7 +28,7 @@ from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
 from imud.sim.physics.motion import Truth, swing
-from tests.support.imu61x_bench import over_i2c, over_spi
+from tests.support.simulated_modules import over_i2c, over_spi
 
 EPOCH_NS = 5_000_000_000
 """Zero of the motion, the same for all devices."""

@@ -13,7 +13,7 @@ from imud.contracts.link import CanLink
 from imud.errors import LinkError, LinkMissing
 from imud.formats.can import CanFilter, CanFrame
 from imud.links import LINKS
-from tests.support.captures import candump_line
+from tests.support.files import candump_line
 
 MS = 1_000_000
 BEGIN_NS = 1_763_717_507_000 * MS

@@ -14,7 +14,7 @@ from imud.links import LINKS
 from imud.links.replay.file import ReplaySettings
 from imud.links.replay.link import PIECE_BYTES_MAX, PIECE_NS, ReplayLink
 from imud.units import NS_PER_MS, uart_byte_ns
-from tests.support.captures import CaptureWriter
+from tests.support.files import CaptureWriter
 
 LIMIT_S = 5.0
 READS = [(b"a" * 82, 1_000_000_000), (b"b" * 41, 1_004_000_000), (b"c", 1_004_000_000), (b"d" * 82, 1_030_000_000)]

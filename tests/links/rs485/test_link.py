@@ -24,8 +24,7 @@ from imud.formats.modbus import framed, is_exception, is_whole
 from imud.links.rs485.line import ENABLED, RTS_ON_SEND, TIOCGRS485, TIOCSRS485, Direction, SharedPorts
 from imud.links.rs485.link import Rs485Link, Rs485Settings
 from imud.links.uart.serial_port import open_port
-from tests.support.modbus_wire import BAUD, serial_of, slave, wired
-from tests.support.pty_port import PtyPort
+from tests.support.pty_port import BAUD, PtyPort, serial_of, slave, wired
 
 SETTINGS = read_registers(4, 3)
 SERIAL = read_registers(0x7F, 4)

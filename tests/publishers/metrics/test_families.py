@@ -18,8 +18,8 @@ from imud.publishers.metrics.family import BYTES, CELSIUS, HERTZ, RATIO, SECONDS
 from imud.publishers.metrics.publisher import SAMPLES_PER_TURN, ClientTotals, Renderer
 from imud.sample import Sync
 from imud.utc.rmc_feed import Refusal
-from tests.support.device_status import LINES, UTC, client, device, equipped
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
+from tests.support.metrics import LINES, UTC, client, device, equipped
 
 Key = tuple[str, frozenset[tuple[str, str]]]
 

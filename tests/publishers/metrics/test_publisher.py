@@ -15,8 +15,7 @@ from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.publishers import PUBLISHERS
 from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
-from tests.support.device_status import device
-from tests.support.http_asking import LIMIT_S, ask, read_all
+from tests.support.metrics import LIMIT_S, ask, device, read_all
 
 DEVICES = (device("front", 0), device("rear", 1))
 

@@ -13,7 +13,7 @@ import pytest
 from imud.errors import ServerError
 from imud.publishers.metrics import scrape_server
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer, parse_request
-from tests.support.http_asking import LIMIT_S, ask, read_all
+from tests.support.metrics import LIMIT_S, ask, read_all
 
 
 @asynccontextmanager

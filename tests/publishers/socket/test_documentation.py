@@ -20,7 +20,7 @@ from imud.formats.jsonrpc import DEFAULT_PATH, LINE_MAX_BYTES, Code
 from imud.publishers.socket.outbox import Limits
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.publishers.socket.rpc import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 from tests.support.socket_rig import LIMIT_S, NOW_NS, Peer, batch, daemon, run, serving, until
 
 DOCUMENT = (ROOT / "docs" / "socket.md").read_text()

@@ -23,7 +23,7 @@ from tests.support.device_rig import play as play_rigs
 NODE = 9
 
 
-class Bench:
+class CanopenDeviceBench:
     """A runner, and a simulated module of node 9 at the other end of its bus."""
 
     def __init__(self, driver: str, options: Settings | None) -> None:
@@ -61,7 +61,7 @@ class Bench:
         return await task
 
 
-def play(bench: Bench, story: Coroutine[Any, Any, None]) -> None:
+def play(bench: CanopenDeviceBench, story: Coroutine[Any, Any, None]) -> None:
     async def told(_rigs: list[DeviceRig]) -> None:
         await bench.until(lambda: bench.link.listening)
         await bench.until(lambda: bench.rig.state is DeviceState.RUNNING)
@@ -73,7 +73,7 @@ def play(bench: Bench, story: Coroutine[Any, Any, None]) -> None:
 @pytest.mark.parametrize(("driver", "options"), [("auto", None), ("hipnuc-canopen", HipnucCanopenSettings(node=NODE))])
 def test_the_command_reaches_the_node(driver: str, options: Settings | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(detection, "LISTEN_NS", 100 * NS_PER_MS)
-    bench = Bench(driver, options)
+    bench = CanopenDeviceBench(driver, options)
 
     async def story() -> None:
         assert await bench.act("interval", tpdo=1, interval_ms=20) is None
@@ -85,7 +85,7 @@ def test_the_command_reaches_the_node(driver: str, options: Settings | None, mon
 
 
 def test_a_node_that_does_not_answer_is_an_error() -> None:
-    bench = Bench("hipnuc-canopen", HipnucCanopenSettings(node=NODE))
+    bench = CanopenDeviceBench("hipnuc-canopen", HipnucCanopenSettings(node=NODE))
 
     async def story() -> None:
         bench.deaf = True

@@ -54,7 +54,7 @@ class Frames:
         return made
 
 
-class Bench:
+class CanDeviceBench:
     """One device, and the module at the other end of its bus."""
 
     def __init__(self, rig: DeviceRig) -> None:
@@ -67,14 +67,14 @@ class Bench:
         assert self.link.feed([frame for index in indices for frame in self.frames(index)])
 
 
-def play(story: Callable[[Bench], Coroutine[Any, Any, None]], config: DeviceConfig | None = None) -> DeviceRig:
+def play(story: Callable[[CanDeviceBench], Coroutine[Any, Any, None]], config: DeviceConfig | None = None) -> DeviceRig:
     """Run the device while the story is told; at the end the ledger closes and the link is released."""
     rigs = DeviceRigs()
     rig = rigs.add(config or configured())
 
     async def told(_made: list[DeviceRig]) -> None:
         await rig.turn(lambda: rig.can_link.listening)
-        await story(Bench(rig))
+        await story(CanDeviceBench(rig))
 
     play_rigs(rigs, told)
     assert rig.ledger.frames_pending == 0
@@ -82,7 +82,7 @@ def play(story: Callable[[Bench], Coroutine[Any, Any, None]], config: DeviceConf
 
 
 def test_samples_of_one_read_are_one_batch_with_their_own_times() -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         bench.feed(1, 2, 3)
         bench.rig.tick()
         assert bench.rig.is_in(DeviceState.RUNNING)
@@ -104,7 +104,7 @@ def delay_ns(name: str, settings: Settings, bitrate: int) -> int:
     assert isinstance(driver, CanDriver)
     burst = driver.example_frames(Random(1))
 
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         begin_ns = monotonic_ns() - 300 * MS
         for number in range(20):
             t_ns = begin_ns + number * 10 * MS
@@ -126,7 +126,7 @@ def test_the_length_of_the_first_frame_is_taken_off(name: str, settings: Setting
 
 
 def test_only_own_identifiers_pass() -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         bench.link.feed(bench.frames(1) + bench.frames(1, base_id=300))
 
     rig = play(story, configured(base_id=300))
@@ -135,7 +135,7 @@ def test_only_own_identifiers_pass() -> None:
 
 
 def test_losses_by_cause() -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         bench.feed(1, 2)
         bench.link.feed(bench.frames(3, lost=[2]))  # nobody says why
         bench.feed(4)
@@ -156,7 +156,7 @@ def test_losses_by_cause() -> None:
 
 
 def test_frames_from_before_a_loss_are_not_mixed_with_those_after() -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         first, second = bench.frames(1), bench.frames(2)
         second[2] = second[2]._replace(after_loss=True)
         bench.link.feed(first[:2] + second[2:])
@@ -166,7 +166,7 @@ def test_frames_from_before_a_loss_are_not_mixed_with_those_after() -> None:
 
 
 def test_bus_down_and_up() -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         bench.feed(1, 2)
         bench.link.feed(bench.frames(3)[:3])
         bench.rig.tick()
@@ -187,7 +187,7 @@ def test_bus_down_and_up() -> None:
 
 
 def test_trouble_of_the_bus_is_shown_while_it_lasts() -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         bench.link.news("can0 is error-passive: x", "can0 is error-passive: x")
         bench.feed(1)
         bench.rig.tick()
@@ -206,7 +206,7 @@ def test_trouble_of_the_bus_is_shown_while_it_lasts() -> None:
 
 @pytest.mark.parametrize(("lost", "words"), [([], "nothing of imu61x-can is heard"), ([4], "no whole sample")])
 def test_silence_says_what_is_heard(lost: list[int], words: str) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: CanDeviceBench) -> None:
         if lost:
             bench.link.feed(bench.frames(1, lost=lost))
         bench.rig.tick(ahead_ns=3000 * MS)

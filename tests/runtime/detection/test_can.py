@@ -9,7 +9,7 @@ from imud.devices.imu61x.can.driver import DRIVER as IMU61X
 from imud.formats.can import CanFrame
 from imud.runtime.detection import CanFound, CanSearch, CanStep, CanSurvey, GaveUp, Listen
 from imud.runtime.detection.can import DEVICES_MAX, IDENTIFIERS_MAX, LISTEN_NS, PATIENCE_NS
-from tests.support.fake_can import BASE, fake_can_driver, fake_frame
+from tests.support.fake_drivers import BASE, fake_can_driver, fake_can_frame
 
 FAKE = fake_can_driver()
 DRIVERS = (FAKE, IMU61X)
@@ -65,7 +65,7 @@ class Round:
 
 
 def test_one_device_is_found_at_the_end_of_the_round() -> None:
-    heard = Round().hear(fake_frame(8), fake_frame(8, 1))
+    heard = Round().hear(fake_can_frame(8), fake_can_frame(8, 1))
     assert heard.early is None
     assert heard.search.on_time(LISTEN_NS - 1) is None
     assert heard.found() == "fake-can node 8"
@@ -76,11 +76,11 @@ def test_one_device_is_found_at_the_end_of_the_round() -> None:
 def test_strangers_beside_it_do_not_matter() -> None:
     random = Random(7)
     strangers = [CanFrame(0x400 + random.randrange(100), False, random.randbytes(3), 0) for _ in range(50)]
-    assert Round().hear(*strangers, fake_frame(8), *strangers, fake_frame(8, 1)).found() == "fake-can node 8"
+    assert Round().hear(*strangers, fake_can_frame(8), *strangers, fake_can_frame(8, 1)).found() == "fake-can node 8"
 
 
 def test_of_several_every_one_is_named() -> None:
-    frames = [f for n in (1, 2) for f in (fake_frame(8, n), fake_frame(9, n), *imu61x(n))]
+    frames = [f for n in (1, 2) for f in (fake_can_frame(8, n), fake_can_frame(9, n), *imu61x(n))]
     assert Round().hear(*frames).complaint() == (
         "3 devices are heard on can0, fake-can node 8, fake-can node 9, imu61x-can base_id 101: name driver and options"
     )
@@ -119,7 +119,7 @@ def test_silence() -> None:
 def test_devices_of_others_are_left_to_them() -> None:
     claimed = {BASE + 8}
     heard = Round(claimed=lambda can_id, extended: can_id in claimed and not extended)
-    heard.hear(*(fake_frame(node, n) for n in (1, 2) for node in (8, 9)))
+    heard.hear(*(fake_can_frame(node, n) for n in (1, 2) for node in (8, 9)))
     assert heard.found() == "fake-can node 9"
     claimed.add(BASE + 9)  # another device found it meanwhile
     assert "only frames of other configured devices" in heard.complaint()
@@ -127,16 +127,16 @@ def test_devices_of_others_are_left_to_them() -> None:
 
 def test_the_remembered_device_is_taken_at_once() -> None:
     heard = Round(remembered=("fake-can", 9))
-    heard.hear(fake_frame(8, 1), fake_frame(9, 1), fake_frame(8, 2))
+    heard.hear(fake_can_frame(8, 1), fake_can_frame(9, 1), fake_can_frame(8, 2))
     assert heard.early is None
-    heard.hear(fake_frame(9, 2))
+    heard.hear(fake_can_frame(9, 2))
     assert heard.early is not None
     assert heard.early.device.title == "fake-can node 9"
 
 
 def test_a_remembered_device_that_another_one_has_is_not() -> None:
     heard = Round(remembered=("fake-can", 9), claimed=lambda can_id, _: can_id == BASE + 9)
-    heard.hear(*(fake_frame(9, n) for n in range(5)))
+    heard.hear(*(fake_can_frame(9, n) for n in range(5)))
     assert heard.early is None
 
 
@@ -144,7 +144,7 @@ def test_a_protocol_that_only_seems_so_does_not_delay_the_right_one() -> None:
     """A second driver names the same frames as those of its own device, and gets no samples out of them."""
     search = CanSearch([fake_can_driver("wrong", BASE - 1), FAKE], "can0")
     search.start(0)
-    search.on_frames([fake_frame(8, 1), fake_frame(8, 2)])
+    search.on_frames([fake_can_frame(8, 1), fake_can_frame(8, 2)])
     step = search.on_time(LISTEN_NS)
     assert isinstance(step, CanFound)
     assert step.device.title == "fake-can node 8"
@@ -153,7 +153,7 @@ def test_a_protocol_that_only_seems_so_does_not_delay_the_right_one() -> None:
 def test_two_protocols_that_both_understand_are_both_named() -> None:
     search = CanSearch([fake_can_driver("twin"), FAKE], "can0")
     search.start(0)
-    search.on_frames([fake_frame(8, 1), fake_frame(8, 2)])
+    search.on_frames([fake_can_frame(8, 1), fake_can_frame(8, 2)])
     step = search.on_time(LISTEN_NS)
     assert isinstance(step, GaveUp)
     assert "twin node 8, fake-can node 8" in step.summary

@@ -24,7 +24,7 @@ from imud.sample import Sample
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
-from tests.support.fake_can import BASE, SYNC_ID, FakeCanSettings, fake_can_driver, fake_frame
+from tests.support.fake_drivers import BASE, SYNC_ID, FakeCanSettings, fake_can_driver, fake_can_frame
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +73,7 @@ class OnBus:
 
     def hear(self, *nodes: int, number: int = 0) -> None:
         """A frame of each node."""
-        self.link.feed([fake_frame(node, number, monotonic_ns()) for node in nodes])
+        self.link.feed([fake_can_frame(node, number, monotonic_ns()) for node in nodes])
 
     async def until(self, condition: Callable[[], object], *nodes: int) -> None:
         """Wait until it holds, with those nodes on the bus."""

@@ -10,7 +10,7 @@ from imud.devices.hipnuc.uart.driver import DRIVER as HIPNUC
 from imud.ledger import Ledger
 from imud.runtime.detection import ASK_TRIES, QUIET_NS, GaveUp, Listen, Search, Step, StreamFound
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.fake_driver import BAUD_RATES, FAKE_DRIVER, QUERY, REPLY, SYNC, fake_frame
+from tests.support.fake_drivers import BAUD_RATES, FAKE_DRIVER, QUERY, REPLY, SYNC, fake_frame
 from tests.support.uart_wire import FakeDevice, received, run_search
 
 HIPNUC_REPLY = b"PNAME=HI14R3\r\nBUILD=Oct 15 2024\r\nUUID=043995698D6E1708\r\nAPP_VER=156\r\nBL_VER=109\r\nOK\r\n"

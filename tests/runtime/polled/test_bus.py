@@ -14,7 +14,7 @@ from imud.contracts.status import KernelCounters
 from imud.errors import DeviceRefused, LinkError, TransferError, Trouble
 from imud.runtime.polled.bus import BusMember, PolledBuses
 from imud.runtime.polled.schedule import Deadlines
-from tests.support.virtual_time import VirtualClock, run_virtually, virtual_buses
+from tests.support.event_loops import VirtualClock, run_virtually, virtual_buses
 
 ASK = Transfer((b"\x01",), 1)
 

@@ -21,8 +21,8 @@ from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.lines import MemoryInput
 from imud.units import NS_PER_S
 from tests.support.device_rig import DeviceRig
-from tests.support.stage import Stage
-from tests.support.virtual_time import VirtualClock
+from tests.support.event_loops import VirtualClock
+from tests.support.polled_bus_bench import PolledBusBench
 
 MS = 1_000_000
 EVERY_NS = 2 * MS
@@ -33,11 +33,11 @@ RATE_HZ = 100.0
 class Signal:
     """The device's side of the line: an edge whenever its registers are renewed."""
 
-    def __init__(self, stage: Stage, device: Imu61xRegisters) -> None:
+    def __init__(self, bench: PolledBusBench, device: Imu61xRegisters) -> None:
         self.stamps: list[int] = []
         """Of the edges since the line was opened."""
         self.quiet = False
-        self._stage, self._device = stage, device
+        self._stage, self._device = bench, device
 
     @property
     def line(self) -> MemoryInput:
@@ -69,8 +69,8 @@ class Signal:
 class Scene:
     """A device with its line, and its runner."""
 
-    def __init__(self, rig: DeviceRig, signal: Signal, device: Imu61xRegisters, stage: Stage) -> None:
-        self.rig, self.signal, self.device, self.stage = rig, signal, device, stage
+    def __init__(self, rig: DeviceRig, signal: Signal, device: Imu61xRegisters, bench: PolledBusBench) -> None:
+        self.rig, self.signal, self.device, self.bench = rig, signal, device, bench
 
     def told(self, words: str) -> Callable[[], bool]:
         """Whether an event says so."""
@@ -94,32 +94,32 @@ class Scene:
 
 
 @pytest.fixture
-def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    return Stage(tmp_path, monkeypatch, VirtualClock())
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
+    return PolledBusBench(tmp_path, monkeypatch, VirtualClock())
 
 
-def with_line(stage: Stage, **more: Any) -> DeviceConfig:
+def with_line(bench: PolledBusBench, **more: Any) -> DeviceConfig:
     return replace(
-        stage.on_spi(RATE_HZ, burst="standard"), lines=DeviceLines(data_ready=ReadySettings(line="Y", **more))
+        bench.on_spi(RATE_HZ, burst="standard"), lines=DeviceLines(data_ready=ReadySettings(line="Y", **more))
     )
 
 
 @asynccontextmanager
-async def scene(stage: Stage, **more: Any) -> AsyncIterator[Scene]:
-    device = stage.registers(update_ns=EVERY_NS)
-    stage.spi.device = device.spi
-    signal = Signal(stage, device)
-    async with stage.running(with_line(stage, **more)) as (rig,):
+async def scene(bench: PolledBusBench, **more: Any) -> AsyncIterator[Scene]:
+    device = bench.registers(update_ns=EVERY_NS)
+    bench.spi.device = device.spi
+    signal = Signal(bench, device)
+    async with bench.running(with_line(bench, **more)) as (rig,):
         task = asyncio.create_task(signal.run())
         try:
-            yield Scene(rig, signal, device, stage)
+            yield Scene(rig, signal, device, bench)
         finally:
             task.cancel()
 
 
-def test_every_edge_is_a_sample_of_its_own_instant(stage: Stage) -> None:
+def test_every_edge_is_a_sample_of_its_own_instant(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with scene(stage) as it:
+        async with scene(bench) as it:
             await it.rig.until_samples(200)
             status = it.rig.device.status()
             assert status.expected_rate_hz == 500
@@ -133,37 +133,37 @@ def test_every_edge_is_a_sample_of_its_own_instant(stage: Stage) -> None:
             assert it.missed == it.rig.device.ledger.lost_queue == 0
             assert EventKind.LINK not in it.rig.kinds
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(stage: Stage) -> None:
+def test_falling_edges_of_an_inverted_line_are_those_of_the_line_as_it_is(bench: PolledBusBench) -> None:
     asked: list[Any] = []
-    make = stage.lines.input
+    make = bench.lines.input
 
     def keep(settings: Any, purpose: str, rising_only: bool = False) -> MemoryInput:
         asked.append((settings.edge, settings.active_low, rising_only))
         return make(settings, purpose, rising_only)
 
-    stage.lines.maker = replace(stage.lines.maker, make_input=keep)
+    bench.lines.maker = replace(bench.lines.maker, make_input=keep)
 
     async def body() -> None:
         for edge, active_low in (("falling", False), ("falling", True), ("rising", True)):
-            async with stage.running(with_line(stage, edge=edge, active_low=active_low)):
+            async with bench.running(with_line(bench, edge=edge, active_low=active_low)):
                 pass
 
-    stage.run(body())
+    bench.run(body())
     assert asked == [("rising", True, True), ("rising", False, True), ("rising", True, True)]
 
 
-def test_the_edges_of_a_loop_that_stalls_are_missed(stage: Stage) -> None:
+def test_the_edges_of_a_loop_that_stalls_are_missed(bench: PolledBusBench) -> None:
     """The kernel has ten more edges when the loop comes back: one read, of the newest."""
 
     async def body() -> None:
-        async with scene(stage) as it:
+        async with scene(bench) as it:
             await it.rig.until_samples(20)
             newest = len(it.signal.stamps)
             for _ in range(10):
-                stage.clock.advance(EVERY_NS)
+                bench.clock.advance(EVERY_NS)
                 it.signal.at_once(it.signal.stamps[-1] + EVERY_NS)
             await it.rig.until_samples(20)
             numbers = [it.dated(sample) for sample in it.rig.samples[1:]]
@@ -174,7 +174,7 @@ def test_the_edges_of_a_loop_that_stalls_are_missed(stage: Stage) -> None:
             assert it.missed == it.rig.device.ledger.lost_queue == lost
             await it.rig.until(lambda: EventKind.LOSS in it.rig.kinds, "told")
 
-    stage.run(body())
+    bench.run(body())
 
 
 class Unheard(MemoryInput):
@@ -184,16 +184,16 @@ class Unheard(MemoryInput):
         super().start(on_edges, on_end, watch=False)
 
 
-def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(stage: Stage) -> None:
+def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(bench: PolledBusBench) -> None:
     """It is in the kernel when the read for the edge before begins; it is not read a second time."""
 
     def make(_settings: Any, purpose: str, rising_only: bool = False) -> MemoryInput:
-        return stage.lines.inputs.setdefault(purpose, Unheard(purpose, rising_only))
+        return bench.lines.inputs.setdefault(purpose, Unheard(purpose, rising_only))
 
-    stage.lines.maker = replace(stage.lines.maker, make_input=make)
+    bench.lines.maker = replace(bench.lines.maker, make_input=make)
 
     async def body() -> None:
-        async with scene(stage) as it:
+        async with scene(bench) as it:
             await it.rig.until_samples(20)
             it.signal.quiet = True
             await asyncio.sleep(0.01)
@@ -201,13 +201,13 @@ def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(stage
             stamp_ns = it.signal.newest_ns
 
             def at_the_beginning_of_the_read() -> None:
-                stage.clock.advance(EVERY_NS)
+                bench.clock.advance(EVERY_NS)
                 it.signal.at_once(stamp_ns + EVERY_NS, heard=False)
 
             it.signal.at_once(stamp_ns)
-            stage.before_next_time = at_the_beginning_of_the_read
+            bench.before_next_time = at_the_beginning_of_the_read
             await asyncio.sleep(0.01)
-            assert stage.before_next_time is None
+            assert bench.before_next_time is None
             after = it.rig.device.status().polling
             assert before is not None
             assert after is not None
@@ -215,12 +215,12 @@ def test_an_edge_that_the_loop_did_not_hear_of_dates_the_read_all_the_same(stage
             assert (after.polls - before.polls, after.missed - before.missed) == (1, 1)
             assert after.stale == before.stale
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_no_edges_any_more_and_edges_again(stage: Stage) -> None:
+def test_no_edges_any_more_and_edges_again(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with scene(stage) as it:
+        async with scene(bench) as it:
             await it.rig.until_samples(20)
             it.signal.quiet = True
             await it.rig.until(it.told("no edges: read at 100 Hz instead"), "told")
@@ -244,14 +244,14 @@ def test_no_edges_any_more_and_edges_again(stage: Stage) -> None:
             stamps = [sample.t_ns for sample in it.rig.samples]
             assert stamps == sorted(set(stamps))
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_without_the_line_deadlines_serve_until_it_comes(stage: Stage) -> None:
-    stage.lines.input(ReadySettings(line="Y"), "imu data_ready", True).open_error = LinkMissing("no such line")
+def test_without_the_line_deadlines_serve_until_it_comes(bench: PolledBusBench) -> None:
+    bench.lines.input(ReadySettings(line="Y"), "imu data_ready", True).open_error = LinkMissing("no such line")
 
     async def body() -> None:
-        async with scene(stage) as it:
+        async with scene(bench) as it:
             await it.rig.until(it.told("line data_ready: no such line"), "told")
             await it.rig.until(it.told("no edges"), "told")
             await it.rig.until_samples(20)
@@ -263,12 +263,12 @@ def test_without_the_line_deadlines_serve_until_it_comes(stage: Stage) -> None:
             await it.rig.until_samples(20)
             it.dated(it.rig.samples[-1])
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_what_came_while_the_device_was_not_believed_is_not_missed(stage: Stage) -> None:
+def test_what_came_while_the_device_was_not_believed_is_not_missed(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with scene(stage) as it:
+        async with scene(bench) as it:
             await it.rig.until_samples(20)
             it.device.faults.line = 0xFF
             await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
@@ -279,15 +279,15 @@ def test_what_came_while_the_device_was_not_believed_is_not_missed(stage: Stage)
             assert max(b - a for a, b in pairwise(numbers)) > 200
             assert it.missed == 0
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_the_line_is_let_go_of_at_the_end(stage: Stage) -> None:
+def test_the_line_is_let_go_of_at_the_end(bench: PolledBusBench) -> None:
     async def body() -> None:
-        async with scene(stage) as it:
+        async with scene(bench) as it:
             await it.rig.until_samples(3)
             rig = it.rig
-        rig.device.tick(stage.clock.now_ns())
+        rig.device.tick(bench.clock.now_ns())
         assert not it.signal.line.is_open
 
-    stage.run(body())
+    bench.run(body())

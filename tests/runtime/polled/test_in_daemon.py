@@ -11,12 +11,12 @@ import pytest
 from imud.config import Config
 from imud.daemon import Daemon
 from imud.sim.imu61x.registers import Imu61xRegisters
-from tests.support.stage import Stage
+from tests.support.polled_bus_bench import PolledBusBench
 
 
 @pytest.fixture
-def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    return Stage(tmp_path, monkeypatch)
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
+    return PolledBusBench(tmp_path, monkeypatch)
 
 
 def wait_until_running(daemon: Daemon, then: Callable[[], None]) -> Coroutine[Any, Any, None]:
@@ -28,28 +28,28 @@ def wait_until_running(daemon: Daemon, then: Callable[[], None]) -> Coroutine[An
     return watch()
 
 
-def test_daemon_serves_a_polled_device(stage: Stage) -> None:
-    stage.spi.device = Imu61xRegisters(monotonic_ns).spi
+def test_daemon_serves_a_polled_device(bench: PolledBusBench) -> None:
+    bench.spi.device = Imu61xRegisters(monotonic_ns).spi
 
     async def body() -> None:
-        daemon = Daemon(Config("info", "", {}, (stage.on_spi(),)))
+        daemon = Daemon(Config("info", "", {}, (bench.on_spi(),)))
         watching = asyncio.create_task(wait_until_running(daemon, daemon.stop))
         await asyncio.wait_for(daemon.run(), 10)
         await watching
         assert daemon.status()[0].driver == "imu61x-spi"
 
     asyncio.run(body())
-    assert not stage.spi.opened
+    assert not bench.spi.opened
 
 
-def test_mistake_in_the_bus_thread_ends_the_daemon(stage: Stage) -> None:
+def test_mistake_in_the_bus_thread_ends_the_daemon(bench: PolledBusBench) -> None:
     def mistake(_selections: Any, _mode: int) -> list[bytes]:
         raise ZeroDivisionError("a mistake")
 
-    stage.spi.device = mistake
+    bench.spi.device = mistake
 
     async def body() -> None:
-        await asyncio.wait_for(Daemon(Config("info", "", {}, (stage.on_spi(),))).run(), 10)
+        await asyncio.wait_for(Daemon(Config("info", "", {}, (bench.on_spi(),))).run(), 10)
 
     with pytest.raises(ZeroDivisionError, match="a mistake"):
         asyncio.run(body())

@@ -13,7 +13,7 @@ from imud.contracts.status import DeviceState
 from imud.event import EventKind
 from imud.units import NS_PER_MS
 from tests.support.device_rig import device_config, running
-from tests.support.modbus_wire import BAUD, serial_of, slave, wired
+from tests.support.pty_port import BAUD, serial_of, slave, wired
 
 
 def run(body: Coroutine[Any, Any, None]) -> None:

@@ -11,13 +11,13 @@ import pytest
 from imud.contracts.status import DeviceState
 from imud.event import EventKind
 from tests.support.device_rig import device_config
-from tests.support.stage import RATE_HZ, Stage, on_i2c
-from tests.support.virtual_time import VirtualClock
+from tests.support.event_loops import VirtualClock
+from tests.support.polled_bus_bench import RATE_HZ, PolledBusBench, on_i2c
 
 
 @pytest.fixture
-def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    return Stage(tmp_path, monkeypatch, VirtualClock())
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PolledBusBench:
+    return PolledBusBench(tmp_path, monkeypatch, VirtualClock())
 
 
 @pytest.mark.parametrize(
@@ -25,10 +25,10 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
     [("standard", 4e-5, 2e-3), ("extended", 2e-6, 2e-3), ("registers", 4e-8, 1e-3)],
 )
 def test_spi_samples_are_the_truth_of_the_latched_instant(
-    stage: Stage, burst: str, resolution_m_s2: float, temperature: float
+    bench: PolledBusBench, burst: str, resolution_m_s2: float, temperature: float
 ) -> None:
     """The resolution of a burst count is 0.2 / 65536 g = 3e-5 m/s², of a register's a thousandth, of f32 1e-6."""
-    device = stage.registers(modes=frozenset({3}), update_ns=970_000)  # not in step with the deadlines
+    device = bench.registers(modes=frozenset({3}), update_ns=970_000)  # not in step with the deadlines
     latched: list[int] = []
 
     def answer(selections: Any, mode: int) -> list[bytes]:
@@ -38,14 +38,14 @@ def test_spi_samples_are_the_truth_of_the_latched_instant(
             latched.append(device.latched_ns)
         return miso
 
-    stage.spi.device = answer
+    bench.spi.device = answer
 
     async def body() -> None:
-        async with stage.running(stage.on_spi(burst=burst, update_hz=1000)) as (rig,):
+        async with bench.running(bench.on_spi(burst=burst, update_hz=1000)) as (rig,):
             await rig.until_samples(60)
             status = rig.device.status()
             assert status.identity == {"product": "IMU614"}
-            assert status.link == f"{stage.node}, mode 3"
+            assert status.link == f"{bench.node}, mode 3"
             assert status.settings["burst"] == ("extended" if burst == "extended" else "standard")
             assert status.expected_rate_hz == RATE_HZ
         errors = []
@@ -60,40 +60,40 @@ def test_spi_samples_are_the_truth_of_the_latched_instant(
             if burst == "extended":
                 assert sample.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-6)
         assert rig.samples[-1].temperature_c == pytest.approx(
-            device.truth_at(stage.clock.now_ns()).temperature_c, abs=0.05
+            device.truth_at(bench.clock.now_ns()).temperature_c, abs=0.05
         )
         assert rig.samples[-1].t_err_ns < 2_000_000
         assert sqrt(sum(error**2 for error in errors) / len(errors)) < 1.1
         assert max(errors) < sqrt(3) * 1.01
 
-    stage.run(body())
+    bench.run(body())
     assert device.window == 0
-    assert not stage.spi.opened
+    assert not bench.spi.opened
 
 
-def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_read(stage: Stage) -> None:
-    stage.spi.device = stage.registers().spi
+def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_read(bench: PolledBusBench) -> None:
+    bench.spi.device = bench.registers().spi
 
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
+        async with bench.running(bench.on_spi()) as (rig,):
             await rig.until_samples(20)
         for before, sample in zip(rig.samples[5:], rig.samples[6:], strict=False):
             asked_ns = sample.t_rx_ns - sample.t_ns
             assert sample.t_err_ns == pytest.approx((sample.t_ns - before.t_ns + asked_ns) / sqrt(3), abs=10)
             assert sample.t_ns > before.t_ns
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_one_burst_is_one_ioctl_in_one_selection(stage: Stage) -> None:
-    stage.spi.device = stage.registers().spi
+def test_one_burst_is_one_ioctl_in_one_selection(bench: PolledBusBench) -> None:
+    bench.spi.device = bench.registers().spi
 
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
+        async with bench.running(bench.on_spi()) as (rig,):
             await rig.until_samples(10)
 
-    stage.run(body())
-    bursts = [mosi for mosi, _, _ in stage.spi.messages if mosi[0][:1] == b"\x80"]
+    bench.run(body())
+    bursts = [mosi for mosi, _, _ in bench.spi.messages if mosi[0][:1] == b"\x80"]
     assert len(bursts) >= 10
     assert {tuple(map(len, mosi)) for mosi in bursts} == {(32,)}
 
@@ -108,12 +108,14 @@ SPI_FAULTS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("fault", "why"), SPI_FAULTS, ids=[why for _, why in SPI_FAULTS])
-def test_vanished_device_is_not_believed_before_it_is_identified(stage: Stage, fault: dict[str, Any], why: str) -> None:
-    device = stage.registers()
-    stage.spi.device = device.spi
+def test_vanished_device_is_not_believed_before_it_is_identified(
+    bench: PolledBusBench, fault: dict[str, Any], why: str
+) -> None:
+    device = bench.registers()
+    bench.spi.device = device.spi
 
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
+        async with bench.running(bench.on_spi()) as (rig,):
             await rig.until_samples(3)
             for name, value in {**fault, "product_id": b"\x00\x00ICM206"}.items():
                 setattr(device.faults, name, value)
@@ -131,31 +133,31 @@ def test_vanished_device_is_not_believed_before_it_is_identified(stage: Stage, f
             assert rig.kinds.count(EventKind.UP) == rig.kinds.count(EventKind.DOWN) + 1
             assert [sample.seq for sample in rig.samples] == list(range(1, len(rig.samples) + 1))
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_readings_on_their_way_when_it_vanished_are_not_decoded(stage: Stage) -> None:
+def test_readings_on_their_way_when_it_vanished_are_not_decoded(bench: PolledBusBench) -> None:
     """On a bus that is never idle the thread has read more before it hears that the device is gone."""
-    device = stage.registers()
+    device = bench.registers()
     armed, gone_ns, good_after = False, 0, 0
 
     def answer(selections: Any, mode: int) -> list[bytes]:
         nonlocal gone_ns, good_after
-        stage.clock.advance(2_000_000)
+        bench.clock.advance(2_000_000)
         miso = device.spi(selections, mode)
         if not armed or selections[0][:1] != b"\x80":
             return miso
         if gone_ns:
             good_after += 1
             return miso
-        gone_ns = stage.clock.now_ns()
+        gone_ns = bench.clock.now_ns()
         return [b"\xff" * 32]
 
-    stage.spi.device = answer
+    bench.spi.device = answer
 
     async def body() -> None:
         nonlocal armed
-        async with stage.running(stage.on_spi(rate_hz=1000)) as (rig,):
+        async with bench.running(bench.on_spi(rate_hz=1000)) as (rig,):
             await rig.until_samples(20)
             before, armed = rig.ledger.bytes_skipped, True
             await rig.until(lambda: EventKind.DOWN in rig.kinds, "down")
@@ -165,15 +167,15 @@ def test_readings_on_their_way_when_it_vanished_are_not_decoded(stage: Stage) ->
             await rig.until(lambda: rig.ledger.bytes_skipped == before + 28 + 32 * good_after, "all counted", 1)
             await rig.until_samples(3)
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_single_damage_costs_its_sample_and_nothing_else(stage: Stage) -> None:
-    device = stage.registers()
-    stage.spi.device = device.spi
+def test_single_damage_costs_its_sample_and_nothing_else(bench: PolledBusBench) -> None:
+    device = bench.registers()
+    bench.spi.device = device.spi
 
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
+        async with bench.running(bench.on_spi()) as (rig,):
             await rig.until_samples(5)
             for number in (1, 2):
                 device.faults.flips = 1
@@ -183,17 +185,17 @@ def test_single_damage_costs_its_sample_and_nothing_else(stage: Stage) -> None:
             assert EventKind.DOWN not in rig.kinds
             assert EventKind.BAD_FRAME in rig.kinds
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_restarted_device_is_set_up_again(stage: Stage) -> None:
+def test_restarted_device_is_set_up_again(bench: PolledBusBench) -> None:
     """Its filter is read every ten seconds."""
-    device = stage.registers()
-    stage.i2c.devices[0x1A] = device
+    device = bench.registers()
+    bench.i2c.devices[0x1A] = device
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 1, "rate_hz": RATE_HZ}, gyro_filter=2)
 
     async def body() -> None:
-        async with stage.running(config) as (rig,):
+        async with bench.running(config) as (rig,):
             await rig.until_samples(3)
             assert device.filter == 0xB2
             device.restart()
@@ -202,34 +204,34 @@ def test_restarted_device_is_set_up_again(stage: Stage) -> None:
             assert rig.device.status().polling.vanished == 1  # type: ignore[union-attr]  # a polled device has it
             assert rig.device.ledger.frames_in_replies > 2
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_setting_that_does_not_take_keeps_it_from_running(stage: Stage) -> None:
-    device = stage.registers()
-    stage.i2c.devices[0x18] = device
+def test_setting_that_does_not_take_keeps_it_from_running(bench: PolledBusBench) -> None:
+    device = bench.registers()
+    bench.i2c.devices[0x18] = device
 
     device.faults.ignores_writes = True
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 1}, gyro_filter=2)
 
     async def body() -> None:
-        async with stage.running(config) as (rig,):
+        async with bench.running(config) as (rig,):
             await rig.until(lambda: "read back 0xbb" in rig.device.status().problem, "told")
             assert rig.state is DeviceState.SEARCHING
             assert not rig.samples
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_auto_finds_driver_and_address_and_does_not_take_one_twice(stage: Stage) -> None:
-    stage.i2c.devices.update({0x19: stage.registers(product="IMU612"), 0x1B: stage.registers(product="IMU618")})
+def test_auto_finds_driver_and_address_and_does_not_take_one_twice(bench: PolledBusBench) -> None:
+    bench.i2c.devices.update({0x19: bench.registers(product="IMU612"), 0x1B: bench.registers(product="IMU618")})
 
     async def body() -> None:
-        async with stage.running(on_i2c("a", "auto"), on_i2c("b"), on_i2c("c")) as rigs:
+        async with bench.running(on_i2c("a", "auto"), on_i2c("b"), on_i2c("c")) as rigs:
 
             def settled() -> bool:
                 for rig in rigs:
-                    rig.device.tick(stage.clock.now_ns())
+                    rig.device.tick(bench.clock.now_ns())
                 return all(rig.state is DeviceState.RUNNING or rig.device.status().problem for rig in rigs)
 
             await rigs[0].until(settled, "settled")
@@ -241,16 +243,16 @@ def test_auto_finds_driver_and_address_and_does_not_take_one_twice(stage: Stage)
             await left.until(lambda: "another device of this configuration" in left.device.status().problem, "told")
             assert {rig.device.status().identity["product"] for rig in there} == {"IMU612", "IMU618"}
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_vanished_device_does_not_hold_up_the_others(stage: Stage) -> None:
-    there, gone = stage.registers(), stage.registers()
-    stage.i2c.devices.update({0x18: there, 0x19: gone})
+def test_vanished_device_does_not_hold_up_the_others(bench: PolledBusBench) -> None:
+    there, gone = bench.registers(), bench.registers()
+    bench.i2c.devices.update({0x18: there, 0x19: gone})
     gone.faults.error = errno.ENXIO
 
     async def body() -> None:
-        async with stage.running(on_i2c("there", address=0x18), on_i2c("gone", address=0x19)) as (good, bad):
+        async with bench.running(on_i2c("there", address=0x18), on_i2c("gone", address=0x19)) as (good, bad):
             await good.until_samples(100)
             polling = good.device.status().polling
             assert polling is not None
@@ -260,15 +262,15 @@ def test_vanished_device_does_not_hold_up_the_others(stage: Stage) -> None:
             gone.faults.error = 0
             await bad.until_samples(3)
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_repeated_values_are_stale_and_then_silence(stage: Stage) -> None:
-    device = stage.registers()
-    stage.i2c.devices[0x18] = device
+def test_repeated_values_are_stale_and_then_silence(bench: PolledBusBench) -> None:
+    device = bench.registers()
+    bench.i2c.devices[0x18] = device
 
     async def body() -> None:
-        async with stage.running(on_i2c()) as (rig,):
+        async with bench.running(on_i2c()) as (rig,):
             await rig.until_samples(3)
             device.faults.frozen = True
             await rig.until(lambda: rig.state is DeviceState.SILENT, "silent")
@@ -279,15 +281,15 @@ def test_repeated_values_are_stale_and_then_silence(stage: Stage) -> None:
             device.faults.frozen = False
             await rig.until_samples(3)
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_device_slower_than_its_polls_gives_each_value_once(stage: Stage) -> None:
-    device = stage.registers(update_ns=10_000_000)
-    stage.spi.device = device.spi
+def test_device_slower_than_its_polls_gives_each_value_once(bench: PolledBusBench) -> None:
+    device = bench.registers(update_ns=10_000_000)
+    bench.spi.device = device.spi
 
     async def body() -> None:
-        async with stage.running(stage.on_spi(rate_hz=500)) as (rig,):
+        async with bench.running(bench.on_spi(rate_hz=500)) as (rig,):
             await rig.until_samples(20)
         values = [sample.accel_m_s2 for sample in rig.samples]
         assert len(set(values)) == len(values)
@@ -297,24 +299,24 @@ def test_device_slower_than_its_polls_gives_each_value_once(stage: Stage) -> Non
         steps = [b.t_ns - a.t_ns for a, b in zip(rig.samples[5:], rig.samples[6:], strict=False)]
         assert sum(steps) / len(steps) == pytest.approx(1e7, rel=0.1)
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_missing_bus_is_waited_for_and_lost_again(stage: Stage) -> None:
-    stage.spi.device = stage.registers().spi
-    plug, unplug = stage.node.touch, stage.node.unlink
+def test_missing_bus_is_waited_for_and_lost_again(bench: PolledBusBench) -> None:
+    bench.spi.device = bench.registers().spi
+    plug, unplug = bench.node.touch, bench.node.unlink
     unplug()
 
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
+        async with bench.running(bench.on_spi()) as (rig,):
             await asyncio.sleep(0)
             assert rig.state is DeviceState.MISSING
             plug()
             await rig.until_samples(3)
             unplug()
-            device = stage.registers()
+            device = bench.registers()
             device.faults.error = errno.ENODEV
-            stage.spi.device = device.spi
+            bench.spi.device = device.spi
             await rig.until(lambda: rig.state is DeviceState.MISSING, "missing")
             assert EventKind.DOWN in rig.kinds
             device.faults.error = 0
@@ -322,34 +324,36 @@ def test_missing_bus_is_waited_for_and_lost_again(stage: Stage) -> None:
             await rig.until_samples(3)
             assert rig.device.status().connects == 2
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_bus_that_may_not_be_opened_fails_with_the_reason(stage: Stage) -> None:
-    stage.spi.open_error = errno.EBUSY
+def test_bus_that_may_not_be_opened_fails_with_the_reason(bench: PolledBusBench) -> None:
+    bench.spi.open_error = errno.EBUSY
 
     async def body() -> None:
-        async with stage.running(stage.on_spi()) as (rig,):
+        async with bench.running(bench.on_spi()) as (rig,):
             await rig.until(lambda: rig.state is DeviceState.FAILED, "failed")
             assert "in use" in rig.device.status().problem
-            stage.spi.open_error = 0
-            stage.spi.device = stage.registers().spi
+            bench.spi.open_error = 0
+            bench.spi.device = bench.registers().spi
             await rig.until_samples(1)
 
-    stage.run(body())
+    bench.run(body())
 
 
-def test_slow_transfers_miss_deadlines_which_are_lost_samples(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
-    device = stage.registers()
+def test_slow_transfers_miss_deadlines_which_are_lost_samples(
+    bench: PolledBusBench, caplog: pytest.LogCaptureFixture
+) -> None:
+    device = bench.registers()
 
     def slow(selections: Any, mode: int) -> list[bytes]:
-        stage.clock.advance(5_000_000)
+        bench.clock.advance(5_000_000)
         return device.spi(selections, mode)
 
-    stage.spi.device = slow
+    bench.spi.device = slow
 
     async def body() -> None:
-        async with stage.running(stage.on_spi(rate_hz=1000)) as (rig,):
+        async with bench.running(bench.on_spi(rate_hz=1000)) as (rig,):
             await rig.until_samples(10)
             await rig.until(lambda: EventKind.LOSS in rig.kinds, "told")
             polling = rig.device.status().polling
@@ -361,4 +365,4 @@ def test_slow_transfers_miss_deadlines_which_are_lost_samples(stage: Stage, capl
             assert "no value of it is new" not in caplog.text  # it was not asked for long enough to say so
             assert rig.device.ledger.lost_queue == polling.missed >= 30
 
-    stage.run(body())
+    bench.run(body())

@@ -21,7 +21,7 @@ from imud.runtime import device as device_module
 from imud.runtime.detection.remembered import RememberedDevice
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
-from tests.support.hi91 import hi91
+from tests.support.files import hi91
 
 MS = 1_000_000
 LIMIT_S = 5.0

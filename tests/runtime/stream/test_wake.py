@@ -16,8 +16,8 @@ from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xModule
 from imud.sim.ports.uart_wire import heard
 from tests.support.device_rig import DeviceRigs
-from tests.support.imu61x_bench import STILL
-from tests.support.virtual_time import VirtualClock, run_virtually
+from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.simulated_modules import IMU61X_STILL
 
 STEP_S = 0.001
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
@@ -44,14 +44,14 @@ class Line(MemoryLink):
             await asyncio.sleep(STEP_S)
 
 
-class Bench:
+class WakeBench:
     """One device on the line."""
 
     def __init__(self, clock: VirtualClock, settings: Imu61xSettings, hardware: dict[str, Any], **link: Any) -> None:
         self.clock = clock
         driver, identify = link.pop("driver", "imu61x-uart"), link.pop("identify", True)
         memory = MemorySettings(**{"baud": 115200, **link})
-        self.module = Imu61xModule(clock.now_ns(), settings, replace(STILL, **hardware))
+        self.module = Imu61xModule(clock.now_ns(), settings, replace(IMU61X_STILL, **hardware))
         self.line = Line(memory, self.module, clock)
         self.rigs = DeviceRigs(clock.host)
         self.rig = self.rigs.add(DeviceConfig("bow", driver, None, identify, "memory", memory), self.line)
@@ -68,7 +68,7 @@ class Bench:
         await self.rig.until(condition, str(self.line.written), limit_s, step_s=0.01)
 
 
-Play = Callable[..., Bench]
+Play = Callable[..., WakeBench]
 
 
 @pytest.fixture
@@ -76,16 +76,16 @@ def play() -> Play:
     """Runs a story with a runner at work, which is cancelled at its end."""
 
     def run(
-        story: Callable[[Bench], Awaitable[None]],
+        story: Callable[[WakeBench], Awaitable[None]],
         settings: Imu61xSettings = QUIET,
         hardware: dict[str, Any] | None = None,
         **link: Any,
-    ) -> Bench:
+    ) -> WakeBench:
         clock = VirtualClock()
-        benches: list[Bench] = []
+        benches: list[WakeBench] = []
 
         async def both() -> None:
-            bench = Bench(clock, settings, hardware or {}, **link)
+            bench = WakeBench(clock, settings, hardware or {}, **link)
             benches.append(bench)
             carrying = asyncio.create_task(bench.line.carry())
             try:
@@ -103,7 +103,7 @@ def play() -> Play:
 
 @pytest.mark.parametrize("link", [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}], ids=str)
 def test_device_saved_in_command_mode_is_made_to_stream(play: Play, link: dict[str, Any]) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         await bench.until(lambda: bench.woken and len(bench.samples) > 20)
         assert bench.device.state is DeviceState.RUNNING
         assert bench.woken == ["it answered and sent no samples: told to stream, which is not saved"]
@@ -115,7 +115,7 @@ def test_device_saved_in_command_mode_is_made_to_stream(play: Play, link: dict[s
 
 
 def test_nothing_is_sent_where_it_may_not_be_asked(play: Play) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         with pytest.raises(AssertionError):
             await bench.until(lambda: bench.samples, 8)
 
@@ -125,7 +125,7 @@ def test_nothing_is_sent_where_it_may_not_be_asked(play: Play) -> None:
 
 
 def test_device_that_streams_is_not_told_to(play: Play) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         await bench.until(lambda: len(bench.samples) > 500)
 
     bench = play(story, Imu61xSettings())
@@ -135,7 +135,7 @@ def test_device_that_streams_is_not_told_to(play: Play) -> None:
 def test_device_that_comes_later_is_woken_and_told_of_once(play: Play) -> None:
     """It boots for 20 s, and does not say that it obeys."""
 
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         await bench.until(lambda: bench.woken and len(bench.samples) > 500, 60)
         assert bench.woken == ["it answered and sent no samples: told to stream, which is not saved"]
         assert [e.detail["acknowledged"] for e in bench.events if "acknowledged" in e.detail] == [False]
@@ -144,7 +144,7 @@ def test_device_that_comes_later_is_woken_and_told_of_once(play: Play) -> None:
 
 
 def test_where_nothing_answers_nothing_is_told(play: Play) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         with pytest.raises(AssertionError):
             await bench.until(lambda: bench.samples, 20)
 
@@ -154,7 +154,7 @@ def test_where_nothing_answers_nothing_is_told(play: Play) -> None:
 
 
 def test_device_that_acknowledges_and_stays_silent_is_told_of_once(play: Play) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         with pytest.raises(AssertionError):
             await bench.until(lambda: bench.samples, 10)
         assert len(bench.woken) == 1
@@ -163,7 +163,7 @@ def test_device_that_acknowledges_and_stays_silent_is_told_of_once(play: Play) -
 
 
 def test_device_that_was_told_to_be_silent_is_left_so(play: Play) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         await bench.until(lambda: len(bench.samples) > 20 and bench.device.status().settings)
         await bench.device.act("stop_streaming", {})
         count = len(bench.samples)
@@ -179,7 +179,7 @@ def test_device_that_was_told_to_be_silent_is_left_so(play: Play) -> None:
 def test_identification_cut_off_anywhere_leaves_it_streaming(play: Play, cut_at: int) -> None:
     """The daemon stops in the middle of the questions; the device answers in command mode only."""
 
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         await bench.until(lambda: len(bench.line.written) >= cut_at)
 
     bench = play(story, Imu61xSettings(), {"answers_while_streaming": False})
@@ -187,7 +187,7 @@ def test_identification_cut_off_anywhere_leaves_it_streaming(play: Play, cut_at:
 
 
 def test_a_link_that_is_gone_needs_nothing(play: Play) -> None:
-    async def story(bench: Bench) -> None:
+    async def story(bench: WakeBench) -> None:
         await bench.until(lambda: bench.module.settings.mode is OutputMode.COMMAND)
         bench.line.disappear()
         await bench.until(lambda: bench.device.state is DeviceState.MISSING)

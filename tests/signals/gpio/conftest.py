@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.fake_gpiod import FakeGpiod
+from tests.support.signal_bench import FakeGpiod
 
 
 @pytest.fixture

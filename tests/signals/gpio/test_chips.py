@@ -12,7 +12,7 @@ import pytest
 from imud.contracts.lines import LineSettings
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.signals.gpio.chips import LineLocation, find_line, load_gpiod, request_error
-from tests.support.fake_gpiod import FakeGpiod
+from tests.support.signal_bench import FakeGpiod
 
 
 @pytest.mark.parametrize("chip", ["gpiochip0", "pinctrl-bcm2711"])

@@ -15,8 +15,8 @@ from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.signals.gpio import GPIO_LINES, GpioInput, GpioOutput
 from imud.signals.gpio.kernel_interface import EVENT
 from imud.signals.gpio.line_request import KERNEL_EVENTS, READ_EVENTS
-from tests.support.fake_gpiod import FakeGpiod
-from tests.support.in_loop import in_loop
+from tests.support.event_loops import in_loop
+from tests.support.signal_bench import FakeGpiod
 
 SOUT = InputSettings(line="SOUT")
 LIMIT_S = 10

@@ -18,9 +18,11 @@ from imud.sim.hipnuc.canopen import (
     ObjectDictionary,
 )
 from imud.sim.simulator import SimulatorOptions
-from tests.support.canopen_bench import BEGIN_NS, MS, QUIET, Bench
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.simulated_modules import BEGIN_NS, QUIET, CanopenBench
 
-SECOND_NS = 1000 * MS
+MS = NS_PER_MS
+SECOND_NS = NS_PER_S
 
 
 def times_of(frames: list[SentFrame], can_id: int) -> list[int]:
@@ -30,7 +32,7 @@ def times_of(frames: list[SentFrame], can_id: int) -> list[int]:
 def test_values_are_the_truth_of_the_sample_instant() -> None:
     module = HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(boot_ms=0, skew_ppm=0))
     instants = [frame.sample_ns for frame in module.advance(BEGIN_NS + SECOND_NS) if frame.can_id == 0x188]
-    bench = Bench(NodeSettings())
+    bench = CanopenBench(NodeSettings())
     bench.run(SECOND_NS)
     assert len(bench.measured) == pytest.approx(95, abs=2)
     for measured, t_ns in zip(bench.measured, instants[-len(bench.measured) :], strict=True):
@@ -76,15 +78,15 @@ def test_next_ns_is_when_something_is_sent() -> None:
 
 
 def test_boot_up_and_heartbeat() -> None:
-    bench = Bench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=100), boot_ms=50)
+    bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=100), boot_ms=50)
     bench.run(400 * MS)
     assert bench.heard == [(0x708, b"\0"), *[(0x708, b"\5")] * 3]
 
 
 def test_sync_sends_what_is_of_type_1() -> None:
-    bench = Bench(NodeSettings(periods_ms={1: 10, 2: 10, 3: 0, 4: 0, 6: 0, 7: 0}))
-    bench.hold(session.set_tpdo_type(8, 1, Transmission.SYNC))
-    bench.hold(session.set_tpdo_type(8, 3, Transmission.SYNC))
+    bench = CanopenBench(NodeSettings(periods_ms={1: 10, 2: 10, 3: 0, 4: 0, 6: 0, 7: 0}))
+    bench.run_script(session.set_tpdo_type(8, 1, Transmission.SYNC))
+    bench.run_script(session.set_tpdo_type(8, 3, Transmission.SYNC))
     bench.heard.clear()
     bench.run(35 * MS)
     assert {can_id for can_id, _ in bench.heard} == {0x288}
@@ -92,20 +94,20 @@ def test_sync_sends_what_is_of_type_1() -> None:
     bench.send(0x080, b"")
     bench.run(4 * MS)
     assert [can_id for can_id, _ in bench.heard if can_id != 0x288] == [0x188, 0x388]
-    bench.hold(session.set_tpdo_type(8, 1, Transmission.TIMER))
+    bench.run_script(session.set_tpdo_type(8, 1, Transmission.TIMER))
     bench.heard.clear()
     bench.run(35 * MS)
     assert sum(can_id == 0x188 for can_id, _ in bench.heard) >= 3
 
 
 def test_nmt_states() -> None:
-    bench = Bench(NodeSettings())
-    bench.hold(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
+    bench = CanopenBench(NodeSettings())
+    bench.run_script(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
     bench.run(20 * MS)
     bench.heard.clear()
     bench.run(50 * MS)
     assert bench.heard == []
-    assert bench.hold(session.identify(8)).product == "HI14"  # SDO goes on
+    assert bench.run_script(session.identify(8)).product == "HI14"  # SDO goes on
     bench.send(0x000, b"\2\0")  # stop all
     bench.heard.clear()
     bench.send(0x608, cia301.read_frame(0x1000, 0))
@@ -117,25 +119,25 @@ def test_nmt_states() -> None:
 
 
 def test_what_applies_at_once_and_what_after_a_restart() -> None:
-    bench = Bench()
-    bench.hold(session.set_tpdo_period(8, 1, 50))
-    bench.hold(session.set_node_id(8, 20))
-    bench.hold(session.set_bit_rate(8, 250_000))
+    bench = CanopenBench()
+    bench.run_script(session.set_tpdo_period(8, 1, 50))
+    bench.run_script(session.set_node_id(8, 20))
+    bench.run_script(session.set_bit_rate(8, 250_000))
     bench.heard.clear()
     bench.run(120 * MS)
     assert [can_id for can_id, _ in bench.heard] in ([0x188] * 2, [0x188] * 3)
     assert bench.module.node == 8
-    bench.hold(session.restart(8))
+    bench.run_script(session.restart(8))
     assert bench.module.node == 8  # nothing was saved
     assert bench.module.objects.settings == QUIET
 
 
 def test_saved_settings_survive_and_a_factory_reset_clears_them_at_power_on() -> None:
-    bench = Bench()
-    bench.hold(session.set_node_id(8, 20))
-    bench.hold(session.set_tpdo_period(8, 2, 100))
-    bench.hold(session.save(8))
-    bench.hold(session.restart(8))
+    bench = CanopenBench()
+    bench.run_script(session.set_node_id(8, 20))
+    bench.run_script(session.set_tpdo_period(8, 2, 100))
+    bench.run_script(session.save(8))
+    bench.run_script(session.restart(8))
     assert bench.module.node == 20
     assert bench.module.objects.settings.periods_ms[2] == 100
     bench.send(0x614, cia301.write_frame(0x2000, 0, b"\1\0\0\0"))
@@ -152,17 +154,17 @@ def test_inclinometer_signs_and_zero() -> None:
         assert angles is not None
         return angles
 
-    bench = Bench(NodeSettings(periods_ms={**QUIET.periods_ms, 7: 5}))
+    bench = CanopenBench(NodeSettings(periods_ms={**QUIET.periods_ms, 7: 5}))
     bench.run(700 * MS)
     x, y = incli()
-    bench.hold(session.set_inclinometer_signs(8, invert_x=True, invert_y=False))
+    bench.run_script(session.set_inclinometer_signs(8, invert_x=True, invert_y=False))
     turned = incli()
     assert math.copysign(1, turned[0]) == -math.copysign(1, x)
     assert math.copysign(1, turned[1]) == math.copysign(1, y)
-    bench.hold(session.set_inclinometer_zero(8, InclinometerZero.SET))
+    bench.run_script(session.set_inclinometer_zero(8, InclinometerZero.SET))
     bench.measured.clear()
     assert incli() == pytest.approx((0, 0), abs=0.05)
-    bench.hold(session.set_inclinometer_zero(8, InclinometerZero.CANCEL))
+    bench.run_script(session.set_inclinometer_zero(8, InclinometerZero.CANCEL))
     assert incli() == pytest.approx(turned, abs=0.1)
 
 

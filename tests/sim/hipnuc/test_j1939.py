@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from imud.contracts.codec import ReplyFrame
-from imud.contracts.session import Reply, RequestScript, Silence
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Silence
 from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings
 from imud.devices.hipnuc.j1939.session import J1939Node
@@ -21,6 +21,7 @@ from imud.sim.can_module import CanModules, SentFrame
 from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings
 from imud.sim.physics.motion import Still
 from imud.sim.simulator import SimulatorOptions
+from tests.support.simulated_modules import run_script
 
 BEGIN_NS = 5_000_000_000
 SECOND_NS = 1_000_000_000
@@ -51,7 +52,7 @@ def pgns(frames: Sequence[SentFrame]) -> Counter[int]:
     return Counter(split(frame.can_id).pgn for frame in frames)
 
 
-class Bench:
+class J1939Bench:
     """A module and a host that talks to it."""
 
     def __init__(self, module: HipnucJ1939Module, host: int = 0x55) -> None:
@@ -68,20 +69,18 @@ class Bench:
         return new
 
     def talk(self, begin: Callable[[J1939Node], RequestScript[object]], address: int = 8) -> object:
-        """Drive a conversation to its end."""
+        """Run a request script to its end."""
         codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Settings(address=address, host_address=self.host))
-        conversation = begin(J1939Node(address, self.host))
-        try:
-            request = next(conversation)
-            while True:
-                can_id, size, data = RAW_FRAME.unpack(request.payload)
-                self.module.receive(can_id & EXTENDED_ID_MAX, True, data[:size], self.now_ns)
-                frames = self.wait(5 * MS)
-                events = [e for f in frames for e in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
-                ends = [e for e in events if isinstance(e, ReplyFrame) and request.is_end(e)]
-                request = conversation.send(Reply((ends[0],)) if ends else Silence(()))
-        except StopIteration as end:
-            return end.value
+
+        def ask(request: Request) -> Outcome:
+            can_id, size, data = RAW_FRAME.unpack(request.payload)
+            self.module.receive(can_id & EXTENDED_ID_MAX, True, data[:size], self.now_ns)
+            frames = self.wait(5 * MS)
+            events = [e for f in frames for e in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
+            ends = [e for e in events if isinstance(e, ReplyFrame) and request.is_end(e)]
+            return Reply((ends[0],)) if ends else Silence(())
+
+        return run_script(begin(J1939Node(address, self.host)), ask)
 
 
 def test_values_are_the_truth_of_the_sample_instant() -> None:
@@ -132,7 +131,7 @@ def test_next_ns_is_when_something_is_sent() -> None:
 
 
 def test_an_interval_is_set_and_read_back() -> None:
-    bench = Bench(made())
+    bench = J1939Bench(made())
     bench.talk(lambda peer: session.set_interval(peer, 0xFF37, 20))
     bench.talk(lambda peer: session.set_interval(peer, 0xFF4A, 500))  # switched on by it
     counts = pgns(bench.wait(SECOND_NS))
@@ -147,7 +146,7 @@ def test_an_interval_is_set_and_read_back() -> None:
 
 
 def test_values_out_of_range_do_not_take() -> None:
-    bench = Bench(made())
+    bench = J1939Bench(made())
     for register, value in ((0x0134, 4), (0x009A, 5), (0x009C, 129), (0x009E, 2)):
         with pytest.raises(Rejected):
             bench.talk(lambda peer, r=register, v=value: session._write_checked(peer, r, v, "x"))  # type: ignore[misc]
@@ -164,7 +163,7 @@ def test_values_out_of_range_do_not_take() -> None:
 
 
 def test_what_is_not_saved_is_lost_at_a_restart() -> None:
-    bench = Bench(made(boot_ms=200))
+    bench = J1939Bench(made(boot_ms=200))
     bench.wait(300 * MS)
     bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
     bench.talk(session.restart)
@@ -182,7 +181,7 @@ def test_what_is_not_saved_is_lost_at_a_restart() -> None:
 
 
 def test_address_and_bit_rate_change_at_the_restart() -> None:
-    bench = Bench(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
+    bench = J1939Bench(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
     bench.talk(lambda peer: session.set_address(peer, 20))
     bench.talk(lambda peer: session.set_bitrate(peer, 125_000))
     assert {split(f.can_id).source for f in bench.wait(SECOND_NS)} == {8}
@@ -206,14 +205,14 @@ def test_a_restart_is_answered_before_it_happens() -> None:
 
 
 def test_replies_go_to_the_one_address() -> None:
-    bench = Bench(made(), host=0x20)
+    bench = J1939Bench(made(), host=0x20)
     assert bench.talk(lambda peer: session.read(peer, session.ADDRESS)) == 8
     replies = [f for f in bench.heard if split(f.can_id).pgn == session.CONFIGURE]
     assert {split(f.can_id).destination for f in replies} == {0x55}
 
 
 def test_a_message_is_sent_once() -> None:
-    bench = Bench(made())
+    bench = J1939Bench(made())
     bench.talk(lambda peer: session.send_once(peer, 0xFF46))
     assert pgns(bench.heard)[0xFF46] == 1
     assert pgns(bench.wait(SECOND_NS))[0xFF46] == 0
@@ -222,7 +221,7 @@ def test_a_message_is_sent_once() -> None:
 def test_zero_and_directions_of_the_inclinometer() -> None:
     still = Still(roll_rad=math.radians(10), pitch_rad=math.radians(20))
     settings = J1939Settings(intervals_ms={messages.INCLINOMETER: 10})
-    bench = Bench(HipnucJ1939Module(BEGIN_NS, settings, J1939Hardware(boot_ms=0, motion=still)))
+    bench = J1939Bench(HipnucJ1939Module(BEGIN_NS, settings, J1939Hardware(boot_ms=0, motion=still)))
 
     def shown() -> tuple[float, float]:
         last = messages.measurement_of([(0xFF4A, bench.wait(50 * MS)[-1].data)]).incli_rad

@@ -13,7 +13,7 @@ from imud.sample import Measurement
 from imud.sim.hipnuc.modbus import ModbusLine, Slave, make
 from imud.sim.simulator import Burst, SimulatorOptions
 from imud.units import NS_PER_S
-from tests.support.modbus_wire import serial_of, slave
+from tests.support.pty_port import serial_of, slave
 
 BEGIN_NS = 5 * NS_PER_S
 BAUD = 115200
@@ -21,7 +21,7 @@ BYTE_NS = 10 * NS_PER_S // BAUD
 GAP_NS = 1_750_000
 
 
-class Rig:
+class ModbusMaster:
     """A line, and a master that has all the time it needs."""
 
     def __init__(self, *slaves: Slave, **more: bool | int) -> None:
@@ -49,14 +49,14 @@ def here(address: int, **more: Any) -> Slave:
 
 
 def test_every_byte_takes_its_time_in_both_directions() -> None:
-    rig = Rig(here(1, processing_ns=100_000))
+    rig = ModbusMaster(here(1, processing_ns=100_000))
     (burst,) = rig.bursts(framed(1, READ_BLOCK))
     assert burst.due_ns == BEGIN_NS + 8 * BYTE_NS + GAP_NS + 100_000 + 57 * BYTE_NS
     assert burst.sample_ns == BEGIN_NS + 8 * BYTE_NS + GAP_NS + 100_000
 
 
 def test_reply_in_pieces_comes_no_sooner() -> None:
-    rig = Rig(here(1, processing_ns=0), chunk_bytes=1)
+    rig = ModbusMaster(here(1, processing_ns=0), chunk_bytes=1)
     bursts = rig.bursts(framed(1, READ_BLOCK))
     assert [len(burst.data) for burst in bursts] == [1] * 57
     begin_ns = BEGIN_NS + 8 * BYTE_NS + GAP_NS
@@ -65,7 +65,7 @@ def test_reply_in_pieces_comes_no_sooner() -> None:
 
 
 def test_echo_comes_before_the_reply() -> None:
-    rig = Rig(here(1), echo=True)
+    rig = ModbusMaster(here(1), echo=True)
     frame = framed(1, READ_BLOCK)
     echo, reply = rig.bursts(frame)
     assert echo.data == frame
@@ -75,7 +75,7 @@ def test_echo_comes_before_the_reply() -> None:
 
 def test_values_are_the_truth_of_that_instant() -> None:
     for firmware, resolution in ((152, 2**-15), (169, 1e-4)):
-        rig = Rig(here(1, firmware=firmware, inclinometer="dual"))
+        rig = ModbusMaster(here(1, firmware=firmware, inclinometer="dual"))
         codec = HipnucModbusCodec(Ledger(), HipnucModbusSettings())
         request = READ_BLOCK if firmware == 169 else read_registers(0x34, 24).sends[0]
         if firmware == 152:
@@ -98,7 +98,7 @@ def test_values_are_the_truth_of_that_instant() -> None:
 
 
 def test_only_who_is_meant_answers_and_only_to_whole_frames() -> None:
-    rig = Rig(here(1), here(2), here(3, dead=True))
+    rig = ModbusMaster(here(1), here(2), here(3, dead=True))
     assert rig.ask(2, READ_BLOCK)[0] == 2
     assert rig.ask(3, READ_BLOCK) == rig.ask(4, READ_BLOCK) == rig.ask(0, READ_BLOCK) == b""
     assert rig.bursts(framed(1, READ_BLOCK)[:-1] + b"\x00") == []
@@ -106,14 +106,14 @@ def test_only_who_is_meant_answers_and_only_to_whole_frames() -> None:
 
 
 def test_two_of_the_same_address_spoil_each_other() -> None:
-    rig = Rig(slave(1, baud=BAUD, serial=0x0F), slave(1, baud=BAUD, serial=0xF0))
+    rig = ModbusMaster(slave(1, baud=BAUD, serial=0x0F), slave(1, baud=BAUD, serial=0xF0))
     reply = rig.ask(1, read_registers(0x7F, 4).sends[0])
     assert len(reply) == 13
     assert not is_whole(reply)
 
 
 def test_ids_by_serial_number_and_by_chance() -> None:
-    rig = Rig(slave(80, baud=BAUD, serial=1), slave(80, baud=BAUD, serial=2))
+    rig = ModbusMaster(slave(80, baud=BAUD, serial=1), slave(80, baud=BAUD, serial=2))
     assert rig.ask(0, set_id_by_serial(serial_of(2).hex(), 99).sends[0]) == b""
     assert [one.settings.slave for one in rig.line.slaves] == [80, 99]
     rig.ask(0, randomise_ids(10, 12).sends[0])
@@ -123,7 +123,7 @@ def test_ids_by_serial_number_and_by_chance() -> None:
 
 
 def test_exceptions() -> None:
-    rig = Rig(here(1))
+    rig = ModbusMaster(here(1))
     for request, code in (
         (read_registers(0x34, 27).sends[0], 2),
         (read_registers(0x33, 1).sends[0], 2),
@@ -136,14 +136,14 @@ def test_exceptions() -> None:
 
 
 def test_wrong_crc_and_silence_on_demand() -> None:
-    rig = Rig(here(1, bad_crc=1, mute=1))
+    rig = ModbusMaster(here(1, bad_crc=1, mute=1))
     assert rig.ask(1, READ_BLOCK) == b""
     assert not is_whole(rig.ask(1, READ_BLOCK))
     assert is_whole(rig.ask(1, READ_BLOCK))
 
 
 def test_module_of_another_rate_is_not_understood() -> None:
-    rig = Rig(here(1), slave(2, baud=9600))
+    rig = ModbusMaster(here(1), slave(2, baud=9600))
     assert not is_whole(rig.ask(2, READ_BLOCK))
     assert is_whole(rig.ask(1, READ_BLOCK))
 

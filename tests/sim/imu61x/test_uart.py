@@ -26,7 +26,7 @@ from imud.sim.physics.motion import swing
 from imud.sim.physics.noise import Noise
 from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_S
-from tests.support.imu61x_bench import BEGIN_NS, STILL, Imu61xBench, bench
+from tests.support.simulated_modules import BEGIN_NS, IMU61X_STILL, Imu61xBench, imu61x_bench
 
 
 def acknowledged(far: Imu61xBench, request: Request) -> int:
@@ -48,7 +48,7 @@ def parameter(far: Imu61xBench, which: Parameter) -> float:
 
 def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
     """Taken apart without the codec: 312 roll 2° about Y, pitch -3° about X, yaw 40° at rest."""
-    module = Imu61xModule(BEGIN_NS, hardware=STILL)
+    module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
     (burst,) = module.advance(BEGIN_NS + 517_000_000)
     data = burst.data
     assert data[:6] == bytes.fromhex("AA5502002C00")
@@ -63,7 +63,7 @@ def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
 
 @pytest.mark.parametrize("rate_hz", c.RATES_HZ)
 def test_it_streams_at_every_rate_of_the_manual(rate_hz: int) -> None:
-    far = bench(Imu61xSettings(baud=230400, rate_hz=rate_hz))
+    far = imu61x_bench(Imu61xSettings(baud=230400, rate_hz=rate_hz))
     far.wait(1000 - far.module.hardware.boot_ms)
     samples = far.samples(2000)
     assert len(samples) == pytest.approx(2 * rate_hz, abs=1)
@@ -74,14 +74,14 @@ def test_it_streams_at_every_rate_of_the_manual(rate_hz: int) -> None:
 
 def test_what_does_not_fit_the_wire_is_not_sent() -> None:
     """Table 3 note 1: no more than 200 Hz at 115200; the wire carries 213."""
-    far = bench(Imu61xSettings(rate_hz=400))
+    far = imu61x_bench(Imu61xSettings(rate_hz=400))
     assert len(far.samples(2000)) == pytest.approx(2 * 213, abs=4)
     assert far.module.frames_dropped > 300
 
 
 def test_the_physics_of_the_truth_come_out() -> None:
     """The rotation of the frame turns the specific force of the truth as the truth's own quaternion does."""
-    hardware = replace(STILL, motion=swing())
+    hardware = replace(IMU61X_STILL, motion=swing())
     far = Imu61xBench(hardware=hardware)
     assert far.samples(40)
     for burst in far.module.advance(far.now_ns + 3 * NS_PER_S):
@@ -97,7 +97,7 @@ def test_the_physics_of_the_truth_come_out() -> None:
 
 
 def test_the_timer_runs_fast_and_wraps() -> None:
-    far = bench(skew_ppm=1000.0, uptime_us=2**32 - 600_000)
+    far = imu61x_bench(skew_ppm=1000.0, uptime_us=2**32 - 600_000)
     samples = far.samples(400)
     ticks = [sample.dev_ticks or 0 for sample in samples]
     assert any(b < a for a, b in pairwise(ticks))
@@ -107,7 +107,7 @@ def test_the_timer_runs_fast_and_wraps() -> None:
 
 
 def test_command_mode_is_silent_but_for_replies() -> None:
-    far = bench()
+    far = imu61x_bench()
     assert acknowledged(far, c.output_mode(c.OutputMode.COMMAND)) == 0
     far.wait(20)
     assert far.wait(2000) == []
@@ -122,13 +122,13 @@ def test_command_mode_is_silent_but_for_replies() -> None:
 
 
 def test_a_device_that_listens_in_command_mode_only() -> None:
-    far = bench(answers_while_streaming=False)
+    far = imu61x_bench(answers_while_streaming=False)
     far.send(c.ask_status().payload + c.factory_reset().payload)
     assert not any(isinstance(event, ReplyFrame) for event in far.wait(500))
 
 
 def test_ram_is_lost_at_power_off_and_flash_is_not() -> None:
-    far = bench()
+    far = imu61x_bench()
     assert acknowledged(far, c.set_rate(50)) == 0
     far.restart()
     assert far.module.settings.rate_hz == 100
@@ -139,7 +139,7 @@ def test_ram_is_lost_at_power_off_and_flash_is_not() -> None:
 
 
 def test_the_mode_is_saved_too() -> None:
-    far = bench()
+    far = imu61x_bench()
     acknowledged(far, c.output_mode(c.OutputMode.COMMAND))
     acknowledged(far, c.save())
     far.restart()
@@ -147,7 +147,7 @@ def test_the_mode_is_saved_too() -> None:
 
 
 def test_restart_is_acknowledged_and_then_silent_while_it_boots() -> None:
-    far = bench()
+    far = imu61x_bench()
     assert acknowledged(far, c.restart()) == 0
     assert far.wait(far.module.hardware.boot_ms - 20) == []
     samples = far.samples(200)
@@ -171,7 +171,7 @@ def test_every_parameter_of_the_manual_can_be_asked_and_no_other() -> None:
         Imu61xSettings().value(which)
     with pytest.raises(ParameterRefused):
         Imu61xSettings().value(4)
-    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     far.send(c.encode_command(c.Command.READ_PARAMETER, 0.0, 4))
     (reply,) = far.wait(50)
     assert isinstance(reply, ReplyFrame)
@@ -180,7 +180,7 @@ def test_every_parameter_of_the_manual_can_be_asked_and_no_other() -> None:
 
 @pytest.mark.parametrize("param1", [2.0, 0.0, float("nan")])
 def test_an_unknown_mode_is_refused(param1: float) -> None:
-    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     far.send(c.encode_command(c.Command.OUTPUT_MODE, param1))
     (reply,) = far.wait(50)
     assert isinstance(reply, ReplyFrame)
@@ -188,7 +188,7 @@ def test_an_unknown_mode_is_refused(param1: float) -> None:
 
 
 def test_the_acknowledgement_of_a_new_rate_comes_at_the_old_one() -> None:
-    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     assert acknowledged(far, c.set_baud(921600)) == 0
     far.wait(10)
     assert far.module.baud == 921600
@@ -197,7 +197,7 @@ def test_the_acknowledgement_of_a_new_rate_comes_at_the_old_one() -> None:
 
 
 def test_what_is_sent_at_another_rate_is_not_understood() -> None:
-    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     far.line_baud = 460800
     far.send(c.factory_reset().payload)
     far.line_baud = 115200
@@ -205,7 +205,7 @@ def test_what_is_sent_at_another_rate_is_not_understood() -> None:
 
 
 def test_damaged_and_unknown_commands_are_not_answered() -> None:
-    far = bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     damaged = bytearray(c.ask_status().payload)
     damaged[12] ^= 1
     far.send(bytes(damaged))
@@ -217,7 +217,7 @@ def test_damaged_and_unknown_commands_are_not_answered() -> None:
 
 
 def test_installation_calibration_takes_its_time() -> None:
-    far = bench()
+    far = imu61x_bench()
     assert acknowledged(far, c.ask_installation_status()) == 0
     assert acknowledged(far, c.start_installation_calibration()) == 0
     assert acknowledged(far, c.ask_installation_status()) == 1
@@ -228,7 +228,7 @@ def test_installation_calibration_takes_its_time() -> None:
 
 
 def test_heading_is_relative_and_wraps() -> None:
-    far = bench()
+    far = imu61x_bench()
     assert acknowledged(far, c.reset_heading(270)) == 0
     euler = far.samples(50)[-1].euler_rad
     assert euler is not None
@@ -240,7 +240,7 @@ def test_heading_is_relative_and_wraps() -> None:
 
 
 def test_power_off_cuts_the_frame_on_the_wire() -> None:
-    module = Imu61xModule(BEGIN_NS, hardware=STILL)
+    module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
     now_ns = BEGIN_NS + 512_000_000
     assert module.advance(now_ns) == []
     module.reboot(now_ns)
@@ -250,7 +250,7 @@ def test_power_off_cuts_the_frame_on_the_wire() -> None:
 
 
 def test_next_ns_says_when_there_is_something() -> None:
-    module = Imu61xModule(BEGIN_NS, hardware=STILL)
+    module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
     now_ns = BEGIN_NS
     for _ in range(20):
         next_ns = module.next_ns()

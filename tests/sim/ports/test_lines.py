@@ -7,7 +7,7 @@ import pytest
 from imud.contracts.lines import Edge, InputLine, InputSettings, OutputLine, OutputSettings
 from imud.errors import LinkBusy, LinkError, LinkMissing
 from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
-from tests.support.in_loop import in_loop
+from tests.support.event_loops import in_loop
 
 
 def test_they_are_lines() -> None:

@@ -8,7 +8,7 @@ from imud.sim.ports.faults import FaultKind, FaultRates, Faults
 from imud.sim.ports.lines import MemoryInput
 from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults, Pins
 from imud.units import NS_PER_MS
-from tests.support.hipnuc_bench import FAST, Bench
+from tests.support.simulated_modules import FAST, HipnucUartBench
 
 
 class Line:
@@ -21,8 +21,8 @@ class Line:
         self.edges.append((t_ns, rising))
 
 
-def run(faults: PinFaults | None, steps: int = 20_000, step_ns: int = 50_000) -> tuple[Line, Pins, Bench]:
-    bench, line = Bench(FAST), Line()
+def run(faults: PinFaults | None, steps: int = 20_000, step_ns: int = 50_000) -> tuple[Line, Pins, HipnucUartBench]:
+    bench, line = HipnucUartBench(FAST), Line()
     bench.module.pins(bench.now_ns)
     pins = Pins(bench.module, {Pin.SOUT: line}, faults)
     for _ in range(steps):
@@ -96,7 +96,7 @@ def test_probabilities_are_probabilities(value: float) -> None:
 
 def test_frames_can_be_lost_whole() -> None:
     faults = Faults(4, FaultRates(lose=0.1))
-    bursts = Bench(FAST).wait(1000.0)
+    bursts = HipnucUartBench(FAST).wait(1000.0)
     arrived = [burst for burst in map(faults.pass_on, bursts) if burst]
     assert 70 <= faults.counts[FaultKind.LOSE] <= 130
     assert len(arrived) == len(bursts) - faults.counts[FaultKind.LOSE]
@@ -107,7 +107,7 @@ def test_frames_can_be_lost_whole() -> None:
 def test_memory_lines_take_them_as_they_are() -> None:
     line = MemoryInput()
     line.open()
-    bench = Bench(FAST)
+    bench = HipnucUartBench(FAST)
     pins = Pins(bench.module, {Pin.SOUT: line.edge})
     for _ in range(100):
         bench.now_ns += NS_PER_MS

@@ -10,7 +10,7 @@ from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.devices.hipnuc.canopen.driver import DRIVER
 from imud.errors import BadArgument
 from imud.sim.hipnuc.canopen import NodeSettings
-from tests.support.canopen_bench import QUIET, Bench, unpack
+from tests.support.simulated_modules import QUIET, CanopenBench, unpack
 
 
 def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
@@ -88,22 +88,22 @@ def test_arguments_that_cannot_be_send_nothing(name: str, given: dict[str, objec
 
 
 def test_the_module_obeys() -> None:
-    bench = Bench(NodeSettings(periods_ms=QUIET.periods_ms))
-    bench.hold(begun("direction", x_reversed=False, y_reversed=True))
-    bench.hold(begun("interval", tpdo=2, interval_ms=20))
+    bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms))
+    bench.run_script(begun("direction", x_reversed=False, y_reversed=True))
+    bench.run_script(begun("interval", tpdo=2, interval_ms=20))
     bench.run(100_000_000)
     assert 0x288 in {can_id for can_id, _ in bench.heard}
     assert bench.module.objects.settings.invert_y
     assert not bench.module.objects.settings.invert_x
-    assert bench.hold(begun("nmt", command="reset_node")) is True  # the boot-up message came
+    assert bench.run_script(begun("nmt", command="reset_node")) is True  # the boot-up message came
     assert not bench.module.objects.settings.invert_y  # nothing was saved
 
 
 def test_a_new_node_number_is_in_force_after_saving_and_restarting() -> None:
-    bench = Bench()
-    bench.hold(begun("node", node=9))
+    bench = CanopenBench()
+    bench.run_script(begun("node", node=9))
     assert bench.module.node == 8
-    bench.hold(begun("save"))
-    bench.hold(begun("restart"))
+    bench.run_script(begun("save"))
+    bench.run_script(begun("restart"))
     bench.run(10_000_000)
     assert bench.module.node == 9

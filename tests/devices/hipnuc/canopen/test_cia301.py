@@ -15,7 +15,7 @@ from imud.devices.hipnuc.canopen.cia301 import (
     write_object,
 )
 from imud.errors import NoReply
-from tests.support.canopen_bench import unpack
+from tests.support.simulated_modules import unpack
 
 
 def frame(text: str, can_id: int = 0x588) -> ReplyFrame:

@@ -9,7 +9,7 @@ import pytest
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from tests.support.shared_data import shared
+from tests.support.files import shared
 
 SIZES = {0x188: 6, 0x288: 6, 0x388: 6, 0x488: 8, 0x688: 4, 0x788: 8}
 BURSTS = 300

@@ -22,7 +22,7 @@ from imud.errors import NoReply
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
-from tests.support.canopen_bench import converse, unpack
+from tests.support.simulated_modules import run_script, unpack
 
 LIMIT_S = 10.0
 NODE = 8
@@ -246,18 +246,18 @@ def local(network: canopen.Network) -> canopen.LocalNode:
 
 
 def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host) -> None:
-    identity = converse(session.identify(NODE), host.ask)
+    identity = run_script(session.identify(NODE), host.ask)
     assert (identity.product, identity.serial_number) == ("HI14", "0x00000014")
     assert identity.details is not None
     assert identity.details["device type"] == "0x00020194"
-    converse(session.set_tpdo_period(NODE, 6, 50), host.ask)
+    run_script(session.set_tpdo_period(NODE, 6, 50), host.ask)
     assert local.get_data(0x1804, 5) == b"\x32\x00"
-    converse(session.set_tpdo_type(NODE, 2, Transmission.SYNC), host.ask)
+    run_script(session.set_tpdo_type(NODE, 2, Transmission.SYNC), host.ask)
     assert local.get_data(0x1801, 2) == b"\x01"
-    converse(session.set_bit_rate(NODE, 250_000), host.ask)
+    run_script(session.set_bit_rate(NODE, 250_000), host.ask)
     assert local.get_data(0x209A, 0) == b"\x03\0\0\0"
-    converse(session.save(NODE), host.ask)
-    settings = converse(session.read_settings(NODE), host.ask)
+    run_script(session.save(NODE), host.ask)
+    settings = run_script(session.read_settings(NODE), host.ask)
     assert settings["1804.5"] == "50"
     assert settings["1801.2"] == "1"
     assert settings["209A.0"] == "3"
@@ -266,7 +266,7 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
 
 def test_their_long_strings_are_left_alone(local: canopen.LocalNode, host: Host) -> None:
     local.set_data(0x1008, 0, b"a name of many letters")
-    identity = converse(session.identify(NODE), host.ask)
+    identity = run_script(session.identify(NODE), host.ask)
     assert identity.product == ""
     assert identity.serial_number == "0x00000014"
 
@@ -274,27 +274,27 @@ def test_their_long_strings_are_left_alone(local: canopen.LocalNode, host: Host)
 def test_their_abort_codes_are_told_in_words(local: canopen.LocalNode, host: Host) -> None:
     assert local.id == NODE
     with pytest.raises(cia301.Aborted, match="object does not exist"):
-        converse(cia301.read_object(NODE, 0x3000, 0), host.ask)
+        run_script(cia301.read_object(NODE, 0x3000, 0), host.ask)
     with pytest.raises(cia301.Aborted, match="sub-index does not exist"):
-        converse(cia301.read_object(NODE, 0x1800, 9), host.ask)
+        run_script(cia301.read_object(NODE, 0x1800, 9), host.ask)
 
 
 def test_nobody_answers_for_another_node(local: canopen.LocalNode, host: Host) -> None:
     host.timeout_factor = 0
     assert local.id == NODE
     with pytest.raises(NoReply):
-        converse(session.identify(NODE + 1), host.ask)
+        run_script(session.identify(NODE + 1), host.ask)
 
 
 def test_their_node_obeys_our_nmt_and_its_heartbeat_is_heard(local: canopen.LocalNode, host: Host) -> None:
     local.nmt.state = "RESET"
     assert host.events(LIMIT_S) == [ReplyFrame(0x708, b"\0")]
-    converse(session.nmt(NODE, NmtCommand.START), host.ask)
+    run_script(session.nmt(NODE, NmtCommand.START), host.ask)
     wait_for(lambda: local.nmt.state == "OPERATIONAL")
-    converse(session.nmt(NODE, NmtCommand.PRE_OPERATIONAL), host.ask)
+    run_script(session.nmt(NODE, NmtCommand.PRE_OPERATIONAL), host.ask)
     wait_for(lambda: local.nmt.state == "PRE-OPERATIONAL")
-    converse(cia301.write_object(NODE, 0x1017, 0, 50, 2), host.ask)
-    identity = converse(session.identify(NODE), host.ask)
+    run_script(cia301.write_object(NODE, 0x1017, 0, 50, 2), host.ask)
+    identity = run_script(session.identify(NODE), host.ask)
     local.nmt.stop_heartbeat()  # type: ignore[no-untyped-call]  # the library has it so
     assert identity.details is not None
     assert identity.details["NMT state"] == "pre-operational"

@@ -11,7 +11,7 @@ from imud.devices.hipnuc.canopen.cia301 import Aborted, NmtCommand, TpdoNumber
 from imud.devices.hipnuc.canopen.session import InclinometerZero, Transmission
 from imud.errors import BadArgument, DeviceRefused, NoReply
 from imud.sim.hipnuc.canopen import NodeSettings
-from tests.support.canopen_bench import QUIET, Bench, converse, unpack
+from tests.support.simulated_modules import QUIET, CanopenBench, run_script, unpack
 
 MANUAL: list[tuple[str, Callable[[], RequestScript[None]]]] = [
     ("23 A0 20 00 09 00 00 00", lambda: session.set_node_id(8, 9)),
@@ -47,8 +47,8 @@ def test_rate_commands_of_the_manual(tpdo: TpdoNumber, period_ms: int) -> None:
 
 @pytest.mark.parametrize("invert", [False, True])
 def test_the_sign_of_y_has_its_own_object(invert: bool) -> None:
-    bench = Bench()
-    bench.hold(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
+    bench = CanopenBench()
+    bench.run_script(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
     assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
 
 
@@ -59,8 +59,8 @@ def test_a_period_below_the_shortest_is_not_sent(period_ms: int) -> None:
 
 
 def test_identify() -> None:
-    bench = Bench()
-    identity = bench.hold(session.identify(8))
+    bench = CanopenBench()
+    identity = bench.run_script(session.identify(8))
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14", "0x17080042", "0x0000009C")
     assert identity.details is not None
     assert identity.details["device type"] == "0x00000000"
@@ -69,16 +69,16 @@ def test_identify() -> None:
 
 
 def test_identify_tells_of_a_node_that_does_not_send() -> None:
-    bench = Bench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=200))
-    bench.hold(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
+    bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=200))
+    bench.run_script(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
     bench.run(1_000_000_000)
-    identity = bench.hold(session.identify(8))
+    identity = bench.run_script(session.identify(8))
     assert identity.details is not None
     assert identity.details["NMT state"] == "pre-operational"
 
 
 def test_read_settings() -> None:
-    settings = Bench(NodeSettings()).hold(session.read_settings(8))
+    settings = CanopenBench(NodeSettings()).run_script(session.read_settings(8))
     assert settings["1800.2"] == "255"
     assert settings["1804.5"] == "50"
     assert settings["1805.5"] == "10"
@@ -97,20 +97,20 @@ def test_what_a_node_does_not_know_is_left_out() -> None:
         assert request.is_rejection(reply)
         return Rejection((reply,))
 
-    identity = converse(session.identify(8), refuse)
+    identity = run_script(session.identify(8), refuse)
     assert (identity.product, identity.details) == ("", {})
     assert asked[:6] == [(0x1000, 0), (0x1008, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4)]
-    assert converse(session.read_settings(8), refuse) == {}
+    assert run_script(session.read_settings(8), refuse) == {}
 
 
 def test_a_node_that_is_not_there_does_not_answer() -> None:
     with pytest.raises(NoReply, match="node 9"):
-        Bench().hold(session.identify(9))
+        CanopenBench().run_script(session.identify(9))
 
 
 def test_settings_are_read_back() -> None:
-    bench = Bench()
-    bench.hold(session.set_tpdo_period(8, 7, 20))
+    bench = CanopenBench()
+    bench.run_script(session.set_tpdo_period(8, 7, 20))
     assert bench.sent[-1] == (0x608, bytes.fromhex("40 05 18 05 00 00 00 00"))
     assert bench.module.objects.settings.periods_ms[7] == 20
 
@@ -122,23 +122,23 @@ def test_a_setting_that_reads_back_otherwise_is_refused() -> None:
         return Reply((ReplyFrame(0x588, bytes([command]) + data[1:4] + b"\7\0\0\0"),))
 
     with pytest.raises(DeviceRefused, match=r"0x1800\.5 = 10, reads back 7"):
-        converse(session.set_tpdo_period(8, 1, 10), answer)
+        run_script(session.set_tpdo_period(8, 1, 10), answer)
 
 
 def test_a_refused_write_says_why() -> None:
-    bench = Bench()
+    bench = CanopenBench()
     with pytest.raises(Aborted, match="invalid value"):
-        bench.hold(cia301.write_object(8, 0x20A0, 0, 200, 4))
+        bench.run_script(cia301.write_object(8, 0x20A0, 0, 200, 4))
 
 
 @pytest.mark.parametrize("command", NmtCommand)
 def test_nmt_commands(command: NmtCommand) -> None:
-    bench = Bench(boot_ms=100)
+    bench = CanopenBench(boot_ms=100)
     bench.run(200_000_000)
-    booted = bench.hold(session.nmt(8, command))
+    booted = bench.run_script(session.nmt(8, command))
     assert bench.sent[-1] == (0x000, bytes([command.value, 8]))
     assert booted == command.name.startswith("RESET")
 
 
 def test_a_reset_without_boot_up_message() -> None:
-    assert Bench().hold(session.nmt(9, NmtCommand.RESET_NODE)) is False
+    assert CanopenBench().run_script(session.nmt(9, NmtCommand.RESET_NODE)) is False

@@ -41,7 +41,7 @@ def stream(kinds: Mapping[int, int], bursts: Iterable[int], period_ns: int = PER
     return frames
 
 
-class Rig:
+class AssemblyBench:
     def __init__(self, kinds: Iterable[int] | None = None) -> None:
         self.ledger = Ledger()
         self.assembly = Assembly(self.ledger, None if kinds is None else set(kinds))
@@ -67,8 +67,8 @@ class Rig:
         return dict(self.made)[burst]
 
 
-def learnt(kinds: Mapping[int, int], bursts: int = 40) -> Rig:
-    rig = Rig()
+def learnt(kinds: Mapping[int, int], bursts: int = 40) -> AssemblyBench:
+    rig = AssemblyBench()
     rig.feed(stream(kinds, range(bursts)))
     assert rig.ledger.lost_gap_device == 0
     return rig
@@ -85,7 +85,7 @@ def whole(kinds: Mapping[int, int], burst: int) -> tuple[int, ...]:
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING, {4: 1}, {1: 3, 2: 1, 4: 3, 6: 7}])
 @pytest.mark.parametrize("begin", [0, 1, 2, 3])
 def test_every_burst_becomes_one_sample_once_learnt(kinds: dict[int, int], begin: int) -> None:
-    rig = Rig()
+    rig = AssemblyBench()
     frames = stream(kinds, range(200))[begin:]
     made = rig.feed(frames)
     assert made[0] <= LEARNING + 2
@@ -252,7 +252,7 @@ def test_a_kind_that_does_not_divide_the_rate_stays_out() -> None:
     frames = sorted(
         [*stream({1: 1, 2: 1}, range(200), 20 * MS), *stream({6: 1}, range(80), 50 * MS)], key=lambda frame: frame.t_ns
     )
-    rig = Rig()
+    rig = AssemblyBench()
     rig.feed(frames)
     assert all(names == (1, 2) for _, names in rig.made)
     assert len(rig.made) >= 190
@@ -260,14 +260,14 @@ def test_a_kind_that_does_not_divide_the_rate_stays_out() -> None:
 
 def test_order_alone_keeps_two_bursts_apart() -> None:
     """Without times: 1 and 3 of a burst, then 2 and 3 of the next; 2 stands before the 3 that is held."""
-    rig = Rig()
+    rig = AssemblyBench()
     rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
     frames = without(stream(EQUAL, range(30, 40)), lambda f: (f.burst, f.kind) in ((32, 2), (33, 1)))
     assert rig.feed(frame._replace(t_ns=0) for frame in frames) == [30, 31, *range(34, 40)]
 
 
 def test_only_the_kinds_that_are_asked_for() -> None:
-    rig = Rig({1, 3})
+    rig = AssemblyBench({1, 3})
     made = rig.feed(stream(MIXED, range(60)))
     assert made == list(range(made[0], 60))
     assert all(names == tuple(k for k in whole(MIXED, b) if k in (1, 3)) for b, names in rig.made if b > 12)
@@ -286,7 +286,7 @@ def test_reset_gives_up_what_is_held() -> None:
 
 
 def test_learning_is_not_misled_by_loss() -> None:
-    rig = Rig()
+    rig = AssemblyBench()
     frames = without(stream(EQUAL, range(30)), lambda f: f.burst in (2, 4) and f.kind == 2)
     made = rig.feed(frames)
     assert made == list(range(made[0], 30))
@@ -296,7 +296,7 @@ def test_learning_is_not_misled_by_loss() -> None:
 
 def test_a_slower_kind_does_not_become_a_fast_one_by_loss() -> None:
     """Whole bursts are lost between its first ones, so that it seems to be in every burst."""
-    rig = Rig()
+    rig = AssemblyBench()
     lost = {(7, 1), (9, 1), (10, 1), (14, 1), (19, 1)}
     rig.feed(frame for frame in stream({1: 1, 2: 2}, range(1, 80)) if (frame.burst, frame.kind) not in lost)
     assert [made for made in rig.made if made[0] >= 25] == [
@@ -305,7 +305,7 @@ def test_a_slower_kind_does_not_become_a_fast_one_by_loss() -> None:
 
 
 def test_frames_without_times_are_put_together_by_their_order() -> None:
-    rig = Rig()
+    rig = AssemblyBench()
     made = rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
     assert made == list(range(5, 30))
 
@@ -315,7 +315,7 @@ def test_frames_without_times_are_put_together_by_their_order() -> None:
 def test_periods_are_never_mixed(seed: int, kinds: dict[int, int]) -> None:
     """Any loss, of single frames and of runs, at any time, learning included; each sample is of one burst (`feed`)."""
     random = Random(seed)
-    rig = Rig()
+    rig = AssemblyBench()
     rate = random.choice((0.0, 0.02, 0.2))
     frames: list[Frame] = []
     run = 0

@@ -14,7 +14,7 @@ from imud.devices.hipnuc.j1939.driver import DRIVER
 from imud.formats.j1939 import J1939Id, join
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from tests.support.shared_data import shared
+from tests.support.files import shared
 
 MS = 1_000_000
 NONE = bytes([0xFF]) * 8

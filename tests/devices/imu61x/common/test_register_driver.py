@@ -10,7 +10,7 @@ from imud.devices.imu61x.spi.driver import DRIVER as SPI
 from imud.devices.imu61x.spi.session import SpiDeviceSettings
 from imud.errors import BadArgument
 from imud.sim.imu61x.registers import Imu61xRegisters
-from tests.support.imu61x_bench import over_i2c, over_spi
+from tests.support.simulated_modules import over_i2c, over_spi
 
 
 class Wires:

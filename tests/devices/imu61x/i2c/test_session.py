@@ -7,7 +7,7 @@ from imud.devices.imu61x.common.register_driver import RegisterSettings
 from imud.devices.imu61x.i2c.session import probe, set_up
 from imud.errors import DeviceRefused
 from imud.sim.imu61x.registers import Imu61xRegisters
-from tests.support.imu61x_bench import over_i2c
+from tests.support.simulated_modules import over_i2c
 
 
 @pytest.mark.parametrize(

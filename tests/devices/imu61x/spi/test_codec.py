@@ -14,7 +14,7 @@ from imud.devices.imu61x.spi.session import READ_STATE, SpiDeviceSettings
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.imu61x.registers import Imu61xRegisters
-from tests.support.imu61x_bench import over_spi
+from tests.support.simulated_modules import over_spi
 
 PIPELINE = b"\xde\xad\xbe\xef"
 GOLDEN = bytes.fromhex("8000 003e 0000 0000 8000 ffc1  0000 0000 0000 fffb 0000 0005  ffff 0002".replace(" ", ""))

@@ -6,7 +6,7 @@ from imud.contracts.polling import Transfer, run_transfer_script
 from imud.devices.imu61x.spi.session import SpiDeviceSettings, probe, set_up
 from imud.errors import DeviceRefused, TransferError, Trouble
 from imud.sim.imu61x.registers import Imu61xRegisters
-from tests.support.imu61x_bench import over_spi
+from tests.support.simulated_modules import over_spi
 
 
 class Wire:

@@ -9,7 +9,7 @@ from imud.contracts.action import Target
 from imud.devices.imu61x.uart.actions import ACTIONS
 from imud.devices.imu61x.uart.session import BaudChange
 from imud.errors import BadArgument
-from tests.support.imu61x_bench import Imu61xBench, bench
+from tests.support.simulated_modules import Imu61xBench, imu61x_bench
 
 
 def act(far: Imu61xBench, name: str, **arguments: Any) -> object:
@@ -19,7 +19,7 @@ def act(far: Imu61xBench, name: str, **arguments: Any) -> object:
 
 
 def test_stop_and_start() -> None:
-    far = bench()
+    far = imu61x_bench()
     act(far, "stop_streaming")
     assert not far.samples(50)
     assert act(far, "start_streaming") is True
@@ -27,7 +27,7 @@ def test_stop_and_start() -> None:
 
 
 def test_parameters_are_set_and_stay() -> None:
-    far = bench()
+    far = imu61x_bench()
     act(far, "rate", rate_hz=200)
     act(far, "filter", accel_filter=3, gyro_filter=5)
     act(far, "i2c_address", address=0x19)
@@ -39,13 +39,13 @@ def test_parameters_are_set_and_stay() -> None:
 
 
 def test_baud_is_followed() -> None:
-    far = bench()
+    far = imu61x_bench()
     assert act(far, "baud", baud=460800) == BaudChange(460800, saved=True)
     assert far.line_baud == far.module.baud == 460800
 
 
 def test_calibrations_answer_three_numbers() -> None:
-    far = bench()
+    far = imu61x_bench()
     for name in ("calibrate_gyro", "calibrate_installation"):
         answer = act(far, name)
         assert isinstance(answer, tuple)
@@ -55,7 +55,7 @@ def test_calibrations_answer_three_numbers() -> None:
 
 
 def test_restart_and_factory_reset_keep_contact() -> None:
-    far = bench()
+    far = imu61x_bench()
     act(far, "baud", baud=921600)
     assert getattr(act(far, "restart"), "product", "") == "IMU61x"
     act(far, "factory_reset")
@@ -91,7 +91,7 @@ def test_restart_and_factory_reset_keep_contact() -> None:
     ],
 )
 def test_what_the_device_would_not_take_is_refused(name: str, arguments: dict[str, Any], named: str) -> None:
-    far = bench()
+    far = imu61x_bench()
     with pytest.raises(BadArgument, match=named):
         act(far, name, **arguments)
     assert not far.asked

@@ -9,13 +9,13 @@ from imud.devices.hipnuc.uart import commands
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.physics.motion import Still
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.hipnuc_bench import FAST, STILL, Bench
+from tests.support.simulated_modules import FAST, HIPNUC_STILL, HipnucUartBench
 
 VERSION = ["PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK"]
 
 
 def test_the_vendors_probe_finds_it() -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     for _ in range(3):
         assert bench.ask("LOG DISABLE") == ["OK"]
     assert bench.wait(100.0) == []
@@ -25,7 +25,7 @@ def test_the_vendors_probe_finds_it() -> None:
 
 
 def test_replies_stand_between_whole_frames() -> None:
-    bench = Bench(FAST)
+    bench = HipnucUartBench(FAST)
     for _ in range(20):
         bench.module.receive(b"LOG VERSION\r\n", bench.now_ns)
         bench.now_ns += 3 * NS_PER_MS
@@ -47,7 +47,7 @@ def test_replies_stand_between_whole_frames() -> None:
     ],
 )
 def test_line_ends_and_garbage_before_a_command(line: str) -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     bench.module.receive(line.encode("latin-1"), bench.now_ns)
     assert bench.text(30.0) == VERSION
 
@@ -56,7 +56,7 @@ def test_line_ends_and_garbage_before_a_command(line: str) -> None:
     "line", ["", "HELLO", "log version", "LOG", "LOG VERSIONS", "LOG HI93 ONTIME 1", "CONFIG ATT", "AT+RST", "X" * 5000]
 )
 def test_unknown_commands_get_no_reply(line: str) -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     assert bench.ask(line) == []
     assert bench.ask("LOG VERSION") == VERSION
     assert bench.module.settings == ModuleSettings()
@@ -66,19 +66,19 @@ def test_a_line_above_128_bytes_is_no_command() -> None:
     identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
     fits, too_long = ("CONFIG IMU URFR " + ",".join(f"{n:.{digits}f}" for n in identity) for digits in (9, 10))
     assert len(fits) <= 128 < len(too_long)
-    assert Bench().ask(fits) == ["OK"]
-    assert Bench().ask(too_long) == []
+    assert HipnucUartBench().ask(fits) == ["OK"]
+    assert HipnucUartBench().ask(too_long) == []
 
 
 def test_commands_split_anyhow_are_the_same() -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     for byte in b"LOG VERSION\r\n":
         bench.module.receive(bytes([byte]), bench.now_ns)
     assert bench.text(30.0) == VERSION
 
 
 def test_a_booting_module_hears_nothing() -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     bench.module.receive(b"REBOOT\r\nLOG VERSION\r\n", bench.now_ns)
     assert bench.ask("LOG VERSION", 800.0) == []
     bench.reboot()
@@ -86,7 +86,7 @@ def test_a_booting_module_hears_nothing() -> None:
 
 
 def test_reboot_forgets_what_was_not_saved_and_restarts_time() -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     assert bench.ask("LOG HI91 ONTIME 0.02") == ["OK"]
     assert bench.ask("SAVECONFIG") == ["OK"]
     assert bench.ask("LOG HI91 ONTIME 0.1") == ["OK"]
@@ -98,7 +98,7 @@ def test_reboot_forgets_what_was_not_saved_and_restarts_time() -> None:
 
 
 def test_reboot_cuts_the_frame_on_the_wire() -> None:
-    bench = Bench(ModuleSettings(baud=9600, hi91=Output(100)), HipnucHardware(skew_ppm=0, processing_ns=0))
+    bench = HipnucUartBench(ModuleSettings(baud=9600, hi91=Output(100)), HipnucHardware(skew_ppm=0, processing_ns=0))
     bench.wait(100.0 + 41.5 * 10 / 9.6)
     bench.module.receive(b"REBOOT\r\n", bench.now_ns)
     (burst,) = bench.wait(300.0)
@@ -107,7 +107,7 @@ def test_reboot_cuts_the_frame_on_the_wire() -> None:
 
 
 def test_baud_changes_after_save_and_reboot_only() -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     assert bench.ask("SERIALCONFIG 921600") == ["OK"]
     assert bench.module.baud == 115_200
     assert "BAUD: 921600" in bench.ask("LOG COMCONFIG")
@@ -121,7 +121,7 @@ def test_baud_changes_after_save_and_reboot_only() -> None:
 
 
 def test_factory_reset_restores_everything() -> None:
-    bench = Bench(FAST)
+    bench = HipnucUartBench(FAST)
     assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
     assert bench.ask("FRESET") == ["OK"]
     assert bench.module.baud == 921_600
@@ -132,7 +132,7 @@ def test_factory_reset_restores_everything() -> None:
 
 
 def test_magconfig_and_usrconfig_have_the_manuals_form() -> None:
-    bench = Bench(hardware=HipnucHardware(mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
+    bench = HipnucUartBench(hardware=HipnucHardware(mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
     assert bench.ask("LOG MAGCONFIG") == ["MB=14.14, -2.08, -8.75", "OK"]
     assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 0"
     assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
@@ -144,7 +144,7 @@ def test_magconfig_and_usrconfig_have_the_manuals_form() -> None:
 
 @pytest.mark.parametrize("mounting", commands.Mounting)
 def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: commands.Mounting) -> None:
-    bench = Bench(hardware=STILL)
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
     before = bench.frames(20.0)[-1]
     assert bench.ask(commands.mounting(mounting).name) == ["OK"]
     assert bench.frames(20.0)[-1].accel_g == before.accel_g
@@ -159,7 +159,7 @@ def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: command
 
 
 def test_relative_level_zeroes_roll_and_pitch_and_can_be_cancelled() -> None:
-    bench = Bench(hardware=STILL)
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
     assert bench.ask("CONFIG ATT RST 2") == ["OK"]
     levelled = bench.frames(20.0)[-1]
@@ -170,7 +170,7 @@ def test_relative_level_zeroes_roll_and_pitch_and_can_be_cancelled() -> None:
 
 
 def test_automatic_level_turns_the_accelerometer_too() -> None:
-    bench = Bench(hardware=STILL)
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.ask("CONFIG ATT RST 3") == ["OK"]
     frame = bench.frames(20.0)[-1]
     assert frame.euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
@@ -178,10 +178,10 @@ def test_automatic_level_turns_the_accelerometer_too() -> None:
 
 
 def test_automatic_level_upside_down_and_too_steep() -> None:
-    steep = Bench(hardware=HipnucHardware(motion=Still(radians(2), radians(6), 0.0)))
+    steep = HipnucUartBench(hardware=HipnucHardware(motion=Still(radians(2), radians(6), 0.0)))
     assert steep.ask("CONFIG ATT RST 3") == ["ERR"]
     assert steep.frames(20.0)[-1].euler_deg[1] == pytest.approx(6.0, abs=1e-4)
-    turned = Bench(hardware=HipnucHardware(motion=Still(radians(-177), radians(1), 0.0)))
+    turned = HipnucUartBench(hardware=HipnucHardware(motion=Still(radians(-177), radians(1), 0.0)))
     assert turned.ask("CONFIG ATT RST 3") == ["OK"]
     roll, pitch, _ = turned.frames(20.0)[-1].euler_deg
     assert abs(roll) == pytest.approx(180.0, abs=1e-4)
@@ -189,7 +189,7 @@ def test_automatic_level_upside_down_and_too_steep() -> None:
 
 
 def test_level_survives_a_reboot_if_saved() -> None:
-    bench = Bench(hardware=STILL)
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
     bench.ask("CONFIG ATT RST 2")
     bench.ask("SAVECONFIG")
     bench.reboot()
@@ -197,7 +197,7 @@ def test_level_survives_a_reboot_if_saved() -> None:
 
 
 def test_yaw_absolute_and_relative_is_lost_at_reboot() -> None:
-    bench = Bench(hardware=STILL)
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
     for command, yaw_deg in (("CONFIG YAW 1 16", 16.0), ("CONFIG YAW 0 1.5", 17.5), ("CONFIG YAW 1 -170", -170.0)):
         assert bench.ask(command) == ["OK"]
         assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, yaw_deg), abs=1e-4)
@@ -208,4 +208,4 @@ def test_yaw_absolute_and_relative_is_lost_at_reboot() -> None:
 
 @pytest.mark.parametrize("line", ["CONFIG ATT RST 4", "CONFIG YAW 2 0", "CONFIG YAW 1 181", "CONFIG YAW 1 nan"])
 def test_bad_values_are_refused(line: str) -> None:
-    assert Bench().ask(line) == ["ERR"]
+    assert HipnucUartBench().ask(line) == ["ERR"]

@@ -11,7 +11,7 @@ from imud.sim.physics.motion import Still, swing
 from imud.sim.ports.pins import Pin, PinEdge
 from imud.sim.simulator import Burst
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.hipnuc_bench import BEGIN_NS, FAST, STILL, Bench
+from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench
 
 HIGH_NS = 80_000
 
@@ -23,14 +23,14 @@ def pulses(edges: list[PinEdge], pin: Pin) -> list[tuple[PinEdge, PinEdge]]:
     return list(zip(mine[::2], mine[1::2], strict=True))
 
 
-def run(bench: Bench, duration_ms: float) -> tuple[list[Burst], list[PinEdge]]:
+def run(bench: HipnucUartBench, duration_ms: float) -> tuple[list[Burst], list[PinEdge]]:
     bursts = bench.wait(duration_ms)
     return bursts, bench.module.pins(bench.now_ns)
 
 
 @pytest.mark.parametrize("settings", [ModuleSettings(), FAST, ModuleSettings(baud=115_200, hi91=Output(1))])
 def test_each_frame_has_its_pulse_right_before_it(settings: ModuleSettings) -> None:
-    bench = Bench(settings)
+    bench = HipnucUartBench(settings)
     bursts, edges = run(bench, 1000.0)
     wire_ns = 82 * 10 * NS_PER_S // settings.baud
     found = pulses(edges, Pin.SOUT)[: len(bursts)]
@@ -43,14 +43,14 @@ def test_each_frame_has_its_pulse_right_before_it(settings: ModuleSettings) -> N
 
 
 def test_frames_that_do_not_fit_the_wire_have_no_pulse() -> None:
-    bench = Bench(ModuleSettings(baud=115_200, hi91=Output(1)))
+    bench = HipnucUartBench(ModuleSettings(baud=115_200, hi91=Output(1)))
     _, edges = run(bench, 1000.0)
     assert bench.module.frames_dropped > 800
     assert len(pulses(edges, Pin.SOUT)) == pytest.approx(bench.module.frames_sent, abs=6)  # those in the buffer
 
 
 def test_both_messages_have_a_pulse_each() -> None:
-    bench = Bench(ModuleSettings(baud=921_600, hi91=Output(10), hi92=Output(10)))
+    bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(10), hi92=Output(10)))
     bursts, edges = run(bench, 1000.0)
     assert len(bursts) == pytest.approx(200, abs=2)
     for burst, (_, fall) in zip(bursts, pulses(edges, Pin.SOUT), strict=True):
@@ -58,7 +58,7 @@ def test_both_messages_have_a_pulse_each() -> None:
 
 
 def test_text_has_no_pulse() -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     bench.ask("UNLOGALL")
     bench.module.pins(bench.now_ns)
     assert bench.ask("LOG VERSION")[-1] == "OK"
@@ -66,7 +66,7 @@ def test_text_has_no_pulse() -> None:
 
 
 def test_the_pulse_is_no_longer_than_the_time_it_has() -> None:
-    _, edges = run(Bench(hardware=HipnucHardware(processing_ns=30_000, skew_ppm=0)), 100.0)
+    _, edges = run(HipnucUartBench(hardware=HipnucHardware(processing_ns=30_000, skew_ppm=0)), 100.0)
     for rise, fall in pulses(edges, Pin.SOUT):
         assert fall.due_ns - rise.due_ns == 30_000
         assert rise.due_ns == rise.sample_ns
@@ -74,8 +74,8 @@ def test_the_pulse_is_no_longer_than_the_time_it_has() -> None:
 
 def test_edges_come_in_order_whatever_the_steps() -> None:
     settings = ModuleSettings(hi91=Output(5), hi92=Output(7), baud=921_600, alarm_x=AlarmSetting(-1, 1, True))
-    whole = run(Bench(settings), 500.0)[1]
-    bench = Bench(settings)
+    whole = run(HipnucUartBench(settings), 500.0)[1]
+    bench = HipnucUartBench(settings)
     steps = [edge for _ in range(5000) for edge in run(bench, 0.1)[1]]
     assert steps == whole
     assert all(after.due_ns >= before.due_ns for before, after in pairwise(whole))
@@ -83,7 +83,7 @@ def test_edges_come_in_order_whatever_the_steps() -> None:
 
 
 def test_next_pin_ns_never_misses_an_edge() -> None:
-    bench = Bench(ModuleSettings(alarm_y=AlarmSetting(-3, 3, True)))
+    bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-3, 3, True)))
     edges: list[PinEdge] = []
     while bench.now_ns < BEGIN_NS + 1500 * NS_PER_MS:
         next_ns = bench.module.next_pin_ns()
@@ -97,7 +97,7 @@ def test_next_pin_ns_never_misses_an_edge() -> None:
 
 
 def test_pins_that_nobody_watches_cost_no_memory() -> None:
-    bench = Bench(FAST)
+    bench = HipnucUartBench(FAST)
     bench.wait(10_000.0)
     assert len(bench.module.pins(bench.now_ns)) <= 8192
 
@@ -107,7 +107,7 @@ def test_pins_that_nobody_watches_cost_no_memory() -> None:
 
 @pytest.mark.parametrize("divider", [1, 4, 8, 64])
 def test_every_nth_pulse_is_repeated(divider: int) -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     assert bench.ask(sout_divider(divider).payload.decode().strip()) == ["OK"]
     bench.module.pins(bench.now_ns)
     _, edges = run(bench, 2000.0)
@@ -119,7 +119,7 @@ def test_every_nth_pulse_is_repeated(divider: int) -> None:
 
 
 def test_a_new_divider_counts_anew() -> None:
-    bench = Bench(hardware=STILL)
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
     bench.wait(45.0)  # within eight pulses
     bench.module.pins(bench.now_ns)
     assert bench.ask("CONFIG PMUX4 DIV20", 0.5) == []
@@ -128,7 +128,7 @@ def test_a_new_divider_counts_anew() -> None:
 
 
 def test_the_factory_divides_by_eight() -> None:
-    _, edges = run(Bench(), 1000.0)
+    _, edges = run(HipnucUartBench(), 1000.0)
     periods = [(b.due_ns - a.due_ns) / NS_PER_MS for (a, _), (b, _) in pairwise(pulses(edges, Pin.SOUT_DIV))]
     assert periods == pytest.approx([80.0] * len(periods), rel=1e-4)  # manual, PMUX4
     assert len(periods) >= 11
@@ -139,7 +139,7 @@ def test_the_factory_divides_by_eight() -> None:
 
 def test_alarm_follows_the_angles() -> None:
     motion = swing()
-    bench = Bench(hardware=HipnucHardware(motion=motion, skew_ppm=0))
+    bench = HipnucUartBench(hardware=HipnucHardware(motion=motion, skew_ppm=0))
     assert bench.ask(alarm(AlarmAxis.Y, -5, 5, enabled=True).payload.decode().strip()) == ["OK"]
     edges = [edge for edge in run(bench, 20_000.0)[1] if edge.pin is Pin.ALARM]
     assert len(edges) > 4
@@ -166,12 +166,12 @@ def test_alarm_follows_the_angles() -> None:
 )
 def test_which_angle_alarms(alarm_x: AlarmSetting, alarm_y: AlarmSetting, expected: bool) -> None:
     hardware = HipnucHardware(motion=Still(radians(2), radians(7), 0.0))
-    _, edges = run(Bench(ModuleSettings(alarm_x=alarm_x, alarm_y=alarm_y), hardware), 100.0)
+    _, edges = run(HipnucUartBench(ModuleSettings(alarm_x=alarm_x, alarm_y=alarm_y), hardware), 100.0)
     assert [edge.rising for edge in edges if edge.pin is Pin.ALARM] == [True] * expected
 
 
 def test_alarm_ends_when_it_is_turned_off() -> None:
-    bench = Bench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), STILL)
+    bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
     run(bench, 100.0)
     assert bench.ask("CONFIG PMUX5 Y,-1,1,0,0") == ["OK"]
     assert [edge.rising for edge in bench.module.pins(bench.now_ns) if edge.pin is Pin.ALARM] == [False]
@@ -181,7 +181,7 @@ def test_alarm_ends_when_it_is_turned_off() -> None:
 
 
 def test_without_power_all_pins_are_low_and_nothing_comes() -> None:
-    bench = Bench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), STILL)
+    bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
     edges = run(bench, 105.0)[1]
     rise_ns = edges[-1].due_ns + 10 * NS_PER_MS  # no skew: SOUT falls every 10 ms, so here it is high or about to be
     bench.now_ns = rise_ns - 40_000
@@ -199,7 +199,7 @@ def test_without_power_all_pins_are_low_and_nothing_comes() -> None:
 
 
 def test_a_trigger_is_answered_125_us_later_on_average() -> None:
-    bench = Bench(ModuleSettings(baud=921_600, hi91=Output(on_mark=True)))
+    bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(on_mark=True)))
     delays, wire_ns = [], 82 * 10 * NS_PER_S // 921_600
     for _ in range(1000):
         marked_ns = bench.now_ns
@@ -214,7 +214,7 @@ def test_a_trigger_is_answered_125_us_later_on_average() -> None:
 
 
 def test_the_pps_stamp_is_cut_off_to_whole_ms() -> None:
-    bench = Bench(FAST, STILL)
+    bench = HipnucUartBench(FAST, HIPNUC_STILL)
     bench.wait(0.7)
     bench.module.mark(bench.now_ns)
     frame = bench.frames(3.0)[-1]
@@ -222,7 +222,7 @@ def test_the_pps_stamp_is_cut_off_to_whole_ms() -> None:
 
 
 def test_a_booting_module_sees_no_pulse() -> None:
-    bench = Bench(FAST, STILL)
+    bench = HipnucUartBench(FAST, HIPNUC_STILL)
     bench.module.reboot(bench.now_ns)
     bench.wait(100.0)
     bench.module.mark(bench.now_ns)

@@ -18,13 +18,13 @@ from imud.sim.physics.motion import Still, swing
 from imud.sim.physics.noise import Noise
 from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.hipnuc_bench import BEGIN_NS, FAST, STILL, Bench, hi91
+from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench, unpack_hi91
 
 # --- frames and time --------------------------------------------------------------------------------------------------
 
 
 def test_factory_output_is_hi91_at_100_hz() -> None:
-    frames = Bench().frames(1000.0)
+    frames = HipnucUartBench().frames(1000.0)
     assert len(frames) == pytest.approx(100, abs=1)
     assert {after.system_time_ms - before.system_time_ms for before, after in pairwise(frames)} == {10}
 
@@ -32,37 +32,37 @@ def test_factory_output_is_hi91_at_100_hz() -> None:
 def test_it_is_silent_while_booting_and_its_time_starts_near_zero() -> None:
     module = HipnucModule(BEGIN_NS)
     assert module.advance(BEGIN_NS + 500 * NS_PER_MS) == []
-    assert hi91(module.advance(BEGIN_NS + 520 * NS_PER_MS)[0].data).system_time_ms == 510
+    assert unpack_hi91(module.advance(BEGIN_NS + 520 * NS_PER_MS)[0].data).system_time_ms == 510
 
 
 @pytest.mark.parametrize("skew_ppm", [-50_000.0, -80.0, 0.0, 123.4, 50_000.0])
 def test_samples_stand_on_milliseconds_of_its_own_crystal(skew_ppm: float) -> None:
-    bench = Bench(FAST, HipnucHardware(skew_ppm=skew_ppm, processing_ns=0))
+    bench = HipnucUartBench(FAST, HipnucHardware(skew_ppm=skew_ppm, processing_ns=0))
     bursts = bench.wait(2000.0)
     assert len(bursts) == pytest.approx(2000 * (1 + skew_ppm / 1e6), abs=2)
     for burst in bursts:
         assert burst.sample_ns
-        assert burst.device_ms == hi91(burst.data).system_time_ms
+        assert burst.device_ms == unpack_hi91(burst.data).system_time_ms
         true_ms = (burst.sample_ns - BEGIN_NS) / NS_PER_MS * (1 + skew_ppm / 1e6)
         assert true_ms == pytest.approx(burst.device_ms, abs=2e-6)
 
 
 @pytest.mark.parametrize("skew_ppm", [-333.3, 20.0, 50_000.0])
 def test_settings_changed_at_the_instant_of_a_sample_repeat_none(skew_ppm: float) -> None:
-    bench = Bench(FAST, HipnucHardware(skew_ppm=skew_ppm))
+    bench = HipnucUartBench(FAST, HipnucHardware(skew_ppm=skew_ppm))
     instants = [burst.sample_ns or 0 for burst in bench.wait(200.0)][50:]
-    bench = Bench(FAST, HipnucHardware(skew_ppm=skew_ppm))
+    bench = HipnucUartBench(FAST, HipnucHardware(skew_ppm=skew_ppm))
     for instant_ns in instants:
         bench.module.receive(b"LOG ENABLE\r\n", instant_ns)
-    times = [hi91(burst.data).system_time_ms for burst in bench.wait(300.0) if burst.sample_ns]
+    times = [unpack_hi91(burst.data).system_time_ms for burst in bench.wait(300.0) if burst.sample_ns]
     assert {after - before for before, after in pairwise(times)} == {1}
 
 
 def test_frame_carries_the_truth_of_its_instant() -> None:
     motion = swing()
-    for burst in Bench(FAST, HipnucHardware(motion=motion)).wait(100.0):
+    for burst in HipnucUartBench(FAST, HipnucHardware(motion=motion)).wait(100.0):
         assert burst.sample_ns
-        truth, frame = motion.at((burst.sample_ns - BEGIN_NS) / NS_PER_S), hi91(burst.data)
+        truth, frame = motion.at((burst.sample_ns - BEGIN_NS) / NS_PER_S), unpack_hi91(burst.data)
         assert frame.accel_g == pytest.approx([value / 9.8 for value in truth.accel_m_s2], abs=1e-6)
         assert frame.gyro_deg_s == pytest.approx([degrees(value) for value in truth.gyro_rad_s], abs=1e-4)
         assert frame.mag_ut == pytest.approx([value * 1e6 for value in truth.mag_t], abs=1e-5)
@@ -73,20 +73,20 @@ def test_frame_carries_the_truth_of_its_instant() -> None:
 
 
 def test_at_rest_it_reads_one_g() -> None:
-    (frame, *_) = Bench(hardware=STILL).frames(20.0)
+    (frame, *_) = HipnucUartBench(hardware=HIPNUC_STILL).frames(20.0)
     assert hypot(*frame.accel_g) == pytest.approx(1.0, abs=1e-6)
     assert frame.gyro_deg_s == (0.0, 0.0, 0.0)
 
 
 def test_frame_leaves_after_processing_and_wire_time() -> None:
     settings = ModuleSettings(baud=115_200)
-    for burst in Bench(settings, HipnucHardware(processing_ns=125_000)).wait(50.0):
+    for burst in HipnucUartBench(settings, HipnucHardware(processing_ns=125_000)).wait(50.0):
         assert burst.sample_ns
         assert burst.due_ns - burst.sample_ns == 125_000 + 82 * 10 * NS_PER_S // 115_200
 
 
 def test_next_ns_is_exactly_when_something_comes() -> None:
-    bench = Bench(FAST)
+    bench = HipnucUartBench(FAST)
     for _ in range(50):
         next_ns = bench.module.next_ns()
         assert next_ns is not None
@@ -95,12 +95,12 @@ def test_next_ns_is_exactly_when_something_comes() -> None:
 
 
 def test_any_steps_give_the_same_bytes() -> None:
-    coarse, fine = Bench(FAST), Bench(FAST)
+    coarse, fine = HipnucUartBench(FAST), HipnucUartBench(FAST)
     assert coarse.wait(60.0) == [burst for _ in range(240) for burst in fine.wait(0.25)]
 
 
 def test_what_does_not_fit_the_wire_is_never_sent() -> None:
-    bench = Bench(ModuleSettings(baud=115_200, hi91=Output(1)))
+    bench = HipnucUartBench(ModuleSettings(baud=115_200, hi91=Output(1)))
     bursts = bench.wait(1000.0)
     assert len(bursts) == pytest.approx(115_200 / 820, abs=2)
     ends = [burst.due_ns for burst in bursts]
@@ -110,13 +110,13 @@ def test_what_does_not_fit_the_wire_is_never_sent() -> None:
 
 
 def test_both_messages_share_the_wire() -> None:
-    bench = Bench(ModuleSettings(hi91=Output(20), hi92=Output(50)))
+    bench = HipnucUartBench(ModuleSettings(hi91=Output(20), hi92=Output(50)))
     sizes = [len(burst.data) for burst in bench.wait(1000.0)]
     assert (sizes.count(82), sizes.count(54)) == pytest.approx((50, 20), abs=1)
 
 
 def test_system_time_wraps_at_32_bits() -> None:
-    frames = Bench(hardware=HipnucHardware(uptime_ms=2**32 - 700)).frames(1000.0)
+    frames = HipnucUartBench(hardware=HipnucHardware(uptime_ms=2**32 - 700)).frames(1000.0)
     times = [frame.system_time_ms for frame in frames]
     assert times[0] > 2**32 - 250
     assert times[-1] < 1000
@@ -124,25 +124,27 @@ def test_system_time_wraps_at_32_bits() -> None:
 
 @pytest.mark.parametrize(("uptime_ms", "first"), [(0, 510), (8192 * 3 - 505, 3)])
 def test_pps_stamp_free_runs_and_wraps_at_8192(uptime_ms: int, first: int) -> None:
-    frames = Bench(hardware=HipnucHardware(uptime_ms=uptime_ms, skew_ppm=0)).frames(9000.0)
+    frames = HipnucUartBench(hardware=HipnucHardware(uptime_ms=uptime_ms, skew_ppm=0)).frames(9000.0)
     assert frames[0].word_1_2 == pytest.approx(first, abs=10)
     assert all(frame.word_1_2 == frame.system_time_ms % 8192 for frame in frames)
     assert min(frame.word_1_2 for frame in frames) < 10
 
 
 def test_newer_firmware_sends_main_status_instead() -> None:
-    bench = Bench(hardware=HipnucHardware(motion=Still(), firmware=169, skew_ppm=0))
+    bench = HipnucUartBench(hardware=HipnucHardware(motion=Still(), firmware=169, skew_ppm=0))
     early, late = bench.frames(20.0)[0], bench.frames(6000.0)[-1]
     assert early.word_1_2 == 1 << 3 | 1 << 7 | 1 << 9 | 1 << 11 | 1 << 12
     assert late.word_1_2 == 1 << 9 | 1 << 11 | 1 << 12
     assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
     assert bench.frames(20.0)[0].word_1_2 & 1 << 10
-    assert not Bench(hardware=HipnucHardware(firmware=169)).frames(20.0)[0].word_1_2 & 1 << 9
+    assert not HipnucUartBench(hardware=HipnucHardware(firmware=169)).frames(20.0)[0].word_1_2 & 1 << 9
 
 
 def test_noise_is_added_to_vectors_only() -> None:
-    clean = Bench(hardware=STILL).frames(50.0)
-    noisy = Bench(hardware=HipnucHardware(motion=STILL.motion, skew_ppm=0, noise=Noise(1))).frames(50.0)
+    clean = HipnucUartBench(hardware=HIPNUC_STILL).frames(50.0)
+    noisy = HipnucUartBench(hardware=HipnucHardware(motion=HIPNUC_STILL.motion, skew_ppm=0, noise=Noise(1))).frames(
+        50.0
+    )
     assert all(a.accel_g != b.accel_g and a.quat_wxyz == b.quat_wxyz for a, b in zip(clean, noisy, strict=True))
 
 
@@ -150,7 +152,7 @@ def test_noise_is_added_to_vectors_only() -> None:
 
 
 def test_a_pulse_restarts_the_pps_stamp() -> None:
-    bench = Bench(hardware=HipnucHardware(skew_ppm=0))
+    bench = HipnucUartBench(hardware=HipnucHardware(skew_ppm=0))
     bench.wait(125.0)
     bench.module.mark(bench.now_ns)
     frame = bench.frames(40.0)[-1]
@@ -158,7 +160,7 @@ def test_a_pulse_restarts_the_pps_stamp() -> None:
 
 
 def test_marked_messages_come_with_the_pulse_and_once() -> None:
-    bench = Bench()
+    bench = HipnucUartBench()
     assert bench.ask("UNLOGALL") == ["OK"]
     assert bench.ask("LOG HI91 ONMARK 1") == ["OK"]
     assert bench.wait(1000.0) == []
@@ -177,7 +179,7 @@ def test_marked_messages_come_with_the_pulse_and_once() -> None:
 # --- with the codec and its conversations -----------------------------------------------------------------------------
 
 
-def converse(bench: Bench, conversation: RequestScript[Identity]) -> Identity:
+def converse(bench: HipnucUartBench, conversation: RequestScript[Identity]) -> Identity:
     """Run a conversation against the module, frames in between."""
     ledger = Ledger()
     codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), Session(ledger)
@@ -204,12 +206,12 @@ def converse(bench: Bench, conversation: RequestScript[Identity]) -> Identity:
 
 
 def test_identity_is_read_amid_frames() -> None:
-    identity = converse(Bench(FAST), DRIVER.identify())
+    identity = converse(HipnucUartBench(FAST), DRIVER.identify())
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
 
 
 def test_settings_are_read_amid_frames() -> None:
-    settings = converse(Bench(FAST), DRIVER.read_settings())  # type: ignore[arg-type]  # another kind of answer
+    settings = converse(HipnucUartBench(FAST), DRIVER.read_settings())  # type: ignore[arg-type]  # another kind of answer
     assert settings["ATT_MODE"] == "0"  # type: ignore[index]
     assert settings["BAUD"] == "921600"  # type: ignore[index]
 
@@ -242,7 +244,13 @@ def test_the_row_makes_a_module() -> None:
 
 @pytest.mark.parametrize(
     ("rate_hz", "message", "baud"),
-    [(1, "", 115_200), (100, "hi91", 115_200), (200, "HI92", 115_200), (200, "HI91", 230_400), (1000, "", 921_600)],
+    [
+        (1, "", 115_200),
+        (100, "hi91", 115_200),
+        (200, "HI92", 115_200),
+        (200, "HI91", 230_400),
+        (1000, "", 921_600),
+    ],
 )
 def test_baud_follows_from_the_rate(rate_hz: float, message: str, baud: int) -> None:
     assert make(SimulatorOptions(rate_hz=rate_hz, message=message), 0).baud == baud

@@ -10,7 +10,7 @@ from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.physics.motion import Still
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.hipnuc_bench import BEGIN_NS, Frame, hi91
+from tests.support.simulated_modules import BEGIN_NS, Hi91, unpack_hi91
 
 UTC_S = 1_795_000_000
 NO_UTC = 1 << 11
@@ -24,7 +24,7 @@ class Receiver:
         self.second = UTC_S
         self.begin_ns = BEGIN_NS + hardware.boot_ms * NS_PER_MS + 123_456
         """CLOCK_MONOTONIC at `second`."""
-        self.frames: list[tuple[int, Frame]] = []
+        self.frames: list[tuple[int, Hi91]] = []
         """Time of sampling on UTC (ns), frame."""
 
     def utc_ns(self, t_ns: int) -> int:
@@ -48,9 +48,9 @@ class Receiver:
         for burst in self.module.advance(self.begin_ns):
             if burst.sample_ns is None:  # cut by a reboot
                 continue
-            self.frames.append((self.utc_ns(burst.sample_ns), hi91(burst.data)))
+            self.frames.append((self.utc_ns(burst.sample_ns), unpack_hi91(burst.data)))
 
-    def last(self, seconds: int) -> list[tuple[int, Frame]]:
+    def last(self, seconds: int) -> list[tuple[int, Hi91]]:
         return [(utc_ns, frame) for utc_ns, frame in self.frames if utc_ns >= (self.second - seconds) * NS_PER_S]
 
     def error_ms(self, modulus: int = 2**32, seconds: int = 1) -> list[float]:

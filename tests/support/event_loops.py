@@ -1,4 +1,4 @@
-"""Time that passes only when the event loop has nothing to do: hours in milliseconds, and every run the same.
+"""Event loops of tests: one for each test in real time, and one in virtual time, where hours pass in milliseconds.
 
     loop would sleep until t ──▶ the clock jumps to t ──▶ what is due then runs
 
@@ -9,12 +9,26 @@ all depends on how busy the machine is.
 import asyncio
 import selectors
 from collections.abc import Callable, Coroutine
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec
 
 from imud.host_clock import HostClock
 from imud.runtime.polled.bus import PolledBuses
 from imud.units import NS_PER_S
 from imud.worker import Round
+
+P = ParamSpec("P")
+
+
+def in_loop(test: Callable[P, Coroutine[None, None, None]]) -> Callable[P, None]:
+    """Runs a test in an event loop of its own."""
+
+    @wraps(test)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        asyncio.run(test(*args, **kwargs))
+
+    return run
+
 
 DESCRIPTOR_LIMIT_S = 10.0
 """How long, in real time, a loop that waits for nothing but descriptors may wait."""

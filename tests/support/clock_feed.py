@@ -1,4 +1,4 @@
-"""Short ways to feed a clock in tests."""
+"""Table: Measurements in and samples out of a `SampleClock`, as rows of device ticks and host time."""
 
 from collections.abc import Iterable
 from itertools import pairwise

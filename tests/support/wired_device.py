@@ -1,4 +1,4 @@
-"""A simulated HiPNUC module with pins, wired to a runner, in virtual time: bytes and edges come in step."""
+"""A simulated HiPNUC module with pins, wired to a device, in virtual time: bytes and edges come in step."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -20,10 +20,11 @@ from imud.sim.ports.faults import Faults
 from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
 from imud.sim.ports.pins import OnEdge, Pin, PinFaults, Pins
 from imud.units import NS_PER_MS, NS_PER_S
-from imud.utc.source import OnSentence, RmcSettings
+from imud.utc.source import RmcSettings
 from imud.utc.system_clock import KernelClock
 from tests.support.device_rig import DeviceRigs
-from tests.support.virtual_time import LoopWorker, VirtualClock, run_virtually
+from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
+from tests.support.rmc_sources import FakeSource
 
 BEGIN_NS = 1000 * NS_PER_S + 123_456_789
 BAUD = 115_200
@@ -34,27 +35,7 @@ EDGE_LATE_NS = 45_000
 """From the measurement to the rising edge: 125 µs to the frame, of which 80 µs are the pulse."""
 
 
-class FakeSource:
-    """An RMC source whose sentences are the test's."""
-
-    title = "test"
-    problem = ""
-
-    def __init__(self) -> None:
-        self.sentences = 0
-        self.give: OnSentence = lambda _sentence, _t_rx_ns: None
-        self.started = 0
-        self.closed = False
-
-    def start(self, on_sentence: OnSentence) -> None:
-        self.started += 1
-        self.give = on_sentence
-
-    def close(self) -> None:
-        self.closed = True
-
-
-class Wired:
+class WiredDevice:
     """The module, the runner, and the lines between them."""
 
     def __init__(

@@ -1,12 +1,33 @@
-"""Writes captures: the stamped format of docs/captures.md, and the log format of `candump -L`."""
+"""Files that tests read and write: those of the repository, shared recordings, captures and logs of frames."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import BinaryIO, Final
 from urllib.parse import quote
 
+import pytest
+
+from imud.devices.hipnuc.uart.codec import encode_hi91
+from imud.devices.imu61x.can.codec import encode_set
 from imud.formats.can import DATA_BYTES_MAX, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
 from imud.formats.capture import HEADER_BYTES_MAX, MAGIC, RECORD, RECORD_BYTES_MAX, VERSION
 from imud.units import NS_PER_S, NS_PER_US
+
+ROOT: Final = Path(__file__).parents[2]
+SHARED: Final = Path(os.environ.get("IMUD_SHARED") or ROOT.parent / "shared")
+
+
+FOLDER: Final = SHARED / "data"
+
+
+def shared(name: str) -> Path:
+    """The path of a file; skips the test where it is not there."""
+    path = FOLDER / name
+    if not path.is_file():
+        pytest.skip(f"{path} is not there: set IMUD_SHARED to the folder with {name}")
+    return path
+
 
 WRITE_BYTES_MAX: Final = 1 << 30
 """Default bound of a capture being written: 1 GiB, 26 hours at 115200 baud."""
@@ -60,3 +81,42 @@ def candump_line(frame: CanFrame, bus: str = "can0") -> str:
     seconds, ns = divmod(frame.t_rx_ns, NS_PER_S)
     digits = 8 if frame.extended else 3
     return f"({seconds:010d}.{ns // NS_PER_US:06d}) {bus} {frame.can_id:0{digits}X}#{frame.data.hex().upper()}\n"
+
+
+BEGIN_NS = 1_763_717_507_000_000_000
+PERIOD_NS = 10_000_000
+FRAME_NS = 250_000
+
+
+def imu61x_log(indices: Iterable[int]) -> str:
+    """Samples of an IMU61x at rest, 100 a second by their index."""
+    lines = []
+    for index in indices:
+        frames = encode_set(
+            index=index,
+            accel_m_s2=(0, 0, 9.80665),
+            gyro_rad_s=(0, 0, 0),
+            euler_rad=(0.1, 0.2, 0.3),
+            temperature_c=25.5,
+        )
+        t_ns = BEGIN_NS + index * PERIOD_NS
+        for place, (can_id, data) in enumerate(frames):
+            lines.append(candump_line(CanFrame(can_id, False, data, t_ns + place * FRAME_NS)))
+    return "".join(lines)
+
+
+HI91_BYTES = 82
+
+
+def hi91(ms: int, accel_z_m_s2: float = 9.8) -> bytes:
+    """The frame at `ms` of device time."""
+    return encode_hi91(
+        system_time_ms=ms,
+        accel_m_s2=(0.0, 0.0, accel_z_m_s2),
+        gyro_rad_s=(0.0, 0.0, 0.0),
+        mag_t=(0.0, 0.0, 0.0),
+        euler_rad=(0.0, 0.0, 0.0),
+        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
+        temperature_c=20.0,
+        pressure_pa=1e5,
+    )

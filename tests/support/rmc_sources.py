@@ -1,7 +1,9 @@
-"""Keeps the sentences that a source gives."""
+"""Contract: A source of RMC sentences that the test gives, and a receiver of sentences that keeps them."""
 
 import asyncio
 from collections.abc import Callable
+
+from imud.utc.source import OnSentence
 
 LIMIT_S = 10.0
 
@@ -11,11 +13,11 @@ class Sentences:
 
     def __init__(self) -> None:
         self.got: list[tuple[bytes, int]] = []
-        self._told = asyncio.Event()
+        self._arrived = asyncio.Event()
 
     def __call__(self, sentence: bytes, t_rx_ns: int) -> None:
         self.got.append((sentence, t_rx_ns))
-        self._told.set()
+        self._arrived.set()
 
     @property
     def data(self) -> list[bytes]:
@@ -25,10 +27,30 @@ class Sentences:
         """Return when the condition holds, looked at after each sentence."""
         async with asyncio.timeout(LIMIT_S):
             while not condition():
-                self._told.clear()
-                await self._told.wait()
+                self._arrived.clear()
+                await self._arrived.wait()
 
 
 async def soon(_seconds: float) -> None:
     """A pause that is none, for `Retry`."""
     await asyncio.sleep(0)
+
+
+class FakeSource:
+    """An RMC source whose sentences are the test's."""
+
+    title = "test"
+    problem = ""
+
+    def __init__(self) -> None:
+        self.sentences = 0
+        self.give: OnSentence = lambda _sentence, _t_rx_ns: None
+        self.started = 0
+        self.closed = False
+
+    def start(self, on_sentence: OnSentence) -> None:
+        self.started += 1
+        self.give = on_sentence
+
+    def close(self) -> None:
+        self.closed = True

@@ -1,4 +1,7 @@
-"""Device and client records with made-up but consistent numbers, for tests and benchmarks of the metrics."""
+"""Status records with made-up but consistent numbers, and HTTP requests to the server under test."""
+
+import asyncio
+import socket
 
 import msgspec
 
@@ -80,3 +83,29 @@ def equipped(name: str, number: int = 0, **changes: object) -> DeviceStatus:
 def client(number: int, encoding: str = "json", sent: int = 0, dropped: int = 0, queue: int = 0) -> ClientStatus:
     """A client that watches."""
     return ClientStatus(number, 100 + number, 1000, False, encoding, sent, dropped, queue, queue * 256)
+
+
+LIMIT_S = 5.0
+
+
+async def ask(port: int, path: str = "/metrics", method: str = "GET", headers: str = "") -> tuple[str, str, str]:
+    """Status line, head and body of one answer, until the server ends the connection."""
+    async with asyncio.timeout(LIMIT_S):
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(f"{method} {path} HTTP/1.1\r\nHost: x\r\n{headers}\r\n".encode())
+        answer = (await reader.read()).decode()
+        writer.close()
+        await writer.wait_closed()
+    head, _, body = answer.partition("\r\n\r\n")
+    return head.partition("\r\n")[0], head, body
+
+
+def read_all(connection: socket.socket) -> bytes:
+    """Until the far end closes; a connection reset counts as closed."""
+    parts = []
+    try:
+        while part := connection.recv(65536):
+            parts.append(part)
+    except ConnectionResetError:
+        pass
+    return b"".join(parts)

@@ -17,14 +17,14 @@ from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.in_process_bus import InProcessI2c, InProcessSpi
 from imud.sim.ports.lines import MemoryLines
 from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, running
-from tests.support.virtual_time import LoopWorker, VirtualClock, run_virtually
+from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
 
 RATE_HZ = 250.0
 TRANSFER_NS = 160_000
 """What every transfer takes: 32 bytes at 1.6 Mbit/s."""
 
 
-class Stage:
+class PolledBusBench:
     """An SPI bus and an I2C bus, which the links of the configuration open, and the time."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, clock: VirtualClock | None = None) -> None:
@@ -44,7 +44,7 @@ class Stage:
         monkeypatch.setattr("imud.links.i2c.LINK", LinkType("i2c", I2cSettings, make_polled=self._make_i2c))
 
     def registers(self, **more: Any) -> Imu61xRegisters:
-        """A device in the time of the stage."""
+        """A device in the time of the bench."""
         return Imu61xRegisters(self.clock.now_ns, **more)
 
     def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[DeviceRig]]:

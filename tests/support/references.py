@@ -1,0 +1,207 @@
+"""Makes the generated parts of the documents from the code: `python -m tests.support.references`.
+
+The tables of docs/configuration.md come from the settings classes, those of docs/commands.md from the drivers' actions,
+and those of docs/shm.md from the layout of shared memory.
+"""
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Final
+
+import msgspec
+
+from imud.config import TABLES, DeviceGeneral, General
+from imud.contracts.action import Action, Actions, parameters_of
+from imud.contracts.driver import Driver
+from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
+from imud.contracts.settings import Settings, expected, shown
+from imud.devices import DRIVERS
+from imud.formats.ring import HEADER_FIELDS
+from imud.formats.slot import PRESENT_BITS, SLOT_FIELDS, SYNC_CODES, SlotField
+from imud.ledger import LEDGER_FIELDS
+from imud.signals.line_actions import RESET, TRIGGER
+from imud.utc.source import RmcSettings
+from tests.support.files import ROOT
+
+# --- docs/configuration.md --------------------------------------------------------------------------------------------
+
+
+def docs_of(schema: type[Settings]) -> dict[str, str]:
+    """The docstring below each field, its own and those it has from a base class."""
+    found: dict[str, str] = {}
+    for base in reversed(schema.__mro__):
+        if issubclass(base, Settings):
+            found |= _own_docs_of(base)
+    return found
+
+
+def _own_docs_of(schema: type[Settings]) -> dict[str, str]:
+    (made,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
+    assert isinstance(made, ast.ClassDef)
+    found, name = {}, ""
+    for node in made.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            name = node.target.id
+        elif name and isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            found[name] = " ".join(str(node.value.value).split())
+            name = ""
+    return found
+
+
+LINE_TITLES = {name: text.rstrip(".") for name, text in docs_of(DeviceLines).items()}
+
+
+def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
+    """Title, path in the file, and schema of every part."""
+    yield "The daemon", "", General
+    for name, publisher in TABLES.publishers.items():
+        yield f"Output `{name}`", f"{name}.", publisher.settings
+    yield "Each device", "devices.NAME.", DeviceGeneral
+    for name, link in TABLES.links.items():
+        yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings
+    for name, driver in TABLES.drivers.items():
+        yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
+    for name, schema in LINE_SCHEMAS.items():
+        yield f"Line `{name}`: {LINE_TITLES[name]}", f"devices.NAME.lines.{name}.", schema
+    yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcSettings
+
+
+def default_of(field: msgspec.structs.FieldInfo) -> str:
+    """The default as one would write it; file modes in octal."""
+    if field.required:
+        return "needed"
+    octal = field.name == "mode" and isinstance(field.default, int)
+    return f"`{field.default:#o}`" if octal else f"`{shown(field.default)}`"
+
+
+def settings_tables() -> str:
+    """The whole generated part."""
+    text = []
+    for title, path, schema in settings_parts():
+        text += [f"### {title}", "", "| key | expected | default | meaning |", "|---|---|---|---|"]
+        docs = docs_of(schema)
+        for field in msgspec.structs.fields(schema):
+            words = expected(field.type).replace("|", "\\|")
+            text.append(f"| `{path}{field.name}` | {words} | {default_of(field)} | {docs[field.name]} |")
+        if not msgspec.structs.fields(schema):
+            text.append("| (none) | | | |")
+        text.append("")
+    return "\n".join(text)
+
+
+# --- docs/commands.md -------------------------------------------------------------------------------------------------
+
+
+def cell(text: str) -> str:
+    """Text that does not end the cell of a actions_table."""
+    return text.replace("|", "\\|")
+
+
+def meanings_of(action: Action) -> dict[str, str]:
+    """The meaning of each argument: description and unit of its annotation, or the docstring of the struct's field."""
+    found = docs_of(action.params)
+    for field in msgspec.structs.fields(action.parameters):
+        info = msgspec.inspect.type_info(field.type)
+        if isinstance(info, msgspec.inspect.Metadata) and info.extra_json_schema:
+            unit = (info.extra or {}).get("unit")
+            meaning = info.extra_json_schema.get("description", "")
+            found[field.name] = meaning[:1].upper() + meaning[1:] + (f" ({unit})" if unit else "")
+    return found
+
+
+def arguments_of(action: Action) -> str:
+    """What it takes, one after the other, each with what it can be and what it means."""
+    docs = meanings_of(action)
+    words = []
+    for parameter in parameters_of(action):
+        default = "" if parameter.default is None else f"; default `{parameter.default}`"
+        meaning = f": {docs[parameter.name].rstrip('.')}" if parameter.name in docs else ""
+        words.append(f"`{parameter.name}` ({parameter.values}{default}){meaning}")
+    return cell(".<br>".join(words)) or "none"
+
+
+def actions_table(actions: Actions) -> Iterator[str]:
+    """The lines of a driver's actions_table."""
+    yield "| action | arguments | what it does |"
+    yield "|---|---|---|"
+    for name, action in actions.items():
+        yield f"| `{name}` | {arguments_of(action)} | {cell(action.help.rstrip('.'))} |"
+
+
+def actions_part(driver: Driver) -> list[str]:
+    """Title and actions_table of a driver."""
+    lines = list(actions_table(driver.actions)) if driver.actions else ["No actions."]
+    return [f"### `{driver.name}`: {driver.title}", "", *lines, ""]
+
+
+def actions_tables() -> str:
+    """The whole generated actions_part."""
+    lines = [line for driver in DRIVERS.values() for line in actions_part(driver)]
+    by_lines = ["### Any device whose `lines` have it", "", *actions_table({"reset": RESET, "trigger": TRIGGER}), ""]
+    return "\n".join([*lines, *by_lines])
+
+
+# --- docs/shm.md ------------------------------------------------------------------------------------------------------
+
+C_TYPES = {
+    "Q": "uint64_t", "q": "int64_t", "I": "uint32_t", "H": "uint16_t", "B": "uint8_t", "d": "double", "s": "char",
+}  # fmt: skip
+
+
+def layout(fields: Sequence[SlotField]) -> str:
+    """Rows of offset, type and name; reserved bytes are left out."""
+    rows = ["| offset | type | field |", "|---|---|---|"]
+    for field in fields:
+        if not field.name.startswith("reserved"):
+            count = f"[{field.count}]" if field.count > 1 else ""
+            rows.append(f"| {field.offset} | `{C_TYPES[field.code]}{count}` | `{field.name}` |")
+    return "\n".join(rows)
+
+
+def layout_tables() -> dict[str, str]:
+    """Every generated part of the page by its name."""
+    return {
+        "header": layout(HEADER_FIELDS),
+        "slot": layout(SLOT_FIELDS),
+        "present": ", ".join(f"`{name}` {bit:#x}" for name, bit in PRESENT_BITS.items()),
+        "sync": ", ".join(f"{code} `{sync}`" for sync, code in SYNC_CODES.items()),
+        "ledger": ", ".join(f"`{name}`" for name in LEDGER_FIELDS),
+    }
+
+
+# --- all --------------------------------------------------------------------------------------------------------------
+
+PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
+    "docs/configuration.md": lambda: {"keys": "\n" + settings_tables()},
+    "docs/commands.md": lambda: {"actions": "\n" + actions_tables()},
+    "docs/shm.md": layout_tables,
+}
+"""The generated parts of each page by the name that their marks have."""
+
+
+def current(page: str) -> str:
+    """The text of a page as it stands."""
+    return (ROOT / page).read_text()
+
+
+def generated(page: str) -> str:
+    """The text of a page with every part between its marks made anew."""
+    text = current(page)
+    for name, content in PAGES[page]().items():
+        text = _replaced(text, name, content)
+    return text
+
+
+def _replaced(text: str, name: str, content: str) -> str:
+    before, begin, rest = text.partition(f"<!-- {name} -->\n")
+    _, end, after = rest.partition(f"\n<!-- end of {name} -->")
+    assert begin, f"no mark of {name}"
+    assert end, f"no mark of the end of {name}"
+    return f"{before}{begin}{content}{end}{after}"
+
+
+if __name__ == "__main__":
+    for name in PAGES:
+        (ROOT / name).write_text(generated(name))

@@ -1,0 +1,261 @@
+"""Simulated modules in virtual time without a link: bytes and frames go in and out by calls, requests run as scripts.
+
+`HipnucUartBench`, `CanopenBench` and `Imu61xBench` each hold a module and the host's end of its line; registers behind
+I2C and SPI are read by single transfers.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from math import radians
+from typing import NamedTuple, TypeVar
+
+from imud.contracts.codec import CodecEvent, message_of
+from imud.contracts.polling import Transfer
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings
+from imud.devices.imu61x.uart.codec import Imu61xCodec
+from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
+from imud.ledger import Ledger
+from imud.sample import Measurement
+from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.imu61x.settings import Imu61xSettings
+from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
+from imud.sim.physics.motion import Still
+from imud.sim.ports.uart_wire import heard
+from imud.sim.simulator import Burst
+from imud.units import NS_PER_MS, NS_PER_US
+
+T = TypeVar("T")
+
+BEGIN_NS = 1_234_567_890_123
+AT_REST = Still(radians(2), radians(-3), radians(40))
+
+
+def run_script(script: RequestScript[T], ask: Callable[[Request], Outcome]) -> T:
+    """Run a request script to its end with the outcomes of `ask`; return its value, raise what it raises."""
+    try:
+        request = next(script)
+        while True:
+            request = script.send(ask(request))
+    except StopIteration as end:
+        value: T = end.value
+        return value
+
+
+# --- HiPNUC on UART ---------------------------------------------------------------------------------------------------
+
+HIPNUC_STILL = HipnucHardware(motion=AT_REST, skew_ppm=0)
+FAST = ModuleSettings(baud=921_600, hi91=Output(1))
+
+
+class Hi91(NamedTuple):
+    """HI91 as it stands on the wire, units of the manual."""
+
+    word_1_2: int
+    temperature_c: int
+    pressure_pa: float
+    system_time_ms: int
+    accel_g: tuple[float, ...]
+    gyro_deg_s: tuple[float, ...]
+    mag_ut: tuple[float, ...]
+    euler_deg: tuple[float, ...]
+    quat_wxyz: tuple[float, ...]
+
+
+def unpack_hi91(data: bytes) -> Hi91:
+    """Unpack a frame by offsets of manual 3.3.1, without the codec."""
+    assert data[:4] == b"\x5a\xa5\x4c\x00"
+    assert data[6] == 0x91
+    _, word, temperature, pressure, time, *rest = struct.unpack("<BHbfI16f", data[6:])
+    parts = [tuple(rest[i:j]) for i, j in ((0, 3), (3, 6), (6, 9), (9, 12), (12, 16))]
+    return Hi91(word, temperature, pressure, time, *parts)
+
+
+class HipnucUartBench:
+    """A module that has booted, and the time."""
+
+    def __init__(self, settings: ModuleSettings | None = None, hardware: HipnucHardware | None = None) -> None:
+        self.now_ns = BEGIN_NS
+        self.module = HipnucModule(BEGIN_NS, settings, hardware)
+        self.wait(self.module.hardware.boot_ms)
+
+    def wait(self, duration_ms: float) -> list[Burst]:
+        """Let time pass; return what the module sent."""
+        self.now_ns += round(duration_ms * NS_PER_MS)
+        return self.module.advance(self.now_ns)
+
+    def frames(self, duration_ms: float) -> list[Hi91]:
+        """Let time pass; return the HI91 frames."""
+        return [unpack_hi91(burst.data) for burst in self.wait(duration_ms) if burst.sample_ns is not None]
+
+    def ask(self, command: str, duration_ms: float = 30.0) -> list[str]:
+        """Send a command; return the lines of text that came."""
+        self.module.receive(command.encode() + b"\r\n", self.now_ns)
+        return self.text(duration_ms)
+
+    def text(self, duration_ms: float) -> list[str]:
+        """Let time pass; return the lines of text that came."""
+        text = b"".join(burst.data for burst in self.wait(duration_ms) if burst.sample_ns is None)
+        assert not text or text.endswith(b"\r\n")
+        return text.decode("ascii").split("\r\n")[:-1]
+
+    def reboot(self) -> None:
+        """Switch off and on, and wait until it has booted."""
+        self.module.reboot(self.now_ns)
+        self.wait(self.module.hardware.boot_ms)
+
+
+# --- HiPNUC on CANopen ------------------------------------------------------------------------------------------------
+
+CAN_STEP_NS = 250 * NS_PER_US
+QUIET = NodeSettings(periods_ms=dict.fromkeys((1, 2, 3, 4, 6, 7), 0))
+
+
+def unpack(payload: bytes) -> tuple[int, bytes]:
+    """Identifier and data of a packed standard frame."""
+    can_id, size, data = RAW_FRAME.unpack(payload)
+    assert can_id < EXTENDED_FLAG
+    return can_id, data[:size]
+
+
+class CanopenBench:
+    """A module, a codec that hears it, and a session."""
+
+    def __init__(self, factory: NodeSettings | None = None, boot_ms: int = 0) -> None:
+        self.now_ns = BEGIN_NS
+        hardware = HipnucCanopenHardware(factory=factory or QUIET, boot_ms=boot_ms, skew_ppm=0)
+        self.module = HipnucCanopenModule(BEGIN_NS, hardware)
+        self.codec = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings(node=self.module.node))
+        self.session = Session(self.codec.ledger)
+        self.sent: list[tuple[int, bytes]] = []
+        """What the host sent."""
+        self.heard: list[tuple[int, bytes]] = []
+        """What the module sent."""
+        self.measured: list[Measurement] = []
+
+    def run(self, duration_ns: int) -> Outcome | None:
+        """Let time pass, up to the end of the outstanding request."""
+        end_ns = self.now_ns + duration_ns
+        while self.now_ns < end_ns:
+            self.now_ns += CAN_STEP_NS
+            for frame in self.module.advance(self.now_ns):
+                self.heard.append((frame.can_id, frame.data))
+                for event in self.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
+                    if isinstance(event, Measurement):
+                        self.measured.append(event)
+                    message = message_of(event)
+                    outcome = self.session.on_message(message, self.now_ns) if message is not None else None
+                    if outcome is not None:
+                        return outcome
+            silence = self.session.on_time(self.now_ns)
+            if silence is not None:
+                return silence
+        return None
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """A frame of the host."""
+        self.sent.append((can_id, data))
+        self.module.receive(can_id, False, data, self.now_ns)
+
+    def run_script(self, script: RequestScript[T]) -> T:
+        """Run a request script to its end."""
+        return run_script(script, self._ask)
+
+    def _ask(self, request: Request) -> Outcome:
+        payload = self.session.start(request, self.now_ns)
+        if payload:
+            self.send(*unpack(payload))
+        if request.silent:
+            return Reply(())
+        outcome = self.run(request.timeout_ns + 2 * CAN_STEP_NS)
+        assert outcome is not None
+        return outcome
+
+
+# --- IMU61x -----------------------------------------------------------------------------------------------------------
+
+IMU61X_STILL = Imu61xHardware(motion=AT_REST, skew_ppm=0)
+UART_STEP_MS = 2
+"""How often the host looks."""
+
+
+class Imu61xBench:
+    """A device that has booted, the time, and the host's end of the line."""
+
+    def __init__(self, settings: Imu61xSettings | None = None, hardware: Imu61xHardware = IMU61X_STILL) -> None:
+        self.now_ns = BEGIN_NS
+        self.module = Imu61xModule(BEGIN_NS, settings, hardware)
+        self.line_baud = self.module.baud
+        self.connected = True
+        """Whether the host's transmit line reaches the device."""
+        self.ledger = Ledger()
+        self.codec = Imu61xCodec(self.ledger)
+        self.session = Session(self.ledger)
+        self.asked: list[str] = []
+        """Names of the requests sent, pauses left out."""
+        self.wait(self.module.hardware.boot_ms)
+
+    def wait(self, duration_ms: float) -> list[CodecEvent]:
+        """Let time pass; return what the host heard."""
+        events: list[CodecEvent] = []
+        end_ns = self.now_ns + round(duration_ms * NS_PER_MS)
+        while self.now_ns < end_ns:
+            self.now_ns = min(self.now_ns + UART_STEP_MS * NS_PER_MS, end_ns)
+            baud = self.module.baud
+            for burst in self.module.advance(self.now_ns):
+                events += self.codec.feed(heard(burst.data, baud, self.line_baud))
+        assert self.ledger.closes()
+        return events
+
+    def samples(self, duration_ms: float) -> list[Measurement]:
+        """Let time pass; return the measurements."""
+        return [event for event in self.wait(duration_ms) if isinstance(event, Measurement)]
+
+    def send(self, data: bytes) -> None:
+        """Send bytes at the line's rate."""
+        if self.connected and data:
+            self.module.receive(heard(data, self.line_baud, self.module.baud), self.now_ns)
+
+    def ask(self, request: Request) -> Outcome:
+        """One request to its outcome."""
+        if request.baud:
+            self.line_baud = request.baud
+        if request.payload:
+            self.asked.append(request.name)
+        self.send(self.session.start(request, self.now_ns))
+        if request.silent:
+            return Reply(())
+        while True:
+            messages = [message for event in self.wait(UART_STEP_MS) if (message := message_of(event)) is not None]
+            outcomes = [self.session.on_message(message, self.now_ns) for message in messages]
+            for outcome in (*outcomes, self.session.on_time(self.now_ns)):
+                if outcome is not None:
+                    return outcome
+
+    def run(self, script: RequestScript[T]) -> T:
+        """Run a request script to its end; return its value, raise what it raises."""
+        return run_script(script, self.ask)
+
+    def restart(self) -> None:
+        """Switch off and on, and wait until it has booted."""
+        self.module.reboot(self.now_ns)
+        self.wait(self.module.hardware.boot_ms + 1)
+
+
+def imu61x_bench(settings: Imu61xSettings | None = None, **hardware: object) -> Imu61xBench:
+    """A bench with a device at rest that differs in `hardware`."""
+    return Imu61xBench(settings, replace(IMU61X_STILL, **hardware))  # type: ignore[arg-type]  # names of fields
+
+
+def over_i2c(device: Imu61xRegisters, transfer: Transfer) -> bytes:
+    """One transfer on I2C; returns what is read."""
+    return device.i2c([*transfer.sends, transfer.read_bytes] if transfer.read_bytes else [*transfer.sends])
+
+
+def over_spi(device: Imu61xRegisters, transfer: Transfer) -> bytes:
+    """One transfer on SPI in mode 0; returns what is read."""
+    return b"".join(device.spi(transfer.sends, 0))
