@@ -4,6 +4,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import pytest
 
@@ -145,11 +146,21 @@ def test_an_interval_is_set_and_read_back() -> None:
     assert settings["bitrate"] == "500000"
 
 
+def written_and_read(peer: J1939Node, register: int, value: int) -> RequestScript[int]:
+    """Write a register, which is acknowledged, and read it back."""
+    acknowledged = yield session.exchange(peer, register, session.WRITE, value, "write")
+    assert isinstance(acknowledged, Reply)
+    return (yield from session.read(peer, register))
+
+
 def test_values_out_of_range_do_not_take() -> None:
     bench = J1939Bench(made())
     for register, value in ((0x0134, 4), (0x009A, 5), (0x009C, 129), (0x009E, 2)):
-        with pytest.raises(Rejected):
-            bench.talk(lambda peer, r=register, v=value: session._write_checked(peer, r, v, "x"))  # type: ignore[misc]
+        assert bench.talk(partial(written_and_read, register=register, value=value)) != value
+    with pytest.raises(Rejected):
+        bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 4))
+    with pytest.raises(Rejected):
+        bench.talk(lambda peer: session.set_address(peer, 129))
     assert bench.module.settings == bench.module.flash
     with pytest.raises(NoReply):
         bench.talk(lambda peer: session.read(peer, 0x0042))

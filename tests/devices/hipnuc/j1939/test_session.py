@@ -15,6 +15,7 @@ from imud.devices.hipnuc.j1939.session import HOST_ADDRESS, X_SIGN, Y_SIGN, J193
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
 from imud.ledger import Ledger
+from tests.support.simulated_modules import run_script
 
 PEER = J1939Node(8)
 SET = Target(HipnucJ1939Settings(), 0)
@@ -31,19 +32,17 @@ def played(conversation: RequestScript[object], *outcomes: Outcome | bytes | Non
     """The frames that were sent, and what came out; each is answered with data from the module, None for silence."""
     frames: list[Frame] = []
     answers = iter(outcomes)
-    try:
-        request = next(conversation)
-        while True:
-            frames.append(sent(request))
-            answer = next(answers)
-            outcome = answer if isinstance(answer, Reply) else Silence(())
-            if isinstance(answer, bytes):
-                reply = ReplyFrame(0x0CEF5508, answer)
-                assert request.is_end(reply)
-                outcome = Reply((reply,))
-            request = conversation.send(outcome)
-    except StopIteration as end:
-        return frames, end.value
+
+    def ask(request: Request) -> Outcome:
+        frames.append(sent(request))
+        answer = next(answers)
+        if isinstance(answer, bytes):
+            reply = ReplyFrame(0x0CEF5508, answer)
+            assert request.is_end(reply)
+            return Reply((reply,))
+        return answer if isinstance(answer, Reply) else Silence(())
+
+    return frames, run_script(conversation, ask)
 
 
 def of_action(name: str, **arguments: object) -> RequestScript[object]:

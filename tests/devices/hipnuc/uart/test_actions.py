@@ -9,6 +9,7 @@ from imud.contracts.action import Target
 from imud.contracts.session import Outcome, Rejection, Reply, Request, Silence
 from imud.devices.hipnuc.uart.actions import ACTIONS
 from imud.errors import BadArgument, NoReply, Rejected
+from tests.support.simulated_modules import run_script
 
 OK = Reply(("OK",))
 VERSION = Reply(("PNAME=HI14R3", "OK"))
@@ -17,17 +18,16 @@ VERSION = Reply(("PNAME=HI14R3", "OK"))
 def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
     """The requests of an action, answered in turn, and its value."""
     action = ACTIONS[name]
-    conversation = action.script(Target(None, 115200), action.arguments(arguments))
     left = list(answers or [OK])
-    requests = []
-    try:
-        request = next(conversation)
-        while True:
-            requests.append(request)
-            request = conversation.send(left.pop(0))
-    except StopIteration as end:
-        assert not left
-        return requests, end.value
+    requests: list[Request] = []
+
+    def answer(request: Request) -> Outcome:
+        requests.append(request)
+        return left.pop(0)
+
+    value = run_script(action.script(Target(None, 115200), action.arguments(arguments)), answer)
+    assert not left
+    return requests, value
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from imud.devices.hipnuc.uart.commands import OutputMessage, Query, ask, log_ont
 from imud.devices.hipnuc.uart.session import identify, read_settings
 from imud.errors import NoReply, Rejected
 from imud.ledger import Ledger
+from tests.support.simulated_modules import run_script
 
 T = TypeVar("T")
 VERSION = ("PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK")
@@ -20,14 +21,8 @@ REPLIES = {
 }
 
 
-def hold(conversation: RequestScript[T], answer: Callable[[str], Outcome]) -> T:
-    try:
-        request = next(conversation)
-        while True:
-            request = conversation.send(answer(request.name))
-    except StopIteration as end:
-        value: T = end.value
-        return value
+def hold(script: RequestScript[T], answer: Callable[[str], Outcome]) -> T:
+    return run_script(script, lambda request: answer(request.name))
 
 
 def test_identity() -> None:

@@ -2,12 +2,12 @@
 
 from itertools import pairwise
 from math import degrees, hypot
+from typing import TypeVar
 
 import pytest
 
 from imud.contracts.codec import TextLine
-from imud.contracts.driver import Identity
-from imud.contracts.session import Outcome, RequestScript, Session
+from imud.contracts.session import Outcome, Request, RequestScript, Session
 from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.ledger import Ledger
 from imud.sample import Measurement
@@ -18,7 +18,9 @@ from imud.sim.physics.motion import Still, swing
 from imud.sim.physics.noise import Noise
 from imud.sim.simulator import SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench, unpack_hi91
+from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench, run_script, unpack_hi91
+
+T = TypeVar("T")
 
 # --- frames and time --------------------------------------------------------------------------------------------------
 
@@ -179,30 +181,23 @@ def test_marked_messages_come_with_the_pulse_and_once() -> None:
 # --- with the codec and its conversations -----------------------------------------------------------------------------
 
 
-def converse(bench: HipnucUartBench, conversation: RequestScript[Identity]) -> Identity:
-    """Run a conversation against the module, frames in between."""
+def converse(bench: HipnucUartBench, script: RequestScript[T]) -> T:
+    """Run a request script against the module, frames in between."""
     ledger = Ledger()
     codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), Session(ledger)
-    request = next(conversation)
-    while True:
+
+    def ask(request: Request) -> Outcome:
         bench.module.receive(session.start(request, bench.now_ns), bench.now_ns)
-        outcome: Outcome | None = None
-        while outcome is None:
-            lines = [
-                event.text
-                for burst in bench.wait(1.0)
-                for event in codec.feed(burst.data)
-                if isinstance(event, TextLine)
-            ]
-            outcomes: list[Outcome | None] = [session.on_message(line, bench.now_ns) for line in lines] + [
-                session.on_time(bench.now_ns)
-            ]
-            outcome = next((found for found in outcomes if found), None)
-        try:
-            request = conversation.send(outcome)
-        except StopIteration as end:
-            assert ledger.closes()
-            return end.value  # type: ignore[no-any-return]  # StopIteration does not say what it carries
+        while True:
+            events = [event for burst in bench.wait(1.0) for event in codec.feed(burst.data)]
+            outcomes = [session.on_message(e.text, bench.now_ns) for e in events if isinstance(e, TextLine)]
+            for outcome in (*outcomes, session.on_time(bench.now_ns)):
+                if outcome is not None:
+                    return outcome
+
+    value = run_script(script, ask)
+    assert ledger.closes()
+    return value
 
 
 def test_identity_is_read_amid_frames() -> None:
@@ -211,9 +206,9 @@ def test_identity_is_read_amid_frames() -> None:
 
 
 def test_settings_are_read_amid_frames() -> None:
-    settings = converse(HipnucUartBench(FAST), DRIVER.read_settings())  # type: ignore[arg-type]  # another kind of answer
-    assert settings["ATT_MODE"] == "0"  # type: ignore[index]
-    assert settings["BAUD"] == "921600"  # type: ignore[index]
+    settings = converse(HipnucUartBench(FAST), DRIVER.read_settings())
+    assert settings["ATT_MODE"] == "0"
+    assert settings["BAUD"] == "921600"
 
 
 @pytest.mark.parametrize("message", ["HI91", "HI92"])
