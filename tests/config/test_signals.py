@@ -19,6 +19,8 @@ from imud.contracts.lines import (
 )
 from imud.devices import DRIVERS
 from imud.errors import ConfigError
+from imud.utc import RMC_SOURCES
+from imud.utc.source import RmcSettings
 
 
 def parse(*devices: str) -> tuple[DeviceConfig, ...]:
@@ -155,7 +157,7 @@ def test_drivers_have_lines_that_there_are() -> None:
 
 
 def test_the_shipped_examples_show_the_defaults() -> None:
-    from tests.config.test_config import SHIPPED, uncommented
+    from tests.config.test_reading import SHIPPED, uncommented
 
     devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
     shown = {}
@@ -166,3 +168,80 @@ def test_the_shipped_examples_show_the_defaults() -> None:
                 shown[name] = settings
                 assert settings == schema(line=settings.line, chip=settings.chip)
     assert set(shown) == set(LINE_SCHEMAS)
+
+
+# --- the source of RMC sentences --------------------------------------------------------------------------------------
+
+
+def rmc_device(rmc: str, keys: str = "driver: hipnuc-uart, uart: {port: x}") -> str:
+    return f"devices:\n  bow: {{{keys}, rmc: {rmc}}}\n"
+
+
+def read_rmc(text: str) -> RmcSettings | None:
+    return config.parse(text, "f").devices[0].rmc
+
+
+def rmc_errors(text: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        config.parse(text, "f")
+    return str(caught.value)
+
+
+def test_each_rmc_source() -> None:
+    assert read_rmc(rmc_device("{source: gpsd}")) == RmcSettings(source="gpsd")
+    assert read_rmc(rmc_device("{source: system, rate_hz: 5, error_ms: 10}")) == RmcSettings(
+        source="system", rate_hz=5, error_ms=10.0
+    )
+    nmea = RmcSettings(source="nmea", port="/dev/ttyUSB1", baud=38400)
+    assert read_rmc(rmc_device("{source: nmea, port: /dev/ttyUSB1, baud: 38400}")) == nmea
+    assert read_rmc("devices:\n  bow: {driver: hipnuc-uart, uart: {port: x}}\n") is None
+
+
+@pytest.mark.parametrize(
+    ("rmc", "said"),
+    [
+        ("{}", "expected the key source"),
+        ("{source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
+        ("{source: nmea}", "needs the path of its serial port"),
+        ("{source: gpsd, rate_hz: 11}", "f:2:"),
+        ("{source: gpsd, rate_hz: 0}", "rate_hz"),
+        ("{source: gpsd, tcp_port: 0}", "tcp_port"),
+        ("{source: gpsd, error_ms: .nan}", "error_ms"),
+        ("{source: gpsd, speed: 1}", "speed"),
+    ],
+)
+def test_what_is_wrong_is_said(rmc: str, said: str) -> None:
+    assert said in rmc_errors(rmc_device(rmc))
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        "driver: imu61x-uart, uart: {port: x}",
+        "driver: hipnuc-uart, replay: {path: x}",
+        "uart: {port: x}",
+    ],
+)
+def test_devices_that_take_no_sentences(keys: str) -> None:
+    assert "expected rmc only beside" in rmc_errors(rmc_device("{source: gpsd}", keys))
+
+
+def test_a_device_that_imud_triggers_has_no_pulse_per_second() -> None:
+    text = """devices:
+  bow:
+    driver: hipnuc-uart
+    uart: {port: x}
+    lines:
+      sin: {line: GPIO17}
+    rmc: {source: gpsd}
+"""
+    said = rmc_errors(text)
+    assert "f:7:" in said
+    assert "by lines.sin (line 6): leave one of them out" in said
+    assert read_rmc(text.replace("sin:", "pps:")) == RmcSettings(source="gpsd")
+
+
+def test_every_source_has_its_row() -> None:
+    assert set(RMC_SOURCES) == set(RmcSettings.__annotations__["source"].__args__)
+    for name in RMC_SOURCES:
+        assert callable(RMC_SOURCES[name])
