@@ -265,3 +265,145 @@ TESTS = Path(__file__).parent
 def test_tests_write_no_private_members(file: Path) -> None:
     if file.relative_to(TESTS).as_posix() not in STILL_WRITE_PRIVATE:
         assert not (writes := private_writes(file)), f"{file}: {', '.join(writes)}"
+
+
+# --- a test by the path of its module ---------------------------------------------------------------------------------
+
+ELSEWHERE = ("bench", "lab", "lab_host", "include", "fuzz", "attack", "support")
+"""Folders of tests that mirror no package: measurements, kernels, the C header, foreign bytes, helpers."""
+
+CROSS_CUTTING = {
+    "test_architecture.py": "the tree itself",
+    "test_docs.py": "README.md, docs, Makefile",
+    "test_end_to_end.py": "the daemon as a process, with its clients",
+    "cli/test_main.py": "`main` of imud/cli/__init__.py",
+    "clock/test_accuracy.py": "every part of the clock against the truth of a simulation",
+    "devices/test_every_row.py": "every driver",
+    "devices/test_every_stream_driver.py": "every driver of byte streams",
+    "devices/test_every_can_driver.py": "every driver on CAN",
+    "devices/test_every_polled_driver.py": "every driver that is polled",
+    "devices/hipnuc/canopen/test_peers.py": "the canopen library as a peer of codec and simulator",
+    "devices/imu61x/test_one_truth.py": "one motion through every protocol of the family",
+    "links/rs485/test_modbus_peers.py": "pymodbus as a peer of link and simulator",
+    "publishers/socket/test_command.py": "`command` through connection, rights and RPC",
+    "publishers/socket/test_documentation.py": "docs/protocol.md",
+    "runtime/detection/test_stream_families.py": "every driver in one search",
+    "runtime/polled/test_in_daemon.py": "a bus thread in the daemon",
+    "runtime/polled/test_shared_line.py": "modules on one RS-485 line, from the port to samples",
+    "runtime/stream/test_wake.py": "a device that is silent, from the line to its state",
+    "signals/test_end_to_end.py": "pins of a simulated module through the whole device",
+    "sim/hipnuc/uart/test_commands.py": "the simulator's replies by the chapters of the manual",
+    "sim/test_main.py": "imud/sim/__main__.py as a process",
+    "utc/test_gpsd_daemon.py": "a real gpsd and the daemon",
+    "utc/test_gpsd_real.py": "a real gpsd",
+}
+"""Test modules that mirror no module of imud, and what they test."""
+
+TESTED_IN = {
+    "imud.cli.modbus.line": "cli/modbus/test_command.py",
+    "imud.cli.probe.command": "cli/probe/test_can.py",
+    "imud.cli.probe.report": "cli/probe/test_can.py",
+    "imud.client.watch": "client/test_connection.py",
+    "imud.config.devices": "config/test_reading.py",
+    "imud.config.keys": "config/test_reading.py",
+    "imud.config.model": "config/test_reading.py",
+    "imud.config.schema": "config/test_reading.py",
+    "imud.devices.polled_frames": "devices/test_every_polled_driver.py",
+    "imud.devices.hipnuc.canopen.driver": "devices/test_every_can_driver.py",
+    "imud.devices.hipnuc.j1939.actions": "devices/hipnuc/j1939/test_session.py",
+    "imud.devices.hipnuc.j1939.driver": "devices/test_every_can_driver.py",
+    "imud.devices.hipnuc.j1939.messages": "devices/hipnuc/j1939/test_codec.py",
+    "imud.devices.hipnuc.modbus.driver": "devices/test_every_polled_driver.py",
+    "imud.devices.hipnuc.modbus.registers": "devices/hipnuc/modbus/test_codec.py",
+    "imud.devices.hipnuc.nmea2000.driver": "devices/test_every_can_driver.py",
+    "imud.devices.hipnuc.nmea2000.messages": "devices/hipnuc/nmea2000/test_codec.py",
+    "imud.devices.hipnuc.uart.driver": "devices/test_every_stream_driver.py",
+    "imud.devices.imu61x.can.driver": "devices/test_every_can_driver.py",
+    "imud.devices.imu61x.common.registers": "devices/imu61x/common/test_register_driver.py",
+    "imud.devices.imu61x.i2c.driver": "devices/test_every_polled_driver.py",
+    "imud.devices.imu61x.spi.driver": "devices/test_every_polled_driver.py",
+    "imud.devices.imu61x.uart.driver": "devices/test_every_stream_driver.py",
+    "imud.devices.imu61x.uart.framing": "devices/imu61x/uart/test_codec.py",
+    "imud.formats.jsonrpc": "publishers/socket/test_rpc.py",
+    "imud.links.replay.file": "links/replay/test_link.py",
+    "imud.links.rs485.line": "links/rs485/test_link.py",
+    "imud.permissions": "links/test_device_node.py",
+    "imud.publishers.metrics.family": "publishers/metrics/test_families.py",
+    "imud.publishers.shm.ring": "publishers/shm/test_publisher.py",
+    "imud.publishers.socket.connection": "publishers/socket/test_publisher.py",
+    "imud.publishers.socket.encoding": "publishers/socket/test_subscription.py",
+    "imud.publishers.socket.hub": "publishers/socket/test_publisher.py",
+    "imud.runtime.detection.steps": "runtime/detection/test_stream.py",
+    "imud.runtime.device_factory": "runtime/test_device.py",
+    "imud.runtime.health": "runtime/stream/test_transport.py",
+    "imud.runtime.path": "runtime/stream/test_transport.py",
+    "imud.runtime.polled.path": "runtime/polled/test_transport.py",
+    "imud.runtime.search_loop": "runtime/stream/test_transport.py",
+    "imud.runtime.transport": "runtime/stream/test_transport.py",
+    "imud.signals.line_actions": "runtime/test_attachments.py",
+    "imud.sim.command_line": "sim/test_main.py",
+    "imud.sim.control": "sim/test_main.py",
+    "imud.sim.imu61x.settings": "sim/imu61x/test_uart.py",
+    "imud.sim.ports.in_process_bus": "devices/imu61x/test_one_truth.py",
+    "imud.sim.simulator": "sim/test_sensor.py",
+    "imud.utc.source": "utc/test_receivers.py",
+    "imud.worker": "runtime/polled/test_bus.py",
+}
+"""Modules without a test module of their own, and the one that tests them with what they serve."""
+
+PROMISES = ("imud.contracts", "imud.errors", "imud.event", "imud.units")
+"""Types and constants without behaviour of their own: what uses them tests them."""
+
+
+def mirrored(test: Path) -> str:
+    """Name of the module that a test module is for, by its path."""
+    return ".".join(("imud", *test.relative_to(TESTS).parent.parts, test.stem.removeprefix("test_")))
+
+
+TEST_MODULES = [path for path in sorted(TESTS.rglob("test_*.py")) if path.relative_to(TESTS).parts[0] not in ELSEWHERE]
+
+
+@pytest.mark.parametrize("test", TEST_MODULES, ids=lambda test: test.relative_to(TESTS).as_posix())
+def test_a_test_module_stands_at_the_path_of_its_module(test: Path) -> None:
+    listed = test.relative_to(TESTS).as_posix() in CROSS_CUTTING
+    assert listed != (mirrored(test) in own_modules()), "mirrors no module, or is in CROSS_CUTTING although it does"
+
+
+@pytest.mark.parametrize("module", own_modules())
+def test_a_module_has_its_tests(module: str) -> None:
+    own = module in map(mirrored, TEST_MODULES)
+    if module.startswith(PROMISES):
+        return
+    assert own != (module in TESTED_IN), "no test module of its own and none in TESTED_IN, or both"
+
+
+def test_the_lists_of_test_modules_are_current() -> None:
+    named = {*CROSS_CUTTING, *TESTED_IN.values()}
+    assert not {name for name in named if not (TESTS / name).is_file()}
+    assert not TESTED_IN.keys() - own_modules().keys()
+
+
+SUPPORT_MAX = 20
+SUPPORT = sorted(path for path in (TESTS / "support").glob("*.py") if path.name != "__init__.py")
+
+
+def test_support_modules_are_few() -> None:
+    assert len(SUPPORT) <= SUPPORT_MAX
+
+
+@pytest.mark.parametrize("module", SUPPORT, ids=lambda path: path.stem)
+def test_size_of_a_support_module(module: Path) -> None:
+    lines = len(module.read_text().splitlines())
+    assert lines <= LINES_MAX
+    assert lines >= LINES_MIN or first_word(module) in REASON
+
+
+def test_classes_of_tests_say_what_they_are() -> None:
+    bare = [
+        f"{path.relative_to(TESTS)}: {node.name}"
+        for path in sorted(TESTS.rglob("*.py"))
+        if path.relative_to(TESTS).parts[0] != "lab"
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.ClassDef) and node.name in ("Bench", "Rig", "Stage", "Play")
+    ]
+    assert not bare, bare
