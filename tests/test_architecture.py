@@ -319,7 +319,7 @@ TESTED_IN = {
     "imud.devices.hipnuc.nmea2000.messages": "devices/hipnuc/nmea2000/test_codec.py",
     "imud.devices.hipnuc.uart.driver": "devices/test_every_stream_driver.py",
     "imud.devices.imu61x.can.driver": "devices/test_every_can_driver.py",
-    "imud.devices.imu61x.common.registers": "devices/imu61x/common/test_register_driver.py",
+    "imud.devices.imu61x.common.registers": "devices/imu61x/spi/test_codec.py",
     "imud.devices.imu61x.i2c.driver": "devices/test_every_polled_driver.py",
     "imud.devices.imu61x.spi.driver": "devices/test_every_polled_driver.py",
     "imud.devices.imu61x.uart.driver": "devices/test_every_stream_driver.py",
@@ -331,7 +331,7 @@ TESTED_IN = {
     "imud.publishers.metrics.family": "publishers/metrics/test_families.py",
     "imud.publishers.shm.ring": "publishers/shm/test_publisher.py",
     "imud.publishers.socket.connection": "publishers/socket/test_publisher.py",
-    "imud.publishers.socket.encoding": "publishers/socket/test_subscription.py",
+    "imud.publishers.socket.encoding": "publishers/socket/test_outbox.py",
     "imud.publishers.socket.hub": "publishers/socket/test_publisher.py",
     "imud.runtime.detection.steps": "runtime/detection/test_stream.py",
     "imud.runtime.device_factory": "runtime/test_device.py",
@@ -344,10 +344,10 @@ TESTED_IN = {
     "imud.sim.command_line": "sim/test_main.py",
     "imud.sim.control": "sim/test_main.py",
     "imud.sim.imu61x.settings": "sim/imu61x/test_uart.py",
-    "imud.sim.ports.in_process_bus": "devices/imu61x/test_one_truth.py",
+    "imud.sim.ports.in_process_bus": "links/test_spi.py",
     "imud.sim.simulator": "sim/test_sensor.py",
     "imud.utc.source": "utc/test_receivers.py",
-    "imud.worker": "runtime/polled/test_bus.py",
+    "imud.worker": "runtime/polled/test_in_daemon.py",
 }
 """Modules without a test module of their own, and the one that tests them with what they serve."""
 

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from time import monotonic_ns
 from typing import Any
 
 import pytest
@@ -19,6 +18,7 @@ from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, 
 from imud.units import NS_PER_MS
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock
 
 NODE = 9
 
@@ -29,18 +29,19 @@ class CanopenDeviceBench:
     def __init__(self, driver: str, options: Settings | None) -> None:
         settings = MemorySettings(name="can0")
         config = DeviceConfig("bow", driver, options, False, "memory", settings)
-        self.rigs = DeviceRigs()
+        self.clock = VirtualClock()
+        self.rigs = DeviceRigs(self.clock.host)
         self.rig = self.rigs.add(config, MemoryCanLink(settings))
         self.link = self.rig.can_link
         hardware = HipnucCanopenHardware(factory=NodeSettings(node=NODE), boot_ms=0, skew_ppm=0)
-        self.module = HipnucCanopenModule(monotonic_ns(), hardware)
+        self.module = HipnucCanopenModule(self.clock.now_ns(), hardware)
         self.deaf = False
         """Whether what imud sends is lost."""
         self._heard = 0
 
     def exchange(self) -> None:
         """What crossed the bus since the last call, both ways."""
-        now_ns = monotonic_ns()
+        now_ns = self.clock.now_ns()
         for payload in self.link.written[self._heard :]:
             self._heard += 1
             if self.deaf:
@@ -67,7 +68,7 @@ def play(bench: CanopenDeviceBench, story: Coroutine[Any, Any, None]) -> None:
         await bench.until(lambda: bench.rig.state is DeviceState.RUNNING)
         await story
 
-    play_rigs(bench.rigs, told)
+    play_rigs(bench.rigs, told, bench.clock)
 
 
 @pytest.mark.parametrize(("driver", "options"), [("auto", None), ("hipnuc-canopen", HipnucCanopenSettings(node=NODE))])

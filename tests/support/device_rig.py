@@ -26,6 +26,7 @@ from imud.runtime.device_factory import DeviceFactory
 from imud.sample import Sample
 from imud.signals.gpio import GPIO_LINES
 from imud.worker import BusThread, StartWorker
+from tests.support.event_loops import VirtualClock, run_virtually
 
 LIMIT_S = 10.0
 STEP_S = 0.002
@@ -193,15 +194,22 @@ async def running(
         yield made
 
 
-def play(rigs: DeviceRigs, story: Callable[[list[DeviceRig]], Coroutine[Any, Any, None]]) -> None:
-    """Run the devices of `rigs` while a story is told; afterwards no link inside the process is open."""
+def play(
+    rigs: DeviceRigs,
+    story: Callable[[list[DeviceRig]], Coroutine[Any, Any, None]],
+    clock: VirtualClock | None = None,
+) -> None:
+    """Run the devices of `rigs` during a story, in the time of `clock` if given; then no link in memory is open."""
 
     async def whole() -> None:
         async with rigs.at_work() as made:
             await story(made)
         assert not any(link.is_open for link in _memory_links(made))
 
-    asyncio.run(whole())
+    if clock is None:
+        asyncio.run(whole())
+    else:
+        run_virtually(clock, whole())
 
 
 def _memory_links(rigs: Iterable[DeviceRig]) -> list[MemoryLink | MemoryCanLink]:

@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from itertools import count
 from pathlib import Path
-from time import monotonic_ns
 from typing import Any
 
 import pytest
@@ -24,6 +23,7 @@ from imud.sample import Sample
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock
 from tests.support.fake_drivers import BASE, SYNC_ID, FakeCanSettings, fake_can_driver, fake_can_frame
 
 
@@ -36,10 +36,11 @@ def fake_table(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Bus:
-    """Devices on the bus `can0`."""
+    """Devices on the bus `can0`, in virtual time."""
 
     def __init__(self, state_dir: Path | None = None) -> None:
-        self.rigs = DeviceRigs(state_dir=state_dir)
+        self.clock = VirtualClock()
+        self.rigs = DeviceRigs(self.clock.host, state_dir=state_dir)
 
     def add(
         self, name: str = "mast", driver: str = "auto", options: Settings | None = None, *, writable: bool = True
@@ -56,7 +57,7 @@ class Bus:
             await asyncio.sleep(0)
             await story()
 
-        play_rigs(self.rigs, told)
+        play_rigs(self.rigs, told, self.clock)
 
 
 class OnBus:
@@ -73,7 +74,7 @@ class OnBus:
 
     def hear(self, *nodes: int, number: int = 0) -> None:
         """A frame of each node."""
-        self.link.feed([fake_can_frame(node, number, monotonic_ns()) for node in nodes])
+        self.link.feed([fake_can_frame(node, number, self.rig.now_ns()) for node in nodes])
 
     async def until(self, condition: Callable[[], object], *nodes: int) -> None:
         """Wait until it holds, with those nodes on the bus."""
@@ -187,12 +188,12 @@ def test_after_long_silence_another_device_is_found() -> None:
     async def story() -> None:
         await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
         newest = bench.samples[-1].seq
-        now_ns = monotonic_ns()
+        now_ns = bench.rig.now_ns()
         bench.device.tick(now_ns + 6 * NS_PER_S)
         assert bench.device.state is DeviceState.SILENT
         bench.device.tick(now_ns + 6 * NS_PER_S + SILENT_SEARCH_NS + NS_PER_S)
         await bench.until(lambda: len(bench.link.filters) == 2)
-        bench.device.tick(monotonic_ns())
+        bench.device.tick(bench.rig.now_ns())
         assert bench.device.status().state is DeviceState.SEARCHING
         await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 9)
         assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 9]
