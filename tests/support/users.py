@@ -1,4 +1,4 @@
-"""Other users of this machine, for tests of what they may not do: root only can be one of them."""
+"""Contract: processes of other users of this machine, for tests of what they may not do; only root can make them."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ from typing import Final
 
 import pytest
 
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 
 DAEMON_UID: Final = 65534
 HOSTILE_UID: Final = 65533

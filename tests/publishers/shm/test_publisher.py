@@ -37,7 +37,7 @@ from imud.ledger import LEDGER_FIELDS
 from imud.publishers import PUBLISHERS
 from imud.publishers.shm import ring
 from imud.publishers.shm.publisher import PUBLISHER, ShmPublisher, ShmSettings
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 
 
@@ -283,7 +283,7 @@ def other_writer(path: Path, pid: int, *, heartbeat_ns: int = START_NS - 1, stat
 OTHER_DAEMON = """
 import sys, time
 from pathlib import Path
-from tests.support.paths import ROOT
+from tests.support.files import ROOT
 from tests.support.rings import Board
 board = Board(Path(sys.argv[1]))
 print("ready", flush=True)
