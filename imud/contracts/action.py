@@ -8,45 +8,43 @@ from typing import Any, cast, get_type_hints
 
 import msgspec
 
-from imud.contracts.settings import NoSettings, Settings, expected, shown
+from imud.contracts.settings import Settings, expected, shown
 from imud.errors import BadArgument
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The device that an action is for."""
+    """The device that an action is carried out on."""
 
     settings: Any
-    """Its driver's settings."""
+    """Settings of the device's driver."""
     baud: int
-    """Rate of its line now, bit/s; 0 where there is none."""
+    """Present bit rate of the line, bit/s; 0 on a link without one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """A row of a driver's actions.
+    """An action of a device: help, arguments and request script.
 
-    Its arguments are described once, by the keyword-only parameters of `begin`. Their annotations give type
-    and bounds (`msgspec.Meta`), their names the unit, their defaults what may be left out.
+    The arguments are the keyword-only parameters of `begin`. Their annotations give type and bounds (`msgspec.Meta`),
+    their names the unit; a parameter with a default is optional.
     """
 
     help: str
-    """Its effect, one sentence."""
+    """The effect, one sentence."""
     begin: Callable[..., Any]
     """`begin(target, *, name: type = default, …)` makes the request script, or a polled driver's transfer script.
 
-    Its value is the answer, something that JSON can carry. Raises BadArgument, like the script itself.
+    The script returns the result of the action, a value that JSON can carry. Both raise BadArgument.
     """
-    params: type[Settings] = NoSettings
-    """Its arguments, where `begin` takes an instance of a struct as its second parameter."""
 
     @property
     def parameters(self) -> type[Settings]:
-        """The arguments as a struct type."""
-        return _parameters(self.begin) if _takes_names(self.begin) else self.params
+        """The parameters of `begin` as a struct type."""
+        return _parameters(self.begin)
 
     def arguments(self, given: Mapping[str, Any]) -> Settings:
-        """The arguments checked. Raises BadArgument naming what was expected and what came."""
+        """Check and convert the arguments of a call. Raises BadArgument naming what was expected and what came."""
         try:
             return msgspec.convert(dict(given), self.parameters)
         except msgspec.ValidationError as error:
@@ -54,15 +52,8 @@ class Action:
             raise BadArgument(f"{error}; arguments: {known}") from None
 
     def script(self, target: Target, arguments: Settings) -> Any:
-        """The script that carries out the action, with arguments that `arguments` returned."""
-        if _takes_names(self.begin):
-            return self.begin(target, **msgspec.structs.asdict(arguments))
-        return self.begin(target, arguments)
-
-
-@cache
-def _takes_names(begin: Callable[..., Any]) -> bool:
-    return sum(p.kind is not p.KEYWORD_ONLY for p in signature(begin).parameters.values()) == 1
+        """Make the script of the action, from the result of `arguments`."""
+        return self.begin(target, **msgspec.structs.asdict(arguments))
 
 
 @cache
@@ -80,21 +71,21 @@ Actions = Mapping[str, Action]
 
 
 class ActionParameter(msgspec.Struct, frozen=True):
-    """One argument of an action, for people."""
+    """Description of one argument of an action."""
 
     name: str
     values: str
-    """What it can be, for example `a whole number from 1 to 127`."""
+    """The accepted values, for example `a whole number from 1 to 127`."""
     default: str | None
-    """As JSON; None where it must be given."""
+    """The default as JSON; None for a required argument."""
 
     def __str__(self) -> str:
-        """For example `rate_hz (a number; default 100)`."""
+        """Format the description, for example `rate_hz (a number; default 100)`."""
         return f"{self.name} ({self.values}{'' if self.default is None else f'; default {self.default}'})"
 
 
 class ActionInfo(msgspec.Struct, frozen=True):
-    """One action, for people."""
+    """Description of one action."""
 
     name: str
     help: str
@@ -102,7 +93,7 @@ class ActionInfo(msgspec.Struct, frozen=True):
 
 
 def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
-    """The arguments that an action takes."""
+    """Describe the arguments of an action."""
     return tuple(
         ActionParameter(field.name, expected(field.type), None if field.required else shown(field.default))
         for field in msgspec.structs.fields(action.parameters)
@@ -110,5 +101,5 @@ def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
 
 
 def described(actions: Actions) -> list[ActionInfo]:
-    """All actions, in their order."""
+    """Describe actions, in their order."""
     return [ActionInfo(name, action.help, parameters_of(action)) for name, action in actions.items()]

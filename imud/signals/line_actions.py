@@ -1,4 +1,4 @@
-"""Table: the actions that the lines of a device add to those of its driver: `reset` and `trigger`."""
+"""Table: actions carried out by the GPIO lines of a device, in addition to those of its driver: `reset`, `trigger`."""
 
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
@@ -8,7 +8,7 @@ from imud.signals.reset import ResetLine
 from imud.signals.sync_signals import SyncSignals
 
 
-def _no_script(_target: object, _params: object) -> None:
+def _no_script(_target: object) -> None:
     raise AssertionError("a line is driven by `LineActions.run`")
 
 
@@ -17,7 +17,7 @@ TRIGGER: Final = Action("make one edge on SIN, in addition to those of its rate"
 
 
 class LineActions:
-    """Actions by the lines of one device. Synchronization: the loop's thread only."""
+    """Actions by the GPIO lines of one device. Synchronization: the loop's thread only."""
 
     def __init__(self, reset: ResetLine | None, signals: SyncSignals | None) -> None:
         self.rows: dict[str, Action] = {}
@@ -33,7 +33,7 @@ class LineActions:
             self.rows["trigger"], self._coroutines["trigger"] = TRIGGER, trigger
 
     async def run(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action, which has no result. Raises BadArgument, CommandError."""
+        """Run an action; none of them has a result. Raises BadArgument, CommandError."""
         self.rows[name].arguments(arguments)
         await self._coroutines[name]()
         return None

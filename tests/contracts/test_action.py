@@ -7,25 +7,23 @@ import pytest
 from msgspec import Meta
 
 from imud.contracts.action import Action, Target, described, parameters_of
-from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
 from imud.errors import BadArgument
 
 ACTIONS = [(driver.name, name) for driver in DRIVERS.values() for name in driver.actions]
 
 
-class Params(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Arguments."""
-
-    angle_deg: float
-    relative: bool = False
+def _yaw(_target: Target, *, angle_deg: float, relative: bool = False) -> tuple[float, bool]:
+    return angle_deg, relative
 
 
-ACTION = Action("turn", lambda _target, params: params, Params)
+ACTION = Action("turn", _yaw)
 
 
-def test_arguments_become_an_instance() -> None:
-    assert ACTION.arguments({"angle_deg": 5}) == Params(angle_deg=5.0)
+def test_arguments_are_converted_and_completed_by_defaults() -> None:
+    arguments = ACTION.arguments({"angle_deg": 5})
+    assert msgspec.structs.asdict(arguments) == {"angle_deg": 5.0, "relative": False}
+    assert ACTION.script(Target(None, 0), arguments) == (5.0, False)
 
 
 @pytest.mark.parametrize("given", [{}, {"angle_deg": "x"}, {"angle_deg": 1, "turns": 2}])

@@ -202,7 +202,7 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
         sample_frames=1,
         example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)],
         cyclic=_cyclic,
-        actions={"node": Action("its number", lambda target, _params: says_nothing(target.settings.node))},
+        actions={"node": Action("its number", lambda target: says_nothing(target.settings.node))},
     )
 
 

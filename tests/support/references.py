@@ -100,8 +100,8 @@ def cell(text: str) -> str:
 
 
 def meanings_of(action: Action) -> dict[str, str]:
-    """The meaning of each argument: description and unit of its annotation, or the docstring of the struct's field."""
-    found = docs_of(action.params)
+    """Meaning of each argument: description and unit of its annotation."""
+    found = {}
     for field in msgspec.structs.fields(action.parameters):
         info = msgspec.inspect.type_info(field.type)
         if isinstance(info, msgspec.inspect.Metadata) and info.extra_json_schema:
@@ -112,7 +112,7 @@ def meanings_of(action: Action) -> dict[str, str]:
 
 
 def arguments_of(action: Action) -> str:
-    """What it takes, one after the other, each with what it can be and what it means."""
+    """List the arguments, each with its values and its meaning."""
     docs = meanings_of(action)
     words = []
     for parameter in parameters_of(action):

@@ -13,9 +13,8 @@ from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from imud.contracts.action import Action, described
+from imud.contracts.action import Action, Target, described
 from imud.contracts.publisher import Batch, PublisherContext
-from imud.contracts.settings import Settings
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.errors import Rejected
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
@@ -86,13 +85,11 @@ def context() -> PublisherContext:
     return PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, lambda _device: described(ACTIONS), act)
 
 
-class OutputParams(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Arguments of an action."""
-
-    rate_hz: int
+def set_rate(_target: Target, *, rate_hz: int) -> None:
+    """The action `output`."""
 
 
-ACTIONS = {"output": Action("send at a rate", lambda _target, _params: None, OutputParams)}
+ACTIONS = {"output": Action("send at a rate", set_rate)}
 done_late = asyncio.Event()
 """`wait` is done when this is set."""
 

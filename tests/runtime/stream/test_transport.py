@@ -296,7 +296,7 @@ def test_error_of_the_link_is_a_failed_device_and_tried_again() -> None:
 
 
 def test_an_action_that_changes_the_rate_takes_port_and_memory_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    def at_921600(_target: object, _params: object) -> RequestScript[None]:
+    def at_921600(_target: object) -> RequestScript[None]:
         yield Request(b"?", "?", never, never, never, silent=True, baud=921600)
 
     monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, actions={"rate": Action("set it", at_921600)}))
