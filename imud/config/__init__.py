@@ -1,4 +1,4 @@
-"""The configuration file: it is read and checked as a whole before any port is opened. Loading opens only that file.
+"""The configuration file: read and checked as a whole before any port is opened. Loading opens only that file.
 
     log_level, state_dir          keys of the daemon (`General`)
     socket, shm, metrics, …       one key per row of PUBLISHERS, with that row's settings

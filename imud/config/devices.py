@@ -1,4 +1,4 @@
-"""Reads the devices of a file: each has a driver, one link, and perhaps lines and a source of RMC sentences."""
+"""Reading of the devices: each has a driver, one link, and perhaps lines and a source of RMC sentences."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -19,14 +19,14 @@ DEVICE_NAME: Final = pattern(r"[a-z0-9][a-z0-9_-]{0,31}")
 
 
 class DeviceReader:
-    """Reads the devices of one file."""
+    """Reader of the devices of one file."""
 
     def __init__(self, keys: Keys, tables: Tables) -> None:
         self._keys = keys
         self._tables = tables
 
     def devices(self, top: Mapping[str, Any]) -> list[tuple[DeviceConfig, bool]] | None:
-        """The devices without a problem, each with whether it is enabled; None where the key is missing or empty."""
+        """Read the devices without a problem, each with whether it is enabled; None if the key is missing or empty."""
         path: KeyPath = ("devices",)
         if "devices" not in top:
             self._keys.problem((), "expected the key devices with a name and keys for each device, got none")
@@ -94,7 +94,7 @@ class DeviceReader:
         return None if settings is None else (names[0], settings)
 
     def _driver_fits(self, path: KeyPath, driver: str, link: str) -> None:
-        """Refuse a driver on a link that does not carry what it speaks."""
+        """Refuse a driver on a link that cannot carry its protocol."""
         links, drivers = self._tables.links, self._tables.drivers
         if driver == "auto" and not links[link].searchable:
             known = ", ".join(self._fitting((name, name, link) for name in drivers))
@@ -104,7 +104,7 @@ class DeviceReader:
             self._keys.problem((*path, link), message, at_key=True)
 
     def _fitting(self, pairs: Iterable[tuple[str, str, str]]) -> list[str]:
-        """Names of those (name, driver, link) that fit, as far as their libraries are installed."""
+        """List the names of those (name, driver, link) that fit, as far as their libraries are installed."""
         found = []
         for name, driver, link in pairs:
             with suppress(ImportError):

@@ -1,4 +1,4 @@
-"""Reads the keys of one file against schemas, and collects problems with their places instead of stopping at one."""
+"""Reading of keys against schemas; problems are collected with their positions."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,25 +24,25 @@ class Keys:
         self.problems: list[Problem] = []
 
     def problems_besides(self, known: Sequence[Problem]) -> Iterator[Problem]:
-        """Problems found, without those that only follow from a `known` one at the same place or inside it."""
+        """List the problems, without those that only follow from a `known` one at the same place or inside it."""
         paths = [problem.path for problem in known]
         return (p for p in self.problems if not any(path[: len(p.path)] == p.path for path in paths))
 
     def mapping(self, path: KeyPath, data: object) -> Mapping[str, Any] | None:
-        """`data` if it is a mapping; otherwise a problem and None."""
+        """Return `data` if it is a mapping; otherwise add a problem and return None."""
         if isinstance(data, dict):
             return data
         self.problem(path, f"expected keys and values, got {got(data)}")
         return None
 
     def unknown_keys(self, path: KeyPath, keys: Mapping[str, Any], known: Sequence[str]) -> None:
-        """A problem for each key that is not `known`."""
+        """Add a problem for each key that is not `known`."""
         for key in keys:
             if key not in known:
                 self.problem((*path, key), unknown_name("a key", key, known), at_key=True)
 
     def row(self, table: Mapping[str, Row], name: str, data: object, path: KeyPath | None = None) -> Settings | None:
-        """The settings of row `name`; nothing written below a key means its defaults."""
+        """Read the settings of row `name`; an empty value means its defaults."""
         path = path or (name,)
         try:
             schema = table[name].settings
@@ -52,7 +52,7 @@ class Keys:
         return self.part(schema, data, path)
 
     def part(self, schema: type[S], data: object, path: KeyPath) -> S | None:
-        """The settings of one part by its schema; nothing written below a key means its defaults."""
+        """Read the settings of one part by its schema; an empty value means its defaults."""
         keys = self.mapping(path, {} if data is None else data)
         if keys is None:
             return None

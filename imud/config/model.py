@@ -1,4 +1,4 @@
-"""What a configuration is once it is read and checked, and how two of them differ."""
+"""A configuration after reading and checking, and the differences between two of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -10,7 +10,7 @@ from imud.utc.source import RmcSettings
 
 @dataclass(frozen=True, slots=True)
 class DeviceConfig:
-    """One device that imud is to use."""
+    """One device of the configuration."""
 
     name: str
     driver: str
@@ -24,7 +24,7 @@ class DeviceConfig:
     line: int = 0
     """Line of its name in the file; no property of the device."""
     lines: DeviceLines | None = None
-    """Its GPIO lines; None where it has none."""
+    """GPIO lines of the device; None without any."""
     rmc: RmcSettings | None = None
     """Source of the RMC sentences that are sent to it; None for none."""
 
@@ -36,7 +36,7 @@ class Config:
     log_level: str
     state_dir: str
     publishers: Mapping[str, Settings]
-    """Settings of every row of PUBLISHERS, with their defaults where the file says nothing."""
+    """Settings of every row of PUBLISHERS; defaults where the file has none."""
     devices: tuple[DeviceConfig, ...]
     """In the order of the file, without the disabled."""
     disabled: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class Config:
 
 @dataclass(frozen=True, slots=True)
 class Differences:
-    """What a new configuration changes, by name. `str()` of it is a sentence for the log."""
+    """Changes from one configuration to another, by name. `str()` of it is a sentence for the log."""
 
     devices_added: tuple[str, ...]
     devices_removed: tuple[str, ...]
@@ -61,7 +61,7 @@ class Differences:
 
 
 def differences(old: Config, new: Config) -> Differences:
-    """What `new` changes. Where in the file a device stands makes no difference."""
+    """List the changes in `new`. The order of devices in the file makes no difference."""
     before, after = ({d.name: _without_line(d) for d in config.devices} for config in (old, new))
     return Differences(
         devices_added=tuple(name for name in after if name not in before),

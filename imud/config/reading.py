@@ -1,4 +1,4 @@
-"""Reads and checks a whole file and makes a `Config` of it."""
+"""Reading and checking of a whole file, which makes a `Config`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,7 +37,7 @@ def parse(text: str | bytes, filename: str, tables: Tables = TABLES) -> Config:
 
 
 def _config(keys: Keys, tables: Tables) -> Config | None:
-    """The configuration, or None where problems do not let it be made."""
+    """Make the configuration; None where problems prevent it."""
     top = keys.mapping((), keys.tree.data)
     if top is None:
         return None

@@ -1,4 +1,4 @@
-"""What a configuration file may say: the keys of the daemon and of a device, and the tables that the rest comes from.
+"""Schema of the configuration file: keys of the daemon and of a device, and the tables that the rest comes from.
 
 A new row of a table (DRIVERS, LINKS, PUBLISHERS) is configurable without a change here.
 """
@@ -19,7 +19,7 @@ class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Keys of the daemon itself."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """What is written to the log: this and what is more severe."""
+    """Lowest level of messages in the log."""
     state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
     """Folder where imud remembers at which rate each device was found. systemd's STATE_DIRECTORY wins over it."""
 
@@ -28,7 +28,7 @@ class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Keys of a device itself, as opposed to those of its link and its driver."""
 
     driver: str = "auto"
-    """Which wire protocol the device speaks, or `auto`: listen and see."""
+    """Wire protocol of the device, or `auto`: detect it by listening."""
     enabled: bool = True
     """Whether imud uses the device; if not, its keys are checked all the same."""
     identify: bool = True
@@ -36,7 +36,7 @@ class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Row(Protocol):
-    """What the configuration needs to know of a row of a table."""
+    """Row of a table, as far as the configuration needs it."""
 
     @property
     def settings(self) -> type[Settings]:
@@ -45,7 +45,7 @@ class Row(Protocol):
 
 
 class DriverRow(Row, Protocol):
-    """What the configuration needs to know of a driver."""
+    """Row of a driver, as far as the configuration needs it."""
 
     @property
     def lines(self) -> frozenset[str]:
@@ -54,7 +54,7 @@ class DriverRow(Row, Protocol):
 
 
 class LinkRow(Row, Protocol):
-    """What the configuration needs to know of a link."""
+    """Row of a link, as far as the configuration needs it."""
 
     @property
     def searchable(self) -> bool:

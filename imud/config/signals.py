@@ -1,4 +1,4 @@
-"""Reads `lines` and `rmc` of a device: its GPIO lines, none of them used twice, and its source of RMC sentences."""
+"""Reading of `lines` and `rmc` of a device: its GPIO lines, none used twice, and its source of RMC sentences."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,13 +16,13 @@ LINK: Final = "uart"
 PULSE: Final = "pps"
 """A device with this line synchronises to a pulse per second and RMC sentences."""
 TRIGGER: Final = "sin"
-"""The line by which imud drives the input that the pulse would come on."""
+"""Key of the line by which imud drives the input of the pulse."""
 
 
 def read_lines(
     keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
 ) -> DeviceLines | None:
-    """The GPIO lines below the key `lines` of a device; None where it has none."""
+    """Read the GPIO lines below the key `lines` of a device; None where it has none."""
     if "lines" not in device:
         return None
     found = keys.mapping(path, device["lines"])
@@ -55,7 +55,7 @@ def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
 def read_rmc(
     keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, DriverRow]
 ) -> RmcSettings | None:
-    """The settings below the key `rmc` of a device; None where it has none."""
+    """Read the settings below the key `rmc` of a device; None where it has none."""
     if "rmc" not in device:
         return None
     driver = device.get("driver", "auto")
@@ -78,7 +78,7 @@ def read_rmc(
 
 
 def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, DriverRow]) -> None:
-    """Refuse lines that no device has, and those that devices of this driver do not have."""
+    """Refuse lines that no device has, and lines that devices of this driver do not have."""
     keys.unknown_keys(path, found, list(LINE_SCHEMAS))
     if driver == "auto":
         message = "expected lines only beside a named driver, got them with driver auto; drivers that have lines"

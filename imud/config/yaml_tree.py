@@ -1,4 +1,4 @@
-"""YAML as plain data that remembers where each value stands, without the surprises of YAML.
+"""YAML as plain data with the position of each value, without YAML's implicit conversions.
 
 Read from parser events into a tree with an explicit stack: `yaml.compose` recurses in C and ends the process with a
 segmentation fault at 200 000 open brackets (measured, PyYAML 6.0.3 with libyaml), and YAML's own rules for plain words
@@ -38,7 +38,7 @@ class SourcePosition:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """Something that is wrong, and where."""
+    """A problem of a file and its position."""
 
     mark: SourcePosition
     path: Path
@@ -55,18 +55,18 @@ class YamlTree:
     """False where reading ended at the last problem: what is behind it is not in `data`."""
     problems: list[Problem] = field(default_factory=list)
     values: dict[Path, SourcePosition] = field(default_factory=dict)
-    """Where the value at a path begins."""
+    """Position of the value at each path."""
     keys: dict[Path, SourcePosition] = field(default_factory=dict)
-    """Where the key of the value at a path stands."""
+    """Position of the key of the value at each path."""
 
     def mark(self, path: Path) -> SourcePosition:
-        """Where the value at `path` begins, or the nearest that is there above it."""
+        """Return the position of the value at `path`, or of its nearest parent that exists."""
         while path and path not in self.values:
             path = path[:-1]
         return self.values.get(path, SourcePosition(1, 1))
 
     def key_mark(self, path: Path) -> SourcePosition:
-        """Where the key of the value at `path` stands, or the value itself in a list."""
+        """Return the position of the key of the value at `path`, or in a list of the value itself."""
         return self.keys.get(path) or self.mark(path)
 
 
@@ -83,18 +83,18 @@ def read_yaml(content: bytes) -> YamlTree:
 
 
 def path_text(path: Path) -> str:
-    """A path for people: `devices.front.uart.baud`, `devices.front.ids[2]`."""
+    """Format a path for people: `devices.front.uart.baud`, `devices.front.ids[2]`."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{_name(part)}" for part in path)
     return text.removeprefix(".")
 
 
 def _name(key: str) -> str:
-    """A key as it is, or in quotes and with escapes if it could be taken for more than a word."""
+    """Format a key as it is, or in quotes and with escapes if it could be taken for more than a word."""
     return key if re.fullmatch(r"[\w()-]+", key) else shown(key)
 
 
 class _Refused(Exception):
-    """Reading cannot go on behind this problem."""
+    """A problem after which reading cannot continue."""
 
     def __init__(self, mark: SourcePosition, message: str, path: Path = ()) -> None:
         super().__init__(message)
@@ -102,7 +102,7 @@ class _Refused(Exception):
 
 
 class _Event(Protocol):
-    """What is used of PyYAML's events, whose stubs leave the fields open."""
+    """The fields of PyYAML's events that are used here; its stubs leave them untyped."""
 
     start_mark: yaml.Mark
     anchor: str | None
@@ -168,7 +168,7 @@ class _Open:
 
 
 class _Builder:
-    """Builds the tree from events. The stack is a list, so that no nesting can overflow the process's own."""
+    """Builder of the tree from events. The stack is a list, so that no nesting can overflow the process's own."""
 
     def __init__(self, tree: YamlTree) -> None:
         self._tree = tree
@@ -292,7 +292,7 @@ _TRAPS = (
 
 
 def plain(word: str) -> object:
-    """What an unquoted word means: null, a truth value, a number, or text. Raises ValueError for traps."""
+    """Resolve an unquoted word: null, a truth value, a number, or text. Raises ValueError for ambiguous words."""
     for trap, message in _TRAPS:
         if trap.fullmatch(word):
             raise ValueError(message.format(word[:_NUMBER_CHARACTERS_MAX]))

@@ -1,1 +1,1 @@
-"""What a codec, link, driver, session, action and publisher promise."""
+"""Interfaces of codecs, links, drivers, sessions, actions and publishers."""

@@ -13,12 +13,12 @@ from imud.ledger import Ledger
 
 
 def nothing_cyclic(_settings: Any) -> Sequence[CyclicFrame]:
-    """The cyclic frames of a device that needs none."""
+    """Return no cyclic frames: the version for devices that need none."""
     return ()
 
 
 class CanCodec(Protocol):
-    """Turns the frames of one device into events. Frames of others may be among them and change nothing.
+    """Decoder of the frames of one device. Frames of other devices may be among them and change nothing.
 
     The ledger counts data bytes: those of frames of other devices as skipped. Synchronization: one thread.
     """
@@ -30,11 +30,11 @@ class CanCodec(Protocol):
         ...
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The bus is idle: return what waits for frames that will not come."""
+        """Return what waits for frames that will not come: the bus is idle."""
         ...
 
     def reset(self) -> None:
-        """Frames are missing here (overrun, bus down): discard those that wait for the rest of their sample."""
+        """Discard frames that wait for the rest of their sample: some are missing here (overrun, bus down)."""
         ...
 
 

@@ -11,7 +11,7 @@ from imud.sample import Measurement
 
 
 class BadReason(StrEnum):
-    """Why a frame was refused; each reason has its own counter in the ledger."""
+    """Reasons to reject a frame; each has its own counter in the ledger."""
 
     CRC = "crc"
     """The check value does not match: damaged on the wire, or a sync word inside other data."""
@@ -46,19 +46,19 @@ class ReplyFrame(msgspec.Struct, frozen=True, gc=False):
 
 
 Message = str | ReplyFrame
-"""What can answer a command: a line of text without its end, or a binary frame."""
+"""A message that can answer a command: a line of text without its end, or a binary frame."""
 CodecEvent = Measurement | TextLine | ReplyFrame | BadFrame
 
 
 def message_of(event: CodecEvent) -> Message | None:
-    """The event as something that can answer a command, or None."""
+    """Return the event if it can answer a command, else None."""
     if isinstance(event, TextLine):
         return event.text
     return event if isinstance(event, ReplyFrame) else None
 
 
 class StreamCodec(Protocol):
-    """Turns a byte stream into events. Any split of the bytes gives the same events.
+    """Decoder of a byte stream. Any split of the bytes gives the same events.
 
     Synchronization: one thread. Memory is bounded by the longest frame plus the longest text line.
     """
@@ -70,9 +70,9 @@ class StreamCodec(Protocol):
         ...
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The line is idle: return whole frames that wait inside a longer frame that never came. Loses nothing."""
+        """Return whole frames that wait inside a longer frame that never came: the line is idle. Loses nothing."""
         ...
 
     def reset(self) -> None:
-        """The stream broke (unplugged, other baud rate): what is pending becomes skipped."""
+        """Count what is pending as skipped: the stream broke (unplugged, other baud rate)."""
         ...

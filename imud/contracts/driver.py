@@ -1,4 +1,4 @@
-"""Contract of a driver: everything the rest of imud needs to know about one wire protocol."""
+"""Contract of a driver, the description of one wire protocol for the rest of imud."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -19,25 +19,25 @@ SAMPLE_COUNTER = 0
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a device says it is. Empty strings where it does not say."""
+    """Identity as the device reports it. Strings are empty where it reports none."""
 
     product: str = ""
     serial_number: str = ""
     firmware: str = ""
     details: Mapping[str, str] | None = None
-    """Everything else it said, by the device's own names."""
+    """Further properties, by the device's own names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Driver:
-    """What the rows of all wire protocols have; the links that a driver can use follow from its kind."""
+    """Fields that drivers of all wire protocols have; the links that a driver can use follow from its kind."""
 
     name: str
     """Family and link, for example `hipnuc-uart`."""
     title: str
     """Vendor and products, for people."""
     settings: type[Settings]
-    """What can be configured of the driver (`options` of a device)."""
+    """Type of the driver's settings (`options` of a device)."""
     tick_ns: int
     """Length of one device tick in ns, or SAMPLE_COUNTER."""
     tick_modulus: int
@@ -51,9 +51,9 @@ class Driver:
     lines: frozenset[str] = frozenset()
     """GPIO lines that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
     alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
-    """Reads from the device's settings what its ALARM line indicates; None if they do not say."""
+    """Reads the meaning of the ALARM line from the device's settings; None if they have none."""
     time_bits: TimeBits = NO_TIME_BITS
-    """Bits of `Measurement.status` that speak of time."""
+    """Bits of `Measurement.status` about time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ class StreamDriver(Driver):
     """A device that sends a byte stream by itself (UART, RS-232, USB serial)."""
 
     baud_rates: tuple[int, ...]
-    """Rates the device knows, in bit/s, most likely first: detection tries them in this order."""
+    """Rates of the device in bit/s, most likely first: detection tries them in this order."""
     make_codec: Callable[[Ledger, Any], StreamCodec]
     """Makes a codec that counts into the ledger, from an instance of `settings`."""
     identify: Callable[[], RequestScript[Identity]]
@@ -74,12 +74,12 @@ class StreamDriver(Driver):
     """Makes a device send samples that answers and sends none, and says whether it acknowledged; nothing is saved.
     Raises NoReply where nothing answers. None for devices that cannot be silent."""
     example_frame: Callable[[Random], bytes]
-    """One valid frame with random values, for the shared property tests and for fault injection."""
+    """Make one valid frame with random values, for the shared property tests and for fault injection."""
 
 
 D = TypeVar("D", bound=Driver)
 
 
 def of_kind(drivers: Iterable[Driver], kind: type[D]) -> list[D]:
-    """The drivers of one kind, in their order."""
+    """Return the drivers of one kind, in their order."""
     return [driver for driver in drivers if isinstance(driver, kind)]

@@ -172,7 +172,7 @@ class AlarmRange(NamedTuple):
 
 
 class AlarmRanges(NamedTuple):
-    """What the ALARM line of a device indicates, as its settings say."""
+    """Meaning of the ALARM line of a device, by its settings."""
 
     by_axis: Mapping[str, AlarmRange]
     """By the device's name of the axis; an axis that the settings do not give is missing."""
@@ -241,7 +241,7 @@ class OutputLine(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LineFactory:
-    """Makes closed lines from their settings and a purpose for people, for example `bow sout`."""
+    """Factory of closed lines, from their settings and a purpose for people, for example `bow sout`."""
 
     make_input: Callable[[Any, str, bool], InputLine]
     """From `InputSettings`; the last argument is True if only rising edges are needed."""

@@ -1,4 +1,4 @@
-"""Contract: a link owns one port; it delivers what arrived with the time of arrival, and reports its own end."""
+"""Contract of a link, the owner of one port: it delivers received data with arrival times, and reports its end."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ OnBusNews = Callable[[str, str], None]
 
 
 class Link(Protocol):
-    """What all links have. Synchronization: the loop's thread only.
+    """Methods of every link. Synchronization: the loop's thread only.
 
     Order of calls: `wait_present`, `open`, `start` (of its kind), then the others in any order, `close`. The same
     object may then be used again from the beginning.
@@ -65,7 +65,7 @@ class StreamLink(Link, Protocol):
     auto_baud: bool
     """Whether detection is to find the rate."""
     hold_ns: int
-    """How long the adapter may hold bytes back (USB latency timer), ns; 0 if it does not."""
+    """Longest time that the adapter holds bytes back (USB latency timer), ns; 0 for none."""
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         """Deliver bytes from now on. Needs a running loop and an open port."""
@@ -77,7 +77,7 @@ class StreamLink(Link, Protocol):
 
 
 class CanLink(Link, Protocol):
-    """A CAN bus as one device sees it; several devices share a bus, each by a link of its own."""
+    """A CAN bus for one device; several devices share a bus, each by a link of its own."""
 
     bus: str
     """Name of the bus: links of the same bus receive the same frames."""
@@ -87,7 +87,7 @@ class CanLink(Link, Protocol):
     """Rate of the bus in bit/s, known once open; 0 where there is none (virtual buses) or it is unknown."""
 
     def absence(self) -> str:
-        """Why `wait_present` would wait now, one sentence; empty when it would not."""
+        """Return the reason why `wait_present` would wait now, one sentence; empty when it would not."""
         ...
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
@@ -103,7 +103,7 @@ class CanLink(Link, Protocol):
 
 
 class PolledLink(Link, Protocol):
-    """A bus as one device sees it; the bus's thread makes the transfers of all its devices.
+    """A polled bus for one device; the bus's thread makes the transfers of all its devices.
 
     The bus's thread calls `select`, `transfer` and `close` once the device has joined the bus, the loop's thread the
     rest. `write` raises LinkError: all bytes are sent in transfers.
@@ -149,7 +149,7 @@ def _no_transfers(_settings: Settings) -> PolledLink:
 
 @dataclass(frozen=True, slots=True)
 class LinkType(Generic[S]):
-    """The row of a link. Its makers decide what kinds of drivers can use it."""
+    """Row of a link. Its factories decide which kinds of drivers can use it."""
 
     name: str
     """The key under a device in the configuration."""

@@ -27,7 +27,7 @@ class Transfer:
     sends: tuple[bytes, ...]
     """SPI: the bytes of each assertion of chip select, of which as many are read. I2C: one item, written first."""
     read_bytes: int = 0
-    """I2C: so many bytes are read after a repeated start; 0 for a write alone."""
+    """I2C: number of bytes to read after a repeated start; 0 for a write alone."""
     gap_us: int = 0
     """SPI: pause after each assertion of chip select."""
 
@@ -49,7 +49,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     """The result of one poll."""
 
     poll: int
-    """Its index in the codec's `polls`."""
+    """Index of the poll in the codec's `polls`."""
     data: bytes
     """All bytes read, in their order; empty if the transfer failed."""
     error: TransferError | None
@@ -60,7 +60,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
 
 
 class Vanished(msgspec.Struct, frozen=True):
-    """The bytes show that the device is absent or has lost its settings: it must be identified again."""
+    """Evidence that the device is absent or has lost its settings: it must be identified again."""
 
     why: str
 
@@ -69,23 +69,23 @@ PolledEvent = CodecEvent | Vanished
 
 
 class PolledCodec(Protocol):
-    """Turns what polls read into events. Synchronization: one thread."""
+    """Decoder of the results of polls. Synchronization: one thread."""
 
     ledger: Ledger
     polls: Sequence[Poll]
-    """What to read; the first makes the samples."""
+    """Cyclic reads; the first makes the samples."""
 
     @property
     def stale(self) -> int:
         """Frames that were the same as the one before: the device had nothing new."""
         ...
 
-    def take(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+    def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
         """Decode the bytes of one transfer. Never raises for any bytes, of any length."""
         ...
 
     def reset(self) -> None:
-        """The device was identified anew: the next frame is not compared with an earlier one."""
+        """Forget the last frame, with which the next one is compared: the device was identified anew."""
         ...
 
 
@@ -98,7 +98,7 @@ class PolledDriver(Driver):
     link: str
     """Name of the link it hangs on, a row of LINKS."""
     targets: tuple[int, ...]
-    """Where to look for it when the link says `auto`, most likely first: I2C addresses, SPI modes."""
+    """Values to try when the link says `auto`, most likely first: I2C addresses, SPI modes."""
     probe: Callable[[Any], TransferScript[Identity]]
     """Reads the identity of a device with these settings. Raises DeviceRefused for another device. Changes nothing."""
     set_up: Callable[[Any], TransferScript[Mapping[str, str]]]

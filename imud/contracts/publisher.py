@@ -1,4 +1,4 @@
-"""What a publisher promises: it outputs samples and events and never makes the pipeline wait."""
+"""Contract of a publisher: it outputs samples and events, and never makes the pipeline wait."""
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,14 +17,14 @@ StatusSource = Callable[[], Sequence[DeviceStatus]]
 
 
 class Batch:
-    """The samples that one read of one device completed, oldest first, at least one; shared by all, changed by none."""
+    """Samples completed by one read of one device, oldest first, at least one; shared by all publishers, immutable."""
 
     __slots__ = ("_slots", "device", "device_id", "samples")
 
     def __init__(self, device: str, device_id: int, samples: Sequence[Sample]) -> None:
         self.device = device
         self.device_id = device_id
-        """The daemon's number of the device, as it stands in slots."""
+        """The daemon's number of the device, as in slots."""
         self.samples = samples
         self._slots: list[bytes] | None = None
 
@@ -44,15 +44,15 @@ class Publisher(Protocol):
         ...
 
     def add_device(self, name: str, device_id: int) -> None:
-        """A device of the configuration appears: make room for it."""
+        """Prepare for a device that the configuration added."""
         ...
 
     def remove_device(self, name: str) -> None:
-        """The device left the configuration."""
+        """Remove a device that left the configuration."""
         ...
 
     def publish(self, batch: Batch) -> None:
-        """Give the samples to readers; drop for readers that are slow, and count that."""
+        """Give the samples to readers; drop and count them for slow readers."""
         ...
 
     def event(self, event: Event) -> None:
@@ -60,7 +60,7 @@ class Publisher(Protocol):
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Called ten times a second: heartbeats, ledgers, time-outs."""
+        """Send heartbeats and ledgers, check time-outs; called ten times a second."""
         ...
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ async def _no_actions(device: str, _name: str, _arguments: Mapping[str, Any]) ->
 
 @dataclass(frozen=True, slots=True)
 class PublisherContext:
-    """What every publisher may know of the daemon."""
+    """The parts of the daemon that publishers may use."""
 
     status: StatusSource
     epoch: int
@@ -94,7 +94,7 @@ class PublisherContext:
 
 
 class PublisherSettings(Protocol):
-    """What the settings of every publisher have; the daemon leaves out those that are not enabled."""
+    """Settings that every publisher has; the daemon leaves out publishers that are not enabled."""
 
     @property
     def enabled(self) -> bool:
@@ -104,7 +104,7 @@ class PublisherSettings(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PublisherType:
-    """The row a publisher file ends with."""
+    """Row of a publisher."""
 
     name: str
     """The top-level key in the configuration."""

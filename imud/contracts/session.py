@@ -17,14 +17,14 @@ from imud.units import NS_PER_S
 T = TypeVar("T")
 
 REPLY_MESSAGES_MAX = 256
-"""No reply of any manual has more than some dozens of messages; more means that its end was lost."""
+"""Limit of messages per reply: the longest reply of any manual has some dozens; more means that its end was lost."""
 LATE_WINDOW_NS = 5 * NS_PER_S
 """A matching message up to this long after a time-out counts as the late reply to the request that timed out."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request: the bytes to send, and how to recognise the reply."""
+    """A request: the bytes to send, and how to recognise the reply."""
 
     payload: bytes
     """Bytes for the link; empty sends nothing."""
@@ -49,12 +49,12 @@ class Request:
 
 
 def never(_message: Message) -> bool:
-    """False for every message."""
+    """Return False: no message matches."""
     return False
 
 
 def of_text(holds: Callable[[str], bool]) -> Callable[[Message], bool]:
-    """A predicate that is true for messages that are text for which `holds` is."""
+    """Make a predicate that is true for text for which `holds` is."""
     return lambda message: isinstance(message, str) and holds(message)
 
 
@@ -64,7 +64,7 @@ def pause(duration_ns: int, *, baud: int = 0) -> Request:
 
 
 def with_undo(script: "RequestScript[T]", undo: bytes) -> "RequestScript[T]":
-    """The same script with `undo` in every request."""
+    """Make the same script with `undo` in every request."""
     try:
         request = next(script)
         while True:
@@ -111,13 +111,13 @@ RequestScript = Generator[Request, Outcome, T]
 
 
 def says_nothing(value: T) -> RequestScript[T]:
-    """The script for a device that answers nothing: no request, and `value` as its result."""
+    """Make the script for a device that answers nothing: no request, and `value` as its result."""
     return value
     yield  # makes it a generator
 
 
 class Session:
-    """One outstanding request at a time; distinguishes late replies from current ones and counts them.
+    """Exchange of one request at a time; distinguishes late replies from current ones and counts them.
 
     Devices answer in the order they were asked. A message is late when it can belong to the request that timed out and
     not to the outstanding one, or when it ends a reply whose messages were late. Two requests whose replies are the
@@ -136,7 +136,7 @@ class Session:
         self._late_messages = 0
         """Messages of the late reply that is just arriving."""
         self.deadline_ns: int | None = None
-        """When the outstanding request times out (CLOCK_MONOTONIC), or None."""
+        """Deadline of the outstanding request (CLOCK_MONOTONIC), or None."""
 
     @property
     def busy(self) -> bool:

@@ -1,4 +1,4 @@
-"""Settings of every part: their base type, and in words what a field of them accepts and what came instead.
+"""Settings: their base type, and descriptions of accepted and of rejected values.
 
 A part declares its own struct: frozen, keyword-only, unknown keys refused, each field with a default where there is
 one. `imud.config` fills it from YAML through msgspec, which checks types and `msgspec.Meta` bounds. The docstring below
@@ -21,16 +21,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class NoSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """For parts that have none."""
+    """Settings of parts that have none."""
 
 
 def expected(field_type: Any) -> str:
-    """What values of `field_type` are, for example `a whole number from 50 to 4000000, or "auto"`."""
+    """Describe the values of `field_type`, for example `a whole number from 50 to 4000000, or "auto"`."""
     return _words(inspect.type_info(field_type))
 
 
 def got(value: object) -> str:
-    """`value` as it stands in a file, with its kind where that is not plain to see."""
+    """Format `value` as it stands in a file, with its kind where that is not obvious."""
     if value is None:
         return "nothing"
     if isinstance(value, Mapping):
@@ -43,13 +43,13 @@ def got(value: object) -> str:
 
 
 def shown(value: object) -> str:
-    """`value` as one would write it into a configuration file, in one line of plain ASCII or printable text."""
+    """Format `value` for a configuration file, in one line of plain ASCII or printable text."""
     text = msgspec.json.encode(value).decode()
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
 
 
 def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
-    """The error for a name that is not among `known`, with the nearest one. `what`: for example `a driver`."""
+    """Format the error for a name that is not among `known`, with the nearest one. `what`: for example `a driver`."""
     near = get_close_matches(name, known, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]}? " if near else ""
     return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"

@@ -1,4 +1,4 @@
-"""What is known of one device at one moment: the one record behind `status`, shared memory and the metrics."""
+"""Status of a device at one moment: the record behind the command `status`, shared memory and the metrics."""
 
 from enum import StrEnum
 
@@ -8,20 +8,20 @@ from imud.sample import Sync
 
 
 class DeviceState(StrEnum):
-    """Where a device is in its life."""
+    """States of a device."""
 
     MISSING = "missing"
-    """Its link is not there; imud waits for it."""
+    """Its link is absent; imud waits for it."""
     SEARCHING = "searching"
     """The link is open; no valid frame was heard yet."""
     RUNNING = "running"
     """Samples flow."""
     SILENT = "silent"
-    """It was running and sends nothing now, though the link is there."""
+    """It sends nothing now, though its link is present; it was running before."""
     FINISHED = "finished"
     """A replay came to its end."""
     FAILED = "failed"
-    """It cannot be used until someone acts; `problem` says why. imud tries again all the same."""
+    """It needs an operator's action, see `problem`; imud tries again all the same."""
 
 
 class ClockStatus(msgspec.Struct, frozen=True):
@@ -31,15 +31,15 @@ class ClockStatus(msgspec.Struct, frozen=True):
     offset_ns: int = 0
     """Host CLOCK_MONOTONIC minus unwrapped device time, at the newest sample."""
     skew_ppm: float = 0.0
-    """How much faster than the host's the device's clock runs; +40 means 40 µs more per second."""
+    """Rate error of the device's clock against the host's, 1e-6; +40: it gains 40 µs per second."""
     residual_ns: int = 0
     """One-sigma spread of the lower envelope of arrival times around the fit."""
     t_err_ns: int = 0
-    """As in the newest sample."""
+    """`sync` of the newest sample."""
     resets: int = 0
     """Times the device's clock started anew (restart of the device, jump of its counter)."""
     hold_ns: int = 0
-    """How long the link's adapter may hold bytes back (USB latency timer); 0 for none."""
+    """Longest time that the link's adapter holds bytes back (USB latency timer); 0 for none."""
     edges: int = 0
     """Pulses on the SOUT line, or triggers given on SIN."""
     edges_unpaired: int = 0
@@ -49,7 +49,7 @@ class ClockStatus(msgspec.Struct, frozen=True):
     triggers_missed: int = 0
     """Triggers on SIN that no frame answered."""
     reference_error_ns: int = 0
-    """One-sigma error of what the host knows of UTC; 0 while it knows nothing."""
+    """One-sigma error of the host's estimate of UTC; 0 without one."""
 
 
 class KernelCounters(msgspec.Struct, frozen=True):
@@ -67,7 +67,7 @@ class KernelCounters(msgspec.Struct, frozen=True):
 
 
 class PollingStatus(msgspec.Struct, frozen=True):
-    """How the reading of a device that must be asked goes, since start."""
+    """Reads of a polled device, since start."""
 
     polls: int = 0
     """Deadlines at which it was read."""
@@ -86,11 +86,11 @@ class PollingStatus(msgspec.Struct, frozen=True):
     late_worst_ns: int = 0
     """The longest."""
     late_sum_ns: int = 0
-    """All of them together."""
+    """Sum of all lateness."""
 
 
 class SerialLineCounters(msgspec.Struct, frozen=True):
-    """What came on a shared serial line other than replies, since it was opened."""
+    """Bytes on a shared serial line other than replies, since it was opened."""
 
     timeouts: int = 0
     """Requests without a reply."""
@@ -130,12 +130,12 @@ class LinesStatus(msgspec.Struct, frozen=True):
 
 
 class UtcStatus(msgspec.Struct, frozen=True):
-    """How a device gets UTC, and what the host knows of it, since start."""
+    """Sources of UTC for a device and for the host, since start."""
 
     source: str
-    """Where RMC sentences come from, for people; empty without a source."""
+    """Source of RMC sentences, for people; empty without a source."""
     problem: str
-    """What is wrong with that or with the feed of chronyd now, one sentence; empty when all is well."""
+    """Present fault of the source or of the feed of chronyd, one sentence; empty for none."""
     sentences: int = 0
     """Sentences that the source gave."""
     sent: int = 0
@@ -145,7 +145,7 @@ class UtcStatus(msgspec.Struct, frozen=True):
     pulses: int = 0
     """Pulses per second that counted."""
     pulses_ignored: int = 0
-    """Those that were in step with none."""
+    """Pulses that were in step with no other."""
     chrony_sent: int = 0
     """Samples given to chronyd."""
     chrony_refused: int = 0
@@ -197,7 +197,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     connects: int
     """Times the link was opened since start."""
     euler_convention: str = ""
-    """Order, axes and signs of `euler_rad`, as the driver says; empty while the driver is not known."""
+    """Order, axes and signs of `euler_rad`, from the driver; empty while the driver is not known."""
     navigation_frame: str = ""
     """The frame that `quat_wxyz` turns into; empty while the driver is not known."""
     polling: PollingStatus | None = None

@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 class Table(Mapping[str, T], Generic[T]):
-    """Maps a name to the object that its row points at. A new plug-in is one new file and one row.
+    """Mapping from a name to the object of its row. A new plug-in is one new file and one row.
 
     Raises KeyError for a name without a row; the message lists the names there are.
     """

@@ -1,4 +1,4 @@
-"""Decode what is read from a polled device: absent, damaged, stale (the same as before), or a new measurement."""
+"""Decoding of frames read from a polled device: absent, damaged, stale (the same as before), or a new measurement."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,7 +12,7 @@ Measured = tuple[Measurement, bool]
 
 
 class PolledFrameDecoder:
-    """Frames of fixed size with a check value, one per transfer. Synchronization: one thread.
+    """Decoder of frames of fixed size with a check value, one per transfer. Synchronization: one thread.
 
     In the ledger a stale frame is a good one that is ignored; one that shows an absent device is skipped bytes.
     """
@@ -30,7 +30,7 @@ class PolledFrameDecoder:
         bad: Callable[[bytes], BadReason | None],
         measure: Callable[[bytes], Measured],
     ) -> Sequence[PolledEvent]:
-        """Decode one frame: `bad` says why it is damaged, `measure` is called for new good ones only. Never raises."""
+        """Decode one frame: `bad` returns why it is damaged, `measure` is called for new good ones. Never raises."""
         ledger = self._ledger
         ledger.bytes_in += len(data)
         if len(data) != self._size_bytes or (why := absence(data)):
@@ -71,7 +71,7 @@ class PolledFrameDecoder:
             ledger.bytes_skipped += len(data)
 
     def reset(self) -> None:
-        """Forget the frame before: the next one is new, even with the same bytes."""
+        """Forget the last frame: the next one is new, even with the same bytes."""
         self._last = b""
 
 
@@ -80,7 +80,7 @@ _ZEROS = frozenset({0x00})
 
 
 def absence(data: bytes) -> str:
-    """Why these bytes come from a line that no device drives; empty if they may be of a device."""
+    """Return why these bytes come from a line that no device drives; empty if they may be of a device."""
     first = data[:1]
     if first not in (b"\xff", b"\x00", b""):
         return ""

@@ -1,1 +1,1 @@
-"""Bytes without I/O that several parts share."""
+"""Formats of bytes and text that several parts share, without I/O."""

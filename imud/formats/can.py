@@ -27,7 +27,7 @@ identifiers of 11 and of 29 bits."""
 
 
 class CanFrame(NamedTuple):
-    """One data frame as received."""
+    """A data frame as received."""
 
     can_id: int
     """Identifier without flags."""
@@ -48,7 +48,7 @@ class CanFilter:
     mask: int
     extended: bool
 
-    def takes(self, can_id: int, extended: bool) -> bool:
+    def matches(self, can_id: int, extended: bool) -> bool:
         """Whether a frame passes the filter."""
         return extended == self.extended and not (can_id ^ self.can_id) & self.mask
 
@@ -64,7 +64,7 @@ class CyclicFrame:
     extended: bool
     data: bytes
     every_ns: int
-    """Its period, whole microseconds; the first one is sent at once."""
+    """Period in whole microseconds; the first frame is sent at once."""
 
 
 def frame_bits(extended: bool, data_bytes: int) -> int:

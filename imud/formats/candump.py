@@ -27,7 +27,7 @@ _OTHER: Final = re.compile(
 
 
 class CandumpReader:
-    """Reads a log from any binary stream. Iterate once: frames with the log's own times as `t_rx_ns`, never falling."""
+    """Reader of a log from any binary stream. Iterate once: frames with the log's times as `t_rx_ns`, never falling."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

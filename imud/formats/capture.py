@@ -1,4 +1,4 @@
-"""Capture files: the bytes a link delivered. A raw capture is the bytes alone; a stamped one has the time of each read.
+"""Capture files: bytes of a link. A raw capture is the bytes alone; a stamped one has the time of each read.
 
 A stamped capture begins with one line of ASCII, then come records to the end of the file, little-endian::
 
@@ -23,7 +23,7 @@ MAGIC: Final = b"#imud-capture "
 VERSION: Final = "1"
 HEADER_BYTES_MAX: Final = 4096
 RECORD_BYTES_MAX: Final = 1 << 20
-"""No link reads more at once; a larger length is damage."""
+"""Largest read of any link; a larger length is damage."""
 RAW_CHUNK_BYTES: Final = 4096
 """Size of the pieces of a raw capture: as much as a tty hands over at once."""
 
@@ -40,7 +40,7 @@ class Chunk(NamedTuple):
 
 
 class CaptureReader:
-    """Reads a raw or stamped capture from any binary stream, seekable or not. Iterate once.
+    """Reader of a raw or stamped capture from any binary stream, seekable or not. Iterate once.
 
     The first bytes of the file decide which of the two it is.
     """
@@ -63,7 +63,7 @@ class CaptureReader:
 
     @property
     def hold_ns(self) -> int:
-        """How long the adapter may have held bytes back, as named in the first line, ns; 0 when it is not."""
+        """Longest time that the adapter held bytes back, as named in the first line, ns; 0 if it is not."""
         return self._number("hold_ns")
 
     def __iter__(self) -> Iterator[Chunk]:

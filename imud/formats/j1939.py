@@ -34,7 +34,7 @@ class J1939Id(NamedTuple):
     priority: int
     """0 is the highest, 7 the lowest."""
     pgn: int
-    """Its low byte is 0 where a destination stands in the identifier."""
+    """PGN; its low byte is 0 where a destination stands in the identifier."""
     source: int
     destination: int = GLOBAL
 

@@ -1,4 +1,4 @@
-"""Modbus RTU framing as a master needs it: address, function, data, CRC, and finding the reply to a request.
+"""Modbus RTU framing for a master: address, function, data, CRC, and the search for the reply to a request.
 
     request   address | function | data … | CRC low | CRC high
     reply     address | function | data … | CRC low | CRC high        exception  address | function + 0x80 | code | CRC
@@ -93,7 +93,7 @@ def frame_gap_ns(baud: int) -> int:
 
 
 class ReplyFinder:
-    """Finds the reply to one request among the received bytes, without I/O.
+    """Finder of the reply to one request among the received bytes, without I/O.
 
     A frame at the beginning with the head of the reply is the reply, damaged or not: the caller counts damage. After
     other bytes only a frame with a matching CRC is accepted. `feed` all that is read; `rest` has what is left when the

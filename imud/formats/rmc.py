@@ -30,12 +30,12 @@ _STATUS, _DAY, _MODE = 1, 8, 11  # numbers of the fields after the time
 
 
 class RmcFault(StrEnum):
-    """Why bytes are not a usable sentence."""
+    """Reasons why bytes are not a usable sentence."""
 
     LENGTH = "length"
     """Longer than SENTENCE_BYTES_MAX."""
     FORM = "form"
-    """Not an RMC sentence: another one, bytes lost, or noise."""
+    """Not an RMC sentence: another sentence, an incomplete one, or noise."""
     CHECKSUM = "checksum"
     """The checksum does not match."""
     CONTENT = "content"

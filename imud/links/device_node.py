@@ -1,4 +1,4 @@
-"""Device nodes in /dev: waiting for one, and what a failed open or transfer means as errors of imud.
+"""Device nodes in /dev: waiting for one, and imud's errors for a failed open or transfer.
 
 A node is missing until its driver makes it, and refused until udev sets its group. Messages name its group and the
 processes that have it open, read from the file system and /proc.
@@ -28,7 +28,7 @@ NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
 STUCK: Final = frozenset({errno.ETIMEDOUT})
 
 ACCESS_WAIT_S: Final = 1.0
-"""How long to wait for access after a refusal: udev sets a node's group within some ms of its making."""
+"""Time to wait for access after a refusal: udev sets a node's group some ms after it makes the node."""
 SERIAL_GROUP: Final = "dialout"
 """Group of serial ports and buses on Debian and its relatives; named where only root may open the node."""
 PROC: Final = Path("/proc")
@@ -57,7 +57,7 @@ class DeviceNode:
 
     @contextmanager
     def opening(self) -> Iterator[None]:
-        """The block that opens the node: a LinkDenied raised in it makes the next wait one for access."""
+        """Open the node in this block: a LinkDenied raised in it makes the next wait one for access."""
         self._denied = False
         try:
             yield
@@ -113,7 +113,7 @@ def transfer_problem(error: OSError, path: str, place: str) -> LinkError | Trans
 
 
 def holders_of(path: str, proc: Path = PROC) -> str:
-    """`minicom (pid 123)` for each process that has the node open, as far as /proc lets this user see; else empty."""
+    """List the processes that have the node open, as `minicom (pid 123)`, as far as /proc lets this user see."""
     target = os.path.realpath(path)
     holders = []
     for process in sorted(proc.glob("[0-9]*")):

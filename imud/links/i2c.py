@@ -34,7 +34,7 @@ class I2cSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     address: Annotated[int, Meta(ge=0x08, le=0x77)] | Literal["auto"] = "auto"
     """7-bit address, for example 0x18, or `auto`: ask at every address that the device can have."""
     rate_hz: Annotated[float, Meta(ge=0.1, le=4000)] = 100.0
-    """How often the device is read, per second."""
+    """Rate of reads, per second."""
 
 
 class I2cBus(Protocol):
@@ -42,7 +42,7 @@ class I2cBus(Protocol):
 
     @property
     def fd(self) -> int | None:
-        """Its descriptor."""
+        """File descriptor of the bus."""
         ...
 
     @property
@@ -51,7 +51,7 @@ class I2cBus(Protocol):
         ...
 
     def i2c_rdwr(self, *messages: i2c_msg) -> None:
-        """One transaction."""
+        """Carry out one transaction."""
         ...
 
     def read_i2c_block_data(self, i2c_addr: int, register: int, length: int) -> list[int]:

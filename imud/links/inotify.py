@@ -33,7 +33,7 @@ libc = ctypes.CDLL(None, use_errno=True)
 
 
 class DirectoryWatch:
-    """One inotify descriptor on some directories. Synchronization: the loop's thread only."""
+    """An inotify descriptor that watches some directories. Synchronization: the loop's thread only."""
 
     def __init__(self) -> None:
         """Raises LinkError when the user's inotify instances are used up."""

@@ -1,4 +1,4 @@
-"""A link inside the process, for tests: bytes are fed by hand, writes and rates are kept.
+"""A link inside the process, for tests: they feed its bytes, and its writes and rates are kept.
 
 A fault is a subclass of three lines, for example::
 
@@ -24,17 +24,17 @@ class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """Settings of a link inside the process."""
 
     name: str = "memory"
-    """Its title."""
+    """Title of the link."""
     baud: Annotated[int, Meta(ge=0)] | Literal["auto"] = 0
     """Rate it pretends to have, in bit/s; 0 is none."""
     hold_ns: Annotated[int, Meta(ge=0)] = 0
-    """How long it pretends to hold bytes back, ns."""
+    """Simulated hold time of an adapter, ns."""
     writable: bool = True
     """Whether it pretends that a device listens."""
 
 
 class MemoryPort:
-    """The part of both links that does not depend on what is delivered. Synchronization: the loop's thread only."""
+    """Common part of both links. Synchronization: the loop's thread only."""
 
     def __init__(self, settings: MemorySettings) -> None:
         self.title = settings.name
@@ -43,23 +43,23 @@ class MemoryPort:
         self.written: list[bytes] = []
         """Every `write`, in order."""
         self.counters = KernelCounters()
-        """What `kernel_counters` returns; a test may set it."""
+        """Result of `kernel_counters`; a test may set it."""
         self.is_open = False
         self._present = asyncio.Event()
         self._present.set()
         self._on_end: OnEnd | None = None
 
     def appear(self) -> None:
-        """The port is there (as it is in the beginning)."""
+        """Make the port present, as it is at the beginning."""
         self._present.set()
 
     def disappear(self) -> None:
-        """The port is pulled out: `wait_present` waits, and a running link ends with LinkMissing."""
+        """Make the port absent: `wait_present` waits, and a running link ends with LinkMissing."""
         self._present.clear()
         self.end(LinkMissing(f"{self.title} is gone: the test pulled it out"))
 
     def end(self, error: LinkError | None = None) -> None:
-        """The link ends by itself: with an error, or None for the regular end."""
+        """End the link by itself: with an error, or None for the regular end."""
         on_end, self._on_end = self._on_end, None
         self._stop()
         if on_end is not None:
@@ -88,7 +88,7 @@ class MemoryPort:
         self.written.append(data)
 
     def kernel_counters(self) -> KernelCounters:
-        """What the test put into `counters`."""
+        """Counters set by the test."""
         return self.counters
 
     def close(self) -> None:
@@ -148,7 +148,7 @@ class MemoryCanLink(MemoryPort):
         self.bitrate = self.baud
         self.filters: Sequence[CanFilter] = ()
         self.cyclic: Sequence[CyclicFrame] = ()
-        """What `send_cyclic` was given; empty when closed."""
+        """Frames passed to `send_cyclic`; empty when closed."""
         self._on_frames: OnFrames | None = None
         self._on_news: OnBusNews | None = None
 
@@ -161,13 +161,13 @@ class MemoryCanLink(MemoryPort):
         """Deliver those frames that pass the filters; False when the link is not started, and then they are lost."""
         if self._on_frames is None:
             return False
-        passed = [f for f in frames if any(wanted.takes(f.can_id, f.extended) for wanted in self.filters)]
+        passed = [f for f in frames if any(wanted.matches(f.can_id, f.extended) for wanted in self.filters)]
         if passed:
             self._on_frames(passed)
         return True
 
     def news(self, news: str, problem: str) -> None:
-        """The state of the bus changes."""
+        """Report a change of the state of the bus."""
         assert self._on_news is not None
         self._on_news(news, problem)
 

@@ -49,7 +49,7 @@ class SpiSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     mode: Literal[0, 3, "auto"] = "auto"
     """SPI mode; `auto` tries 0, then 3, and decides by the product id."""
     rate_hz: Annotated[float, Meta(ge=0.1, le=4000)] = 100.0
-    """How often the device is read, per second."""
+    """Rate of reads, per second."""
 
 
 class SpiLink:
@@ -185,7 +185,7 @@ class _Message:
         self.request = 0x40006B00 | len(self.rows) << 16  # _IOW('k', 0, char[n])
 
     def read(self) -> bytes:
-        """What was read, in the order of the wire."""
+        """The received bytes, in the order of the wire."""
         return _byteswapped(self._rx.raw) if self._swapped else self._rx.raw
 
 

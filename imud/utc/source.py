@@ -15,7 +15,7 @@ MakePort = Callable[[str, int], StreamLink]
 
 
 class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The source of the sentences that a device is fed."""
+    """Settings of the source of a device's RMC sentences."""
 
     source: Literal["gpsd", "nmea", "system"]
     """`gpsd`: a GNSS receiver that gpsd owns. `nmea`: one on a serial port of its own. `system`: the system clock,
@@ -23,11 +23,11 @@ class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     rate_hz: Annotated[int, Meta(ge=1, le=10)] = 1
     """Sentences per second at most, for the device."""
     host: Annotated[str, Meta(min_length=1, max_length=253)] = "127.0.0.1"
-    """Where gpsd runs."""
+    """Host on which gpsd runs."""
     tcp_port: Annotated[int, Meta(ge=1, le=65535)] = 2947
-    """Where gpsd listens."""
+    """TCP port of gpsd."""
     gps: Annotated[str, Meta(max_length=256)] = ""
-    """The receiver's path as gpsd knows it, where gpsd has several; empty for all."""
+    """Path of the receiver in gpsd, where gpsd has several; empty for all."""
     port: str = ""
     """Path of the receiver's serial port, for `nmea`."""
     baud: Annotated[int, Meta(ge=4800, le=921_600)] = 9600
@@ -42,7 +42,7 @@ class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class RmcSource(Protocol):
-    """Delivers sentences as they come, good or bad; recovers from failures. Synchronization: the loop's thread only."""
+    """Source of sentences, valid or not; recovers from failures. Synchronization: the loop's thread only."""
 
     title: str
     """The source for people, for example `gpsd at 127.0.0.1:2947`."""
@@ -61,7 +61,7 @@ class RmcSource(Protocol):
 
 
 class SourceContext(NamedTuple):
-    """What sources need of the host."""
+    """Services of the host that sources need."""
 
     make_port: MakePort
     now_ns: Callable[[], int]

@@ -55,8 +55,8 @@ class Device:
         )
         self.path = CanPath(codec, clock, context)
 
-    def take(self, times_ns: list[int]) -> int:
-        """Read and take what was sent, as if it had come at these times; return the CPU time, ns."""
+    def read_and_decode(self, times_ns: list[int]) -> int:
+        """Read and decode what was sent, as if it had come at these times; return the CPU time, ns."""
         begin_ns = process_time_ns()
         frames = self.reader.read()
         read_ns = process_time_ns()
@@ -100,7 +100,7 @@ def measure(waiting: int, samples: int) -> float:
                     for raw in frames:
                         device.sender.send(raw)
             for device, each in zip(devices, zip(*(share[n % len(share)] for n in turn), strict=True), strict=True):
-                taken_ns += device.take(
+                taken_ns += device.read_and_decode(
                     [begun_ns + n * PERIOD_NS for n, some in zip(turn, each, strict=True) for _ in some]
                 )
             if begin < LEARNING:

@@ -44,7 +44,7 @@ class Latency:
             self.latencies_ns.append(now_ns - struct.unpack_from("<q", self.times, 8 * index)[0])
 
 
-def take_binary(buffer: bytearray, seen: Latency, now_ns: int) -> None:
+def count_binary(buffer: bytearray, seen: Latency, now_ns: int) -> None:
     """Take whole length-prefixed messages off the front of `buffer`."""
     at = 0
     while len(buffer) - at >= 4:
@@ -60,7 +60,7 @@ def take_binary(buffer: bytearray, seen: Latency, now_ns: int) -> None:
     del buffer[:at]
 
 
-def take_json(buffer: bytearray, seen: Latency, now_ns: int) -> None:
+def count_json(buffer: bytearray, seen: Latency, now_ns: int) -> None:
     """Take whole lines off the front of `buffer`."""
     end = buffer.rfind(b"\n") + 1
     for line in bytes(buffer[:end]).splitlines():
@@ -86,9 +86,9 @@ def subscribe(path: str, encoding: str, bare: bool) -> tuple[socket.socket, byte
     return sock, reply[2]
 
 
-def receive(socks: list[tuple[socket.socket, bytes]], take: object, seen: Latency, until_ns: int) -> None:
+def receive(socks: list[tuple[socket.socket, bytes]], on_bytes: object, seen: Latency, until_ns: int) -> None:
     """Receive on all sockets until they end, standard input closes or it is `until_ns`."""
-    assert callable(take)
+    assert callable(on_bytes)
     first = socks[0][0]
     buffer = bytearray(socks[0][1])
     poll = select.epoll()
@@ -110,7 +110,7 @@ def receive(socks: list[tuple[socket.socket, bytes]], take: object, seen: Latenc
             if found is first:
                 t_ns = now_ns()
                 buffer += memoryview(scratch)[:count]
-                take(buffer, seen, t_ns)
+                on_bytes(buffer, seen, t_ns)
 
 
 def percentile(ordered: list[int], share: float) -> float:
@@ -139,8 +139,8 @@ def main() -> None:
     stuck = subscribe(args.socket, args.encoding, args.bare) if args.stuck else None
     socks = [subscribe(args.socket, args.encoding, args.bare) for _ in range(args.clients)]
     print("ready", flush=True)
-    take = take_binary if args.encoding == "binary" else take_json
-    receive(socks, take, seen, time.monotonic_ns() + int(args.seconds * 1e9))
+    on_bytes = count_binary if args.encoding == "binary" else count_json
+    receive(socks, on_bytes, seen, time.monotonic_ns() + int(args.seconds * 1e9))
     ordered = sorted(seen.latencies_ns)
     shares = {"p50_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}
     figures = {name: percentile(ordered, share) / 1e3 for name, share in shares.items()}

@@ -46,7 +46,7 @@ def timed(driver: CanDriver, random: Random, number: int) -> list[CanFrame]:
 
 
 def is_own(driver: CanDriver, frame: CanFrame) -> bool:
-    return any(wanted.takes(frame.can_id, frame.extended) for wanted in driver.filters(driver.settings()))
+    return any(wanted.matches(frame.can_id, frame.extended) for wanted in driver.filters(driver.settings()))
 
 
 def foreign(driver: CanDriver, random: Random) -> CanFrame:

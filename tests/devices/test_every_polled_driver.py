@@ -15,7 +15,7 @@ from imud.errors import DeviceRefused, TransferError, Trouble
 from imud.ledger import Ledger
 from imud.links import LINKS
 from imud.sample import Measurement
-from tests.support.codec_invariants import take_polled as take
+from tests.support.codec_invariants import decode_polled
 
 NAMES = [driver.name for driver in of_kind(DRIVERS.values(), PolledDriver)]
 TRANSFERS_MAX = 20
@@ -43,7 +43,7 @@ def test_good_frames_make_one_measurement_each(name: str, seed: int) -> None:
     driver, random = row(name), Random(seed)
     codec = make(driver)
     for number in range(1, 6):
-        (event,) = take(codec, 0, driver.example_reading(random))
+        (event,) = decode_polled(codec, 0, driver.example_reading(random))
         assert isinstance(event, Measurement)
         assert event.size_bytes * number == codec.ledger.bytes_in_good_frames
     assert codec.ledger.frames_in_samples == codec.ledger.frames_good == 5
@@ -56,7 +56,7 @@ def test_damage_never_passes_silently(name: str, seed: int) -> None:
     """One wrong bit, one wrong byte, or a run of them: the same measurement, or none and an event that says so."""
     driver, random = row(name), Random(seed)
     data = driver.example_reading(random)
-    (good,) = make(driver).take(0, data)
+    (good,) = make(driver).decode(0, data)
     damaged = bytearray(data)
     at = random.randrange(len(data))
     match random.randrange(3):
@@ -66,7 +66,7 @@ def test_damage_never_passes_silently(name: str, seed: int) -> None:
             damaged[at] = random.randrange(256)
         case _:
             damaged[at:] = bytes([random.choice((0x00, 0xFF))]) * (len(data) - at)
-    events = take(make(driver), 0, bytes(damaged))
+    events = decode_polled(make(driver), 0, bytes(damaged))
     assert events
     assert events == (good,) or not any(isinstance(event, Measurement) for event in events)
 
@@ -77,8 +77,8 @@ def test_damage_never_passes_silently(name: str, seed: int) -> None:
 def test_any_bytes_of_any_length_raise_nothing(name: str, data: bytes, poll: int, repeat: bool) -> None:
     codec = make(row(name))
     poll %= len(codec.polls)
-    take(codec, poll, data)
-    take(codec, poll, data * 2 if repeat else data)
+    decode_polled(codec, poll, data)
+    decode_polled(codec, poll, data * 2 if repeat else data)
     codec.reset()
     assert codec.ledger.closes()
 
@@ -89,7 +89,7 @@ def test_a_line_that_no_device_drives_is_a_device_that_vanished(name: str, line:
     driver = row(name)
     codec = make(driver)
     data = bytes([line]) * len(driver.example_reading(Random(1)))
-    (event,) = take(codec, 0, data)
+    (event,) = decode_polled(codec, 0, data)
     assert isinstance(event, Vanished)
     assert f"0x{line:02X}" in event.why
     assert codec.ledger.frames_bad() == 0
@@ -102,11 +102,11 @@ def test_the_same_bytes_again_are_counted_and_no_sample(name: str, seed: int) ->
     driver = row(name)
     codec = make(driver)
     data = driver.example_reading(Random(seed))
-    take(codec, 0, data)
-    assert take(codec, 0, data) == ()
+    decode_polled(codec, 0, data)
+    assert decode_polled(codec, 0, data) == ()
     assert codec.stale == codec.ledger.frames_ignored == 1
     codec.reset()
-    assert len(take(codec, 0, data)) == 1
+    assert len(decode_polled(codec, 0, data)) == 1
 
 
 @every_driver

@@ -50,18 +50,18 @@ def test_what_no_identifier_can_say(parts: J1939Id) -> None:
 
 def test_filters_look_at_all_but_the_priority() -> None:
     one = filter_of(0xFF34, 8)
-    assert all(one.takes(priority << 26 | 0xFF3408, True) for priority in range(8))
-    assert not one.takes(0x0CFF3409, True)
-    assert not one.takes(0x0CFF3508, True)
-    assert not one.takes(0x0DFF3408, True)  # another data page
-    assert not one.takes(0x0CFF3408 & 0x7FF, False)
+    assert all(one.matches(priority << 26 | 0xFF3408, True) for priority in range(8))
+    assert not one.matches(0x0CFF3409, True)
+    assert not one.matches(0x0CFF3508, True)
+    assert not one.matches(0x0DFF3408, True)  # another data page
+    assert not one.matches(0x0CFF3408 & 0x7FF, False)
     any_source = filter_of(127250, None)
-    assert any_source.takes(0x09F11200, True)
-    assert any_source.takes(0x1DF112FD, True)
-    assert not any_source.takes(0x09F11300, True)
+    assert any_source.matches(0x09F11200, True)
+    assert any_source.matches(0x1DF112FD, True)
+    assert not any_source.matches(0x09F11300, True)
     reply = filter_of(0xEF00, 8, 0x55)
-    assert reply.takes(0x18EF5508, True)
-    assert not reply.takes(0x18EF0855, True)
+    assert reply.matches(0x18EF5508, True)
+    assert not reply.matches(0x18EF0855, True)
 
 
 def test_sender_of_a_message() -> None:

@@ -13,7 +13,7 @@ from imud.errors import DeviceRefused, TransferError, Trouble
 from imud.ledger import Ledger
 from tests.fuzz.drivers import EXAMPLES, mend_reading, names_of, row, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
-from tests.support.codec_invariants import check_closed, take_polled
+from tests.support.codec_invariants import check_closed, decode_polled
 
 CONVERSATION = 0x80
 FAILS = 0x40
@@ -61,7 +61,7 @@ def _poll(driver: PolledDriver, settings: object, data: bytes) -> None:
     codec = driver.make_codec(Ledger(), settings)
     stale = 0
     for poll, reading in _readings(data):
-        take_polled(codec, poll % len(codec.polls), reading)
+        decode_polled(codec, poll % len(codec.polls), reading)
         assert codec.stale >= stale
         stale = codec.stale
     codec.reset()

@@ -73,11 +73,11 @@ def feed_frames(codec: CanCodec, frames: Iterable[CanFrame]) -> list[CodecEvent]
     return events
 
 
-def take_polled(codec: PolledCodec, poll: int, data: bytes) -> Sequence[PolledEvent]:
+def decode_polled(codec: PolledCodec, poll: int, data: bytes) -> Sequence[PolledEvent]:
     """Take one transfer, checking that every byte is in the ledger and that it closes."""
     ledger = codec.ledger
     before, bad = ledger.bytes_in, ledger.frames_bad()
-    events = codec.take(poll, data)
+    events = codec.decode(poll, data)
     assert before <= ledger.bytes_in <= before + len(data)
     check_closed(ledger)
     damaged = [e for e in events if isinstance(e, BadFrame) and e.reason is not BadReason.NOT_FINITE]

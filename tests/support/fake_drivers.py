@@ -46,17 +46,17 @@ class FakeCodec:
         """Events in the order of their ends."""
         self.ledger.bytes_in += len(data)
         self._pending += data
-        return self._take(flushing=False)
+        return self._decode(flushing=False)
 
     def flush(self) -> Sequence[CodecEvent]:
         """Frames inside a longer one that never came."""
-        return self._take(flushing=True)
+        return self._decode(flushing=True)
 
     def reset(self) -> None:
         """Forget what is pending."""
         self._pending.clear()
 
-    def _take(self, *, flushing: bool) -> list[CodecEvent]:
+    def _decode(self, *, flushing: bool) -> list[CodecEvent]:
         events: list[CodecEvent] = []
         pending = self._pending
         while (at := pending.find(SYNC)) >= 0:

@@ -17,7 +17,7 @@ ACTIVE: Final = 0x40
 
 
 class ControllerState(IntEnum):
-    """As `enum can_state` of linux/can/netlink.h numbers them."""
+    """Error states of a CAN controller, numbered as `enum can_state` of linux/can/netlink.h."""
 
     ACTIVE = 0
     """Takes part in all traffic."""
@@ -37,7 +37,7 @@ _WORDS: Final = {
 }
 _HELP: Final = {
     ControllerState.PASSIVE: "do all nodes have the same bit rate, is the bus terminated at both ends?",
-    ControllerState.BUS_OFF: "it left the bus; `ip link set {name} type can restart-ms 100` lets it come back alone",
+    ControllerState.BUS_OFF: "it left the bus; `ip link set {name} type can restart-ms 100` lets it recover by itself",
 }
 
 
@@ -56,7 +56,7 @@ class BusState:
 
     @property
     def problem(self) -> str:
-        """What is wrong, one sentence; empty in the states error-active and warning."""
+        """Describe the fault in one sentence; empty in the states error-active and warning."""
         advice = _HELP.get(self.state)
         return f"{self._name} is {_WORDS[self.state]}: {advice.format(name=self._name)}" if advice else ""
 

@@ -35,7 +35,7 @@ _PAD: Final = bytes(-_HEAD.size % 8)
 
 
 class Sender(Protocol):
-    """Sends cyclic frames until it is closed."""
+    """Sender of cyclic frames until it is closed."""
 
     def close(self) -> None:
         """Stop; may be called twice."""
@@ -54,7 +54,7 @@ class KernelSender:
     """Frames sent by the broadcast manager on one interface."""
 
     def __init__(self, interface: str, frames: Sequence[CyclicFrame]) -> None:
-        """Starts at once. Raises OSError, one of NO_MANAGER when the kernel has none."""
+        """Start sending. Raises OSError, one of NO_MANAGER when the kernel has no broadcast manager."""
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK, socket.CAN_BCM)
         try:
             self._socket.connect((interface,))
@@ -79,7 +79,7 @@ class LoopSender:
         frames: Sequence[CyclicFrame],
         now_ns: Callable[[], int] = monotonic_ns,
     ) -> None:
-        """Starts at once. An error of a later `write` stops it and goes to `on_error`. Raises LinkError."""
+        """Start sending. An error of a later `write` stops it and goes to `on_error`. Raises LinkError."""
         self._write = write
         self._on_error = on_error
         self._now_ns = now_ns

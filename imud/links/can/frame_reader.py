@@ -1,4 +1,4 @@
-"""Reads CAN frames from a raw socket in batches, with the kernel's stamps and its count of what it dropped.
+"""Reader of CAN frames from a raw socket in batches, with the kernel's time stamps and drop count.
 
 Plan: one `recvmmsg` per wake-up takes all that is there, up to BATCH_FRAMES, into buffers made once; nothing is
 allocated but the frames. Python's own `recvmsg` costs two system calls per frame (it asks for the interface's name each

@@ -1,4 +1,4 @@
-"""A CAN bus: a raw SocketCAN socket of our own, or any other interface that python-can knows.
+"""A CAN bus: a raw SocketCAN socket, or any other interface of python-can.
 
 Every device opens its own socket with filters for its frames, so that several share a bus without seeing the
 frames of the others. Bit rate and state of the interface belong to the system (docs/can.md): imud reads them and
@@ -29,7 +29,7 @@ from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
 
 NATIVE: Final = "socketcan"
 FRAME_BUFFER_BYTES: Final = 960
-"""What the kernel charges a socket for one waiting frame, about (222 fit the usual 208 KiB)."""
+"""Bytes that the kernel charges a socket for one queued frame, about (222 fit the usual 208 KiB)."""
 CAN_RAW_ERR_FILTER: Final = 2
 """Option of SOL_CAN_RAW: classes of error frames to receive (linux/can/raw.h)."""
 SO_RCVBUFFORCE: Final = 33
@@ -46,7 +46,7 @@ class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fiel
     receive_buffer_bytes: Annotated[int, Meta(ge=4096, le=1 << 26)] = 1 << 20
     """Kernel memory for frames that wait to be read, about 960 bytes each. The system may allow less."""
     coalesce_ms: Annotated[int, Meta(ge=0, le=100)] = 0
-    """Let frames gather for so long before they are read: less CPU, more delay. Their time stamps stay the kernel's."""
+    """Time to gather frames before they are read: less CPU, more delay. Their time stamps stay the kernel's."""
     backend: Annotated[str, Meta(min_length=1)] = NATIVE
     """`socketcan`, or the name of another interface of python-can, for example `virtual` or `slcan`."""
     bitrate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
@@ -76,7 +76,7 @@ def open_raw(settings: SocketCanSettings, filters: Sequence[CanFilter]) -> socke
 
 
 def _enlarge(opened: socket.socket, settings: SocketCanSettings) -> None:
-    """As much receive buffer as is wanted, or as the system gives; the kernel doubles and reports the double."""
+    """Enlarge the receive buffer as far as permitted; the kernel doubles the value and reports the double."""
     wanted = settings.receive_buffer_bytes
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted // 2)
@@ -133,7 +133,7 @@ class SocketCanLink:
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
 
     def absence(self) -> str:
-        """Why the interface cannot be used now; empty when it can. Raises LinkError when it is no CAN interface."""
+        """Return why the interface cannot be used now; empty when it can. Raises LinkError if it is not of kind CAN."""
         return netlink.absence(self._settings.interface, self._sys)
 
     async def wait_present(self) -> None:

@@ -50,7 +50,7 @@ def absence(name: str, sys: Path = SYS) -> str:
         return f"{name} is not there: expected a CAN interface (`ip link` lists them)"
     if kind != ARPHRD_CAN:
         raise LinkError(f"{name} is no CAN interface (`ip -details link show type can` lists them)")
-    return "" if flags & IFF_UP else f"{name} is down: set its bit rate and take it up (`ip link set {name} up`)"
+    return "" if flags & IFF_UP else f"{name} is down: set its bit rate and bring it up (`ip link set {name} up`)"
 
 
 def can_interfaces(sys: Path = SYS, *, down: bool = False) -> list[str]:
@@ -80,7 +80,7 @@ async def wait_until(holds: Callable[[], bool]) -> None:
 
 
 def _drain(news: socket.socket) -> None:
-    """Discard the messages: only that there were some matters, also those that overran the buffer (ENOBUFS)."""
+    """Discard the messages: their arrival is all that matters, even if they overran the buffer (ENOBUFS)."""
     while True:
         try:
             news.recv(NEWS_BYTES)

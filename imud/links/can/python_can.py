@@ -20,7 +20,7 @@ from imud.formats.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilte
 from imud.links.can.cyclic_sender import LoopSender
 
 LOOK_S: Final = 0.05
-"""How long the thread waits for a frame before it checks whether it is to end."""
+"""Time-out of a read, after which the thread checks whether to end, s."""
 BATCH_FRAMES: Final = 64
 
 
@@ -128,7 +128,7 @@ class PythonCanLink:
         on_frames: OnFrames,
         on_end: OnEnd,
     ) -> None:
-        """The thread."""
+        """Receive frames; the body of the thread."""
 
         def deliver(frames: list[CanFrame]) -> None:
             if not stop.is_set():

@@ -1,1 +1,1 @@
-"""Captures instead of a port."""
+"""Replay of captures in place of a port."""

@@ -92,7 +92,7 @@ class CanReplayLink(FileReplay):
                 first_ns = frame.t_rx_ns if first_ns is None else first_ns
                 due_ns = origin_ns + frame.t_rx_ns - first_ns
                 count += 1
-                if any(wanted.takes(frame.can_id, frame.extended) for wanted in self.filters):
+                if any(wanted.matches(frame.can_id, frame.extended) for wanted in self.filters):
                     yield frame._replace(t_rx_ns=due_ns)
             if reader.problem:
                 log.warning("%s: %s", self.title, reader.problem)

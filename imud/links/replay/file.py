@@ -1,4 +1,4 @@
-"""The file of a replay: its settings, waiting for it, opening and closing it, for both kinds of replay."""
+"""The file of a replay: settings, waiting for it, opening and closing it, for both kinds of replay."""
 
 import asyncio
 import os
@@ -23,7 +23,7 @@ class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     speed: Literal["recorded", "real", "maximum"] = "recorded"
     """`recorded`: by the stamps in the file; `real`: by wire time at `baud`; `maximum`: as fast as possible."""
     baud: Annotated[int, Meta(ge=0, le=4_000_000)] = 0
-    """Rate of the wire in bit/s; 0 means as the capture says. A raw capture at speed `real` needs it."""
+    """Rate of the wire in bit/s; 0 for that of the capture. A raw capture at speed `real` needs it."""
     repeat: bool = False
     """Start again at the end of the file; not at speed `maximum`."""
 
@@ -34,7 +34,7 @@ class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class FileReplay:
-    """The part of a replay that does not depend on what is in the file. Synchronization: the loop's thread only.
+    """Common part of both kinds of replay. Synchronization: the loop's thread only.
 
     `close` drops the timer and the file: a turn that finds another file in `_file` than at its begin has ended.
     """

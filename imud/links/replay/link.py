@@ -28,7 +28,7 @@ from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 PIECE_NS: Final = 2 * NS_PER_MS
 """Wire time of one piece at speed `real`; a native UART hands over about as much at a time."""
 PIECE_BYTES_MAX: Final = 65536
-"""As much as a port is read at once."""
+"""Bytes per chunk of a capture without times: the size of a read from a port."""
 TURN_BYTES: Final = 16384
 """Delivered in one turn of the event loop, 0.5 ms of decoding: others get their turn between."""
 
@@ -134,7 +134,7 @@ class ReplayLink(FileReplay):
                 yield piece, sent * byte_ns
 
     def _measure(self, reader: CaptureReader) -> int:
-        """How long the capture lasts in its own time, ns."""
+        """Duration of the capture in its own time, ns."""
         if self._file is not None and not reader.stamped:
             return os.fstat(self._file.fileno()).st_size * uart_byte_ns(self.baud)
         return max((offset_ns for _, offset_ns in self._pieces(reader)), default=0)

@@ -1,4 +1,4 @@
-"""One RS-485 line: a serial port opened once for all devices on it, its direction control, requests and replies.
+"""An RS-485 line: a serial port opened once for all devices on it, its direction control, requests and replies.
 
     silence ▸ request ▸ (echo) ▸ silence ▸ reply ▸ silence …
 
@@ -91,7 +91,7 @@ class Direction:
 
 
 class PortSetup(NamedTuple):
-    """What all devices of a line must agree on."""
+    """Settings that all devices of a line must agree on."""
 
     path: str
     baud: int
@@ -179,7 +179,7 @@ class Rs485Line:
         return self._ask(target, request, reply_bytes, reply_ns)
 
     def _settle(self, target: int, owed: bytes, reply_ns: int) -> None:
-        """Read so few registers that the reply differs in length from the one owed, which may come before it."""
+        """Read so few registers that the reply differs in length from an outstanding one, which may come before it."""
         first, count = owed[1:3], owed[3:5]
         few = 2 if owed[0] == READ_HOLDING and count == b"\0\1" else 1
         request = bytes([READ_HOLDING]) + first + few.to_bytes(2, "big")
@@ -331,4 +331,4 @@ def _check_agreement(first: PortSetup, other: PortSetup) -> None:
 
 
 SHARED_PORTS: Final = SharedPorts()
-"""Those of this process."""
+"""The open lines of this process."""

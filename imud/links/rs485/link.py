@@ -29,14 +29,14 @@ class Rs485Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
     address: Annotated[int, Meta(ge=1, le=247)] | Literal["auto"] = "auto"
     """Modbus address, or `auto`: ask at every address. Give it where a line has more than one device."""
     rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 0.0
-    """How often the device is read, per second; 0 for as often as the line allows, in turns with the others."""
+    """Rate of reads, per second; 0 for as often as the line allows, in turns with the other devices."""
     reply_ms: Annotated[int, Meta(ge=1, le=1000)] = 20
-    """How long the device may think before it answers. Time on the wire comes on top."""
+    """Longest delay of the device before it answers. Time on the wire is added."""
     direction: Literal["auto", "kernel", "none"] = "auto"
-    """Who switches between sending and receiving: `kernel` its driver (RTS), `none` the adapter, `auto` the driver if
+    """Control of the direction: `kernel` by its driver (RTS), `none` by the adapter, `auto` by the driver if
     it can."""
     echo: Literal["auto"] | bool = "auto"
-    """Whether the adapter hears what it sends; `auto` finds out."""
+    """Whether the adapter receives what it sends; `auto` detects it."""
 
 
 class Rs485Link:

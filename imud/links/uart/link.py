@@ -44,9 +44,9 @@ class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     port: Annotated[str, Meta(min_length=1)]
     """Path of the port. `/dev/serial/by-id/…` names the adapter and survives replugging; `/dev/ttyUSB0` does not."""
     baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
-    """Rate in bit/s, or `auto`: listen at every rate the device knows."""
+    """Rate in bit/s, or `auto`: search at every rate of the device."""
     coalesce_ms: Annotated[int, Meta(ge=0, le=100)] = 0
-    """After a read wait so long before the next: fewer wake-ups and less CPU, as much more latency."""
+    """Pause after a read before the next: fewer wake-ups and less CPU, as much more latency."""
     low_latency: bool = True
     """Ask driver and USB adapter to hand bytes over at once."""
 
@@ -132,7 +132,7 @@ class UartLink:
             port.close()
 
     def _read(self) -> int:
-        """One read; returns its size, 0 for nothing there, -1 for the end."""
+        """Read once; returns the size, 0 for no data, -1 for the end."""
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:

@@ -18,10 +18,10 @@ ALIAS_DIRECTORIES: Final = ("by-id", "by-path")
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """One port."""
+    """A serial port."""
 
     path: str
-    """What to write into the configuration: the by-id name where there is one, else by-path, else the node."""
+    """Device path for the configuration: the by-id name where there is one, else by-path, else the node."""
     node: str
     """The device node, for example `/dev/ttyUSB0`."""
     title: str
@@ -29,7 +29,7 @@ class SerialPort:
 
 
 def list_ports(dev: Path = Path("/dev"), sys: Path = Path("/sys")) -> list[SerialPort]:
-    """All real ports, by node name in natural order."""
+    """List all ports that have hardware, by node name in natural order."""
     aliases = _aliases(dev)
     nodes = sorted(_nodes(dev, sys), key=lambda node: (node.name.rstrip("0123456789"), len(node.name), node.name))
     return [SerialPort(aliases.get(node.name, str(node)), str(node), _usb_title(sys, node.name)) for node in nodes]

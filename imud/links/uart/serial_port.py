@@ -1,4 +1,4 @@
-"""A serial port: opened exclusively and raw, its rate read back, its adapter's latency lowered, its errors counted.
+"""A serial port: exclusive raw access, the rate read back, the latency of its adapter lowered, errors counted.
 
 What pyserial leaves undone is done here: TIOCEXCL beside its flock (programs that do not lock are refused too), no
 BRKINT (with it, a break, which is what a wrong baud rate looks like, discards everything received), no HUPCL (DTR
@@ -34,7 +34,7 @@ OSPEED_INDEX: Final = 10
 BAUD_TOLERANCE: Final = 0.03
 """8N1 is sampled 9.5 bits after its start edge: half a bit there is 5 %, of which the far end may use some."""
 UNKNOWN_USB_HOLD_NS: Final = 16 * NS_PER_MS
-"""USB adapters whose driver does not say: as long as the worst common one."""
+"""Assumed hold time of USB adapters whose driver does not report one: the longest common one."""
 ACM_HOLD_NS: Final = 1 * NS_PER_MS
 TIOCGICOUNT: Final = 0x545D
 """ioctl: errors that the kernel's serial driver counts (ioctl_tty(2))."""
@@ -115,7 +115,7 @@ def request_low_latency(port: serial.Serial, path: str, sys: Path) -> None:
 
 
 def hold_ns(path: str, sys: Path) -> int:
-    """How long bytes may wait in the adapter behind `path` now, ns."""
+    """Read the latency timer of the adapter behind `path`, ns; 0 without one."""
     timer_ms = read_latency_timer_ms(path, sys)
     if timer_ms is not None:
         return timer_ms * NS_PER_MS
@@ -152,7 +152,7 @@ def read_counters(fd: int) -> tuple[int, ...] | None:
 
 
 def relative(start: tuple[int, ...] | None, now: tuple[int, ...] | None) -> KernelCounters:
-    """What was counted from `start` to `now`; differences modulo 2³², because the kernel's ints wrap."""
+    """Subtract counters from `start` to `now`; modulo 2³², because the kernel's ints wrap."""
     if start is None or now is None:
         return KernelCounters()
     counted = [(b - a) & 0xFFFF_FFFF for a, b in zip(start, now, strict=True)]

@@ -1,4 +1,4 @@
-"""Shared by the devices of one daemon: which frames of a CAN bus belong to which device, and who sends what cyclically.
+"""CAN buses shared by the devices of one daemon: the owner of each frame, and the sender of each cyclic frame.
 
 A device that searches must not choose one that is configured by another name, and two devices must not have the same
 frame sent: receivers would get it twice per period.
@@ -23,7 +23,7 @@ class CanBuses:
         self._members: dict[str, _Member] = {}
 
     def join(self, name: str, bus: str, filters: Sequence[CanFilter], cyclic: Sequence[CyclicFrame]) -> None:
-        """Add a device to a bus: the frames it hears, and those that it needs to be sent."""
+        """Add a device to a bus: the frames it receives, and those that it needs to be sent."""
         self._members[name] = _Member(bus, filters, cyclic)
 
     def leave(self, name: str) -> None:
@@ -31,11 +31,11 @@ class CanBuses:
         self._members.pop(name, None)
 
     def claimed(self, name: str, bus: str) -> Callable[[int, bool], bool]:
-        """Return a test of an identifier (and 29 bits or not): whether another device of the bus hears such frames."""
+        """Return a test of an identifier (and 29 bits or not): whether another device of the bus receives it."""
 
         def is_claimed(can_id: int, extended: bool) -> bool:
             return any(
-                wanted.takes(can_id, extended)
+                wanted.matches(can_id, extended)
                 for other, member in self._members.items()
                 if other != name and member.bus == bus
                 for wanted in member.filters

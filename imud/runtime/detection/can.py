@@ -1,13 +1,13 @@
-"""Which devices exchange on a CAN bus: listens and sends nothing, without I/O or clock of its own.
+"""Detection of the devices on a CAN bus: listens and sends nothing, without I/O or clock of its own.
 
-Strategy. `node_of` of every driver says whose frame it may be. Each (driver, node) named so gets a trial codec with
-`node_settings(node)`, which is fed with all frames that its filters take. A device is accepted after LOCK_SAMPLES
+Strategy. `node_of` of every driver returns the possible sender of a frame. Each such (driver, node) gets a trial codec
+with `node_settings(node)`, which is fed with all frames that pass its filters. A device is accepted after LOCK_SAMPLES
 measurements, more than it had damaged frames. A round lasts LISTEN_NS, so that all devices of the bus have been heard
 before one is chosen; while there are candidates in doubt it goes on, PATIENCE_NS at most: a device at 1 Hz whose sample
 is made of several frames needs some of its periods.
 
 One device is found when it is the only one that no other configured device of the bus has. A device that was found
-before is chosen as soon as it is accepted, whatever else is heard.
+before is chosen as soon as it is accepted, whatever other devices send.
 
 A device that sends only when it is asked (CANopen TPDOs by SYNC, J1939 on request) is not heard; it must be named.
 """
@@ -46,20 +46,20 @@ def none_claimed(_can_id: int, _extended: bool) -> bool:
 
 
 class CanDevice(NamedTuple):
-    """One device of a bus, as its driver numbers them."""
+    """A device of a bus, by the number that its driver uses."""
 
     driver: CanDriver
     node: int
 
     @property
     def title(self) -> str:
-        """For people, for example `imu61x-can base_id 101`."""
+        """Title for people, for example `imu61x-can base_id 101`."""
         return f"{self.driver.name} {self.driver.node_title(self.node)}"
 
 
 @dataclass(frozen=True, slots=True)
 class CanFound:
-    """The one device there is."""
+    """The only device found."""
 
     device: CanDevice
 
@@ -74,7 +74,7 @@ class CanSurvey:
         self._drivers = tuple(drivers)
         self._trials: dict[tuple[str, int], _Trial] = {}
         self._listeners: dict[Identifier, tuple[_Trial, ...]] = {}
-        """Whose filters take which frames; every identifier heard is a key."""
+        """Candidates whose filters pass a frame, by identifier; every received identifier is a key."""
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
         """Process frames in the order they came."""
@@ -87,7 +87,7 @@ class CanSurvey:
                 trial.count(trial.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
 
     def flush(self) -> None:
-        """Process what waits: the bus is idle, or the round ends."""
+        """Process frames that wait: the bus is idle, or the round ends."""
         for trial in self._trials.values():
             trial.count(trial.codec.flush())
 
@@ -139,7 +139,7 @@ class CanSurvey:
 
 
 class CanSearch:
-    """One round of detection on one bus. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
+    """A round of detection on one bus. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
 
     def __init__(
         self,
@@ -175,7 +175,7 @@ class CanSearch:
         return None
 
     def on_time(self, now_ns: int) -> CanStep | None:
-        """`until_ns` of the last Listen has come; None when it has not."""
+        """End the present step if `until_ns` of the last Listen has come; return None when it has not."""
         if now_ns < self._until_ns:
             return None
         self.survey.flush()
@@ -185,7 +185,7 @@ class CanSearch:
         return CanFound(devices[0]) if len(devices) == 1 else GaveUp(self.summary())
 
     def summary(self) -> str:
-        """Why no device was chosen."""
+        """Explain why no device was chosen."""
         survey, where = self.survey, self._where
         if devices := survey.devices(self._claimed):
             return f"{len(devices)} devices are heard on {where}, {_listed(devices)}: name driver and options"
@@ -229,7 +229,7 @@ class _Trial:
 
     def hears(self, identifier: Identifier) -> bool:
         """Whether its codec needs such frames."""
-        return any(wanted.takes(*identifier) for wanted in self._filters)
+        return any(wanted.matches(*identifier) for wanted in self._filters)
 
     def has_any(self, claimed: Claimed) -> bool:
         """Whether another device is configured for frames of it."""

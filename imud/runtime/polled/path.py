@@ -20,21 +20,21 @@ from imud.sample import Measurement, Sample
 from imud.signals.ready_edges import ReadyEdges, Stamp
 
 FAULTS_MAX: Final = 3
-"""So many damaged or failed reads in a row: it may be another device, or one that lost its settings."""
+"""Number of damaged or failed reads in a row after which the device is identified again."""
 SIGMA_OF_AGE: Final = 1 / sqrt(3)
 """Root mean square of an age that is anything from 0 to its bound."""
 
 
 @dataclass(frozen=True, slots=True)
 class PollTiming:
-    """What is known of the time of reads."""
+    """Timing of reads, as far as known."""
 
     period_ns: int
     """Time between two reads."""
     update_ns: int
     """Longest time between two updates of the device's registers; 0 where it is not known."""
     edges: ReadyEdges | None
-    """Those of the data-ready line; None without one."""
+    """Edges of the data-ready line; None without one."""
 
 
 class PolledPath(SamplePath):
@@ -57,7 +57,7 @@ class PolledPath(SamplePath):
         return self._period_ns
 
     def begin(self, now_ns: int) -> None:
-        """Start: the device was identified and set up, what comes from now on is its own."""
+        """Start: the device was identified and set up."""
         super().begin(now_ns)
         self.reset()
 
@@ -65,7 +65,7 @@ class PolledPath(SamplePath):
         """No-op: what is read comes whole or not at all."""
 
     def reset(self) -> None:
-        """Compare what comes next with nothing that came before."""
+        """Forget earlier data: the next frame is not compared with it."""
         self.codec.reset()
         self._before_ns = 0
         self._faults = 0
@@ -96,7 +96,7 @@ class PolledPath(SamplePath):
 
     def _decode(self, reading: Reading, stamp: Stamp | None, utc_offset_ns: int, samples: list[Sample]) -> str:
         gone = ""
-        for event in self.codec.take(reading.poll, reading.data):
+        for event in self.codec.decode(reading.poll, reading.data):
             if type(event) is Measurement:
                 self._faults = 0
                 t_ns, error_ns, edge_seq = stamp or (reading.start_ns, self._error_ns(reading), None)

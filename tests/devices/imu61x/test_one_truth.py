@@ -119,7 +119,7 @@ def by_polls(
     run_transfer_script(set_up, lambda one: transfer(device, one))
     found: dict[int, Measurement] = {}
     for now_ns in INSTANTS:
-        found[now_ns] = only(codec.take(0, transfer(device, codec.polls[0].transfer)))
+        found[now_ns] = only(codec.decode(0, transfer(device, codec.polls[0].transfer)))
         assert device.latched_ns == now_ns
     return found
 

@@ -134,14 +134,14 @@ def test_pymodbus_server_as_modules_under_our_driver() -> None:
             assert found == {"baud": "921600", "id": str(address), "heading_mode": "six axes"}
             codec = HipnucModbusCodec(Ledger(), settings)
             if address == 1:
-                (event,) = codec.take(0, link.transfer(codec.polls[0].transfer))
+                (event,) = codec.decode(0, link.transfer(codec.polls[0].transfer))
                 assert isinstance(event, Vanished)
             assert codec.polls[0].transfer == (READ_SHORT_BLOCK if address == 1 else READ_BLOCK)
-            (event,) = codec.take(0, link.transfer(codec.polls[0].transfer))
+            (event,) = codec.decode(0, link.transfer(codec.polls[0].transfer))
             assert isinstance(event, Measurement)
             assert event.euler_rad == pytest.approx((0.151896, 0.571735, -2.913600), abs=1e-6)
             assert event.dev_ticks == (None if address == 1 else 74_565)
-            assert codec.take(1, link.transfer(codec.polls[1].transfer)) == ()
+            assert codec.decode(1, link.transfer(codec.polls[1].transfer)) == ()
             run_transfer_script(set_heading_mode(AttitudeMode.NINE_AXIS), link.transfer)
             run_transfer_script(set_mounting(LineMounting.Y_UP), link.transfer)
             assert run_transfer_script(DRIVER.set_up(settings), link.transfer)["heading_mode"] == "nine axes"

@@ -66,7 +66,7 @@ class Sink:
         self.calls = 0
         self.enough = asyncio.Event()
 
-    def take(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
+    def on_readings(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
         self.calls += 1
         self.readings += readings
         self.problem = problem or self.problem
@@ -75,7 +75,7 @@ class Sink:
 
 
 def joined(buses: PolledBuses, wire: Wire, sink: Sink) -> BusMember:
-    return buses.get(wire.bus).join(wire, Deadlines(), sink.take)
+    return buses.get(wire.bus).join(wire, Deadlines(), sink.on_readings)
 
 
 def three() -> TransferScript[int]:

@@ -97,7 +97,7 @@ def test_on_a_bus_every_reading_is_handed_over_at_once() -> None:
         sinks = [Sink(), Sink()]
         for wire, sink in zip(wires, sinks, strict=True):
             wire.rate_hz = 0.0
-            buses.get("wire").join(wire, Deadlines(), sink.take).start((Poll(ASK),))
+            buses.get("wire").join(wire, Deadlines(), sink.on_readings).start((Poll(ASK),))
         for sink in sinks:
             await sink.enough.wait()
         for sink in sinks:

@@ -80,11 +80,11 @@ def test_values_are_the_truth_of_that_instant() -> None:
         request = READ_BLOCK if firmware == 169 else read_registers(0x34, 24).sends[0]
         if firmware == 152:
             assert is_exception(rig.ask(1, READ_BLOCK))
-            codec.take(0, rig.ask(1, READ_BLOCK))
+            codec.decode(0, rig.ask(1, READ_BLOCK))
         (burst,) = rig.bursts(framed(1, request))
         assert burst.sample_ns is not None
         truth = rig.line.slaves[0].motion.at((burst.sample_ns - BEGIN_NS) / NS_PER_S)
-        (m,) = codec.take(0, burst.data)
+        (m,) = codec.decode(0, burst.data)
         assert isinstance(m, Measurement)
         assert m.accel_m_s2 is not None
         assert m.gyro_rad_s is not None

@@ -104,7 +104,7 @@ ACTIONS: Final[Actions] = {
     "save": _simple("write all settings to flash", session.save),
     "restart": _simple("restart it; what was not saved is lost", session.restart),
     "factory_reset": _simple(
-        "factory settings, node 8 and 500 kbit/s included, when power comes back: imud then hears it only where bus "
+        "factory settings, node 8 and 500 kbit/s included, after the next power-on: imud then hears it only where bus "
         "and `options.node` are set to that",
         session.factory_reset,
     ),

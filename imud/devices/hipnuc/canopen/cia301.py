@@ -1,4 +1,4 @@
-"""What CiA 301 defines of a node: identifiers, network management (NMT), and expedited SDO from the client's side.
+"""CANopen as CiA 301 defines it: identifiers, network management (NMT), and expedited SDO from the client's side.
 
 An identifier is a function (upper four bits) plus the node's number; two functions are the whole bus's. Manual
 "IMU配置手冊" V1.5.9, section 5.2:
@@ -53,7 +53,7 @@ class NmtCommand(Enum):
     START = 0x01
     """Operational: TPDOs are sent."""
     STOP = 0x02
-    """Only NMT and heartbeat remain."""
+    """Only NMT and heartbeat work."""
     PRE_OPERATIONAL = 0x80
     """SDO remains, TPDOs do not."""
     RESET_NODE = 0x81
@@ -124,7 +124,7 @@ ABORT_TEXTS: Final = {
     0x0800_0023: "object dictionary not present, or its generation failed",
     0x0800_0024: "no data available",
 }
-"""What abort codes mean (CiA 301, table 22)."""
+"""Meanings of SDO abort codes (CiA 301, table 22)."""
 
 
 class Aborted(Rejected):

@@ -60,7 +60,7 @@ SYNC_HZ_MIN, SYNC_HZ_MAX = 0.01, 200.0
 
 
 class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be configured of a node, and of SYNC."""
+    """Settings of a node, and of SYNC."""
 
     node: Annotated[int, Meta(ge=1, le=NODE_MAX)] = NODE_DEFAULT
     """The node's number; 8 as delivered."""
@@ -76,7 +76,7 @@ class HipnucCanopenSettings(Settings, frozen=True, kw_only=True, forbid_unknown_
 
 
 class HipnucCanopenCodec:
-    """Measurements out of the TPDOs of one node. Synchronization: one thread."""
+    """Decoder of the TPDOs of one node. Synchronization: one thread."""
 
     def __init__(self, ledger: Ledger, settings: HipnucCanopenSettings) -> None:
         self.ledger = ledger
@@ -102,15 +102,15 @@ class HipnucCanopenCodec:
         return () if frames is None else (_measurement(dict(frames)),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The bus is idle: no-op, since the next frame shows what is lost."""
+        """No-op: the next frame shows what is lost."""
         return ()
 
     def reset(self) -> None:
-        """Frames are missing here: drop the incomplete sample."""
+        """Drop the incomplete sample: frames are missing here."""
         self._assembly.reset()
 
     def _other(self, can_id: int, extended: bool, data: bytes) -> Sequence[CodecEvent]:
-        """A frame that is no TPDO of this node."""
+        """Decode a frame that is no TPDO of this node."""
         ledger, size = self.ledger, len(data)
         if extended or can_id not in (self._sdo_id, self._heartbeat_id, self._emergency_id):
             ledger.bytes_skipped += size
@@ -140,7 +140,7 @@ class HipnucCanopenCodec:
 
 
 def _measurement(frames: Mapping[int, bytes]) -> Measurement:
-    """A set of TPDOs in SI units; absent ones stay absent, but an attitude comes from the angles where it has to."""
+    """Make a measurement of a set of TPDOs; without a quaternion its attitude comes from the angles."""
     euler = _vector(frames.get(3), EULER_RAD_PER_LSB)
     quat: Quaternion | None = None
     if 4 in frames:

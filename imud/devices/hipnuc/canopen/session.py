@@ -61,10 +61,10 @@ HEARTBEAT_WAIT_NS: Final = 3 * NS_PER_S // 2
 
 
 class Transmission(Enum):
-    """When a TPDO is sent (sub-index 2 of its parameters)."""
+    """Transmission types of a TPDO (sub-index 2 of its parameters)."""
 
     SYNC = 0x01
-    """When SYNC comes."""
+    """On each SYNC."""
     TIMER_MANUFACTURER = 0xFE
     """By its own timer (the table of section 5.2)."""
     TIMER = 0xFF
@@ -72,7 +72,7 @@ class Transmission(Enum):
 
 
 class InclinometerZero(Enum):
-    """What to do with the zero of the inclinometer."""
+    """Operations on the zero of the inclinometer."""
 
     SET = 2
     """The present position reads 0, 0."""
@@ -84,7 +84,7 @@ class InclinometerZero(Enum):
 
 
 def identify(node: int) -> RequestScript[Identity]:
-    """Ask a node what it is (0x1000, 0x1008, 0x1018); what it does not know stays empty. Raises NoReply."""
+    """Read the identity of a node (0x1000, 0x1008, 0x1018); missing objects stay empty. Raises NoReply."""
     details: dict[str, str] = {}
     device_type = yield from _try_read(node, DEVICE_TYPE, 0)
     if device_type is not None:
@@ -165,7 +165,7 @@ def save(node: int) -> RequestScript[None]:
 
 
 def factory_reset(node: int) -> RequestScript[None]:
-    """Everything as delivered, node number and bit rate included; in force after the next power-on."""
+    """Restore the factory settings, node number and bit rate included; in force after the next power-on."""
     yield from write_object(node, CONTROL, 0, FACTORY_RESET, 4, timeout_ns=FLASH_TIMEOUT_NS)
 
 

@@ -1,1 +1,1 @@
-"""What the HiPNUC protocols share: units of raw values, registers, assembly of samples from frames."""
+"""Parts that the HiPNUC protocols share: units of raw values, registers, assembly of samples from frames."""

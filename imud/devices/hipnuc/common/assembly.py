@@ -1,4 +1,4 @@
-"""One sample out of several frames that carry neither counter nor time (CANopen TPDOs, J1939 and NMEA 2000 PGNs).
+"""Assembly of samples from frames without counter and time (CANopen TPDOs, J1939 and NMEA 2000 PGNs).
 
 A device sends the frames of one instant back to back, always in the same order: a burst. Each kind of frame (a TPDO, a
 PGN) has its own rate; the fastest kinds are in every burst, a slower one in every m-th. **Frames of two periods are
@@ -170,7 +170,7 @@ class Assembly:
         return self._learning is None
 
     def _begin(self, t_rx_ns: int) -> None:
-        """A burst begins."""
+        """Begin a burst."""
         was_late = self._cadence.is_late
         missed, lost = self._cadence.begin(t_rx_ns)
         if missed:
@@ -189,7 +189,7 @@ class Assembly:
             self._due = self._fast.union(due) if due else self._fast
 
     def _close(self) -> list[tuple[int, bytes]]:
-        """The sample is whole."""
+        """Finish the sample: it is whole."""
         held, ledger = self._held, self._ledger
         frames = list(held.items())
         held.clear()
@@ -225,7 +225,7 @@ class Assembly:
         return fits and self._learning is None
 
     def _meet(self, kind: int, t_rx_ns: int) -> None:
-        """A frame of a kind that is not known, or any while learning."""
+        """Learn from a frame of an unknown kind, or from any while learning."""
         if self._allowed is not None and kind not in self._allowed:
             return
         if self._learning is not None:
@@ -239,14 +239,14 @@ class Assembly:
             self._plan()
 
     def _put(self, kind: int, t_rx_ns: int) -> None:
-        """Place a kind where its newest frame stands: behind the newest frame of the burst, or before the next one."""
+        """Place a kind by its newest frame: behind the newest frame of the burst, or before the next one."""
         order = [other for other in self._order if other != kind]
         follows = bool(self._held) or 2 * (t_rx_ns - self._newest_ns) < self._cadence.period_ns
         order.insert(order.index(self._newest) + 1 if follows else 0, kind)
         self._order = order
         self._place = {other: place for place, other in enumerate(order)}
 
-    # --- what does not fit ---------------------------------------------------------------------------------------
+    # --- frames that do not fit ----------------------------------------------------------------------------------
 
     def _ends(self, kind: _Kind, t_rx_ns: int) -> bool:
         """Whether such a frame shows that the rest of what is held does not come."""
@@ -257,7 +257,7 @@ class Assembly:
         return kind.every == 1 and self._place[kind.number] < self._place[self._newest]
 
     def _end(self) -> list[tuple[int, bytes]] | None:
-        """The rest of what is held does not come."""
+        """Stop waiting for the rest of the sample."""
         frames = self._close() if len(self._fast) > 1 and self._fast <= self._held.keys() else None
         if frames is None:
             self._drop_sample()
@@ -270,7 +270,7 @@ class Assembly:
         return frames
 
     def _drop_sample(self) -> None:
-        """The sample that was begun stays incomplete."""
+        """Drop the incomplete sample."""
         self._drop()
         self._ledger.lost_gap_device += 1
         self._is_whole = False
@@ -292,7 +292,7 @@ class Assembly:
         if self._strays >= STRAYS_MAX:
             self._relearn()
 
-    # --- what is known -------------------------------------------------------------------------------------------
+    # --- learning ------------------------------------------------------------------------------------------------
 
     def _relearn(self) -> None:
         self._drop()
@@ -302,7 +302,7 @@ class Assembly:
         self._learning = BurstLearning()
 
     def _learn(self, learned: Learned, t_rx_ns: int) -> None:
-        """The device is known; its next burst is the first one that counts."""
+        """Adopt what was learned; the next burst is the first one that counts."""
         self._learning = None
         self._cadence = Cadence(learned.period_ns, t_rx_ns)
         self._kinds = {number: _Kind(number, 1, self._burst) for number in learned.order}
@@ -311,7 +311,7 @@ class Assembly:
         self._plan()
 
     def _plan(self) -> None:
-        """Kinds came, went, or changed their rates."""
+        """Plan anew after kinds came, went, or changed their rates."""
         kinds = self._kinds
         fast = [number for number in self._order if number in kinds and kinds[number].every == 1]
         if not fast:

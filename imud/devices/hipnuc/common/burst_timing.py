@@ -1,4 +1,4 @@
-"""Bursts in time: what a device sends, learned from the first frames heard, and how many bursts did not come at all.
+"""Timing of bursts: a device's bursts, learned from the first frames heard, and the number of missing bursts.
 
 A device sends the frames of one instant back to back: a burst. `BurstLearning` finds the kinds that are in every burst,
 their order and the period. `Cadence` follows the period from then on and counts missing bursts by time, because these
@@ -17,13 +17,13 @@ from imud.units import NS_PER_MS, NS_PER_S
 PERIODS: Final = 4
 """Periods that must look alike."""
 STEPS_MAX: Final = 64
-"""Where times of arrival are so bad that four periods are never alike, the mean of so many."""
+"""Number of periods to average where arrival times vary so much that four periods are never alike."""
 FRAMES_MAX: Final = 128
 """Frames kept while learning; they have room for four periods of more kinds than any device has."""
 
 
 class Learned(NamedTuple):
-    """A device's bursts."""
+    """Learned properties of a device's bursts."""
 
     order: tuple[int, ...]
     """Kinds that are in every burst, as they are sent."""
@@ -32,7 +32,7 @@ class Learned(NamedTuple):
 
 
 class BurstLearning:
-    """Learns from frames in the order they come. Synchronization: one thread."""
+    """Learning from frames in the order they arrive. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._frames: list[tuple[int, int]] = []
@@ -63,7 +63,7 @@ class BurstLearning:
 
 
 def _in_every(slices: Sequence[Sequence[tuple[int, int]]]) -> tuple[int, ...] | None:
-    """The kinds that stand in every slice once, if their order is the same in all; else None."""
+    """Return the kinds that occur once in every slice, if their order is the same in all; else None."""
     common = set.intersection(*({kind for kind, _ in one} for one in slices))
     orders = {tuple(kind for kind, _ in one if kind in common) for one in slices}
     order = orders.pop()
@@ -84,11 +84,11 @@ def _from_head(order: tuple[int, ...], frames: Sequence[tuple[int, int]]) -> tup
 SILENCE_NS: Final = NS_PER_S
 """A longer gap is silence of the device, not loss."""
 PERIOD_LEAST_NS: Final = NS_PER_MS
-"""No device sends faster than 1 kHz."""
+"""Shortest period: no device sends faster than 1 kHz."""
 STEADY_BURSTS: Final = 2
-"""So many bursts at the usual distance show that nothing more is made up for."""
+"""Number of bursts at the usual distance after which no delayed burst is expected any more."""
 ODD_BURSTS: Final = 8
-"""So many distances in a row that are all shorter, or all longer, and within 1/4 of each other, are another rate."""
+"""Number of distances in a row, all shorter or all longer and within 1/4 of each other, that are another rate."""
 SMOOTHING: Final = 16
 """Weight of what is known of the period against one more distance."""
 

@@ -1,4 +1,4 @@
-"""Table: what raw values of HiPNUC modules mean in SI, where two or more protocols share it; and counts of SI values.
+"""Table: scales of raw values of HiPNUC modules to SI that two or more protocols share; and counts of SI values.
 
 Manual "IMU配置手冊" V1.5.9: HI91 and HI92 in section 3.3, registers in section 4.2, TPDOs in section 5.2, PGNs in
 section 6.1. A scale that one protocol has alone stands with its layout.
@@ -23,7 +23,7 @@ M_S2_PER_G: Final = 9.8
 ACCEL_M_S2_PER_LSB: Final = 0.00048828 * M_S2_PER_G
 GYRO_RAD_S_PER_LSB: Final = 0.061035 * RAD_PER_DEG
 MAG_T_PER_LSB: Final = 0.030517 * T_PER_UT
-"""As printed; 1000 / 32768 µT would be 1.9e-5 more."""
+"""As the manual prints it; 1000 / 32768 µT would be 1.9e-5 more."""
 EULER_RAD_PER_LSB: Final = 0.001 * RAD_PER_DEG
 QUAT_PER_LSB: Final = 0.0001
 TEMPERATURE_C_PER_LSB: Final = 0.01
@@ -31,7 +31,7 @@ PRESSURE_PA_PER_LSB: Final = 0.01
 
 
 def counts_of(value: float, bits: int) -> int:
-    """The nearest count of a signed field, for a value beyond its range the first or last one. ValueError for NaN."""
+    """Round to a count of a signed field, clipped to its range. Raises ValueError for NaN."""
     if isnan(value):
         raise ValueError("NaN has no count")
     most = 1 << bits - 1

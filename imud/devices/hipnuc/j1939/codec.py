@@ -1,10 +1,10 @@
 """HiPNUC CH0x0/CH10x/HI14 on SAE J1939. Manual "IMU配置手冊" V1.5.9, chapter 6.
 
-    0CFF3408   priority 3 | PGN FF34 | source 08, the module's address     eight bytes, see `j1939_messages.py`
-    0CEF5508   a reply to imud, see `j1939_session.py`
+    0CFF3408   priority 3 | PGN FF34 | source 08, the module's address     eight bytes, see `messages.py`
+    0CEF5508   a reply to imud, see `session.py`
 
 Several modules share a bus and have different addresses; priority means nothing on reception. A module sends each PGN
-that is switched on at its own interval, with neither counter nor time: `assembly.py` makes samples of them.
+that is switched on at its own interval, with neither counter nor time: `common/assembly.py` makes samples of them.
 
 FF2F (UTC) is accepted and ignored. It is a calendar time which jumps when the module's receiver finds out what
 time it is, it has an interval of its own, and no source says of which instant it is: no device time for a sample.
@@ -29,7 +29,7 @@ Address = Annotated[int, Meta(ge=0, le=ADDRESS_MAX)]
 
 
 class HipnucJ1939Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be configured of the codec."""
+    """Settings of a module on J1939."""
 
     address: Address = FACTORY_ADDRESS
     """The module's address on the bus (J1939 source address); it can be set to 1 … 128."""
@@ -40,7 +40,7 @@ class HipnucJ1939Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fi
 
     @property
     def peer(self) -> J1939Node:
-        """The module, and imud as it sees it."""
+        """Address of the module, and imud's own."""
         return J1939Node(self.address, self.host_address)
 
     def measured(self) -> tuple[int, ...]:
@@ -51,7 +51,7 @@ class HipnucJ1939Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class HipnucJ1939Codec:
-    """Measurements and replies out of the frames of one module. Synchronization: one thread."""
+    """Decoder of the frames of one module. Synchronization: one thread."""
 
     def __init__(self, ledger: Ledger, settings: HipnucJ1939Settings) -> None:
         self.ledger = ledger
@@ -85,11 +85,11 @@ class HipnucJ1939Codec:
         return () if whole is None else (messages.measurement_of(whole),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The bus is idle: no-op, since the next frame shows what is lost."""
+        """No-op: the next frame shows what is lost."""
         return ()
 
     def reset(self) -> None:
-        """Frames are missing here: drop the incomplete sample."""
+        """Drop the incomplete sample: frames are missing here."""
         self._assembly.reset()
 
 

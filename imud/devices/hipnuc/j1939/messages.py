@@ -46,9 +46,9 @@ PgnName = MeasuredName | Literal["FF2F"]
 ACCEL, GYRO, ROLL_PITCH, HEADING, INCLINOMETER = 0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A
 MAG, TEMPERATURE, QUATERNION, UTC = 0xFF3A, 0xFF43, 0xFF46, 0xFF2F
 PGNS: Final = (UTC, ACCEL, GYRO, MAG, ROLL_PITCH, HEADING, TEMPERATURE, QUATERNION, INCLINOMETER)
-"""All of them, in rising order."""
+"""All PGNs, in rising order."""
 MEASURED: Final = PGNS[1:]
-"""Those that become samples."""
+"""Messages that become samples."""
 PRIORITY: Final = 3
 MESSAGE_BYTES: Final = 8
 
@@ -63,7 +63,7 @@ TURN: Final = 360_000
 """Counts of a full turn."""
 HALF_TURN: Final = TURN // 2
 TEMPERATURE_MOST_C: Final = 150.0
-"""No module works beyond."""
+"""Highest valid temperature: no module works beyond."""
 PRESSURE_MOST_PA: Final = 2_000_000.0
 UNIT_TOLERANCE: Final = 0.02
 YEAR_ZERO: Final = 2000
@@ -74,7 +74,7 @@ _ZERO_VECTOR: Final = bytes(6)
 
 
 def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
-    """One sample out of messages of eight bytes (PGN, data) of one instant, each PGN at most once."""
+    """Make one sample of messages of eight bytes (PGN, data) of one instant, each PGN at most once."""
     parts = _Parts()
     for pgn, data in messages:
         _DECODE[pgn](parts, data)
@@ -104,7 +104,7 @@ class _Parts:
 
     @property
     def euler(self) -> Vector3 | None:
-        """What is known of roll, pitch and yaw."""
+        """The known ones of roll, pitch and yaw."""
         roll, pitch, yaw = self.roll, self.pitch, self.yaw
         return (roll, pitch, yaw) if roll == roll or pitch == pitch or yaw == yaw else None  # noqa: PLR0124 - no NaN
 
@@ -166,7 +166,7 @@ def _vector(data: bytes, factor: float) -> Vector3:
 
 
 def _angle(counts: int) -> float:
-    """In rad; NaN beyond a full turn."""
+    """Decode an angle to rad; NaN beyond a full turn."""
     return counts * EULER_RAD_PER_LSB if -TURN <= counts <= TURN else nan
 
 
@@ -174,50 +174,50 @@ def _angle(counts: int) -> float:
 
 
 def pack_accel(accel_m_s2: Vector3) -> bytes:
-    """FF34. Values beyond the range are clipped, here and in all of these."""
+    """Pack FF34. Values beyond the range are clipped, here and in all of these."""
     return _pack_vector(accel_m_s2, ACCEL_M_S2_PER_LSB)
 
 
 def pack_gyro(gyro_rad_s: Vector3) -> bytes:
-    """FF37."""
+    """Pack FF37."""
     return _pack_vector(gyro_rad_s, GYRO_RAD_S_PER_LSB)
 
 
 def pack_mag(mag_t: Vector3) -> bytes:
-    """FF3A."""
+    """Pack FF3A."""
     return _pack_vector(mag_t, MAG_T_PER_LSB)
 
 
 def pack_roll_pitch(roll_rad: float, pitch_rad: float) -> bytes:
-    """FF3D."""
+    """Pack FF3D."""
     return TWO_ANGLES.pack(counts_of(roll_rad / EULER_RAD_PER_LSB, 32), counts_of(pitch_rad / EULER_RAD_PER_LSB, 32))
 
 
 def pack_heading(yaw_rad: float, *, twice: bool = True) -> bytes:
-    """FF41 of a counter-clockwise yaw; `twice` as newer firmware does, else with zeros in the reserved bytes."""
+    """Pack FF41 of a counter-clockwise yaw; `twice` as newer firmware does, else with zeros in the reserved bytes."""
     counter_clockwise = round(yaw_rad / EULER_RAD_PER_LSB)
     signed = (counter_clockwise + HALF_TURN) % TURN - HALF_TURN
     return HEADING_LAYOUT.pack(-counter_clockwise % TURN, signed if twice else 0)
 
 
 def pack_inclinometer(x_rad: float, y_rad: float) -> bytes:
-    """FF4A."""
+    """Pack FF4A."""
     return pack_roll_pitch(x_rad, y_rad)
 
 
 def pack_temperature(temperature_c: float, pressure_pa: float) -> bytes:
-    """FF43."""
+    """Pack FF43."""
     celsius, pressure = temperature_c / TEMPERATURE_C_PER_LSB, pressure_pa / PRESSURE_PA_PER_LSB
     return TEMPERATURE_LAYOUT.pack(counts_of(celsius, 16), 0, counts_of(pressure, 32))
 
 
 def pack_quaternion(quat_wxyz: Quaternion) -> bytes:
-    """FF46."""
+    """Pack FF46."""
     return QUATERNION_LAYOUT.pack(*(counts_of(q / QUAT_PER_LSB, 16) for q in quat_wxyz))
 
 
 def pack_utc(year: int, month: int, day: int, second_of_day: float) -> bytes:
-    """FF2F."""
+    """Pack FF2F."""
     whole, millisecond = divmod(int(second_of_day * 1000), 1000)
     minutes, second = divmod(whole, 60)
     return UTC_LAYOUT.pack(year - YEAR_ZERO, month, day, *divmod(minutes, 60), second, millisecond)

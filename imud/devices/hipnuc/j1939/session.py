@@ -35,7 +35,7 @@ LAYOUT: Final = struct.Struct("<HBBI")
 READ: Final = 0x03
 WRITE: Final = 0x06
 HOST_ADDRESS: Final = 0x55
-"""Where the manual's example comes from, and where all replies go."""
+"""Source address in the manual's example, and destination of all replies."""
 
 CONTROL: Final = 0x0000
 ONCE: Final = 0x0096
@@ -60,7 +60,7 @@ FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S
 
 
 class Zero(Enum):
-    """What to do with the zero of the angles."""
+    """Operations on the zero of the angles."""
 
     HERE = 2
     """The present position is zero."""
@@ -85,7 +85,7 @@ class J1939Node:
 def exchange(
     peer: J1939Node, register: int, command: int, value: int, name: str, timeout_ns: int = REPLY_TIMEOUT_NS
 ) -> Request:
-    """One frame to the module and the reply to it."""
+    """Make a request: one frame to the module, and its reply."""
     ids = peer.reply_ids()
     head = LAYOUT.pack(register, command, 0, 0)[:3]
 
@@ -167,7 +167,7 @@ def save(peer: J1939Node) -> RequestScript[None]:
 
 
 def factory_reset(peer: J1939Node) -> RequestScript[None]:
-    """Back to factory settings, address and bit rate included: it may be gone from the bus before it replies."""
+    """Restore the factory settings, address and bit rate included: it may leave the bus before it replies."""
     yield exchange(peer, CONTROL, WRITE, FACTORY, "factory reset", FLASH_TIMEOUT_NS)
 
 

@@ -67,9 +67,9 @@ UPTIME: Final = struct.Struct(">I")
 """Registers 0x4C … 0x4D, ms."""
 DATA_AT: Final = 3
 CHECK_NS: Final = 10 * NS_PER_S
-"""How often the serial number is read again: another module can take a place on the line unnoticed."""
+"""Interval of reading the serial number again: another module can take a place on the line unnoticed."""
 UNIT_TOLERANCE: Final = 0.02
-"""How far from 1 a quaternion may be: the two scales are a factor of 3.3 apart, rounding costs 1e-4."""
+"""Tolerance of a quaternion's length: the two scales are a factor of 3.3 apart, rounding costs 1e-4."""
 PITCHED_RAD: Final = radians(1.0)
 """A dual-axis inclinometer shows 182 counts here."""
 
@@ -80,13 +80,13 @@ _SAMPLE: Final = 0
 
 
 class HipnucModbusSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be configured of the codec."""
+    """Settings of a module on RS-485."""
 
     inclinometer: Literal["auto", "single", "dual"] = "auto"
     """Axes of an inclinometer product: `single` has X from 0 to 360°, `dual` X ±180° and Y ±90°; `auto` decides by the
     values, which takes a tilt of more than 1°."""
     update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
-    """How often the device renews its registers, per second, for the error of time stamps; 0 for not known."""
+    """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
 
 
 def update_ns(settings: HipnucModbusSettings) -> int:
@@ -95,7 +95,7 @@ def update_ns(settings: HipnucModbusSettings) -> int:
 
 
 class HipnucModbusCodec:
-    """Measurements out of blocks of registers. Synchronization: one thread.
+    """Decoder of blocks of registers. Synchronization: one thread.
 
     What was learned of the firmware stays, after `reset` too; scales and serial number are learned anew.
     """
@@ -114,22 +114,22 @@ class HipnucModbusCodec:
         """Blocks that repeated the one before."""
         return self._stale_before + self._book.stale
 
-    def take(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Take one reply. Never raises."""
+    def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+        """Decode one reply. Never raises."""
         if poll != _SAMPLE:
-            return self._take_serial(data)
+            return self._decode_serial(data)
         if is_exception(data):
-            return self._take_exception(data)
+            return self._decode_exception(data)
         return self._book.decode(data, self._bad, self._measure)
 
     def reset(self) -> None:
-        """Another module may be there: nothing is known of its values."""
+        """Forget scales and serial number: another module may be there."""
         self._book.reset()
         self._quat_scale = 0.0
         self._incli_scale = self._fixed_incli
         self._serial = b""
 
-    def _take_exception(self, data: bytes) -> Sequence[PolledEvent]:
+    def _decode_exception(self, data: bytes) -> Sequence[PolledEvent]:
         if data[2] == ILLEGAL_ADDRESS and self._size == READ_BLOCK.read_bytes:
             self._book.add_reply(data, good=True)
             self.polls, self._size = _polls(short=True), READ_SHORT_BLOCK.read_bytes
@@ -140,7 +140,7 @@ class HipnucModbusCodec:
         self.ledger.frames_bad_content += 1
         return (BadFrame(BadReason.CONTENT, data),)
 
-    def _take_serial(self, data: bytes) -> Sequence[PolledEvent]:
+    def _decode_serial(self, data: bytes) -> Sequence[PolledEvent]:
         whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)
         self._book.add_reply(data, good=whole or is_exception(data))
         if not whole:  # damaged, or a firmware that does not like this read: nothing is known
@@ -200,7 +200,7 @@ _INCLI: Final = {"auto": 0.0, "single": INCLI_SINGLE_RAD_PER_LSB, "dual": INCLI_
 
 
 def _dual_y_rad(roll_rad: float, pitch_rad: float) -> float:
-    """What the Y axis of a dual-axis inclinometer shows in this attitude: atan2(gy, gz) of the vertical in the body."""
+    """Compute the Y axis of a dual-axis inclinometer in this attitude: atan2(gy, gz) of the vertical in the body."""
     return atan2(sin(pitch_rad), cos(pitch_rad) * cos(roll_rad))
 
 
@@ -224,7 +224,7 @@ def pack_block(
     incli_counts: tuple[int, int] = (0, 0),
     quat_per_lsb: float = QUAT_PER_LSB,
 ) -> bytes:
-    """Registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
+    """Pack registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
     data = BLOCK.pack(
         *(counts_of(a / ACCEL_M_S2_PER_LSB, 16) for a in accel_m_s2),
         *(counts_of(w / GYRO_RAD_S_PER_LSB, 16) for w in gyro_rad_s),

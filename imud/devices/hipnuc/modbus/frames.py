@@ -59,7 +59,7 @@ def write_register(register: int, value: int) -> Transfer:
 
 
 def set_id_by_serial(serial_number: str, new_id: int) -> Transfer:
-    """To all: the module with this serial number (16 hexadecimal digits) takes an ID."""
+    """Give the module with this serial number (16 hexadecimal digits) an ID; a broadcast."""
     check_id("ID", new_id)
     serial = serial_bytes(serial_number)
     data_bytes = len(serial) + 2
@@ -67,7 +67,7 @@ def set_id_by_serial(serial_number: str, new_id: int) -> Transfer:
 
 
 def randomise_ids(lowest: int, highest: int) -> Transfer:
-    """To all: take a random ID of this range, both ends included. Ranges of one ID are refused."""
+    """Make every module choose a random ID from `lowest` to `highest`; a broadcast. Ranges of one ID are refused."""
     check_id("lowest ID", lowest)
     check_id("highest ID", highest)
     if lowest >= highest:
@@ -76,7 +76,7 @@ def randomise_ids(lowest: int, highest: int) -> Transfer:
 
 
 def check_id(name: str, value: int) -> int:
-    """An address that a slave can be called by. Raises BadArgument.
+    """Check that an address is one of a slave. Raises BadArgument.
 
     The manual gives 1 … 128, 1 … 255 and 1 … 0xFF; Modbus has 1 … 247.
     """

@@ -22,7 +22,7 @@ from imud.devices.hipnuc.common.raw_units import (
 
 
 class Access(StrEnum):
-    """What can be done with a register."""
+    """Permitted accesses to a register."""
 
     READ = "R"
     WRITE = "W"
@@ -31,7 +31,7 @@ class Access(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One value: where it is, how wide, what a count of it means in SI."""
+    """A value in the registers: address, width, and scale to SI."""
 
     name: str
     address: int
@@ -46,7 +46,7 @@ class Register:
     unit: str = ""
     """SI unit; empty for a plain number."""
     values: tuple[int, ...] | range = ()
-    """What may be written, where not everything may."""
+    """Values that may be written, where these are limited."""
 
 
 QUAT_OLD_PER_LSB: Final = 2.0**-15

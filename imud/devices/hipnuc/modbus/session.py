@@ -1,4 +1,4 @@
-"""Transfer scripts of a HiPNUC module on RS-485. What is written is read back where the module lets it be read.
+"""Transfer scripts of a HiPNUC module on RS-485. Settings are read back after a write where they can be read.
 
 Manual "IMU配置手冊" V1.5.9, section 4.3. Settings are lost at power-off unless `save` follows. A new ID is in force at
 once: what comes next goes to the new address. When a new baud rate is in force the manual does not say; saved and
@@ -58,7 +58,7 @@ def probe(_settings: object) -> TransferScript[Identity]:
 
 
 def identity_of(data: bytes) -> Identity:
-    """What registers 0x70 … 0x83 say. Raises DeviceRefused where the name is no text."""
+    """Decode registers 0x70 … 0x83. Raises DeviceRefused where the name is no text."""
     name = data[:NAME_BYTES].rstrip(b"\0 ")
     if not name or any(byte not in range(0x20, 0x7F) for byte in name):
         raise DeviceRefused(f"expected the name of a product at register 0x70, got {data[:NAME_BYTES].hex(' ')}")
@@ -83,12 +83,12 @@ def save() -> TransferScript[None]:
 
 
 def factory_reset() -> TransferScript[None]:
-    """Back to factory settings, ID and baud rate included; they are in force after a restart at the latest."""
+    """Restore the factory settings, ID and baud rate included; they are in force after a restart at the latest."""
     return _write_unheard(BY_NAME["CTRL"], FACTORY_RESET)
 
 
 def restart() -> TransferScript[None]:
-    """Restart, as by power-on. Whether it is confirmed is not stated, so silence is not taken for a failure."""
+    """Restart, as by power-on. No confirmation is documented, so silence is no failure."""
     return _write_unheard(BY_NAME["CTRL"], RESTART)
 
 
@@ -98,7 +98,7 @@ def set_baud(baud: BaudRate) -> TransferScript[None]:
 
 
 def set_id(new_id: int) -> TransferScript[None]:
-    """Take another address, 1 … 128. It may be confirmed from the old address, the new one, or not at all.
+    """Set the address, 1 … 128. The confirmation may come from the old address, the new one, or not at all.
 
     Raises BadArgument for an address beyond that, which goes by serial number only; DeviceRefused.
     """
@@ -108,12 +108,12 @@ def set_id(new_id: int) -> TransferScript[None]:
 
 
 def set_heading_mode(mode: AttitudeMode) -> TransferScript[None]:
-    """Six or nine axes."""
+    """Choose six or nine axes."""
     return _write(BY_NAME["HEADING_MODE"], mode.value)
 
 
 def set_mounting(mounting: LineMounting) -> TransferScript[None]:
-    """How the module is mounted."""
+    """Set the mounting of the module."""
     return _write(BY_NAME["URFR"], mounting.value)
 
 
@@ -138,7 +138,7 @@ def _write(register: Register, value: int) -> TransferScript[None]:
 
 
 def _write_unheard(register: Register, value: int) -> TransferScript[None]:
-    """Write what may stop the module from being heard where it was. Raises DeviceRefused for an exception only."""
+    """Write a setting that may change where the module answers. Raises DeviceRefused for an exception only."""
     request = write_register(register.address, value)
     try:
         reply = yield request

@@ -1,18 +1,18 @@
-"""HiPNUC modules on NMEA 2000, and any other heading or attitude sensor there. Messages: `nmea2000_messages.py`.
+"""HiPNUC modules on NMEA 2000, and any other heading or attitude sensor there. Messages: `messages.py`.
 
     09F112ss  127250 Vessel Heading     09F113ss  127251 Rate of Turn     0DF119ss  127257 Attitude
 
-ss is the sender's address, which NMEA 2000 gives out anew each time the bus is put together. `source: auto` takes the
-first sender of these messages and keeps it; when it has been silent for SILENT_NS, the next one who is heard.
-imud sends nothing: it claims no address and asks no questions.
+ss is the sender's address, which NMEA 2000 gives out anew each time the bus is put together. `source: auto` selects
+the first sender of these messages and keeps it; after SILENT_NS without a message, the next sender. imud claims no
+address and sends no requests.
 
-Messages of one instant have the same SID. `assembly.py` makes samples by their order and time; a SID that differs from
-that of the frames held gives these up. A sender whose messages of one instant have SIDs of their own, against the
+Messages of one instant have the same SID. `common/assembly.py` makes samples by their order and time; frames held with
+another SID than the newest are dropped. A sender whose messages of one instant have SIDs of their own, against the
 standard, would never make a sample: after SID_DOUBTS such samples in a row SIDs are not looked at, until they agree in
 as many samples again.
 
-A sender may give its heading twice, from true and from magnetic north. `heading` says which to take; `auto` takes the
-reference that comes first and keeps it. Headings of the other one are ignored. Deviation and variation are not applied.
+A sender may give its heading twice, from true and from magnetic north. `heading` selects the one to use; `auto` selects
+the reference that comes first and keeps it. The other heading is ignored. Deviation and variation are not applied.
 """
 
 from collections.abc import Sequence
@@ -39,16 +39,16 @@ _REFERENCES: Final = {"true": Reference.TRUE, "magnetic": Reference.MAGNETIC, "a
 
 
 class HipnucNmea2000Settings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be configured of the codec."""
+    """Settings of a heading or attitude sensor."""
 
     source: Literal["auto"] | Annotated[int, Meta(ge=0, le=ADDRESS_MAX)] = "auto"
     """Address of the sender; `auto` for the first who is heard, and another one when that is silent."""
     heading: Literal["auto", "true", "magnetic"] = "auto"
-    """Which heading to take where the sender has two; `auto` for the first that is heard."""
+    """Heading to use where the sender has two; `auto` for the first that is received."""
 
 
 class HipnucNmea2000Codec:
-    """Measurements out of the frames of one sender. Synchronization: one thread."""
+    """Decoder of the frames of one sender. Synchronization: one thread."""
 
     def __init__(self, ledger: Ledger, settings: HipnucNmea2000Settings) -> None:
         self.ledger = ledger
@@ -84,11 +84,11 @@ class HipnucNmea2000Codec:
         return (messages.measurement_of(whole, heading_elsewhere=self._has_heading),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The bus is idle: no-op, since the next frame shows what is lost."""
+        """No-op: the next frame shows what is lost."""
         return ()
 
     def reset(self) -> None:
-        """Frames are missing here: drop the incomplete sample."""
+        """Drop the incomplete sample: frames are missing here."""
         self._assembly.reset()
 
     # --- whose frames --------------------------------------------------------------------------------------------
@@ -114,12 +114,12 @@ class HipnucNmea2000Codec:
         self._sid_doubts = 0
 
     def _is_reference(self, reference: Reference) -> bool:
-        """Whether it is the heading to take; an error is one of either, and its value absent."""
+        """Whether this is the heading to use; an error counts for both, with its value absent."""
         if self._reference is None and reference is not Reference.ERROR:
             self._reference = reference
         return reference in (self._reference, Reference.ERROR)
 
-    # --- what belongs together -----------------------------------------------------------------------------------
+    # --- messages of one instant ---------------------------------------------------------------------------------
 
     def _match(self, sid: int | None) -> None:
         """Drop the frames of another instant."""
@@ -132,7 +132,7 @@ class HipnucNmea2000Codec:
                 self._uses_sids, self._sid_doubts = False, 0
 
     def _count_sids(self, whole: Sequence[tuple[int, bytes]]) -> None:
-        """A sample is whole."""
+        """Count the SIDs of a whole sample."""
         if self._uses_sids:
             self._sid_doubts = 0
         elif len(whole) > 1:

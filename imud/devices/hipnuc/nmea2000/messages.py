@@ -1,4 +1,4 @@
-"""Three PGNs of NMEA 2000, as any heading or attitude sensor sends them: layouts, scales, and values that are none.
+"""Three PGNs of NMEA 2000 as any heading or attitude sensor sends them: layouts, scales, "not available" values.
 
     127250 Vessel Heading  | SID u8 | heading u16 | deviation i16 | variation i16 | reference 2 bits, 6 reserved |
     127251 Rate of Turn    | SID u8 | rate i32 | 3 reserved |
@@ -40,7 +40,7 @@ I16_MOST, U16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0xFFFC, 0x7FFF_FFFC, 252
 
 
 class Reference(IntEnum):
-    """What a heading is measured from."""
+    """North to which a heading refers."""
 
     TRUE = 0
     MAGNETIC = 1
@@ -49,7 +49,7 @@ class Reference(IntEnum):
 
 
 class Head(NamedTuple):
-    """What is known of a message before its values."""
+    """Header of a message: all that is known before its values."""
 
     sid: int | None
     """Number of the instant, the same in all messages of one; None where the sender has none."""
@@ -58,13 +58,13 @@ class Head(NamedTuple):
 
 
 def head_of(pgn: int, data: bytes) -> Head:
-    """The head of a message of eight bytes."""
+    """Decode the header of a message of eight bytes."""
     reference = Reference(data[7] & 3) if pgn == HEADING else None
     return Head(data[0] if data[0] <= SID_MOST else None, reference)
 
 
 def measurement_of(messages: Sequence[tuple[int, bytes]], *, heading_elsewhere: bool = False) -> Measurement:
-    """One sample out of messages (PGN, data) of one instant, each PGN at most once.
+    """Make one sample of messages (PGN, data) of one instant, each PGN at most once.
 
     Yaw is that of the heading, else that of the attitude, but for a device that sends its heading in other samples.
     """
@@ -108,19 +108,19 @@ def _counter_clockwise(clockwise: int) -> float:
 
 
 def pack_heading(sid: int, yaw_rad: float | None, reference: Reference) -> bytes:
-    """127250 of a counter-clockwise yaw, without deviation and variation; None is "not available"."""
+    """Pack 127250 of a counter-clockwise yaw, without deviation and variation; None is "not available"."""
     counts = 0xFFFF if yaw_rad is None else round(-yaw_rad % tau / RAD_PER_LSB)
     return HEADING_LAYOUT.pack(sid, counts, 0x7FFF, 0x7FFF, 0xFC | reference)
 
 
 def pack_rate_of_turn(sid: int, gyro_z_rad_s: float | None) -> bytes:
-    """127251 of a counter-clockwise rate."""
+    """Pack 127251 of a counter-clockwise rate."""
     counts = 0x7FFF_FFFF if gyro_z_rad_s is None else _clip(-gyro_z_rad_s / RATE_RAD_S_PER_LSB, I32_MOST)
     return RATE_LAYOUT.pack(sid, counts)[:5] + b"\xff\xff\xff"
 
 
 def pack_attitude(sid: int, euler_rad: Vector3, *, has_yaw: bool = True) -> bytes:
-    """127257 of roll, pitch and a counter-clockwise yaw."""
+    """Pack 127257 of roll, pitch and a counter-clockwise yaw."""
     roll, pitch, yaw = (_clip(angle / RAD_PER_LSB, I16_MOST) for angle in euler_rad)
     return ATTITUDE_LAYOUT.pack(sid, -yaw if has_yaw else 0x7FFF, pitch, roll, 0xFF)
 

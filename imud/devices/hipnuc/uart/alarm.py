@@ -1,4 +1,4 @@
-"""Table: which angle each axis of the ALARM pin is, and how its ranges are read from settings (HiPNUC manual, 2.2.4).
+"""Table: the angle of each axis of the ALARM pin, and the form of its ranges in the settings (HiPNUC manual, 2.2.4).
 
 `CONFIG PMUX5 AXIS,MIN,MAX,THR,ENABLE` sets them; the pin is high while an angle is outside MIN … MAX degrees. No source
 shows how LOG USRCONFIG prints them. Accepted are lines that name the alarm and hold the values in the command's order,

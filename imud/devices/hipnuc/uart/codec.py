@@ -7,7 +7,7 @@
 
 `crc` is CRC-16/XMODEM over bytes 0…3 and the payload. The payload is a row of sub-packets, each a tag byte and as many
 bytes as its tag says: 0x91 (HI91, floats, 76 bytes), 0x92 (HI92, integers, 48 bytes). Lines of text, the replies to
-commands (`commands.py`), stand between the frames and may be cut by them (`lines.py`).
+commands (`commands.py`), stand between the frames and may be cut by them (`replies.py`).
 
 Strategy. A frame whose check fails spends only its sync word, because a real frame may begin inside the false one.
 What follows up to its claimed end counts as part of it unless it turns out to be good. While a claimed frame is
@@ -50,7 +50,7 @@ FRAME_BYTES_MAX: Final = HEADER.size + PAYLOAD_BYTES_MAX
 STATUS_SINCE_APP_VER: Final = 169
 """Firmware 1.6.9 and newer sends MAIN_STATUS in bytes 1-2 of HI91; before, pps_sync_stamp as in the manual."""
 TIME_BITS: Final = TimeBits(sync_out=1 << 12, not_utc=1 << 11)
-"""What MAIN_STATUS says of time: the frame belongs to a pulse on SOUT; `system_time` is not synchronised to UTC."""
+"""Status bits about time in MAIN_STATUS: pulse on SOUT with this frame; `system_time` not synchronised to UTC."""
 
 _HI91_FRAME_BYTES: Final = HEADER.size + HI91.size
 _HI91_HEAD: Final = SYNC + HI91.size.to_bytes(2, "little")
@@ -67,7 +67,7 @@ device always sends. Less comes by chance inside half a frame, which would then 
 
 
 class HipnucSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What can be configured of the codec."""
+    """Settings of a module on a UART."""
 
     hi91_word: Literal["auto", "pps", "status"] = "auto"
     """Meaning of bytes 1-2 of HI91: time since the last PPS edge (firmware before 1.6.9) or status bits (since).
@@ -75,7 +75,7 @@ class HipnucSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class HipnucCodec:
-    """Frames and lines of text out of bytes in any split. Synchronization: one thread.
+    """Decoder of frames and lines of text from bytes in any split. Synchronization: one thread.
 
     Every sub-packet that is known becomes one `Measurement`, with the size of the whole frame, so that all of a frame
     come to the same time. A sub-packet cut off by the end of the payload makes the whole frame bad. A frame with NaN or
@@ -90,12 +90,12 @@ class HipnucCodec:
         self._word_is_fixed = settings.hi91_word != "auto"
         self._lines = LineFinder(ledger)
         self._tail = b""
-        """What came after the last thing complete: begins with a sync word, or is the first half of one."""
+        """Incomplete rest of the bytes: begins with a sync word, or is the first half of one."""
         self._bad_ahead = 0
-        """How far a damaged frame claimed to reach into the tail and what follows it, in bytes."""
+        """Claimed rest of a damaged frame, in bytes from the begin of the tail."""
 
     def learn_app_ver(self, app_ver: int) -> None:
-        """The firmware's version number is known, 169 for 1.6.9. A configured meaning of HI91 bytes 1-2 stays."""
+        """Set the firmware's version number, 169 for 1.6.9. A configured meaning of HI91 bytes 1-2 stays."""
         if not self._word_is_fixed:
             self.word_is_status = app_ver >= STATUS_SINCE_APP_VER
 
@@ -109,7 +109,7 @@ class HipnucCodec:
         return self._scan(self._tail + data if self._tail else data, 0)
 
     def _decode_single(self, data: bytes) -> Measurement | None:
-        """A read that is one plain HI91 frame, which is what a port at 1 kHz gives: half the cost of `_scan`."""
+        """Decode a read that is one plain HI91 frame, as from a port at 1 kHz: half the cost of `_scan`."""
         payload = data[HEADER.size :]
         if not data.startswith(_HI91_HEAD) or crc16_xmodem(payload, _RUN_SEED) != data[4] | data[5] << 8:
             return None
@@ -123,14 +123,14 @@ class HipnucCodec:
         return decode_hi91(HI91_VALUES.unpack(payload), self.word_is_status, _HI91_FRAME_BYTES, 0)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """The line is idle: drop an incomplete frame if something whole waits inside it; no-op otherwise."""
+        """Drop an incomplete frame if a whole message waits inside it; no-op otherwise. The line is idle."""
         events: list[CodecEvent] = []
         while give_up := self._whole_inside():
             events += self._scan(self._tail, give_up)
         return events
 
     def reset(self) -> None:
-        """The stream broke: what is pending becomes skipped. What is known of the firmware stays."""
+        """Skip what is pending: the stream broke. The known firmware version stays."""
         self._lines.clear()
         self.ledger.bytes_skipped += len(self._tail)
         self._tail = b""
@@ -159,7 +159,7 @@ class HipnucCodec:
         return events
 
     def _decode_frame(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
-        """Decode what begins with the sync word at `at`; return where it ends, or `at` if it is not complete yet."""
+        """Decode the frame at `at`; return where it ends, or `at` if it is not complete yet."""
         total = len(data)
         if (run := _RUN.match(data, at)) and (after := self._decode_run(data, at, run.end(), events)) > at:
             return after
@@ -233,7 +233,7 @@ class HipnucCodec:
         events += found
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, events: list[CodecEvent]) -> int:
-        """What begins at `at` and claims to reach `end` is no frame: spend the sync word only."""
+        """Reject the frame from `at` to its claimed `end`: consume the sync word only."""
         ledger = self.ledger
         if reason is BadReason.CRC:
             ledger.frames_bad_crc += 1
@@ -246,7 +246,7 @@ class HipnucCodec:
         return at + len(SYNC)
 
     def _whole_inside(self) -> int:
-        """Where in the tail the first whole frame begins or, when the tail ends with a line, where it ends; else 0."""
+        """Find the begin of the first whole frame in the tail, or the end of a line that the tail ends with; else 0."""
         tail = self._tail
         at = tail.find(SYNC, len(SYNC))
         while at >= 0:

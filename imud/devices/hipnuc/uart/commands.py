@@ -29,11 +29,11 @@ FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S  # erasing a flash page takes longer than
 
 OutputRate = Literal[0, 1, 2, 5, 10, 20, 50, 100, 200, 250, 500, 1000]
 RATES_HZ: Final[tuple[OutputRate, ...]] = get_args(OutputRate)[1:]
-"""Output rates: those of section 2.2.5 and of table 3.7. 5 Hz stands in neither; "and so on" is read to include it."""
+"""Output rates of section 2.2.5 and of table 3.7, and 5 Hz, which "and so on" is read to include."""
 SOUT_DIVIDER_MAX: Final = 64
 PIN_MAX: Final = 9
 ROTATION_TOLERANCE: Final = 1e-3
-"""How far nine numbers typed with three decimals may be from a rotation."""
+"""Tolerance of nine numbers typed with three decimals against a rotation matrix."""
 
 
 class OutputMessage(StrEnum):
@@ -53,7 +53,7 @@ MAX_RATE_HZ: Final = {
 
 
 class AttitudeMode(Enum):
-    """Whether the magnetometer aids the heading."""
+    """Attitude modes: without or with the magnetometer."""
 
     SIX_AXIS = 0
     """Heading is relative, 0 at power-on."""
@@ -62,18 +62,18 @@ class AttitudeMode(Enum):
 
 
 class LevelReset(Enum):
-    """What to do with the level; the module must be at rest."""
+    """Operations on the level; the module must be at rest."""
 
     RELATIVE = 2
-    """Pitch and roll are zero as the module stands now, whatever its tilt."""
+    """Pitch and roll are zero in the present attitude, at any tilt."""
     AUTOMATIC = 3
-    """As RELATIVE and for the accelerometer too, but only within 5° of level or of upside down."""
+    """Like RELATIVE and for the accelerometer too, but only within 5° of level or of upside down."""
     CANCEL = 5
     """Back to the factory's level."""
 
 
 class YawMode(Enum):
-    """What the angle of `yaw` means."""
+    """Meanings of the angle of `yaw`."""
 
     RELATIVE = 0
     """Added to the present yaw."""
@@ -139,7 +139,7 @@ class Query(StrEnum):
 
 
 def reboot() -> Request:
-    """Restart, as by power-on. Not answered."""
+    """Restart, as by power-on. The module does not answer."""
     return _command("REBOOT", silent=True)
 
 
@@ -149,7 +149,7 @@ def save_config() -> Request:
 
 
 def factory_reset() -> Request:
-    """Back to factory settings, the baud rate included."""
+    """Restore the factory settings, the baud rate included."""
     return _command("FRESET", timeout_ns=FLASH_TIMEOUT_NS)
 
 

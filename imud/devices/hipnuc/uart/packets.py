@@ -93,7 +93,7 @@ _GROUPS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad")
 
 
 def _finite_groups(m: Measurement) -> Measurement:
-    """The same without the groups of values of which one is NaN or infinite."""
+    """Decode without the groups of values of which one is NaN or infinite."""
     absent = [name for name in _GROUPS if not all(map(isfinite, getattr(m, name)))]
     if m.pressure_pa is not None and not isfinite(m.pressure_pa):
         absent.append("pressure_pa")
@@ -101,7 +101,7 @@ def _finite_groups(m: Measurement) -> Measurement:
 
 
 def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
-    """HI92 has no device time: `dev_ticks` is None."""
+    """Decode HI92, which has no device time: `dev_ticks` is None."""
     (
         _, status, temperature, pps_ms, pressure, gx, gy, gz, ax, ay, az, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) = HI92.unpack_from(data, at)  # fmt: skip
@@ -121,7 +121,7 @@ class Packet:
     size: int
     """In bytes, tag included."""
     decode: Callable[[bytes, int, bool, int, int], tuple[Measurement, bool]]
-    """`decode(data, at, word_is_status, size, trailing)` makes the measurement, and says whether all is finite."""
+    """`decode(data, at, word_is_status, size, trailing)` returns the measurement, and whether all is finite."""
 
 
 PACKETS: Final = {TAG_HI91: Packet(HI91.size, _decode_hi91), TAG_HI92: Packet(HI92.size, _decode_hi92)}

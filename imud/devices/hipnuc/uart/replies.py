@@ -1,4 +1,4 @@
-"""Replies of HiPNUC modules to ASCII commands: which line is what, and the four reports of LOG as records.
+"""Replies of HiPNUC modules to ASCII commands: kinds of lines, and the four reports of LOG as records.
 
 Manual "IMU配置手冊" V1.5.9 sections 2.2.5 and 8.1.1, which show one line of USRCONFIG and one of MAGCONFIG; LOG VERSION
 as modules with firmware 1.5.6 answer it:
@@ -32,7 +32,7 @@ def is_end(line: str) -> bool:
 
 
 def is_rejection(line: str) -> bool:
-    """Whether `line` is a refusal: ERR and whatever follows, but not a setting whose name begins so."""
+    """Whether `line` is a refusal: ERR with any text, but not a setting whose name begins with it."""
     return line.startswith("ERR") and "=" not in line
 
 
@@ -49,7 +49,7 @@ def is_setting_line(line: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A reply, taken apart as far as it can be without knowing it."""
+    """A reply split into lines by name, as far as its form is known."""
 
     values: Mapping[str, str]
     """Values by the device's own names."""
@@ -59,7 +59,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """Reply to LOG VERSION. Empty or None where the device does not say."""
+    """Reply to LOG VERSION. Fields are empty or None where the device sends none."""
 
     product: str
     build: str
@@ -99,7 +99,7 @@ class MagConfig:
 
 
 def parse_report(lines: Sequence[str]) -> Report:
-    """The lines of a reply by name; the end line and comments (`/* … */`) are left out."""
+    """Parse the lines of a reply by name; the end line and comments (`/* … */`) are left out."""
     values: dict[str, str] = {}
     other: list[str] = []
     for line in lines:
@@ -114,7 +114,7 @@ def parse_report(lines: Sequence[str]) -> Report:
 
 
 def parse_version(lines: Sequence[str]) -> Version:
-    """The reply to LOG VERSION."""
+    """Parse the reply to LOG VERSION."""
     report = parse_report(lines)
     get = report.values.get
     return Version(
@@ -123,19 +123,19 @@ def parse_version(lines: Sequence[str]) -> Version:
 
 
 def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
-    """The reply to LOG USRCONFIG."""
+    """Parse the reply to LOG USRCONFIG."""
     report = parse_report(lines)
     return UserConfig(_whole(report.values.get("ATT_MODE")), report)
 
 
 def parse_comconfig(lines: Sequence[str]) -> ComConfig:
-    """The reply to LOG COMCONFIG."""
+    """Parse the reply to LOG COMCONFIG."""
     periods_s = {f"HI{message}": float(period) for line in lines for message, period in _OUTPUT.findall(line)}
     return ComConfig(periods_s, parse_report(lines))
 
 
 def parse_magconfig(lines: Sequence[str]) -> MagConfig:
-    """The reply to LOG MAGCONFIG."""
+    """Parse the reply to LOG MAGCONFIG."""
     report = parse_report(lines)
     return MagConfig(_vector(report.values.get("MB", "")), report)
 
@@ -159,7 +159,7 @@ _PRINTABLE: Final = bytes([0x09, *range(0x20, 0x7F)])
 
 
 class LineFinder:
-    """Finds lines of text across reads and frames, and counts every byte in the ledger: good, bad, skipped, or pending.
+    """Finder of text lines across reads and frames; counts every byte in the ledger: good, bad, skipped, or pending.
 
     Synchronization: one thread. Holds at most LINE_CHARACTERS_MAX + 1 bytes.
     """
@@ -169,7 +169,7 @@ class LineFinder:
         self._held = b""
         """Printable characters without a line end yet, with the CR that may belong to it."""
         self._held_bad = 0
-        """How many of them, from the first on, lie where a damaged frame claimed to be."""
+        """Number of the held bytes, from the first on, that lie inside a damaged frame's claimed length."""
         self._overlong = False
         """The line is longer than allowed: it is dropped up to its end."""
 
@@ -191,12 +191,12 @@ class LineFinder:
         return lines
 
     def break_off(self) -> None:
-        """Something other than text came: what is held is no line."""
+        """Drop the incomplete line: bytes other than text followed."""
         self._drop(len(self._held))
         self._overlong = False
 
     def clear(self) -> None:
-        """The stream broke: what is held is skipped."""
+        """Skip the held bytes: the stream broke."""
         self._held_bad = 0
         self.break_off()
 
@@ -216,7 +216,7 @@ class LineFinder:
             self._drop(characters)
 
     def _end(self, bad: bool, lines: list[TextLine]) -> None:
-        """The LF of a line; `bad` says whether it lies inside a damaged frame."""
+        """Finish a line at its LF; `bad`: it lies inside a damaged frame."""
         ledger = self._ledger
         text = self._held.removesuffix(b"\r")
         if text and not self._overlong:

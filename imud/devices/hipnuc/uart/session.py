@@ -58,7 +58,7 @@ def _lines(outcome: Outcome, query: Query) -> tuple[str, ...]:
 
 
 def send(request: Request) -> RequestScript[None]:
-    """Send one command. Raises NoReply (also for a command this firmware does not know) and Rejected."""
+    """Send one command. Raises NoReply (also for a command unknown to this firmware) and Rejected."""
     outcome = yield request
     if isinstance(outcome, Silence):
         raise NoReply(f"{request.name}: expected OK, got nothing; is the host's transmit line connected?")

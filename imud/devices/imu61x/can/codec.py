@@ -72,13 +72,13 @@ class Imu61xCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class _Pace:
-    """Learns how long a set takes on the bus, and how long a sample, from sets that are surely whole."""
+    """Duration of a set on the bus, and of a sample, learned from sets that are certainly whole."""
 
     __slots__ = ("_period_ns", "_sets", "_span_ns", "longest_ns")
 
     def __init__(self) -> None:
         self.longest_ns = _NEVER_NS
-        """The longest that a set can take which is of one sample."""
+        """Longest duration of a set of one sample, ns."""
         self._span_ns = 0
         self._period_ns = 0
         self._sets = 0
@@ -105,7 +105,7 @@ def _moved(mean_ns: int, new_ns: int) -> int:
 
 
 class Imu61xCanCodec:
-    """Decodes the frames of one device into measurements. Synchronization: one thread."""
+    """Decoder of the frames of one device. Synchronization: one thread."""
 
     def __init__(self, ledger: Ledger, settings: Imu61xCanSettings) -> None:
         self.ledger = ledger
@@ -115,11 +115,11 @@ class Imu61xCanCodec:
         self._newest = -1
         """Place of the newest frame held."""
         self._first_ns = 0
-        """When the first frame held came."""
+        """Arrival of the first frame of the set, ns."""
         self._index: int | None = None
         """INDEX of the newest 105."""
         self._closed_ns = 0
-        """When it came."""
+        """Arrival of the newest 105, ns."""
         self._pace = _Pace()
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:

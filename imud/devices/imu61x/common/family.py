@@ -114,4 +114,4 @@ def filter_codes(control: int) -> tuple[int, int]:
 I2cAddress = Literal[0x18, 0x19, 0x1A, 0x1B]
 """A 7-bit address that a device can have."""
 I2C_ADDRESSES: Final[tuple[I2cAddress, ...]] = get_args(I2cAddress)
-"""All of them, the one as delivered first."""
+"""All I2C addresses, the factory setting first."""

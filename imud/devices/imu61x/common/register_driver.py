@@ -29,7 +29,7 @@ from imud.ledger import Ledger
 from imud.units import NS_PER_S
 
 CHECK_NS: Final = 10 * NS_PER_S
-"""How often identity and settings are read again: a device that restarted by itself has lost what was not saved."""
+"""Interval of reading identity and settings again: a device that restarted by itself has lost unsaved settings."""
 
 
 class RegisterSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -40,7 +40,7 @@ class RegisterSettings(Settings, frozen=True, kw_only=True, forbid_unknown_field
     gyro_filter: FilterCode | None = None
     """The same of the gyroscope."""
     update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
-    """How often the device renews its registers, per second, for the error of time stamps; 0 for not known."""
+    """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
 
 
 S = TypeVar("S", bound=RegisterSettings)

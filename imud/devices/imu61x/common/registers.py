@@ -15,7 +15,7 @@ from imud.devices.imu61x.common.family import M_S2_PER_G, RAD_S_PER_DEG_S
 BURST: Final = 0x00
 FILTER_CTRL: Final = 0x06
 BURST_CTRL: Final = 0x0C
-"""Its high byte, at 0x0D, selects the burst: 0 standard, 1 extended (the value is the vendor's, not the manual's)."""
+"""The high byte, at 0x0D, selects the burst: 0 standard, 1 extended (the vendor's value, not the manual's)."""
 TEMP_HIGH: Final = 0x0E
 ZACCEL_LOW: Final = 0x28
 PROD_ID: Final = 0x6A

@@ -3,8 +3,8 @@
     S addr W 0x12 | Sr addr R  accel x y z g | gyro x y z °/s | temperature °C, all f32 | CRC-32 u32 | P
 
 Little-endian. The address is 0x18 as delivered, 0x18 to 0x1B by parameter 30 of the UART. There is no counter and no
-time in a burst: one that repeats the bytes of the one before is taken for the same measurement. Identity and filters,
-which are read now and then as well, stand in `session.py`.
+time in a burst: one that repeats the bytes of the one before counts as the same measurement. Identity and filters,
+which are also read at intervals, are in `session.py`.
 """
 
 import struct
@@ -31,7 +31,7 @@ _BURST, _ID, _FILTER = range(3)
 
 
 class Imu61xI2cCodec:
-    """Measurements out of bursts. Synchronization: one thread."""
+    """Decoder of bursts. Synchronization: one thread."""
 
     polls: Sequence[Poll] = (Poll(READ_BURST), Poll(READ_ID, CHECK_NS), Poll(READ_FILTER, CHECK_NS))
 
@@ -45,8 +45,8 @@ class Imu61xI2cCodec:
         """Bursts that repeated the one before."""
         return self._frames.stale
 
-    def take(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Take the bytes of one transfer. Never raises."""
+    def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+        """Decode the bytes of one transfer. Never raises."""
         if poll == _BURST:
             return self._frames.decode(data, _check, _measure)
         why = id_problem(data) if poll == _ID else filter_problem(data, self._settings)
@@ -54,7 +54,7 @@ class Imu61xI2cCodec:
         return (Vanished(why),) if why else ()
 
     def reset(self) -> None:
-        """The next burst is not compared with an earlier one."""
+        """Forget the last burst: the next one is not compared with it."""
         self._frames.reset()
 
 

@@ -44,12 +44,12 @@ def set_up(settings: RegisterSettings) -> TransferScript[Mapping[str, str]]:
 
 
 def id_problem(data: bytes) -> str:
-    """What is wrong with a PROD_ID read later; an empty string if nothing is."""
+    """Compare a PROD_ID that was read later; an empty string if it is the same."""
     return "" if product_of(data) is not None else f"wrong product id {data.hex(' ')}"
 
 
 def filter_problem(data: bytes, settings: RegisterSettings) -> str:
-    """What is wrong with a FILTER_CTRL read later; an empty string if it is as set up."""
+    """Compare a FILTER_CTRL that was read later; an empty string if it is as set up."""
     wanted = wanted_filter(settings, _only(data))
     if data == bytes([wanted]):
         return ""

@@ -9,7 +9,7 @@
 The manual prints 13 words for the standard burst, with a checksum of 16 bits; devices send 14, with one of 32 bits
 (`checksum_bits: 16` looks at the low word only). The extended burst, which the manual mentions and does not define, is
 as the vendor's own program reads it; the order of its angles is assumed. How words are written and read, and the
-messages for identity and settings, stand in `session.py`.
+messages for identity and settings, are in `session.py`.
 """
 
 import struct
@@ -49,7 +49,7 @@ from imud.sample import Measurement, Vector3
 from imud.units import NS_PER_S, RAD_PER_DEG
 
 TEMPERATURE_NS: Final = NS_PER_S
-"""How often the temperature is read where the burst has none."""
+"""Interval of reading the temperature where the burst has none."""
 
 STANDARD_WORDS: Final = 14
 EXTENDED_WORDS: Final = 24
@@ -73,12 +73,12 @@ POLLS: Final = {
     "extended": (Poll(READ_EXTENDED), Poll(READ_STATE, CHECK_NS)),
     "registers": (Poll(READ_REGISTERS), Poll(READ_STATE, CHECK_NS)),
 }
-"""What is read by the setting `burst`, in the order of the codec's polls."""
+"""Polls by the setting `burst`, in the order of the codec's polls."""
 _BURST, _STATE, _TEMPERATURE = range(3)
 
 
 class Imu61xSpiCodec:
-    """Measurements out of bursts or registers. Synchronization: one thread.
+    """Decoder of bursts or registers. Synchronization: one thread.
 
     Where a burst has no temperature, samples carry the last one read, at most two seconds old. Registers have no check
     value: only what no device can send is refused there, and a value may be of two updates (by one step of its high
@@ -102,14 +102,14 @@ class Imu61xSpiCodec:
         """Frames that repeated the one before."""
         return self._frames.stale
 
-    def take(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
-        """Take the bytes of one transfer; those of the pipeline are no part of a frame. Never raises."""
+    def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
+        """Decode the bytes of one transfer; those of the pipeline are no part of a frame. Never raises."""
         if poll == _BURST:
             return self._frames.decode(data[PIPELINE_BYTES:], self._bad, self._measure)
         return self._on_state(data) if poll == _STATE else self._on_temperature(data)
 
     def reset(self) -> None:
-        """The next frame is not compared with an earlier one."""
+        """Forget the last frame: the next one is not compared with it."""
         self._frames.reset()
         self._temperature_c = None
 

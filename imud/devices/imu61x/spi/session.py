@@ -38,7 +38,7 @@ class SpiDeviceSettings(RegisterSettings, frozen=True, kw_only=True, forbid_unkn
     """Settings of an IMU61x on SPI."""
 
     burst: Literal["standard", "extended", "registers"] = "standard"
-    """What is read: the standard burst; the extended burst, which has temperature and angles; or single registers."""
+    """Kind of read: the standard burst; the extended burst, which has temperature and angles; or single registers."""
     checksum_bits: Literal[16, 32] = 32
     """Checksum of the standard burst: all 32 bits, or only the 16 that the manual has."""
 
@@ -79,7 +79,7 @@ _EXTENDED_ON: Final = {"standard": 0, "extended": 1}
 
 
 class State:
-    """What READ_STATE read. Shorter data counts as zeros."""
+    """State as READ_STATE reads it. Missing bytes count as zeros."""
 
     def __init__(self, data: bytes) -> None:
         _, *words, _, self.window = (*answers(data), *(0,) * 9)[:9]
@@ -88,7 +88,7 @@ class State:
         self.extended = words[5] >> 8
 
     def differences(self, settings: SpiDeviceSettings) -> str:
-        """What is not as the settings say; an empty string if all is."""
+        """Compare the state with the settings; an empty string if all agrees."""
         wanted = wanted_filter(settings, self.filter)
         if self.filter != wanted:
             return f"FILTER_CTRL is {self.filter:#04x}, expected {wanted:#04x}"
@@ -102,13 +102,13 @@ class State:
 
 
 def probe(_settings: SpiDeviceSettings) -> TransferScript[Identity]:
-    """PROD_ID1 … 4. Raises DeviceRefused for anything but an IMU61x. Whatever happens, the window is closed."""
+    """Read PROD_ID1 … 4, and close the window in any case. Raises DeviceRefused for anything but an IMU61x."""
     data = yield from _in_window_1(READ_STATE)
     return identity_of(State(data).product_id)
 
 
 def set_up(settings: SpiDeviceSettings) -> TransferScript[Mapping[str, str]]:
-    """Write FILTER_CTRL and BURST_CTRL where they differ, read them back. Raises DeviceRefused if they did not take."""
+    """Write FILTER_CTRL and BURST_CTRL where they differ, read them back. Raises DeviceRefused if they differ still."""
     state = State((yield from _in_window_1(READ_STATE)))
     wanted = wanted_filter(settings, state.filter)
     if state.differences(settings):

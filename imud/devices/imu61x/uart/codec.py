@@ -2,7 +2,7 @@
 
     AHRS, id 0x0002, 44 bytes   timer µs u32 | pitch | roll | yaw ° | accel 3 g | gyro 3 °/s | temperature °C, all f32
 
-Framing stands in `framing.py`, the other frames in `replies.py`, what is sent to the device in `commands.py`. Pitch
+Framing is in `framing.py`, the other frames in `replies.py`, commands in `commands.py`. Pitch
 comes before roll. The quaternion is computed from the angles, whose convention is assumed (`common.EULER_CONVENTION`).
 
 The timer counts µs and wraps after 71.6 minutes.
@@ -43,7 +43,7 @@ _ONLY: Final = struct.Struct(f"<{HEADER.size}xI10fI")  # a whole frame: values a
 
 
 class Imu61xCodec:
-    """Decodes bytes of any split into measurements and reply frames. Synchronization: one thread.
+    """Decoder of bytes in any split into measurements and reply frames. Synchronization: one thread.
 
     Frames of an unknown kind are counted (`frames_ignored`) and dropped. Frames of a known kind that are too short are
     bad. A frame with NaN or infinity is delivered without the values concerned, after a `BadFrame` (not-finite) that

@@ -4,11 +4,11 @@
 
 Each function returns a `Request`. Values are checked where they enter, by the annotations of `actions.py`: for one that
 the device does not have it would silently use a default instead. Settings last until power is off unless `save`
-follows. Whether the device obeys more than `output_mode` while it streams stands in no source; `session.py` does not
+follows. Whether the device accepts more than `output_mode` while it streams is not documented; `session.py` does not
 depend on it.
 
-Commands that change something are acknowledged (K1). Its result is not judged here, because its codes stand in no
-source: any K1 for the command ends the reply.
+Commands that change something are acknowledged (K1). Its result is not judged here, because its codes are not
+documented: any K1 for the command ends the reply.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from imud.units import BITS_PER_UART_BYTE, NS_PER_MS, NS_PER_S
 BaudRate = Literal[115200, 921600, 460800, 230400, 1500000]
 """A rate of table 12, bit/s."""
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
-"""All of them, the factory default first, then those that people choose for 200 and 400 Hz."""
+"""All baud rates, the factory setting first, then those usual for 200 and 400 Hz."""
 RateHz = Literal[1, 10, 50, 100, 200, 400]
 """An AHRS output rate of table 12."""
 RATES_HZ: Final[tuple[RateHz, ...]] = get_args(RateHz)
@@ -63,7 +63,7 @@ class Command(Enum):
 
 
 class OutputMode(Enum):
-    """What the device sends without a request."""
+    """Messages that the device sends without a request."""
 
     STREAM = 1
     """Sends AHRS frames."""
@@ -76,7 +76,7 @@ class BusMode(Enum):
 
     UART_ONLY = 0
     SPI = 1
-    """As delivered."""
+    """Factory setting."""
     I2C = 2
     BY_PIN = 3
     """A pin decides: open or low is SPI, high is I2C."""
@@ -106,9 +106,9 @@ def read_parameter(parameter: Parameter) -> Request:
 
 
 def ask_installation_status() -> Request:
-    """Ask how the installation error calibration stands (CMD 8).
+    """Ask for the state of the installation error calibration (CMD 8).
 
-    Whether K1 or S1 carries the answer stands in no source: both are taken.
+    Whether K1 or S1 carries the answer is not documented: both are accepted.
     """
     command = Command.INSTALLATION_STATUS
     acknowledged = _acknowledges(command)
@@ -123,7 +123,7 @@ def ask_installation_status() -> Request:
 
 
 def output_mode(mode: OutputMode, *, baud: int = 0) -> Request:
-    """Stream AHRS frames, or only answer (CMD 3). With `baud`, the line is set to that rate first."""
+    """Stream AHRS frames, or only reply (CMD 3). With `baud`, the line is set to that rate first."""
     return _command(Command.OUTPUT_MODE, f"output mode {mode.name}", param1=mode.value, baud=baud)
 
 
@@ -138,7 +138,7 @@ def save() -> Request:
 
 
 def start_installation_calibration() -> Request:
-    """Begin to measure the mounting error (CMD 7); `ask_installation_status` says how far it is."""
+    """Begin to measure the mounting error (CMD 7); `ask_installation_status` asks for its progress."""
     return _command(Command.CALIBRATE_INSTALLATION, "installation calibration")
 
 
@@ -183,7 +183,7 @@ def set_filter(accel: int, gyro: int) -> Request:
 
 
 def factory_reset() -> Request:
-    """Back to factory settings, the baud rate included (CMD 15). `session.factory_reset` does not lose the device."""
+    """Restore the factory settings, the baud rate included (CMD 15). `session.factory_reset` follows the device."""
     return _command(Command.FACTORY_RESET, "factory reset", timeout_ns=FLASH_TIMEOUT_NS)
 
 
@@ -192,7 +192,7 @@ def max_rate_hz(baud: int) -> int:
     return max(rate_hz for rate_hz in RATES_HZ if rate_hz * AHRS_FRAME_BYTES * BITS_PER_UART_BYTE <= baud)
 
 
-# --- how they are made ------------------------------------------------------------------------------------------------
+# --- encoding ---------------------------------------------------------------------------------------------------------
 
 
 def encode_command(command: Command, param1: float = 0.0, param3: int = 0) -> bytes:

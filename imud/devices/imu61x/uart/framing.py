@@ -55,7 +55,7 @@ def encode_frame(sync: bytes, frame_id: int, payload: bytes) -> bytes:
 
 
 class FrameFinder:
-    """Finds the frames of one direction in bytes of any split. Synchronization: one thread.
+    """Finder of the frames of one direction in bytes of any split. Synchronization: one thread.
 
     Books into the ledger every byte and every damaged frame, but not the frames it returns: only the caller knows
     whether they are good.
@@ -65,13 +65,13 @@ class FrameFinder:
         self._ledger = ledger
         self._sync = sync
         self._tail = b""
-        """What came after the last thing complete: begins with a sync word, or is the first half of one."""
+        """Incomplete rest of the bytes: begins with a sync word, or is the first half of one."""
         self._bad_ahead = 0
-        """How far a damaged frame claimed to reach into the tail and what follows it, in bytes."""
+        """Claimed rest of a damaged frame, in bytes from the begin of the tail."""
 
     @property
     def idle(self) -> bool:
-        """Whether nothing that came before matters for what comes next."""
+        """Whether the next bytes can be decoded without the earlier ones."""
         return not (self._tail or self._bad_ahead)
 
     def feed(self, data: bytes) -> Sequence[Frame | BadFrame]:
@@ -153,7 +153,7 @@ class FrameFinder:
         return at + len(self._sync)
 
     def _whole_inside(self) -> int:
-        """Where in the tail, behind its own sync word, the first frame with a matching CRC begins; 0 if none does."""
+        """Find the first frame with a matching CRC in the tail, after its own sync word; 0 for none."""
         tail, sync = self._tail, self._sync
         at = tail.find(sync, len(sync))
         while at > 0:

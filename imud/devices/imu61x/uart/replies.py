@@ -7,7 +7,7 @@
     K1, any id, 4 bytes                     command u16 | result u16
 
 S1 is shorter or longer by model; what lies behind the serial number is as the vendor's programs have it, its units and
-codes stand in no source. Nor does the id of K1, so any frame with 4 bytes of payload is one, and its result is kept as
+codes are not documented. Nor is the id of K1, so any frame with 4 bytes of payload is one, and its result is kept as
 sent: that 0 means done is assumed.
 """
 
@@ -24,7 +24,7 @@ PARAMETER_FRAME: Final = 0x0006
 _STATUS_HEAD: Final = struct.Struct("<IIH3I")  # 22 bytes: what every model sends
 _STATUS_REST: Final = struct.Struct("<IHHBBBB32s")
 _STATUS_STEPS: Final = tuple(_STATUS_HEAD.size + n for n in (4, 6, 8, 9, 10, 11, 12, 44))
-"""Where each member of the rest ends: one that is not there whole is absent."""
+"""End offset of each member of the rest; a member that is not complete is absent."""
 STATUS_BYTES_MIN: Final = _STATUS_HEAD.size
 PARAMETERS: Final = struct.Struct("<ffIIii")
 """P1, and R1 of commands: value, 0, index, 0, 0, 0 (tables 8 and 11)."""
@@ -53,7 +53,7 @@ class Parameter(IntEnum):
     """The second bus, next to the UART, see `commands.BusMode`."""
     I2C_ADDRESS = 30
     FILTER = 31
-    """As FILTER_CTRL, see `filter_codes` of `common/family.py`."""
+    """Filter codes as in FILTER_CTRL, see `filter_codes` of `common/family.py`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Acknowledgement:
 
     command: int
     result: int
-    """As sent."""
+    """The raw value."""
 
 
 def is_reply(frame_id: int, payload: bytes) -> bool:

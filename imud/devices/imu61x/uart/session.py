@@ -9,7 +9,7 @@ Command mode is never saved: a device that loses its host in the middle streams 
 the script is stopped, the order to stream is the last that is sent (`Request.undo`). For a device that was saved in
 command mode there is `wake`.
 
-What the codes of acknowledgements mean stands in no source. Changes are confirmed by reading them back where they can
+The codes of acknowledgements are not documented. Changes are confirmed by reading them back where they can
 be; elsewhere result 0 counts as done (assumed), which `done` changes.
 """
 
@@ -40,12 +40,12 @@ T = TypeVar("T")
 
 FACTORY_BAUD: Final = BAUD_RATES[0]
 STREAM_TRIES: Final = 3
-"""How often streaming is asked for until it is acknowledged: a device left silent is worth two repetitions."""
+"""Number of requests to stream until one is acknowledged: a device left silent is worth two repetitions."""
 LOOK_TRIES: Final = 2
 """A device in the middle of a false frame, made of bytes at another rate, may miss one request."""
 BOOT_NS: Final = NS_PER_S
 BOOT_TRIES: Final = 5
-"""How often a device is looked for after a restart; with their time-outs more than the 3 s that section 2.2 names."""
+"""Number of searches after a restart; with their time-outs longer than the 3 s that section 2.2 names."""
 POLL_NS: Final = 500 * NS_PER_MS
 POLLS_MAX: Final = 120
 """Installation calibration: a minute; the manual gives no time."""
@@ -94,7 +94,7 @@ def _identity() -> RequestScript[Identity]:
 
 
 def identity_of(status: Status) -> Identity:
-    """S1 as an identity. The source does not say which model has which number."""
+    """Make the identity from S1. The numbers of the models are not documented."""
     numbers = {
         name: str(value)
         for name in Status.__dataclass_fields__
@@ -129,7 +129,7 @@ def _shown(parameter: Parameter, value: float) -> str:
 
 
 def start_streaming() -> RequestScript[bool]:
-    """Make it send AHRS frames (CMD 3, mode 1); return whether it acknowledged."""
+    """Start streaming of AHRS frames (CMD 3, mode 1); return whether the device acknowledged."""
     for _ in range(STREAM_TRIES):
         if isinstance((yield commands.output_mode(OutputMode.STREAM)), Reply):
             return True
@@ -137,13 +137,13 @@ def start_streaming() -> RequestScript[bool]:
 
 
 def wake() -> RequestScript[bool]:
-    """Make it stream if it answers; return whether it acknowledged. Not saved. Raises NoReply where nothing answers."""
+    """Start streaming if the device answers; return whether it acknowledged. Not saved. Raises NoReply."""
     yield from _answered(commands.ask_status())
     return (yield from start_streaming())
 
 
 def stop_streaming() -> RequestScript[None]:
-    """Enter command mode (CMD 3, mode 100): it sends nothing but replies. Raises NoReply where it answers nothing."""
+    """Enter command mode (CMD 3, mode 100), in which the device only replies. Raises NoReply for no answer."""
     yield commands.output_mode(OutputMode.COMMAND)
     yield from _answered(commands.ask_status())
 
@@ -256,7 +256,7 @@ def calibrate_installation(*, done: int = RESULT_DONE) -> RequestScript[Vector3]
 
 
 def installation_status() -> RequestScript[int | None]:
-    """How the installation calibration stands, as sent; None where the reply does not say. Raises NoReply."""
+    """Read the state of the installation calibration; None where the reply has none. Raises NoReply."""
     return _in_contact(_installation_status)
 
 
@@ -274,8 +274,8 @@ def _installation_status() -> RequestScript[int | None]:
 def change_baud(baud: int, present_baud: int) -> RequestScript[BaudChange]:
     """Set the baud rate of device and line from `present_baud` to `baud`, and save it.
 
-    Whether the device changes at once or at its next start stands in no source, so it is looked for at both rates. It
-    is saved only after it was heard at the new rate, or said at the old one that the new one is set. Ends streaming.
+    Whether the device changes at once or at its next start is not documented, so it is searched at both rates. The
+    rate is saved only after a reply at the new rate, or a report of it at the old one. Ends streaming.
     Raises BadArgument, Rejected where it stays at the old rate (the line too), and NoReply where it is not heard; if
     nothing was saved, it has the old rate again after power-on.
     """
@@ -308,7 +308,7 @@ def _change_baud(baud: int, present_baud: int) -> RequestScript[BaudChange]:
 
 
 def factory_reset(present_baud: int) -> RequestScript[BaudChange]:
-    """Restore and save the factory's settings, and follow the device to its baud rate. Raises NoReply.
+    """Restore and save the factory settings, and follow the device to its baud rate. Raises NoReply.
 
     Ends streaming, as delivered.
     """
@@ -335,7 +335,7 @@ def _factory_reset(present_baud: int) -> RequestScript[BaudChange]:
 
 
 def _look(bauds: Sequence[int], tries: int = LOOK_TRIES) -> RequestScript[tuple[int, float] | None]:
-    """Find the device, and enter command mode; return the rate it answers at and the rate it says it has.
+    """Find the device, and enter command mode; return the rate it answers at and the rate it reports.
 
     The line is left at that rate, or at the last of `bauds` where it is not heard.
     """
@@ -383,7 +383,7 @@ def _answered(request: Request) -> RequestScript[Message]:
 
 
 def _done(request: Request, done: int) -> RequestScript[None]:
-    """Have something done. Raises NoReply, and Rejected where the acknowledgement has another result than `done`."""
+    """Send a command. Raises NoReply, and Rejected where the acknowledgement has another result than `done`."""
     reply = parse_acknowledgement((yield from _answered(request)))
     if reply is not None and reply.result != done:
         raise Rejected(f"{request.name}: expected result {done} (done), got {reply.result}")

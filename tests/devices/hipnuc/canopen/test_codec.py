@@ -157,7 +157,7 @@ def test_a_boot_up_gives_up_what_is_held() -> None:
 
 def test_filters_take_what_a_node_sends() -> None:
     filters = DRIVER.filters(HipnucCanopenSettings(node=1))
-    taken = [can_id for can_id in range(0x800) if any(wanted.takes(can_id, False) for wanted in filters)]
+    taken = [can_id for can_id in range(0x800) if any(wanted.matches(can_id, False) for wanted in filters)]
     assert taken == [0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x681, 0x701, 0x781]
 
 

@@ -44,7 +44,7 @@ def codec(**options: object) -> HipnucModbusCodec:
 def short(**options: object) -> HipnucModbusCodec:
     """One that knows already that there is no UPTIME."""
     made = codec(**options)
-    made.take(0, EXCEPTION)
+    made.decode(0, EXCEPTION)
     made.reset()
     return made
 
@@ -65,7 +65,7 @@ def block(
 
 
 def measured(made: HipnucModbusCodec, data: bytes) -> Measurement:
-    (event,) = made.take(0, data)
+    (event,) = made.decode(0, data)
     assert isinstance(event, Measurement)
     assert made.ledger.closes()
     return event
@@ -111,15 +111,15 @@ def test_block_of_newer_firmware() -> None:
 def test_firmware_without_uptime_is_read_without_it_from_then_on() -> None:
     made = codec()
     assert made.polls[0].transfer == READ_BLOCK
-    (event,) = made.take(0, EXCEPTION)
+    (event,) = made.decode(0, EXCEPTION)
     assert isinstance(event, Vanished)
     assert made.polls[0].transfer == READ_SHORT_BLOCK
     made.reset()
     assert made.polls[0].transfer == READ_SHORT_BLOCK
     assert measured(made, SENSORS)
-    assert made.take(0, SENSORS) == ()
+    assert made.decode(0, SENSORS) == ()
     assert made.stale == 1
-    (bad,) = made.take(0, EXCEPTION)
+    (bad,) = made.decode(0, EXCEPTION)
     assert isinstance(bad, BadFrame)
     assert made.ledger.closes()
 
@@ -127,7 +127,7 @@ def test_firmware_without_uptime_is_read_without_it_from_then_on() -> None:
 def test_an_exception_of_another_kind_is_a_bad_frame() -> None:
     made = codec()
     busy = framed(0x50, b"\x83\x06")
-    assert list(made.take(0, busy)) == [BadFrame(BadReason.CONTENT, busy)]
+    assert list(made.decode(0, busy)) == [BadFrame(BadReason.CONTENT, busy)]
     assert made.polls[0].transfer == READ_BLOCK
     assert made.ledger.frames_bad_content == 1
 
@@ -135,7 +135,7 @@ def test_an_exception_of_another_kind_is_a_bad_frame() -> None:
 def test_reply_of_another_function_or_count_is_no_block() -> None:
     data = block()
     for inner in (b"\x04" + data[2:-2], b"\x03\x33" + data[3:-2]):
-        (event,) = codec().take(0, framed(9, inner))
+        (event,) = codec().decode(0, framed(9, inner))
         assert isinstance(event, BadFrame)
         assert event.reason is BadReason.CONTENT
 
@@ -181,12 +181,12 @@ def test_another_module_in_its_place_is_noticed() -> None:
     made = codec()
     first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
     assert made.polls[1].transfer == READ_SERIAL
-    assert made.take(1, first) == made.take(1, first) == ()
-    assert made.take(1, EXCEPTION) == made.take(1, first[:-1] + b"\x00") == made.take(1, b"") == ()
-    (event,) = made.take(1, second)
+    assert made.decode(1, first) == made.decode(1, first) == ()
+    assert made.decode(1, EXCEPTION) == made.decode(1, first[:-1] + b"\x00") == made.decode(1, b"") == ()
+    (event,) = made.decode(1, second)
     assert event == Vanished("serial number 0202020202020202, was 0101010101010101: another module")
     made.reset()
-    assert made.take(1, second) == ()
+    assert made.decode(1, second) == ()
     assert made.ledger.closes()
 
 

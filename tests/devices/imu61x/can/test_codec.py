@@ -95,7 +95,7 @@ def test_base_identifier_moves_all_five() -> None:
     assert feed(make(600), GOLDEN) == []
     wanted = DRIVER.filters(Imu61xCanSettings(base_id=600))
     assert [f.can_id for f in wanted] == [600, 601, 602, 603, 604]
-    assert not any(f.takes(605, False) or f.takes(600, True) for f in wanted)
+    assert not any(f.matches(605, False) or f.matches(600, True) for f in wanted)
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"base_id": 2044}, Imu61xCanSettings)
 

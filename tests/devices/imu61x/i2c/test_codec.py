@@ -23,7 +23,7 @@ def codec(**settings: int) -> Imu61xI2cCodec:
 
 def test_burst_in_si() -> None:
     made = codec()
-    (m,) = made.take(0, GOLDEN)
+    (m,) = made.decode(0, GOLDEN)
     assert isinstance(m, Measurement)
     assert m.accel_m_s2 == pytest.approx((0, G / 2, G))
     assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S))
@@ -35,13 +35,13 @@ def test_crc_covers_all_28_bytes() -> None:
     for at in range(32):
         damaged = GOLDEN[:at] + bytes([GOLDEN[at] ^ 0x80]) + GOLDEN[at + 1 :]
         made = codec()
-        assert made.take(0, damaged) == (BadFrame(BadReason.CRC, damaged),)
+        assert made.decode(0, damaged) == (BadFrame(BadReason.CRC, damaged),)
         assert made.ledger.closes()
 
 
 def test_infinite_value_is_left_out_and_told() -> None:
     values = struct.pack("<7f", 0, 0, 1, float("inf"), 0, 0, 25)
-    bad, m = codec().take(0, values + struct.pack("<I", slow_crc(values)))
+    bad, m = codec().decode(0, values + struct.pack("<I", slow_crc(values)))
     assert isinstance(bad, BadFrame)
     assert bad.reason is BadReason.NOT_FINITE
     assert isinstance(m, Measurement)
@@ -51,19 +51,19 @@ def test_infinite_value_is_left_out_and_told() -> None:
 
 def test_stale_absent_and_short() -> None:
     made = codec()
-    made.take(0, GOLDEN)
-    assert made.take(0, GOLDEN) == ()
+    made.decode(0, GOLDEN)
+    assert made.decode(0, GOLDEN) == ()
     assert made.stale == 1
     for data in (b"\xff" * 32, b"\x00" * 32, b"", GOLDEN[:31]):
-        assert isinstance(made.take(0, data)[0], Vanished)
+        assert isinstance(made.decode(0, data)[0], Vanished)
     assert made.ledger.closes()
 
 
 def test_identity_and_filter_are_watched() -> None:
     made = codec(gyro_filter=3)
-    assert made.take(1, b"\x00\x00IMU612") == ()
-    assert made.take(2, b"\xb3") == ()
+    assert made.decode(1, b"\x00\x00IMU612") == ()
+    assert made.decode(2, b"\xb3") == ()
     assert made.ledger.frames_in_replies == 2
     for poll, data in ((1, b"\x00\x00IMU61C"), (2, b"\xbb"), (1, b""), (2, b"")):
-        assert isinstance(made.take(poll, data)[0], Vanished)
+        assert isinstance(made.decode(poll, data)[0], Vanished)
     assert made.ledger.closes()

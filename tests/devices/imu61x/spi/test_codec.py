@@ -47,7 +47,7 @@ def one(events: Sequence[PolledEvent]) -> Measurement:
 
 def test_standard_burst_in_si() -> None:
     made = codec()
-    m = one(made.take(0, PIPELINE + GOLDEN))
+    m = one(made.decode(0, PIPELINE + GOLDEN))
     assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S), rel=1e-12)
     assert m.accel_m_s2 == pytest.approx((0, -G, G), rel=1e-12)
     assert m.temperature_c is None
@@ -58,10 +58,10 @@ def test_standard_burst_in_si() -> None:
 
 def test_both_halves_of_the_checksum_count_unless_told_otherwise() -> None:
     wrong_high, wrong_low = with_sum(GOLDEN[:24], 0x1FFFF), with_sum(GOLDEN[:24], 0x2FFFE)
-    assert codec().take(0, PIPELINE + wrong_high) == (BadFrame(BadReason.CRC, wrong_high),)
-    one(codec(checksum_bits=16).take(0, PIPELINE + wrong_high))
+    assert codec().decode(0, PIPELINE + wrong_high) == (BadFrame(BadReason.CRC, wrong_high),)
+    one(codec(checksum_bits=16).decode(0, PIPELINE + wrong_high))
     for made in (codec(), codec(checksum_bits=16)):
-        assert made.take(0, PIPELINE + wrong_low) == (BadFrame(BadReason.CRC, wrong_low),)
+        assert made.decode(0, PIPELINE + wrong_low) == (BadFrame(BadReason.CRC, wrong_low),)
         assert made.ledger.frames_bad_crc == 1
         assert made.ledger.closes()
 
@@ -85,7 +85,7 @@ def extended(*values: float, status: int = 0x01020304) -> bytes:
 def test_extended_burst_in_si() -> None:
     data = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
     assert words(data)[:6] == (0x0000, 0x3F80, 0, 0, 0x0000, 0xBF80)  # 1.0 = 0x3F800000, low word first
-    m = one(codec("extended").take(0, PIPELINE + data))
+    m = one(codec("extended").decode(0, PIPELINE + data))
     assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S))
     assert m.accel_m_s2 == pytest.approx((0, G / 2, G))
     assert m.temperature_c == 25.0
@@ -95,7 +95,7 @@ def test_extended_burst_in_si() -> None:
 
 
 def test_extended_burst_with_nan_comes_without_the_values_concerned() -> None:
-    bad, m = codec("extended").take(0, PIPELINE + extended(1, nan, 0, 0, 0, 1, 25, 0, 0, 0))
+    bad, m = codec("extended").decode(0, PIPELINE + extended(1, nan, 0, 0, 0, 1, 25, 0, 0, 0))
     assert isinstance(bad, BadFrame)
     assert bad.reason is BadReason.NOT_FINITE
     assert isinstance(m, Measurement)
@@ -107,13 +107,13 @@ def test_extended_crc_covers_44_bytes() -> None:
     good = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
     for at in range(48):
         damaged = good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :]
-        assert codec("extended").take(0, PIPELINE + damaged) == (BadFrame(BadReason.CRC, damaged),)
+        assert codec("extended").decode(0, PIPELINE + damaged) == (BadFrame(BadReason.CRC, damaged),)
 
 
 def test_single_registers_in_si() -> None:
     """TEMP 2634 · 65536 is 25 °C; gyro high word 1 is 0.016 °/s; accel 327680000 = 0x13880000 is 1 g."""
     data = bytes.fromhex("0a4a0000 00010000 00000000 ffff0000 00000000 ec780000 13880000".replace(" ", ""))
-    m = one(codec("registers").take(0, PIPELINE + data))
+    m = one(codec("registers").decode(0, PIPELINE + data))
     assert m.temperature_c == 25.0
     assert m.gyro_rad_s == pytest.approx((0.016 * RAD_S, 0, -0.016 * RAD_S))
     assert m.accel_m_s2 == pytest.approx((0, -G, G))
@@ -126,23 +126,23 @@ def test_temperature_of_counts(counts: int, celsius: float) -> None:
 
 def test_temperature_read_between_bursts_is_in_the_samples_after_it() -> None:
     made = codec()
-    made.take(2, PIPELINE + bytes.fromhex("0a4a0000"))
-    assert one(made.take(0, PIPELINE + GOLDEN)).temperature_c == 25.0
-    made.take(2, PIPELINE + bytes.fromhex("fff00000"))  # above 35 °C counts are negative
+    made.decode(2, PIPELINE + bytes.fromhex("0a4a0000"))
+    assert one(made.decode(0, PIPELINE + GOLDEN)).temperature_c == 25.0
+    made.decode(2, PIPELINE + bytes.fromhex("fff00000"))  # above 35 °C counts are negative
     other = with_sum(bytes.fromhex("0001") + GOLDEN[2:24])
-    assert one(made.take(0, PIPELINE + other)).temperature_c == pytest.approx(35 + 16 / 263.4)
-    made.take(2, PIPELINE + b"\xff" * 4)
-    assert one(made.take(0, PIPELINE + GOLDEN)).temperature_c is None
+    assert one(made.decode(0, PIPELINE + other)).temperature_c == pytest.approx(35 + 16 / 263.4)
+    made.decode(2, PIPELINE + b"\xff" * 4)
+    assert one(made.decode(0, PIPELINE + GOLDEN)).temperature_c is None
     assert made.ledger.closes()
 
 
 def test_same_bytes_again_are_stale_until_reset() -> None:
     made = codec()
-    one(made.take(0, PIPELINE + GOLDEN))
-    assert made.take(0, b"\0\0\0\0" + GOLDEN) == ()
+    one(made.decode(0, PIPELINE + GOLDEN))
+    assert made.decode(0, b"\0\0\0\0" + GOLDEN) == ()
     assert (made.stale, made.ledger.frames_ignored, made.ledger.frames_good) == (1, 1, 2)
     made.reset()
-    one(made.take(0, PIPELINE + GOLDEN))
+    one(made.decode(0, PIPELINE + GOLDEN))
     assert made.stale == 1
 
 
@@ -150,7 +150,7 @@ def test_same_bytes_again_are_stale_until_reset() -> None:
 def test_no_device_is_no_damage(data: bytes) -> None:
     """Zeros would pass the checksum."""
     made = codec()
-    (event,) = made.take(0, PIPELINE + data)
+    (event,) = made.decode(0, PIPELINE + data)
     assert isinstance(event, Vanished)
     assert made.ledger.bytes_skipped == made.ledger.bytes_in == len(data)
 
@@ -165,17 +165,17 @@ def test_transfers_on_the_wire() -> None:
     assert [spi.READ_REGISTERS.sends[n].hex() for n in (0, 13)] == ["0e00", "2800"]
 
 
-def take_state(**changes: int | bytes) -> list[PolledEvent]:
+def decode_state(**changes: int | bytes) -> list[PolledEvent]:
     device, made = Imu61xRegisters(lambda: 0), codec(gyro_filter=0xB)
     for name, value in changes.items():
         setattr(device.faults if name == "product_id" else device, name, value)
-    events = made.take(1, over_spi(device, READ_STATE))
+    events = made.decode(1, over_spi(device, READ_STATE))
     assert made.ledger.closes()
     return list(events)
 
 
 def test_state_that_changed_by_itself_is_noticed() -> None:
-    assert take_state() == []
-    for (event,) in (take_state(filter=0xB0), take_state(extended=1), take_state(product_id=b"\x00\x00ICM206")):
+    assert decode_state() == []
+    for (event,) in (decode_state(filter=0xB0), decode_state(extended=1), decode_state(product_id=b"\x00\x00ICM206")):
         assert isinstance(event, Vanished)
-    assert isinstance(codec().take(1, b"")[0], Vanished)
+    assert isinstance(codec().decode(1, b"")[0], Vanished)

@@ -39,12 +39,12 @@ class Receiver:
                 self.sentence(build((self.second + says) * NS_PER_S), late_ms)
             self.second += 1
             self.begin_ns += NS_PER_S
-            self.take()
+            self.advance()
 
     def sentence(self, data: bytes, late_ms: int) -> None:
         self.module.receive(data, self.begin_ns + late_ms * NS_PER_MS)
 
-    def take(self) -> None:
+    def advance(self) -> None:
         for burst in self.module.advance(self.begin_ns):
             if burst.sample_ns is None:  # cut by a reboot
                 continue
