@@ -35,7 +35,7 @@ TICK_S = 0.1
 
 
 class Daemon:
-    """Runs one configuration. Synchronization: all in the event loop's thread.
+    """Runtime of one configuration. Synchronization: all in the event loop's thread.
 
     `file` is read again on SIGHUP; `state_dir` is where found devices are remembered (None remembers nothing);
     `extra` are publishers in addition to the configured ones; `until_finished` ends the run with the last replay;
@@ -72,7 +72,7 @@ class Daemon:
     # --- life ------------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run until stopped. Raises ServerError when an output cannot start, and whatever a device's task died of."""
+        """Run until stopped. Raises ServerError when an output cannot start, and the error of a device's task."""
         asyncio.get_running_loop().set_exception_handler(self._on_loop_error)
         try:
             for name in self.config.publishers:
@@ -94,7 +94,7 @@ class Daemon:
         self._stop.set()
 
     def install_signals(self) -> None:
-        """SIGTERM and SIGINT stop, SIGHUP reloads. Needs a running loop in the main thread."""
+        """Install signal handlers: SIGTERM and SIGINT stop, SIGHUP reloads. Needs a running loop in the main thread."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)
@@ -199,7 +199,7 @@ class Daemon:
             publisher.remove_device(name)
 
     def _on_done(self, task: asyncio.Task[None]) -> None:
-        """A device's task that dies of an error ends the process with that error; the service manager restarts it."""
+        """End the process with the error that ended a device's task; the service manager restarts it."""
         if not task.cancelled() and task.exception() is not None:
             self._failure = task.exception()
             self._stop.set()
@@ -207,7 +207,7 @@ class Daemon:
             self._stop.set()
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-        """A callback that raised is a mistake of ours: end with it instead of limping on."""
+        """End the process after an exception in a callback, which is a defect of imud."""
         error = context.get("exception")
         log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))

@@ -25,7 +25,7 @@ class Subcommand(NamedTuple):
     help: str
 
     def load(self) -> "CliCommand":
-        """The command, its module imported."""
+        """Import the command's module and return the command."""
         module, _, name = self.target.partition(":")
         return cast("CliCommand", getattr(import_module(module), name))
 
@@ -50,7 +50,7 @@ COMMANDS = {
 
 
 def build_parser(only: str = "") -> argparse.ArgumentParser:
-    """The parser of the whole command line; with `only` the arguments of that command alone, which imports no other."""
+    """Build the parser of the command line; with `only` for that command alone, which imports no other."""
     parser = argparse.ArgumentParser(prog="imud", description="A daemon for inertial sensors.")
     parser.add_argument("--version", action="version", version=f"imud {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -72,6 +72,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # the reader of our output has gone, as with `imud watch | head`
+    except BrokenPipeError:  # the reader of the output has ended, as with `imud watch | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered has no reader
         return 0

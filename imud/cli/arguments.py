@@ -1,4 +1,4 @@
-"""What commands share: the type of a row, the daemon's socket, and values written as `NAME=VALUE`."""
+"""Parts that several commands share: the type of a command, the daemon's socket, and arguments `NAME=VALUE`."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +27,7 @@ class CliCommand(NamedTuple):
 
 
 def add_socket(parser: argparse.ArgumentParser) -> None:
-    """`--socket PATH`, with the environment variable IMUD_SOCKET as its default."""
+    """Add `--socket PATH`, with the environment variable IMUD_SOCKET as its default."""
     parser.add_argument(
         "--socket",
         default=default_path(),
@@ -37,12 +37,12 @@ def add_socket(parser: argparse.ArgumentParser) -> None:
 
 
 def connect(args: argparse.Namespace) -> Client:
-    """A connection to the daemon. Raises LinkMissing, LinkDenied, ServerError with what to look at."""
+    """Connect to the daemon. Raises LinkMissing, LinkDenied, ServerError with what to look at."""
     return Client(args.socket)
 
 
 def statuses(client: Client) -> list[DeviceStatus]:
-    """The state of every device."""
+    """Ask for the status of every device."""
     return msgspec.convert(client.status()["devices"], list[DeviceStatus])
 
 
@@ -50,7 +50,7 @@ def statuses(client: Client) -> list[DeviceStatus]:
 
 
 def argument(text: str) -> tuple[str, object]:
-    """`name=value`: numbers, true, false, null and lists as in JSON, everything else text. Raises BadArgument."""
+    """Parse `name=value`: numbers, true, false, null and lists as in JSON, everything else text. Raises BadArgument."""
     name, sign, value = text.partition("=")
     if not name or not sign:
         raise BadArgument(f"expected NAME=VALUE, got {text!r}")
@@ -61,7 +61,7 @@ def argument(text: str) -> tuple[str, object]:
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:
-    """The argument, which may be given several times."""
+    """Add an argument that may be given several times."""
     parser.add_argument(
         "--option",
         action="append",
@@ -72,7 +72,7 @@ def add_option(parser: argparse.ArgumentParser) -> None:
 
 
 def given_options(driver: Driver, words: Sequence[str]) -> dict[str, object]:
-    """The options by name, each checked. Raises BadArgument naming what was expected."""
+    """Check the options; return them by name. Raises BadArgument naming what was expected."""
     options = dict(map(argument, words))
     fields = {field.name: field for field in msgspec.structs.fields(driver.settings)}
     for name, value in options.items():
@@ -86,7 +86,7 @@ def given_options(driver: Driver, words: Sequence[str]) -> dict[str, object]:
 
 
 def driver_settings(driver: Driver, options: Mapping[str, object]) -> Settings:
-    """The driver's settings with these options. Raises BadArgument for some that do not go together."""
+    """Make the driver's settings from these options. Raises BadArgument for options that exclude each other."""
     try:
         return msgspec.convert(options, driver.settings)
     except msgspec.ValidationError as error:

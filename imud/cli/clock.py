@@ -22,13 +22,13 @@ KEPT: Final = 2000
 REFRESH_S: Final = 1.0
 CLEAR: Final = "\x1b[H\x1b[2J"
 ENOUGH: Final = 20
-"""Fewer arrivals say nothing about their spread."""
+"""Least number of arrivals for a statement about their spread."""
 HELD_SHARE: Final = 0.5
 """An adapter that holds bytes for up to its timer spreads arrivals over most of it."""
 LOADED_NS: Final = NS_PER_MS
 """Arrivals of a wire and an idle system spread over some ten microseconds."""
 EDGES_ENOUGH: Final = 100
-"""Fewer edges say nothing: the first ones come before it is known which samples they belong to."""
+"""Least number of edges for a judgement: the first ones come before their samples can be assigned."""
 UNPAIRED_SHARE: Final = 0.1
 """Noise and losses leave less without their match; another wire or a divided pulse leaves half or more."""
 
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Live until interrupted; 1 when no sample came."""
+    """Show the report, live until interrupted; return 1 when no sample came."""
     with connect(args) as asking:
         chosen = args.device or [status.name for status in statuses(asking)]
         if args.json:
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | None) -> Iterator[None]:
-    """Note of each sample how long after its measurement it was read; yield when it is time to draw.
+    """Record how long after its measurement each sample was read; yield whenever a report is due.
 
     With a duration it ends then, and nothing is drawn. Raises TimeoutError when no sample comes for as long.
     """
@@ -76,12 +76,12 @@ def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | No
 
 
 def page(devices: list[DeviceStatus], behind: dict[str, deque[int]]) -> str:
-    """All devices that are looked at, one block each."""
+    """Format the blocks of all shown devices."""
     return "\n\n".join(block(status, behind[status.name]) for status in devices if status.name in behind)
 
 
 def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
-    """One device for people."""
+    """Format the block of one device."""
     clock = status.clock
     lines = [
         f"{status.name}: time stamps by {clock.sync}, error {clock.t_err_ns / NS_PER_US:.1f} µs (one sigma)",
@@ -97,7 +97,7 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
 
 
 def aids(status: DeviceStatus) -> Iterator[tuple[str, str]]:
-    """Name and text of each source of time other than arrivals, as far as the device has them."""
+    """List name and text of each aiding source that the device has."""
     clock, lines, utc = status.clock, status.lines, status.utc
     if lines is not None and "sout" in lines.edges:
         yield (
@@ -116,7 +116,7 @@ def aids(status: DeviceStatus) -> Iterator[tuple[str, str]]:
 
 
 def verdict(clock: ClockStatus, behind_ns: Sequence[int]) -> str:
-    """`behind_ns`: how much later than the time of measurement each of the newest samples was read."""
+    """Judge the time stamps. `behind_ns`: delays from the measurement to the read, of the newest samples."""
     if mistake := miswired(clock):
         return mistake
     error = f"{clock.t_err_ns / NS_PER_US:.1f} µs"
@@ -130,7 +130,7 @@ def verdict(clock: ClockStatus, behind_ns: Sequence[int]) -> str:
 
 
 def miswired(clock: ClockStatus) -> str:
-    """What the counts since start say of the wires, one sentence; empty when they fit the samples."""
+    """Judge the wiring of the lines by their counts since start, in one sentence; empty when they fit the samples."""
     edges, most = clock.edges, UNPAIRED_SHARE * clock.edges
     if edges < EDGES_ENOUGH:
         return ""
@@ -158,7 +158,7 @@ def miswired(clock: ClockStatus) -> str:
 
 
 def _of_arrivals(clock: ClockStatus, ordered: Sequence[int]) -> str:
-    """What the spread of arrivals says about the way they come."""
+    """Judge the link by the spread of arrivals."""
     if len(ordered) < ENOUGH:
         return "too few samples to say"
     spread_ns = ordered[int(0.99 * len(ordered))] - ordered[int(0.01 * len(ordered))]

@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def open_capture(name: str) -> BinaryIO:
-    """The file, or standard input for `-`. Raises ImudError."""
+    """Open the file, or standard input for `-`. Raises ImudError."""
     try:
         return sys.stdin.buffer if name == "-" else open(name, "rb")
     except OSError as error:
@@ -59,7 +59,7 @@ def open_capture(name: str) -> BinaryIO:
 
 
 def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | None = None) -> Iterator[str]:
-    """JSON lines of everything in `file`; `settings` default to the driver's own defaults.
+    """Decode `file` to JSON lines; `settings` default to the driver's own defaults.
 
     Raises ImudError for a driver without captures, or a file that is no capture.
     """
@@ -69,7 +69,7 @@ def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings | 
 
 
 def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings) -> Iterator[CodecEvent]:
-    """The events of the driver's codec for a capture."""
+    """Decode a capture to the events of the driver's codec."""
     if isinstance(driver, StreamDriver):
         codec = driver.make_codec(ledger, settings)
         for _, data in CaptureReader(file):
@@ -88,7 +88,7 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Settings
 
 
 def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:
-    """One codec event as the object that is printed."""
+    """Convert a codec event to the object that is printed."""
     if isinstance(event, TextLine):
         return {"text": event.text}
     if isinstance(event, ReplyFrame):
@@ -106,13 +106,13 @@ def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:
 
 
 class UnwrappedTime:
-    """Unwraps device ticks without a host clock: a step back by more than half the range is a rollover."""
+    """Unwrapped device time without a host clock: a step back by more than half the range is a rollover."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
         self._tick = 1 if driver.tick_ns == SAMPLE_COUNTER else driver.tick_ns
         self.key = "index" if driver.tick_ns == SAMPLE_COUNTER else "t_dev_ns"
-        """What the unwrapped ticks are: device time in ns, or the number of the sample."""
+        """Field name of the unwrapped ticks: device time in ns, or the number of the sample."""
         self._last: int | None = None
         self._turns = 0
 

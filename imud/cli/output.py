@@ -10,18 +10,18 @@ BARS: Final = 12
 """Most lines of a histogram."""
 STEPS: Final = (1, 2, 5, 10, 20)
 TAIL: Final = 0.005
-"""What lies beyond this share on either side is in the outermost bars, so that one stray value hides nothing."""
+"""Share of outliers on either side; they are counted in the outermost bars, so that one outlier hides nothing."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Columns as wide as their widest cell, numbers right-aligned, two spaces between; ends without a line end."""
+    """Format columns as wide as their widest cell, numbers right-aligned, two spaces between, no final line end."""
     cells = [[str(cell) for cell in head], *([_word(cell) for cell in row] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
     return "\n".join(_line(line, widths) for line in cells)
 
 
 def histogram(values: Sequence[float], unit: str) -> list[str]:
-    """Lines with the lower edge of each bar, its share and its length. Nothing for no values."""
+    """Format a histogram: lower edge of each bar, its share and its length. Empty for no values."""
     if not values:
         return []
     ordered = sorted(values)
@@ -41,7 +41,7 @@ def histogram(values: Sequence[float], unit: str) -> list[str]:
 
 
 def bar_width(span: float) -> float:
-    """The smallest of 1, 2, 5 · 10ⁿ of which at most BARS make up the span; 1 for none."""
+    """Choose the smallest of 1, 2, 5 · 10ⁿ of which at most BARS make up the span; 1 for none."""
     if span <= 0:
         return 1.0
     power = 10.0 ** floor(log10(span / BARS))

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check(device: config.DeviceConfig) -> None:
-    """Raises LinkError for a file that cannot be played: the daemon would retry."""
+    """Check that the file can be played, since the daemon would retry. Raises LinkError."""
     row = LINKS[device.link]
     is_can = isinstance(DRIVERS[device.driver], CanDriver)
     link = row.make_can(device.link_settings) if is_can else row.make(device.link_settings)
@@ -61,13 +61,13 @@ def check(device: config.DeviceConfig) -> None:
 
 
 async def serve(daemon: Daemon) -> None:
-    """Run until the capture ends or someone interrupts."""
+    """Run until the capture ends or the user interrupts."""
     daemon.install_signals()
     await daemon.run()
 
 
 def configuration(args: argparse.Namespace) -> str:
-    """The configuration of a daemon that does only this, as text, read the same way as a file.
+    """Write the configuration of a daemon for this replay alone, as text, read the same way as a file.
 
     Raises BadArgument for options that the driver does not have.
     """
@@ -94,27 +94,27 @@ class Printer:
     """A publisher that prints samples as JSON lines."""
 
     def start(self) -> None:
-        """Nothing to open."""
+        """No-op: there is nothing to open."""
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Every device is printed."""
+        """No-op: every device is printed."""
 
     def remove_device(self, name: str) -> None:
-        """Nothing is kept per device."""
+        """No-op: nothing is kept per device."""
 
     def publish(self, batch: Batch) -> None:
-        """One line per sample."""
+        """Print one line per sample."""
         for sample in batch.samples:
             sys.stdout.write(msgspec.json.encode(sample).decode() + "\n")
 
     def event(self, event: Event) -> None:
-        """Events go to the log already."""
+        """No-op: events are in the log."""
 
     def tick(self, now_ns: int) -> None:
-        """Nothing is timed."""
+        """No-op: nothing depends on time."""
 
     def close(self) -> None:
-        """Leave nothing in the buffer."""
+        """Write out the buffer."""
         sys.stdout.flush()
 
 

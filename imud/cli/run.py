@@ -50,13 +50,13 @@ async def serve(settings: Config, file: Path) -> None:
 
 
 def state_dir(settings: Config) -> Path:
-    """The service manager's state directory if it gave one, else the configured one."""
+    """Choose the service manager's state directory if it gave one, else the configured one."""
     given = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(given or settings.state_dir)
 
 
 def start_log(level: str) -> None:
-    """Log to standard error; under a service manager the journal adds the time, else we do."""
+    """Log to standard error, without the time under a service manager, whose journal adds it."""
     stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
     logging.basicConfig(level=level.upper(), format=stamp + "%(levelname)s %(message)s")
 

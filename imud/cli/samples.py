@@ -39,12 +39,12 @@ def watch(args: argparse.Namespace) -> int:
 
 
 def as_json(sample: Sample) -> str:
-    """The sample as the socket sends it."""
+    """Format a sample as the socket sends it."""
     return msgspec.json.encode(sample).decode()
 
 
 def as_text(sample: Sample) -> str:
-    """One line for people: seconds, degrees, °/s, g stays m/s²."""
+    """Format a sample as one line: seconds, degrees, °/s; acceleration stays in m/s²."""
     words = [
         f"{sample.device:12} {sample.t_ns / NS_PER_S:14.6f} s ±{sample.t_err_ns / NS_PER_MS:6.3f} ms {sample.sync:10}"
     ]

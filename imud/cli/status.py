@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def block(status: DeviceStatus) -> str:
-    """One device for people."""
+    """Format the block of one device."""
     clock, ledger = status.clock, status.ledger
     words = " ".join(dict.fromkeys(status.identity.values())) or "not known"
     lines = [
@@ -52,7 +52,7 @@ def block(status: DeviceStatus) -> str:
 
 
 def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
-    """Name and text of each row that only some devices have."""
+    """List name and text of each row that only some devices have."""
     if status.polling is not None:
         yield "polling", polling(status.polling)
     if status.serial_line is not None:
@@ -69,7 +69,7 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
 
 
 def polling(polls: PollingStatus) -> str:
-    """Deadlines and failures of a polled device."""
+    """Format deadlines and failures of a polled device."""
     return (
         f"{polls.polls} reads, {polls.late} late, {polls.missed} missed, {polls.stale} stale, {polls.failed} failed;"
         f" {polls.late_mean_ns / NS_PER_US:.1f} µs after the deadline, {polls.late_worst_ns / NS_PER_US:.1f} at worst;"
@@ -78,7 +78,7 @@ def polling(polls: PollingStatus) -> str:
 
 
 def serial_line(line: SerialLineCounters) -> str:
-    """Bytes on a shared serial line that are no replies."""
+    """Format the bytes on a shared serial line that are no replies."""
     return (
         f"{line.timeouts} requests unanswered; {line.late_bytes} bytes unasked, {line.strange_bytes} strange;"
         f" {line.echoes} echoes (all devices of the line)"
@@ -86,7 +86,7 @@ def serial_line(line: SerialLineCounters) -> str:
 
 
 def watched(lines: LinesStatus, name: str, edges: int) -> str:
-    """One input line."""
+    """Format the row of one input line."""
     words = f"{edges} edges, {lines.edges_lost.get(name, 0)} lost"
     if name == "alarm":
         level = {True: "ACTIVE", False: "inactive", None: "level not known"}[lines.alarm]
@@ -95,7 +95,7 @@ def watched(lines: LinesStatus, name: str, edges: int) -> str:
 
 
 def driven(lines: LinesStatus) -> str:
-    """SIN."""
+    """Format the row of SIN."""
     return (
         f"{lines.triggers} triggers, {lines.triggers_missed} missed;"
         f" {lines.trigger_late_mean_ns / NS_PER_US:.1f} µs after the deadline,"
@@ -104,12 +104,12 @@ def driven(lines: LinesStatus) -> str:
 
 
 def problem_of(lines: LinesStatus, name: str) -> str:
-    """Why a line is not watched or driven, in brackets; empty when it is."""
+    """Format why a line is not watched or driven, in brackets; empty when it is."""
     return f" ({lines.problems[name]})" if name in lines.problems else ""
 
 
 def utc(status: UtcStatus) -> str:
-    """RMC sentences and pulses for a device, and samples for chronyd."""
+    """Format RMC sentences and pulses of a device, and samples for chronyd."""
     words = []
     if status.source:
         refused = ", ".join(f"{cause} {count}" for cause, count in status.refused.items())
@@ -130,7 +130,7 @@ def closes(ledger: dict[str, int]) -> bool:
 
 
 def latency(status: DeviceStatus) -> str:
-    """Mean time from measurement to publication."""
+    """Format the mean time from measurement to publication."""
     count = sum(status.latency_buckets)
     return f"{status.latency_sum_ns / count / NS_PER_MS:.3f} ms mean over {count} samples" if count else "no samples"
 

@@ -45,7 +45,7 @@ Message = dict[str, Any] | bytes
 
 
 class Hello(msgspec.Struct, frozen=True):
-    """How the daemon greets."""
+    """The daemon's greeting."""
 
     protocol: int
     version: str
@@ -101,24 +101,24 @@ class Client:
     # --- questions --------------------------------------------------------------------------------------------------
 
     def devices(self) -> list[dict[str, Any]]:
-        """The devices, one mapping each."""
+        """Request the list of devices, one mapping each."""
         return msgspec.convert(self.call("devices"), list[dict[str, Any]])
 
     def status(self) -> dict[str, Any]:
-        """Everything the daemon knows: `now_ns`, `devices`, `socket`."""
+        """Request the full status: `now_ns`, `devices`, `socket`."""
         return msgspec.convert(self.call("status"), dict[str, Any])
 
     def schema(self) -> dict[str, Any]:
-        """What the members of samples mean: `fields`, `devices`, `slot`."""
+        """Descriptions of the members of samples: `fields`, `devices`, `slot`."""
         return msgspec.convert(self.call("schema"), dict[str, Any])
 
     def poll(self, devices: Iterable[str] | None = None) -> list[Sample]:
-        """The newest sample of each device that has one."""
+        """Request the newest sample of each device that has one."""
         reply = self.call("poll", devices=_listed(devices))
         return [sample_of(params) for params in reply["samples"]]
 
     def call(self, method: str, **params: object) -> Any:
-        """Any method by its name; parameters that are None are left out. Returns the result as JSON values."""
+        """Call a method by its name; parameters that are None are left out. Returns the result as JSON values."""
         self._id += 1
         chosen = {name: value for name, value in params.items() if value is not None}
         self._send(line_of(encode_request(method, chosen, self._id)))
@@ -142,7 +142,7 @@ class Client:
         encoding: str = "binary",
         timeout_s: float | None = None,
     ) -> Watch:
-        """Samples as they come, an endless iterator; it replaces an earlier one. None asks for all.
+        """Subscribe to samples; an endless iterator that replaces an earlier one. None asks for all.
 
         `fields` names the values that are wanted of JSON samples, the others are None then; binary ones are complete
         always. Waiting longer than `timeout_s` for a sample raises TimeoutError.
@@ -158,12 +158,12 @@ class Client:
         return self._watch
 
     def unwatch(self) -> None:
-        """No more samples. Those that came meanwhile still come out of the iterator, which ends then."""
+        """End the subscription. The iterator still returns the samples received meanwhile, then ends."""
         self.call("unwatch")
         self._end_watch()
 
     def events(self, devices: Iterable[str] | None = None, timeout_s: float | None = None) -> EventStream:
-        """Events as they come, an endless iterator. Waiting longer than `timeout_s` for one raises TimeoutError."""
+        """Subscribe to events; an endless iterator. Waiting longer than `timeout_s` for one raises TimeoutError."""
         self.call("events", devices=_listed(devices))
         return EventStream(self, timeout_s)
 
@@ -179,7 +179,7 @@ class Client:
         return self._fds.pop()
 
     def kept_message(self, names: frozenset[str]) -> Message | None:
-        """The oldest such message among those kept while waiting for something else; None when there is none."""
+        """Return the oldest such message among those kept while waiting for another; None for none."""
         for index, message in enumerate(self._inbox):
             if _is_one_of(message, names):
                 del self._inbox[index]
@@ -187,7 +187,7 @@ class Client:
         return None
 
     def next_message(self, names: frozenset[str], timeout_s: float | None) -> Message:
-        """The next message: slots, or a notification whose method is among `names`; others are kept."""
+        """Receive the next message: slots, or a notification whose method is among `names`; others are kept."""
         kept = self.kept_message(names)
         if kept is not None:
             return kept
@@ -235,7 +235,7 @@ class Client:
             raise _lost(self.path, error) from error
 
     def _receive(self, deadline_s: float | None, what: str) -> Message:
-        """The next message in order of arrival."""
+        """Receive the next message in order of arrival."""
         while (message := self._parse()) is None:
             left_s = None if deadline_s is None else deadline_s - monotonic()
             if left_s is not None and left_s <= 0:

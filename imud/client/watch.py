@@ -1,4 +1,4 @@
-"""The client's iterators: samples and events as they come."""
+"""Iterators of the client over samples and events."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ _DEVICE_ID_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.n
 
 
 class Source(Protocol):
-    """Gives the iterators their messages."""
+    """Receiver of messages for the iterators."""
 
     def kept_message(self, names: frozenset[str]) -> dict[str, Any] | bytes | None:
         """A message that came before, or None."""
@@ -27,7 +27,7 @@ class Source(Protocol):
 
 
 class Watch:
-    """Samples as they come; ends when the client asks for something else or for no more.
+    """Iterator over samples; ends when the client subscribes anew or unsubscribes.
 
     `on_dropped`, where it is set, is called with device and number before the first sample after the loss.
     """
@@ -94,7 +94,7 @@ class Watch:
 
 
 class EventStream:
-    """Events as they come, an endless iterator."""
+    """Endless iterator over events."""
 
     NAMES: Final = frozenset(("event",))
 
@@ -121,7 +121,7 @@ def sample_of(params: Mapping[str, Any]) -> Sample:
 
 
 def event_of(params: Mapping[str, Any]) -> Event:
-    """The event in a JSON notification. A kind this client does not know stays a plain string. Raises ServerError."""
+    """Decode the event in a JSON notification. An unknown kind stays a plain string. Raises ServerError."""
     try:
         kind = params["kind"]
         known = kind in EventKind.__members__.values()

@@ -1,1 +1,1 @@
-"""The life of a device: its link, its codec and its clock, from start to end, and again after each loss of the link."""
+"""The life of a device: link, codec and clock from start to end, and again after each loss of the link."""

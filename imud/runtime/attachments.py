@@ -1,4 +1,4 @@
-"""What a device has beside its link: signals on GPIO lines, a reset line, a data-ready line, a source of UTC.
+"""Parts of a device next to its link: signals on GPIO lines, a reset line, a data-ready line, a source of UTC.
 
 All of them live by one small contract, so that the device goes through those that exist. They are made here.
 """
@@ -22,18 +22,18 @@ from imud.signals.sync_signals import SyncSignals
 
 
 class Attachment(Protocol):
-    """One part of a device beside its link. Synchronization: the loop's thread only."""
+    """A part of a device next to its link. Synchronization: the loop's thread only."""
 
     def start(self, clock: SampleClock) -> None:
-        """The device was found: what the attachment delivers is for this clock."""
+        """Begin delivery to this clock: the device was found."""
         ...
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Ten times a second from the start of the device's task on: CLOCK_MONOTONIC and the newest sample."""
+        """Do periodic work, ten times a second while the device's task runs: CLOCK_MONOTONIC and the newest sample."""
         ...
 
     def stop(self) -> None:
-        """The device's link ended; may be called twice."""
+        """End delivery: the device's link ended; may be called twice."""
         ...
 
     def close(self) -> None:
@@ -43,7 +43,7 @@ class Attachment(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class AttachmentHooks:
-    """What attachments call on their device."""
+    """Callbacks from attachments to their device."""
 
     port: DevicePort
     """The device's port, as far as sentences with UTC need it."""
@@ -52,12 +52,12 @@ class AttachmentHooks:
 
 
 class Attachments:
-    """Those of one device. Synchronization: the loop's thread only."""
+    """Attachments of one device. Synchronization: the loop's thread only."""
 
     def __init__(
         self, config: DeviceConfig, lines: LineFactory, hooks: AttachmentHooks, notices: Notices, host: HostClock
     ) -> None:
-        """Make what `config` has; `lines` makes the GPIO lines."""
+        """Make the attachments that `config` has; `lines` makes the GPIO lines."""
         raise_event = notices.raise_event
         self._utc: UtcKeeper | None = make_keeper(config, hooks.port, host.now_ns, host.utc_offset_ns)
         self._signals: SyncSignals | None = None
@@ -78,23 +78,23 @@ class Attachments:
         """Gives the clock all edges that the kernel has; None without lines. To be called before bytes are decoded."""
 
     def add(self, attachment: Attachment) -> None:
-        """Let one more live with the device."""
+        """Add an attachment."""
         self._present.append(attachment)
 
     # --- the contract, for all of them -------------------------------------------------------------------------------
 
     def start(self, clock: SampleClock) -> None:
-        """The device was found."""
+        """Start all attachments: the device was found."""
         for one in self._present:
             one.start(clock)
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Ten times a second."""
+        """Call `tick` of all attachments, ten times a second."""
         for one in self._present:
             one.tick(now_ns, newest)
 
     def stop(self) -> None:
-        """The device's link ended; may be called twice."""
+        """Stop all attachments: the device's link ended; may be called twice."""
         for one in self._present:
             one.stop()
 
@@ -126,12 +126,12 @@ class Attachments:
             await self._reset.settled()
 
     def device_found(self) -> None:
-        """Samples of the device come."""
+        """Note that samples of the device come."""
         if self._reset is not None:
             self._reset.found()
 
     async def device_not_found(self, now_ns: int) -> None:
-        """A round of search ended without the device: reset it by its line, if it is time to."""
+        """Note that a round of search ended without the device: reset it by its line, if due."""
         if self._reset is not None:
             await self._reset.not_found(now_ns)
 
@@ -144,7 +144,7 @@ class Attachments:
 
     @property
     def actions(self) -> Mapping[str, Action]:
-        """Actions that lines give to any device, by name."""
+        """Actions by GPIO lines, which any device can have, by name."""
         return self._line_actions.rows
 
     def run_action(self, name: str, arguments: Mapping[str, Any]) -> Awaitable[object]:

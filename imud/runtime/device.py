@@ -1,11 +1,11 @@
-"""The life of one device, whatever its link: open, stream, notice silence and end, and again when it comes back.
+"""The life of one device, whatever its link: open, stream, detect silence and loss of the link, and recover.
 
 MISSING ──port appears──▶ SEARCHING ──samples──▶ RUNNING ──none for a while──▶ SILENT
    ▲                        │    ▲                  │                            │
    └──────── unplugged ─────┴────┼──────────────────┴────────────────────────────┤
                                  └── bytes without frames, or long silence ──────┘
 
-A device is composed of a transport, which owns the link and the sample path, and of attachments beside the link.
+A device is composed of a transport, which owns the link and the sample path, and of attachments next to the link.
 """
 
 import asyncio
@@ -47,7 +47,7 @@ MakeTransport = Callable[[DeviceContext], Transport]
 
 
 class Device:
-    """Owns one configured device. Synchronization: the event loop's thread only."""
+    """A configured device. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class Device:
 
     @property
     def link(self) -> Link:
-        """Its link."""
+        """Link of the device."""
         return self._transport.link
 
     async def run(self) -> None:
@@ -100,7 +100,7 @@ class Device:
             self._transport.close()
 
     def tick(self, now_ns: int) -> None:
-        """Ten times a second: states, idle line, events that gathered."""
+        """Update states, detect an idle line, send gathered events; ten times a second."""
         transport = self._transport
         self._rate.mark(now_ns, self.ledger.samples)
         path = transport.path
@@ -164,7 +164,7 @@ class Device:
     def _down(self, state: DeviceState, error: LinkError) -> None:
         self._health.down(self._host.now_ns(), state, str(error))
 
-    # --- what its parts call -----------------------------------------------------------------------------------------
+    # --- callbacks of its parts --------------------------------------------------------------------------------------
 
     def _write(self, data: bytes) -> None:
         self._transport.link.write(data)
@@ -182,7 +182,7 @@ class Device:
 
     @property
     def actions(self) -> Actions:
-        """What can be done with it, by name; while its driver is not known, by its lines only."""
+        """Actions of the device by name; while its driver is not known, those of its lines only."""
         driver = self._transport.driver
         return {**(driver.actions if driver is not None else {}), **self._attachments.actions}
 
@@ -205,7 +205,7 @@ class Device:
         health = self._health
         searching = health.state is DeviceState.SEARCHING and self._transport.hears_replies
         if not health.streaming and not searching:
-            problem = health.problem or "it cannot be told anything now"
+            problem = health.problem or "it accepts no commands now"
             raise CommandError(f"{self.config.name} is {health.state}: {problem}")
 
     def _known_actions(self) -> str:
@@ -229,10 +229,10 @@ class Device:
         driver = transport.driver.name if transport.driver is not None else ""
         self._health.up(now_ns, driver, transport.where, transport.bit_rate)
 
-    # --- what it looks like from outside -----------------------------------------------------------------------------
+    # --- state -------------------------------------------------------------------------------------------------------
 
     def status(self) -> DeviceStatus:
-        """Return everything there is to say of the device now."""
+        """Return the full status of the device."""
         transport, health = self._transport, self._health
         path, driver = transport.path, transport.driver
         newest = path.newest if path is not None else None

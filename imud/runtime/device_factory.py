@@ -1,4 +1,4 @@
-"""Makes devices from their configuration: each with the transport that its link and driver need.
+"""Factory of devices from their configuration, each with the transport that its link and driver need.
 
 What the devices of a daemon share (time, buses, remembered devices, GPIO lines) is kept here.
 """
@@ -29,7 +29,7 @@ from imud.worker import BusThread, StartWorker
 
 
 class DeviceFactory:
-    """Makes the devices of one daemon. Synchronization: the event loop's thread only."""
+    """Factory of the devices of one daemon. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class DeviceFactory:
         """Found devices are remembered in `state_dir` (None: not beyond this run); `lines` makes the GPIO lines, and
         `start_worker` starts what serves a polled bus."""
         self.remembered = Remembered(state_dir)
-        """Where devices were found last."""
+        """Last known driver and rate of each device."""
         self._publish = publish
         self._send_event = send_event
         self._host = host

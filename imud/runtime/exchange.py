@@ -1,4 +1,4 @@
-"""Runs request scripts with one device: sends their requests over the link, feeds them what comes back."""
+"""Execution of request scripts: their requests are sent over the link, the device's messages are passed to them."""
 
 import asyncio
 from collections.abc import Callable
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Exchange:
-    """Runs one request script at a time. Synchronization: the event loop's thread only."""
+    """Executor of one request script at a time. Synchronization: the event loop's thread only."""
 
     def __init__(
         self,

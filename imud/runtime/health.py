@@ -1,4 +1,4 @@
-"""The state of a device and what is wrong with it: shown in its status, logged, raised as events UP and DOWN.
+"""State and present problem of a device: shown in its status, logged, raised as events UP and DOWN.
 
 Trouble of a link that goes on (a CAN bus that is error-passive) stays shown while samples flow, and explains why none
 come.
@@ -21,11 +21,11 @@ class Health:
     def __init__(self, notices: Notices) -> None:
         self.state = DeviceState.MISSING
         self.problem = ""
-        """What is wrong, one sentence; empty for nothing."""
+        """Present fault, one sentence; empty for none."""
         self.silent_since_ns = 0
         """CLOCK_MONOTONIC when the state became SILENT."""
         self.link_problem = ""
-        """What is wrong with the link though it goes on; empty for nothing."""
+        """Present fault of a link that still works; empty for none."""
         self._notices = notices
 
     @property
@@ -38,7 +38,7 @@ class Health:
         self.problem = self.link_problem = ""
 
     def searching(self) -> None:
-        """Enter SEARCHING; what is wrong stays shown until something is found."""
+        """Enter SEARCHING; the problem stays shown until a device is found."""
         self.state = DeviceState.SEARCHING
 
     def finished(self) -> None:
@@ -63,7 +63,7 @@ class Health:
             log.warning("%s: %s", self._notices.device, problem)
 
     def report(self, problem: str) -> None:
-        """Show what is wrong while the state stays; trouble of the link takes precedence."""
+        """Show a problem while the state stays; trouble of the link takes precedence."""
         problem = self.link_problem or problem
         if problem != self.problem:
             log.warning("%s: %s", self._notices.device, problem)

@@ -1,6 +1,6 @@
-"""Who a device is and how it is set: asked for, kept, and compared with what it said before.
+"""Identity and settings of a device: requested, kept, and compared with those of before.
 
-A device that was unplugged and comes back may be another one, or have other settings.
+A device that was unplugged and connected again may be another one, or have other settings.
 """
 
 import logging
@@ -19,7 +19,7 @@ IDENTIFY_TRIES = 3
 
 
 def ignore_settings(_settings: Mapping[str, str]) -> None:
-    """Where nothing depends on the settings of the device."""
+    """Ignore the settings: the version for devices on which nothing depends on them."""
 
 
 class KnownIdentity:
@@ -56,7 +56,7 @@ class KnownIdentity:
                 log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, IDENTIFY_TRIES)
 
     def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
-        """Keep what the device said; raise an event for what differs from before."""
+        """Keep the reported values; raise an event for those that differ from before."""
         now_ns, before, known = self._now_ns(), self.identity, self.settings
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"

@@ -1,4 +1,4 @@
-"""Small measurements of one device's flow: rate, latency, loss by cause. Plain integers, read when someone asks."""
+"""Meters of one device: rate, latency, loss by cause. Plain integers, evaluated when they are read."""
 
 from bisect import bisect_left
 from collections import deque
@@ -48,7 +48,7 @@ class LatencyMeter:
 
 
 class LossMeter:
-    """Attributes missing samples to causes: what damaged frames and kernel overruns explain, the rest to the device.
+    """Attribution of missing samples to causes: damaged frames, then kernel overruns, the rest to the device.
 
     A device-time gap says how many samples are missing; damaged frames heard since the last sample explain as many of
     them, then overruns the kernel counted explain the rest, and what is left the device itself did not send.
@@ -61,7 +61,7 @@ class LossMeter:
         self._overruns_seen = 0
 
     def missed(self, count: int, overruns: int) -> None:
-        """`count` samples are missing; the kernel counted `overruns` since the link was opened."""
+        """Attribute `count` missing samples; the kernel counted `overruns` since the link was opened."""
         ledger = self._ledger
         by_crc = min(count, self.bad_frames)
         left = count - by_crc
@@ -72,5 +72,5 @@ class LossMeter:
         self._overruns_seen = overruns
 
     def link_opened(self) -> None:
-        """The kernel's counters start anew."""
+        """Note that the kernel's counters start anew."""
         self._overruns_seen = 0

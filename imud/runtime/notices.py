@@ -1,4 +1,4 @@
-"""Turns counters into events at a bounded rate: a line full of noise must not flood the subscribers."""
+"""Events from counters, at a bounded rate: a line full of noise must not flood the subscribers."""
 
 import logging
 from collections.abc import Callable
@@ -15,7 +15,7 @@ INTERVAL_NS = NS_PER_S
 """At most one loss and one bad-frame event a second and device."""
 RAW_SHOWN_BYTES = 32
 LEVELS = {EventKind.UP: logging.INFO, EventKind.MARK: logging.DEBUG}
-"""What is not worth a warning; marks come as often as a camera is triggered."""
+"""Events below a warning; marks are as frequent as camera triggers."""
 
 
 class Notices:
@@ -44,7 +44,7 @@ class Notices:
         self._last_bad = frame
 
     def tick(self, now_ns: int, sync: Sync | None) -> None:
-        """Send what has gathered since the last interval."""
+        """Send the events gathered since the last interval."""
         if sync is not None and sync is not self._sync:
             self._report_sync(now_ns, sync)
         if now_ns < self._due_ns:

@@ -24,7 +24,7 @@ from imud.units import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class PathContext:
-    """What every sample path of one device needs in addition to its codec and clock."""
+    """Parts that every sample path of one device needs in addition to its codec and clock."""
 
     device: str
     """Name in the configuration."""
@@ -40,7 +40,7 @@ class PathContext:
 
 
 class SamplePath(ABC):
-    """Turns what one device sends into published samples; how it arrives is the subclass's part."""
+    """Path from the data of one device to published samples; subclasses receive the data."""
 
     def __init__(self, clock: SampleClock, context: PathContext) -> None:
         self.clock = clock
@@ -74,7 +74,7 @@ class SamplePath(ABC):
         return int(NS_PER_S / expected_hz) if expected_hz else 0
 
     def begin(self, now_ns: int) -> None:
-        """Start on a link whose device is found: what comes from now on is fresh."""
+        """Start on a link whose device is found."""
         self.begun_ns = self.last_data_ns = now_ns
         self._begun_samples = self._ledger.samples
 

@@ -1,4 +1,4 @@
-"""Finds the device on a link, asks it, and searches again when that is wanted: the same for streams and CAN buses.
+"""Search for the device on a link, and for its identity, repeated on request: the same for streams and CAN buses.
 
     begin ──round──▶ found ──▶ ask ──▶ wait until `search_again`
       ▲                │ nothing: report, reset line          │
@@ -18,7 +18,7 @@ from imud.runtime.health import Health
 
 
 class BegunRound(Protocol):
-    """One round that has begun, on a stream or a CAN bus."""
+    """A round in progress, on a stream or a CAN bus."""
 
     async def finished(self) -> None:
         """Return when a device was found. Raises NothingHeard with what was heard instead, and LinkError."""
@@ -30,7 +30,7 @@ class BegunRound(Protocol):
 
 
 class SearchLoop:
-    """Drives the rounds of search of one link. Synchronization: the loop's thread only."""
+    """Loop of search rounds on one link. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class SearchLoop:
         return self._again.is_set()
 
     def start(self) -> None:
-        """Begin a search, in place of one that goes on."""
+        """Begin a search, in place of one in progress."""
         self.stop()
         self._again.clear()
         self._health.searching()

@@ -1,7 +1,7 @@
-"""Contract: what a device needs of the transport that brings its data, and what it gives to it.
+"""Contract of the transport that connects a device to its link.
 
 A transport is a stream of bytes, a CAN bus, or a bus that is polled. It owns the link, finds the device behind it, and
-feeds what comes to the device's sample path.
+feeds received data to the device's sample path.
 """
 
 from collections.abc import Callable
@@ -63,7 +63,7 @@ class DeviceContext:
 
 
 class Transport(Protocol):
-    """How the data of one device gets from its link to its sample path. Synchronization: the loop's thread only.
+    """Transport of one device's data from its link to its sample path. Synchronization: the loop's thread only.
 
     Order of calls: `wait_present`, `link.open`, `start`, then `work` until it or the link ends, `stop`; then again from
     the beginning, and `close` at the end of all.
@@ -86,7 +86,7 @@ class Transport(Protocol):
 
     @property
     def where(self) -> str:
-        """The link and how it is set, for people."""
+        """The link and its settings, for people."""
         ...
 
     @property
@@ -96,7 +96,7 @@ class Transport(Protocol):
 
     @property
     def receiving(self) -> bool:
-        """Whether what comes goes to the sample path; False while the device is searched for."""
+        """Whether received data goes to the sample path; False while the device is searched for."""
         ...
 
     @property
@@ -118,7 +118,7 @@ class Transport(Protocol):
         ...
 
     async def work(self) -> None:
-        """Find the device and ask it, as often as needed. Ends only with the link, or by an error."""
+        """Find the device and ask for its identity, as often as needed. Ends only with the link, or by an error."""
         ...
 
     def tick(self, now_ns: int) -> None:
@@ -126,11 +126,11 @@ class Transport(Protocol):
         ...
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
-        """Report what is heard instead, and do what can help: no sample came for UNHEARD_NS."""
+        """Report received data instead, and try what can help: no sample came for UNHEARD_NS."""
         ...
 
     def on_reset(self) -> None:
-        """The device is about to be reset by its line."""
+        """Prepare for a reset of the device by its line."""
         ...
 
     async def run_action(self, action: Action, params: Settings) -> object:
@@ -138,11 +138,11 @@ class Transport(Protocol):
         ...
 
     def add_status(self, status: DeviceStatus) -> DeviceStatus:
-        """Return the status with what only this kind of transport knows."""
+        """Return the status with the fields of this kind of transport."""
         ...
 
     def stop(self) -> None:
-        """End what goes on and close the link; may be called twice."""
+        """Stop all work and close the link; may be called twice."""
         ...
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ ASK_NS = NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class DevicePort:
-    """The device's port, as far as sentences need it."""
+    """Port of the device, as far as sentences need it."""
 
     write: Callable[[bytes], None]
     baud: Callable[[], int]
@@ -41,7 +41,7 @@ class DevicePort:
 
 
 class UtcKeeper:
-    """Feeds a device's port and clock with UTC. Synchronization: the loop's thread only."""
+    """Feed of UTC to a device's port and clock. Synchronization: the loop's thread only."""
 
     def __init__(
         self,

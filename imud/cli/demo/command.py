@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """0 when samples flowed and the ledger closed."""
+    """Run the demo; return 0 when samples flowed and the ledger closed."""
     wanted: list[tuple[str, int]] = args.device or [(DEVICE, 0)]
     if any(bus_of(name) for name, _ in wanted):
         return run_on_bus(wanted, args)
@@ -83,18 +83,18 @@ def run(args: argparse.Namespace) -> int:
 
 
 def wanted_device(text: str) -> tuple[str, int]:
-    """Name and node of a device for `--device`. Raises ArgumentTypeError."""
+    """Parse `--device` to name and node. Raises ArgumentTypeError."""
     return (text, 0) if bus_of(text) else simulated(text)
 
 
 def bus_of(name: str) -> str:
-    """`i2c` or `spi` for a driver whose far end only hardware can be, otherwise empty."""
+    """Return `i2c` or `spi` for a driver of a bus without a simulator, otherwise an empty string."""
     driver = DRIVERS.get(name)
     return driver.link if isinstance(driver, PolledDriver) and driver.link in ("i2c", "spi") else ""
 
 
 def run_on_bus(wanted: list[tuple[str, int]], args: argparse.Namespace) -> int:
-    """The daemon on a bus of this machine with whatever device is there: nothing is simulated. As `run`."""
+    """Run the daemon on a bus of this machine with the device that is there; nothing is simulated. As `run`."""
     name, bus = wanted[0][0], bus_of(wanted[0][0])
     if len(wanted) > 1:
         raise ImudError(f"expected {name} alone, got {len(wanted)} devices")
@@ -109,7 +109,7 @@ def run_on_bus(wanted: list[tuple[str, int]], args: argparse.Namespace) -> int:
 
 
 def watch_daemon(stack: ExitStack, folder: Path, devices: Devices, args: argparse.Namespace) -> int:
-    """Start the daemon, say how other programs reach it, and show its samples. Returns the exit status."""
+    """Start the daemon, print how to reach it, and show its samples. Returns the exit status."""
     port = free_port()
     stack.enter_context(daemon(folder, devices, port))
     path = folder / "imud.sock"
@@ -118,7 +118,7 @@ def watch_daemon(stack: ExitStack, folder: Path, devices: Devices, args: argpars
 
 
 def commands(folder: Path, device: str, port: int) -> str:
-    """Lines to paste into another terminal: they reach this daemon from any directory."""
+    """List commands to paste into another terminal: they reach this daemon from any directory."""
     python = shlex.quote(sys.executable)
     beside = Path(sys.executable).with_name("imud")
     imud = shlex.quote(str(beside)) if beside.exists() else f"{python} -m imud"
@@ -135,7 +135,7 @@ def commands(folder: Path, device: str, port: int) -> str:
 
 
 def free_port() -> int:
-    """The documented port of metrics, or another one that is free."""
+    """Choose the documented port of metrics, or another one that is free."""
     for port in (METRICS_PORT, 0):
         with suppress(OSError), socket.create_server((METRICS_ADDRESS, port)) as server:
             return int(server.getsockname()[1])
@@ -168,7 +168,7 @@ def show(path: Path, args: argparse.Namespace) -> int:
 
 @contextmanager
 def simulator(folder: Path, devices: list[tuple[str, int]], rate_hz: float, interface: str) -> Iterator[None]:
-    """The simulated sensor, its port at `folder`/port, or sensors on a CAN interface."""
+    """Start the simulated sensor with its port at `folder`/port, or sensors on a CAN interface."""
     argv = [
         sys.executable,
         "-m",
@@ -189,7 +189,7 @@ def simulator(folder: Path, devices: list[tuple[str, int]], rate_hz: float, inte
 
 
 def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, object]:
-    """Configuration of a device that is simulated."""
+    """Write the configuration of a simulated device."""
     if interface:
         driver = DRIVERS[name]
         options = msgspec.to_builtins(driver.node_settings(node)) if isinstance(driver, CanDriver) and node else {}
@@ -201,7 +201,7 @@ def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, 
 
 @contextmanager
 def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
-    """`imud run` on the simulated devices, with everything it needs below `folder`."""
+    """Start `imud run` on the simulated devices, with everything it needs below `folder`."""
     tree = {
         "log_level": "error",
         "state_dir": str(folder),
@@ -225,7 +225,7 @@ def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
 
 @contextmanager
 def child(argv: list[str], name: str, **options: int) -> Iterator[subprocess.Popen[str]]:
-    """A child process that does not see our Ctrl-C and is ended with us."""
+    """Start a child process that does not receive Ctrl-C and is ended with this one."""
     environment = dict(os.environ, PYTHONUNBUFFERED="1")
     with subprocess.Popen(
         argv, stdin=subprocess.PIPE, text=True, env=environment, start_new_session=True, **options

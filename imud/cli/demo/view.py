@@ -14,7 +14,7 @@ UP = "\x1b[{}A"
 
 
 class View:
-    """Counts samples, their latency to this client, and draws the newest ten times a second."""
+    """View of one device: counts samples and their latency, and draws the newest ten times a second."""
 
     def __init__(self, out: TextIO, *, live: bool) -> None:
         self.samples = 0
@@ -44,12 +44,12 @@ class View:
             self._draw(sample)
 
     def end(self) -> None:
-        """Leave the last picture where it is."""
+        """Leave the last picture on the terminal."""
         self._drawn_lines = 0
         self._out.flush()
 
     def account(self) -> str:
-        """Rate, losses and latency as this client saw them."""
+        """Format rate, losses and latency as this client saw them."""
         if self._last is None:
             return "  client    no sample arrived"
         span_ns = self._last.t_ns - self._first_ns
@@ -72,7 +72,7 @@ class View:
 
 
 def picture(sample: Sample) -> list[str]:
-    """The newest sample in people's units."""
+    """Format the newest sample in everyday units."""
     degrees, rates = _in(sample.euler_rad, RAD_PER_DEG), _in(sample.gyro_rad_s, RAD_PER_DEG)
     return [
         f"{sample.device} #{sample.seq}   stamp by {sample.sync}, ±{sample.t_err_ns / NS_PER_MS:.3f} ms",

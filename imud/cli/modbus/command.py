@@ -57,7 +57,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
 
 
 def addresses(text: str) -> range:
-    """A range of addresses from `5` or `5-20`. Raises ArgumentTypeError."""
+    """Parse a range of addresses: `5` or `5-20`. Raises ArgumentTypeError."""
     first, _, last = text.partition("-")
     if not first.isdecimal() or not (last or first).isdecimal():
         raise argparse.ArgumentTypeError(f"expected FIRST-LAST, got {text!r}")
@@ -68,7 +68,7 @@ def addresses(text: str) -> range:
 
 
 def run(args: argparse.Namespace) -> int:
-    """0 when modules were found or numbered; 1 when none was, or something is wrong with one."""
+    """Scan or assign; return 0 when modules were found or numbered, 1 for none or a faulty one."""
     if not 1 <= args.reply_ms <= 1000:
         raise BadArgument(f"--reply-ms: expected 1 to 1000, got {args.reply_ms}")
     found = _scan(args) if args.action == "scan" else _assign(args)

@@ -1,4 +1,4 @@
-"""Finds the modules of an RS-485 line and sets their addresses."""
+"""Search for the modules of an RS-485 line, and assignment of their addresses."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ SETTLE_S: Final = 0.3
 
 
 class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What answers at one address."""
+    """A module that answered at one address."""
 
     baud: int
     address: int
@@ -32,12 +32,12 @@ class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
     serial_number: str = ""
     firmware: str = ""
     problem: str = ""
-    """What is wrong there; then nothing else is known."""
+    """The fault at this address; the other fields are then unknown."""
 
 
 @contextmanager
 def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
-    """The line, opened for this program alone. Raises LinkError."""
+    """Open the line for this program alone. Raises LinkError."""
     link = Rs485Link(Rs485Settings(line=port, baud=baud, reply_ms=reply_ms))
     link.open()
     try:
@@ -101,7 +101,7 @@ def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
 
 
 def _identity(link: Rs485Link, address: int) -> Identity | None:
-    """Identity of the module at an address; None where none answers. Raises CommandError for invalid replies."""
+    """Read the identity of the module at an address; None for no answer. Raises CommandError for invalid replies."""
     problem: Exception | None = None
     for _ in range(TRIES):
         try:

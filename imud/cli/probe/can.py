@@ -1,4 +1,4 @@
-"""Lists the devices heard on a CAN interface, for `imud probe`; sends nothing but permitted queries."""
+"""Search for the devices on a CAN interface, for `imud probe`; sends nothing but permitted queries."""
 
 import asyncio
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from imud.runtime.identity import identity_words
 
 
 async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
-    """One report per device heard on an interface, or one that says why there is none."""
+    """List one report per device heard on an interface, or one that gives the reason for none."""
     row = LINKS["socketcan"]
     link = row.make_can(msgspec.convert({"interface": interface}, row.settings))
     try:
@@ -46,7 +46,7 @@ async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
 
 
 async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
-    """One round of detection: the devices heard, and the reason if there is none. Raises LinkError."""
+    """Run one round of detection: the devices heard, and the reason for none. Raises LinkError."""
     search = CanSearch(of_kind(DRIVERS.values(), CanDriver), link.title)
     finder = CanRound(search, Ledger(), lambda found: None, monotonic_ns)
     ended = asyncio.get_running_loop().create_future()
@@ -64,7 +64,7 @@ async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
 
 
 def state_of(interface: str) -> str:
-    """State of the controller, for people. Raises LinkError."""
+    """Describe the state of the controller. Raises LinkError."""
     details = can_details(interface)
     if details.bitrate is None or details.state is None or details.state >= len(ControllerState):
         return "bus without a bit rate" if details.bitrate is None else ""
@@ -79,20 +79,20 @@ async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -
 
 
 async def ask(device: CanDevice, link: CanLink) -> Identity:
-    """The identity of a device; empty when it does not answer."""
+    """Ask a device for its identity; empty when it does not answer."""
     driver, settings = device.driver, device.driver.node_settings(device.node)
     ledger = Ledger()
     codec = driver.make_codec(ledger, settings)
     exchange = Exchange(ledger, link.write, monotonic_ns)
 
-    def take(frames: Sequence[CanFrame]) -> None:
+    def on_frames(frames: Sequence[CanFrame]) -> None:
         for frame in frames:
             for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns):
                 if (message := message_of(event)) is not None:
                     exchange.on_message(message, frame.t_rx_ns)
 
     link.filters = driver.filters(settings)
-    link.start(take, lambda news, problem: None, lambda error: None)
+    link.start(on_frames, lambda news, problem: None, lambda error: None)
     with suppress(CommandError):
         return await exchange.run(driver.identify(settings))
     return Identity()

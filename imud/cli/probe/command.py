@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]) -> list[ProbeReport]:
-    """All ports at the same time."""
+    """Probe all ports at the same time."""
     found = await asyncio.gather(
         *(
             examine(port, port in active, titles.get(port, "")) if "/" in port else examine_bus(port, port in active)
@@ -79,7 +79,7 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
 
 
 async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
-    """One round of detection. Raises NothingHeard and LinkError."""
+    """Run one round of detection. Raises NothingHeard and LinkError."""
     findings: list[StreamFound] = []
     finder = StreamRound(config, link, Ledger(), None, findings.append, monotonic_ns, may_ask=config.identify)
     ended = asyncio.get_running_loop().create_future()
@@ -96,17 +96,17 @@ async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
 
 
 async def ask(found: StreamFound, link: StreamLink) -> Identity:
-    """The identity of a device; empty when it does not answer."""
+    """Ask a device for its identity; empty when it does not answer."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
     exchange = Exchange(ledger, link.write, monotonic_ns, link.set_baud)
 
-    def take(data: bytes, t_rx_ns: int) -> None:
+    def on_data(data: bytes, t_rx_ns: int) -> None:
         for event in codec.feed(data):
             if (message := message_of(event)) is not None:
                 exchange.on_message(message, t_rx_ns)
 
-    link.start(take, lambda error: None)
+    link.start(on_data, lambda error: None)
     with contextlib.suppress(CommandError):
         return await exchange.run(found.driver.identify())
     return Identity()

@@ -1,4 +1,4 @@
-"""Table: what `imud probe` says of one device, or of a port without one, and the columns of its output."""
+"""Table: the columns of `imud probe`, one row per device or per port without one."""
 
 import msgspec
 
@@ -6,14 +6,14 @@ HEAD = ("PORT", "DRIVER", "RATE", "PRODUCT", "SERIAL NUMBER", "")
 
 
 class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What stands at one port, or is one of those on a bus."""
+    """Result for one port, or for one device of a bus."""
 
     port: str
     title: str = ""
-    """What the adapter calls itself; the state of a bus."""
+    """Product name of the adapter; the state of a bus."""
     driver: str = ""
     device: str = ""
-    """Which one on a bus, for example `node 8`."""
+    """Address on a bus, for example `node 8`."""
     baud: int = 0
     """Rate of port or bus, bit/s."""
     identity: dict[str, str] = {}  # msgspec copies a mutable default
@@ -21,7 +21,7 @@ class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def row(report: ProbeReport) -> tuple[object, ...]:
-    """A report as a line of the table."""
+    """Format a report as a row of the table."""
     identity = report.identity
     return (
         report.port,

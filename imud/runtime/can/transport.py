@@ -1,4 +1,4 @@
-"""A CAN bus: the driver of the device is named, or found by listening; its frames are those of its filters."""
+"""Transport of a device on a CAN bus: its driver is configured, or found by listening; filters select its frames."""
 
 from collections.abc import Sequence
 from random import Random
@@ -24,7 +24,7 @@ from imud.units import NS_PER_S
 
 
 class CanTransport:
-    """Brings the frames of one device on a CAN bus. Synchronization: the event loop's thread only."""
+    """Transport of the frames of one device on a CAN bus. Synchronization: the event loop's thread only."""
 
     def __init__(self, context: DeviceContext, link: CanLink, buses: CanBuses, remembered: Remembered) -> None:
         """`buses` is what the devices of a daemon share. Raises LinkError for a driver that is none for CAN."""
@@ -69,7 +69,7 @@ class CanTransport:
         self.link.start(self._on_frames, self._on_news, on_end)
 
     async def work(self) -> None:
-        """Find the device and ask it, as often as needed; ends only with the link."""
+        """Find the device and ask for its identity, as often as needed; ends only with the link."""
         await self._search.run()
 
     def stop(self) -> None:
@@ -143,7 +143,7 @@ class CanTransport:
         path.begin(self._now_ns())
         self._context.attachments.start(path.clock)
 
-    # --- what devices of one bus know of each other ------------------------------------------------------------------
+    # --- other devices of the bus ------------------------------------------------------------------------------------
 
     def _join(self) -> None:
         driver, options = self.driver, self._options
@@ -164,7 +164,7 @@ class CanTransport:
     # --- asking ------------------------------------------------------------------------------------------------------
 
     async def _ask(self) -> None:
-        """Have the link send what the device needs, and ask for identity and settings where that is allowed.
+        """Have the link send the cyclic frames, and ask for identity and settings where that is allowed.
 
         Raises LinkError where another device sends it already.
         """
@@ -184,7 +184,7 @@ class CanTransport:
             self.driver.apply_identity(self._codec, identity)
 
     async def run_action(self, action: Action, params: Settings) -> object:
-        """Run an action of the driver on the device that is heard: one that was found has a number of its own."""
+        """Run an action of the driver on the device that was found, with its own node number."""
         return await self._exchange.run(action.script(Target(self._options, self.bit_rate), params))
 
     # --- the flow ----------------------------------------------------------------------------------------------------
@@ -203,7 +203,7 @@ class CanTransport:
         """No-op: frames come by themselves."""
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
-        """Report what is heard instead, and search anew after a long silence."""
+        """Report the received frames instead, and search anew after a long silence."""
         health, driver = self._health, self.driver
         since_ns = health.silent_since_ns if health.state is DeviceState.SILENT else path.begun_ns
         if self._searchable and now_ns - since_ns > SILENT_SEARCH_NS:
@@ -218,7 +218,7 @@ class CanTransport:
     def on_reset(self) -> None:
         """No-op: the device sends again by itself."""
 
-    # --- what it looks like ------------------------------------------------------------------------------------------
+    # --- state -------------------------------------------------------------------------------------------------------
 
     @property
     def where(self) -> str:

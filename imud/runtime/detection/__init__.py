@@ -1,4 +1,4 @@
-"""Finds out which device is on a link: searches without I/O, and the rounds that do their I/O."""
+"""Detection of the device on a link: searches without I/O, and the rounds that do their I/O."""
 
 from imud.runtime.detection.can import CanDevice, CanFound, CanSearch, CanStep, CanSurvey
 from imud.runtime.detection.steps import GaveUp, Listen

@@ -1,4 +1,4 @@
-"""Where each device was last found: driver and baud rate or node, in one small JSON file that survives restarts.
+"""Store of the last known driver and baud rate or node of each device, in one small JSON file.
 
 A missing or damaged file costs a few hundred milliseconds of detection, nothing else, so every error here is only
 reported.
@@ -34,11 +34,11 @@ class Remembered:
         self._found = self._read()
 
     def get(self, device: str) -> RememberedDevice | None:
-        """What is remembered of `device`."""
+        """The remembered driver and rate of `device`."""
         return self._found.get(device)
 
     def put(self, device: str, found: RememberedDevice) -> None:
-        """Remember, and write the file if that is news."""
+        """Remember, and write the file if anything changed."""
         if self._found.get(device) != found:
             self._found[device] = found
             self._write()

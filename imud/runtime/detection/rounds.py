@@ -1,6 +1,6 @@
-"""One round of a search on an open link: passes on what comes, sets rates, sends queries, keeps its time.
+"""A round of a search on an open link: passes received data on, sets rates, sends queries, keeps the deadlines.
 
-What to do next is said by a search without I/O (`detection.stream`, `detection.can`); here it is done.
+A search without I/O (`detection.stream`, `detection.can`) determines each step; here it is carried out.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ from imud.runtime.detection.stream import Search, StreamFound
 from imud.units import NS_PER_S
 
 EARLY_S: Final = 0.001
-"""The loop's timer may fire a little early against CLOCK_MONOTONIC; so long is waited then."""
+"""Extra wait when the loop's timer fires a little early against CLOCK_MONOTONIC."""
 EVERYTHING: Final = (CanFilter(0, 0, False), CanFilter(0, 0, True))
 """Filters that pass every data frame."""
 
@@ -31,7 +31,7 @@ F_co = TypeVar("F_co", covariant=True)
 
 
 class TimedSearch(Protocol[F_co]):
-    """A search as far as time is concerned; all times are CLOCK_MONOTONIC in ns."""
+    """Timing of a search; all times are CLOCK_MONOTONIC in ns."""
 
     def start(self, now_ns: int) -> Listen | F_co | GaveUp:
         """Return the first step."""
@@ -43,7 +43,7 @@ class TimedSearch(Protocol[F_co]):
 
 
 class SearchRound(ABC, Generic[F]):
-    """Follows the steps of one search. Synchronization: the loop's thread only."""
+    """Execution of the steps of one search. Synchronization: the loop's thread only."""
 
     def __init__(
         self, search: TimedSearch[F], ledger: Ledger, on_found: Callable[[F], None], now_ns: Callable[[], int]
@@ -58,7 +58,7 @@ class SearchRound(ABC, Generic[F]):
         self._done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def start(self) -> None:
-        """Begin; what comes from now on is to be given to the round."""
+        """Begin; data received from now on is to be given to the round."""
         self._follow(self._steps.start(self._now_ns()))
 
     async def finished(self) -> None:
@@ -79,7 +79,7 @@ class SearchRound(ABC, Generic[F]):
 
     @abstractmethod
     def _listen(self, step: Listen) -> Listen | F | GaveUp | None:
-        """Do what `step` wants now; return the next step where that failed."""
+        """Carry out `step`; return the next step if that failed."""
 
     def _found(self, found: F) -> None:
         self._on_found(found)
@@ -101,7 +101,7 @@ class SearchRound(ABC, Generic[F]):
             self._found(step)
 
     def _wait_until(self, until_ns: int) -> None:
-        """Call `_on_time` then, and not at an earlier time that was asked for before."""
+        """Call `_on_time` at that time; replaces an earlier request."""
         if self._timer is not None:
             self._timer.cancel()
         self._call_later(max(0, until_ns - self._now_ns()) / NS_PER_S)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Listen:
-    """Pass on what comes, call `on_time` at `until_ns`. On a line of bytes first set the rate and send `send`."""
+    """Pass on received data, call `on_time` at `until_ns`. On a line of bytes first set the rate and send `send`."""
 
     until_ns: int
     baud: int = 0
@@ -15,9 +15,9 @@ class Listen:
 
 @dataclass(frozen=True, slots=True)
 class GaveUp:
-    """A round found no device, or several."""
+    """End of a round that found no device, or several."""
 
     summary: str
-    """What was heard, and what to look at, for people."""
+    """Observations and advice, for people."""
     wasted_bytes: int = 0
     """Bytes heard on a line of bytes: the ledger's `bytes_skipped`."""

@@ -1,4 +1,4 @@
-"""Which device talks on a port, and at which baud rate: a search without I/O or clock of its own.
+"""Detection of the device and the baud rate on a port: a search without I/O or clock of its own.
 
 Strategy. Listen at one rate after the other, decode with a fresh codec of every driver, and count frames whose check
 value holds. Passes get slower: QUICK finds a 100 Hz device, MIDDLE 5 Hz, SLOW 1 Hz; the slow ones run only when
@@ -38,25 +38,25 @@ WHOLE_FRAME_BYTES: Final = 300
 """On a line that is full, one frame is whole within twice its length: two of 150 bytes (HI91 and HI92 in one frame are
 130). It decides at 9600 baud only."""
 QUIET_NS: Final = 1200 * NS_PER_MS
-"""So long nothing must be heard before asking: a device at 1 Hz is then heard at whatever rate, if only as garbage."""
+"""Silence required before a query: a device at 1 Hz is received within it at any rate, if only as garbage."""
 ASK_NS: Final = 120 * NS_PER_MS
 QUERY_BYTES: Final = 32
 REPLY_GAP_NS: Final = 200 * NS_PER_MS
 """Longest pause within a reply."""
 VISIT_BYTES_MAX: Final = 256 * 1024
-"""Kept of one visit; a visit that hears more without a lock is over."""
+"""Bytes kept of one visit; a visit that receives more without a lock ends."""
 ASK_TRIES: Final = 2
-"""What was sent at wrong rates may stand in the device's line buffer and spoil the first query at the right one."""
+"""Bytes sent at wrong rates may stand in the device's line buffer and spoil the first query at the right one."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamFound:
-    """A device, and the bytes that its own codec has to be fed so that every byte gets into its ledger."""
+    """The device found, and the bytes to feed to its own codec so that every byte gets into its ledger."""
 
     driver: StreamDriver
     baud: int
     chunks: tuple[tuple[bytes, int], ...] = ()
-    """What was heard at that rate in the last visit, with the time of each read."""
+    """Bytes of the last visit at that rate, with the time of each read."""
     wasted_bytes: int = 0
     """Bytes heard before, in visits that found nothing: the ledger's `bytes_skipped`."""
 
@@ -65,7 +65,7 @@ Step = Listen | StreamFound | GaveUp
 
 
 class Search:
-    """One round of detection on one port. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
+    """A round of detection on one port. Synchronization: one thread. All times are CLOCK_MONOTONIC in ns."""
 
     def __init__(
         self,
@@ -124,7 +124,7 @@ class Search:
         return self._listen_until(until_ns)
 
     def on_time(self, now_ns: int) -> Step | None:
-        """`until_ns` of the last Listen has come; None when it has not."""
+        """End the present step if `until_ns` of the last Listen has come; return None when it has not."""
         visit = self._visit
         if now_ns < visit.until_ns:
             return None
@@ -137,7 +137,7 @@ class Search:
         return self._next(now_ns)
 
     def refused(self, why: str, now_ns: int) -> Step:
-        """The port cannot do the rate of the last Listen: go on without it."""
+        """Go on without the rate of the last Listen: the port does not support it."""
         self._tallies[self._visit.baud].refusal = why
         return self._next(now_ns)
 
@@ -195,7 +195,7 @@ class Search:
         return [_Trial(driver, self._options) for driver in fitting or self._drivers]
 
     def _dwell_ns(self, flow_ns: int) -> int:
-        """How long a visit lasts that waits `flow_ns` for bytes to flow."""
+        """Duration of a visit that waits `flow_ns` for bytes to flow."""
         return self._hold_ns + SETTLE_NS + max(flow_ns, WHOLE_FRAME_BYTES * uart_byte_ns(self._visit.baud))
 
     def _listen_until(self, until_ns: int) -> Listen | None:
@@ -228,7 +228,7 @@ class Search:
 
 @dataclass(slots=True)
 class _Tally:
-    """What was heard at one rate, all visits together."""
+    """Result of all visits at one rate."""
 
     size: int = 0
     good: int = 0
@@ -247,7 +247,7 @@ class _Tally:
 
 
 class _Trial:
-    """One driver's codec listening in one visit."""
+    """A codec of one driver during one visit."""
 
     def __init__(self, driver: StreamDriver, options: Any) -> None:
         self.driver = driver
@@ -265,7 +265,7 @@ class _Trial:
 
 @dataclass(slots=True)
 class _Visit:
-    """A stay at one rate."""
+    """A period of listening at one rate."""
 
     baud: int
     dwell_ns: int
@@ -298,7 +298,7 @@ class _Visit:
         return max((trial.good_frames() for trial in self.trials), default=0)
 
     def _look_for_reply(self, trial: _Trial, events: Sequence[CodecEvent]) -> None:
-        """A reply has as many messages as the question wants: an end alone (`OK`) many devices say."""
+        """Look for a reply with as many messages as the query wants: the end alone (`OK`) is common to many devices."""
         question = self.question
         if question is None or trial.driver is not self.asked:
             return
@@ -322,6 +322,6 @@ def _usable(remembered: tuple[str, int] | None, drivers: Sequence[StreamDriver],
 
 
 def _rates(drivers: Sequence[StreamDriver]) -> tuple[int, ...]:
-    """All rates of all drivers once, the most likely ones of each first."""
+    """List all rates of all drivers once, the most likely ones of each first."""
     ranked = [(rank, baud) for driver in drivers for rank, baud in enumerate(driver.baud_rates)]
     return tuple(dict.fromkeys(baud for _, baud in sorted(ranked, key=lambda pair: pair[0])))

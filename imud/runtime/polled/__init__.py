@@ -1,1 +1,1 @@
-"""Devices that speak only when they are asked: I2C, SPI, Modbus."""
+"""Devices that send only on request: I2C, SPI, Modbus."""

@@ -1,4 +1,4 @@
-"""One thread per bus: it makes the transfers of all devices there at absolute deadlines, and hands over what was read.
+"""Transfers of all devices of a bus in one thread, at absolute deadlines.
 
     loop ──commands──▶ thread: due poll? ─▶ transfer ─▶ readings ─┐
       ▲                        │ no: one transfer of a script      │ before it sleeps: one wake-up for all of it
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 IDLE_NS = 60 * NS_PER_S
 POLLS_IN_ROW = 8
-"""On a bus that is never idle, a script has its turn after so many polls."""
+"""Number of polls after which a script has its turn on a bus that is never idle."""
 READINGS_MAX = 10_000
 """Readings that wait for a loop that does not run; more are dropped and count as missed deadlines."""
 
@@ -36,7 +36,7 @@ Callback = Callable[[], None]
 
 
 class BusMember:
-    """One device on a bus, for its owner. Synchronization: the loop's thread only."""
+    """A device on a bus, for its owner. Synchronization: the loop's thread only."""
 
     def __init__(self, bus: "PolledBus", link: PolledLink, deadlines: Deadlines, on_readings: OnReadings) -> None:
         """`PolledBus.join` makes it; how its deadlines are kept is counted in `deadlines`."""
@@ -70,7 +70,7 @@ class BusMember:
         self.command(lambda: self._polling.start(polls, schedule))
 
     def command(self, command: Callback) -> None:
-        """Have something done by the bus's thread between two transfers, at once where it sleeps."""
+        """Have the bus's thread run a function between two transfers, at once if it sleeps."""
         self._bus.command(command)
 
     def stop(self) -> None:
@@ -90,7 +90,7 @@ class BusMember:
 
 
 class _Polling:
-    """What the bus's thread does for one device. Synchronization: that thread only."""
+    """Polls of one device. Synchronization: the bus's thread only."""
 
     def __init__(self, link: PolledLink, deadlines: Deadlines, now_ns: Callable[[], int], deliver: OnReadings) -> None:
         """`deliver` is to be called in the loop's thread."""
@@ -98,7 +98,7 @@ class _Polling:
         self.scripts: deque[_ScriptRun] = deque()
         """Transfer scripts that wait for their transfers, the running one first."""
         self.schedule: Timetable | None = None
-        """When it is read; None while it is not."""
+        """Timetable of its reads; None while it is not read."""
         self._deadlines = deadlines
         self._now_ns = now_ns
         self._deliver = deliver
@@ -202,7 +202,7 @@ def _settle(future: asyncio.Future[Any], value: object, error: Exception | None)
 
 
 class PolledBus:
-    """One bus and its devices."""
+    """A bus and its devices."""
 
     def __init__(
         self, name: str, loop: asyncio.AbstractEventLoop, now_ns: Callable[[], int], start_worker: StartWorker
@@ -211,7 +211,7 @@ class PolledBus:
         """CLOCK_MONOTONIC."""
         self._loop = loop
         self._polling: list[_Polling] = []
-        """Those of the members. The bus's thread."""
+        """Polls of the members. The bus's thread."""
         self._commands: deque[Callback] = deque()
         self._callbacks: list[Callback] = []
         """For the loop's thread, at the next wake-up."""
@@ -259,7 +259,7 @@ class PolledBus:
         polling.link.close()
 
     def _round(self) -> int:
-        """Run commands, then what is due or one step of a script; return how long there is nothing else to do, ns."""
+        """Run commands, then due polls or one step of a script; return the time until the next work, ns."""
         commands = self._commands
         while commands:
             commands.popleft()()
@@ -299,7 +299,7 @@ class PolledBus:
         return False
 
     def _hand_over(self) -> None:
-        """Give the loop all that has gathered, with one wake-up."""
+        """Deliver all gathered results to the loop, with one wake-up."""
         callbacks = self._callbacks
         for polling in self._polling:
             delivery = polling.delivery()
@@ -314,7 +314,7 @@ class PolledBus:
             self._loop.call_soon_threadsafe(callback)
 
     def _failed(self, error: BaseException) -> None:
-        """Let the loop's thread raise what a round raised."""
+        """Raise the exception of a round in the loop's thread."""
         self._failure = error
         self._call_loop(self._raise)
 

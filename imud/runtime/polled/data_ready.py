@@ -1,4 +1,4 @@
-"""The data-ready line of a polled device: an edge has the bus's thread read at once, and is the time of what was read.
+"""The data-ready line of a polled device: an edge triggers a read, and dates what was read.
 
     edge ──kernel stamp──▶ loop ──ReadySchedule.on_edge──▶ bus's thread: read
     read ──▶ loop: drain, ReadyEdges.match ──▶ clock
@@ -25,7 +25,7 @@ from imud.units import NS_PER_S
 
 
 class DataReady:
-    """Owns the line of one device: an attachment of it. Synchronization: the loop's thread only."""
+    """The data-ready line of one device, an attachment of it. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class DataReady:
         """Process the edges that the kernel has."""
         self._watched.drain()
 
-    # --- what it looks like ------------------------------------------------------------------------------------------
+    # --- state -------------------------------------------------------------------------------------------------------
 
     @property
     def expected_rate_hz(self) -> float:

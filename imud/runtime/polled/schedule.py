@@ -1,4 +1,4 @@
-"""When a device is read: at absolute deadlines, in turns with others, or at the edges of its data-ready line.
+"""Schedules of reads: at absolute deadlines, in turns with other devices, or at the edges of a data-ready line.
 
 Deadlines (`Schedule`) do not drift; those that were not kept are counted. Turns (`RoundRobin`) are for a line that
 several devices share and that is to be used as much as it allows. Edges (`ReadySchedule`) fall back to deadlines:
@@ -17,7 +17,7 @@ QUIET_INTERVALS: Final = 3
 
 
 class Deadlines:
-    """How deadlines were kept, over all schedules of a device. Written by the bus's thread, read by any thread."""
+    """Counters of kept and missed deadlines, over all schedules of a device."""
 
     __slots__ = ("late", "missed", "polls", "sum_late_ns", "worst_ns")
 
@@ -34,7 +34,7 @@ class Deadlines:
         """Longest time from deadline to read."""
 
     def served(self, late_ns: int, limit_ns: int) -> None:
-        """Count a read that begins so long after its deadline; longer than `limit_ns` is late."""
+        """Count a read by its delay after its deadline; longer than `limit_ns` is late."""
         self.polls += 1
         self.sum_late_ns += late_ns
         self.late += late_ns > limit_ns
@@ -42,7 +42,7 @@ class Deadlines:
 
 
 class Timetable(Protocol):
-    """Says when a device is read next."""
+    """Timetable of a device's reads."""
 
     due_ns: int
     """CLOCK_MONOTONIC; the lowest on a bus comes first."""
@@ -90,17 +90,17 @@ class RoundRobin:
 
     def __init__(self, begin_ns: int, counts: Deadlines) -> None:
         self.period_ns = 0
-        """There is none."""
+        """No-op: there are no deadlines."""
         self.counts = counts
         self.due_ns = begin_ns
-        """When its last turn was over (CLOCK_MONOTONIC): the lowest of all members is next."""
+        """End of the device's last turn (CLOCK_MONOTONIC): the lowest of all members is next."""
 
     def begun(self, _start_ns: int) -> None:
         """Count the turn that begins."""
         self.counts.polls += 1
 
     def done(self, now_ns: int) -> None:
-        """Go behind all others: the turn is over."""
+        """Queue behind all other devices: the turn is over."""
         self.due_ns = now_ns
 
 
@@ -117,7 +117,7 @@ class ReadySchedule:
         self._edge_ns = begin_ns
         """The newest edge, or the beginning."""
         self._start_ns = 0
-        """When the newest read began."""
+        """Begin of the newest read."""
         self._pending = True
         """Whether the newest edge was not read yet."""
         self.counts = counts

@@ -1,4 +1,4 @@
-"""A bus that is polled: the device is identified and set up before it is read, and again whenever it vanished.
+"""Transport of a polled device: it is identified and set up before it is read, and again whenever it vanished.
 
 MISSING ──bus appears──▶ SEARCHING ──identified, set up, samples──▶ RUNNING ──same bytes for a while──▶ SILENT
    ▲                        ▲                                          │                                   │
@@ -48,7 +48,7 @@ class IdentifiedDevice:
 
 
 class PolledTransport:
-    """Reads one device on a polled bus. Synchronization: the event loop's thread only."""
+    """Transport of one device on a polled bus. Synchronization: the event loop's thread only."""
 
     def __init__(self, context: DeviceContext, link: PolledLink, buses: PolledBuses, ready: DataReady | None) -> None:
         """`buses` is what the devices of a daemon share; `ready` is the device's data-ready line, if it has one."""
@@ -86,7 +86,7 @@ class PolledTransport:
         self._member = self._buses.get(self.link.bus).join(self.link, self._deadlines, self._on_readings)
 
     async def work(self) -> None:
-        """Find, set up, read; and again. Ends only with the bus."""
+        """Find, set up and read the device, repeatedly. Ends only with the bus."""
         member, attachments = self._member, self._context.attachments
         assert member is not None
         while True:
@@ -132,7 +132,7 @@ class PolledTransport:
         return None
 
     async def _set_up(self, member: BusMember, device: IdentifiedDevice) -> bool:
-        """Make the device what the configuration says; return False when that failed."""
+        """Set the device up as configured; return False when that failed."""
         try:
             settings = await member.run(device.driver.set_up(device.options), device.target)
         except (TransferError, DeviceRefused) as error:
@@ -143,7 +143,7 @@ class PolledTransport:
         return True
 
     async def _read(self, member: BusMember, device: IdentifiedDevice) -> None:
-        """Read until the device is gone. Raises LinkError when its bus is."""
+        """Read until the device is gone. Raises LinkError when its bus is gone."""
         gone = self._gone = asyncio.get_running_loop().create_future()
         path, ready = self._begin(device), self._ready
         if ready is not None:
@@ -208,7 +208,7 @@ class PolledTransport:
     # --- the flow ----------------------------------------------------------------------------------------------------
 
     def _on_readings(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
-        """Decode what the bus's thread hands over."""
+        """Decode the readings of the bus's thread."""
         path, why = self.path, ""
         if self._ready is not None:
             self._ready.drain()  # all edges before the end of a read are needed to say which of them it belongs to
@@ -245,7 +245,7 @@ class PolledTransport:
         """Identify the device again: its settings are lost."""
         self._identify_again("reset by its line")
 
-    # --- what it looks like ------------------------------------------------------------------------------------------
+    # --- state -------------------------------------------------------------------------------------------------------
 
     @property
     def where(self) -> str:
@@ -304,4 +304,4 @@ class PolledTransport:
 
 
 def _ignore_message(_message: Message, _t_rx_ns: int) -> None:
-    """Ignore what no polled codec makes: it answers to transfers."""
+    """Ignore messages: polled codecs make none, their devices answer to transfers."""

@@ -1,4 +1,4 @@
-"""A link of bytes (UART, replay): finds out which device sends and at which rate, asks who it is, and streams."""
+"""Transport of bytes (UART, replay): finds the device and its rate, asks for its identity, and streams."""
 
 import asyncio
 import logging
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class DataReceiver(Protocol):
-    """What the bytes of a link go to."""
+    """Receiver of the bytes of a link."""
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process bytes as read, with CLOCK_MONOTONIC right after the read."""
@@ -34,7 +34,7 @@ class DataReceiver(Protocol):
 
 
 class StreamTransport:
-    """Brings the bytes of one device. Synchronization: the event loop's thread only."""
+    """Transport of the bytes of one device. Synchronization: the event loop's thread only."""
 
     def __init__(self, context: DeviceContext, link: StreamLink, remembered: Remembered) -> None:
         self.link = link
@@ -66,7 +66,7 @@ class StreamTransport:
         self._search.start()
 
     async def work(self) -> None:
-        """Find the device and ask it, as often as needed; ends only with the link."""
+        """Find the device and ask for its identity, as often as needed; ends only with the link."""
         await self._search.run()
 
     def stop(self) -> None:
@@ -127,7 +127,7 @@ class StreamTransport:
     # --- asking ------------------------------------------------------------------------------------------------------
 
     async def _ask(self) -> None:
-        """Ask for identity and settings, and make a device stream that sends nothing, where asking is allowed."""
+        """Ask for identity and settings, and start the streaming of a silent device, where asking is allowed."""
         driver = self.driver
         if self._may_ask and driver is not None:
             await self._context.identity.ask(self._exchange, driver.identify, driver.read_settings, self._apply)
@@ -150,7 +150,7 @@ class StreamTransport:
                 continue
             if not reported:
                 reported = True
-                message = "it answered and sent no samples: told to stream, which is not saved"
+                message = "it answered and sent no samples: commanded to stream, which is not saved"
                 self._context.notices.raise_event(
                     self._now_ns(), EventKind.CONFIGURATION, message, acknowledged=acknowledged
                 )
@@ -160,7 +160,7 @@ class StreamTransport:
             self.driver.apply_identity(self.path.codec, identity)
 
     def _change_rate(self, baud: int) -> None:
-        """A script has set the device to another rate: the port, its clock and the remembered rate follow."""
+        """Follow a script that has changed the device's rate: port, clock and remembered rate."""
         if baud == self.link.baud:
             return
         self.link.set_baud(baud)
@@ -182,7 +182,7 @@ class StreamTransport:
         """No-op: bytes come by themselves."""
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
-        """Report what is heard, and search anew where that can help."""
+        """Report the received bytes, and search anew where that can help."""
         health = self._health
         unheard = path.last_data_ns - max(path.last_sample_ns, path.begun_ns) > UNHEARD_NS
         if unheard:
@@ -198,7 +198,7 @@ class StreamTransport:
     def on_reset(self) -> None:
         """No-op: the device streams again by itself."""
 
-    # --- what it looks like ------------------------------------------------------------------------------------------
+    # --- state -------------------------------------------------------------------------------------------------------
 
     @property
     def where(self) -> str:
@@ -239,7 +239,7 @@ class StreamTransport:
 
 
 class _Discard:
-    """Receives bytes between two uses of the port, where none are expected; they are counted all the same."""
+    """Receiver of unexpected bytes between two uses of the port, which are counted all the same."""
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger

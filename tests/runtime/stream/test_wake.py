@@ -61,7 +61,7 @@ class WakeBench:
     @property
     def woken(self) -> list[str]:
         """What was told of waking it."""
-        return [event.message for event in self.events if "told to stream" in event.message]
+        return [event.message for event in self.events if "commanded to stream" in event.message]
 
     async def until(self, condition: Callable[[], object], limit_s: float = 30.0) -> None:
         """Let time pass until it holds."""
@@ -106,12 +106,12 @@ def test_device_saved_in_command_mode_is_made_to_stream(play: Play, link: dict[s
     async def story(bench: WakeBench) -> None:
         await bench.until(lambda: bench.woken and len(bench.samples) > 20)
         assert bench.device.state is DeviceState.RUNNING
-        assert bench.woken == ["it answered and sent no samples: told to stream, which is not saved"]
+        assert bench.woken == ["it answered and sent no samples: commanded to stream, which is not saved"]
         assert bench.device.status().identity["serial_number"] == "003200473133510D33383736"
 
     bench = play(story, hardware={"boot_ms": 0}, **link)
     assert bench.module.flash.mode is OutputMode.COMMAND
-    assert [e.kind for e in bench.events if "told to stream" in e.message] == [EventKind.CONFIGURATION]
+    assert [e.kind for e in bench.events if "commanded to stream" in e.message] == [EventKind.CONFIGURATION]
 
 
 def test_nothing_is_sent_where_it_may_not_be_asked(play: Play) -> None:
@@ -137,7 +137,7 @@ def test_device_that_comes_later_is_woken_and_told_of_once(play: Play) -> None:
 
     async def story(bench: WakeBench) -> None:
         await bench.until(lambda: bench.woken and len(bench.samples) > 500, 60)
-        assert bench.woken == ["it answered and sent no samples: told to stream, which is not saved"]
+        assert bench.woken == ["it answered and sent no samples: commanded to stream, which is not saved"]
         assert [e.detail["acknowledged"] for e in bench.events if "acknowledged" in e.detail] == [False]
 
     play(story, hardware={"boot_ms": 20_000, "acknowledges": False})
