@@ -1,4 +1,4 @@
-"""Time: device ticks to host time, with an honest error. Pure: no I/O, every time is an argument."""
+"""Conversion of device ticks to host time, with an error estimate. Pure: no I/O, every time is an argument."""
 
 from imud.clock.sampler import SampleClock
 

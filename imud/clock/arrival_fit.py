@@ -31,21 +31,21 @@ SLOPE_LOWEST: Final = 1 / 1.07
 SLOPE_HIGHEST: Final = 1 / 0.93
 """Host ns per device ns. Parts 4.08 % off nominal have been sold; past 7 % it is another tick, not a crystal."""
 SUPPORT_AT: Final = 0.75
-"""Where in the window the hull edge is taken."""
+"""Position of the chosen hull edge, as a share of the window."""
 SPREAD_BINS: Final = 12
 """A fit under n bins is off by their mean distance times this over n, one sigma (by simulation, loaded host)."""
 RECENT_BINS: Final = 8
 RECENT_NS: Final = 2 * NS_PER_S
-"""A delay that so many of the newest bins share, arriving over at least this time, is no delay of single messages."""
+"""Number of the newest bins, over at least this time, whose common delay is no delay of single messages."""
 LATENCIES_NS: Final = (200 * NS_PER_US, 600 * NS_PER_US, 2000 * NS_PER_US, 6000 * NS_PER_US)
-"""What polling and wake-up may add to the longest wait, tried in turn until some line fits."""
+"""Allowances for polling and wake-up on top of the longest wait, tried in turn until some line fits."""
 
 Point = tuple[float, float]
 """(device ns, ns)."""
 
 
 class _Bin:
-    """The lowest point of a stretch of device time, and how long its messages waited, least and on average."""
+    """The lowest point in an interval of device time, with the least and the mean wait of its messages."""
 
     __slots__ = ("arrival_ns", "begin_ns", "count", "device_ns", "lowest", "wait", "wait_least", "wait_most")
 
@@ -62,7 +62,7 @@ class _Bin:
         self.count = 1
 
     def longest_wait(self) -> float:
-        """How long the timer held a message at most, without the stalls of the host.
+        """Longest time that the timer held a message, without the stalls of the host.
 
         Waits that sweep the timer's period, or repeat in even steps, lie as far above their mean as the least lies
         below it; a stall adds little to a mean.
@@ -70,7 +70,7 @@ class _Bin:
         return min(2 * self.wait / self.count - self.wait_least, self.wait_most)
 
     def merged(self, after: "_Bin") -> "_Bin":
-        """This bin and its neighbour as one."""
+        """Merge this bin with its neighbour."""
         low = self if self.lowest <= after.lowest else after
         merged = _Bin(low.device_ns, low.arrival_ns, low.lowest, self.wait + after.wait)
         merged.begin_ns = self.begin_ns
@@ -113,7 +113,7 @@ class ArrivalFit:
         self.hidden_ns = float(hold_ns)
         """Width of what a latency timer leaves open at the newest end (`feasible_lines`)."""
         self.shift_ns = hold_ns / 2
-        """How far under the fit the middle of that is."""
+        """Distance from the fit down to the middle of the feasible lines, ns."""
         self._wait_most = float(hold_ns + LATENCIES_NS[0])
         self._pause_ns = float(hold_ns)
         self._pause_count = 1

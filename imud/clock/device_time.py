@@ -15,12 +15,12 @@ from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 # --- period and missing samples -------------------------------------------------------------------------------------
 CONSISTENT: Final = 4
-"""So many equal steps in a row are a rate."""
+"""Number of equal steps in a row that make a rate."""
 CONSISTENT_LONGER: Final = 12
 """The same for a longer step than before: where one of ten messages is lost, every second minute at 1 kHz leaves the
 same hole four times in a row, and a period of two ticks for one would shift device time by a tick."""
 WHOLE_AFTER: Final = 64
-"""After so many equal steps the period is whole: what differed in the beginning was a loss."""
+"""Number of equal steps after which the period is a whole number of ticks: a different step before was a loss."""
 EVERY_TICK: Final = 1.5
 """With a shorter period two samples can be in one tick; with a longer one it is the same sample."""
 MEMORY: Final = 4096
@@ -33,14 +33,14 @@ SETTLED_CHANGES: Final = 64
 """After so many steps that differ from the one before, the phase of an uneven rate within its ticks is known to a small
 part of one. At 400 Hz in ms that is 64 samples; a rate 50 ppm off 100 Hz takes ten minutes."""
 EVEN_FOR: Final = 64
-"""After so many even samples one uneven step is the counter's, not the device's: its samples stay even."""
+"""Number of even samples after which one uneven step is the counter's, not the device's: its samples stay even."""
 FOLLOWED_NS: Final = 15 * NS_PER_US
 """A sample that is outside its tick by no more shows the error of the learned period, which is followed."""
 UNEVEN_NS: Final = 200 * NS_PER_US
 """A step that is off by less than this or a tick is no correction of the counter."""
 UNEVEN_SHARE: Final = 0.25
 WATCHED: Final = 256
-"""For so many samples after an uneven step or a gap, device time is compared with the arrivals."""
+"""Number of samples after an uneven step or a gap whose device time is compared with the arrivals."""
 
 # --- corrections ----------------------------------------------------------------------------------------------------
 CORRECTION_MOST_NS: Final = 250 * NS_PER_MS
@@ -49,7 +49,7 @@ CORRECTION_SPAN_NS: Final = 5 * NS_PER_S
 """A fit over less time swings by more than a correction."""
 CORRECTION_SIGMAS: Final = 4
 CORRECTION_TICKS: Final = 0.5
-"""A message so far below the fit came before its sample, if that was taken when the stamp says."""
+"""Distance below the fit at which a message came before its sample, if that was taken at its stamp."""
 
 # --- jumps ----------------------------------------------------------------------------------------------------------
 JUMP_EARLY_NS: Final = 5 * NS_PER_MS
@@ -59,21 +59,21 @@ FIRST_EARLY_NS: Final = NS_PER_S
 """The same before the fit is used: the first message may have waited that long in a buffer."""
 JUMP_LATE_NS: Final = NS_PER_S // 2
 JUMP_LATE_READS: Final = 3
-"""Messages may queue up while the host is busy; late in so many reads over a second, it is the device's clock."""
+"""Number of late reads over a second that show a jump of the device's clock: fewer may be a busy host's queue."""
 
 # --- counters of samples --------------------------------------------------------------------------------------------
 STEPS_ALWAYS: Final = 4
-"""So many steps are accepted at any arrival: messages that waited arrive together."""
+"""Number of steps that are accepted at any arrival: messages that waited arrive together."""
 STEPS_FACTOR: Final = 1.5
 """Error of the rate over a longer gap, at most; a larger jump is a counter that began anew."""
 QUEUED_NS: Final = NS_PER_S // 2
-"""How long messages may wait and then arrive together; no device starts anew within that time."""
+"""Longest wait of messages that then arrive together; no device restarts within that time."""
 STEPS_UNKNOWN: Final = 1000
-"""So many steps are accepted while the rate is not known."""
+"""Number of steps that are accepted while the rate is not known."""
 
 
 class PeriodLearner:
-    """Learn the step between samples, in device ticks, and count the samples missing in a longer one.
+    """Estimate of the step between samples in device ticks; counts the samples missing in a longer one.
 
     The period is measured, not taken from the nominal rate.
     """
@@ -175,7 +175,7 @@ class DeviceTime:
         self._ticks = 0
         self._phase_ns = 0.0
         self._shift_ns = 0.0
-        """What corrections took from the counter and `even_ns` still has."""
+        """Part of the corrections of the counter that is still in `even_ns`."""
         self._even_for = 0
         self._step_ns = 0
         """The newest step of the counter; negative where that is shorter than half a turn forward."""
@@ -191,7 +191,7 @@ class DeviceTime:
         self.raw_ns = 0
         """Unwrapped device time as stamped."""
         self.even_ns = 0
-        """As `raw_ns`, plus the part of a tick that an uneven rate reveals; never falls while the clock runs on."""
+        """`raw_ns` plus the part of a tick that an even rate reveals; never falls while the clock runs on."""
         self.missed = 0
         """Samples missing between the last two."""
 
@@ -326,7 +326,7 @@ class DeviceTime:
 
 
 class JumpDetector:
-    """Detect that the device's clock jumped: early messages show it at once, late ones when they stay late."""
+    """Detector of jumps of the device's clock: early messages show them at once, late ones when they stay late."""
 
     __slots__ = ("_since_ns", "late_reads")
 

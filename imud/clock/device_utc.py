@@ -1,4 +1,4 @@
-"""Devices on UTC or beside a pulse per second: each sample lies within a millisecond of known time.
+"""Devices on UTC or with a pulse per second: each sample lies within a millisecond of known time.
 
 `DeviceUtc`: with PPS and RMC the ms counter of a HiPNUC module turns into "UTC in ms" (manual 1.2.1); of 32 bits, so
 either Unix time modulo 2³² or the time of day, no source says which. A counter that agrees with the host's UTC within
@@ -31,9 +31,9 @@ Hz), a tick together, and twice the stated error covers that."""
 CHECK_EVERY_NS: Final = NS_PER_S // 8
 """A device that is not on UTC is checked so often."""
 REFERENCE_STEP: Final = 4
-"""A reference that moves by so many of its errors was set: intervals by the old one no longer hold."""
+"""Change of a reference, in its errors, above which it was set anew: earlier intervals no longer hold."""
 AGE_MOST_MS: Final = 2000
-"""One pulse may be missing; an older age belongs to an input without pulses."""
+"""Oldest valid age: one pulse may be missing; an older age belongs to an input without pulses."""
 STAMP_NS: Final = 50 * NS_PER_US
 """The host's stamp of a pulse may be late by so much."""
 STALE_NS: Final = 3 * NS_PER_S
@@ -41,7 +41,7 @@ PULSES_KEPT: Final = 8
 
 
 class DeviceUtc:
-    """Whether a device's counter is UTC, and where its samples lie by UTC."""
+    """Detection that a device's counter is UTC, and the time of its samples by UTC."""
 
     __slots__ = ("_agreed", "_checked_ns", "_differed", "_tick_ns", "_turn_ns", "active", "intervals", "reference")
 
@@ -52,7 +52,7 @@ class DeviceUtc:
         self._differed = 0
         self._checked_ns = 0
         self.reference: UtcReference | None = None
-        """What the host knows of UTC; None while it knows nothing."""
+        """The host's estimate of UTC; None while it has none."""
         self.active = False
         """Whether the device is on UTC."""
         self.intervals = IntervalFit(tick_ns)  # device time itself is no finer than that
@@ -63,7 +63,7 @@ class DeviceUtc:
         return TICK_ERROR * self._tick_ns
 
     def set_reference(self, reference: UtcReference | None) -> None:
-        """Set what the host knows of UTC now."""
+        """Set the host's present estimate of UTC."""
         before = self.reference
         if before and reference:
             step_ns = abs(reference.offset_ns - before.offset_ns)
@@ -74,7 +74,7 @@ class DeviceUtc:
             self.reset()
 
     def reset(self) -> None:
-        """Forget that the device was on UTC: it is not any more, or that cannot be known."""
+        """Forget that the device was on UTC."""
         self.active = False
         self._agreed = self._differed = 0
         self._checked_ns = 0
@@ -133,7 +133,7 @@ class DeviceUtc:
 
 
 class PpsAge:
-    """Intervals for the time of samples, from pulses per second and the samples' ages of the newest one."""
+    """Intervals for the time of samples, from pulses per second and from the samples' age since the newest pulse."""
 
     __slots__ = ("_pulses_ns", "_trusted", "intervals")
 

@@ -1,4 +1,4 @@
-"""Edges paired with the samples they belong to, whichever of both gets lost.
+"""Pairing of edges with samples, robust against the loss of either.
 
 An event is a pulse on SOUT or a trigger on SIN; its stamp is the kernel's, its number that of its rising edge or of the
 trigger. Counting alone goes wrong with the first loss. Device time says how many periods lie between two samples, so
@@ -24,20 +24,20 @@ from imud.units import NS_PER_US
 REACH: Final = 0.45
 """Share of a period; an event further off than this belongs to another sample."""
 SURE: Final = 1.4
-"""The fit may choose the events of the first samples when so many of its errors are within reach."""
+"""The fit may choose the events of the first samples when this multiple of its error is within reach."""
 WINDOW_NS: Final = 30 * NS_PER_US
 WINDOW_SPREADS: Final = 8
 FIRST: Final = 8
 AGREE: Final = 6
-"""Of the first so many samples, so many must agree."""
+"""AGREE of the FIRST samples must agree."""
 AGREE_NS: Final = 150 * NS_PER_US
 AGREE_SHARE: Final = 0.1
-"""They agree within this much, or this share of a period."""
+"""Tolerance of agreement in ns, or as a share of a period."""
 MISSES_MOST: Final = 8
-"""After so many samples in a row without an event the line is dropped."""
+"""Number of samples in a row without an event after which the line is dropped."""
 WRONG: Final = 0.75
 WRONG_MOST: Final = 64
-"""The line is wrong when for so many samples in a row the fit is off by this share of a period."""
+"""The line is wrong when the fit is off by this share of a period for that many samples in a row."""
 SLOPE_OFF_MOST: Final = 0.12
 """A line whose slope differs from the fit's by more went through the events of other samples: past two crystals."""
 LEARNED: Final = 16
@@ -61,7 +61,7 @@ EdgeStamp = tuple[int, int]
 
 
 class PulseDecoder:
-    """Decode the edges of a line into pulses of known width: a falling edge stands in for a lost rising one."""
+    """Decoder of edges into pulses of known width: a falling edge stands in for a lost rising one."""
 
     __slots__ = ("_risen", "_width_ns")
 
@@ -87,7 +87,7 @@ def rising_edges(edges: Sequence[Edge]) -> list[EdgeStamp]:
 
 
 class EdgeTracker:
-    """A line from device time to host time through the stamps of even events: when the next one is due.
+    """A line from device time to host time through the stamps of periodic events; it predicts the next event.
 
     Unlike arrivals, stamps of edges are late by microseconds, so their mean is followed and not their lower envelope:
     at first a fit of equal weights, later one that forgets (alpha-beta filter), 32 events long. A crystal that drifts
@@ -108,11 +108,11 @@ class EdgeTracker:
         """Mean distance of stamps from where they were due."""
 
     def above(self, device_ns: int, edge_ns: int) -> float:
-        """How much later than due at `device_ns` the event at `edge_ns` is, ns."""
+        """Delay of the event at `edge_ns` behind the line at `device_ns`, ns."""
         return edge_ns - self._edge_ns - self._offset - self.slope * (device_ns - self._device_ns)
 
     def due_ns(self, device_ns: int) -> int:
-        """When the event at `device_ns` is due."""
+        """Predict the time of the event at `device_ns`."""
         return self._edge_ns + int(self._offset + self.slope * (device_ns - self._device_ns))
 
     def add_edge(self, device_ns: int, edge_ns: int, above: float) -> None:
@@ -133,7 +133,7 @@ class EdgeTracker:
 
 
 class EdgePairing:
-    """The events of one source, and which sample each belongs to.
+    """Pairing of the events of one source with samples.
 
     `lead_ns` is the time from the event to the first byte of the message.
     """
@@ -151,13 +151,13 @@ class EdgePairing:
         self._pairs = 0
         self._wrong = 0
         self.delay_ns = float(lead_ns)
-        """How much later than the events the fit of arrivals is."""
+        """Delay of the fit of arrivals behind the events, ns."""
         self.delay_error_ns = 0.0
         """One-sigma error of the fit when it was compared last."""
         self.learned = False
         """Whether `delay_ns` comes from pairs."""
         self.due_ns = 0
-        """When the event of the newest sample was due; only while `running`."""
+        """Predicted time of the newest sample's event; only while `running`."""
         self.spread_ns = float(FIRST_SPREAD_NS)
         """Mean distance of events from where they were due."""
         self.stamp_ns = 0
@@ -189,7 +189,7 @@ class EdgePairing:
         self._drop_line()
 
     def _drop_line(self) -> None:
-        """Drop the line; how far the fit is behind the events still holds if it was learned."""
+        """Drop the line; a learned delay of the fit behind the events still holds."""
         self._tracker = None
         self._first.clear()
         self.misses = self._wrong = 0
@@ -249,7 +249,7 @@ class EdgePairing:
             self.due_ns = self._tracker.due_ns(device_ns)
 
     def _nearest(self, tracker: EdgeTracker, device_ns: int, reach: float) -> bool:
-        """Find the event nearest to where it is due, drop those before it; follow it if it is in the window."""
+        """Find the event nearest to the predicted time, drop those before it; follow it if it is in the window."""
         queue = self._queue
         best, best_off = (0, 0), inf
         while queue:
@@ -309,7 +309,7 @@ class EdgePairing:
 
 
 class MarkPairing:
-    """Pulses on SOUT_DIV and the samples they belong to."""
+    """Pairing of pulses on SOUT_DIV with samples."""
 
     __slots__ = ("_found", "_waiting")
 

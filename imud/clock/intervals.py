@@ -1,4 +1,4 @@
-"""The time of samples by stamps of whole milliseconds: each is an interval, and all of the last half minute say more.
+"""The time of samples from stamps of whole milliseconds: an interval each, narrowed by those of the last half minute.
 
 All lines from device time to host time that pass through every interval are a feasible set (`feasible_lines`); its
 middle is the estimate and its width the error. A device whose samples drift through the milliseconds of the other clock
@@ -24,7 +24,7 @@ APART_SIGMAS: Final = 1.75
 
 
 class _Bin:
-    """The narrowest bounds of a stretch of device time, each with the device time it stands at."""
+    """The narrowest bounds in an interval of device time, each with its device time."""
 
     __slots__ = ("begin_ns", "high", "high_device_ns", "low", "low_device_ns")
 
@@ -42,7 +42,7 @@ class _Bin:
 
 
 class IntervalFit:
-    """Lowest and highest time that a sample can have, by the intervals of the last half minute.
+    """Lowest and highest possible time of a sample, by the intervals of the last half minute.
 
     The set is never taken for narrower than `narrowest_ns`.
     """

@@ -1,4 +1,4 @@
-"""The delay of a message as far as the link alone bounds it: the bias that no arrival shows, the spread of arrivals."""
+"""The delay of messages on a link: its constant part, which arrivals cannot show, and the spread of arrivals."""
 
 from typing import Final
 
@@ -9,14 +9,14 @@ WAKE_NS: Final = 100 * NS_PER_US
 FIFO_BYTES: Final = 4
 """A 16550 or PL011 receive FIFO reports a tail below its trigger level after up to four byte times."""
 USB_POLL_NS: Final = 125 * NS_PER_US
-"""One micro-frame: how long a full adapter waits for the host's poll."""
+"""One micro-frame: the wait of a full adapter for the host's poll."""
 FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
 """Spread assumed of arrivals before any is known."""
 SMOOTHING: Final = 1 / 32
 
 
 class LinkDelay:
-    """Bounds of the constant part of the delay, which no arrival shows: between 0 and the bias that the link can have.
+    """Bounds of the constant part of the delay, which arrivals cannot show: from 0 to the largest bias of the link.
 
     `byte_ns` is the time of a byte on the wire (0: unknown), `hold_ns` the period of an adapter's latency timer.
     """

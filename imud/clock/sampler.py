@@ -52,7 +52,7 @@ from imud.units import NS_PER_MS, NS_PER_S
 ENOUGH_POINTS: Final = 8
 ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
 ENOUGH_HOLDS: Final = 20
-"""A fit is used once it has so many points, and spans so much time or so many periods of a latency timer."""
+"""A fit is used from this number of points on, and this time or number of periods of a latency timer."""
 HOLDOVER_NS: Final = 16 * NS_PER_S
 """The same during holdover: a young fit swings, and holdover is 0.3 ms off by then at worst."""
 YOUNG_NS: Final = 32 * NS_PER_S
@@ -66,7 +66,7 @@ _ARRIVAL: Final = Sync.ARRIVAL
 
 
 class SampleClock:
-    """Makes samples of one device's measurements.
+    """Clock that makes samples of one device's measurements.
 
     `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
     known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
@@ -105,12 +105,12 @@ class SampleClock:
         self._fit_begin_ns = 0
         """Device time at which the fit began."""
         self._fit_bias_ns = 0.0
-        """How far under the fit the time of measurement is."""
+        """Distance from the fit down to the time of measurement, ns."""
         self._fit_error_ns = 0.0
         self._fit_sync = Sync.ARRIVAL
         """REGRESSION once the fit is used."""
         self._sync = Sync.ARRIVAL
-        """What the newest sample rests on, where there are aiding sources."""
+        """Origin of the newest time stamp, where there are aiding sources."""
         self._known = False
         """Whether device time has begun."""
         self._seq = 0
@@ -207,13 +207,13 @@ class SampleClock:
         self._aided().on_pps_edges(edges)
 
     def set_utc_reference(self, reference: UtcReference | None) -> None:
-        """Set what the host knows of UTC; None while it knows nothing. A device on UTC is recognised by it."""
+        """Set the host's estimate of UTC, or None. A device on UTC is recognised by it."""
         if reference is not None or self._aiding is not None:
             self._aided().utc.set_reference(reference)
 
     @property
     def utc_reference(self) -> UtcReference | None:
-        """What the host knows of UTC; None while it knows nothing."""
+        """The host's estimate of UTC; None while it has none."""
         return self._aiding.utc.reference if self._aiding else None
 
     def set_own_status(self, bits: int | None) -> None:
@@ -376,7 +376,7 @@ class SampleClock:
         return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
 
     def _reset(self, ticks: int, arrival_ns: int) -> None:
-        """Begin anew: the device's clock did."""
+        """Begin anew after a jump of the device's clock."""
         self._resets += 1
         self.missed = 0
         self._time.begin(ticks)

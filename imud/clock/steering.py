@@ -1,4 +1,4 @@
-"""Steering: what aiding sources (edges, a pulse per second, UTC) change in the fit of arrivals, without a step.
+"""Steering: corrections of the fit of arrivals by aiding sources (edges, a pulse per second, UTC), without a step.
 
 Ranked by what the stamp rests on; `sync` names the best of them:
 
@@ -30,13 +30,13 @@ SLEW_SETTLING: Final = 0.2
 """The same while the fit is young."""
 SETTLED_AFTER_NS: Final = 10 * NS_PER_S
 HOLDOVER_RATE: Final = 50e-6
-"""How far CLOCK_MONOTONIC is from the rate of UTC at most: a crystal's tolerance, where nothing steers it."""
+"""Largest rate error of CLOCK_MONOTONIC against UTC: a crystal's tolerance, where nothing steers it."""
 TICK_SHARE: Final = 0.5
-"""Where in its ticks the device measures is not known."""
+"""Error of a tick's start: the instant of measurement within it is not known."""
 UNPAIRED_MOST: Final = 2
-"""So many samples in a row may lack their edge before the fit of arrivals takes over."""
+"""Number of samples in a row that may lack their edge before the fit of arrivals takes over."""
 STAMP_SPREADS: Final = 2.0
-"""One sigma of a stamp, in mean distances of stamps from their line: they are late, by an exponential law."""
+"""Standard deviation of a stamp, in mean distances of stamps from their line: delays are exponentially distributed."""
 STAMP_FLOOR_NS: Final = 3 * NS_PER_US
 """From the edge to the kernel's stamp at best; the mean of all stamps does not show it."""
 
@@ -104,7 +104,7 @@ class Holdover:
 
 @dataclass(slots=True, eq=False)
 class EdgeSource:
-    """A source whose events show when samples were taken: SOUT or SIN."""
+    """An aiding source with an edge per sample: SOUT or SIN."""
 
     pairing: EdgePairing
     offset_ns: int
@@ -128,7 +128,7 @@ class EdgeSource:
         self.pairing.add_events((event,))
 
     def silent(self, status: int | None) -> bool:
-        """Whether the device's status says that this sample has no event."""
+        """Whether the device's status bits deny that this sample has an event."""
         if status is None:
             return False
         if status & self.mask:
@@ -138,7 +138,7 @@ class EdgeSource:
 
 
 class AidingSources:
-    """The sources of a sample's time other than its arrival; each counts from its first edge on.
+    """All aiding sources of a device's time; each is used from its first edge on.
 
     Edges are added before the messages that follow them, in the order of time. Synchronization: none; one thread.
     """
@@ -159,7 +159,7 @@ class AidingSources:
         """In the order of their first edges: the first one counts where several have an event."""
         self._source: EdgeSource | None = None
         self._fix_ns = 0.0
-        """What is added to the fit of arrivals."""
+        """Correction that is added to the fit of arrivals, ns."""
         self._device_ns: int | None = None
         self._pps: PpsAge | None = None
         self.sout: EdgeSource | None = None
@@ -172,7 +172,7 @@ class AidingSources:
         self.error_ns = 0.0
         """One-sigma error of the newest time."""
         self.sync = Sync.ARRIVAL
-        """What the newest time rests on."""
+        """Origin of the newest time stamp."""
         self.edge_seq: int | None = None
         """Number of the event of the newest sample; None where it has none."""
 

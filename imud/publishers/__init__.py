@@ -1,4 +1,4 @@
-"""Outputs: each gives samples to readers and never makes the pipeline wait."""
+"""Publishers: outputs of samples and events that never make the pipeline wait."""
 
 from imud.contracts.publisher import PublisherType
 from imud.contracts.table import Table

@@ -1,1 +1,1 @@
-"""GPIO lines and what they mean: SOUT, SIN, PPS, ALARM, reset, data ready."""
+"""Signals of devices on GPIO lines: SOUT, SIN, PPS, ALARM, reset, data ready."""

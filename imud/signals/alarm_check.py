@@ -1,4 +1,4 @@
-"""Compares the level of the ALARM line with the angles of the samples, and so finds wiring faults.
+"""Check of the ALARM line against the angles of the samples, which finds wiring faults.
 
 The line should be active while an angle is outside the range that the device is set to. The driver reads the ranges
 from the device's settings (`Driver.alarm_ranges`); without them nothing is checked. If the line contradicts the angles,
@@ -32,7 +32,7 @@ class AlarmVerdict(StrEnum):
     STUCK_LOW = "stuck_low"
     """An angle is out of its range, and the line is low: not connected, another pin, or pulled down."""
     STUCK_HIGH = "stuck_high"
-    """No angle is out of its range, and the line is high: inverted, another pin, or pulled up."""
+    """The line is high though no angle is out of its range: inverted, another pin, or pulled up."""
     OTHER_AXIS = "other_axis"
     """The line changes, and always agrees with roll and pitch exchanged. Needs the history that `AlarmCheck` has."""
 
@@ -50,7 +50,7 @@ def judge(ranges: Mapping[str, AlarmRange], euler_rad: Vector3 | None, level: bo
 
 
 class AlarmCheck:
-    """Verdict over time: the line may lag behind the angle, so only what lasts counts. Synchronization: one thread."""
+    """Verdict over time: the line may lag behind the angle, so only lasting contradictions count. One thread."""
 
     def __init__(self, ranges: Mapping[str, AlarmRange]) -> None:
         """`ranges` by name of the axis."""

@@ -1,4 +1,4 @@
-"""The ALARM line of a device: its level, its events at a bounded rate, and whether it can be wired correctly."""
+"""The ALARM line of a device: level, events at a bounded rate, and a check of its wiring."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -31,7 +31,7 @@ _PROBLEMS: Final = {
 
 
 class AlarmLine:
-    """Follows the level of the line, and raises its events. Synchronization: one thread."""
+    """Level of the line, with its events. Synchronization: one thread."""
 
     def __init__(self, raise_event: RaiseEvent) -> None:
         self.active: bool | None = None

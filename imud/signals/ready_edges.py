@@ -1,4 +1,4 @@
-"""Matches reads to data-ready edges: a read belongs to the newest edge before it began, unless it is too late for it.
+"""Matching of reads with data-ready edges: a read belongs to the newest edge before it, unless it is too late for it.
 
     edge 7        edge 8                 edge 9          edge 10
       │             │  ┌─read─┐            │               │ ┌─read─┐
@@ -28,7 +28,7 @@ EITHER: Final = 1 / sqrt(2)
 
 
 class Stamp(NamedTuple):
-    """Instant of measurement of what a read returned."""
+    """Instant of measurement of the values that were read."""
 
     t_ns: int
     """CLOCK_MONOTONIC; not after the begin of the read."""

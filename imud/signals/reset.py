@@ -1,4 +1,4 @@
-"""The reset line of a device: pulsed on request, and when a search for the device has failed for long.
+"""The reset line of a device: pulsed on request, and after a long unsuccessful search for the device.
 
 A pulse is the last resort: a device that restarts by itself is absent for `wait_s` as well, and one that was unplugged
 is not helped. It needs ROUNDS failed rounds of search and more than `wait_s`, and comes once a minute at most.
@@ -42,7 +42,7 @@ async def reset(line: OutputLine, settings: ResetSettings, sleep: Sleep = asynci
 
 
 class ResetLine:
-    """Owns the line, and keeps it open and inactive. Synchronization: the loop's thread only."""
+    """Reset line, kept open and inactive. Synchronization: the loop's thread only."""
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ frame."""
 
 
 class SyncSignals:
-    """Owns the lines of one device, except reset and data ready. Synchronization: the loop's thread only."""
+    """Lines of one device, except reset and data ready. Synchronization: the loop's thread only."""
 
     def __init__(
         self,

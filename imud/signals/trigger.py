@@ -57,7 +57,7 @@ class TriggerCounts:
 
 
 class SquareWave:
-    """Generates pulses on a line. Synchronization: one thread calls `work`; any thread may call `once`."""
+    """Generator of pulses on a line. Synchronization: one thread calls `work`; any thread may call `once`."""
 
     def __init__(
         self, line: OutputLine, rate_hz: float, counts: TriggerCounts, now_ns: Callable[[], int], pulse_ns: int
@@ -144,7 +144,7 @@ class SquareWave:
 
 
 class Trigger:
-    """Drives an open line from its own thread. Synchronization: the loop's thread only."""
+    """Driver of an open line with its own thread. Synchronization: the loop's thread only."""
 
     def __init__(
         self,
@@ -248,7 +248,7 @@ class Trigger:
 
 
 class SinTrigger:
-    """Keeps SIN driven: opens the line, runs its `Trigger`, and starts both again after a failure.
+    """SIN as a driven line: opens the line, runs its `Trigger`, and starts both again after a failure.
 
     Synchronization: the loop's thread only.
     """

@@ -12,7 +12,7 @@ RETRY_NS: Final = 5 * NS_PER_S
 
 
 class WatchedLine:
-    """Owns one input. Synchronization: the loop's thread only."""
+    """An input line that is kept open. Synchronization: the loop's thread only."""
 
     def __init__(
         self,

@@ -30,7 +30,7 @@ def encode(system_ns: int, offset_ns: int, *, pulse: bool, leap: int = 0) -> byt
 
 
 class ChronyFeed:
-    """Sends samples to chronyd. Never blocks. Synchronization: one thread."""
+    """Sender of samples to chronyd. Never blocks. Synchronization: one thread."""
 
     def __init__(self, path: str, utc_offset_ns: Callable[[int], int]) -> None:
         """`path` is chronyd's socket, which may not exist yet; `utc_offset_ns` as `SourceContext.utc_offset_ns`."""
@@ -65,7 +65,7 @@ class ChronyFeed:
             self._socket.sendto(sample, self._path)
         except OSError as error:
             self.refused += 1
-            self.problem = f"{self.title} takes no samples: {error.strerror or error}; is it running, with this socket?"
+            self.problem = f"{self.title} refuses samples: {error.strerror or error}; is it running, with this socket?"
             return False
         self.sent += 1
         self.problem = ""

@@ -38,7 +38,7 @@ MAD_TO_SIGMA: Final = 1.4826
 
 
 class PpsReference:
-    """Estimates UTC from pulses and sentences. Pure. Synchronization: one thread."""
+    """Estimator of UTC from pulses and sentences. Pure. Synchronization: one thread."""
 
     def __init__(self, on_second: Callable[[int, int], None] | None = None) -> None:
         """`on_second(t_ns, unix_s)` is called for each pulse whose second is known."""

@@ -1,4 +1,4 @@
-"""Feeds a device RMC sentences over its own serial port, so that its time becomes UTC (HiPNUC manual 1.2.1).
+"""Feed of RMC sentences to a device over its own serial port, so that its time becomes UTC (HiPNUC manual 1.2.1).
 
 A sentence names the second that a pulse began; the device assigns it to the last pulse it saw. It therefore has to be
 transmitted before the next pulse, or the device would be wrong by one second, and only if the receiver marks it valid.
@@ -29,16 +29,16 @@ DOUBT_MOST_NS: Final = NS_PER_S // 4
 
 
 class Refusal(StrEnum):
-    """Why a sentence was not sent."""
+    """Reasons for not sending a sentence."""
 
     DAMAGED = "damaged"
     """No RMC sentence, or a wrong checksum."""
     NOT_VALID = "not_valid"
     """Marked as not valid by the receiver (status V), or without time."""
     STALE = "stale"
-    """It would not be transmitted before the next second."""
+    """Transmission would not end before the next second."""
     AHEAD = "ahead"
-    """It names a time in the future, by the pulse line or the host's UTC reference."""
+    """The sentence names a time in the future, by the pulse line or the host's UTC reference."""
     TOO_MANY = "too_many"
     """Above the configured rate."""
     BUSY = "busy"
@@ -59,7 +59,7 @@ class RmcFeedStatus:
 
 
 class RmcFeed:
-    """Passes sentences on to the device's port. Synchronization: the loop's thread only."""
+    """Feed of sentences to the device's port. Synchronization: the loop's thread only."""
 
     def __init__(
         self,

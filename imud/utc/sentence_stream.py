@@ -15,7 +15,7 @@ LONGEST_PAUSE_S: Final = 30.0
 
 
 class SentenceSplitter:
-    """Finds RMC sentences among other sentences, JSON and noise. Buffers LINE_BYTES_MAX at most.
+    """Finder of RMC sentences among other sentences, JSON and noise. Buffers LINE_BYTES_MAX at most.
 
     Synchronization: one thread.
     """
@@ -117,4 +117,4 @@ def _rmc_in(line: bytes) -> bytes | None:
 
 
 def _ignore(_sentence: bytes, _t_rx_ns: int) -> None:
-    """Before `start` and after `close`."""
+    """Ignore the sentence: the receiver before `start` and after `close`."""

@@ -23,7 +23,7 @@ AFTER_NS: Final = 200 * NS_PER_MS
 """Delay of a sentence after the instant it names: more than the allowed error of the clock (60 ms, three sigma), so
 that it never precedes the pulse of its second."""
 LATEST_NS: Final = 800 * NS_PER_MS
-"""No sentence is sent later in a second, where it could be assigned to the next."""
+"""Latest time in a second to send a sentence; a later one could be assigned to the next."""
 LATE_NS: Final = 50 * NS_PER_MS
 """A sentence that is due longer than this is skipped: the next one is near."""
 

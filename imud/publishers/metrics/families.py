@@ -115,7 +115,7 @@ def _clients_by_encoding(snapshot: Snapshot) -> Lines:
     return (((encoding,), encodings[encoding]) for encoding in CLIENT_ENCODINGS)
 
 
-# --- the daemon and what its devices are ------------------------------------------------------------------------------
+# --- the daemon and its devices ---------------------------------------------------------------------------------------
 
 DAEMON_FAMILIES: Final = (
     _info(
@@ -216,7 +216,7 @@ DEVICE_FAMILIES: Final = (
     ),
 )  # fmt: skip
 
-# --- what only some devices have --------------------------------------------------------------------------------------
+# --- metrics of some devices ------------------------------------------------------------------------------------------
 
 POLLING_FAMILIES: Final = (
     _counter("imud_polls_total", "Deadlines at which the device was read.", POLLING.one(lambda p: p.polls)),

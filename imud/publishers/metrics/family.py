@@ -1,4 +1,4 @@
-"""What describes a metric: name, type, unit, help, labels, and how its values are read from the snapshot of a scrape.
+"""Descriptions of metrics: name, type, unit, help, labels, and how the values are read from the snapshot of a scrape.
 
 A `Reader` has the names of the labels and gives the values. Those of devices come from a `DevicePart`: it finds the
 record that the values are in, and leaves out devices that have none, because absent is not zero.
@@ -28,7 +28,7 @@ Lines = Iterable[tuple[tuple[str, ...], float]]
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What one scrape shows, all of one moment of the event loop."""
+    """Contents of one scrape, all of one moment of the event loop."""
 
     devices: Sequence[DeviceStatus] = ()
     clients: Sequence[ClientStatus] = ()
@@ -64,7 +64,7 @@ class MetricType(StrEnum):
     GAUGE = "gauge"
     COUNTER = "counter"
     INFO = "info"
-    """Always 1; what it says is in the labels."""
+    """Always 1; the information is in the labels."""
 
 
 _MAKE: Final[Mapping[MetricType, Callable[..., Any]]] = {
@@ -76,7 +76,7 @@ _MAKE: Final[Mapping[MetricType, Callable[..., Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Reader:
-    """Reads the values of one metric."""
+    """Reader of the values of one metric."""
 
     labels: tuple[str, ...]
     lines: Callable[[Snapshot], Lines]
@@ -87,7 +87,7 @@ class Family:
     """The description of one metric."""
 
     name: str
-    """As it stands in the text, `_total` and `_info` included."""
+    """Name in the text format, `_total` and `_info` included."""
     type: MetricType
     unit: Unit
     help: str

@@ -34,7 +34,7 @@ from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, Scr
 log = logging.getLogger(__name__)
 
 SNAPSHOT_S: Final = 2.0
-"""An event loop that does not answer within this is stuck; the scrape then says so."""
+"""Time-out for the event loop's answer; the scrape then reports that it is stuck."""
 PAUSE_S: Final = 100e-6
 """Long enough for the kernel to wake the loop's thread, which takes some ten microseconds."""
 
@@ -45,7 +45,7 @@ ABOUT: Final = b"imud: metrics for Prometheus are at /metrics\n"
 
 
 class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The Prometheus endpoint."""
+    """Settings of the Prometheus endpoint."""
 
     enabled: bool = True
     """Whether metrics are served at all."""
@@ -56,7 +56,7 @@ class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class ClientTotals:
-    """Adds up samples sent to and dropped for clients; a sum over the present ones would fall when one leaves."""
+    """Sums of samples sent to and dropped for clients; a sum over the present ones would fall when one leaves."""
 
     def __init__(self) -> None:
         self.sent = 0
@@ -73,7 +73,7 @@ class ClientTotals:
 
 
 class DaemonCollector(Collector):
-    """Turns a snapshot into metrics. Synchronization: the HTTP thread."""
+    """Collector that makes metrics of a snapshot. Synchronization: the HTTP thread."""
 
     def __init__(self, pause: Callable[[], None]) -> None:
         self._snapshot = Snapshot()
@@ -89,11 +89,11 @@ class DaemonCollector(Collector):
         )  # fmt: skip
 
     def describe(self) -> list[Metric]:
-        """No names are claimed ahead: they would be rendered once for nothing."""
+        """Describe nothing in advance: the registry would render everything once for it."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """All metrics of the snapshot, which pause while they are rendered."""
+        """Yield all metrics of the snapshot, with pauses while they are rendered."""
         for family in FAMILIES:
             metric = family.metric(self._snapshot)
             metric.samples = _PausingList(metric.samples, self._pause)
@@ -141,7 +141,7 @@ def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]
 
 
 class MetricsPublisher:
-    """Serves metrics. Synchronization: the event loop's thread; `_answer` runs in the HTTP thread."""
+    """Publisher of metrics. Synchronization: the event loop's thread; `_answer` runs in the HTTP thread."""
 
     def __init__(self, settings: MetricsSettings, context: PublisherContext, *, snapshot_s: float = SNAPSHOT_S) -> None:
         self._settings = settings
@@ -169,7 +169,7 @@ class MetricsPublisher:
         log.info("metrics at http://%s:%d/metrics", self._settings.address, self.port)
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Devices are found in the status at every scrape."""
+        """No-op: devices are found in the status at every scrape."""
 
     def remove_device(self, name: str) -> None:
         """Forget the device's events."""
@@ -177,7 +177,7 @@ class MetricsPublisher:
             del self._events[key]
 
     def publish(self, batch: Batch) -> None:
-        """Samples are counted by the pipeline already."""
+        """No-op: samples are counted by the pipeline."""
 
     def event(self, event: Event) -> None:
         """Count it."""
@@ -208,7 +208,7 @@ class MetricsPublisher:
         return self._renderer.render(snapshot, request.accept)
 
     async def _ask_loop(self) -> Snapshot:
-        """A snapshot made in the daemon's event loop. Raises TimeoutError when the loop is stuck or has ended."""
+        """Get a snapshot from the daemon's event loop. Raises TimeoutError when the loop is stuck or has ended."""
         answer: Future[Snapshot] = Future()
         if self._loop is None or self._loop.is_closed():
             raise TimeoutError

@@ -22,7 +22,7 @@ from imud.errors import ServerError
 CONNECTION_S: Final = 5.0
 """From connection to the end of the answer. Prometheus itself waits 10 s."""
 CONNECTIONS_MAX: Final = 32
-"""A handful of scrapers and people is what is meant."""
+"""Limit of connections: the server is for a handful of scrapers and people."""
 REQUEST_BYTES_MAX: Final = 8192
 """Prometheus sends about 400 bytes of request and headers."""
 
@@ -34,7 +34,7 @@ TEXT: Final = "text/plain; charset=utf-8"
 
 @dataclass(frozen=True, slots=True)
 class HttpRequest:
-    """What is looked at of a request."""
+    """The parts of an HTTP request that are used."""
 
     method: str
     path: str
@@ -45,7 +45,7 @@ class HttpRequest:
 
 @dataclass(frozen=True, slots=True)
 class HttpResponse:
-    """What goes back."""
+    """Answer to an HTTP request."""
 
     status: str
     """Code and reason, for example `200 OK`."""
@@ -54,7 +54,7 @@ class HttpResponse:
 
 
 class ScrapeServer:
-    """Serves `answer` over HTTP."""
+    """HTTP server of `answer`."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class ScrapeServer:
         await asyncio.gather(*connections, return_exceptions=True)
 
     def _accept(self, loop: asyncio.AbstractEventLoop, listener: socket.socket) -> None:
-        """Accept one client. `asyncio.start_server` may neither report nor close what it accepts at the end."""
+        """Accept one client: `asyncio.start_server` may neither report nor close a client accepted at the end."""
         try:
             client, _ = listener.accept()
         except (BlockingIOError, ConnectionError):

@@ -33,7 +33,7 @@ _LEVELS = {active: (ctypes.c_uint64 * 2)(active, 1) for active in (False, True)}
 
 
 class LineEventDecoder:
-    """Decodes the edge events of one line, numbers them over all requests of the line, and counts the lost ones.
+    """Decoder of the edge events of one line; numbers them over all requests of the line, and counts lost ones.
 
     Synchronization: one thread.
     """
