@@ -1,4 +1,4 @@
-"""Simulated devices with known truth: `imud demo` and the tests run the same ones."""
+"""Simulated devices with known truth, for `imud demo` and the tests."""
 
 from imud.contracts.table import Table
 from imud.sim.can_module import CanSimulator

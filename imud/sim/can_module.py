@@ -1,4 +1,4 @@
-"""Simulated devices on a CAN bus: their contract, their way to the wire, and what several of them have in common.
+"""Simulated devices on a CAN bus: their contract, their wire, and their common parts.
 
 CanModule           the contract: frames of others in, frames that crossed the wire out
 FrameWire           one frame after the other at the bit rate of the bus
@@ -42,7 +42,7 @@ class CanModule(Protocol):
     """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Take a frame that another device sent."""
+        """Receive a frame of another device."""
         ...
 
     def advance(self, now_ns: int) -> list[SentFrame]:
@@ -50,28 +50,28 @@ class CanModule(Protocol):
         ...
 
     def next_ns(self) -> int | None:
-        """When `advance` will have something next, or None while nothing is to come."""
+        """Time of the next output of `advance`; None for none."""
         ...
 
     def counters(self) -> dict[str, int]:
-        """What it counts of itself, by name."""
+        """Return the module's own counters, by name."""
         ...
 
     def mark(self, now_ns: int) -> None:
-        """A rising edge on its sync input; ignored by a device without one."""
+        """Pulse its sync input (a rising edge); ignored by a device without one."""
         ...
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power: what was not saved is gone."""
+        """Restart after a loss of power: unsaved settings are lost."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class CanSimulator:
-    """The row a simulated CAN device's file ends with."""
+    """Row of a simulated CAN device."""
 
     name: str
-    """Name of the driver it stands in for."""
+    """Name of the driver of the device."""
     title: str
     """The product, for people."""
     make: Callable[[SimulatorOptions, int], CanModule]
@@ -79,7 +79,7 @@ class CanSimulator:
 
 
 class FrameWire:
-    """One frame after the other at the rate of the bus; frames of one device never overlap."""
+    """The wire of a CAN bus: one frame after the other at the bit rate; frames of one device never overlap."""
 
     def __init__(self, bitrate: int, free_ns: int) -> None:
         """`bitrate` 0: frames take no time, so that those of one instant leave together. `free_ns`: nothing before."""
@@ -96,14 +96,14 @@ class FrameWire:
         self._waiting.append(SentFrame(self._free_ns, can_id, extended, data, sample_ns))
 
     def sent(self, now_ns: int) -> list[SentFrame]:
-        """Take out what has crossed the wire by now."""
+        """Return and remove the frames that have crossed the wire by now."""
         done: list[SentFrame] = []
         while self._waiting and self._waiting[0].due_ns <= now_ns:
             done.append(self._waiting.popleft())
         return done
 
     def next_ns(self) -> int | None:
-        """When the next frame is through, None if none waits."""
+        """Time at which the next frame is through; None if none waits."""
         return self._waiting[0].due_ns if self._waiting else None
 
 
@@ -156,7 +156,7 @@ class PeriodicCanModule:
         return self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """When `advance` will have something next."""
+        """Time of the next output of `advance`; None for none."""
         waiting = self._wire.next_ns()
         if waiting is not None:
             return waiting
@@ -188,12 +188,12 @@ class CanModules:
         self.epoch_ns = modules[0].epoch_ns
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
-        """Every module hears it."""
+        """Pass a frame to every module."""
         for module in self.modules:
             module.receive(can_id, extended, data, now_ns)
 
     def advance(self, now_ns: int) -> list[SentFrame]:
-        """What has crossed the wire since the last call; frames of the same moment in the order of the modules."""
+        """Return the frames through since the last call; those of the same moment in the order of the modules."""
         sent = [module.advance(now_ns) for module in self.modules]
         for sender, frames in zip(self.modules, sent, strict=True):
             for frame in frames:
@@ -201,11 +201,11 @@ class CanModules:
         return list(merge(*sent, key=lambda frame: frame.due_ns))
 
     def next_ns(self) -> int | None:
-        """When the first of them will have something next."""
+        """Earliest time of output of all modules."""
         return min((due_ns for module in self.modules if (due_ns := module.next_ns()) is not None), default=None)
 
     def counters(self) -> dict[str, int]:
-        """The sums of what they count."""
+        """Sums of the modules' counters."""
         total: dict[str, int] = {}
         for module in self.modules:
             for name, value in module.counters().items():
@@ -213,12 +213,12 @@ class CanModules:
         return total
 
     def mark(self, now_ns: int) -> None:
-        """The sync inputs of all are wired together."""
+        """Pulse the sync inputs, which are wired together."""
         for module in self.modules:
             module.mark(now_ns)
 
     def reboot(self, now_ns: int) -> None:
-        """All of them lose power."""
+        """Power all modules off."""
         for module in self.modules:
             module.reboot(now_ns)
 

@@ -20,7 +20,7 @@ class BadCommand(ValueError):
 
 
 class StandardInputControl:
-    """Runs a simulated port: waits for the time, for bytes and for commands on stdin."""
+    """Main loop of a simulated port: waits for deadlines, bytes and commands on stdin."""
 
     def __init__(
         self,

@@ -10,12 +10,12 @@ from imud.sim.simulator import SimulatorOptions
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorHardware:
-    """What every simulated device has, whatever it is connected by."""
+    """Hardware of every simulated sensor, whatever its link."""
 
     motion: Motion = field(default_factory=swing)
     noise: Noise | None = None
     skew_ppm: float = 20.0
-    """How much faster its crystal runs than the host's."""
+    """Rate error of the crystal against the host's clock, 1e-6."""
     boot_ms: int = 500
     """Silence after power-on and reboot."""
     processing_ns: int = 125_000

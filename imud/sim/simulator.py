@@ -1,6 +1,6 @@
 """Contract of simulated devices: their options, and the module at the far end of a byte stream.
 
-Modules do no I/O and read no clock: their owner says what time it is.
+Modules do no I/O and read no clock: their owner passes the time.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from imud.sim.physics.motion import GRAVITY_M_S2
 
 
 class Burst(NamedTuple):
-    """Bytes that left the device in one piece."""
+    """Bytes that leave the device in one piece."""
 
     due_ns: int
     """CLOCK_MONOTONIC at which the last byte has crossed the wire."""
@@ -34,7 +34,7 @@ class StreamModule(Protocol):
     """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Take bytes that the host sent, already as the device hears them."""
+        """Receive bytes that the host sent, already sampled at the device's rate."""
         ...
 
     def advance(self, now_ns: int) -> list[Burst]:
@@ -42,25 +42,25 @@ class StreamModule(Protocol):
         ...
 
     def next_ns(self) -> int | None:
-        """When `advance` will have something next, or None while nothing is to come."""
+        """Time of the next output of `advance`; None for none."""
         ...
 
     def counters(self) -> dict[str, int]:
-        """What it counts of itself, by name."""
+        """Return the module's own counters, by name."""
         ...
 
     def mark(self, now_ns: int) -> None:
-        """A rising edge on its sync input; ignored by a device without one."""
+        """Pulse its sync input (a rising edge); ignored by a device without one."""
         ...
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power or by a command: what was not saved is gone."""
+        """Restart after a loss of power or by a command: unsaved settings are lost."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatorOptions:
-    """Options that all simulated devices have in common."""
+    """Options of every simulated device."""
 
     rate_hz: float = 100.0
     """Samples per second of the device's own time."""
@@ -73,7 +73,7 @@ class SimulatorOptions:
     gravity_m_s2: float = GRAVITY_M_S2
     noise: Literal["real", "none"] = "real"
     skew_ppm: float = 20.0
-    """How much faster the device's crystal runs than the host's."""
+    """Rate error of the device's crystal against the host's clock, 1e-6."""
     firmware: int = 0
     """Firmware version as the device states it, 0 for a common one."""
     boot_ms: int = 500
@@ -94,10 +94,10 @@ class SimulatorOptions:
 
 @dataclass(frozen=True, slots=True)
 class Simulator:
-    """The row a simulated device's file ends with."""
+    """Row of a simulated device."""
 
     name: str
-    """Name of the driver it stands in for."""
+    """Name of the driver of the device."""
     title: str
     """The product, for people."""
     make: Callable[[SimulatorOptions, int], StreamModule]

@@ -1,4 +1,4 @@
-"""A HiPNUC module on a CAN bus with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; CiA 301 for what it leaves open.
+"""A HiPNUC module on a CAN bus with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; for the rest CiA 301.
 
 Without I/O and without a clock of its own. Its timers count milliseconds of its own crystal, which runs `skew_ppm`
 fast; what is due at one instant is measured then and sent back to back `processing_ns` later, TPDO1 first. After
@@ -70,7 +70,7 @@ _COMMANDS: Final = {size: command for command, size in reversed(READ_SIZES.items
 
 
 class Control(Enum):
-    """What a write asks of the module in addition to a new setting."""
+    """Side effects that a write has on the module in addition to a new setting."""
 
     NONE = auto()
     ZERO = auto()
@@ -80,7 +80,7 @@ class Control(Enum):
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """What can be saved."""
+    """Settings that can be saved."""
 
     node: int = NODE_DEFAULT
     bit_rate: int = 500_000
@@ -101,7 +101,7 @@ class _Entry(NamedTuple):
     size: int
     read: Callable[[NodeSettings], int] | None
     values: Container[int] = ()
-    """What may be written; empty for read-only."""
+    """Accepted values; empty for read-only."""
     write: Callable[[NodeSettings, int], NodeSettings] | None = None
 
 
@@ -113,11 +113,11 @@ class ObjectDictionary:
         self._factory = self._saved = factory
 
     def restore(self) -> None:
-        """The module starts: what was saved counts."""
+        """Restore the saved settings: the module starts."""
         self.settings = self._saved
 
     def serve(self, data: bytes) -> tuple[bytes, Control]:
-        """Answer an SDO request of eight bytes: the reply's data, and what else is to be done."""
+        """Answer an SDO request of eight bytes: the reply's data, and its side effect."""
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
         entry = _ENTRIES.get((index, sub))
         if entry is None:
@@ -222,13 +222,13 @@ PRESSURE_PERIOD_MS: Final = 50
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HipnucCanopenHardware(SensorHardware):
-    """What a module is made of and how it was set when it left the factory."""
+    """Hardware and factory settings of a module."""
 
     factory: NodeSettings = field(default_factory=NodeSettings)
 
 
 class HipnucCanopenModule:
-    """One module, powered on when it is made."""
+    """A simulated module, powered on from construction."""
 
     def __init__(self, now_ns: int, hardware: HipnucCanopenHardware | None = None) -> None:
         self.hardware = hardware or HipnucCanopenHardware()
@@ -240,7 +240,7 @@ class HipnucCanopenModule:
 
     @property
     def node(self) -> int:
-        """The number it answers to."""
+        """Node number that it answers to."""
         return self._node
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
@@ -256,10 +256,10 @@ class HipnucCanopenModule:
             self._serve(data, now_ns)
 
     def mark(self, now_ns: int) -> None:
-        """It has no sync input on this port."""
+        """No-op: the module has no sync input on this port."""
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back: what was not saved is gone."""
+        """Restart after a loss of power: unsaved settings are lost."""
         self._leaving = FrameWire(0, now_ns)
         self._power_on(now_ns)
 
@@ -269,7 +269,7 @@ class HipnucCanopenModule:
         return [*self._leaving.sent(now_ns), *self._wire.sent(now_ns)]
 
     def next_ns(self) -> int | None:
-        """When `advance` will have something next."""
+        """Time of the next output of `advance`; None for none."""
         waiting, tick = self._leaving.next_ns() or self._wire.next_ns(), self._next_tick()
         if waiting is not None or tick is None:
             return waiting
@@ -296,7 +296,7 @@ class HipnucCanopenModule:
         return self._begin_ns + round(tick * NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6))
 
     def _run(self, now_ns: int) -> None:
-        """Send what the timers made due by now."""
+        """Send what the timers have made due by now."""
         while (tick := self._next_tick()) is not None and (t_ns := self._tick_ns(tick)) <= now_ns:
             heartbeat_ms = self.objects.settings.heartbeat_ms
             if heartbeat_ms and tick % heartbeat_ms == 0:
@@ -312,7 +312,7 @@ class HipnucCanopenModule:
         return [(n, period_ms) for n, period_ms in sorted(periods) if period_ms and not self._is_synchronous(n)]
 
     def _next_tick(self) -> int | None:
-        """When the next timer ends, in ticks; None if none runs."""
+        """End of the next timer, in ticks; None if none runs."""
         periods_ms = [period_ms for _, period_ms in self._timers()]
         periods_ms += [self.objects.settings.heartbeat_ms] if self.objects.settings.heartbeat_ms else []
         return min((-(-self._tick // period_ms) * period_ms for period_ms in periods_ms), default=None)
@@ -320,7 +320,7 @@ class HipnucCanopenModule:
     def _is_synchronous(self, number: int) -> bool:
         return self.objects.settings.types[number] == Transmission.SYNC.value
 
-    # --- what it says --------------------------------------------------------------------------------------------
+    # --- output --------------------------------------------------------------------------------------------------
 
     def _send(self, ready_ns: int, can_id: int, data: bytes, sample_ns: int | None = None) -> None:
         self.frames_sent += 1

@@ -41,7 +41,7 @@ YEAR: Final = 2025
 
 @dataclass(frozen=True, slots=True)
 class J1939Settings:
-    """What its flash holds."""
+    """Settings in flash."""
 
     intervals_ms: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(MESSAGES[""], INTERVAL_MS))
     """Of the messages that are on."""
@@ -55,7 +55,7 @@ class J1939Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class J1939Hardware(SensorHardware):
-    """What a module is made of."""
+    """Hardware of a module."""
 
     bitrate: int | None = None
     """Of the bus in bit/s, 0 for frames that take no time; None for what it is set to."""
@@ -64,7 +64,7 @@ class J1939Hardware(SensorHardware):
 
 
 class HipnucJ1939Module:
-    """One module, powered on when it is made."""
+    """A simulated module, powered on from construction."""
 
     def __init__(
         self, now_ns: int, settings: J1939Settings | None = None, hardware: J1939Hardware | None = None
@@ -91,10 +91,10 @@ class HipnucJ1939Module:
             self._obey(register, command, value, now_ns)
 
     def mark(self, now_ns: int) -> None:
-        """It has no sync input on this port."""
+        """No-op: the module has no sync input on this port."""
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back, or a restart was requested: what was not saved is lost."""
+        """Restart, on request or after a loss of power: unsaved settings are lost."""
         self.settings = self.flash
         self._power_on(now_ns)
 
@@ -106,7 +106,7 @@ class HipnucJ1939Module:
         return left + self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """When `advance` will have something next."""
+        """Time of the next output of `advance`; None for none."""
         waiting = self._leaving[0].due_ns if self._leaving else self._wire.next_ns()
         if waiting is not None or not self._next_ms:
             return waiting
@@ -206,7 +206,7 @@ class HipnucJ1939Module:
         }.get(register)
 
     def _set(self, register: int, value: int, now_ns: int) -> None:
-        """Take a value that is in range."""
+        """Set a register to a value that is in range."""
         settings = self.settings
         pgn = next((pgn for pgn, address in session.INTERVALS.items() if address == register), None)
         if pgn is not None and session.INTERVAL_MIN_MS <= value <= session.INTERVAL_MAX_MS:

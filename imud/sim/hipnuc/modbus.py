@@ -70,7 +70,7 @@ STATUS_AT: Final = BY_NAME["MAIN_STATUS"].address
 
 @dataclass(frozen=True, slots=True)
 class SlaveSettings:
-    """What CTRL saves."""
+    """Settings that CTRL saves."""
 
     slave: int = FACTORY_ID
     baud: int = FACTORY_BAUD
@@ -79,7 +79,7 @@ class SlaveSettings:
 
 @dataclass(slots=True)
 class Slave:
-    """One module. What has to do with its health may be changed at any time."""
+    """A simulated module. Its fault settings may be changed at any time."""
 
     serial: bytes
     settings: SlaveSettings = field(default_factory=SlaveSettings)
@@ -95,27 +95,27 @@ class Slave:
     """Time from the end of a request to the beginning of its reply (assumed)."""
     dead: bool = False
     bad_crc: int = 0
-    """So many replies to come have a wrong CRC."""
+    """Number of next replies with a wrong CRC."""
     mute: int = 0
-    """So many requests to come are not answered."""
+    """Number of next requests without a reply."""
     answered: int = 0
     flash: SlaveSettings = field(init=False)
     since_ns: int = field(init=False, default=0)
-    """When it was switched on (CLOCK_MONOTONIC)."""
+    """Power-on time (CLOCK_MONOTONIC)."""
 
     def __post_init__(self) -> None:
         self.flash = self.settings
 
     def restart(self, now_ns: int) -> None:
-        """What was not saved is gone."""
+        """Restart: unsaved settings are lost."""
         self.settings, self.since_ns = self.flash, now_ns
 
     def uptime_ms(self, now_ns: int) -> int:
-        """Of its own crystal."""
+        """Time since power-on, ms of its own crystal."""
         return int((now_ns - self.since_ns) * (1 + self.skew_ppm * 1e-6)) // NS_PER_MS
 
     def obey(self, request: bytes, now_ns: int, epoch_ns: int, random: Random) -> bytes:
-        """Do what function and data say; the reply without address and CRC."""
+        """Carry out a request (function and data); return the reply without address and CRC."""
         match request[0]:
             case function if function == READ_HOLDING and len(request) == READ.size:
                 _, first, count = READ.unpack(request)
@@ -134,7 +134,7 @@ class Slave:
         return bytes([function | EXCEPTION_BIT, code])
 
     def _read(self, first: int, count: int, now_ns: int, epoch_ns: int) -> bytes:
-        """The registers, or nothing where one of them is not there."""
+        """Read registers; empty where one of them does not exist."""
         new = self.firmware >= NEW_FIRMWARE
         settings = self.settings
         words = [BAUD_RATES.index(settings.baud), settings.slave, settings.heading_mode, 0, 0, 0x0800, 0, 0]
@@ -163,7 +163,7 @@ class Slave:
         )  # fmt: skip
 
     def _write(self, register: int, value: int, now_ns: int) -> int:
-        """0, or the code of an exception."""
+        """Write a register; return 0, or the code of an exception."""
         known = [one for one in BY_NAME.values() if one.address == register and "W" in one.access]
         if not known:
             return ILLEGAL_ADDRESS
@@ -208,12 +208,12 @@ def incli_counts(truth: Truth, kind: str) -> tuple[int, int]:
 
 
 class ModbusLine:
-    """The line and its modules, as a `StreamModule`: what it sends is what the host's port hears."""
+    """The line and its modules, as a `StreamModule`: its output is what the host's port receives."""
 
     def __init__(
         self, now_ns: int, slaves: Sequence[Slave], *, echo: bool = False, chunk_bytes: int = 0, seed: int = 1
     ) -> None:
-        """`echo`: the host's adapter hears what it sends. `chunk_bytes`: 0 for whole frames."""
+        """`echo`: the host's adapter receives what it sends. `chunk_bytes`: 0 for whole frames."""
         self.slaves = list(slaves)
         self.epoch_ns = now_ns
         self.echo, self.chunk_bytes = echo, chunk_bytes
@@ -229,11 +229,11 @@ class ModbusLine:
 
     @property
     def baud(self) -> int:
-        """Rate of most modules: the first one's. Those of another rate hear and say garbage."""
+        """Rate of most modules: the first one's. Those of another rate receive and send garbage."""
         return self._baud
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Take bytes that the host sent."""
+        """Receive bytes that the host sent."""
         self._finish(now_ns)
         begin_ns = max(now_ns, self._heard_ns)
         self._heard_ns = begin_ns + len(data) * uart_byte_ns(self.baud)
@@ -249,7 +249,7 @@ class ModbusLine:
         return through
 
     def next_ns(self) -> int | None:
-        """When there is something next."""
+        """Time of the next byte on the line."""
         times = [self._waiting[0].due_ns] if self._waiting else []
         if self._heard:
             times.append(self._heard_ns + frame_gap_ns(self.baud))
@@ -261,10 +261,10 @@ class ModbusLine:
         return {"requests": self.requests, "damaged": self.damaged, "answered": answered}
 
     def mark(self, _now_ns: int) -> None:
-        """These modules have no sync input."""
+        """No-op: these modules have no sync input."""
 
     def reboot(self, now_ns: int) -> None:
-        """All modules lose power."""
+        """Power all modules off."""
         self._waiting, self._heard, self._free_ns = [], b"", now_ns
         for slave in self.slaves:
             slave.restart(now_ns)
@@ -275,13 +275,13 @@ class ModbusLine:
             self._baud = self.slaves[0].settings.baud
 
     def _finish(self, now_ns: int) -> None:
-        """A frame has ended if the line was silent for long enough."""
+        """Finish the frame if the line was silent for long enough."""
         end_ns = self._heard_ns + frame_gap_ns(self.baud)
         if self._heard and now_ns >= end_ns:
             frame, self._heard = self._heard, b""
-            self._take(frame, end_ns)
+            self._on_request(frame, end_ns)
 
-    def _take(self, frame: bytes, now_ns: int) -> None:
+    def _on_request(self, frame: bytes, now_ns: int) -> None:
         replies: list[tuple[int, bytes]] = []
         is_good = False
         for slave in self.slaves:
@@ -324,7 +324,7 @@ class ModbusLine:
 
 
 def _together(replies: Iterable[bytes]) -> bytes:
-    """What is heard when several send at once."""
+    """Combine the replies of several modules that send at once."""
     whole = b""
     for reply in replies:
         whole = bytes(a & b for a, b in zip_longest(whole or reply, reply, fillvalue=0xFF))

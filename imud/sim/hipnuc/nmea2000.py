@@ -1,9 +1,9 @@
 """A HiPNUC module, or any heading and attitude sensor, on NMEA 2000: PGNs 127250, 127251 and 127257.
 
 Without I/O and without a clock of its own. It samples at whole periods of its own crystal, which runs `skew_ppm` fast,
-and sends the three messages of an instant, with the same SID, back to back `processing_ns` later. It listens to nobody
-and claims no address. Vessel and sensor frame: see `imud.devices.hipnuc.nmea2000.messages`. The rate of turn is the
-sensor's rate about its own z.
+and sends the three messages of an instant, with the same SID, back to back `processing_ns` later. It ignores all other
+nodes and claims no address. Vessel and sensor frame: see `imud.devices.hipnuc.nmea2000.messages`. The rate of turn is
+the sensor's rate about its own z.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ SIDS: Final = messages.SID_MOST + 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nmea2000Hardware(SensorHardware):
-    """One sensor and its settings."""
+    """A sensor and its settings."""
 
     rate_hz: float = 10.0
     message: str = ""
@@ -40,7 +40,7 @@ class Nmea2000Hardware(SensorHardware):
 
 
 class HipnucNmea2000Module(PeriodicCanModule):
-    """One sensor, powered on when it is made."""
+    """A simulated sensor, powered on from construction."""
 
     def __init__(self, now_ns: int, hardware: Nmea2000Hardware | None = None) -> None:
         self.hardware = hardware = hardware or Nmea2000Hardware()

@@ -22,7 +22,7 @@ RATE_MAX_HZ: Final = 400.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imu61xCanHardware(SensorHardware):
-    """One device and its settings."""
+    """A device and its settings."""
 
     rate_hz: float = 100.0
     base_id: int = BASE_ID
@@ -32,7 +32,7 @@ class Imu61xCanHardware(SensorHardware):
 
 
 class Imu61xCanModule(PeriodicCanModule):
-    """One device, powered on when it is made."""
+    """A simulated device, powered on from construction."""
 
     def __init__(self, now_ns: int, hardware: Imu61xCanHardware | None = None) -> None:
         self.hardware = hardware = hardware or Imu61xCanHardware()

@@ -32,24 +32,24 @@ _WINDOW_0, _WINDOW_1 = 0, 1
 
 @dataclass(slots=True)
 class RegisterFaults:
-    """What is wrong with the device or its wires; may be changed at any time."""
+    """Faults of the device or its wires; may be changed at any time."""
 
     error: int = 0
     """The errno that every transaction fails with: ENXIO not acknowledged, ETIMEDOUT bus stuck; 0 for none."""
     line: int | None = None
-    """All bytes read are this: 0xFF or 0x00 for a data line that no device drives."""
+    """Value of all bytes read: 0xFF or 0x00 for a data line that no device drives."""
     flips: int = 0
-    """So many transactions to come have one wrong bit in what is read."""
+    """Number of next transactions with one wrong bit in the bytes read."""
     frozen: bool = False
     """The registers are not renewed."""
     ignores_writes: bool = False
     """Settings that are written have no effect."""
     product_id: bytes = b""
-    """What another device has in its place."""
+    """Product id of another device in its place."""
 
 
 class Imu61xRegisters:
-    """One simulated device. Synchronization: one thread."""
+    """A simulated device. Synchronization: one thread."""
 
     def __init__(
         self,
@@ -82,18 +82,18 @@ class Imu61xRegisters:
         self._truth = self.motion.at(0.0)
 
     def restart(self) -> None:
-        """Power was lost and came back."""
+        """Restart after a loss of power."""
         self.filter, self.extended, self.window = FILTER_DEFAULT, 0, _WINDOW_0
         self._pipeline.extend((0, 0))
 
     def truth_at(self, instant_ns: int) -> Truth:
-        """What an ideal sensor measures at CLOCK_MONOTONIC `instant_ns`."""
+        """Return the measurement of an ideal sensor at CLOCK_MONOTONIC `instant_ns`."""
         return self.motion.at((instant_ns - self.epoch_ns) / NS_PER_S)
 
     # --- SPI ---------------------------------------------------------------------------------------------------------
 
     def spi(self, selections: Sequence[bytes], mode: int = 0) -> list[bytes]:
-        """One transaction: MOSI of each assertion of chip select; returns MISO. Raises OSError by `faults.error`."""
+        """Carry out a transaction: MOSI of each assertion of chip select → MISO. Raises OSError by `faults.error`."""
         self._begin()
         answers = [self._selection(selection) for selection in selections]
         if mode not in self._modes:
@@ -123,7 +123,7 @@ class Imu61xRegisters:
         return [int.from_bytes(data[at : at + 2], "big") for at in range(0, len(data), 2)]
 
     def _answer(self, word: int) -> int:
-        """Do what a word says; the word that answers it."""
+        """Carry out a word; return the word that answers it."""
         address = word >> 8 & 0x7F
         if word & 0x8000:
             self._write(address, word & 0xFF)
@@ -149,7 +149,7 @@ class Imu61xRegisters:
         return int.from_bytes(self.product_id[at : at + 2], "big") if 0 <= at < 8 and not at % 2 else 0
 
     def _value(self, address: int) -> int:
-        """One half of a value in window 0, high word first."""
+        """Return one half of a value in window 0, high word first."""
         index, low = divmod((address - registers.TEMP_HIGH) // 2, 2)
         truth = self._truth
         values = (
@@ -164,7 +164,7 @@ class Imu61xRegisters:
     # --- I2C ---------------------------------------------------------------------------------------------------------
 
     def i2c(self, parts: Sequence[bytes | int]) -> bytes:
-        """One transaction between start and stop: bytes written, or how many are read; returns all that is read.
+        """Carry out a transaction between start and stop: bytes written, or number to read; returns all bytes read.
 
         Raises OSError by `faults.error`.
         """
@@ -201,7 +201,7 @@ class Imu61xRegisters:
         return self.faults.product_id or self._product_id
 
     def _begin(self) -> None:
-        """A transaction begins: latch the registers."""
+        """Latch the registers at the begin of a transaction."""
         self.transactions += 1
         if self.faults.error:
             raise OSError(self.faults.error, errno.errorcode.get(self.faults.error, "?"))
@@ -221,12 +221,12 @@ class Imu61xRegisters:
         return answers or [b""]
 
     def _flipped(self, data: bytes) -> bytes:
-        """One bit wrong, not in the words of an SPI pipeline, which say nothing."""
+        """Invert one bit, not in the words of an SPI pipeline that carry no answer."""
         first = PIPELINE_BYTES if len(data) > PIPELINE_BYTES else 0
         at = self._random.randrange(first, len(data))
         return data[:at] + bytes([data[at] ^ 1 << self._random.randrange(8)]) + data[at + 1 :]
 
 
 def _one_bit_late(data: bytes) -> bytes:
-    """What is read on the wrong edge."""
+    """Sample the bits at the wrong edge."""
     return (int.from_bytes(data, "big") >> 1).to_bytes(len(data), "big")

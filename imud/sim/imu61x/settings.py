@@ -1,6 +1,6 @@
-"""Parameters of a simulated Forsense IMU61x: what RAM and flash hold, and how a command changes them.
+"""Parameters of a simulated Forsense IMU61x in RAM and flash, and the commands that change them.
 
-Manual "IMU61X Interface Protocol and Instructions", tables 9 and 12. A value that the device does not take becomes the
+Manual "IMU61X Interface Protocol and Instructions", tables 9 and 12. A value that the device does not have becomes the
 default where the manual names one, and is refused otherwise (assumed).
 """
 
@@ -22,7 +22,7 @@ class ParameterRefused(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Imu61xSettings:
-    """All that CMD 5 saves. The defaults are the factory's."""
+    """Settings that CMD 5 saves. The defaults are the factory's."""
 
     mode: OutputMode = OutputMode.STREAM
     baud: int = 115_200

@@ -50,12 +50,12 @@ STATUS: Final = Status(
     system_status=0, cpu_load=120, drop_rate=0, i2c_master=0, voltage=50, user_config_status=0,
     calibration_status=0, imu_health=bytes(32),
 )  # fmt: skip
-"""What S1 says; model number and units are made up."""
+"""Contents of S1; model number and units are made up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imu61xHardware(SensorHardware):
-    """One device, and how it behaves where the manual is silent."""
+    """A device, and its assumed behaviour where the manual is silent."""
 
     status: Status = STATUS
     uptime_us: int = 0
@@ -71,7 +71,7 @@ class Imu61xHardware(SensorHardware):
 
 
 class Imu61xModule:
-    """One device, powered on when it is made."""
+    """A simulated device, powered on from construction."""
 
     def __init__(
         self, now_ns: int, settings: Imu61xSettings | None = None, hardware: Imu61xHardware | None = None
@@ -93,17 +93,17 @@ class Imu61xModule:
         return self._wire.baud
 
     def reboot(self, now_ns: int) -> None:
-        """Restart after a loss of power: what was not saved is gone."""
+        """Restart after a loss of power: unsaved settings are lost."""
         self._sample(now_ns)
         self._cut_off += self._wire.stopped(now_ns)
         self.settings = self.flash
         self._power_on(now_ns, 0)
 
     def mark(self, now_ns: int) -> None:
-        """It has no sync input."""
+        """No-op: the device has no sync input."""
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Take bytes that the host sent, already as the device hears them."""
+        """Receive bytes that the host sent, already sampled at the device's rate."""
         self._sample(now_ns)
         if now_ns < self._ready_ns:  # still booting
             return
@@ -120,7 +120,7 @@ class Imu61xModule:
         return done + self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """When `advance` will have something next, or None while nothing is to come."""
+        """Time of the next output of `advance`; None for none."""
         if self._cut_off:
             return self._cut_off[0].due_ns
         if (due_ns := self._wire.next_ns()) is not None:
@@ -131,7 +131,7 @@ class Imu61xModule:
         return self._wire.due_ns(ready_ns, AHRS_FRAME_BYTES)
 
     def counters(self) -> dict[str, int]:
-        """Frames by what became of them."""
+        """Counters of frames by their fate."""
         return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
 
     # --- time --------------------------------------------------------------------------------------------------------
@@ -179,7 +179,7 @@ class Imu61xModule:
             self.settings = self.flash
             self._power_on(self._restart_ns, 0)
 
-    # --- what it sends -----------------------------------------------------------------------------------------------
+    # --- output ------------------------------------------------------------------------------------------------------
 
     def _queue_ahrs(self, sample_ns: int, device_us: int) -> None:
         ready_ns = sample_ns + self.hardware.processing_ns
@@ -206,7 +206,7 @@ class Imu61xModule:
         )
 
     def _reading(self, sample_ns: int) -> Truth:
-        """What the sensors measure at an instant, noise included."""
+        """Return the measurement at an instant, noise included."""
         return self.hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
 
     def _say(self, data: bytes, now_ns: int) -> None:
@@ -267,7 +267,7 @@ class Imu61xModule:
         orders[command]()
 
     def _after(self, command: Command, now_ns: int) -> None:
-        """What waits until the acknowledgement has left."""
+        """Carry out what is postponed until the acknowledgement has left."""
         if command is Command.RESTART:
             self._next_us = None
             self._restart_ns = self._wire.due_ns(now_ns, 0)
@@ -287,7 +287,7 @@ class Imu61xModule:
         self._heading_rad = radians(heading_deg) - euler_zyx_from_quat(self._reading(now_ns).quat_wxyz)[2]
 
     def _save(self) -> None:
-        """Everything, but not command mode where CMD 5 is obeyed in that only: it would never start streaming."""
+        """Save all but command mode where CMD 5 is obeyed in that only: the device would never start streaming."""
         keeps_mode = self.hardware.answers_while_streaming
         self.flash = self.settings if keeps_mode else replace(self.settings, mode=self.flash.mode)
 

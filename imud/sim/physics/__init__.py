@@ -1,1 +1,1 @@
-"""What a simulated sensor measures: motion, mounting, noise."""
+"""Physics of a simulated sensor: motion, mounting, noise."""

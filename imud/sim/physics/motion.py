@@ -1,4 +1,4 @@
-"""Ground truth: where a simulated sensor is, how it turns and what it would measure, as a pure function of time.
+"""Ground truth: position, attitude and ideal measurements of a simulated sensor, as a pure function of time.
 
 Attitude is given as Euler angles in the order of HiPNUC manual chapter 9.1 (312: yaw about Z, then pitch about X, then
 roll about Y, navigation frame ENU), each a sum of sines, so that the angular rate is their exact derivative and not a
@@ -20,7 +20,7 @@ from imud.attitude import quat_from_euler312
 from imud.sample import Quaternion, Vector3
 
 GRAVITY_M_S2: Final = 9.8
-"""What HiPNUC firmware calls 1 G; a module at rest then reads |accel| = 1."""
+"""HiPNUC's 1 G: a module at rest then reads |accel| = 1."""
 FIELD_ENU_T: Final[Vector3] = (-3.0e-6, 36.0e-6, -27.0e-6)
 """Earth's magnetic field, east, north, up: about 45 µT, pointing north and down as in the northern subtropics."""
 SEA_LEVEL_PA: Final = 101_325.0
@@ -32,7 +32,7 @@ WARMING_PERIOD_S: Final = 600.0
 
 
 class Truth(NamedTuple):
-    """What an ideal sensor measures at one instant; vectors in the right-handed sensor frame."""
+    """Measurement of an ideal sensor at one instant; vectors in the right-handed sensor frame."""
 
     accel_m_s2: Vector3
     """Specific force: +g on the axis that points up when at rest."""
@@ -56,7 +56,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Sine:
-    """One term of a motion: amplitude · sin(2π · frequency · t + phase)."""
+    """A term of a motion: amplitude · sin(2π · frequency · t + phase)."""
 
     amplitude: float
     frequency_hz: float

@@ -1,4 +1,4 @@
-"""How a module is mounted: the turns it puts between what its chip measures and what it sends.
+"""Mounting of a module: the rotations between the axes of its chip and those of its output.
 
 URFR (manual chapter 2.2.4) says v_before = C · v_after, so every vector is turned by Cᵀ and the attitude becomes
 q ⊗ C. Levelling (ATT RST) turns the attitude once more about the body, and with RST 3 the accelerometer as well;
@@ -15,7 +15,7 @@ UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 class MountingRotation:
-    """The turns in force. Without any it is not `active`, and `turned` gives back what it gets."""
+    """The rotations in force. Without any it is not `active`, and `turned` returns its argument."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class MountingRotation:
         self._heading = (cos(yaw_rad / 2), 0.0, 0.0, sin(yaw_rad / 2))
 
     def turned(self, truth: Truth) -> Truth:
-        """What the mounted module sends of a truth in the chip's frame."""
+        """Rotate a truth from the chip's frame to that of the mounted module."""
         if not self.active:
             return truth
         quat_wxyz = multiplied(multiplied(self._heading, truth.quat_wxyz), self._body)

@@ -53,7 +53,7 @@ class Noise:
         return (accel * a, accel * b, accel * c), (gyro * d, gyro * e, gyro * f), (mag * g, mag * h, mag * i)
 
     def add(self, truth: Truth, t_s: float) -> Truth:
-        """What a real sensor would read instead of `truth`."""
+        """Add noise to `truth`."""
         levels = self._levels
         accel_bias, gyro_bias, mag_bias = self.bias(t_s)
         accel, gyro, mag, euler, quat, temperature_c, pressure_pa = truth

@@ -1,1 +1,1 @@
-"""What simulated devices stand behind (a pseudo-terminal, a CAN interface, pins), its timing and its faults."""
+"""Ports of simulated devices (a pseudo-terminal, a CAN interface, pins), with their timing and faults."""

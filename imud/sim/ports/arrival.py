@@ -1,4 +1,4 @@
-"""When samples of a device reach a program, with the truth known: what the clock is measured against.
+"""Model of arrival times with the truth known: the reference that the clock is measured against.
 
 A device with a crystal of its own samples at even steps of its own time; each message crosses the wire (in turn, if
 the wire is slower than the samples); an adapter may hold bytes until a latency timer fires or a USB packet is full;
@@ -22,7 +22,7 @@ class Crystal:
     """The device's clock against the host's."""
 
     skew_ppm: float = 0.0
-    """How much faster than the host's it runs at the start."""
+    """Rate error against the host's clock at the start, 1e-6."""
     drift_ppm_s: float = 0.0
     """Change of the skew per second (temperature)."""
     drift_limit_ppm: float = 10.0
@@ -33,19 +33,19 @@ class Crystal:
 
 @dataclass(frozen=True, slots=True)
 class ArrivalProfile:
-    """What lies between the wire and the reader."""
+    """Delays between the wire and the reader."""
 
     name: str
     timer_ns: int = 0
     """Period of a latency timer that hands bytes over, 0 for none."""
     timer_ppm: float = 0.0
-    """How much faster than the host's clock the timer runs; 0 beats in lockstep with an exact device."""
+    """Rate error of the timer against the host's clock; 0 beats in lockstep with an exact device."""
     packet_bytes: int = 0
-    """The timer's adapter also hands bytes over when so many wait (FT232: 62), and starts the timer anew; 0 never."""
+    """Bytes after which the timer's adapter hands over and restarts the timer (FT232: 62); 0 for never."""
     poll_ns: int = 0
     """Longest wait for the bus to ask the adapter, evenly spread."""
     fifo_bytes: float = 0.0
-    """A receive FIFO reports a tail below its trigger level after so many byte times (16550: 4)."""
+    """Byte times after which a receive FIFO reports a tail below its trigger level (16550: 4)."""
     floor_ns: int = 0
     """Shortest wake-up."""
     wake_ns: int = 0
@@ -57,7 +57,7 @@ class ArrivalProfile:
 
     @property
     def hold_ns(self) -> int:
-        """What a link would say of the adapter: its latency timer."""
+        """Hold time of the adapter as a link reports it: its latency timer."""
         return self.timer_ns
 
 
@@ -86,7 +86,7 @@ PROFILES = (PERFECT, BARE_UART, USB_1MS, USB_16MS, USB_16MS_PACKET, LOADED)
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """One message as the reader gets it, and what the reader cannot know."""
+    """A message as the reader receives it, and its true times."""
 
     t_ns: int
     """The truth: host time of the instant of measurement."""
@@ -148,7 +148,7 @@ class ArrivalModel:
                 slope = -abs(slope) if ppm > 0 else abs(slope)
 
     def _on_wire(self, truth: list[float]) -> list[float]:
-        """When the first byte of each message leaves: at once, or when the one before is through."""
+        """Compute when the first byte of each message leaves: at once, or when the one before is through."""
         duration_ns = self.size_bytes * self.byte_ns
         begins: list[float] = []
         free_ns = 0.0
@@ -158,7 +158,7 @@ class ArrivalModel:
         return begins
 
     def _handed_over(self, begins: list[float], random: Random) -> list[float]:
-        """When the adapter has handed over the last byte of each message."""
+        """Compute when the adapter has handed over the last byte of each message."""
         profile, duration_ns = self.profile, self.size_bytes * self.byte_ns
         if not profile.timer_ns:
             return [begin + duration_ns + profile.fifo_bytes * self.byte_ns for begin in begins]
@@ -169,7 +169,7 @@ class ArrivalModel:
         return [end - (end - phase_ns) % step_ns + step_ns for end in (begin + duration_ns for begin in begins)]
 
     def _packets(self, begins: list[float], timer_from_ns: float) -> list[float]:
-        """As `_handed_over`, for an adapter that sends full packets at once and restarts its timer with each."""
+        """Compute the same for an adapter that sends full packets at once and restarts its timer with each."""
         byte_ns, size, full, step_ns = self.byte_ns, self.size_bytes, self.profile.packet_bytes, self._timer_step_ns()
         handed = [0.0] * len(begins)
         sent = done = 0
@@ -198,7 +198,7 @@ class ArrivalModel:
         return wait_ns
 
     def _newest_hand_over(self, handed_ns: float, t_rx_ns: int) -> float:
-        """Up to which instant the bytes on the wire are in a read at `t_rx_ns` that holds what came at `handed_ns`."""
+        """Instant up to which the bytes on the wire are in a read at `t_rx_ns` that holds what came at `handed_ns`."""
         profile = self.profile
         if not profile.timer_ns:
             return t_rx_ns - profile.fifo_bytes * self.byte_ns

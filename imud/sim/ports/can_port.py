@@ -2,7 +2,7 @@
 
 The simulator's frames leave when they would have crossed the wire of the simulated device; all that is due goes out in
 one system call, so that a stall of the simulator's process falls between bursts and not into one. What the interface's
-queue does not take is lost and counted, as on a bus that is too full.
+queue does not accept is lost and counted, as on a bus that is too full.
 """
 
 import ctypes
@@ -22,7 +22,7 @@ READ_BYTES: Final = 4096
 
 
 class CanPort:
-    """One module, or several as one (`CanModules`), on one interface. Synchronization: one thread."""
+    """A module, or several as one (`CanModules`), on one interface. Synchronization: one thread."""
 
     is_open = True
     """A bus needs no reader."""
@@ -35,7 +35,7 @@ class CanPort:
         self.interface = interface
         self._unplugged_until_ns = 0
         self.frames_refused = 0
-        """Frames that the interface's queue did not take."""
+        """Frames that the interface's queue did not accept."""
         self._socket = (open_socket or open_can_socket)(interface)
 
     def fileno(self) -> int:
@@ -48,7 +48,7 @@ class CanPort:
         return self
 
     def unplug(self, now_ns: int, duration_ns: int) -> None:
-        """The device leaves the bus and loses power."""
+        """Take the device from the bus and cut its power."""
         self._unplugged_until_ns = now_ns + duration_ns
         self.module.reboot(self._unplugged_until_ns)
 
@@ -61,12 +61,12 @@ class CanPort:
             self.frames_refused += len(send_all(self._socket.fileno(), due))
 
     def next_ns(self, now_ns: int) -> int:
-        """When to call `step` next."""
+        """Time of the next call of `step`."""
         due_ns = self.module.next_ns()
         return max(self._unplugged_until_ns, now_ns if due_ns is None else due_ns)
 
     def summary(self) -> dict[str, int]:
-        """What was counted so far, and the zero of the motion, CLOCK_MONOTONIC."""
+        """Return the counters, and the zero of the motion, CLOCK_MONOTONIC."""
         counters = {**self.module.counters(), "frames_refused": self.frames_refused}
         return {**counters, "epoch_ns": self.module.epoch_ns}
 

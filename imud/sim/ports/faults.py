@@ -1,4 +1,4 @@
-"""Seeded faults on a stream of bursts: what happens to bytes on bad wires, each fault noted with its kind.
+"""Seeded faults on a stream of bursts, as bad wires cause them; each fault is recorded with its kind.
 
 Each burst (a frame or a reply) meets each kind of fault with its own probability, so that a test can say how many
 damaged frames, missing samples and skipped bytes the ledger at the other end must show.
@@ -25,10 +25,10 @@ WRONG_BAUDS: Final = (9600, 115_200, 230_400, 256_000, 460_800, 921_600)
 
 
 class FaultKind(StrEnum):
-    """What can happen to a burst."""
+    """Kinds of fault of a burst."""
 
     CUT = "cut"
-    """Its end is missing, at least one byte of it."""
+    """The end is missing, at least one byte of it."""
     FLIP = "flip"
     """One bit is wrong."""
     DROP = "drop"
@@ -36,13 +36,13 @@ class FaultKind(StrEnum):
     INSERT = "insert"
     """Up to 16 random bytes come before one of its bytes."""
     DELAY = "delay"
-    """It is held back, and with it all that follows."""
+    """The burst is held back, and with it all that follows."""
     UNPLUG = "unplug"
     """The port disappears; this burst and those of the next `unplug_ns` are gone."""
     WRONG_BAUD = "wrong_baud"
-    """It is sent at another rate."""
+    """The burst is sent at another rate."""
     LOSE = "lose"
-    """Nothing of it arrives."""
+    """The whole burst is missing."""
 
 
 _Order = (
@@ -53,7 +53,7 @@ _Order = (
 
 @dataclass(frozen=True, slots=True)
 class FaultRates:
-    """Probability of each fault per burst, 0 … 1, and how long the lasting ones last."""
+    """Probability of each fault per burst, 0 … 1, and the duration of lasting faults."""
 
     cut: float = 0.0
     flip: float = 0.0
@@ -78,11 +78,11 @@ class FaultRates:
 
 
 class Fault(NamedTuple):
-    """One fault that happened."""
+    """A fault that happened."""
 
     kind: FaultKind
     due_ns: int
-    """When the burst would have been through."""
+    """Time at which the burst would have been through."""
     burst: int
     """Number of the burst, from 0."""
     sample_ns: int | None
@@ -90,7 +90,7 @@ class Fault(NamedTuple):
 
 
 class Faults:
-    """Passes bursts on, damaged or not. Same seed, same bursts: same faults."""
+    """Injector of faults into bursts. Same seed, same bursts: same faults."""
 
     def __init__(self, seed: int, rates: FaultRates, baud: int = 115_200) -> None:
         self.rates = rates
@@ -106,7 +106,7 @@ class Faults:
         self._held_until_ns = 0
 
     def pass_on(self, burst: Burst) -> Burst | None:
-        """The burst as it arrives, None if nothing of it does. Bursts never overtake each other."""
+        """Pass a burst on as it arrives, None if it is lost. Bursts never overtake each other."""
         number, self.bursts = self.bursts, self.bursts + 1
         kinds = self._strike()
         if burst.due_ns < self.unplugged_until_ns:
@@ -128,7 +128,7 @@ class Faults:
         return burst._replace(due_ns=due_ns, data=data) if data else None
 
     def _strike(self) -> list[FaultKind]:
-        """The faults of one burst, in the order they act. Draws the same number of times whatever happens.
+        """Choose the faults of one burst, in the order they act. Draws the same number of times for every burst.
 
         For losses it draws only where there are any: seeds of older tests go on to mean the same.
         """

@@ -13,14 +13,14 @@ from imud.sim.simulator import StreamModule
 from imud.units import NS_PER_MS, NS_PER_S
 
 SIN_LOOK_NS: Final = 4 * NS_PER_MS
-"""How often SIN is looked at: a pulse has to be longer."""
+"""Interval of reading SIN: a pulse has to be longer."""
 
 
 class MarkedModule(Protocol):
     """A device with a sync input."""
 
     def mark(self, now_ns: int) -> None:
-        """A rising edge on its sync input."""
+        """Pulse its sync input (a rising edge)."""
         ...
 
 
@@ -55,7 +55,7 @@ class SinFile:
         self._level = True  # a line that is high from the beginning has no edge
 
     def look(self, now_ns: int) -> None:
-        """Pass a rising edge since the last look to the module. Raises OSError."""
+        """Pass a rising edge since the last call to the module. Raises OSError."""
         level = self._path.read_bytes().strip() == b"1"
         if level and not self._level:
             self._module.mark(now_ns)
@@ -86,7 +86,7 @@ class SimulatedLines:
             self._pins.step(now_ns)
 
     def next_ns(self, now_ns: int) -> int:
-        """When `step` is to be called again at the latest."""
+        """Latest time of the next call of `step`."""
         next_ns = self._pins.next_ns() if self._pins is not None else None
         latest_ns = now_ns + (SIN_LOOK_NS if self._sin is not None else NS_PER_S)
         return latest_ns if next_ns is None else min(next_ns, latest_ns)

@@ -1,4 +1,4 @@
-"""I2C and SPI inside the process: simulated devices behind what smbus2 and spidev's ioctl would be.
+"""I2C and SPI inside the process: simulated devices behind substitutes of smbus2 and spidev's ioctl.
 
 For tests and measurements without the kernel's buses: `SpiLink(settings, ioctl=bus.ioctl, open_node=bus.open, …)` and
 `I2cLink(settings, open_bus=bus.open, ioctl=bus.ioctl)`.
@@ -20,7 +20,7 @@ FD = 1_000_000
 
 
 class InProcessI2c:
-    """An I2C bus with devices by address. It plays the parts of `SMBus` and of its opener."""
+    """An I2C bus with devices by address; it replaces `SMBus` and its opener."""
 
     def __init__(self, devices: dict[int, Imu61xRegisters], funcs: int = I2cFunc.I2C) -> None:
         self.devices = devices
@@ -33,18 +33,18 @@ class InProcessI2c:
         """Address and parts of every transaction."""
 
     def open(self, _path: str) -> "InProcessI2c":
-        """As `SMBus(path)`."""
+        """Open the bus, as `SMBus(path)` does."""
         if self.open_error:
             raise OSError(self.open_error, "by the test")
         self.fd, self.opened = FD, self.opened + 1
         return self
 
     def ioctl(self, _fd: int, _request: int, _argument: int) -> int:
-        """Setting the time-out goes well."""
+        """Accept the setting of the time-out."""
         return 0
 
     def i2c_rdwr(self, *messages: i2c_msg) -> None:
-        """One transaction."""
+        """Carry out one transaction."""
         reads = [message for message in messages if message.flags & I2C_M_RD]
         parts = [message.len if message in reads else bytes(message) for message in messages]
         data = self._transact(messages[0].addr, parts)
@@ -52,15 +52,15 @@ class InProcessI2c:
             ctypes.memmove(message.buf, data, message.len)
 
     def read_i2c_block_data(self, i2c_addr: int, register: int, length: int) -> list[int]:
-        """The SMBus way to read."""
+        """Read as SMBus does."""
         return list(self._transact(i2c_addr, [bytes([register]), length]))
 
     def write_i2c_block_data(self, i2c_addr: int, register: int, data: list[int]) -> None:
-        """The SMBus way to write."""
+        """Write as SMBus does."""
         self._transact(i2c_addr, [bytes([register, *data])])
 
     def close(self) -> None:
-        """Nothing is open any more."""
+        """Close the bus."""
         self.fd = None
 
     def _transact(self, address: int, parts: Sequence[bytes | int]) -> bytes:
@@ -72,7 +72,7 @@ class InProcessI2c:
 
 
 class InProcessSpi:
-    """One chip select of an SPI bus, seen through spidev's ioctl."""
+    """A chip select of an SPI bus, seen through spidev's ioctl."""
 
     def __init__(
         self, device: Callable[[Sequence[bytes], int], Sequence[bytes]] | None = None, *, word_bits: int = 8
@@ -89,18 +89,18 @@ class InProcessSpi:
         self.word_bits = word_bits
 
     def open(self, _path: str, _flags: int) -> int:
-        """As `os.open`."""
+        """Replace `os.open`."""
         if self.open_error:
             raise OSError(self.open_error, "by the test")
         self.opened.append(FD + len(self.opened))
         return self.opened[-1]
 
     def close(self, fd: int) -> None:
-        """As `os.close`."""
+        """Replace `os.close`."""
         self.opened.remove(fd)
 
     def ioctl(self, _fd: int, request: int, argument: bytes) -> int:
-        """As `fcntl.ioctl` on spidev."""
+        """Replace `fcntl.ioctl` on spidev."""
         if request == spi.WR_MODE:
             self.mode = argument[0]
         elif request == spi.WR_BITS_PER_WORD and argument[0] > self.word_bits:

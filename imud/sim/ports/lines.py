@@ -1,4 +1,4 @@
-"""Lines inside the process: for tests and the demo, with the side of the wire that the device has."""
+"""GPIO lines inside the process, driven by the simulated device: for tests and the demo."""
 
 import asyncio
 from collections.abc import Callable
@@ -8,12 +8,12 @@ from imud.errors import LinkError
 
 
 class MemoryInput:
-    """An `InputLine` that the device's side drives by `edge`. Synchronization: the loop's thread only."""
+    """An `InputLine` that the simulated device drives by `edge`. Synchronization: the loop's thread only."""
 
     def __init__(self, title: str = "memory line", rising_only: bool = False) -> None:
         self.title = title
         self.open_error: LinkError | None = None
-        """What `open` raises."""
+        """Error that `open` raises."""
         self.is_open = False
         self._rising_only = rising_only
         self._watch = True
@@ -27,13 +27,13 @@ class MemoryInput:
 
     @property
     def edges_lost(self) -> int:
-        """Edges of `lose`."""
+        """Number of edges that `lose` simulated."""
         return self._lost
 
     # --- the device's side -------------------------------------------------------------------------------------------
 
     def edge(self, t_ns: int, rising: bool) -> None:
-        """The line changed at that time. Delivered by the loop in its next round, or by `drain`."""
+        """Change the level at that time. Delivered by the loop in its next round, or by `drain`."""
         self._level = rising
         if self.is_open and (rising or not self._rising_only):
             self._number += 1
@@ -42,17 +42,17 @@ class MemoryInput:
                 self._loop.call_soon(self.drain)
 
     def pulse(self, t_ns: int, width_ns: int) -> None:
-        """Up at that time, and down again."""
+        """Pulse the line: up at that time, and down again."""
         self.edge(t_ns, True)
         self.edge(t_ns + width_ns, False)
 
     def lose(self, count: int) -> None:
-        """So many edges come that the kernel drops."""
+        """Simulate edges that the kernel drops."""
         self._number += count
         self._lost += count
 
     def vanish(self, error: LinkError) -> None:
-        """The chip is pulled out."""
+        """End the line with an error: the chip is removed."""
         on_end = self._on_end
         self.close()
         if on_end is not None:
@@ -61,7 +61,7 @@ class MemoryInput:
     # --- imud's side -------------------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Edges count from now on. Raises `open_error`."""
+        """Open the line; edges count from now on. Raises `open_error`."""
         if self.open_error is not None:
             raise self.open_error
         self.is_open = True
@@ -75,26 +75,26 @@ class MemoryInput:
             self._loop.call_soon(self.drain)
 
     def drain(self) -> None:
-        """Deliver what there is."""
+        """Deliver the buffered edges."""
         if self._on_edges is not None and self._waiting:
             found, self._waiting = self._waiting, []
             self._on_edges(found)
 
     def level(self) -> bool:
-        """The level of the last edge. Raises LinkError."""
+        """Return the level of the last edge. Raises LinkError."""
         if not self.is_open:
             raise LinkError(f"{self.title} is not open")
         return self._level
 
     def close(self) -> None:
-        """Nothing is delivered any more; may be called twice."""
+        """Stop the delivery of edges; may be called twice."""
         self.is_open = False
         self._waiting = []
         self._loop = self._on_edges = self._on_end = None
 
 
 class MemoryOutput:
-    """An `OutputLine` that keeps what was done to it."""
+    """An `OutputLine` that records its changes."""
 
     def __init__(
         self,
@@ -109,9 +109,9 @@ class MemoryOutput:
         """
         self.title = title
         self.open_error: LinkError | None = None
-        """What `open` raises."""
+        """Error that `open` raises."""
         self.set_error: LinkError | None = None
-        """What `set` raises."""
+        """Error that `set` raises."""
         self.is_open = False
         self.active = False
         self.history: list[tuple[int, bool]] = []
@@ -120,20 +120,20 @@ class MemoryOutput:
         self._on_change = on_change
 
     def open(self) -> None:
-        """Inactive from now on. Raises `open_error`."""
+        """Open the line, inactive. Raises `open_error`."""
         if self.open_error is not None:
             raise self.open_error
         self.is_open = True
         self._become(False)
 
     def set(self, active: bool) -> None:
-        """Drive it. Raises `set_error`, and LinkError where it is not open."""
+        """Set the level. Raises `set_error`, and LinkError where the line is not open."""
         if self.set_error is not None or not self.is_open:
             raise self.set_error or LinkError(f"{self.title} is not open")
         self._become(active)
 
     def close(self) -> None:
-        """Inactive and not driven any more; may be called twice."""
+        """Release the line, inactive; may be called twice."""
         if self.is_open:
             self._become(False)
         self.is_open = False
@@ -148,7 +148,7 @@ class MemoryOutput:
 
 
 class MemoryLines:
-    """Makes lines inside the process and keeps them by their purpose, for example `bow sout`."""
+    """Factory of lines inside the process, which keeps them by their purpose, for example `bow sout`."""
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self.inputs: dict[str, MemoryInput] = {}
@@ -157,9 +157,9 @@ class MemoryLines:
         self.maker = LineFactory(self.input, self.output)
 
     def input(self, _settings: InputSettings, purpose: str, rising_only: bool = False) -> MemoryInput:
-        """The input of that purpose; the same one every time."""
+        """Return the input of that purpose; the same one every time."""
         return self.inputs.setdefault(purpose, MemoryInput(purpose, rising_only))
 
     def output(self, _settings: OutputSettings, purpose: str) -> MemoryOutput:
-        """The output of that purpose; the same one every time."""
+        """Return the output of that purpose; the same one every time."""
         return self.outputs.setdefault(purpose, MemoryOutput(purpose, now_ns=self._now_ns))

@@ -1,4 +1,4 @@
-"""Pins of a simulated device, single wires beside its data, and their way to lines, with faults.
+"""Pins of a simulated device, single wires next to its data, and their connection to lines, with faults.
 
     module.pins() ──▶ faults ──▶ when it is due: on_edge[pin](due_ns, rising)
 
@@ -37,7 +37,7 @@ class Pin(StrEnum):
 
 
 class PinEdge(NamedTuple):
-    """One change of a pin's level."""
+    """A change of a pin's level."""
 
     due_ns: int
     """CLOCK_MONOTONIC of the change."""
@@ -56,7 +56,7 @@ class PinModule(Protocol):
         ...
 
     def next_pin_ns(self) -> int | None:
-        """When `pins` may have something next, or None while nothing is to come."""
+        """Time of the next output of `pins`; None for none."""
         ...
 
 
@@ -78,7 +78,7 @@ class PinFaultRates:
 
 
 class PinFaults:
-    """Passes edges on, or not. Same seed, same edges: same faults."""
+    """Injector of faults into edges. Same seed, same edges: same faults."""
 
     def __init__(self, seed: int, rates: PinFaultRates) -> None:
         self.rates = rates
@@ -89,7 +89,7 @@ class PinFaults:
         self._losing: set[Pin] = set()
 
     def pass_on(self, edge: PinEdge) -> list[PinEdge]:
-        """The edge if it comes, and edges that come with it. Draws three times whatever happens."""
+        """Pass an edge on, with extra edges, or drop it. Draws three times for every edge."""
         rates, pin = self.rates, edge.pin
         pulse, alone, extra = (self._random.random() for _ in fields(rates))
         if edge.rising and pulse < rates.lose_pulse:
@@ -115,7 +115,7 @@ class PinFaults:
 
 
 class Pins:
-    """Hands the edges of a module's pins over when they are due. Synchronization: one thread."""
+    """Connection of a module's pins to lines: delivers edges when they are due. Synchronization: one thread."""
 
     def __init__(
         self,
@@ -149,7 +149,7 @@ class Pins:
         self.edges += len(done)
 
     def next_ns(self) -> int | None:
-        """When `step` may have something next, or None while nothing is to come."""
+        """Time of the next output of `step`; None for none."""
         times = [edge.due_ns for edge in self._held[:1]]
         if (next_ns := self._module.next_pin_ns()) is not None:
             times.append(next_ns)

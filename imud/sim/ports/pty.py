@@ -35,16 +35,16 @@ BOTHER: Final = 0o010000
 CBAUD: Final = 0o010017
 READ_BYTES: Final = 4096
 LOOK_NS: Final = 20 * NS_PER_MS
-"""How often to look whether a program has opened the port: a pty reports no such event."""
+"""Interval of checks whether a program has opened the port: a pty reports no such event."""
 
 
 @dataclass(slots=True)
 class PtyCounters:
-    """Where the module's bytes went."""
+    """Counts of the module's bytes by their fate."""
 
     bytes_written: int = 0
     bytes_unheard: int = 0
-    """No program had the port open."""
+    """Lost: no program had the port open."""
     bytes_lost_full: int = 0
     """The reader did not keep up."""
     bursts_wrong_baud: int = 0
@@ -53,7 +53,7 @@ class PtyCounters:
 
 
 class PtyNode:
-    """One pseudo-terminal under a name that stays the same from plug to plug."""
+    """A pseudo-terminal under a name that stays the same from plug to plug."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -100,7 +100,7 @@ class PtyNode:
         return int(TERMIOS2.unpack(fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size)))[6])
 
     def read(self) -> bytes:
-        """What the program sent."""
+        """Read the bytes that the program sent."""
         try:
             return os.read(self._master, READ_BYTES)
         except OSError:  # nothing there, or the program closed the port (EIO)
@@ -123,20 +123,20 @@ def set_baud(fd: int, baud: int) -> None:
 
 
 class Adapter:
-    """When bytes that crossed the wire reach the terminal: at once, or when a USB adapter's latency timer fires."""
+    """Delay between wire and terminal: none, or until a USB adapter's latency timer fires."""
 
     def __init__(self, profile: ArrivalProfile, begin_ns: int) -> None:
         self._begin_ns = begin_ns
         self._step_ns = round(profile.timer_ns / (1 + profile.timer_ppm * 1e-6))
 
     def handed_over_ns(self, due_ns: int) -> int:
-        """When a burst whose last byte came at `due_ns` is handed over."""
+        """Return the time at which a burst whose last byte came at `due_ns` is handed over."""
         step_ns = self._step_ns
         return due_ns + step_ns - (due_ns - self._begin_ns) % step_ns if step_ns else due_ns
 
 
 class SimulatedPort:
-    """Moves bytes between a module and its terminal. It reads no clock: the owner gives the time and waits.
+    """Connection between a module and its terminal. It reads no clock: the owner gives the time and waits.
 
     Synchronization: one thread.
     """
@@ -169,7 +169,7 @@ class SimulatedPort:
         self._hand_over(now_ns)
 
     def next_ns(self, now_ns: int) -> int:
-        """When `step` is to be called again at the latest."""
+        """Latest time of the next call of `step`."""
         times = [now_ns + NS_PER_S]
         if self._held:
             times.append(self._held[0].due_ns)
@@ -208,7 +208,7 @@ class SimulatedPort:
         self.node.plug(self.module.baud)
 
     def _receive_from_module(self, now_ns: int) -> None:
-        """Bring what left the module through faults and adapter."""
+        """Pass the module's output through faults and adapter."""
         faults = self._faults
         for burst in self.module.advance(now_ns):
             arriving: Burst | None = burst
@@ -226,7 +226,7 @@ class SimulatedPort:
             self.module.receive(heard(data, self.node.baud, self.module.baud), now_ns)
 
     def _hand_over(self, now_ns: int) -> None:
-        """Write what is due in one piece; nothing is kept for later."""
+        """Write what is due in one piece; what does not fit is lost."""
         held, due = self._held, []
         while held and held[0].due_ns <= now_ns:
             due.append(held.popleft())

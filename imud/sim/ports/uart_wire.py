@@ -1,4 +1,4 @@
-"""The wire of a UART: the device's transmitter at the rate of the line, and what a receiver at another rate hears."""
+"""The wire of a UART: the device's transmitter at the rate of the line, and reception at another rate."""
 
 from collections import deque
 from typing import Final
@@ -11,7 +11,7 @@ TOLERANCE: Final = 0.03
 
 
 class Transmitter:
-    """Sends one burst after the other from a buffer of limited size; bursts never overlap or overtake each other."""
+    """Transmitter with a buffer of limited size; bursts never overlap or overtake each other."""
 
     def __init__(self, baud: int, buffer_bytes: int, free_ns: int) -> None:
         """`free_ns`: nothing leaves before."""
@@ -25,7 +25,7 @@ class Transmitter:
         return size_bytes * BITS_PER_UART_BYTE * NS_PER_S // self.baud
 
     def due_ns(self, ready_ns: int, size_bytes: int) -> int:
-        """When a burst that is ready then would be through."""
+        """Return the time at which a burst that is ready at that time would be through."""
         return max(ready_ns, self._free_ns) + self.wire_ns(size_bytes)
 
     def fits(self, ready_ns: int, size_bytes: int) -> bool:
@@ -33,23 +33,23 @@ class Transmitter:
         return self.due_ns(ready_ns, size_bytes) - ready_ns <= self._buffer_ns
 
     def send(self, ready_ns: int, data: bytes, sample_ns: int | None = None, device_ms: int | None = None) -> None:
-        """Queue a burst, room or not."""
+        """Queue a burst, whether it fits or not."""
         self._free_ns = self.due_ns(ready_ns, len(data))
         self._waiting.append(Burst(self._free_ns, data, sample_ns, device_ms))
 
     def sent(self, now_ns: int) -> list[Burst]:
-        """Take out what has left the wire by now."""
+        """Return and remove the bursts that have left the wire by now."""
         waiting, done = self._waiting, []
         while waiting and waiting[0].due_ns <= now_ns:
             done.append(waiting.popleft())
         return done
 
     def next_ns(self) -> int | None:
-        """When the next burst is through, None if none waits."""
+        """Time at which the next burst is through; None if none waits."""
         return self._waiting[0].due_ns if self._waiting else None
 
     def stopped(self, now_ns: int) -> list[Burst]:
-        """Power is gone: what got through, the beginning of the burst on the wire last. The rest is forgotten."""
+        """Cut the power: return what was sent, the begin of the burst on the wire last; the rest is discarded."""
         through = self.sent(now_ns)
         if self._waiting:
             burst = self._waiting.popleft()
@@ -62,7 +62,7 @@ class Transmitter:
 
 
 def heard(data: bytes, sent_baud: int, listening_baud: int) -> bytes:
-    """The bytes that a receiver at `listening_baud` makes of 8N1 `data` sent at `sent_baud` (0 bit/s: none).
+    """Simulate a receiver at `listening_baud`: its bytes of 8N1 `data` sent at `sent_baud` (0 bit/s: none).
 
     The line is idle before and after. A byte without a valid stop bit is delivered as sampled, as a Linux tty does
     without INPCK; the receiver then waits for the line to go idle.
@@ -75,7 +75,7 @@ def heard(data: bytes, sent_baud: int, listening_baud: int) -> bytes:
 
 
 def _line(data: bytes) -> bytes:
-    """One 0 or 1 per bit time: start bit, eight data bits from the lowest, stop bit."""
+    """Return one 0 or 1 per bit time: start bit, eight data bits from the lowest, stop bit."""
     return b"".join(_SYMBOLS[byte] for byte in data)
 
 

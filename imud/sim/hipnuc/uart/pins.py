@@ -25,7 +25,7 @@ EDGES_MAX: Final = 8192
 
 
 class HipnucPins:
-    """Edges to come and levels now. Synchronization: one thread."""
+    """Pending edges and present levels. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._waiting: list[PinEdge] = []
@@ -35,11 +35,11 @@ class HipnucPins:
         """SOUT pulses since the last that SOUT_DIV repeated."""
 
     def restart_divider(self) -> None:
-        """The divider was set anew."""
+        """Restart the count of the divider: it was set anew."""
         self._pulses = 0
 
     def frame(self, start_ns: int, high_ns: int, divider: int, sample_ns: int) -> None:
-        """A frame begins on the wire at `start_ns`; the pulse before it is `high_ns` long."""
+        """Schedule the pulse, `high_ns` long, before a frame that begins on the wire at `start_ns`."""
         pins = [Pin.SOUT]
         self._pulses += 1
         if self._pulses >= divider:
@@ -50,13 +50,13 @@ class HipnucPins:
             self._add(PinEdge(start_ns, pin, False, sample_ns))
 
     def alarm(self, at_ns: int, active: bool) -> None:
-        """ALARM has this level from now on."""
+        """Set the level of ALARM from now on."""
         if active != self._alarm:
             self._alarm = active
             self._add(PinEdge(at_ns, Pin.ALARM, active))
 
     def edges(self, now_ns: int) -> list[PinEdge]:
-        """Take out what has happened by now."""
+        """Return and remove the edges that have happened by now."""
         count = bisect_right(self._waiting, now_ns, key=_due_ns)
         done, self._waiting = self._waiting[:count], self._waiting[count:]
         return done
@@ -66,7 +66,7 @@ class HipnucPins:
         return self._waiting[0].due_ns if self._waiting else None
 
     def power_lost(self, now_ns: int) -> None:
-        """What is to come does not come; pins that are high fall."""
+        """Cancel pending edges; pins that are high fall."""
         count = bisect_right(self._waiting, now_ns, key=_due_ns)
         dropped = self._waiting[count:]
         del self._waiting[count:]

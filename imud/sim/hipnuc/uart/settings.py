@@ -1,4 +1,4 @@
-"""What a simulated HiPNUC module is made of, what its RAM and flash hold, how a command changes that, its status bits.
+"""Hardware of a simulated HiPNUC module, its settings in RAM and flash, the commands that change them, status bits.
 
 IMU configuration manual V1.5.9, chapters 2.2.3 to 2.2.6 and 8.2. The forms of the USRCONFIG and COMCONFIG replies
 beyond `ATT_MODE: 0` are assumed: the manual does not print them.
@@ -23,12 +23,12 @@ URFR_TOLERANCE: Final = 1e-3
 
 
 class CommandRefused(ValueError):
-    """A known command with a value that the module does not take; it answers `ERR`."""
+    """A known command with a value out of range; the module answers `ERR`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """One message: sent every `period_ms` (0: never), or with each pulse on SIN."""
+    """An output message: sent every `period_ms` (0: never), or with each pulse on SIN."""
 
     period_ms: int = 0
     on_mark: bool = False
@@ -51,7 +51,7 @@ class AlarmSetting:
 
 @dataclass(frozen=True, slots=True)
 class ModuleSettings:
-    """All that SAVECONFIG saves. The defaults are the factory's (chapter 3.2: HI91 at 100 Hz)."""
+    """Settings that SAVECONFIG saves. The defaults are the factory's (chapter 3.2: HI91 at 100 Hz)."""
 
     baud: int = 115_200
     att_mode: int = 0
@@ -200,7 +200,7 @@ MARK_SPREAD_NS: Final = 15_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HipnucHardware(SensorHardware):
-    """One module. What commands change is in `ModuleSettings`; `processing_ns` counts from an edge on SIN too."""
+    """Hardware of a module; settings are in `ModuleSettings`. `processing_ns` counts from an edge on SIN too."""
 
     product: str = "HI14R3"
     build: str = "Oct 15 2024"
@@ -208,10 +208,10 @@ class HipnucHardware(SensorHardware):
     firmware: int = 156
     bootloader: int = 109
     mark_spread_ns: int = MARK_SPREAD_NS
-    """How much it takes longer or shorter at most after an edge on SIN."""
+    """Largest deviation of the processing time after an edge on SIN."""
     mark_seed: int = 1
     utc_epoch: Epoch = "unix"
-    """What UTC in ms counts from."""
+    """Epoch of UTC in ms."""
     uptime_ms: int = 0
     """Device time at the first power-on, to begin near the end of a counter's range."""
     mag_bias_t: Vector3 = (0.0, 0.0, 0.0)

@@ -61,7 +61,7 @@ _FRAME_BYTES: Final = {OutputMessage.HI91: 82, OutputMessage.HI92: 54}
 
 
 class HipnucModule:
-    """One module, powered on when it is made."""
+    """A simulated module, powered on from construction."""
 
     def __init__(
         self, now_ns: int, settings: ModuleSettings | None = None, hardware: HipnucHardware | None = None
@@ -87,7 +87,7 @@ class HipnucModule:
         return self._wire.baud
 
     def reboot(self, now_ns: int) -> None:
-        """Power was lost and came back, or REBOOT came: what was not saved is lost."""
+        """Restart, by REBOOT or after a loss of power: unsaved settings are lost."""
         self._sample(now_ns)
         self._before_reboot += self._wire.stopped(now_ns)
         self._pins.power_lost(now_ns)
@@ -95,7 +95,7 @@ class HipnucModule:
         self._power_on(now_ns, 0)
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Take bytes that the host sent, already as the module hears them."""
+        """Receive bytes that the host sent, already sampled at the module's rate."""
         self._sample(now_ns)
         if now_ns < self._ready_ns:  # still booting
             return
@@ -113,7 +113,7 @@ class HipnucModule:
                 self._line.clear()
 
     def mark(self, now_ns: int) -> None:
-        """A rising edge on SIN/PPS: the PPS stamp starts anew, and messages set to ONMARK are sent."""
+        """Pulse SIN/PPS (a rising edge): the PPS stamp starts anew, and messages set to ONMARK are sent."""
         self._sample(now_ns)
         if now_ns < self._ready_ns:  # still booting
             return
@@ -129,7 +129,7 @@ class HipnucModule:
         return done + self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
-        """When `advance` will have something next, or None while nothing is to come."""
+        """Time of the next output of `advance`; None for none."""
         if self._before_reboot:
             return self._before_reboot[0].due_ns
         if (due_ns := self._wire.next_ns()) is not None or not self._next_ms:
@@ -144,7 +144,7 @@ class HipnucModule:
         return self._pins.edges(now_ns)
 
     def next_pin_ns(self) -> int | None:
-        """When `pins` may have something next, or None while nothing is to come."""
+        """Time of the next output of `pins`; None for none."""
         times = [] if (next_ns := self._pins.next_ns()) is None else [next_ns]
         if self._next_ms:
             times.append(self._instant_ns(min(self._next_ms.values())))
@@ -153,7 +153,7 @@ class HipnucModule:
         return min(times, default=None)
 
     def counters(self) -> dict[str, int]:
-        """Frames by what became of them."""
+        """Counters of frames by their fate."""
         return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
 
     def _power_on(self, now_ns: int, uptime_ms: int) -> None:
@@ -195,7 +195,7 @@ class HipnucModule:
         return self._on_ns - (self._on_ms - device_ms) * NS_PER_MS * NS_PER_S // self._scale
 
     def _sample(self, now_ns: int) -> None:
-        """Take all samples up to now and queue their frames; look at the angles as often as is due."""
+        """Sample up to now and queue the frames; check the angles for ALARM as often as is due."""
         self._watch_angles(now_ns)
         while self._next_ms:
             message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
@@ -218,7 +218,7 @@ class HipnucModule:
             )
 
     def _queue_frame(self, message: OutputMessage, sample_ns: int, device_ms: int, later_ns: int = 0) -> None:
-        """`later_ns`: how much longer than usual it takes to leave."""
+        """Queue a frame; `later_ns`: its delay in addition to the usual one."""
         processing_ns = max(self.hardware.processing_ns + later_ns, 0)
         ready_ns, size = sample_ns + processing_ns, _FRAME_BYTES[message]
         if not self._wire.fits(ready_ns, size):
@@ -251,12 +251,12 @@ class HipnucModule:
         )  # fmt: skip
 
     def _reading(self, sample_ns: int) -> Truth:
-        """What the module measures at an instant, noise and mounting included."""
+        """Return the measurement at an instant, noise and mounting included."""
         truth = self._truth(sample_ns)
         return self.hardware.noise.add(truth, self._t_s(sample_ns)) if self.hardware.noise else truth
 
     def _truth(self, at_ns: int) -> Truth:
-        """What a perfect module, mounted and levelled like this one, measures."""
+        """Return the measurement of an ideal module that is mounted and levelled like this one."""
         truth = self.hardware.motion.at(self._t_s(at_ns))
         return self._mounting.turned(truth) if self._mounting.active else truth
 
@@ -343,7 +343,7 @@ class HipnucModule:
         return MountingRotation(self._frame).turned(self.hardware.motion.at(self._t_s(now_ns)))
 
     def _level(self, kind: str, now_ns: int) -> list[str]:
-        """CONFIG ATT RST: 2 levels here, 3 only where nearly level (upside down allowed), 5 cancels."""
+        """Carry out CONFIG ATT RST: 2 levels here, 3 only where nearly level (upside down allowed), 5 cancels."""
         if kind not in ("2", "3", "5"):
             raise CommandRefused(kind)
         attitude = self._attitude(now_ns)
@@ -357,7 +357,7 @@ class HipnucModule:
         return []
 
     def _set_yaw(self, mode: str, value: str, now_ns: int) -> list[str]:
-        """CONFIG YAW: 0 adds to the heading, 1 makes it so."""
+        """Carry out CONFIG YAW: 0 adds to the heading, 1 sets it."""
         angle_rad = radians(number(value, -180.0, 180.0))
         if mode not in ("0", "1"):
             raise CommandRefused(mode)

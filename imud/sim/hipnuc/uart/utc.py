@@ -1,4 +1,4 @@
-"""Time of a simulated HiPNUC module: ms since power-on, or UTC once PPS and RMC say so. Manual V1.5.9, section 1.2.1.
+"""Time of a simulated HiPNUC module: ms since power-on, or UTC after PPS and RMC. Manual V1.5.9, section 1.2.1.
 
 The manual: a rising edge on SIN/PPS at each full second of UTC, 5 ms long, and RMC sentences at 1-10 Hz; once the two
 agree, the time in all frames is at once UTC in ms. The rest is assumed, with the reason:
@@ -23,13 +23,13 @@ STEP_TOLERANCE_NS: Final = 10 * NS_PER_MS
 INTERVALS_NEEDED: Final = 2
 SENTENCES_NEEDED: Final = 2
 REGAIN_NS: Final = 100 * NS_PER_MS
-"""Farther off a full second a pulse says nothing: it may be a disturbance, or a sentence has to say which it is."""
+"""Largest distance of a pulse from a full second at which it counts without a sentence."""
 LOST_NS: Final = 2 * NS_PER_S
 UPTIME_MODULUS_MS: Final = 2**32
 
 
 class UtcTime:
-    """What the module shows as time. Arguments are ns of its own clock since power-on. Synchronization: one thread."""
+    """Time in the module's frames. Arguments are ns of its own clock since power-on. Synchronization: one thread."""
 
     def __init__(self, epoch: Epoch) -> None:
         self._modulus_ms = MODULUS_MS[epoch]
@@ -43,7 +43,7 @@ class UtcTime:
         self._agreed = 0
 
     def pulse(self, device_ns: int) -> None:
-        """A rising edge on SIN/PPS."""
+        """Note a rising edge on SIN/PPS."""
         in_step = self._pulse_ns is not None and abs(device_ns - self._pulse_ns - NS_PER_S) <= STEP_TOLERANCE_NS
         if in_step and self._claim_s is not None:
             self._claim_s += 1
@@ -58,7 +58,7 @@ class UtcTime:
                 self._anchor = device_ns, second + seconds
 
     def sentence(self, line: bytes, device_ns: int) -> None:
-        """A line that begins with `$`; all but good RMC sentences are ignored."""
+        """Process a line that begins with `$`; all but valid RMC sentences are ignored."""
         rmc = parse(line)
         if not isinstance(rmc, Rmc) or not rmc.valid or self._pulse_ns is None:
             return
