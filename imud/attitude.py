@@ -1,4 +1,4 @@
-"""Attitude as quaternion, Euler angles (312 and ZYX) and rotation matrix, and every way between them.
+"""Attitude as quaternion, Euler angles (312 and ZYX) and rotation matrix, with conversions between all of them.
 
 One convention for all: the rotation takes a vector from the body frame (right-handed: x right, y forward, z up) to the
 navigation frame ENU (x east, y north, z up), v_n = C v_b. Quaternions are scalar first and need not be of unit length;
@@ -27,7 +27,7 @@ is about cos(pitch), the error of not doing so about 1e-16 / cos(pitch): both ar
 
 
 def quat_normalized(quat_wxyz: Quaternion) -> Quaternion:
-    """The same rotation with unit length. Raises ValueError where it has no direction (zero, NaN or infinite)."""
+    """Normalise to unit length. Raises ValueError for a quaternion without direction (zero, NaN or infinite)."""
     w, x, y, z = quat_wxyz
     norm = math.hypot(w, x, y, z)
     if not 0.0 < norm < math.inf:

@@ -11,7 +11,7 @@ ImudError
  │   ├─ NoReply          no reply came in time
  │   └─ Rejected         the device answered that it will not
  ├─ TransferError        one transfer on a bus failed; the next may go through
- ├─ DeviceRefused        what answers on a bus is not the device, or does not do what it is told
+ ├─ DeviceRefused        another device answers on a bus, or it refuses a setting
  ├─ NothingHeard         detection found no device
  └─ ServerError          the daemon's own interfaces: socket in use, shared memory not writable, protocol violated
 """
@@ -32,7 +32,7 @@ class LinkError(ImudError):
 
 
 class LinkMissing(LinkError):
-    """The port is not there, and may come back. Example: /dev/ttyUSB0 after the cable moved."""
+    """The port is absent, and may appear again. Example: /dev/ttyUSB0 after the cable moved."""
 
 
 class LinkDenied(LinkError):
@@ -52,15 +52,15 @@ class BadArgument(CommandError, ValueError):
 
 
 class NoReply(CommandError):
-    """No reply came in time. Example: the device is in another mode, or its receive line is not connected."""
+    """No reply within the time-out. Example: the device is in another mode, or its receive line is not connected."""
 
 
 class Rejected(CommandError):
-    """The device answered that it will not. Example: `ERR` after a command with a value it does not take."""
+    """The device refused a command. Example: `ERR` after a command with a value outside its range."""
 
 
 class Trouble(StrEnum):
-    """How a transfer failed."""
+    """Kinds of failure of a transfer."""
 
     ABSENT = "absent"
     """Nobody acknowledges the address: not powered, not wired, another address."""
@@ -71,7 +71,7 @@ class Trouble(StrEnum):
 
 
 class TransferError(ImudError):
-    """One transfer on a bus failed; the next may go through. Example: no acknowledgement from address 0x18."""
+    """A transfer on a bus failed; the next may succeed. Example: no acknowledgement from address 0x18."""
 
     def __init__(self, trouble: Trouble, message: str) -> None:
         super().__init__(message)
@@ -79,7 +79,7 @@ class TransferError(ImudError):
 
 
 class DeviceRefused(ImudError):
-    """What answers is not the device, or does not do what it is told. Example: a wrong product id."""
+    """The device that answers is not the expected one, or refused a setting. Example: a wrong product id."""
 
 
 class NothingHeard(ImudError):

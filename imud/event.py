@@ -12,11 +12,11 @@ class EventKind(StrEnum):
     UP = "up"
     """The device is found and identified; samples follow."""
     DOWN = "down"
-    """The device or its link is gone; `detail` says how."""
+    """The device or its link is gone; `detail` has the reason."""
     SYNC = "sync"
     """The source of time stamps changed."""
     LOSS = "loss"
-    """Samples were lost; `detail` says how many and by which cause. Sent at most once a second and device."""
+    """Samples were lost; `detail` has their number and cause. Sent at most once a second and device."""
     CONFIGURATION = "configuration"
     """The device's own settings, or the daemon's configuration, are not what they were."""
     ALARM = "alarm"
@@ -30,20 +30,20 @@ class EventKind(StrEnum):
 
 
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One event of one device, or of the daemon itself when `device` is empty."""
+    """An event of one device, or of the daemon itself when `device` is empty."""
 
     t_ns: int
     """CLOCK_MONOTONIC when it was noticed."""
     device: str
     kind: EventKind
     message: str
-    """One sentence for people."""
+    """Description, one sentence."""
     detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
 
 
 class RaiseEvent(Protocol):
-    """Sends one event of one device, and logs it."""
+    """Function that sends and logs one event of one device."""
 
     def __call__(self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None) -> None:
-        """At `now_ns` (CLOCK_MONOTONIC): one sentence for people, and details by name."""
+        """Raise an event of `now_ns` (CLOCK_MONOTONIC): one sentence for people, and details by name."""
         ...

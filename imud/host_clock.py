@@ -27,7 +27,7 @@ KEPT_NS: Final = 1 * NS_PER_S
 
 
 class HostClock:
-    """Reads the host's clocks. Synchronization: `now_ns` any thread, the rest one thread."""
+    """Reader of the host's clocks. Synchronization: `now_ns` any thread, the rest one thread."""
 
     __slots__ = ("_due_ns", "_least_ns", "_most_ns", "_offset_ns", "_realtime_ns", "error_ns", "now_ns")
 

@@ -1,4 +1,4 @@
-"""The ledger of one device: where every byte, frame and lost sample went. It closes to zero at every moment.
+"""The ledger of one device: an account of every byte, frame and lost sample. It closes to zero at every moment.
 
 Hot paths add to plain integers; the outputs read them. Synchronization: written and read by the event loop only,
 between two callbacks; another thread asks the loop for a snapshot, because inside a callback the sums are not closed.
@@ -17,7 +17,7 @@ LEDGER_FIELDS: Final = (
     "frames_good",
     "frames_in_samples",
     "frames_in_replies",  # text lines and reply frames
-    "frames_ignored",  # valid, but nothing in it that imud knows
+    "frames_ignored",  # valid, without content that imud decodes
     "frames_pending",  # valid, waiting for the rest of their sample
     "frames_bad_crc",
     "frames_bad_length",
@@ -88,12 +88,12 @@ class Ledger:
         return self.lost_gap_device + self.lost_crc + self.lost_overrun + self.lost_queue
 
     def values(self) -> tuple[int, ...]:
-        """All counters in the order of LEDGER_FIELDS."""
+        """Return all counters in the order of LEDGER_FIELDS."""
         values: tuple[int, ...] = _ALL(self)
         return values
 
     def snapshot(self) -> dict[str, int]:
-        """All counters by name."""
+        """Return all counters by name."""
         return dict(zip(LEDGER_FIELDS, self.values(), strict=True))
 
 

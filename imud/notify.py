@@ -1,4 +1,4 @@
-"""The whole of sd_notify(3), the notification protocol of service managers: one datagram to NOTIFY_SOCKET."""
+"""Notifications to the service manager by sd_notify(3): one datagram to NOTIFY_SOCKET."""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""Names of the user and of a device node's group, for messages of links and signals, which share only this."""
+"""Names of the user and of a device node's group, for error messages of links and signals."""
 
 import grp
 import os

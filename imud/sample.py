@@ -1,4 +1,4 @@
-"""The two records of the sample path: what a device said, and what imud makes of it.
+"""The two records of the sample path: a decoded message of a device, and the sample that imud makes of it.
 
 A codec yields `Measurement`: device time and physical values, no host time. Only `imud.clock` makes a `Sample`,
 so a path that skips the clock does not type-check. All values are SI, in the right-handed sensor frame; a field is
@@ -16,7 +16,7 @@ Pair = tuple[float, float]
 
 
 class Sync(StrEnum):
-    """Where a time stamp comes from, worst first."""
+    """Origin of a time stamp, worst first."""
 
     ARRIVAL = "arrival"
     """Time of arrival less the time on the wire; the device sends no usable time."""
@@ -29,7 +29,7 @@ class Sync(StrEnum):
 
 
 class Measurement(msgspec.Struct, frozen=True, gc=False):
-    """One message of a device, decoded to SI units, without host time."""
+    """A message of a device, decoded to SI units, without host time."""
 
     size_bytes: int
     """Bytes of the message on the wire, all framing included."""
@@ -55,7 +55,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """One measurement with its place in time. Field names are the names in JSON; absent fields are left out there."""
+    """A measurement with its host time. Field names are the names in JSON, which leaves absent fields out."""
 
     device: str
     """Name of the device in the configuration."""
@@ -90,7 +90,7 @@ SAMPLE_FIELDS: tuple[str, ...] = Sample.__struct_fields__
 
 
 class FieldInfo(msgspec.Struct, frozen=True):
-    """One member of a sample."""
+    """Description of one member of a sample."""
 
     name: str
     type: str
@@ -98,7 +98,7 @@ class FieldInfo(msgspec.Struct, frozen=True):
     unit: str
     """Unit of the value, SI; empty where it has none."""
     frame: str
-    """Frame or time scale that the value stands in; empty where it has none."""
+    """Frame or time scale of the value; empty where it has none."""
     meaning: str
     always: bool
     """False where the member is left out when the message had no such value."""

@@ -1,6 +1,6 @@
 """Table: conversion factors to SI units, each the exact definition; a value times its factor is the SI value.
 
-A factor that belongs to one sensor (counts to m/s²) stands in that sensor's file, made from these.
+A factor that belongs to one sensor (counts to m/s²) is in that sensor's file, made from these.
 """
 
 import math

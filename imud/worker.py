@@ -1,6 +1,6 @@
-"""A thread that sleeps from one deadline to the next: it serves a polled bus, or drives a trigger line.
+"""A thread that sleeps from one deadline to the next: for a polled bus, or a trigger line.
 
-A worker calls a function that says how long it may sleep; tests call that function themselves, at times they choose
+A worker calls a function that returns how long it may sleep; tests call that function themselves, at times they choose
 (`tests/support/virtual_time.py`).
 """
 
@@ -20,10 +20,10 @@ Round = Callable[[], int]
 
 
 class Worker(Protocol):
-    """Calls a `Round` again and again, one call at a time."""
+    """Caller of a `Round` again and again, one call at a time."""
 
     def ring(self) -> None:
-        """End the present sleep, or skip the next: there is something to do. From any thread."""
+        """End the present sleep, or skip the next: there is work. From any thread."""
         ...
 
     def end(self) -> None:
@@ -80,7 +80,7 @@ class BusThread:
                 rest_ns = work()
                 if rest_ns > 0 and not self._ended:
                     wait(rest_ns / NS_PER_S)
-        except BaseException as error:  # noqa: BLE001 - a mistake of ours must end the daemon, not just this thread
+        except BaseException as error:  # noqa: BLE001 - a defect of imud must end the daemon, not just this thread
             self._failed(error)
 
 
