@@ -15,13 +15,14 @@ PACKAGE = Path(__file__).parent.parent / "imud"
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud", "imud.units"),
     ("imud.sample", "imud.errors", "imud.ledger", "imud.event"),
-    ("imud.attitude", "imud.permissions", "imud.worker", "imud.notify", "imud.host_clock"),
+    ("imud.attitude", "imud.files", "imud.host_clock", "imud.log", "imud.notify", "imud.permissions", "imud.worker"),
     ("imud.formats",),
     ("imud.contracts",),
     ("imud.devices", "imud.clock", "imud.links", "imud.publishers", "imud.utc"),
     ("imud.sim", "imud.config", "imud.client"),
     ("imud.signals",),
     ("imud.runtime",),
+    ("imud.reload",),
     ("imud.daemon",),
     ("imud.cli", "imud.__main__"),
 )

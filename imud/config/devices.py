@@ -1,7 +1,8 @@
 """Reading of the devices: each has a driver, one link, and perhaps lines and a source of RMC sentences."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from re import compile as pattern
 from typing import Any, Final
 
@@ -21,9 +22,11 @@ DEVICE_NAME: Final = pattern(r"[a-z0-9][a-z0-9_-]{0,31}")
 class DeviceReader:
     """Reader of the devices of one file."""
 
-    def __init__(self, keys: Keys, tables: Tables) -> None:
+    def __init__(self, keys: Keys, tables: Tables, pause: Callable[[], None]) -> None:
+        """`pause` is called after every device."""
         self._keys = keys
         self._tables = tables
+        self._pause = pause
 
     def devices(self, top: Mapping[str, Any]) -> list[tuple[DeviceConfig, bool]] | None:
         """Read the devices without a problem, each with whether it is enabled; None if the key is missing or empty."""
@@ -37,7 +40,7 @@ class DeviceReader:
         found = self._keys.mapping(path, top["devices"]) or {}
         if len(found) > DEVICES_MAX:
             self._keys.problem(path, f"expected at most {DEVICES_MAX} devices, got {len(found)}")
-        devices = [self._device(name, data) for name, data in found.items()]
+        devices = [self._device(name, data) for name, data in islice(found.items(), DEVICES_MAX)]
         made = [device for device in devices if device is not None]
         used = [device for device, enabled in made if enabled]
         self._ports_once(used)
@@ -45,6 +48,7 @@ class DeviceReader:
         return made
 
     def _device(self, name: str, data: object) -> tuple[DeviceConfig, bool] | None:
+        self._pause()
         path: KeyPath = ("devices", name)
         if not DEVICE_NAME.fullmatch(name):
             rule = "1 to 32 of a-z, 0-9, _ and -, beginning with a letter or digit"

@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from imud.config.schema import Row
+from imud.config.yaml_tree import PROBLEMS_MAX, Problem, YamlTree
 from imud.config.yaml_tree import Path as KeyPath
-from imud.config.yaml_tree import Problem, YamlTree
 from imud.contracts.settings import Settings, expected, got, unknown_name
 
 S = TypeVar("S", bound=Settings)
@@ -38,7 +38,7 @@ class Keys:
     def unknown_keys(self, path: KeyPath, keys: Mapping[str, Any], known: Sequence[str]) -> None:
         """Add a problem for each key that is not `known`."""
         for key in keys:
-            if key not in known:
+            if key not in known and len(self.problems) < PROBLEMS_MAX:
                 self.problem((*path, key), unknown_name("a key", key, known), at_key=True)
 
     def row(self, table: Mapping[str, Row], name: str, data: object, path: KeyPath | None = None) -> Settings | None:

@@ -1,6 +1,6 @@
 """Reading and checking of a whole file, which makes a `Config`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -8,35 +8,38 @@ from imud.config.devices import DeviceReader
 from imud.config.keys import Keys
 from imud.config.model import Config
 from imud.config.schema import TABLES, General, Tables
-from imud.config.yaml_tree import FILE_BYTES_MAX, Problem, path_text, read_yaml
+from imud.config.yaml_tree import FILE_BYTES_MAX, Problem, no_pause, path_text, read_yaml
 from imud.errors import ConfigError
+from imud.files import read_regular
 
 PROBLEMS_SHOWN: Final = 20
 
 
-def load(path: Path | str, tables: Tables = TABLES) -> Config:
-    """Read a configuration file. Raises ConfigError with every problem that was found, one per line."""
+def load(path: Path | str, tables: Tables = TABLES, pause: Callable[[], None] = no_pause) -> Config:
+    """Read a configuration file. Raises ConfigError with every problem that was found, one per line.
+
+    `pause` is called after every piece of work of less than a millisecond.
+    """
     try:
-        with open(path, "rb") as file:
-            content = file.read(FILE_BYTES_MAX + 1)
+        content = read_regular(path, FILE_BYTES_MAX + 1)
     except OSError as error:
         hint = "give the file with --config" if isinstance(error, FileNotFoundError) else "look at its owner and mode"
         raise ConfigError(f"{path}: cannot be read: {error.strerror}; {hint}") from None
-    return parse(content, str(path), tables)
+    return parse(content, str(path), tables, pause)
 
 
-def parse(text: str | bytes, filename: str, tables: Tables = TABLES) -> Config:
-    """Read a configuration from text; `filename` is for messages. Raises ConfigError."""
-    tree = read_yaml(text.encode() if isinstance(text, str) else text)
+def parse(text: str | bytes, filename: str, tables: Tables = TABLES, pause: Callable[[], None] = no_pause) -> Config:
+    """Read a configuration from text; `filename` is for messages, `pause` as for `load`. Raises ConfigError."""
+    tree = read_yaml(text.encode() if isinstance(text, str) else text, pause)
     keys = Keys(tree)
-    config = _config(keys, tables) if tree.complete else None
+    config = _config(keys, tables, pause) if tree.complete else None
     problems = [*tree.problems, *keys.problems_besides(tree.problems)]
     if problems or config is None:
         raise ConfigError(_report(problems, filename))
     return config
 
 
-def _config(keys: Keys, tables: Tables) -> Config | None:
+def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | None:
     """Make the configuration; None where problems prevent it."""
     top = keys.mapping((), keys.tree.data)
     if top is None:
@@ -45,7 +48,7 @@ def _config(keys: Keys, tables: Tables) -> Config | None:
     keys.unknown_keys((), top, known)
     general = keys.settings(General, (), {key: top[key] for key in General.__struct_fields__ if key in top})
     publishers = {name: keys.row(tables.publishers, name, top.get(name)) for name in tables.publishers}
-    devices = DeviceReader(keys, tables).devices(top)
+    devices = DeviceReader(keys, tables, pause).devices(top)
     if general is None or devices is None or keys.problems:
         return None
     used = tuple(device for device, enabled in devices if enabled)

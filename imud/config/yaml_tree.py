@@ -11,7 +11,7 @@ both end in RecursionError after seconds at 1000 brackets, stop at the first pro
 import codecs
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, Protocol, cast
 
@@ -23,6 +23,10 @@ FILE_BYTES_MAX: Final = 1 << 20
 """256 devices with every key written out take 0.1 MB."""
 DEPTH_MAX: Final = 32
 """A configuration needs five."""
+PROBLEMS_MAX: Final = 1000
+"""A file with more is not a configuration; comparing their places takes time by the square of their number."""
+EVENTS_PER_TURN: Final = 64
+"""Events of the parser between two calls of `pause`: a third of a millisecond."""
 
 Path = tuple[str | int, ...]
 """Keys and indices from the top of the file to a value."""
@@ -70,12 +74,19 @@ class YamlTree:
         return self.keys.get(path) or self.mark(path)
 
 
-def read_yaml(content: bytes) -> YamlTree:
-    """Read one YAML document. Never raises: all that is wrong, as far as it could be read, is in `problems`."""
+def no_pause() -> None:
+    """Return at once: no other thread waits for this one."""
+
+
+def read_yaml(content: bytes, pause: Callable[[], None] = no_pause) -> YamlTree:
+    """Read one YAML document. Never raises: all that is wrong, as far as it could be read, is in `problems`.
+
+    `pause` is called after every EVENTS_PER_TURN events.
+    """
     tree = YamlTree()
     try:
         text = _text(content)
-        _Builder(tree).build(_events(text))
+        _Builder(tree).build(_events(text), pause)
     except _Refused as refused:
         tree.complete = False
         tree.problems.append(refused.problem)
@@ -175,8 +186,10 @@ class _Builder:
         self._stack: list[_Open] = []
         self._documents = 0
 
-    def build(self, events: Iterator[_Event]) -> None:
-        for event in events:
+    def build(self, events: Iterator[_Event], pause: Callable[[], None]) -> None:
+        for number, event in enumerate(events, start=1):
+            if number % EVENTS_PER_TURN == 0:
+                pause()
             mark = SourcePosition(event.start_mark.line + 1, event.start_mark.column + 1)
             if isinstance(event, yaml.DocumentStartEvent):
                 self._documents += 1
@@ -267,6 +280,8 @@ class _Builder:
             self._problem(mark, path, f"expected a plain value, got the tag {event.tag}: leave it out")
 
     def _problem(self, mark: SourcePosition, path: Path, message: str) -> None:
+        if len(self._tree.problems) >= PROBLEMS_MAX:
+            raise _Refused(mark, f"expected at most {PROBLEMS_MAX} problems, got more: the rest is not read", path)
         self._tree.problems.append(Problem(mark, path, message))
 
 

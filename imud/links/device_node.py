@@ -139,6 +139,6 @@ def _target(descriptor: Path) -> str:
 
 def _name(process: Path) -> str:
     try:
-        return (process / "comm").read_text().strip()
+        return (process / "comm").read_text("utf-8", "backslashreplace").strip()
     except OSError:
         return "a process"

@@ -69,8 +69,9 @@ class DeviceFactory:
         return Device(config, device_id, make_transport, self._publish, self._send_event, self._host, self._lines)
 
     def close(self) -> None:
-        """Stop what serves the polled buses; may be called twice."""
+        """Stop what serves the polled buses, and have what was found written; may be called twice."""
         self._polled_buses.end()
+        self.remembered.close()
 
     def on_stream(self, link: StreamLink) -> MakeTransport:
         """Return a maker of transports on a link of bytes, for `make_on`."""

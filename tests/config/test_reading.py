@@ -2,6 +2,7 @@
 
 # ruff: noqa: E501 - a row of the table is a whole file and the whole message for it
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +16,8 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from imud import config
-from imud.config import DEVICES_MAX, TABLES, Config, DeviceConfig, Tables
+from imud.config import DEVICES_MAX, PROBLEMS_SHOWN, TABLES, Config, DeviceConfig, Tables
+from imud.config.yaml_tree import EVENTS_PER_TURN
 from imud.contracts.settings import NoSettings, Settings, expected, got
 from imud.devices import DRIVERS
 from imud.errors import ConfigError
@@ -413,3 +415,35 @@ def test_what_talks_on_a_can_bus_is_searched() -> None:
 def test_a_can_driver_on_the_links_that_carry_frames(link: str) -> None:
     (device,) = config.parse(f"devices:\n  a: {{driver: imu61x-can, {link}}}\n", "x.yaml").devices
     assert device.driver == "imu61x-can"
+
+
+@pytest.mark.timeout(10)
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(ConfigError, match=r"fifo: cannot be read: is a FIFO, expected a regular file"):
+        config.load(tmp_path / "fifo", FAKE)
+    with pytest.raises(ConfigError, match="is a character device"):
+        config.load("/dev/zero", FAKE)
+
+
+@pytest.mark.timeout(10)
+@pytest.mark.parametrize("line", ["d{0}: no", "d{0}: {{baud: 1}}", "same: 1", "? {0}", "d{0}: [!a b, !c d]"])
+def test_a_file_of_nothing_but_problems_is_refused_soon(line: str) -> None:
+    """What comes after 1000 problems is not read: their number squared was an hour of work."""
+    text = "\n".join(line.format(number) for number in range(40_000))
+    found = errors(text)
+    assert len(found) == PROBLEMS_SHOWN + 1
+    assert "more problems" in found[-1]
+
+
+def test_pauses_between_pieces_of_work() -> None:
+    """At least one for every device, and one for so many events of the parser."""
+    text = "devices:\n" + "".join(f"  d{n}: {{uart: {{port: /dev/tty{n}}}}}\n" for n in range(DEVICES_MAX))
+    pauses = 0
+
+    def pause() -> None:
+        nonlocal pauses
+        pauses += 1
+
+    config.parse(text, "f.yaml", pause=pause)
+    assert pauses >= DEVICES_MAX + DEVICES_MAX * 8 // EVENTS_PER_TURN

@@ -1,8 +1,6 @@
 """The file of a replay: settings, waiting for it, opening and closing it, for both kinds of replay."""
 
 import asyncio
-import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, BinaryIO, Literal
@@ -12,6 +10,8 @@ from msgspec import Meta
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
 from imud.errors import LinkDenied, LinkError, LinkMissing
+from imud.files import NotRegularFile
+from imud.files import open_regular as open_file
 from imud.links.inotify import wait_until
 
 
@@ -74,12 +74,12 @@ class FileReplay:
 def open_regular(path: str) -> BinaryIO:
     """Open a capture for reading. Raises LinkMissing, LinkDenied, LinkError."""
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            raise LinkError(f"{path} is not a regular file: a replay reads a capture file")
-        return open(path, "rb")
+        return open_file(path)
     except FileNotFoundError as error:
         raise LinkMissing(f"{path} is not there: expected a capture file") from error
     except PermissionError as error:
         raise LinkDenied(f"{path} may not be read by this user") from error
+    except NotRegularFile as error:
+        raise LinkError(f"{path} is not a regular file: a replay reads a capture file") from error
     except OSError as error:
         raise LinkError(f"{path} cannot be read: {error.strerror}") from error

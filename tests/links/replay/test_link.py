@@ -213,7 +213,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def refuse(path: str) -> None:
         raise PermissionError
 
-    monkeypatch.setattr("imud.links.replay.file.os.stat", refuse)
+    monkeypatch.setattr("imud.files.os.stat", refuse)
     with pytest.raises(LinkDenied):
         ReplayLink(ReplaySettings(path=str(tmp_path))).open()
 
