@@ -3,21 +3,23 @@
 import argparse
 import asyncio
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from imud import config
 from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
-from imud.cli.run import start_log
 from imud.cli.status import block
 from imud.contracts.can import CanDriver
 from imud.contracts.publisher import Batch
+from imud.contracts.status import DeviceStatus
 from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ImudError
 from imud.event import Event
 from imud.links import LINKS
+from imud.log import STDERR, log_to
 
 SPEEDS = ("recorded", "real", "maximum")
 
@@ -39,16 +41,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play the file to its end; the ledger goes to standard error. 1 when there was no sample in it."""
-    start_log("warning")
+    with log_to(STDERR, "warning"):
+        status = play(args)
+    print(block(status), file=sys.stderr)
+    return 0 if status.ledger["samples"] else 1
+
+
+def play(args: argparse.Namespace) -> DeviceStatus:
+    """Play the file to its end and return the state of its device then. Raises ImudError."""
     if not args.file.is_file():
         raise ImudError(f"{args.file}: expected a capture file, found none")
     settings = config.parse(configuration(args), str(args.file))
     check(settings.devices[0])
-    daemon = Daemon(settings, extra={"print": Printer()} if args.json else {}, until_finished=True)
+    printer = Printer(lambda: daemon.stop())  # noqa: PLW0108 - the daemon is made with the printer
+    daemon = Daemon(settings, extra={"print": printer} if args.json else {}, until_finished=True)
     asyncio.run(serve(daemon))
-    status = daemon.status()[0]
-    print(block(status), file=sys.stderr)
-    return 0 if status.ledger["samples"] else 1
+    if printer.problem is not None:
+        raise printer.problem
+    return daemon.status()[0]
 
 
 def check(device: config.DeviceConfig) -> None:
@@ -91,7 +101,13 @@ def configuration(args: argparse.Namespace) -> str:
 
 
 class Printer:
-    """A publisher that prints samples as JSON lines."""
+    """A publisher that prints samples as JSON lines, as long as they can be written."""
+
+    def __init__(self, stop: Callable[[], None]) -> None:
+        """`stop` is called at the first line that cannot be written."""
+        self.problem: OSError | None = None
+        """Why lines could not be written; None while they can."""
+        self._stop = stop
 
     def start(self) -> None:
         """No-op: there is nothing to open."""
@@ -103,9 +119,8 @@ class Printer:
         """No-op: nothing is kept per device."""
 
     def publish(self, batch: Batch) -> None:
-        """Print one line per sample."""
-        for sample in batch.samples:
-            sys.stdout.write(msgspec.json.encode(sample).decode() + "\n")
+        """One line per sample."""
+        self._output("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples))
 
     def event(self, event: Event) -> None:
         """No-op: events are in the log."""
@@ -114,8 +129,17 @@ class Printer:
         """No-op: nothing depends on time."""
 
     def close(self) -> None:
-        """Write out the buffer."""
-        sys.stdout.flush()
+        """Leave nothing in the buffer."""
+        self._output("", flush=True)
+
+    def _output(self, text: str, *, flush: bool = False) -> None:
+        if self.problem is not None:
+            return
+        try:
+            print(text, end="", flush=flush)
+        except OSError as error:
+            self.problem = error
+            self._stop()
 
 
 REPLAY = CliCommand(add_arguments, run)

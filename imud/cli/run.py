@@ -4,12 +4,18 @@ import argparse
 import asyncio
 import logging
 import os
+import sys
 from pathlib import Path
 
 from imud import config
 from imud.cli.arguments import CliCommand
 from imud.config import Config
+from imud.config.yaml_tree import FILE_BYTES_MAX
 from imud.daemon import Daemon
+from imud.errors import ImudError
+from imud.log import STDERR, log_to
+
+log = logging.getLogger(__name__)
 
 DEFAULT_FILE = Path("/etc/imud.yaml")
 
@@ -22,24 +28,35 @@ def run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGTERM or SIGINT."""
+    """Run until SIGTERM or SIGINT; 1 after a mistake of imud's own, which is in the log."""
     settings = config.load(args.config)
-    start_log(settings.log_level)
-    asyncio.run(serve(settings, args.config))
+    with log_to(STDERR, settings.log_level):
+        try:
+            asyncio.run(serve(settings, args.config))
+        except ImudError:
+            raise
+        except Exception:
+            log.critical("imud ends because of a mistake of its own", exc_info=True)
+            return 1
     return 0
 
 
 def check_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud check`."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="configuration file")
+    parser.add_argument("file", metavar="FILE", help="configuration file, or - for standard input")
 
 
 def check(args: argparse.Namespace) -> int:
     """Print one line when the file is good; the error with line and column goes to standard error."""
-    settings = config.load(args.file)
+    settings = config.parse(standard_input(), "standard input") if args.file == "-" else config.load(args.file)
     names = ", ".join(device.name for device in settings.devices) or "none"
     print(f"{args.file}: good; devices: {names}")
     return 0
+
+
+def standard_input() -> bytes:
+    """Return standard input, no more of it than a configuration may have."""
+    return sys.stdin.buffer.read(FILE_BYTES_MAX + 1)
 
 
 async def serve(settings: Config, file: Path) -> None:
@@ -53,12 +70,6 @@ def state_dir(settings: Config) -> Path:
     """Choose the service manager's state directory if it gave one, else the configured one."""
     given = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(given or settings.state_dir)
-
-
-def start_log(level: str) -> None:
-    """Log to standard error, without the time under a service manager, whose journal adds it."""
-    stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    logging.basicConfig(level=level.upper(), format=stamp + "%(levelname)s %(message)s")
 
 
 RUN = CliCommand(run_arguments, run)

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from imud import config
-from imud.cli.run import start_log
 from imud.contracts.lines import InputSettings, LineFactory
 from imud.daemon import Daemon
+from imud.log import STDERR, log_to
 from imud.signals.gpio import GpioInput, GpioOutput
 
 
@@ -42,14 +42,14 @@ def main() -> None:
     file = Path(sys.argv[1])
     FifoInput.path = str(file.parent / "edges")
     settings = config.load(file)
-    start_log(settings.log_level)
 
     async def serve() -> None:
         daemon = Daemon(settings, lines=LineFactory(FifoInput, GpioOutput))
         daemon.install_signals()
         await daemon.run()
 
-    asyncio.run(serve())
+    with log_to(STDERR, settings.log_level):
+        asyncio.run(serve())
 
 
 if __name__ == "__main__":

@@ -1,0 +1,218 @@
+"""A message is one line whatever it is made of, and no reader of the log makes the one who logs wait."""
+
+import logging
+import os
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from time import monotonic
+
+import pytest
+
+from imud.log import (
+    FLUSH_S,
+    MESSAGE_CHARACTERS_MAX,
+    TRACEBACK_LINES_MAX,
+    VALUE_CHARACTERS_MAX,
+    LineFormatter,
+    LogWriter,
+    log_to,
+    messages_dropped,
+    printable,
+    shown,
+)
+from tests.support.pipes import pipe, read_until
+from tests.support.running import wait_until
+
+log = logging.getLogger("imud.test")
+
+FORGED = "bow\n2026-11-22 05:00:00,000 WARNING root logged in"
+HOSTILE = (
+    FORGED, "\x1b[2J\x1b]0;title\x07", "a\rb", "\x00", "\x85next", "\u2028line", "\u202eevil", "\udc80\ud800",
+    "\x9b31m", "x" * 10_000, "\n" * 10_000,
+)  # fmt: skip
+
+
+def nested(levels: int) -> object:
+    """What 974 brackets of a request become."""
+    value: object = {}
+    for number in range(levels):
+        value = [value] if number % 2 else {"a": value}
+    return value
+
+
+def formatted(message: str, *values: object, **more: object) -> str:
+    """The line of one message."""
+    record = logging.LogRecord("imud", logging.WARNING, __file__, 1, message, values, None)
+    record.__dict__.update(more)
+    return LineFormatter(stamped=False).format(record)
+
+
+# --- texts and values -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_printable_is_one_bounded_line_for_every_encoding(text: str) -> None:
+    line = printable(text)
+    assert line.isprintable()
+    assert len(line) <= VALUE_CHARACTERS_MAX
+    line.encode("utf-8")
+
+
+def test_printable_says_what_it_hides() -> None:
+    assert printable("Überseeschiff 3 °C") == "Überseeschiff 3 °C"
+    assert printable("a\nb\x1b\udc80\u202e") == r"a\nb\x1b\udc80\u202e"
+    assert printable("x" * 300, 10) == "x" * 9 + "…"
+    assert printable("\n" * 6, 10) == r"\n\n\n\n\n"[:9] + "…"
+
+
+class Unshowable:
+    def __repr__(self) -> str:
+        raise ValueError("no")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [nested(974), nested(100_000), {f"k{n}": "\n" for n in range(10_000)}, b"\n\xff" * 10_000, 10**5000, Unshowable(),
+     [Unshowable()], *HOSTILE],
+    ids=lambda value: type(value).__name__,
+)  # fmt: skip
+def test_shown_is_one_bounded_line_of_any_value(value: object) -> None:
+    line = shown(value)
+    assert line.isprintable()
+    assert len(line) <= VALUE_CHARACTERS_MAX
+
+
+def test_shown_is_a_literal_where_it_fits() -> None:
+    assert shown({"rate_hz": 100, "name": "a'b"}) == """{'name': "a'b", 'rate_hz': 100}"""
+    assert shown(b"\x01") == r"b'\x01'"
+
+
+# --- messages ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_a_message_is_one_line(text: str) -> None:
+    for line in (formatted("%s: gone", text), formatted(text)):
+        assert line.isprintable()
+        assert line.startswith("WARNING ")
+        assert len(line) <= MESSAGE_CHARACTERS_MAX + len("WARNING ")
+
+
+@pytest.mark.parametrize(
+    ("message", "values"), [("%d of %s", ("x", "y")), ("%s", (nested(100_000),)), ("%s", (Unshowable(),)), ("%s", ())]
+)
+def test_a_message_that_cannot_be_made_is_still_one(message: str, values: tuple[object, ...]) -> None:
+    line = formatted(message, *values)
+    assert line.isprintable()
+    assert line.startswith("WARNING ")
+
+
+def test_lines_of_a_traceback_cannot_be_taken_for_messages() -> None:
+    def deep(levels: int) -> None:
+        if levels == 0:
+            raise ValueError(FORGED)
+        deep(levels - 1)
+
+    try:
+        deep(200)
+    except ValueError:
+        lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
+    assert lines[0] == "WARNING it failed"
+    assert all(line.startswith("    ") for line in lines[1:])
+    assert any("root logged in" in line for line in lines)
+    assert len(lines) <= TRACEBACK_LINES_MAX + 1
+
+
+def test_a_long_traceback_is_cut() -> None:
+    try:
+        raise ValueError("\n".join("line" for _ in range(10_000)))
+    except ValueError:
+        assert len(formatted("it failed", exc_info=sys.exc_info()).split("\n")) == TRACEBACK_LINES_MAX + 1
+
+
+# --- the writer -------------------------------------------------------------------------------------------------------
+
+
+def test_messages_arrive_in_order_and_whole_at_the_end() -> None:
+    with pipe() as (reader, descriptor):
+        with log_to(descriptor, "info"):
+            for number in range(100):
+                log.info("message %d", number)
+            log.debug("not this one")
+        os.close(descriptor)
+        lines = os.read(reader, 1 << 16).decode().splitlines()
+    assert [line.partition("INFO ")[2] for line in lines] == [f"message {number}" for number in range(100)]
+
+
+def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing() -> None:
+    with pipe(full=True) as (reader, descriptor), log_to(descriptor, "info") as writer:
+        begin = monotonic()
+        for number in range(5000):
+            log.warning("message %d", number)
+        assert monotonic() - begin < 2.0
+        dropped = writer.dropped
+        assert 3900 < dropped <= 4000  # all but what the queue holds, and what the thread has in its hand
+        assert messages_dropped() == dropped
+        text = read_until(reader, b"messages dropped").decode()
+        lines = text.splitlines()
+        assert f"WARNING {dropped} messages dropped: the log was not read in time" in lines
+        assert sum("WARNING message " in line for line in lines) == 5000 - dropped
+        log.warning("it flows")
+        assert "dropped" not in read_until(reader, b"it flows\n").decode()
+
+
+def test_the_end_waits_for_the_reader_only_so_long() -> None:
+    with pipe(full=True) as (_, descriptor):
+        begin = monotonic()
+        with log_to(descriptor, "info"):
+            log.warning("lost")
+        assert monotonic() - begin < FLUSH_S + 1.0
+    wait_until(lambda: all(thread.name != "log" for thread in threading.enumerate()), "the thread has ended")
+
+
+def no_reader() -> int:
+    reader, descriptor = os.pipe()
+    os.close(reader)
+    return descriptor
+
+
+def full_disk() -> int:
+    return os.open("/dev/full", os.O_WRONLY)
+
+
+def closed() -> int:
+    descriptor = os.open("/dev/null", os.O_WRONLY)
+    os.close(descriptor)
+    return descriptor
+
+
+@pytest.mark.parametrize("make", [no_reader, full_disk, closed])
+def test_messages_that_cannot_be_written_are_counted(make: Callable[[], int]) -> None:
+    descriptor = make()
+    with log_to(descriptor, "info") as writer:
+        log.warning("one")
+        log.warning("two")
+        wait_until(lambda: writer.dropped == 2, "both are counted")
+    if make is not closed:
+        os.close(descriptor)
+
+
+def test_a_file_is_written_and_what_python_reports_too(tmp_path: Path) -> None:
+    with (tmp_path / "log").open("wb") as file, log_to(file.fileno(), "info"):
+        thread = threading.Thread(target=lambda: {}["missing"], name="worker")  # type: ignore[index]
+        thread.start()
+        thread.join()
+    text = (tmp_path / "log").read_text()
+    assert "ERROR thread worker ended by an exception" in text
+    assert "KeyError: 'missing'" in text
+
+
+def test_a_writer_closed_twice_returns_at_once() -> None:
+    with pipe(full=True) as (_, descriptor):
+        writer = LogWriter(descriptor)
+        writer.close()
+        begin = monotonic()
+        writer.close()
+        assert monotonic() - begin < 0.1
