@@ -22,8 +22,10 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
 from imud.host_clock import HostClock
+from imud.log import printable, shown
 from imud.notify import notify, watchdog_interval_s
 from imud.publishers import PUBLISHERS
+from imud.reload import Reloader
 from imud.runtime.device import Device
 from imud.runtime.device_factory import DeviceFactory
 from imud.signals.gpio import GPIO_LINES
@@ -54,6 +56,7 @@ class Daemon:
     ) -> None:
         self.config = config
         self._file = file
+        self._reloader: Reloader | None = None
         host = HostClock()
         self._now_ns = host.now_ns
         self._factory = DeviceFactory(self._publish, self._send_event, host, state_dir=state_dir, lines=lines)
@@ -74,6 +77,8 @@ class Daemon:
     async def run(self) -> None:
         """Run until stopped. Raises ServerError when an output cannot start, and the error of a device's task."""
         asyncio.get_running_loop().set_exception_handler(self._on_loop_error)
+        if self._file is not None:
+            self._reloader = Reloader(self._file, self, self._now_ns)
         try:
             for name in self.config.publishers:
                 self._start_configured(name)
@@ -108,29 +113,37 @@ class Daemon:
     # --- reload ----------------------------------------------------------------------------------------------------
 
     def reload(self) -> None:
-        """Read the configuration file again and change what differs; a bad file leaves everything as it is."""
-        if self._file is None:
-            return
-        notify(f"RELOADING=1\nMONOTONIC_USEC={self._now_ns() // 1000}")
-        try:
-            new = configuration.load(self._file)
-        except ConfigError as error:
-            log.error("the configuration stays as it was: %s", error)
-            self._send_event(
-                Event(self._now_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}")
-            )
-        else:
-            self._change_to(new)
-        notify("READY=1")
+        """Read the configuration file again and change what differs; a bad file leaves everything as it is.
 
-    def _change_to(self, new: Config) -> None:
+        Returns at once; a device at a time is changed in turns of the event loop.
+        """
+        if self._reloader is not None:
+            self._reloader.request(self._on_reloaded)
+
+    def refuse(self, error: ConfigError) -> None:
+        """Log and send what is wrong with a new configuration."""
+        for problem in str(error).splitlines():
+            log.error("the configuration stays as it was: %s", problem)
+        self._send_event(
+            Event(self._now_ns(), "", EventKind.CONFIGURATION, f"the new configuration is refused: {error}")
+        )
+
+    async def change_to(self, new: Config) -> None:
+        """Start, stop and restart what differs in `new`; other work has its turn after each."""
         change = configuration.differences(self.config, new)
         old, self.config = self.config, new
         logging.getLogger().setLevel(new.log_level.upper())
         for name in (*change.devices_removed, *change.devices_changed):
             self._stop_device(name)
-        problems = [self._restart_publisher(name, old) for name in change.publishers_changed]
-        problems += [self._try_device(device) for device in new.devices if device.name not in self._devices]
+            await asyncio.sleep(0)
+        problems = []
+        for name in change.publishers_changed:
+            problems.append(self._restart_publisher(name, old))
+            await asyncio.sleep(0)
+        for device in new.devices:
+            if device.name not in self._devices:
+                problems.append(self._try_device(device))
+                await asyncio.sleep(0)
         words = "; ".join([f"configuration read again: {change}", *filter(None, problems)])
         log.info("%s", words)
         self._send_event(Event(self._now_ns(), "", EventKind.CONFIGURATION, words))
@@ -168,7 +181,7 @@ class Daemon:
 
     async def act(self, device: str, name: str, arguments: Mapping[str, Any]) -> object:
         """Run an action of a device. Raises ImudError."""
-        log.info("%s: run %s %s", device, name, dict(arguments) or "")
+        log.info("%s: run %s %s", device, printable(name), shown(arguments) if arguments else "")
         return await self._devices[device].act(name, arguments)
 
     def _start_configured(self, name: str) -> None:
@@ -204,6 +217,12 @@ class Daemon:
             self._failure = task.exception()
             self._stop.set()
         if self._until_finished and self.finished:
+            self._stop.set()
+
+    def _on_reloaded(self, task: asyncio.Task[None]) -> None:
+        """A reload that dies of an error ends the process, as a device's task does."""
+        if not task.cancelled() and task.exception() is not None:
+            self._failure = task.exception()
             self._stop.set()
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
@@ -242,6 +261,8 @@ class Daemon:
             self._watchdog_due_ns = now_ns + int(self._watchdog_s * NS_PER_S)
 
     async def _close(self) -> None:
+        if self._reloader is not None:
+            await self._reloader.close()
         tasks = list(self._tasks.values())
         for task in tasks:
             task.cancel()
