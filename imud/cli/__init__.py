@@ -4,13 +4,13 @@ Exit status: 0 done, 1 it ran and the answer is no, 2 it could not run.
 """
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from imud import __version__
+from imud.cli.streams import complain, discard_output, open_standard_streams
 from imud.errors import ImudError
 
 if TYPE_CHECKING:
@@ -63,15 +63,23 @@ def build_parser(only: str = "") -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Expected errors are one line on standard error."""
+    open_standard_streams()
     words = sys.argv[1:] if argv is None else argv
-    args = build_parser(words[0] if words and words[0] in COMMANDS else "").parse_args(words)
+    name = words[0] if words and words[0] in COMMANDS else ""
     try:
-        return COMMANDS[args.command].load().run(args)
+        try:
+            args = build_parser(name).parse_args(words)
+            return COMMANDS[args.command].load().run(args)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # the reader of our output has gone, as with `imud watch | head`
+        discard_output()
+        return 0
     except ImudError as error:
-        print(f"imud {args.command}: {error}", file=sys.stderr)
-        return 2
+        complain(f"imud {name}: {error}")
+    except OSError as error:
+        discard_output()
+        complain(f"imud {name}: {error.filename or 'standard output'}: {error.strerror or error}")
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # the reader of the output has ended, as with `imud watch | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered has no reader
-        return 0
+    return 2
