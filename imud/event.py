@@ -44,6 +44,8 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
 class RaiseEvent(Protocol):
     """Function that sends and logs one event of one device."""
 
-    def __call__(self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None) -> None:
-        """Raise an event of `now_ns` (CLOCK_MONOTONIC): one sentence for people, and details by name."""
+    def __call__(
+        self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
+    ) -> None:
+        """At `now_ns` (CLOCK_MONOTONIC): one sentence for people, and details by name."""
         ...

@@ -38,19 +38,25 @@ def open_standard_streams() -> None:
 
 def discard_output() -> None:
     """Throw away what is buffered for standard output, and all that follows: it cannot be written."""
-    with suppress(OSError):
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, sys.stdout.fileno())
-        os.close(null)
+    _discard(sys.stdout)
 
 
 def complain(text: str) -> None:
     """Write `text` to standard error, each line escaped; give up when it cannot be written, or nobody reads it."""
-    with suppress(OSError):
+    try:
         for line in text.splitlines():
             if not _writable(sys.stderr):
                 return
             print(printable(line, MESSAGE_CHARACTERS_MAX), file=sys.stderr, flush=True)
+    except OSError:
+        _discard(sys.stderr)
+
+
+def _discard(stream: TextIO) -> None:
+    with suppress(OSError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
 
 
 def _writable(stream: TextIO) -> bool:

@@ -14,6 +14,7 @@ from typing import Final
 
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
 from imud.links.inotify import wait_until
+from imud.log import printable
 from imud.permissions import group_of, user_name
 
 MISSING: Final = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN})
@@ -139,6 +140,6 @@ def _target(descriptor: Path) -> str:
 
 def _name(process: Path) -> str:
     try:
-        return (process / "comm").read_text("utf-8", "backslashreplace").strip()
+        return printable((process / "comm").read_text("utf-8", "backslashreplace").strip())
     except OSError:
         return "a process"

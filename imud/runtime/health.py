@@ -8,6 +8,7 @@ import logging
 
 from imud.contracts.status import DeviceState
 from imud.event import EventKind
+from imud.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.runtime.notices import Notices
 
 log = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ class Health:
 
     def down(self, now_ns: int, state: DeviceState, problem: str) -> None:
         """Enter a state in which no samples come, for the reason `problem`."""
+        problem = printable(problem, MESSAGE_CHARACTERS_MAX)
         if state is DeviceState.SILENT:
             problem = self.link_problem or problem
             self.silent_since_ns = now_ns
@@ -63,13 +65,13 @@ class Health:
             log.warning("%s: %s", self._notices.device, problem)
 
     def report(self, problem: str) -> None:
-        """Show a problem while the state stays; trouble of the link takes precedence."""
-        problem = self.link_problem or problem
+        """Show what is wrong while the state stays; trouble of the link takes precedence."""
+        problem = self.link_problem or printable(problem, MESSAGE_CHARACTERS_MAX)
         if problem != self.problem:
             log.warning("%s: %s", self._notices.device, problem)
         self.problem = problem
 
     def on_link_news(self, now_ns: int, news: str, problem: str) -> None:
         """Raise an event: the state of the link changed, and `problem` is what is wrong with it from now on."""
-        self.link_problem = self.problem = problem
+        self.link_problem = self.problem = printable(problem, MESSAGE_CHARACTERS_MAX)
         self._notices.raise_event(now_ns, EventKind.LINK, news, problem=problem)

@@ -5,17 +5,21 @@ A device that was unplugged and connected again may be another one, or have othe
 
 import logging
 from collections.abc import Callable, Mapping
+from itertools import islice
 
 from imud.contracts.driver import Identity
 from imud.contracts.session import RequestScript
 from imud.errors import CommandError
 from imud.event import EventKind
+from imud.log import printable
 from imud.runtime.exchange import Exchange
 from imud.runtime.notices import Notices
 
 log = logging.getLogger(__name__)
 
 IDENTIFY_TRIES = 3
+WORDS_MAX = 200
+"""Settings or details of one device; the HI14 has the most, some 60."""
 
 
 def ignore_settings(_settings: Mapping[str, str]) -> None:
@@ -56,7 +60,8 @@ class KnownIdentity:
                 log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, IDENTIFY_TRIES)
 
     def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
-        """Keep the reported values; raise an event for those that differ from before."""
+        """Keep what the device said; raise an event for what differs from before."""
+        identity, settings = printable_identity(identity), printable_words(settings)
         now_ns, before, known = self._now_ns(), self.identity, self.settings
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
@@ -69,6 +74,17 @@ class KnownIdentity:
             self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, **changed)
         self.identity, self.settings = identity, settings
         self._on_settings(settings)
+
+
+def printable_identity(identity: Identity) -> Identity:
+    """Return an identity as every output can have it: each text bounded, in printable characters."""
+    product, serial, firmware = map(printable, (identity.product, identity.serial_number, identity.firmware))
+    return Identity(product, serial, firmware, None if identity.details is None else printable_words(identity.details))
+
+
+def printable_words(words: Mapping[str, str]) -> dict[str, str]:
+    """Return names and texts of a device, WORDS_MAX at most, each bounded, in printable characters."""
+    return {printable(name): printable(text) for name, text in islice(words.items(), WORDS_MAX)}
 
 
 def identity_words(identity: Identity) -> dict[str, str]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from imud.contracts.codec import BadFrame
 from imud.event import Event, EventKind
 from imud.ledger import Ledger
+from imud.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.sample import Sync
 from imud.units import NS_PER_S
 
@@ -33,9 +34,11 @@ class Notices:
         self._sync: Sync | None = None
 
     def raise_event(
-        self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None
+        self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
-        """Send one event, and log it."""
+        """Send one event, and log it; texts that came from the device may hold anything, and are made printable."""
+        message = printable(message, MESSAGE_CHARACTERS_MAX)
+        detail = {name: printable(one) if isinstance(one, str) else one for name, one in detail.items()}
         log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self.device, message)
         self._send(Event(now_ns, self.device, kind, message, detail))
 

@@ -1,5 +1,7 @@
 """What is known of a device, and what is reported when it differs from before."""
 
+import msgspec
+
 from imud.contracts.driver import Identity
 from imud.event import Event, EventKind
 from imud.ledger import Ledger
@@ -33,3 +35,25 @@ def test_a_device_that_never_said_its_number_is_no_other() -> None:
 
 def test_words_leave_out_what_is_empty() -> None:
     assert identity_words(Identity("HI14", details={"BUILD": "x", "EMPTY": ""})) == {"product": "HI14", "BUILD": "x"}
+
+
+HOSTILE = "\x1b[2J\n\udc80\ud800\u202e" + "x" * 10_000
+
+
+def test_what_a_device_says_fits_every_output() -> None:
+    """Long, unprintable, not UTF-8, and named as the arguments of our own functions."""
+    events: list[Event] = []
+    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
+    names = ("message", "kind", "now_ns", "self", "device", HOSTILE)
+    many = {f"n{number}": HOSTILE for number in range(10_000)}
+    known.update(Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, "old"))
+    known.update(Identity("HI14", "B2"), dict.fromkeys(names, HOSTILE))
+    known.update(Identity(HOSTILE, HOSTILE, HOSTILE, many), {})
+    assert len(events) == 3
+    assert set(names[:-1]) <= set(events[1].detail)
+    shown = [known.identity, known.settings, identity_words(known.identity), *events]
+    for one in shown:
+        assert len(msgspec.json.encode(one)) < 100_000
+    texts = [text for event in events for text in (event.message, *event.detail, *event.detail.values())]
+    texts += [text for pair in identity_words(known.identity).items() for text in pair]
+    assert all(isinstance(text, str) and text.isprintable() for text in texts)

@@ -1,5 +1,7 @@
 """Events come at a bounded rate and say what is behind them."""
 
+import msgspec
+
 from imud.contracts.codec import BadFrame, BadReason
 from imud.event import Event, EventKind
 from imud.ledger import Ledger
@@ -50,3 +52,16 @@ def test_change_of_sync_is_told_but_not_the_first_one() -> None:
     notices.tick(1, Sync.ARRIVAL)
     notices.tick(2, Sync.REGRESSION)
     assert [(e.kind, e.detail) for e in events] == [(EventKind.SYNC, {"sync": "regression", "before": "arrival"})]
+
+
+def test_texts_of_an_event_are_printable_and_bounded() -> None:
+    notices, _, events = make()
+    hostile = "a\n\x1b[31m\udc80" + "x" * 10_000
+    notices.raise_event(S, EventKind.LINK, hostile, message=hostile, kind=hostile, number=1)
+    assert events[0].message.isprintable()
+    assert len(events[0].message) <= 2000
+    assert events[0].message.startswith(r"a\n\x1b[31m\udc80")
+    assert isinstance(events[0].detail["kind"], str)
+    assert events[0].detail["kind"].isprintable()
+    assert events[0].detail["number"] == 1
+    msgspec.json.encode(events[0])

@@ -58,7 +58,7 @@ class SignalBench:
         return self.workers[-1]
 
     def raise_event(
-        self, now_ns: int, kind: EventKind, message: str, **detail: str | int | float | bool | None
+        self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
         """As `RaiseEvent`."""
         self.events.append(Event(now_ns, DEVICE, kind, message, dict(detail)))
