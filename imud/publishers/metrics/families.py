@@ -127,6 +127,10 @@ DAEMON_FAMILIES: Final = (
         "Time since the daemon's ten-times-a-second tick; grows when the event loop is stuck.",
         daemon(lambda snapshot: snapshot.heartbeat_age_ns), SECONDS,
     ),
+    _counter(
+        "imud_log_messages_dropped_total", "Messages missing in the log because it was not read in time.",
+        daemon(lambda snapshot: snapshot.log_messages_dropped),
+    ),
     _info("imud_device_info", "What the device is; always 1.", Reader(DEVICE_INFO_LABELS, _device_info)),
 )  # fmt: skip
 

@@ -35,6 +35,7 @@ class Snapshot:
     events: Sequence[tuple[tuple[str, str], int]] = ()
     """Events so far, by device and kind."""
     heartbeat_age_ns: int = 0
+    log_messages_dropped: int = 0
     client_samples_sent: int = 0
     """Samples sent to clients, those that disconnected included, as seen at scrapes."""
     client_samples_dropped: int = 0

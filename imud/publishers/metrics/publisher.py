@@ -27,6 +27,7 @@ from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus
 from imud.event import Event
+from imud.log import messages_dropped
 from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
@@ -220,7 +221,13 @@ class MetricsPublisher:
         if answer.set_running_or_notify_cancel():
             age_ns = self._context.now_ns() - self._tick_ns
             answer.set_result(
-                Snapshot(self._context.status(), self._context.clients(), tuple(self._events.items()), age_ns)
+                Snapshot(
+                    self._context.status(),
+                    self._context.clients(),
+                    tuple(self._events.items()),
+                    age_ns,
+                    messages_dropped(),
+                )
             )
 
 

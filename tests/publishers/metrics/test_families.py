@@ -100,7 +100,7 @@ def test_ledger_closes_in_the_scrape_and_a_hole_shows() -> None:
 
 
 def test_values_in_base_units() -> None:
-    shown = rendered(Snapshot(DEVICES, heartbeat_age_ns=250_000_000))
+    shown = rendered(Snapshot(DEVICES, heartbeat_age_ns=250_000_000, log_messages_dropped=3))
     front = {"device": "front"}
     expected = {
         "imud_clock_offset_seconds": 5.25,
@@ -120,6 +120,7 @@ def test_values_in_base_units() -> None:
     for kind, count in kinds.items():
         assert shown[key("imud_kernel_errors_total", kind=kind, **front)] == count
     assert shown[key("imud_heartbeat_age_seconds")] == 0.25
+    assert shown[key("imud_log_messages_dropped_total")] == 3
 
 
 def test_absent_is_not_zero() -> None:
