@@ -276,6 +276,7 @@ ELSEWHERE = ("bench", "lab", "lab_host", "include", "fuzz", "attack", "support")
 CROSS_CUTTING = {
     "test_architecture.py": "the tree itself",
     "test_docs.py": "README.md, docs, Makefile",
+    "test_daemon_signals.py": "the daemon as a process: log, reload, kill",
     "test_end_to_end.py": "the daemon as a process, with its clients",
     "publishers/shm/test_hostile.py": "the directory of the rings against other users",
     "cli/test_main.py": "`main` of imud/cli/__init__.py",
@@ -302,6 +303,7 @@ CROSS_CUTTING = {
 """Test modules that mirror no module of imud, and what they test."""
 
 TESTED_IN = {
+    "imud.reload": "test_daemon_signals.py",
     "imud.publishers.shm.directory": "publishers/shm/test_hostile.py",
     "imud.cli.modbus.line": "cli/modbus/test_command.py",
     "imud.cli.probe.command": "cli/probe/test_can.py",

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from tests.support.pipes import pipe
-from tests.support.running import RunningDaemon, running_daemon, wait_until, write_config
+from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
+from tests.support.surroundings import pipe
 from tests.test_daemon import cable, device, samples
 
 MISSING = 250

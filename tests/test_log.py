@@ -22,8 +22,8 @@ from imud.log import (
     printable,
     shown,
 )
-from tests.support.pipes import pipe, read_until
-from tests.support.running import wait_until
+from tests.support.daemon_process import wait_until
+from tests.support.surroundings import pipe, read_until
 
 log = logging.getLogger("imud.test")
 

@@ -10,7 +10,7 @@ import pytest
 
 from imud.client.ring import Ring
 from tests.support.rings import DEVICE
-from tests.support.users import DAEMON_UID, HOSTILE_UID, needs_root, python_as
+from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root, python_as
 
 pytestmark = [needs_root, pytest.mark.timeout(40)]
 

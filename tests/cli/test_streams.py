@@ -8,9 +8,9 @@ from time import monotonic
 
 import pytest
 
-from tests.support.hi91 import hi91
-from tests.support.pipes import pipe
-from tests.support.running import running_daemon
+from tests.support.daemon_process import running_daemon
+from tests.support.files import hi91
+from tests.support.surroundings import pipe
 
 BUFFERED = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
 ASCII = {**BUFFERED, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}

@@ -23,7 +23,7 @@ from imud.publishers.shm import directory
 from imud.publishers.shm.directory import RingDirectory, open_directory
 from tests.support.daemon_process import running_daemon, wait_until, write_config
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
-from tests.support.users import DAEMON_UID, HOSTILE_UID, needs_root, python_as
+from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root, python_as
 
 pytestmark = pytest.mark.timeout(20)  # a daemon that hangs fails the test
 
