@@ -6,6 +6,7 @@ where the path is a symbolic link, the directories on its way as well.
 """
 
 import asyncio
+import concurrent.futures.thread  # noqa: F401 - `run_in_executor` imports it late, when there may be no descriptor left
 import ctypes
 import os
 from collections.abc import Callable
