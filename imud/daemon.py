@@ -5,12 +5,14 @@ tick, 10 Hz ──▶ devices, publishers         SIGHUP ──▶ reload       
 """
 
 import asyncio
+import gc
 import logging
 import secrets
 import signal
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from time import thread_time_ns
 from typing import Any, cast
 
 from imud import config as configuration
@@ -60,7 +62,9 @@ class Daemon:
         host = HostClock()
         self._now_ns = host.now_ns
         self._factory = DeviceFactory(self._publish, self._send_event, host, state_dir=state_dir, lines=lines)
-        self._context = PublisherContext(self.status, secrets.randbits(63) | 1, host.now_ns, self.actions, self.act)
+        self._context = PublisherContext(
+            self.status, secrets.randbits(63) | 1, host.now_ns, self.actions, self.act, thread_time_ns
+        )
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
@@ -86,6 +90,8 @@ class Daemon:
                 self._start_publisher(name, publisher)
             for device in self.config.devices:
                 self._start_device(device)
+            gc.collect()
+            gc.freeze()  # what is there now stays: collections in service need not look at it
             notify("READY=1")
             await self._tick_until_stopped()
         finally:

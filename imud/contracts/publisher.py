@@ -85,6 +85,8 @@ class PublisherContext:
     """The actions of a device."""
     act: Callable[[str, str, Mapping[str, Any]], Awaitable[object]] = _no_actions
     """Run an action of a device: its name, the action's, arguments. Raises ImudError; the answer is JSON values."""
+    cpu_ns: Callable[[], int] = lambda: 0
+    """CPU time of the event loop's thread."""
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
 

@@ -241,4 +241,6 @@ class SocketStatus(msgspec.Struct, frozen=True):
     refused: int
     """Connections refused since start: too many, or no right to read."""
     evicted: int
-    """Clients disconnected since start because they asked without reading, or sent a line over the limit."""
+    """Clients disconnected since start because they asked without reading, asked too much, or sent a line too long."""
+    failed: int = 0
+    """Clients disconnected since start because of an error in the daemon."""

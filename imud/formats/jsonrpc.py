@@ -26,6 +26,10 @@ PROTOCOL: Final = 1
 DEFAULT_PATH: Final = "/run/imud/imud.sock"
 LINE_MAX_BYTES: Final = 65536
 """Longest line the server takes, newline left out: a `watch` that names every field of 1,000 devices is half of it."""
+NESTED_MAX: Final = 64
+"""Arrays and objects in a request, so that it cannot be nested deeper; arguments of actions have three at most."""
+ITEMS_MAX: Final = 2048
+"""Members and elements in a request, by its commas: names of every device and every field, with room."""
 FRAME_HEADER: Final = struct.Struct("<I")
 FRAME_MAX_BYTES: Final = 1 << 24
 """A client that reads a larger length has lost the frame boundary."""
@@ -85,7 +89,7 @@ def parse_object(line: bytes | bytearray) -> dict[str, Any]:
         value = _decode(line)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise RpcError(Code.PARSE, f"not JSON: {error}") from None
-    except RecursionError:
+    except RecursionError:  # of a server's answer; a request is checked before
         raise RpcError(Code.PARSE, "not JSON that can be read: nested too deeply") from None
     if not isinstance(value, dict):
         raise RpcError(Code.INVALID_REQUEST, f"expected one JSON object per line, got {_kind(value)}")
@@ -94,6 +98,7 @@ def parse_object(line: bytes | bytearray) -> dict[str, Any]:
 
 def parse_request(line: bytes | bytearray) -> RpcRequest:
     """The request in `line`. Raises RpcError (PARSE, INVALID_REQUEST, INVALID_PARAMS)."""
+    _check_bounds(line)
     value = parse_object(line)
     request_id = value.get("id")
     if isinstance(request_id, bool) or not isinstance(request_id, int | float | str | None):
@@ -108,6 +113,14 @@ def parse_request(line: bytes | bytearray) -> RpcRequest:
     if not isinstance(params, dict):
         raise RpcError(Code.INVALID_REQUEST, f"params: expected an object, got {_kind(params)}", request_id)
     return RpcRequest(method, params, request_id, "id" in value)
+
+
+def _check_bounds(line: bytes | bytearray) -> None:
+    """Refuse what would be costly to parse or too deep to handle, without parsing. Brackets in strings count too."""
+    if line.count(b"[") + line.count(b"{") > NESTED_MAX:
+        raise RpcError(Code.PARSE, f"nested too deeply: expected at most {NESTED_MAX} arrays and objects")
+    if line.count(b",") > ITEMS_MAX:
+        raise RpcError(Code.PARSE, f"too long a list: expected at most {ITEMS_MAX} members and elements")
 
 
 def encode_request(method: str, params: Mapping[str, Any], request_id: int) -> bytes:

@@ -79,10 +79,10 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
     )
 
 
-def context() -> PublisherContext:
-    """A daemon with the devices of `DEVICES` whose clock stands still."""
+def context(now_ns: Callable[[], int] = lambda: NOW_NS) -> PublisherContext:
+    """A daemon with the devices of `DEVICES`; its clock stands still if no other is given."""
     statuses = [device_status(*item) for item in DEVICES.items()]
-    return PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, lambda _device: described(ACTIONS), act)
+    return PublisherContext(lambda: statuses, EPOCH, now_ns, lambda _device: described(ACTIONS), act)
 
 
 def set_rate(_target: Target, *, rate_hz: int) -> None:
@@ -99,6 +99,8 @@ async def act(device: str, name: str, arguments: Mapping[str, Any]) -> object:
     if name == "wait":
         await done_late.wait()
         return {"waited": device}
+    if name == "break":
+        raise ZeroDivisionError("a mistake in an action")
     if name != "output":
         raise Rejected(f"{device} refuses {name}")
     ACTIONS[name].arguments(arguments)
@@ -121,11 +123,13 @@ def run(body: Callable[[], Awaitable[T]]) -> T:
 
 
 @asynccontextmanager
-async def serving(directory: Path, **settings: Any) -> AsyncIterator[SocketServer]:
+async def serving(
+    directory: Path, now_ns: Callable[[], int] = lambda: NOW_NS, **settings: Any
+) -> AsyncIterator[SocketServer]:
     """A started server with two devices; closed at the end, and then nothing of it is left."""
     path = directory / "imud.sock"
     own_group = grp.getgrgid(os.getgid()).gr_name
-    server = SocketServer(SocketSettings(**{"path": str(path), "group": own_group, **settings}), context())
+    server = SocketServer(SocketSettings(**{"path": str(path), "group": own_group, **settings}), context(now_ns))
     server.start()
     for name, number in DEVICES.items():
         server.add_device(name, number)

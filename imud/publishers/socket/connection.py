@@ -1,7 +1,7 @@
 """One client of the socket: reads its lines, sends it replies, events and samples, and ends the connection."""
 
-import asyncio
 import logging
+import select
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,47 +9,51 @@ from typing import Final
 
 from imud.contracts.status import ClientStatus
 from imud.formats.jsonrpc import LINE_MAX_BYTES, Code, RpcError, encode_error, frame_of, line_of
-from imud.publishers.socket.outbox import NO_FD, Limits, Outbox
+from imud.publishers.socket.outbox import NO_FD, Limits, Outbox, Pool
 from imud.publishers.socket.rights import Peer, Rights
+from imud.publishers.socket.serving import Scheduler
 from imud.publishers.socket.waker import ClientWakers
 
 log = logging.getLogger(__name__)
 
-RECV_BYTES: Final = 65536
-LINES_PER_TURN: Final = 4
-"""After so many requests of one client others have their turn: 64 KiB hold a thousand `status` requests."""
+RECV_BYTES: Final = 16384
+"""What is read at once; nothing is read while a whole line waits, so a client has at most this and a line in memory."""
+BLANK: Final = b" \t\r\n"
 LINGER_TICKS: Final = 20
 """A client that ended its side has so many ticks (100 ms each) to read what still waits for it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Owner:
+class ServerSide:
     """What a connection needs of the server."""
 
     on_line: Callable[["Connection", bytes], None]
     on_close: Callable[["Connection"], None]
     on_evicted: Callable[[], None]
+    on_failed: Callable[[Exception], None]
     limits: Limits
+    pool: Pool
+    scheduler: Scheduler
 
 
 class Connection:
     """A connected client with at least the right to read. Synchronization: the event loop's thread."""
 
-    def __init__(self, number: int, sock: socket.socket, peer: Peer, rights: Rights, owner: Owner) -> None:
+    def __init__(self, number: int, sock: socket.socket, peer: Peer, rights: Rights, server: ServerSide) -> None:
         self.number = number
         self.peer = peer
         self.rights = rights
-        self.outbox = Outbox(sock, owner.limits, self._broken, self._flooded, self._emptied)
+        self.outbox = Outbox(sock, server.limits, server.pool, self)
         self.wakers = ClientWakers()
         self.closed = False
         self._framed = False
         self._sock = sock
-        self._owner = owner
+        self._server = server
         self._input = bytearray()
         self._searched = 0
+        self._readable = self._writable = False
         self._linger_ticks: int | None = None
-        self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(sock, self._readable)
+        self._place = server.scheduler.add(self, sock.fileno(), number, peer.uid)
 
     def post(self, body: bytes, fd: int = NO_FD) -> None:
         """Send one JSON object, with a copy of a descriptor where one is given."""
@@ -91,7 +95,7 @@ class Connection:
         """Read nothing more from the client, send what waits, then close; no-op if already so."""
         if self.closed or self.finishing:
             return
-        self._loop.remove_reader(self._sock)
+        self._input.clear()
         self._linger_ticks = LINGER_TICKS
         if not self.outbox.waiting:
             self.close()
@@ -108,19 +112,70 @@ class Connection:
         if self.closed:
             return
         self.closed = True
-        self._loop.remove_reader(self._sock)
+        self._place.leave()
         self.outbox.close()
         self._sock.close()
         self.wakers.close()
         self._input.clear()
-        self._owner.on_close(self)
+        self._server.on_close(self)
 
-    # --- reading ----------------------------------------------------------------------------------------------------
+    def evict(self, reason: str) -> None:
+        """Close, and count and log why."""
+        if not self.closed:
+            self._server.on_evicted()
+            self.on_broken(reason)
 
-    def _readable(self) -> None:
+    # --- served by the scheduler --------------------------------------------------------------------------------------
+
+    def on_ready(self, events: int) -> None:
+        """The socket has data or room; an error or an end shows when it is read or written."""
+        ends = select.EPOLLHUP | select.EPOLLERR
+        self._readable = self._readable or bool(events & (select.EPOLLIN | ends))
+        self._writable = self._writable or bool(events & (select.EPOLLOUT | ends))
+
+    def serve(self) -> bool:
+        """Send one piece of what waits, and read one piece or carry out one request."""
+        if self._writable and self.outbox.waiting:
+            self.outbox.flush()
+        if not self.closed and not self.finishing:
+            line = self._next_line()
+            if line is None and self._readable and not self.finishing:
+                self._read()
+                line = self._next_line()
+            if line is not None:
+                self._server.on_line(self, line)
+        return self._has_work()
+
+    def wanted_events(self) -> int:
+        """Input, unless the connection is finishing or has some to read; room, if something waits for it."""
+        events = 0 if self.finishing or self._readable else select.EPOLLIN
+        return events | select.EPOLLOUT if self.outbox.waiting and not self._writable else events
+
+    def on_failure(self, error: Exception) -> None:
+        """End the connection with an error: what its request met is a mistake in this program."""
+        self._server.on_failed(error)
+        if not self.closed:
+            self.post(
+                encode_error(RpcError(Code.INTERNAL, "an error in the daemon, which is logged; this connection ends"))
+            )
+            self.finish()
+
+    def on_overload(self) -> None:
+        """Evict the client."""
+        self.evict("it goes on asking for more than a client may have")
+
+    def _has_work(self) -> bool:
+        if self.closed:
+            return False
+        if self._writable and self.outbox.waiting:
+            return True
+        return not self.finishing and (self._readable or self._input.find(b"\n", self._searched) >= 0)
+
+    def _read(self) -> None:
         try:
             data = self._sock.recv(RECV_BYTES)
         except BlockingIOError:
+            self._readable = False
             return
         except OSError:  # reset by the peer
             self.close()
@@ -128,28 +183,9 @@ class Connection:
         if not data:
             self.finish()
             return
-        self._input += data
-        self._work()
-
-    def _work(self) -> None:
-        """Handle the lines that are there; after LINES_PER_TURN, go on in the next turn of the event loop."""
-        for _ in range(LINES_PER_TURN):
-            if self.closed or self.finishing:
-                return
-            line = self._next_line()
-            if line is None:
-                return
-            if line.strip():
-                self._owner.on_line(self, line)
-        if not self.closed:
-            self._loop.remove_reader(self._sock)
-            self._loop.call_soon(self._resume)
-
-    def _resume(self) -> None:
-        if self.closed or self.finishing:
-            return
-        self._loop.add_reader(self._sock, self._readable)
-        self._work()
+        self._readable = len(data) == RECV_BYTES
+        self._place.count_bytes(len(data))
+        self._input += data if self._input else data.lstrip(BLANK)
 
     def _next_line(self) -> bytes | None:
         """The next whole line; None when there is none yet, or when the client is over the limit and finished."""
@@ -163,29 +199,41 @@ class Connection:
             return None
         line = bytes(data[:end])
         del data[: end + 1]
+        if data and data[0] in BLANK:
+            self._input = data.lstrip(BLANK)
         self._searched = 0
-        return line
+        return line if line.strip(BLANK) else None
 
     def _refuse_line(self) -> None:
-        self._input.clear()
-        self._owner.on_evicted()
+        self._server.on_evicted()
         message = f"a line has at most {LINE_MAX_BYTES} bytes; this connection ends"
         self.post(encode_error(RpcError(Code.LINE_TOO_LONG, message)))
         self.finish()
 
     # --- callbacks of the outbox --------------------------------------------------------------------------------------
 
-    def _broken(self, reason: str) -> None:
+    def on_broken(self, reason: str) -> None:
         """Close: the client is gone, or was evicted. Called during `publish` too, which iterates over outboxes."""
         if not self.closed:
             log.info("client %d (pid %d, uid %d) is gone: %s", self.number, self.peer.pid, self.peer.uid, reason)
             self.close()
 
-    def _flooded(self) -> None:
-        self._owner.on_evicted()
-        self._broken("it does not read the answers to what it asks")
+    def on_flooded(self) -> None:
+        """Evict the client."""
+        self.evict("it does not read the answers to what it asks")
 
-    def _emptied(self) -> None:
+    def on_full(self) -> None:
+        """Go on sending when the socket has room."""
+        self._writable = False
+        self._place.arm()
+
+    def on_deferred(self) -> None:
+        """Go on sending when it is the client's turn."""
+        self._writable = True
+        self._place.line_up()
+
+    def on_emptied(self) -> None:
+        """Everything is sent, descriptors too."""
         self.wakers.handed_over()
         if self.finishing:
             self.close()

@@ -11,6 +11,8 @@ from imud.sample import Sample
 
 ALWAYS_FIELDS: Final = ("device", "seq", "t_ns")
 """Members of every JSON sample, whatever was selected: without them it cannot be identified."""
+MESSAGE_GUESS_BYTES: Final = 700
+"""What a sample with the values of a whole HI91 message has as JSON."""
 _HEAD: Final = b'{"jsonrpc":"2.0","method":"sample","params":'
 _TAIL: Final = b"}"
 _SLOT_HEADER: Final = FRAME_HEADER.pack(SLOT_BYTES)
@@ -18,6 +20,11 @@ _SLOT_HEADER: Final = FRAME_HEADER.pack(SLOT_BYTES)
 
 class Encoding(Protocol):
     """Makes messages of samples. One message is one sample, so that a queue can drop by the sample."""
+
+    @property
+    def message_bytes(self) -> int:
+        """Size of the message that was encoded last; a guess before the first."""
+        ...
 
     def encode(self, batch: Batch) -> list[bytes]:
         """Every sample of the batch as a message."""
@@ -38,14 +45,23 @@ class JsonEncoding:
     def __init__(self, fields: tuple[str, ...] | None, framed: bool) -> None:
         self._wrap = frame_of if framed else line_of
         self._select = None if fields is None else selector(fields)
+        self._last: bytes = bytes(MESSAGE_GUESS_BYTES)
+
+    @property
+    def message_bytes(self) -> int:
+        """Size of the notification that was encoded last."""
+        return len(self._last)
 
     def encode(self, batch: Batch) -> list[bytes]:
         """Every sample of the batch as a notification."""
-        return [self._message(sample) for sample in batch.samples]
+        messages = [self._message(sample) for sample in batch.samples]
+        self._last = messages[-1]
+        return messages
 
     def encode_one(self, batch: Batch, index: int) -> bytes:
         """One sample of the batch as a notification."""
-        return self._message(batch.samples[index])
+        self._last = self._message(batch.samples[index])
+        return self._last
 
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
         """Add the device's own number as a member of the sample, and put notifications of the others before it."""
@@ -62,6 +78,8 @@ class JsonEncoding:
 
 class BinaryEncoding:
     """Frames of one slot each."""
+
+    message_bytes = FRAME_HEADER.size + SLOT_BYTES
 
     def encode(self, batch: Batch) -> list[bytes]:
         """Every sample of the batch as a frame."""

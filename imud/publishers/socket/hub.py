@@ -1,24 +1,37 @@
 """What all clients of the socket share: devices, newest samples, subscriptions, delivery of batches and events."""
 
 import asyncio
+import logging
 from collections.abc import Collection, Coroutine, Iterable, Mapping
-from typing import Any
+from typing import Any, Final
 
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClientStatus, SocketStatus
 from imud.event import Event
 from imud.formats.jsonrpc import encode_notification
 from imud.publishers.socket.connection import Connection
-from imud.publishers.socket.subscription import DeliveryPlan, Subscription, Watcher, make_plan
+from imud.publishers.socket.outbox import Pool
+from imud.publishers.socket.quota import Quota, Seldom
+from imud.publishers.socket.serving import TokenBucket
+from imud.publishers.socket.subscription import DeliveryPlan, FormKey, Subscription
 from imud.sample import Sample
+
+log = logging.getLogger(__name__)
+
+WAKE_NS: Final = 300_000
+"""Waking clients takes so long in one turn of the event loop; the others are woken in the next."""
+CLIENTS_PER_LOOK: Final = 16
 
 
 class Hub:
     """Keeps the clients and what each of them asked for. Synchronization: the event loop's thread."""
 
-    def __init__(self, path: str, context: PublisherContext) -> None:
+    def __init__(self, path: str, context: PublisherContext, quota: Quota, time: TokenBucket, pool: Pool) -> None:
         self.path = path
         self.context = context
+        self._quota = quota
+        self._time = time
+        self._pool = pool
         self._devices: dict[str, int] = {}
         self._newest: dict[str, Sample] = {}
         self._connections: dict[int, Connection] = {}
@@ -28,9 +41,15 @@ class Hub:
         self._plans: dict[str, DeliveryPlan] = {}
         self._work: dict[int, asyncio.Future[None]] = {}
         """Requests that take their time, by the number of the client."""
+        self._wanting_wake: dict[str, dict[Connection, None]] = {}
+        """Clients that have a descriptor to be woken by, by device."""
         self._accepted = 0
         self._refused = 0
         self._evicted = 0
+        self._failed = 0
+        self._failures = Seldom(context.now_ns)
+        self._to_wake: dict[str, list[Connection]] = {}
+        """Clients that are still to be woken for the newest batch of a device."""
 
     @property
     def devices(self) -> Mapping[str, int]:
@@ -64,15 +83,15 @@ class Hub:
 
     def publish(self, batch: Batch) -> None:
         """Send a batch to all clients that watch its device."""
-        self._newest[batch.device] = batch.samples[-1]
-        plan = self._plans.get(batch.device)
+        device = batch.device
+        self._newest[device] = batch.samples[-1]
+        plan = self._plans.get(device)
         if plan is None:
-            plan = self.plan_of(batch.device)
-        for group in plan.groups:
-            group.send(batch)
-        if plan.wakes:
+            plan = self._plans[device] = self._new_plan(device)
+        plan.send(batch, self.context.now_ns, self._time)
+        if device in self._wanting_wake:
             # Not now: a client that wakes reads shared memory, whose publisher may have its turn after this one.
-            asyncio.get_running_loop().call_soon(self._wake, batch.device)
+            asyncio.get_running_loop().call_soon(self._wake_all, device)
 
     def event(self, event: Event) -> None:
         """Send an event to all clients that asked for it; those of the daemon itself ("") go to all that get any."""
@@ -85,32 +104,74 @@ class Hub:
         if wanting:
             post_all(wanting, encode_notification("event", event))
 
-    def plan_of(self, device: str) -> DeliveryPlan:
-        """Where batches of `device` go."""
-        plan = self._plans.get(device)
-        if plan is None:
-            clients = ((self._connections[number], wanted) for number, wanted in self._subscriptions.items())
-            watchers = (Watcher(wanted, client.outbox, client.framed) for client, wanted in clients)
-            wakes = any(device in client.wakers for client in self._connections.values())
-            plan = self._plans[device] = make_plan(device, watchers, wakes)
+    def _new_plan(self, device: str) -> DeliveryPlan:
+        """The plan for a device, with the clients that watch it."""
+        plan = DeliveryPlan(self._pool.next_order)
+        for number, wanted in self._subscriptions.items():
+            if wanted.matches(device):
+                plan.add(device, wanted, self._connections[number].outbox)
         return plan
 
-    def _wake(self, device: str) -> None:
-        gone = [connection for connection in self._connections.values() if not connection.wakers.wake(device)]
-        if gone:
-            self._plans = {}
+    def _wake_all(self, device: str) -> None:
+        """Wake all clients that want it; those left of the round before come first."""
+        waiting = self._to_wake.get(device)
+        if waiting:
+            left = dict.fromkeys(waiting)
+            self._to_wake[device] = [*(one for one in self._wanting_wake.get(device, ()) if one not in left), *waiting]
+        else:
+            self._to_wake[device] = list(self._wanting_wake.get(device, ()))
+            self._wake_some(device)
+
+    def _wake_some(self, device: str) -> None:
+        """Wake clients, from the end of the list, for WAKE_NS, then go on in the next turn of the event loop."""
+        now_ns, waiting = self.context.now_ns, self._to_wake[device]
+        end_ns = now_ns() + WAKE_NS
+        while waiting:
+            for _ in range(min(CLIENTS_PER_LOOK, len(waiting))):
+                connection = waiting.pop()
+                if not connection.wakers.wake(device):
+                    self._forget_waker(connection, device)
+            if waiting and now_ns() > end_ns:
+                asyncio.get_running_loop().call_soon(self._wake_some, device)
+                return
+
+    def _forget_waker(self, connection: Connection, device: str) -> None:
+        wanting = self._wanting_wake.get(device)
+        if wanting is not None:
+            wanting.pop(connection, None)
+            if not wanting:
+                del self._wanting_wake[device]
 
     # --- what a client asks for ---------------------------------------------------------------------------------------
 
     def subscribe(self, connection: Connection, subscription: Subscription) -> None:
-        """Send samples to a client from now on, in place of those it watched before."""
+        """Send samples to a client from now on, in place of those it watched before.
+
+        Raises RpcError when its user has too many forms of samples.
+        """
+        uid = connection.peer.uid
+        self._quota.check_form(uid, subscription.key, self._forms_of(uid, connection))
+        self.unsubscribe(connection)
         self._subscriptions[connection.number] = subscription
-        self._plans = {}
+        for device, plan in self._plans.items():
+            if subscription.matches(device):
+                plan.add(device, subscription, connection.outbox)
+
+    def _forms_of(self, uid: int, but: Connection) -> set[FormKey]:
+        """The forms of samples that other clients of a user get."""
+        return {
+            wanted.key
+            for number, wanted in self._subscriptions.items()
+            if number != but.number and self._connections[number].peer.uid == uid
+        }
 
     def unsubscribe(self, connection: Connection) -> None:
         """Send no more samples to a client; no-op if it watches none."""
-        self._subscriptions.pop(connection.number, None)
-        self._plans = {}
+        subscription = self._subscriptions.pop(connection.number, None)
+        if subscription is not None:
+            for device, plan in self._plans.items():
+                if subscription.matches(device):
+                    plan.discard(subscription, connection.outbox)
 
     def subscribe_events(self, connection: Connection, devices: Collection[str] | None) -> None:
         """Send events of `devices` (None for all) to a client from now on, in place of those before."""
@@ -122,9 +183,14 @@ class Hub:
 
     def make_waker(self, connection: Connection, device: str) -> int:
         """Make a descriptor that wakes a client after batches of `device`. Raises RpcError as `ClientWakers.make`."""
-        fd = connection.wakers.make(device)
-        self._plans = {}
+        self._quota.check_waker(connection.peer, self._connections.values())
+        fd = connection.wakers.make(device, self._quota.check_fds)
+        self._wanting_wake.setdefault(device, {})[connection] = None
         return fd
+
+    def wakes(self, device: str) -> bool:
+        """Whether batches of `device` wake any client."""
+        return device in self._wanting_wake
 
     def busy(self, connection: Connection) -> bool:
         """Whether a request of the client is still being carried out."""
@@ -151,9 +217,10 @@ class Hub:
         """Remove a client and all it asked for; no-op if absent."""
         number = connection.number
         self._connections.pop(number, None)
-        self._subscriptions.pop(number, None)
+        self.unsubscribe(connection)
         self._events.pop(number, None)
-        self._plans = {}
+        for device in list(self._wanting_wake):
+            self._forget_waker(connection, device)
 
     def count_refused(self) -> None:
         """Count a connection that was refused."""
@@ -163,13 +230,20 @@ class Hub:
         """Count a client that is disconnected for what it did."""
         self._evicted += 1
 
+    def count_failed(self, error: Exception) -> None:
+        """Count a client whose request met a mistake in this program; log the first, and one a minute of more."""
+        self._failed += 1
+        count = self._failures.count()
+        if count:
+            log.error("an error while a client was served (%d since the last report)", count, exc_info=error)
+
     def clients(self) -> tuple[ClientStatus, ...]:
         """The state of every client."""
         return tuple(connection.status(self._encoding(number)) for number, connection in self._connections.items())
 
     def status(self) -> SocketStatus:
         """The state of the socket."""
-        return SocketStatus(self.path, self.clients(), self._accepted, self._refused, self._evicted)
+        return SocketStatus(self.path, self.clients(), self._accepted, self._refused, self._evicted, self._failed)
 
     def close(self) -> None:
         """Close every client and cancel what is still being carried out; may be called twice."""

@@ -1,25 +1,29 @@
 """Sends to one client: straight from `publish` while its socket has room, through a bounded queue while it has not.
 
 Goal: at 1 kHz one `send` per client and batch is the whole cost. A client with nothing queued gets the bytes that all
-clients share, in one system call; a queue, and a writer in the event loop, exist only while a socket is full.
+clients share, in one system call; a queue, sent by the scheduler (serving.py), exists only while a socket is full or
+while `publish` has used up its time.
 
 Order is kept. Two queues hold what waits, joined by an order number, because they are bounded differently: samples go
 oldest first when there are too many, replies never, but a client for which too many gather is disconnected. A message
-that was sent in part is finished before anything else and cannot be dropped.
+that was sent in part is finished before anything else and cannot be dropped. A queue of samples holds references to
+deliveries, which all clients of one form share and which are encoded when the first of them sends them.
 """
 
 import array
-import asyncio
 import socket
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
+from imud.contracts.publisher import Batch
 from imud.publishers.socket.encoding import Encoding
 
 CHUNK_BYTES: Final = 32768
 """Queued messages are sent together up to this size: what a socket buffer of the usual 208 KiB takes at once."""
+SAMPLE_BYTES: Final = 300
+"""What a sample in a queue needs in addition to its message, most of it shared by the clients of a form."""
 NO_FD: Final = -1
 
 
@@ -33,44 +37,138 @@ class Limits:
     reply_bytes: int = 1 << 20
 
 
-class Outbox:
-    """The sending side of one non-blocking socket. Synchronization: the event loop's thread.
+class Delivery:
+    """Samples of one batch in one form, or those of `chosen` indices; encoded on first use, for all clients."""
 
-    `on_broken` is called with the reason when the socket fails, `on_flooded` when more replies wait than may,
-    `on_empty` when all that waited is sent.
-    """
-
-    __slots__ = (
-        "_limits", "_loop", "_on_broken", "_on_empty", "_on_flooded", "_order", "_partial", "_partial_fd", "_replies",
-        "_reply_bytes", "_sample_bytes", "_samples", "_send", "_sock", "_unreported", "dropped", "sent", "waiting",
-    )  # fmt: skip
+    __slots__ = ("_messages", "batch", "chosen", "count", "each_bytes", "encoding", "order")
 
     def __init__(
         self,
-        sock: socket.socket,
-        limits: Limits,
-        on_broken: Callable[[str], None],
-        on_flooded: Callable[[], None],
-        on_empty: Callable[[], None],
+        order: int,
+        batch: Batch,
+        encoding: Encoding,
+        messages: Sequence[bytes] | None,
+        chosen: Sequence[int] | None = None,
     ) -> None:
+        self.order = order
+        self.batch = batch
+        self.encoding = encoding
+        self.chosen = chosen
+        self.count = len(batch.samples) if chosen is None else len(chosen)
+        self._messages = messages
+        self.each_bytes = SAMPLE_BYTES + (encoding.message_bytes if messages is None else len(messages[0]))
+        """Memory that a message and its sample need; before it is encoded, by the one encoded last."""
+
+    def messages(self) -> Sequence[bytes]:
+        """The samples as messages."""
+        if self._messages is None:
+            encoding, batch = self.encoding, self.batch
+            if self.chosen is None:
+                self._messages = encoding.encode(batch)
+            else:
+                self._messages = [encoding.encode_one(batch, index) for index in self.chosen]
+        return self._messages
+
+
+class Pool:
+    """What waits for all clients together: three eighths of `limit_bytes` for samples, an eighth for replies.
+
+    The other half is for messages that were sent in part and for what clients have sent and is not carried out yet,
+    which have a limit for each client: 32 KiB or one message, and 80 KiB (connection.py).
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        self._sample_bytes = limit_bytes * 3 // 8
+        self._reply_bytes = limit_bytes // 8
+        self._waiting: dict[Outbox, None] = {}
+        self._replies = 0
+        self._order = 0
+
+    def next_order(self) -> int:
+        """The number of the next message that is queued, for all clients: within each they ascend."""
+        self._order += 1
+        return self._order
+
+    @property
+    def share_bytes(self) -> int:
+        """The samples that may wait for one client: an equal share for each that waits."""
+        return self._sample_bytes // (len(self._waiting) or 1)
+
+    def add(self, outbox: "Outbox") -> None:
+        """Count a client for which something waits from now on."""
+        self._waiting[outbox] = None
+
+    def remove(self, outbox: "Outbox") -> None:
+        """Count a client no longer."""
+        self._waiting.pop(outbox, None)
+
+    def count_replies(self, size_bytes: int) -> None:
+        """Add to the bytes of replies that wait; negative to subtract."""
+        self._replies += size_bytes
+
+    def evict(self) -> None:
+        """Report the client with the most replies to its owner if too many wait for all together."""
+        if self._replies > self._reply_bytes and self._waiting:
+            max(self._waiting, key=lambda outbox: outbox.reply_bytes).flood()
+
+    def trim(self) -> None:
+        """Drop samples of clients that have more than the share, which shrinks with each client that waits."""
+        for outbox in self._waiting:
+            outbox.trim()
+
+
+class Owner(Protocol):
+    """Whose outbox it is."""
+
+    def on_broken(self, reason: str) -> None:
+        """The socket failed."""
+        ...
+
+    def on_flooded(self) -> None:
+        """More replies wait than may."""
+        ...
+
+    def on_full(self) -> None:
+        """The socket is full: call `flush` when it is writable."""
+        ...
+
+    def on_deferred(self) -> None:
+        """Samples wait although the socket may have room: call `flush` when there is time."""
+        ...
+
+    def on_emptied(self) -> None:
+        """All that waited is sent."""
+        ...
+
+
+class Outbox:
+    """The sending side of one non-blocking socket. Synchronization: the event loop's thread."""
+
+    __slots__ = (
+        "_limits", "_owner", "_partial", "_partial_fd", "_pool", "_replies", "_sample_bytes", "_sample_count",
+        "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "reply_bytes", "sent", "waiting",
+    )  # fmt: skip
+
+    def __init__(self, sock: socket.socket, limits: Limits, pool: Pool, owner: Owner) -> None:
         self.sent = 0
         """Samples given to the socket."""
         self.dropped = 0
         """Samples dropped."""
         self.waiting = False
         """Whether anything waits; then everything new has to wait behind it."""
+        self.reply_bytes = 0
+        """Bytes of replies that wait."""
         self._sock = sock
         self._send = sock.send
         self._limits = limits
-        self._on_broken = on_broken
-        self._on_flooded = on_flooded
-        self._on_empty = on_empty
-        self._loop = asyncio.get_running_loop()
-        self._order = 0
-        self._samples: deque[tuple[int, bytes, str, Encoding]] = deque()
+        self._pool = pool
+        self._owner = owner
+        self._samples: deque[Delivery] = deque()
+        self._skip = 0
+        """Samples of the first delivery that were sent or dropped already."""
+        self._sample_count = 0
         self._sample_bytes = 0
         self._replies: deque[tuple[int, bytes, int]] = deque()
-        self._reply_bytes = 0
         self._partial = b""
         self._partial_fd = NO_FD
         self._unreported: dict[str, int] = {}
@@ -79,7 +177,7 @@ class Outbox:
     @property
     def queue_samples(self) -> int:
         """Whole samples that wait."""
-        return len(self._samples)
+        return self._sample_count
 
     @property
     def queue_replies(self) -> int:
@@ -89,56 +187,98 @@ class Outbox:
     @property
     def queue_bytes(self) -> int:
         """Bytes that wait."""
-        return self._sample_bytes + self._reply_bytes + len(self._partial)
+        return self._sample_bytes + self.reply_bytes + len(self._partial)
 
     @staticmethod
-    def put_samples(outboxes: Iterable["Outbox"], messages: Sequence[bytes], device: str, encoding: Encoding) -> None:
+    def put_samples(
+        outboxes: Iterable["Outbox"], messages: Sequence[bytes], batch: Batch, encoding: Encoding,
+        chosen: Sequence[int] | None = None,
+    ) -> None:  # fmt: skip
         """Send samples of one device to several clients: the same bytes, one `send` each.
 
         The loop is in here because a call per client would cost as much as all the rest around `send`.
         """
         whole = messages[0] if len(messages) == 1 else b"".join(messages)
         size, samples = len(whole), len(messages)
+        delivery: Delivery | None = None
         for outbox in outboxes:
             if outbox.waiting:
-                outbox._queue_samples(messages, device, encoding)
+                delivery = delivery or Delivery(outbox._pool.next_order(), batch, encoding, messages, chosen)
+                outbox._queue_samples(delivery)
                 continue
             try:
                 count = outbox._send(whole)
             except BlockingIOError:
                 count = 0
             except OSError as error:
-                outbox._on_broken(str(error))
+                outbox._owner.on_broken(str(error))
                 continue
             if count == size:
                 outbox.sent += samples
             else:
-                outbox._keep_rest(count, messages, device, encoding)
+                delivery = delivery or Delivery(outbox._pool.next_order(), batch, encoding, messages, chosen)
+                outbox._keep_rest(count, delivery)
+
+    def defer(self, delivery: Delivery) -> None:
+        """Queue samples for the scheduler to send, because `publish` has no more time."""
+        self._queue_samples(delivery)
+        if not self.waiting:
+            self._wait()
+            self._owner.on_deferred()
 
     def put_reply(self, message: bytes, fd: int = NO_FD) -> None:
         """Send anything that is not a sample; with `fd`, a copy of that descriptor goes with its first byte."""
-        self._order += 1
-        self._replies.append((self._order, message, fd))
-        self._reply_bytes += len(message)
         if not self.waiting:
-            self._flush()
-        elif len(self._replies) > self._limits.replies or self._reply_bytes > self._limits.reply_bytes:
-            self._on_flooded()
+            self._partial, self._partial_fd = message, fd
+            self.flush()
+            return
+        self._replies.append((self._pool.next_order(), message, fd))
+        self.reply_bytes += len(message)
+        self._pool.count_replies(len(message))
+        if len(self._replies) > self._limits.replies or self.reply_bytes > self._limits.reply_bytes:
+            self.flood()
+        else:
+            self._pool.evict()
+
+    def flood(self) -> None:
+        """Report to the owner that more replies wait than may."""
+        self._owner.on_flooded()
+
+    def trim(self) -> None:
+        """Drop the oldest samples that are more than may wait: whole deliveries, while a later one is there."""
+        limits, samples = self._limits, self._samples
+        most_bytes = min(limits.sample_bytes, self._pool.share_bytes)
+        while self._sample_count > limits.samples or self._sample_bytes > most_bytes:
+            delivery = samples[0]
+            if len(samples) == 1:
+                count = 1
+                self._take_sample()
+            else:
+                count = delivery.count - self._skip
+                samples.popleft()
+                self._skip = 0
+                self._sample_count -= count
+                self._sample_bytes -= count * delivery.each_bytes
+            device = delivery.batch.device
+            self._unreported[device] = self._unreported.get(device, 0) + count
+            self.dropped += count
 
     def close(self) -> None:
         """Drop everything that waits; the owner closes the socket."""
-        if self._sock.fileno() >= 0:
-            self._loop.remove_writer(self._sock)
         self.waiting = False
         self._samples.clear()
         self._replies.clear()
         self._partial = b""
-        self._sample_bytes = self._reply_bytes = 0
+        self._sample_bytes = self._sample_count = 0
+        waited, self.reply_bytes = self.reply_bytes, 0
+        self._pool.remove(self)
+        self._pool.count_replies(-waited)
 
     # --- queueing ---------------------------------------------------------------------------------------------------
 
-    def _keep_rest(self, count: int, messages: Sequence[bytes], device: str, encoding: Encoding) -> None:
-        """The socket took `count` bytes of `messages`: keep the rest, the cut message apart."""
+    def _keep_rest(self, count: int, delivery: Delivery) -> None:
+        """The socket took `count` bytes of a delivery: keep the rest, the cut message apart."""
+        messages = delivery.messages()
         whole = 0
         while count >= len(messages[whole]):
             count -= len(messages[whole])
@@ -147,46 +287,66 @@ class Outbox:
             self._partial = messages[whole][count:]
             whole += 1
         self.sent += whole
-        self._queue_samples(messages[whole:], device, encoding)
+        if whole < len(messages):
+            self._skip = whole
+            self._sample_count -= whole
+            self._sample_bytes -= whole * delivery.each_bytes
+            self._queue_samples(delivery)
         self._wait()
+        self._owner.on_full()
 
-    def _queue_samples(self, messages: Sequence[bytes], device: str, encoding: Encoding) -> None:
-        queue = self._samples
-        for message in messages:
-            self._order += 1
-            queue.append((self._order, message, device, encoding))
-            self._sample_bytes += len(message)
-        while queue and (len(queue) > self._limits.samples or self._sample_bytes > self._limits.sample_bytes):
-            self._drop_oldest()
+    def _queue_samples(self, delivery: Delivery) -> None:
+        self._samples.append(delivery)
+        self._sample_count += delivery.count
+        self._sample_bytes += delivery.count * delivery.each_bytes
+        limits, size_bytes = self._limits, self._sample_bytes
+        if self._sample_count > limits.samples or size_bytes > min(limits.sample_bytes, self._pool.share_bytes):
+            self.trim()
 
-    def _drop_oldest(self) -> None:
-        _, message, device, _ = self._samples.popleft()
-        self._sample_bytes -= len(message)
-        self._unreported[device] = self._unreported.get(device, 0) + 1
-        self.dropped += 1
+    def _take_sample(self) -> tuple[Delivery, int]:
+        """Remove the oldest sample from the queue: its delivery and its place in it."""
+        delivery, place = self._samples[0], self._skip
+        self._sample_count -= 1
+        self._sample_bytes -= delivery.each_bytes
+        self._skip += 1
+        if self._skip == delivery.count:
+            self._samples.popleft()
+            self._skip = 0
+        return delivery, place
 
     def _wait(self) -> None:
         if not self.waiting:
             self.waiting = True
-            self._loop.add_writer(self._sock, self._flush)
+            self._pool.add(self)
 
     # --- sending what waited ----------------------------------------------------------------------------------------
 
-    def _flush(self) -> None:
-        """Send until all is sent or the socket is full."""
+    def flush(self) -> bool:
+        """Send one piece of what waits. Returns whether there is more and the socket may have room."""
         try:
-            while self._partial or self._next():
-                count = self._send_partial()
-                self._partial = self._partial[count:]
+            if not self._partial and not self._next():
+                return self._emptied()
+            count = self._send_partial()
         except BlockingIOError:
             self._wait()
+            self._owner.on_full()
+            return False
         except OSError as error:
-            self._on_broken(str(error))
-        else:
-            if self.waiting:
-                self.waiting = False
-                self._loop.remove_writer(self._sock)
-                self._on_empty()
+            self._owner.on_broken(str(error))
+            return False
+        self._partial = self._partial[count:]
+        if self._partial or self._samples or self._replies:
+            self._wait()
+            self._owner.on_deferred()
+            return True
+        return self._emptied()
+
+    def _emptied(self) -> bool:
+        if self.waiting:
+            self.waiting = False
+            self._pool.remove(self)
+            self._owner.on_emptied()
+        return False
 
     def _send_partial(self) -> int:
         if self._partial_fd == NO_FD:
@@ -202,7 +362,7 @@ class Outbox:
         size = 0
         samples, replies = self._samples, self._replies
         while size < CHUNK_BYTES and (samples or replies):
-            if replies and (not samples or replies[0][0] < samples[0][0]):
+            if replies and (not samples or replies[0][0] < samples[0].order):
                 if replies[0][2] != NO_FD and chunk:
                     break
                 chunk.append(self._next_reply())
@@ -216,14 +376,15 @@ class Outbox:
 
     def _next_reply(self) -> bytes:
         _, message, self._partial_fd = self._replies.popleft()
-        self._reply_bytes -= len(message)
+        self.reply_bytes -= len(message)
+        self._pool.count_replies(-len(message))
         return message
 
     def _next_sample(self) -> bytes:
-        _, message, device, encoding = self._samples.popleft()
-        self._sample_bytes -= len(message)
+        delivery, place = self._take_sample()
+        message = delivery.messages()[place]
         self.sent += 1
         if self._unreported:
-            message = encoding.with_dropped(message, device, self._unreported)
+            message = delivery.encoding.with_dropped(message, delivery.batch.device, self._unreported)
             self._unreported.clear()
         return message

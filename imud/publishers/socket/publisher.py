@@ -1,9 +1,10 @@
 """The UNIX socket publisher: JSON-RPC 2.0 for questions, samples as JSON lines or binary slots (docs/socket.md).
 
-    Listener ──accept──▶ Guard (rights) ──▶ Connection ──line──▶ rpc.handle_line ──▶ Hub
+    Listener ──accept──▶ Guard, Quota ──▶ Connection ◀──its turn── Scheduler;  line ──▶ rpc.handle_line ──▶ Hub
     publish(batch) ──▶ Hub ──▶ DeliveryGroup per form ──the same bytes──▶ Outbox per client ──▶ send, or a bounded queue
 
-Readers and writers are descriptors in the event loop, no streams: measured elsewhere, asyncio streams cost three times
+Samples go out while they are published; everything else that clients cause is done by the scheduler (serving.py), in
+pieces and in a limited time per turn of the event loop. No asyncio streams: measured elsewhere, they cost three times
 as much per sample.
 """
 
@@ -20,16 +21,21 @@ from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.settings import Settings
 from imud.event import Event
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
-from imud.publishers.socket.connection import Connection, Owner
+from imud.publishers.socket.connection import Connection, ServerSide
 from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.listener import Listener
-from imud.publishers.socket.outbox import Limits
+from imud.publishers.socket.outbox import Limits, Pool
+from imud.publishers.socket.quota import Quota, Seldom, Shares, raise_fd_limit
 from imud.publishers.socket.rights import Guard, Peer, Rights, gid_of, peer_of
 from imud.publishers.socket.rpc import handle_line, hello
+from imud.publishers.socket.serving import SERVING_BURST_NS, SERVING_PER_S_NS, Scheduler, TokenBucket
 
 log = logging.getLogger(__name__)
 
 ACCEPTS_PER_TURN: Final = 16
+ACCEPT_NS: Final = 300_000
+"""Accepting in one turn of the event loop, three clients with their greetings."""
+MIB: Final = 1 << 20
 
 
 class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,6 +51,10 @@ class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """Members of this group may also change things."""
     clients_max: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
     """At most so many clients at a time; one more gets an error and is disconnected."""
+    clients_per_user: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 128
+    """At most so many of them belong to one user; root and the daemon's own user may have them all."""
+    memory_mb: Annotated[int, msgspec.Meta(ge=8, le=4096)] = 64
+    """At most so much memory for what waits for all clients together."""
     queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
     """At most so many samples wait for a client that does not read; 4096 are 4 s at 1 kHz. The oldest are dropped."""
     queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
@@ -57,22 +67,32 @@ class SocketServer:
     def __init__(self, settings: SocketSettings, context: PublisherContext) -> None:
         self._settings = settings
         self._context = context
-        self.hub = Hub(settings.path, context)
-        self._owner = Owner(
-            self._on_line, self.hub.remove, self.hub.count_evicted, Limits(settings.queue_samples, settings.queue_bytes)
-        )
+        shares = Shares(settings.clients_max, settings.clients_per_user)
+        self._quota = Quota(shares, os.geteuid(), raise_fd_limit(), context.now_ns)
+        self._pool = Pool(settings.memory_mb * MIB)
+        self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.now_ns())
+        self.hub = Hub(settings.path, context, self._quota, self._time, self._pool)
+        self._side: ServerSide | None = None
         self._listener: Listener | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._guard = Guard(os.geteuid(), None, None)
         self._paused = False
+        self._pauses = Seldom(context.now_ns)
 
     def start(self) -> None:
         """Listen. Raises ServerError and leaves nothing behind when that is not possible."""
         settings = self._settings
-        self._loop = asyncio.get_running_loop()
         self._guard = Guard(os.geteuid(), gid_of(settings.group), gid_of(settings.control_group))
-        self._listener = Listener(Path(settings.path), settings.group)
-        self._loop.add_reader(self._listener.sock, self._accept)
+        self._listener = Listener(Path(settings.path), settings.group, settings.control_group)
+        self._side = ServerSide(
+            self._on_line,
+            self.hub.remove,
+            self.hub.count_evicted,
+            self.hub.count_failed,
+            Limits(settings.queue_samples, settings.queue_bytes),
+            self._pool,
+            Scheduler(self._context.now_ns, self._context.cpu_ns, self._time),
+        )
+        asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
         self._context.client_sources.append(self.hub.clients)
 
     def add_device(self, name: str, device_id: int) -> None:
@@ -92,29 +112,35 @@ class SocketServer:
         self.hub.event(event)
 
     def tick(self, now_ns: int) -> None:
-        """Close what lingered long enough; accept again after a pause."""
+        """Close what lingered long enough, fill allowances; accept again after a pause."""
         for connection in list(self.hub.connections.values()):
             connection.tick()
-        if self._paused and self._listener is not None and self._loop is not None:
+        if self._side is not None:
+            self._side.scheduler.tick()
+            self._pool.trim()
+        self._quota.tick()
+        if self._paused and self._listener is not None:
             self._paused = False
-            self._loop.add_reader(self._listener.sock, self._accept)
+            asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
 
     def close(self) -> None:
         """Stop listening, close every client, remove the socket file if it is ours; may be called twice."""
-        if self._listener is None:
+        if self._listener is None or self._side is None:
             return
-        if self._loop is not None:
-            self._loop.remove_reader(self._listener.sock)
+        asyncio.get_running_loop().remove_reader(self._listener.sock)
         self._listener.close()
         self._listener = None
         self.hub.close()
+        self._side.scheduler.close()
         self._context.client_sources.remove(self.hub.clients)
 
     # --- clients ----------------------------------------------------------------------------------------------------
 
     def _accept(self) -> None:
+        now_ns = self._context.now_ns
+        end_ns = now_ns() + ACCEPT_NS
         for _ in range(ACCEPTS_PER_TURN):
-            if self._listener is None:
+            if self._listener is None or now_ns() > end_ns:
                 return
             try:
                 sock, _address = self._listener.sock.accept()
@@ -129,9 +155,10 @@ class SocketServer:
     def _pause(self, error: OSError) -> None:
         """Stop accepting until the next tick: out of descriptors or memory, an immediate retry would be a busy loop."""
         assert self._listener is not None
-        assert self._loop is not None
-        log.warning("cannot accept a client: %s", error.strerror)
-        self._loop.remove_reader(self._listener.sock)
+        count = self._pauses.count()
+        if count:
+            log.warning("cannot accept a client: %s (%d times since the last report)", error.strerror, count)
+        asyncio.get_running_loop().remove_reader(self._listener.sock)
         self._paused = True
 
     def _welcome(self, sock: socket.socket) -> None:
@@ -141,24 +168,21 @@ class SocketServer:
             sock.close()
             return
         rights = self._guard.rights_of(peer)
-        refusal = self._refusal(peer, rights)
+        refusal = self._refusal(peer, rights, sock.fileno())
         if refusal is not None:
             self.hub.count_refused()
             _refuse(sock, refusal)
             return
-        connection = Connection(self.hub.next_number(), sock, peer, rights, self._owner)
+        assert self._side is not None
+        connection = Connection(self.hub.next_number(), sock, peer, rights, self._side)
         self.hub.add(connection)
         connection.post(hello(self.hub, connection))
 
-    def _refusal(self, peer: Peer, rights: Rights) -> RpcError | None:
-        settings = self._settings
+    def _refusal(self, peer: Peer, rights: Rights, fd: int) -> RpcError | None:
         if Rights.READ not in rights:
-            message = f"uid {peer.uid} may not read: expected root or a member of group {settings.group!r}"
+            message = f"uid {peer.uid} may not read: expected root or a member of group {self._settings.group!r}"
             return RpcError(Code.DENIED, message)
-        if len(self.hub.connections) >= settings.clients_max:
-            message = f"there are {settings.clients_max} clients already, as many as socket.clients_max allows"
-            return RpcError(Code.TOO_MANY_CLIENTS, message)
-        return None
+        return self._quota.refuse_client(peer, rights, fd, self.hub.connections.values())
 
     def _on_line(self, connection: Connection, line: bytes) -> None:
         handle_line(self.hub, connection, line)

@@ -6,6 +6,8 @@
 | control | root, members of the control group                     |
 """
 
+import ctypes
+import errno
 import grp
 import os
 import pwd
@@ -21,6 +23,9 @@ _UCRED: Final = struct.Struct("iII")
 _GID: Final = struct.Struct("I")
 _GETSOCKOPT_MAX_BYTES: Final = 1024
 """Python's limit for getsockopt: room for 256 groups."""
+_GROUPS_MAX: Final = 65536
+"""NGROUPS_MAX of Linux (limits.h)."""
+_libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
 class Rights(Flag):
@@ -74,12 +79,24 @@ def gid_of(group: str) -> int | None:
 
 
 def _supplementary(sock: socket.socket, uid: int, gid: int) -> list[int]:
-    """The kernel's list; where it has none (old kernel, more than 256 groups), the list of the user database."""
+    """The kernel's list; where the kernel has none (before Linux 4.13), the list of the user database."""
     try:
         raw = sock.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, _GETSOCKOPT_MAX_BYTES)
-    except OSError:
+    except OSError as error:
+        if error.errno == errno.ERANGE:
+            return _long_list(sock)
         try:
             return os.getgrouplist(pwd.getpwuid(uid).pw_name, gid)
         except KeyError:
             return []
     return [number for (number,) in _GID.iter_unpack(raw)]
+
+
+def _long_list(sock: socket.socket) -> list[int]:
+    """A list of more than 256 groups, for which Python's getsockopt has no room. Raises OSError."""
+    groups = (ctypes.c_uint32 * _GROUPS_MAX)()
+    size_bytes = ctypes.c_uint32(ctypes.sizeof(groups))
+    if _libc.getsockopt(sock.fileno(), socket.SOL_SOCKET, SO_PEERGROUPS, groups, ctypes.byref(size_bytes)) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return list(groups[: size_bytes.value // _GID.size])

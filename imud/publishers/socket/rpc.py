@@ -32,6 +32,9 @@ RATE_MIN_HZ: Final = 0.001
 RATE_MAX_HZ: Final = 1_000_000
 """No sensor is as fast; far above, the count of periods would leave the range of a float."""
 
+NAME_MAX: Final = 64
+"""Characters of an action's name; the longest has fewer than half of it."""
+
 P = TypeVar("P", bound=msgspec.Struct)
 
 
@@ -138,10 +141,12 @@ async def _answer_later(connection: Connection, request: RpcRequest, later: Late
     """Wait for the result and send it."""
     try:
         result = await later
+        body = encode_result(request.request_id, result)
     except ImudError as error:
         body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
-    else:
-        body = encode_result(request.request_id, result)
+    except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+        connection.on_failure(error)
+        return
     if request.wants_reply:
         connection.post(body)
 
@@ -221,7 +226,8 @@ def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
     devices = _known_devices(hub, params.devices)
     fields = _known_fields(params.fields)
     rate_hz = _rate(params.rate_hz)
-    hub.subscribe(connection, Subscription(devices, fields, rate_hz, params.encoding))
+    framed = connection.framed or params.encoding is Form.BINARY
+    hub.subscribe(connection, Subscription(devices, fields, rate_hz, params.encoding, framed))
     numbers = hub.devices if devices is None else {name: hub.devices[name] for name in devices}
     result = {"encoding": params.encoding, "devices": numbers, "rate_hz": rate_hz}
     return Answer(result, framed_from_here=params.encoding is Form.BINARY)
@@ -272,6 +278,8 @@ def _command(hub: Hub, connection: Connection, params: CommandParams) -> Later:
     _known_devices(hub, [params.device])
     if hub.busy(connection):
         raise RpcError(Code.UNAVAILABLE, "command: the one before is not done yet; wait for its reply")
+    if len(params.name) > NAME_MAX or not params.name.isprintable():
+        raise RpcError(Code.INVALID_PARAMS, f"command: expected a name of at most {NAME_MAX} printable characters")
     return _done(hub, params)
 
 
@@ -302,8 +310,11 @@ def _known_devices(hub: Hub, names: list[str] | None) -> tuple[str, ...] | None:
 
 
 def _known_fields(names: list[str] | None) -> tuple[str, ...] | None:
-    """The names without repetition, None for all. Raises RpcError."""
-    return None if names is None else _known("field", names, SAMPLE_FIELDS)
+    """The names in the order of `schema`, so that one set has one form; None for all. Raises RpcError."""
+    if names is None:
+        return None
+    known = set(_known("field", names, SAMPLE_FIELDS))
+    return tuple(name for name in SAMPLE_FIELDS if name in known)
 
 
 def _known(kind: str, names: list[str], known: Collection[str]) -> tuple[str, ...]:

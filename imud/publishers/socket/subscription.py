@@ -1,16 +1,24 @@
 """What clients watch (devices, form, rate), and the plan by which a batch goes to all that watch its device."""
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import chain
 from typing import Final
 
 from imud.contracts.publisher import Batch
 from imud.publishers.socket.encoding import BinaryEncoding, Encoding, JsonEncoding
-from imud.publishers.socket.outbox import Outbox
+from imud.publishers.socket.outbox import Delivery, Outbox
+from imud.publishers.socket.serving import TokenBucket
 from imud.units import NS_PER_S
 
+PUBLISH_NS: Final = 1_000_000
+"""Sending a batch takes so long at most; the clients that are left are served by the scheduler, in several turns."""
+NEVER_NS: Final = 1 << 63
+CLIENTS_PER_LOOK: Final = 32
+FORMS_AT_ONCE: Final = 16
+"""So many forms are encoded while a batch is sent. Others are encoded when their clients are served, in their time."""
 _BINARY: Final = BinaryEncoding()
 
 
@@ -51,6 +59,10 @@ class Pace:
         return True
 
 
+FormKey = tuple[Form, tuple[str, ...] | None, bool]
+"""What clients that get the same messages have in common: encoding, fields, frames or lines."""
+
+
 @dataclass(slots=True)
 class Subscription:
     """The parameters of a `watch`, checked."""
@@ -62,7 +74,14 @@ class Subscription:
     rate_hz: float
     """At most so many samples per second and device; 0 for all."""
     form: Form
+    framed: bool = False
+    """Whether messages go out as frames."""
     _paces: dict[str, Pace] = field(default_factory=dict)
+
+    @property
+    def key(self) -> FormKey:
+        """What clients have in common that get the same messages."""
+        return self.form, self.fields if self.form is Form.JSON else None, self.framed
 
     def matches(self, device: str) -> bool:
         """Whether samples of `device` are wanted."""
@@ -76,72 +95,145 @@ class Subscription:
 
 
 class DeliveryGroup:
-    """Clients that get samples of one device in the same form: each message is encoded once for all of them."""
+    """Clients that get samples of one device in the same form: each message is encoded once for all of them.
 
-    def __init__(self, encoding: Encoding) -> None:
+    The lists are replaced, never changed: a client may leave while a batch is being sent to them.
+    """
+
+    def __init__(self, encoding: Encoding, order: Callable[[], int]) -> None:
         self.encoding = encoding
-        self.direct: list[Outbox] = []
-        """Of clients that get every sample."""
-        self.paced: list[tuple[Pace, Outbox]] = []
+        self._order = order
+        self._direct: list[list[Outbox]] = []
+        """Of clients that get every sample, in lists of CLIENTS_PER_LOOK at most."""
+        self._paced: list[tuple[Pace, Outbox]] = []
 
-    def send(self, batch: Batch) -> None:
-        """Send the batch to every client of the group."""
-        encoding, device = self.encoding, batch.device
-        made: dict[int, bytes] = {}
-        if self.direct:
+    @property
+    def is_small(self) -> bool:
+        """Whether sending to all takes so little time that no look at the clock is needed."""
+        return len(self._direct) <= 1 and len(self._paced) <= CLIENTS_PER_LOOK
+
+    def add(self, outbox: Outbox, pace: Pace | None) -> None:
+        """Add a client."""
+        if pace is None:
+            self._direct = _in_parts([*chain(*self._direct), outbox])
+        else:
+            self._paced = [*self._paced, (pace, outbox)]
+
+    def discard(self, outbox: Outbox) -> bool:
+        """Remove a client if it is there; return whether none is left."""
+        self._direct = _in_parts([one for one in chain(*self._direct) if one is not outbox])
+        self._paced = [(pace, one) for pace, one in self._paced if one is not outbox]
+        return not self._direct and not self._paced
+
+    def send(self, batch: Batch, now_ns: Callable[[], int], end_ns: int) -> None:
+        """Send the batch to every client of the group until `end_ns`, then queue it for the others."""
+        encoding = self.encoding
+        messages: Sequence[bytes] = ()
+        if self._direct:
             messages = encoding.encode(batch)
-            Outbox.put_samples(self.direct, messages, device, encoding)
-            made = dict(enumerate(messages)) if self.paced else made
-        newest_ns = batch.samples[-1].t_ns
-        for pace, outbox in self.paced:
+            Outbox.put_samples(self._direct[0], messages, batch, encoding)
+            if len(self._direct) > 1:
+                self._send_parts(self._direct[1:], messages, batch, None, now_ns, end_ns)
+        if self._paced:
+            for chosen, outboxes in self._due(batch).items():
+                if messages:
+                    some: Sequence[bytes] = [messages[index] for index in chosen]
+                else:
+                    some = [encoding.encode_one(batch, index) for index in chosen]
+                self._send_parts(_in_parts(outboxes), some, batch, chosen, now_ns, end_ns)
+
+    def defer(self, batch: Batch) -> None:
+        """Queue the batch for every client of the group; it is encoded when the first of them is served."""
+        for chosen, outboxes in self._due(batch).items():
+            _defer(outboxes, Delivery(self._order(), batch, self.encoding, None, chosen))
+        if self._direct:
+            _defer(chain(*self._direct), Delivery(self._order(), batch, self.encoding, None))
+
+    def _due(self, batch: Batch) -> dict[tuple[int, ...], list[Outbox]]:
+        """Which samples of the batch are due for clients that get only some, by their indices."""
+        found: dict[tuple[int, ...], list[Outbox]] = {}
+        times_ns = [sample.t_ns for sample in batch.samples]
+        newest_ns = times_ns[-1]
+        for pace, outbox in self._paced:
             if newest_ns < pace.due_ns:
                 continue  # the usual case, so no call for it
-            chosen = [index for index, sample in enumerate(batch.samples) if pace.is_due(sample.t_ns)]
+            chosen = tuple([index for index, t_ns in enumerate(times_ns) if pace.is_due(t_ns)])
             if chosen:
-                for index in chosen:
-                    if index not in made:
-                        made[index] = encoding.encode_one(batch, index)
-                messages = [made[index] for index in chosen]
-                Outbox.put_samples((outbox,), messages, device, encoding)
+                found.setdefault(chosen, []).append(outbox)
+        return found
+
+    def _send_parts(
+        self, parts: Iterable[list[Outbox]], messages: Sequence[bytes], batch: Batch, chosen: Sequence[int] | None,
+        now_ns: Callable[[], int], end_ns: int,
+    ) -> None:  # fmt: skip
+        """Send to clients in parts of CLIENTS_PER_LOOK, with a look at the clock before each; queue after `end_ns`."""
+        delivery: Delivery | None = None
+        for outboxes in parts:
+            if delivery is None and now_ns() < end_ns:
+                Outbox.put_samples(outboxes, messages, batch, self.encoding, chosen)
+                continue
+            delivery = delivery or Delivery(self._order(), batch, self.encoding, messages, chosen)
+            _defer(outboxes, delivery)
 
 
-@dataclass(frozen=True, slots=True)
+def _defer(outboxes: Iterable[Outbox], delivery: Delivery) -> None:
+    for outbox in outboxes:
+        outbox.defer(delivery)
+
+
+def _in_parts(outboxes: list[Outbox]) -> list[list[Outbox]]:
+    return [outboxes[first : first + CLIENTS_PER_LOOK] for first in range(0, len(outboxes), CLIENTS_PER_LOOK)]
+
+
 class DeliveryPlan:
-    """Where a batch of one device goes. Never changed, but replaced when clients or their subscriptions change."""
+    """Where batches of one device go: a group of clients for each form that is wanted.
 
-    groups: Sequence[DeliveryGroup]
-    wakes: bool
-    """Whether these batches wake any client."""
+    `order` gives the number of the next message that is queued.
+    """
 
+    def __init__(self, order: Callable[[], int]) -> None:
+        self._next_order = order
+        self._groups: dict[FormKey, DeliveryGroup] = {}
+        self._order: tuple[DeliveryGroup, ...] = ()
 
-@dataclass(frozen=True, slots=True)
-class Watcher:
-    """A client that watches."""
+    def __len__(self) -> int:
+        return len(self._groups)
 
-    subscription: Subscription
-    outbox: Outbox
-    framed: bool
-    """Whether it gets frames."""
-
-
-def make_plan(device: str, watchers: Iterable[Watcher], wakes: bool) -> DeliveryPlan:
-    """The plan for batches of `device`: one group per form that is wanted."""
-    groups: dict[tuple[Form, tuple[str, ...] | None, bool], DeliveryGroup] = {}
-    for watcher in watchers:
-        wanted, framed = watcher.subscription, watcher.framed
-        if not wanted.matches(device):
-            continue
-        key = (wanted.form, wanted.fields if wanted.form is Form.JSON else None, framed)
-        group = groups.get(key)
+    def add(self, device: str, wanted: Subscription, outbox: Outbox) -> None:
+        """Send to a client that watches this device."""
+        key = wanted.key
+        group = self._groups.get(key)
         if group is None:
-            group = groups[key] = DeliveryGroup(_encoding(wanted, framed))
-        pace = wanted.pace_of(device)
-        if pace is None:
-            group.direct.append(watcher.outbox)
-        else:
-            group.paced.append((pace, watcher.outbox))
-    return DeliveryPlan(tuple(groups.values()), wakes)
+            encoding: Encoding = _BINARY if wanted.form is Form.BINARY else JsonEncoding(wanted.fields, wanted.framed)
+            group = self._groups[key] = DeliveryGroup(encoding, self._next_order)
+            self._order = tuple(self._groups.values())
+        group.add(outbox, wanted.pace_of(device))
 
+    def discard(self, wanted: Subscription, outbox: Outbox) -> None:
+        """Send to a client no more; no-op if absent."""
+        key = wanted.key
+        group = self._groups.get(key)
+        if group is not None and group.discard(outbox):
+            del self._groups[key]
+            self._order = tuple(self._groups.values())
 
-def _encoding(wanted: Subscription, framed: bool) -> Encoding:
-    return _BINARY if wanted.form is Form.BINARY else JsonEncoding(wanted.fields, framed)
+    def send(self, batch: Batch, now_ns: Callable[[], int], time: TokenBucket) -> None:
+        """Send a batch to all clients of the plan: to few at once, to many for PUBLISH_NS, then through their queues.
+
+        `time` is what is left of the time for serving; without any, most of many clients get it through their queues.
+        """
+        groups = self._order
+        if not groups:
+            return
+        if len(groups) == 1 and groups[0].is_small:
+            groups[0].send(batch, now_ns, NEVER_NS)
+            return
+        begun_ns = now_ns()
+        time.fill(begun_ns)
+        end_ns = begun_ns + PUBLISH_NS if time.level > 0 else begun_ns
+        for number, group in enumerate(groups):
+            if number and (number >= FORMS_AT_ONCE or now_ns() > end_ns):
+                group.defer(batch)
+            else:
+                group.send(batch, now_ns, end_ns)
+        time.use(now_ns() - begun_ns)

@@ -13,6 +13,7 @@ lock that a sender needs while it copies. The daemon keeps one end, which takes 
 """
 
 import socket
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from imud.formats.jsonrpc import Code, RpcError
@@ -41,6 +42,11 @@ class Waker:
         """The descriptor for the client, NO_FD once it is handed over."""
         return self._theirs.fileno()
 
+    @property
+    def fds(self) -> tuple[int, int]:
+        """Both descriptors."""
+        return self._sock.fileno(), self._theirs.fileno()
+
     def handed_over(self) -> None:
         """Close the daemon's copy of the client's end, so that it shows when the client closes its own."""
         self._theirs.close()
@@ -67,8 +73,11 @@ class ClientWakers:
     def __init__(self) -> None:
         self._wakers: dict[str, Waker] = {}
 
-    def __contains__(self, device: str) -> bool:
+    def __contains__(self, device: object) -> bool:
         return device in self._wakers
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._wakers)
 
     def __len__(self) -> int:
         return len(self._wakers)
@@ -78,10 +87,11 @@ class ClientWakers:
         """Descriptors of the client's that the daemon still holds because their replies wait to be sent."""
         return sum(waker.client_end != NO_FD for waker in self._wakers.values())
 
-    def make(self, device: str) -> int:
+    def make(self, device: str, check: Callable[[Sequence[int]], None]) -> int:
         """Make a descriptor for the client, to be sent with the next reply; it replaces the one of `device` before.
 
-        Raises RpcError when none can be made, or while the one before still waits to be sent: a client that never
+        `check` is given the numbers of the new descriptors and raises RpcError when clients may not use them.
+        Raises RpcError also when none can be made, or while the one before still waits to be sent: a client that never
         reads would gather descriptors in the daemon.
         """
         old = self._wakers.get(device)
@@ -92,6 +102,11 @@ class ClientWakers:
             waker = Waker()
         except OSError as error:
             raise RpcError(Code.UNAVAILABLE, f"notify: the daemon cannot make a descriptor: {error.strerror}") from None
+        try:
+            check(waker.fds)
+        except RpcError:
+            waker.close()
+            raise
         if old is not None:
             old.close()
         self._wakers[device] = waker

@@ -14,7 +14,7 @@ from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.publishers.socket.connection import Connection
 from imud.publishers.socket.encoding import JsonEncoding
-from imud.publishers.socket.outbox import Limits, Outbox
+from imud.publishers.socket.outbox import Limits, Outbox, Pool
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.waker import BYTE
 from tests.support.socket_rig import Peer, batch, run, serving, until
@@ -331,6 +331,21 @@ class Trickle:
         return self.sock.send(data[: self.rng.choice([1, 3, 10, 1000, 100_000])])
 
 
+class Sink:
+    """An owner that has nothing to do: the test sends what waits."""
+
+    on_broken = on_flooded = staticmethod(pytest.fail)
+
+    def on_full(self) -> None:
+        pass
+
+    def on_deferred(self) -> None:
+        pass
+
+    def on_emptied(self) -> None:
+        pass
+
+
 def drained(sock: socket.socket) -> bytes:
     """What there is to read."""
     try:
@@ -348,20 +363,20 @@ def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
         ours.setblocking(False)
         theirs.setblocking(False)
         encoding = JsonEncoding(("sync",), framed=False)
-        outbox = Outbox(Trickle(ours, rng), Limits(20, 1 << 20), pytest.fail, pytest.fail, lambda: None)  # type: ignore[arg-type]  # all that Outbox uses
+        outbox = Outbox(Trickle(ours, rng), Limits(20, 1 << 20), Pool(1 << 26), Sink())  # type: ignore[arg-type]  # all that Outbox uses
         peer = Peer(theirs)
         seq = 0
         seen: list[tuple[str, int, dict[str, int]]] = []
         for number in range(100):
             part = batch("imu0", seq + 1, rng.choice([1, 2, 15]))
             seq += len(part.samples)
-            Outbox.put_samples([outbox], encoding.encode(part), "imu0", encoding)
+            Outbox.put_samples([outbox], encoding.encode(part), part, encoding)
             if number % 10 == 0:
                 outbox.put_reply(b'{"method":"other","params":{}}\n')
-            await asyncio.sleep(0)
+            outbox.flush()
             peer.buffer += drained(theirs)
         while outbox.waiting:
-            await asyncio.sleep(0)
+            outbox.flush()
             peer.buffer += drained(theirs)
         others = 0
         while not seen or seen[-1][1] != seq:

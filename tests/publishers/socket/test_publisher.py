@@ -1,7 +1,9 @@
 """The socket server end to end: greeting, questions, samples in both encodings, events, limits."""
 
 import asyncio
+import itertools
 import os
+import random
 import socket
 import struct
 from pathlib import Path
@@ -13,6 +15,7 @@ from imud.event import Event, EventKind
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.publishers import PUBLISHERS
 from imud.publishers.socket.publisher import PUBLISHER, SocketServer, SocketSettings
+from imud.publishers.socket.quota import FORMS_PER_USER
 from imud.sample import SAMPLE_FIELDS
 from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, Peer, batch, context, run, sample, serving, until
 
@@ -249,6 +252,92 @@ def test_events_go_to_those_who_want_them(tmp_path: Path) -> None:
     run(body)
 
 
+def test_one_set_of_fields_has_one_form_in_any_order(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            fields = ["sync", "mag_t", "gyro_rad_s", "t_err_ns", "accel_m_s2"]
+            peers = []
+            for number in range(2 * FORMS_PER_USER):  # 16 different forms are what a user may have
+                peers.append(await Peer.greeted(server))
+                random.Random(number).shuffle(fields)
+                await peers[-1].result("watch", fields=fields)
+            server.publish(batch())
+            assert len({await peer.body() for peer in peers}) == 1
+            for peer in peers:
+                peer.close()
+
+    run(body)
+
+
+def test_a_user_s_clients_watch_a_limited_number_of_selections(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peers = [await Peer.greeted(server) for _ in range(FORMS_PER_USER + 1)]
+            names = ["sync", "gyro_rad_s", "accel_m_s2", "t_err_ns", "utc_ns", "mag_t", "t_rx_ns"]
+            choices = list(itertools.combinations(names, 2))
+            for peer, fields in zip(peers[:-1], choices[:FORMS_PER_USER], strict=True):
+                await peer.result("watch", fields=fields)
+            assert (await peers[-1].error("watch", fields=choices[FORMS_PER_USER]))[0] == -32004
+            await peers[0].result("watch", fields=choices[FORMS_PER_USER])  # in place of its own
+            await peers[-1].result("watch", fields=choices[1])  # one that there is
+            for peer in peers:
+                peer.close()
+
+    run(body)
+
+
+def test_to_many_clients_samples_go_in_several_turns_and_none_is_lost(tmp_path: Path) -> None:
+    now_ns, step_ns = NOW_NS, 0
+
+    def clock() -> int:
+        nonlocal now_ns
+        now_ns += step_ns
+        return now_ns
+
+    async def body() -> None:
+        nonlocal step_ns
+        async with serving(tmp_path, clock) as server:
+            peers = [await Peer.greeted(server) for _ in range(100)]
+            for number, peer in enumerate(peers):
+                rate = {"rate_hz": 1000.0} if number % 3 else {}
+                await peer.result("watch", **rate)
+            step_ns = 400_000  # sending takes its time
+            for seq in range(1, 11):
+                server.publish(batch("imu0", seq))
+                waiting = sum(client.queue_samples > 0 for client in server.hub.clients())
+            step_ns = 0
+            assert waiting > 20  # publishing them all at once would have taken too long
+            for peer in peers:
+                assert [message["params"]["seq"] for message in await peer.messages(10)] == list(range(1, 11))
+            assert all(client.dropped == 0 for client in server.hub.clients())
+            for peer in peers:
+                peer.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize("selection", ["one", "many"])
+def test_what_waits_for_all_clients_together_is_bounded(tmp_path: Path, selection: str) -> None:
+    fields = ["sync", "gyro_rad_s", "accel_m_s2", "t_err_ns", "utc_ns", "t_dev_ns", "t_rx_ns", "temperature_c"]
+
+    async def body() -> None:
+        async with serving(tmp_path, memory_mb=8) as server:
+            peers = [await Peer.greeted(server) for _ in range(20)]
+            for number, peer in enumerate(peers):
+                chosen = {"fields": fields[: 1 + number % 8]} if selection == "many" else {}
+                await peer.result("watch", **chosen)
+            for seq in range(1, 4001):
+                server.publish(batch("imu0", seq))
+            server.tick(0)
+            clients = server.hub.clients()
+            assert sum(client.dropped for client in clients)
+            assert 1 << 20 < sum(client.queue_bytes for client in clients) < 4 << 20
+            for peer in peers:
+                peer.close()
+
+    run(body)
+
+
 def test_one_client_too_many_gets_an_error(tmp_path: Path) -> None:
     async def body() -> None:
         async with serving(tmp_path, clients_max=2) as server:
@@ -312,3 +401,28 @@ def test_out_of_descriptors_pauses_accepting_until_the_next_tick(
 
     run(body)
     assert "Too many open files" in caplog.text
+
+
+def test_running_out_of_descriptors_is_logged_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls = 0
+
+    def refuse(_sock: socket.socket) -> None:
+        nonlocal calls
+        calls += 1
+        raise OSError(24, "Too many open files")
+
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            with monkeypatch.context() as patch:
+                patch.setattr(socket.socket, "accept", refuse)
+                peer = await Peer.connect(server)
+                for count in range(1, 21):
+                    await until(lambda count=count: calls >= count)  # type: ignore[misc]
+                    server.tick(0)
+            assert (await peer.message())["method"] == "hello"
+            peer.close()
+
+    run(body)
+    assert caplog.text.count("cannot accept") == 1

@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -77,22 +77,36 @@ def open_directory() -> Iterator[Path]:
         ([], 0o666, '"code":-32001'),
         (["daemon"], 0o660, '"rights":["read"]'),
         (["bin"], 0o666, '"rights":["read","control"]'),
+        (["bin"], None, '"rights":["read","control"]'),
     ],
 )
-def test_other_users(open_directory: Path, groups: list[str], mode: int, expected: str) -> None:
+def test_other_users(open_directory: Path, groups: list[str], mode: int | None, expected: str) -> None:
     async def body() -> str:
         async with serving(open_directory, group="daemon", control_group="bin") as server:
-            os.chmod(server.hub.path, mode)
-            return await asyncio.to_thread(ask, server.hub.path)
-
-    def ask(path: str) -> str:
-        done = subprocess.run(
-            [sys.executable, "-I", "-S", "-c", CLIENT, path, *(str(gid_of(name)) for name in groups)],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-        return done.stdout
+            if mode is not None:
+                os.chmod(server.hub.path, mode)
+            return await asyncio.to_thread(ask, server.hub.path, [gid_of(name) for name in groups])
 
     assert expected in run(body)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become other users")
+def test_a_user_with_more_groups_than_python_has_room_for(open_directory: Path) -> None:
+    async def body() -> str:
+        async with serving(open_directory, group="daemon", control_group="bin") as server:
+            groups = [*range(70_000, 70_300), gid_of("daemon"), gid_of("bin")]
+            return await asyncio.to_thread(ask, server.hub.path, groups)
+
+    assert '"rights":["read","control"]' in run(body)
+
+
+def ask(path: str, groups: Sequence[int | None]) -> str:
+    """What a user with these groups is greeted with."""
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", CLIENT, path, *map(str, groups)],
+        capture_output=True,
+        text=True,
+        timeout=10,
+        check=True,
+    )
+    return done.stdout

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import LINE_MAX_BYTES, RpcError, parse_request
 from imud.publishers.socket.publisher import SocketServer
+from imud.publishers.socket.serving import BYTES_BURST
 from tests.support.socket_rig import LIMIT_S, Peer, batch, run, serving
 
 
@@ -26,6 +27,13 @@ from tests.support.socket_rig import LIMIT_S, Peer, batch, run, serving
         (b"[" * 60_000, -32700, None, "nested too deeply"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":NaN}}', -32700, None, "not JSON"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":1e999}}', -32700, None, "not JSON"),
+        (
+            b'{"jsonrpc":"2.0","id":1,"method":"x","params":' + b'{"a":' * 974 + b"1" + b"}" * 975,
+            -32700,
+            None,
+            "nested",
+        ),
+        (b"[" + b"1," * 3000 + b"1]", -32700, None, "too long a list: expected at most 2048"),
         (b"7", -32600, None, "got a number"),
         (b'[{"jsonrpc":"2.0","id":1,"method":"devices"}]', -32600, None, "one JSON object per line, got an array"),
         (b"{}", -32600, None, '"2.0"'),
@@ -186,6 +194,94 @@ def test_one_client_s_flood_of_requests_leaves_turns_to_others(tmp_path: Path) -
                 flood.buffer += await asyncio.get_running_loop().sock_recv(flood.sock, 1 << 20)
             assert flood.buffer.count(b"\n") < 200  # of 1000, when the other was answered
             flood.close()
+            other.close()
+
+    run(body)
+
+
+def test_deep_arguments_of_a_command_are_refused_before_anything_sees_them(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            deep = b'{"a":' * 974 + b"1" + b"}" * 974
+            params = b'{"device":"imu0","name":"output","arguments":' + deep + b"}"
+            await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":' + params + b"}\n")
+            error = (await peer.message())["error"]
+            assert (error["code"], "nested too deeply" in error["message"]) == (-32700, True)
+            peer.close()
+
+    run(body)
+
+
+def test_a_name_that_would_forge_a_line_of_the_log_is_refused(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            for name in ("x\nERROR forged", "x" * 65):
+                code, _ = await peer.error("command", device="imu0", name=name)
+                assert code == -32602
+            peer.close()
+
+    run(body)
+
+
+def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            other = await Peer.greeted(server)
+            for _ in range(3):
+                peer = await Peer.greeted(server)
+                params = b'{"device":"imu0","name":"break"}'
+                await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":' + params + b"}\n")
+                assert (await peer.message())["error"]["code"] == -32603
+                assert await peer.ended()
+                peer.close()
+            assert server.hub.status().failed == 3
+            assert len(await other.result("devices")) == 2
+            other.close()
+
+    run(body)
+    assert caplog.text.count("an error while a client was served") == 1
+
+
+def test_a_mistake_in_answering_ends_that_client_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RecursionError("deep")
+
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer, other = await Peer.greeted(server), await Peer.greeted(server)
+            with monkeypatch.context() as patch:
+                patch.setattr("imud.publishers.socket.rpc.encode_result", fail)
+                await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"devices"}\n')
+                assert (await peer.message())["error"]["code"] == -32603
+                assert await peer.ended()
+            assert server.hub.status().failed == 1
+            assert len(await other.result("devices")) == 2
+            peer.close()
+            other.close()
+
+    run(body)
+
+
+def test_empty_lines_use_up_the_allowance_of_their_client(tmp_path: Path) -> None:
+    """30 clients with 7 MB of them each kept the daemon busy for minutes."""
+
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer, other = await Peer.greeted(server), await Peer.greeted(server)
+            peer.sock.setblocking(False)
+            written, full = 0, 0
+            while full < 200:  # nothing is read any more
+                try:
+                    written += peer.sock.send(b"\n" * 65_536)
+                    full = 0
+                except BlockingIOError:
+                    full += 1
+                await asyncio.sleep(0)
+            assert written < 2 * BYTES_BURST
+            assert len(await other.result("devices")) == 2
+            peer.close()
             other.close()
 
     run(body)

@@ -150,7 +150,7 @@ def test_a_client_that_closes_its_descriptor_is_not_woken_any_more(tmp_path: Pat
             await wakened()
             assert not second.wakers
             server.publish(batch("imu0", 4))
-            assert not server.hub.plan_of("imu0").wakes  # no client is left to wake
+            assert not server.hub.wakes("imu0")  # no client is left to wake
             for peer in (closing, other):
                 assert len(await peer.result("devices")) == 2
                 peer.close()

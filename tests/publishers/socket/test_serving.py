@@ -1,0 +1,225 @@
+"""The scheduler: turns are limited, the least user is next, abuse is parked and evicted, errors are contained."""
+
+import asyncio
+import select
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from imud.publishers.socket import serving
+from imud.publishers.socket.serving import Place, Scheduler, TokenBucket
+from tests.support.socket_rig import run, until
+
+MS = 1_000_000
+
+
+class Clock:
+    """A clock that moves when work is done."""
+
+    def __init__(self) -> None:
+        self.ns = 80_000 * MS
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+class Worker:
+    """A client with `pieces` pieces of work of `cost_ns` each."""
+
+    def __init__(self, name: str, clock: Clock, log: list[str], pieces: int, cost_ns: int) -> None:
+        self.name, self.clock, self.log = name, clock, log
+        self.pieces, self.cost_ns = pieces, cost_ns
+        self.error: Exception | None = None
+        self.failures: list[Exception] = []
+        self.overloads = 0
+
+    def on_ready(self, events: int) -> None:
+        assert events & select.EPOLLIN
+
+    def serve(self) -> bool:
+        self.clock.ns += self.cost_ns
+        self.log.append(self.name)
+        self.pieces -= 1
+        if self.error is not None:
+            raise self.error
+        return self.pieces > 0
+
+    def wanted_events(self) -> int:
+        return 0
+
+    def on_failure(self, error: Exception) -> None:
+        self.failures.append(error)
+        self.error = None
+
+    def on_overload(self) -> None:
+        self.overloads += 1
+
+
+class Rig:
+    """A scheduler and its clients, one socket for each."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.log: list[str] = []
+        time = TokenBucket(1_000_000_000, 1_000 * MS, self.clock())
+        self.scheduler = Scheduler(self.clock, self.clock, time)
+        self.socks: list[socket.socket] = []
+
+    def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> tuple[Worker, Place]:
+        ours, theirs = socket.socketpair()
+        self.socks += [ours, theirs]
+        worker = Worker(name, self.clock, self.log, pieces, cost_ns)
+        place = self.scheduler.add(worker, ours.fileno(), len(self.socks), uid)
+        return worker, place
+
+
+@contextmanager
+def scheduling() -> Iterator[Rig]:
+    rig = Rig()
+    try:
+        yield rig
+    finally:
+        rig.scheduler.close()
+        for sock in rig.socks:
+            sock.close()
+
+
+def playing(body: Callable[[Rig], None]) -> None:
+    """Run a test that needs no turn of the loop."""
+
+    async def limited() -> None:
+        with scheduling() as rig:
+            body(rig)
+
+    run(limited)
+
+
+def test_a_turn_is_limited_and_other_callbacks_run_in_between() -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            rig.add("busy", 1, 100, MS // 4)[1].line_up()
+            for _ in range(20):
+                asyncio.get_running_loop().call_soon(rig.log.append, "sample")
+                await asyncio.sleep(0)
+            served = "".join("b" if word == "busy" else "." for word in rig.log)
+            assert "b" * 5 not in served  # 4 pieces of 0.25 ms make a turn
+            assert served.count("b") > 40
+
+    run(body)
+
+
+def test_the_client_that_used_least_is_next_within_its_user_and_among_users() -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            for number in range(8):
+                rig.add(f"many{number}", 1, 50, MS // 4)[1].line_up()
+            rig.add("one", 2, 50, MS // 4)[1].line_up()
+            await until(lambda: len(rig.log) >= 60)
+            assert 26 <= rig.log[:60].count("one") <= 34  # half of the time for each user
+            counts = [rig.log[:60].count(f"many{number}") for number in range(8)]
+            assert max(counts) - min(counts) <= 1
+
+    run(body)
+
+
+def test_a_newcomer_goes_before_those_that_use_much() -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            for number in range(20):
+                rig.add(f"many{number}", 1, 1000, MS // 2)[1].line_up()
+            await until(lambda: len(rig.log) > 100)
+            before = len(rig.log)
+            rig.add("good", 1, 1, MS // 10)[1].line_up()
+            await until(lambda: "good" in rig.log)
+            assert rig.log.index("good") - before <= 20  # one round of the others at most
+
+    run(body)
+
+
+def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted() -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            worker, place = rig.add("busy", 1, 1_000_000, 5 * MS)
+            place.line_up()
+            for _ in range(200):
+                await asyncio.sleep(0)
+            used = len(rig.log)
+            assert used * 5 * MS <= serving.CPU_NEW_NS + serving.CPU_PER_S_NS  # then nothing for it any more
+            rig.clock.ns += 500 * MS
+            rig.scheduler.tick()
+            await until(lambda: len(rig.log) > used)
+            for _ in range(serving.OVER_TICKS_MAX + 2):
+                for _ in range(100):
+                    await asyncio.sleep(0)
+                assert not worker.overloads
+                rig.clock.ns += 20 * MS
+                rig.scheduler.tick()
+                if worker.overloads:
+                    break
+            assert worker.overloads == 1
+
+    run(body)
+
+
+def test_bytes_count_too() -> None:
+    def body(rig: Rig) -> None:
+        _worker, place = rig.add("talker", 1, 5, 0)
+        place.count_bytes(serving.BYTES_BURST)
+        assert not place.is_over
+        place.count_bytes(1)
+        assert place.is_over
+        place.fill(rig.clock() + 1000 * MS)
+        assert not place.is_over
+
+    playing(body)
+
+
+def test_when_the_time_for_serving_is_used_up_only_light_clients_are_served() -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            for number in range(4):
+                rig.add(f"heavy{number}", 1, 10_000, MS // 2)[1].line_up()
+            good, place = rig.add("good", 1, 1, MS // 10)
+            place.fill(rig.clock() + 1000 * MS)  # it has been there, silent, for a second
+            await until(lambda: len(rig.log) >= 8)
+            rig.scheduler.serving_time.use(2_000 * MS)
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            before = len(rig.log)
+            place.line_up()
+            await until(lambda: "good" in rig.log[before:])
+            assert len(rig.log) - before <= 3  # at most the turn that everybody has in 10 ms
+            assert not good.pieces
+
+    run(body)
+
+
+def test_an_error_ends_that_client_and_no_other(caplog: pytest.LogCaptureFixture) -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            bad, place = rig.add("bad", 1, 2, 1000)
+            bad.error = RecursionError("deep")
+            other, other_place = rig.add("other", 1, 3, 1000)
+            place.line_up()
+            other_place.line_up()
+            await until(lambda: not other.pieces and not bad.pieces)
+            assert [str(error) for error in bad.failures] == ["deep"]
+            assert not other.failures
+
+    run(body)
+
+
+def test_a_client_that_left_is_not_served() -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            _, place = rig.add("gone", 1, 5, 1000)
+            _, other = rig.add("other", 1, 1, 1000)
+            place.line_up()
+            place.leave()
+            place.leave()
+            other.line_up()
+            await until(lambda: rig.log == ["other"])
+
+    run(body)
