@@ -3,6 +3,7 @@
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 # make pictures   the pictures of README.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
+# make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
 SHELL := /bin/sh
 PYTHON ?= python3
 VENV := .venv
@@ -10,7 +11,7 @@ BIN := $(VENV)/bin
 ARGS ?=
 LAB_OPTIONS ?= --steady
 
-.PHONY: all demo test lint check bench soak pictures fuzz fuzz-deps clean lab lab-deps
+.PHONY: all demo test lint check bench attack soak pictures fuzz fuzz-deps clean lab lab-deps
 
 all: check
 
@@ -35,6 +36,9 @@ check: lint test
 
 bench: $(VENV)/made
 	$(BIN)/python -m tests.bench $(ARGS)
+
+attack: $(VENV)/made
+	$(BIN)/python -m tests.attack $(ARGS)
 
 soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)

@@ -1,0 +1,1 @@
+"""Hostile clients, users and hosts against a running daemon: `make attack`."""

@@ -1,0 +1,237 @@
+"""A process full of hostile clients: `python -m tests.attack.hostile KIND --socket PATH --clients N --seconds S`.
+
+Each kind says what its clients send and how they read. The engine writes and reads as fast as that allows, connects
+again when it is disconnected, and ends after the given time.
+"""
+
+import argparse
+import json
+import os
+import random
+import selectors
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from imud.sample import SAMPLE_FIELDS
+
+NICE = 10
+"""Hostile processes are to cost the daemon its own time, not that of the machine's scheduler."""
+RECONNECTS_PER_S = 200
+
+
+class Reading(Enum):
+    """How a client reads what it gets."""
+
+    ALL = auto()
+    SLOWLY = auto()
+    NEVER = auto()
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What clients of one kind do."""
+
+    sends: Callable[[random.Random], bytes]
+    """What a client sends next; empty for nothing more."""
+    reading: Reading = Reading.ALL
+    once: bool = False
+    """Whether it sends only once per connection."""
+    leaves: bool = False
+    """Whether it disconnects as soon as it has sent."""
+
+
+def request(method: str, **params: object) -> bytes:
+    """A request as a line."""
+    return json.dumps({"jsonrpc": "2.0", "id": 1, "method": method, "params": params}).encode() + b"\n"
+
+
+def padded_line(_rng: random.Random) -> bytes:
+    """A request of 64 KiB."""
+    line = b'{"jsonrpc":"2.0","id":1,"method":"poll","x":"'
+    return line + b"x" * (65_500 - len(line)) + b'"}\n'
+
+
+def any_watch(rng: random.Random) -> bytes:
+    """A watch of some fields in any order."""
+    fields = rng.sample(SAMPLE_FIELDS, rng.randrange(1, len(SAMPLE_FIELDS)))
+    return request("watch", fields=fields)
+
+
+def any_rate(rng: random.Random) -> bytes:
+    """A watch at any rate."""
+    return request("watch", rate_hz=rng.choice([0.001, 1, 333, 999, 1000, 1e6]), fields=["sync"])
+
+
+def many_names(_rng: random.Random) -> bytes:
+    """A list of as many names as fit."""
+    return request("watch", devices=["d0"] * 2000)
+
+
+def deep_arguments(_rng: random.Random) -> bytes:
+    """A command whose arguments are nested 974 deep."""
+    inner = b'{"a":' * 974 + b"1" + b"}" * 974
+    head = b'{"jsonrpc":"2.0","id":1,"method":"command","params":{"device":"d0","name":"x","arguments":'
+    return head + inner + b"}}\n"
+
+
+def all_wakers(_rng: random.Random) -> bytes:
+    """A descriptor for each device."""
+    return b"".join(request("notify", device=f"d{number}") for number in range(4))
+
+
+KINDS: dict[str, Kind] = {
+    "nested": Kind(lambda _rng: b"[" * 65_000 + b"\n"),
+    "deep-arguments": Kind(deep_arguments),
+    "empty-lines": Kind(lambda _rng: b"\n" * 65_536),
+    "spaces": Kind(lambda _rng: b" " * 65_000 + b"\n"),
+    "long-lines": Kind(padded_line),
+    "many-names": Kind(many_names),
+    "half-lines": Kind(lambda _rng: b"x" * 65_000, once=True),
+    "field-orders": Kind(any_watch, once=True),
+    "watch-storm": Kind(any_watch),
+    "rates": Kind(any_rate),
+    "polls": Kind(lambda _rng: request("poll") * 16),
+    "statuses": Kind(lambda _rng: request("status") * 4),
+    "never-reads": Kind(lambda _rng: request("watch") + request("status") * 2, Reading.NEVER),
+    "watch-unread": Kind(lambda _rng: request("watch"), Reading.NEVER, once=True),
+    "reads-slowly": Kind(lambda _rng: request("watch") + request("events"), Reading.SLOWLY, once=True),
+    "connects": Kind(lambda _rng: request("watch"), leaves=True, once=True),
+    "wakers": Kind(all_wakers, Reading.NEVER, once=True),
+    "waker-storm": Kind(all_wakers),
+}
+
+
+class Hostile:
+    """One hostile client."""
+
+    def __init__(self, path: str, kind: Kind, rng: random.Random) -> None:
+        self._path, self._kind, self._rng = path, kind, rng
+        self._left = b""
+        self._sent = False
+        self.sock: socket.socket | None = None
+
+    def connect(self) -> socket.socket | None:
+        """Connect; None when that was refused at once."""
+        sock = socket.socket(socket.AF_UNIX)
+        sock.setblocking(False)
+        try:
+            sock.connect(self._path)
+        except OSError:
+            sock.close()
+            return None
+        self.sock, self._left, self._sent = sock, b"", False
+        return sock
+
+    def write(self) -> bool:
+        """Send some; False when the connection is to end."""
+        assert self.sock is not None
+        if not self._left:
+            if self._sent and self._kind.once:
+                return not self._kind.leaves
+            self._left, self._sent = self._kind.sends(self._rng), True
+        try:
+            self._left = self._left[self.sock.send(self._left) :]
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        return True
+
+    def read(self) -> bool:
+        """Read as the kind does; False when the connection has ended."""
+        assert self.sock is not None
+        try:
+            data, fds, _flags, _address = socket.recv_fds(self.sock, 512 if self._slow else 1 << 18, 8)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        for fd in fds:
+            os.close(fd)
+        return bool(data)
+
+    @property
+    def _slow(self) -> bool:
+        return self._kind.reading is Reading.SLOWLY
+
+    @property
+    def events(self) -> int:
+        """What to wait for."""
+        reads = 0 if self._kind.reading is Reading.NEVER else selectors.EVENT_READ
+        writes = 0 if self._sent and self._kind.once and not self._left else selectors.EVENT_WRITE
+        return reads | writes
+
+
+def attack(kinds: list[Kind], path: str, clients: int, seconds: float, seed: int) -> int:
+    """Run the clients; return how many connections were made."""
+    rng = random.Random(seed)
+    end_s = time.monotonic() + seconds
+    selector = selectors.DefaultSelector()
+    everyone = [Hostile(path, kinds[number % len(kinds)], rng) for number in range(clients)]
+    idle = list(everyone)  # a client that waits for nothing is in no other list, and its connection has to last
+    connections, allowed = 0, float(clients)
+    last_s = time.monotonic()
+    slow = any(kind.reading is Reading.SLOWLY for kind in kinds)
+    while (now_s := time.monotonic()) < end_s:
+        allowed, last_s = min(clients, allowed + (now_s - last_s) * RECONNECTS_PER_S), now_s
+        while idle and allowed >= 1:
+            allowed -= 1
+            client = idle.pop()
+            sock = client.connect()
+            if sock is None:
+                idle.insert(0, client)
+                break
+            connections += 1
+            selector.register(sock, selectors.EVENT_READ | selectors.EVENT_WRITE, client)
+        for key, events in selector.select(0.01):
+            client = key.data
+            alive = (not events & selectors.EVENT_WRITE or client.write()) and (
+                not events & selectors.EVENT_READ or client.read()
+            )
+            if not alive:
+                selector.unregister(key.fileobj)
+                client.sock.close()
+                idle.append(client)
+            elif client.events != key.events:
+                if client.events:
+                    selector.modify(key.fileobj, client.events, client)
+                else:
+                    selector.modify(key.fileobj, selectors.EVENT_READ, client)
+                    selector.unregister(key.fileobj)
+        if slow:
+            time.sleep(0.01)
+    return connections
+
+
+def become(uid: int, gid: int) -> None:
+    """Become another user."""
+    os.setgroups([gid])
+    os.setgid(gid)
+    os.setuid(uid)
+
+
+def main() -> None:
+    """Run as `python -m tests.attack.hostile`."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("kind", choices=[*KINDS, "mix"])
+    parser.add_argument("--socket", required=True)
+    parser.add_argument("--clients", type=int, default=128)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--uid", type=int)
+    parser.add_argument("--gid", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    with suppress(OSError):
+        os.nice(NICE)
+    if args.uid is not None:
+        become(args.uid, args.gid)
+    kinds = list(KINDS.values()) if args.kind == "mix" else [KINDS[args.kind]]
+    print(attack(kinds, args.socket, args.clients, args.seconds, args.seed), flush=True)
+
+
+if __name__ == "__main__":
+    main()
