@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from time import monotonic
 
 from tests.attack.attacks import ATTACKS, Attack
-from tests.attack.stage import Stage
+from tests.attack.stage import AttackedDaemon
 
 P99_LIMIT_MS = 5.0
 RSS_LIMIT_MB = 64 * 1.048576
@@ -29,7 +29,7 @@ class Peak:
     fds: int = 0
 
 
-def watch(stage: Stage, peak: Peak, over: threading.Event) -> None:
+def watch(stage: AttackedDaemon, peak: Peak, over: threading.Event) -> None:
     """Look at the daemon ten times a second."""
     while not over.wait(0.1):
         try:
@@ -39,7 +39,7 @@ def watch(stage: Stage, peak: Peak, over: threading.Event) -> None:
             return
 
 
-def attack(name: str, entry: Attack, stage: Stage, seconds: float, idle_mb: float) -> list[str]:
+def attack(name: str, entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float) -> list[str]:
     """Run one attack, print its row, return the bounds that were exceeded."""
     stage.figures()
     before, used_ns, begun_s = stage.status(), stage.cpu_ns, monotonic()
@@ -86,7 +86,7 @@ def main() -> int:
         chosen = {name: entry for name, entry in chosen.items() if entry.short}
     seconds = args.seconds or (SHORT_S if args.short else LONG_S)
     problems: list[str] = []
-    with Stage(60 + (seconds + 15) * len(chosen)) as stage:
+    with AttackedDaemon(60 + (seconds + 15) * len(chosen)) as stage:
         idle_mb = stage.rss_mb
         others = (
             "run after daemon, device and good client"

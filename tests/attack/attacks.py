@@ -9,7 +9,7 @@ from functools import partial
 from time import sleep
 
 from tests.attack.hostile import KINDS
-from tests.attack.stage import HOSTILE_UIDS, READ_GID, Stage
+from tests.attack.stage import HOSTILE_UIDS, READ_GID, AttackedDaemon
 from tests.bench.rig import REST_CORES
 
 CLIENTS = 256
@@ -17,7 +17,7 @@ SHORT = ("nested", "empty-lines", "field-orders", "rates", "statuses", "watch-un
 """Kinds of hostile clients in the short form, one of each sort."""
 
 
-def hostile(stage: Stage, seconds: float, kind: str) -> list[str]:
+def hostile(stage: AttackedDaemon, seconds: float, kind: str) -> list[str]:
     """Hostile clients, half of them of one user and half of another where this process may become others."""
     children = []
     for number, uid in enumerate(HOSTILE_UIDS):
@@ -38,7 +38,7 @@ def hostile(stage: Stage, seconds: float, kind: str) -> list[str]:
     return problems
 
 
-def replug(stage: Stage, seconds: float) -> list[str]:
+def replug(stage: AttackedDaemon, seconds: float) -> list[str]:
     """All descriptors that clients can get, then a device is unplugged and plugged in again."""
     children = []
     for uid in HOSTILE_UIDS:
@@ -56,7 +56,7 @@ def replug(stage: Stage, seconds: float) -> list[str]:
     return problems
 
 
-def calm(_stage: Stage, seconds: float) -> list[str]:
+def calm(_stage: AttackedDaemon, seconds: float) -> list[str]:
     """No attack: what the machine itself does."""
     sleep(seconds)
     return []
@@ -66,7 +66,7 @@ def calm(_stage: Stage, seconds: float) -> list[str]:
 class Attack:
     """A row of the table."""
 
-    run: Callable[[Stage, float], list[str]]
+    run: Callable[[AttackedDaemon, float], list[str]]
     """Attacks for so many seconds; returns what went wrong."""
     short: bool = True
     """Whether it is in the short form."""

@@ -59,7 +59,7 @@ class IdlePort:
             os.close(fd)
 
 
-class Stage:
+class AttackedDaemon:
     """A running daemon in a folder of its own. Use as a context."""
 
     def __init__(self, seconds: float) -> None:

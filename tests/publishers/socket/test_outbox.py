@@ -337,13 +337,13 @@ class Sink:
     on_broken = on_flooded = staticmethod(pytest.fail)
 
     def on_full(self) -> None:
-        pass
+        """The test sends again."""
 
     def on_deferred(self) -> None:
-        pass
+        """The test sends again."""
 
     def on_emptied(self) -> None:
-        pass
+        """Nothing is kept for it."""
 
 
 def drained(sock: socket.socket) -> bytes:

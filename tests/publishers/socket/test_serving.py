@@ -36,9 +36,11 @@ class Worker:
         self.overloads = 0
 
     def on_ready(self, events: int) -> None:
+        """The socket has input."""
         assert events & select.EPOLLIN
 
     def serve(self) -> bool:
+        """Do a piece, which takes its time."""
         self.clock.ns += self.cost_ns
         self.log.append(self.name)
         self.pieces -= 1
@@ -47,17 +49,20 @@ class Worker:
         return self.pieces > 0
 
     def wanted_events(self) -> int:
+        """None: the tests put it in line."""
         return 0
 
     def on_failure(self, error: Exception) -> None:
+        """Keep the error, and go on."""
         self.failures.append(error)
         self.error = None
 
     def on_overload(self) -> None:
+        """Count."""
         self.overloads += 1
 
 
-class Rig:
+class SchedulerBench:
     """A scheduler and its clients, one socket for each."""
 
     def __init__(self) -> None:
@@ -68,6 +73,7 @@ class Rig:
         self.socks: list[socket.socket] = []
 
     def add(self, name: str, uid: int, pieces: int, cost_ns: int) -> tuple[Worker, Place]:
+        """Add a client."""
         ours, theirs = socket.socketpair()
         self.socks += [ours, theirs]
         worker = Worker(name, self.clock, self.log, pieces, cost_ns)
@@ -76,8 +82,8 @@ class Rig:
 
 
 @contextmanager
-def scheduling() -> Iterator[Rig]:
-    rig = Rig()
+def scheduling() -> Iterator[SchedulerBench]:
+    rig = SchedulerBench()
     try:
         yield rig
     finally:
@@ -86,7 +92,7 @@ def scheduling() -> Iterator[Rig]:
             sock.close()
 
 
-def playing(body: Callable[[Rig], None]) -> None:
+def playing(body: Callable[[SchedulerBench], None]) -> None:
     """Run a test that needs no turn of the loop."""
 
     async def limited() -> None:
@@ -164,7 +170,7 @@ def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted() -> None:
 
 
 def test_bytes_count_too() -> None:
-    def body(rig: Rig) -> None:
+    def body(rig: SchedulerBench) -> None:
         _worker, place = rig.add("talker", 1, 5, 0)
         place.count_bytes(serving.BYTES_BURST)
         assert not place.is_over
