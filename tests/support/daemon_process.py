@@ -70,6 +70,11 @@ def write_config(folder: Path, devices: Mapping[str, Any], **more: Any) -> Path:
     return file
 
 
+def inode_of(path: Path) -> int | None:
+    """Inode of a file; None where there is none."""
+    return path.stat().st_ino if path.exists() else None
+
+
 @contextmanager
 def running_daemon(
     folder: Path,
@@ -85,13 +90,18 @@ def running_daemon(
     """
     file = write_config(folder, devices, **more)
     argv = [sys.executable, *python, "-m", "imud", "run", "--config", str(file)]
+    stale = inode_of(folder / "imud.sock")  # a daemon that was killed leaves its socket
     with (
         (folder / "log").open("w") as log,
         subprocess.Popen(argv, stderr=log, stdin=subprocess.DEVNULL, text=True) as process,
     ):
         daemon = RunningDaemon(folder, process)
         try:
-            wait_until(lambda: daemon.socket.exists() or process.poll() is not None, "the daemon's socket", limit_s)
+            wait_until(
+                lambda: inode_of(daemon.socket) not in (None, stale) or process.poll() is not None,
+                "the daemon's socket",
+                limit_s,
+            )
             assert process.poll() is None, (folder / "log").read_text()
             yield daemon
         finally:
