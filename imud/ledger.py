@@ -31,6 +31,7 @@ LEDGER_FIELDS: Final = (
     "replies_late",  # replies that came after their time-out
     "replies_unsolicited",  # text that answers no request
     "frames_not_finite",  # good frames whose NaN or infinite values were left out
+    "lost_unknown",  # gaps, not samples: how many are missing is not known within one
 )
 """Names in the order of shared memory; new ones go to the end."""
 
@@ -62,6 +63,7 @@ class Ledger:
     replies_late: int
     replies_unsolicited: int
     frames_not_finite: int
+    lost_unknown: int
 
     def __init__(self) -> None:
         for name in LEDGER_FIELDS:
@@ -84,8 +86,12 @@ class Ledger:
         return self.frames_bad_crc + self.frames_bad_length + self.frames_bad_content
 
     def lost(self) -> int:
-        """Samples lost by every cause."""
-        return self.lost_gap_device + self.lost_crc + self.lost_overrun + self.lost_queue
+        """Samples lost by every cause; right within one for each gap but `lost_unknown`."""
+        return lost(self.snapshot())
+
+    def add_unknown_gap(self) -> None:
+        """Count a gap between samples whose size is not known."""
+        self.lost_unknown += 1
 
     def values(self) -> tuple[int, ...]:
         """Return all counters in the order of LEDGER_FIELDS."""
@@ -98,6 +104,11 @@ class Ledger:
 
 
 _ALL = attrgetter(*LEDGER_FIELDS)
+
+
+def lost(counts: Mapping[str, int]) -> int:
+    """Samples lost by every cause in a snapshot, wherever it was read; gaps of unknown size are not among them."""
+    return counts["lost_gap_device"] + counts["lost_crc"] + counts["lost_overrun"] + counts["lost_queue"]
 
 
 def bytes_open(counts: Mapping[str, int]) -> int:

@@ -7,7 +7,7 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect, statuses
 from imud.contracts.status import DeviceStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
-from imud.ledger import bytes_open, frames_open
+from imud.ledger import bytes_open, frames_open, lost
 from imud.units import NS_PER_MS, NS_PER_US
 
 
@@ -40,9 +40,10 @@ def block(status: DeviceStatus) -> str:
         f"  clock     {clock.sync}, skew {clock.skew_ppm:+.2f} ppm, residual {clock.residual_ns / NS_PER_US:.1f} µs, "
         f"error {clock.t_err_ns / NS_PER_MS:.3f} ms, {clock.resets} resets",
         f"  latency   {latency(status)}",
-        f"  samples   {ledger['samples']}; lost {sum(v for k, v in ledger.items() if k.startswith('lost_'))}"
+        f"  samples   {ledger['samples']}; lost {lost(ledger)}"
         f" (device {ledger['lost_gap_device']}, damaged {ledger['lost_crc']},"
-        f" overrun {ledger['lost_overrun']}, queue {ledger['lost_queue']})",
+        f" overrun {ledger['lost_overrun']}, queue {ledger['lost_queue']}),"
+        f" {ledger['lost_unknown']} gaps of unknown size",
         f"  bytes     {ledger['bytes_in']} = {ledger['bytes_in_good_frames']} in good frames"
         f" + {ledger['bytes_in_bad_frames']} in bad frames + {ledger['bytes_skipped']} skipped"
         f" + {ledger['bytes_pending']} pending: {'closed' if closes(ledger) else 'DOES NOT CLOSE'}",

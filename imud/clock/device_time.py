@@ -5,12 +5,14 @@
                     ├─ absorb_correction: the counter was set by a little while the samples went on
                     └─ JumpDetector: the counter began anew, or is another time
 
-`SampleNumber` serves counters that number the samples and give no time. Nothing here reads a clock.
+Counters that number the samples and give no time are in `gaps`. Nothing here reads a clock.
 """
 
+from collections.abc import Callable
 from typing import Final
 
 from imud.clock.arrival_fit import SLOPE_HIGHEST, ArrivalFit
+from imud.clock.gaps import CounterLine
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 # --- period and missing samples -------------------------------------------------------------------------------------
@@ -19,6 +21,10 @@ CONSISTENT: Final = 4
 CONSISTENT_LONGER: Final = 12
 """The same for a longer step than before: where one of ten messages is lost, every second minute at 1 kHz leaves the
 same hole four times in a row, and a period of two ticks for one would shift device time by a tick."""
+GAP_FACTOR: Final = 1.5
+"""While the period is not known, a step that is so much longer than the one before or after has a gap in it."""
+LEARNED_STEPS: Final = 4
+"""A gap of more periods is not learned from: how many it has rests on the period itself."""
 WHOLE_AFTER: Final = 64
 """Number of equal steps after which the period is a whole number of ticks: a different step before was a loss."""
 EVERY_TICK: Final = 1.5
@@ -61,26 +67,21 @@ JUMP_LATE_NS: Final = NS_PER_S // 2
 JUMP_LATE_READS: Final = 3
 """Number of late reads over a second that show a jump of the device's clock: fewer may be a busy host's queue."""
 
-# --- counters of samples --------------------------------------------------------------------------------------------
-STEPS_ALWAYS: Final = 4
-"""Number of steps that are accepted at any arrival: messages that waited arrive together."""
-STEPS_FACTOR: Final = 1.5
-"""Error of the rate over a longer gap, at most; a larger jump is a counter that began anew."""
-QUEUED_NS: Final = NS_PER_S // 2
-"""Longest wait of messages that then arrive together; no device restarts within that time."""
-STEPS_UNKNOWN: Final = 1000
-"""Number of steps that are accepted while the rate is not known."""
-
 
 class PeriodLearner:
     """Estimate of the step between samples in device ticks; counts the samples missing in a longer one.
 
-    The period is measured, not taken from the nominal rate.
+    The period is measured, not taken from the nominal rate. `on_unknown_gap` is called for a step whose missing samples
+    are not known within one: before there is a period, or where its error over many periods is too large.
     """
 
-    __slots__ = ("_before", "_candidate", "_count", "_even", "_run", "_run_sum", "_sum", "changes", "period_ticks")
+    __slots__ = (
+        "_before", "_candidate", "_count", "_even", "_on_unknown_gap", "_run", "_run_sum", "_sum", "changes",
+        "period_ticks",
+    )  # fmt: skip
 
-    def __init__(self) -> None:
+    def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
+        self._on_unknown_gap = on_unknown_gap
         self.period_ticks = 0.0
         """Mean step; 0 while unknown."""
         self._sum = 0.0
@@ -111,10 +112,19 @@ class PeriodLearner:
             return 0
         if not period:
             return 0
+        return self.steps_in(ticks) - 1
+
+    def steps_in(self, ticks: int) -> int:
+        """Return how many periods are in a longer step; the period must be known."""
+        period = self.period_ticks
         steps = max(int(ticks / period + 0.5), 1)
-        if self.changes and abs(ticks - steps * period) <= 1:
+        if not self.changes:
+            return steps
+        if steps <= LEARNED_STEPS and abs(ticks - steps * period) <= 1:
             self._average(ticks, steps)  # the mean of what is left, where one of ten is lost, is off by a thousandth
-        return steps - 1
+        elif steps > (self._count + self._even) * period:  # the mean is off by a tick over all it was made of
+            self._on_unknown_gap()
+        return steps
 
     def _average(self, ticks: int, steps: int) -> None:
         """Add `steps` periods of `ticks` in all to the mean."""
@@ -140,6 +150,10 @@ class PeriodLearner:
             self._run += 1
             self._run_sum += ticks
         else:
+            if self._run and not self.period_ticks:
+                shorter, longer = sorted((ticks, self._candidate))
+                if longer > GAP_FACTOR * shorter + 1:
+                    self._on_unknown_gap()
             self._candidate, self._run, self._run_sum = ticks, 1, ticks
         if self._run < (CONSISTENT_LONGER if 0 < self.period_ticks < self._candidate else CONSISTENT):
             return False
@@ -169,7 +183,8 @@ class DeviceTime:
         "missed", "period", "raw_ns", "tick_ns", "uneven", "watched",
     )  # fmt: skip
 
-    def __init__(self, tick_ns: int, tick_modulus: int) -> None:
+    def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
+        """`on_unknown_gap` is called for a gap in which the number of missing samples is not known."""
         self.tick_ns = tick_ns
         self._modulus = tick_modulus
         self._ticks = 0
@@ -187,7 +202,7 @@ class DeviceTime:
         """By how much even samples were preferred to stamps, until an arrival confirms it."""
         self.watched = 0
         """Number of further samples whose device time is compared with their arrivals."""
-        self.period = PeriodLearner()
+        self.period = PeriodLearner(on_unknown_gap)
         self.raw_ns = 0
         """Unwrapped device time as stamped."""
         self.even_ns = 0
@@ -206,6 +221,17 @@ class DeviceTime:
     def elapsed_ns(self, ticks: int) -> int:
         """Device time from the newest stamp to `ticks`, if the counter only went forward and wrapped once at most."""
         return (ticks - self._ticks) % self._modulus * self.tick_ns
+
+    def missed_since(self, line: CounterLine, ticks: int, arrival_ns: int) -> int | None:
+        """Return how many samples are missing since the newest one; None where the counter did not run on to `ticks`.
+
+        The message is at `arrival_ns` and not read at once after the newest one: the counter may have turned meanwhile.
+        """
+        step_ns, turn_ns, period = self.elapsed_ns(ticks), self._modulus * self.tick_ns, self.period
+        turns = line.turns(self.even_ns + step_ns, arrival_ns, turn_ns)
+        if not period.period_ticks or not line.is_on_time(self.even_ns + step_ns + turns * turn_ns, arrival_ns):
+            return None
+        return period.steps_in(step_ns // self.tick_ns + turns * self._modulus) - 1
 
     def advance(self, ticks: int) -> None:
         """Set the next stamp."""
@@ -328,16 +354,33 @@ class DeviceTime:
 class JumpDetector:
     """Detector of jumps of the device's clock: early messages show them at once, late ones when they stay late."""
 
-    __slots__ = ("_since_ns", "late_reads")
+    __slots__ = ("_begin_ns", "_since_ns", "late_reads")
 
     def __init__(self) -> None:
         self._since_ns = 0
+        self._begin_ns = 0
+        """Device time between the first late message and the one before."""
         self.late_reads = 0
         """Number of late reads in a row."""
+
+    def is_late_since_gap(self, period_ns: float) -> bool:
+        """Whether samples were missing before the first late message: the counter may have begun anew there."""
+        return self.late_reads > 0 and self._begin_ns > GAP_FACTOR * period_ns
 
     def reset(self) -> None:
         """Forget late reads: a new fit begins."""
         self.late_reads = 0
+
+    def is_jump(
+        self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, error_ns: float | None, t_rx_ns: int, t_before_ns: int
+    ) -> bool:
+        """Whether a message so far above or below the fit shows that the device's clock jumped.
+
+        `t_before_ns` is when the message before was read. No `error_ns`: a young fit.
+        """
+        if above_ns < -JUMP_EARLY_NS:
+            return self.is_early(fit, above_ns, elapsed_ns, error_ns)
+        return self.is_late(fit, above_ns, elapsed_ns, t_rx_ns, new_read=t_rx_ns > t_before_ns)
 
     def is_early(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, error_ns: float | None) -> bool:
         """Whether a message `above_ns` (negative) above the fit came before it could; no `error_ns`: a young fit."""
@@ -351,40 +394,6 @@ class JumpDetector:
             self.late_reads = 0
             return False
         if not self.late_reads:
-            self._since_ns = t_rx_ns
+            self._since_ns, self._begin_ns = t_rx_ns, elapsed_ns
         self.late_reads += new_read
         return self.late_reads >= JUMP_LATE_READS and t_rx_ns - self._since_ns > NS_PER_S
-
-
-class SampleNumber:
-    """A wrapping counter that numbers a device's samples and gives no time.
-
-    A gap in which it wraps once or more (11 minutes at 100 Hz and 16 bits) is counted short by whole turns.
-    """
-
-    __slots__ = ("_arrival_ns", "_modulus", "_number", "known")
-
-    def __init__(self, modulus: int) -> None:
-        self._modulus = modulus
-        self._number = 0
-        self._arrival_ns = 0
-        self.known = False
-        """Whether there is a sample before."""
-
-    def restart(self) -> None:
-        """Forget the newest sample: the next one is the first."""
-        self.known = False
-
-    def steps(self, number: int, arrival_ns: int, period_ns: float) -> int:
-        """Number of samples from the newest one to this; 0 for the first one and after a counter began anew."""
-        if not self.known:
-            return 0
-        steps = (number - self._number) % self._modulus
-        if steps <= STEPS_ALWAYS:
-            return steps
-        most = STEPS_FACTOR * (arrival_ns - self._arrival_ns + QUEUED_NS) / period_ns if period_ns else STEPS_UNKNOWN
-        return steps if steps <= most else 0
-
-    def advance(self, number: int, arrival_ns: int) -> None:
-        """Set the newest sample."""
-        self._number, self._arrival_ns, self.known = number, arrival_ns, True

@@ -13,6 +13,8 @@ USB_POLL_NS: Final = 125 * NS_PER_US
 FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
 """Spread assumed of arrivals before any is known."""
 SMOOTHING: Final = 1 / 32
+WIRE_SLACK: Final = 1.05
+"""Messages that follow each other this much faster than the wire can carry them did not come over such a wire."""
 
 
 class LinkDelay:
@@ -33,6 +35,10 @@ class LinkDelay:
         if self.hold_ns:
             return WAKE_NS + USB_POLL_NS
         return WAKE_NS + FIFO_BYTES * self.byte_ns
+
+    def carries(self, period_ns: float, size_bytes: int) -> bool:
+        """Whether the wire time fits the rate; a pty or a USB device accepts any baud rate."""
+        return not period_ns or period_ns * WIRE_SLACK >= size_bytes * self.byte_ns
 
     def held_ns(self, period_ns: float, size_bytes: int) -> float:
         """Longest time that an adapter's timer can hide behind bytes that follow.

@@ -17,7 +17,7 @@ new fit instead of carrying the stamps along.
 Synchronization: none; one thread.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from math import hypot
 from typing import Final
@@ -30,8 +30,8 @@ from imud.clock.device_time import (
     JUMP_LATE_NS,
     DeviceTime,
     JumpDetector,
-    SampleNumber,
 )
+from imud.clock.gaps import ArrivalLosses, CounterLine
 from imud.clock.intervals import SIGMA_OF_RANGE
 from imud.clock.link_delay import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
 from imud.clock.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
@@ -60,8 +60,8 @@ YOUNG_FACTOR: Final = 1.5
 """A fit this short has not seen the timer's beat, and a stalled read in it weighs more."""
 T_ERR_MOST: Final = 0xFFFF_FFFF
 """`t_err_ns` is 32 bits wide wherever it is published."""
-WIRE_SLACK: Final = 1.05
-"""Messages that follow each other this much faster than the wire can carry them did not come over such a wire."""
+GAP_PERIODS: Final = 1.5
+"""With less host time since the sample before, none is missing."""
 _ARRIVAL: Final = Sync.ARRIVAL
 
 
@@ -72,6 +72,9 @@ class SampleClock:
     known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
     the samples: it shows how many are missing, and the arrivals show when they were. `bits` are the status bits of the
     device that concern time, `sout` and `sin` where on their edges the measurement is.
+
+    `missed` counts within one sample. For a gap where that cannot be known, `on_unknown_gap` is called: its samples are
+    not in `missed`, or by an estimate.
 
     Edges, triggers and UTC (`on_…`, `set_utc_reference`) are given before the messages that follow them, in the order
     of time. Only a device that sends time can make use of them; for others they are ignored.
@@ -88,16 +91,21 @@ class SampleClock:
         bits: TimeBits = NO_TIME_BITS,
         sout: SoutTiming | None = None,
         sin: TriggerTiming | None = None,
+        on_unknown_gap: Callable[[], None] = lambda: None,
     ) -> None:
         self._device = device
+        self._on_unknown_gap = on_unknown_gap
         self._make_aiding = partial(
             AidingSources, tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming()
         )
         self._aiding: AidingSources | None = None
-        self._time = DeviceTime(tick_ns, tick_modulus)
-        self._number = SampleNumber(tick_modulus) if tick_ns == 0 else None
+        self._time = DeviceTime(tick_ns, tick_modulus, on_unknown_gap)
+        self._losses = ArrivalLosses(0 if tick_ns else tick_modulus, on_unknown_gap)
+        self._by_number = tick_ns == 0
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._spread = ArrivalSpread()
+        self._line: CounterLine | None = None
+        """Where the device's counter is by the fit when it was lowest; None until a fit is used."""
         self._jump = JumpDetector()
         self._slew = Slew()
         self._holdover: Holdover | None = None
@@ -122,7 +130,7 @@ class SampleClock:
         self._resets = 0
         self._own_status: int | None = None
         self.missed = 0
-        """Samples missing right before the newest one, by device time."""
+        """Samples missing right before the newest one; one of unknown size is no part of it."""
 
     def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
         """Return the measurement with its place in time, as the next sample of the device.
@@ -137,7 +145,7 @@ class SampleClock:
         size_bytes, ticks, byte_ns = m.size_bytes, m.dev_ticks, self._delay.byte_ns or 1
         trailing_ns = m.trailing_bytes * byte_ns
         arrival_ns = t_rx_ns - size_bytes * byte_ns - trailing_ns if t_begin_ns is None else t_begin_ns
-        if ticks is None or self._number is not None:
+        if ticks is None or self._by_number:
             wanted_ns, t_dev_ns, sync = self._by_arrival(ticks, arrival_ns, size_bytes), None, _ARRIVAL
         else:
             wanted_ns = self._by_device(ticks, arrival_ns, trailing_ns, t_rx_ns, size_bytes)
@@ -237,6 +245,8 @@ class SampleClock:
     def expected_rate_hz(self) -> float:
         """Samples per second of the host by the device's own stamps; 0 while unknown."""
         period_ns = self._period_ns()
+        if self._line is not None and self._fit is not None:
+            period_ns *= self._line.slope / self._fit.slope  # the fit's swings while messages wait
         return NS_PER_S / period_ns if period_ns else 0.0
 
     def status(self) -> ClockStatus:
@@ -251,7 +261,7 @@ class SampleClock:
             skew_ppm=(1 / fit.slope - 1) * 1e6 if fit else 0.0,
             residual_ns=int(fit.residual_ns if fit else self._spread.sigma_ns),
             t_err_ns=self._t_err_ns,
-            resets=self._resets,
+            resets=self._resets + self._losses.resets,
             hold_ns=self._delay.hold_ns,
             edges=first.pairing.events if first else 0,
             edges_unpaired=sout.pairing.events_unpaired if sout else 0,
@@ -267,11 +277,13 @@ class SampleClock:
         self._drop_fit()
 
     def restart(self) -> None:
-        """Begin anew after the device or the link was away: the next stamp counts neither as a reset nor as a gap."""
+        """Begin anew after the device or the link was away: the next stamp is no reset.
+
+        What is missing until then is counted if the device's counter ran on; else the gap is one of unknown size.
+        """
         self._known = False
         self._spread = ArrivalSpread()
-        if self._number is not None:
-            self._number.restart()
+        self._losses.restart()
         self.missed = 0
         self._drop_fit()
 
@@ -284,20 +296,19 @@ class SampleClock:
 
     def _by_arrival(self, ticks: int | None, arrival_ns: int, size_bytes: int) -> int:
         """Return the time of a message without device time; it may have a number."""
-        spread, number = self._spread, self._number
-        self.missed = 0
-        if number is None or ticks is None:
-            spread.add_arrival(arrival_ns)
-        else:
-            steps = number.steps(ticks, arrival_ns, spread.period_ns)
-            if steps:
-                self.missed = steps - 1
-                spread.add_arrival(arrival_ns, steps)
-            else:
-                self._resets += number.known
+        spread, losses = self._spread, self._losses
+        missed = 0
+        if self._by_number and ticks is not None:
+            steps = losses.add_number(ticks, arrival_ns, spread.period_ns)
+            if not steps:
                 self._spread = spread = ArrivalSpread()
-                spread.add_arrival(arrival_ns)
-            number.advance(ticks, arrival_ns)
+            spread.add_arrival(arrival_ns, steps or 1)
+            missed = losses.missed
+        else:
+            spread.add_arrival(arrival_ns)
+            if not self._by_number and not self._known:
+                missed = losses.add_arrival(arrival_ns, is_first=not self._seq)
+        self.missed = missed
         return self._less_bias(arrival_ns, size_bytes, spread.period_ns, spread.sigma_ns)
 
     def _less_bias(self, arrival_ns: int, size_bytes: int, period_ns: float, sigma_ns: float) -> int:
@@ -319,18 +330,24 @@ class SampleClock:
         device_ns = time.even_ns
         fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
         above_ns = arrival_ns - fit_ns
-        if time.watched and self._fit_sync is not _ARRIVAL and time.absorb_correction(fit, before_ns, arrival_ns):
+        if (
+            time.watched
+            and self._fit_sync is not _ARRIVAL
+            and (above_ns >= -JUMP_EARLY_NS or not self._ran_on(device_ns, arrival_ns))
+            and time.absorb_correction(fit, before_ns, arrival_ns)
+        ):
             device_ns = time.even_ns
             fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
             above_ns = arrival_ns - fit_ns
         odd = above_ns < -JUMP_EARLY_NS or above_ns > JUMP_LATE_NS or self._jump.late_reads
         if odd and self._jumped(fit, above_ns, device_ns - before_ns, t_rx_ns):
-            return self._after_jump(ticks, arrival_ns, size_bytes)
+            return self._after_jump(above_ns, ticks, arrival_ns, size_bytes)
         self.missed = time.missed
         if fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
             if fit.recent_ns > JUMP_EARLY_NS + JUMP_EARLY_SIGMAS * self._fit_error_ns:
-                self._reset(ticks, arrival_ns)  # messages stay late: the device's clock stood still for a while
-            elif not self._wire_carries(size_bytes):
+                self._resets += 1  # messages stay late: the device's clock stood still for a while
+                self._start_fit(arrival_ns)
+            elif fit.span_ns >= NS_PER_S and not self._delay.carries(self._period_ns(), size_bytes):
                 self._delay = LinkDelay(0, self._delay.hold_ns)
                 self._start_fit(arrival_ns)
             else:
@@ -348,49 +365,73 @@ class SampleClock:
 
     def _begin(self, ticks: int, arrival_ns: int, t_rx_ns: int) -> None:
         """Set the first stamp of a fit: of a new device, or of one whose clock runs on over a changed link."""
-        time = self._time
-        if self._known and time.elapsed_ns(ticks) <= SLOPE_HIGHEST * (t_rx_ns - self._t_rx_ns) + FIRST_EARLY_NS:
+        time, line = self._time, self._line
+        elapsed_ns = time.elapsed_ns(ticks)
+        if self._known and (
+            elapsed_ns <= SLOPE_HIGHEST * (t_rx_ns - self._t_rx_ns) + FIRST_EARLY_NS
+            or (line is not None and line.carries(time.even_ns + elapsed_ns, arrival_ns))
+        ):
             time.advance(ticks)
+            self.missed = time.missed
         else:
+            missed = time.missed_since(line, ticks, arrival_ns) if line is not None and not self._known else None
+            self._begin_counter(ticks, arrival_ns, missed)
             self._resets += self._known
             self._known = True
-            time.begin(ticks)
-        self.missed = time.missed
         self._start_fit(arrival_ns)
+
+    def _begin_counter(self, ticks: int, arrival_ns: int, missed: int | None) -> None:
+        """Set the first stamp of a counter that began anew, or was not read for a while, `missed` where it is known."""
+        if missed is None and self._seq:
+            period_ns = self._period_ns()
+            if not period_ns or arrival_ns - self._t_ns >= GAP_PERIODS * period_ns:
+                self._on_unknown_gap()
+        self.missed = missed or 0
+        self._line = None
+        self._time.begin(ticks)
 
     def _jumped(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, t_rx_ns: int) -> bool:
-        """Whether a message so far below or above the fit shows that the device's clock jumped."""
-        if above_ns < -JUMP_EARLY_NS:
-            error_ns = None if self._fit_sync is _ARRIVAL else self._fit_error_ns
-            return self._jump.is_early(fit, above_ns, elapsed_ns, error_ns)
-        return self._jump.is_late(fit, above_ns, elapsed_ns, t_rx_ns, new_read=t_rx_ns > self._t_rx_ns)
+        error_ns = None if self._fit_sync is _ARRIVAL else self._fit_error_ns
+        return self._jump.is_jump(fit, above_ns, elapsed_ns, error_ns, t_rx_ns, self._t_rx_ns)
 
-    def _after_jump(self, ticks: int, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of the first message after a jump: by UTC if the counter jumped to it, else by arrival."""
-        aiding = self._aiding
+    def _after_jump(self, above_ns: float, ticks: int, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of the first message after a jump: by UTC if the counter jumped to it, else by arrival.
+
+        A counter that only looks as if it had jumped goes on: the fit rests on messages that waited, or they wait now.
+        """
+        aiding, time = self._aiding, self._time
+        ran_on = above_ns > 0.0 or self._ran_on(time.even_ns, arrival_ns)
         if aiding is not None:
-            above_ns = aiding.utc.above(ticks, arrival_ns, FIRST_SPREAD_NS + self._delay.hold_ns)
-            if above_ns is not None:
-                return self._hold_over(aiding, ticks, arrival_ns, arrival_ns + above_ns + self._time.tick_ns // 2)
-        self._reset(ticks, arrival_ns)
+            utc_ns = aiding.utc.above(ticks, arrival_ns, FIRST_SPREAD_NS + self._delay.hold_ns)
+            if utc_ns is not None:
+                utc_ns += arrival_ns + time.tick_ns // 2
+                return self._hold_over(aiding, ticks, arrival_ns, utc_ns, time.missed if ran_on else None)
+        if ran_on:
+            if above_ns > 0.0 and self._jump.is_late_since_gap(time.period.period_ticks * time.tick_ns):
+                self._on_unknown_gap()
+            self._resets += above_ns > 0.0
+            self.missed = time.missed
+        else:
+            self._resets += 1
+            self._begin_counter(ticks, arrival_ns, None)
+        self._start_fit(arrival_ns)
         return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
 
-    def _reset(self, ticks: int, arrival_ns: int) -> None:
-        """Begin anew after a jump of the device's clock."""
-        self._resets += 1
-        self.missed = 0
-        self._time.begin(ticks)
-        self._start_fit(arrival_ns)
+    def _ran_on(self, device_ns: int, arrival_ns: int) -> bool:
+        """Whether a message below the fit is no earlier than the device's counter allows: the fit is late."""
+        return self._line is not None and self._line.carries(device_ns, arrival_ns)
 
-    def _hold_over(self, aiding: AidingSources, ticks: int, arrival_ns: int, utc_ns: int) -> int:
+    def _hold_over(self, aiding: AidingSources, ticks: int, arrival_ns: int, utc_ns: int, missed: int | None) -> int:
         """Return the time of a message whose counter jumped to `utc_ns`, or within UTC; holdover begins there."""
         period_ns, tick_ns, error_ns = self._period_ns() or 1.0, self._time.tick_ns, float(self._t_err_ns)
-        t_ns = self._t_ns + int(max(round((utc_ns - self._t_ns) / period_ns), 1) * period_ns)
+        steps = max(round((utc_ns - self._t_ns) / period_ns), 1)
+        t_ns = self._t_ns + int(steps * period_ns)
         unknown = self._fit_sync is _ARRIVAL and self._holdover is None
         if unknown or abs(t_ns - utc_ns) > tick_ns + 2 * error_ns:
             t_ns, error_ns = max(utc_ns, self._t_ns + 1), aiding.utc.tick_error_ns  # or the device samples anew
-        self.missed = 0
-        self._time.begin(ticks)
+        elif missed is None and error_ns + tick_ns < period_ns:
+            missed = steps - 1
+        self._begin_counter(ticks, arrival_ns, missed)
         self._start_fit(arrival_ns)
         aiding.utc.confirm()
         self._holdover = holdover = Holdover(self._fit_begin_ns, t_ns, error_ns, tick_ns)
@@ -434,6 +475,10 @@ class SampleClock:
             held_ns = self._holdover.at(device_ns) if self._holdover else self._t_ns + elapsed_ns * fit.slope
             self._holdover = None
             self._slew.set(held_ns - (fit_ns - self._fit_bias_ns))
+        if self._line is not None:
+            self._line.follow(fit, self._fit_error_ns)
+        elif self._fit_sync is not _ARRIVAL:
+            self._line = CounterLine(fit, self._fit_error_ns)
         return fit_ns
 
     def _steered(self, aiding: AidingSources, m: Measurement, fit_ns: int, arrival_ns: int) -> int:
@@ -447,16 +492,9 @@ class SampleClock:
         self._error_ns = aiding.error_ns
         return t_ns
 
-    def _wire_carries(self, size_bytes: int) -> bool:
-        """Whether the wire time fits the rate; a pty or a USB device accepts any baud rate."""
-        fit, period_ns = self._fit, self._period_ns()
-        if fit is None or not period_ns or fit.span_ns < NS_PER_S:
-            return True
-        return period_ns * WIRE_SLACK >= size_bytes * self._delay.byte_ns
-
     def _period_ns(self) -> float:
         """Host time between samples; 0 while unknown."""
-        if self._number is not None:
+        if self._by_number:
             return self._spread.period_ns
         time, fit = self._time, self._fit
         return time.period.period_ticks * time.tick_ns * (fit.slope if fit else 1.0)

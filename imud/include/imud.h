@@ -112,7 +112,8 @@ enum {
     IMUD_LEDGER_LOST_QUEUE,
     IMUD_LEDGER_REPLIES_LATE,
     IMUD_LEDGER_REPLIES_UNSOLICITED,
-    IMUD_LEDGER_FRAMES_NOT_FINITE
+    IMUD_LEDGER_FRAMES_NOT_FINITE,
+    IMUD_LEDGER_LOST_UNKNOWN
 };
 
 /* One sample: a slot of the ring, and a record of the socket's binary encoding. */

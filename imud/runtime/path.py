@@ -214,7 +214,13 @@ class CanPath(SamplePath):
 
 
 def make_clock(
-    config: DeviceConfig, driver: Driver, before: SampleClock | None, *, byte_ns: int = 0, hold_ns: int = 0
+    config: DeviceConfig,
+    driver: Driver,
+    before: SampleClock | None,
+    *,
+    byte_ns: int = 0,
+    hold_ns: int = 0,
+    on_unknown_gap: Callable[[], None] = lambda: None,
 ) -> SampleClock:
     """Return the clock of a device that `driver` decodes; it continues the numbers and stamps of the one before."""
     lines = config.lines
@@ -227,6 +233,7 @@ def make_clock(
         bits=driver.time_bits,
         sout=lines.sout.timing if lines is not None and lines.sout is not None else None,
         sin=lines.sin.timing if lines is not None and lines.sin is not None else None,
+        on_unknown_gap=on_unknown_gap,
     )
     if before is not None:
         clock.continue_from(before)

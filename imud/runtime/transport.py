@@ -59,7 +59,8 @@ class DeviceContext:
 
     def new_clock(self, driver: Driver, path: SamplePath | None) -> SampleClock:
         """Return a clock for what `driver` decodes, which continues that of the path before."""
-        return make_clock(self.config, driver, path.clock if path is not None else None)
+        before = path.clock if path is not None else None
+        return make_clock(self.config, driver, before, on_unknown_gap=self.ledger.add_unknown_gap)
 
 
 class Transport(Protocol):

@@ -26,7 +26,7 @@ LEDGER = {name: 100 + i for i, name in enumerate(LEDGER_FIELDS)}
 
 GOLDEN = (
     b"imudshm\0"
-    + bytes.fromhex("01000000 01000000 00100000 00010000 00100000 16000000")  # 1, 1, 4096, 256, 4096, 22 counters
+    + bytes.fromhex("01000000 01000000 00100000 00010000 00100000 17000000")  # 1, 1, 4096, 256, 4096, 23 counters
     + bytes.fromhex("0807060504030201 67120000 01000000 03000000")
     + bytes(12)
     + b"front-imu".ljust(64, b"\0")
@@ -84,7 +84,7 @@ def test_impossible_counts_are_refused(name: str, value: int) -> None:
 
 def test_ledger_block_by_hand() -> None:
     body = struct.pack("<Q", 6) + b"hipnuc-uart".ljust(32, b"\0")
-    body += b"".join(struct.pack("<Q", 100 + i) for i in range(22)) + bytes(8 * (LEDGER_ROOM - 22))
+    body += b"".join(struct.pack("<Q", 100 + i) for i in range(23)) + bytes(8 * (LEDGER_ROOM - 23))
     expected = body + zlib.crc32(body).to_bytes(4, "little")
     assert encode_ledger_block(6, "hipnuc-uart", LEDGER) == expected
     assert len(expected) == LEDGER_BLOCK_BYTES

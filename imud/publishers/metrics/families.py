@@ -176,6 +176,10 @@ DEVICE_FAMILIES: Final = (
         _ledger_by("cause", gap_device="lost_gap_device", crc="lost_crc", overrun="lost_overrun", queue="lost_queue"),
     ),
     _counter(
+        "imud_gaps_unknown_total", "Gaps between samples whose size is not known within one sample.",
+        _ledger("lost_unknown"),
+    ),
+    _counter(
         "imud_replies_stray_total", "Lines of text from the device that answered no request in time.",
         _ledger_by("kind", late="replies_late", unsolicited="replies_unsolicited"),
     ),

@@ -74,6 +74,7 @@ LEDGER_LINES = {
     "lost_crc": ("imud_samples_lost_total", {"cause": "crc"}),
     "lost_overrun": ("imud_samples_lost_total", {"cause": "overrun"}),
     "lost_queue": ("imud_samples_lost_total", {"cause": "queue"}),
+    "lost_unknown": ("imud_gaps_unknown_total", {}),
     "replies_late": ("imud_replies_stray_total", {"kind": "late"}),
     "replies_unsolicited": ("imud_replies_stray_total", {"kind": "unsolicited"}),
 }

@@ -175,6 +175,7 @@ class Assembly:
         missed, lost = self._cadence.begin(t_rx_ns)
         if missed:
             self._ledger.lost_gap_device += lost
+            self._ledger.lost_unknown += not lost
             for kind in self._kinds.values():
                 if kind.seen < self._gap:
                     kind.seen -= missed

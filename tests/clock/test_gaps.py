@@ -1,0 +1,222 @@
+"""Losses while the process does not run: the device samples on, the kernel keeps what fits, and the rest is missing.
+
+The truth is what the device made less what was delivered. Losses are right within one sample per stall, or the gap is
+reported as one of unknown size.
+"""
+
+from dataclasses import dataclass, field, replace
+from random import Random
+from typing import Final
+
+import pytest
+
+from imud.clock import SampleClock
+from imud.sample import Measurement
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+FRAME_BYTES: Final = 82
+READ_BYTES: Final = 4095
+BEGIN_NS: Final = 1_000 * NS_PER_S
+N_TTY: Final = 4096
+FLIP_BUFFER: Final = 65536
+STALLS: Final = 25
+
+
+@dataclass(frozen=True)
+class Device:
+    """A simulated device: its rate, its counter, and how far its crystal is off."""
+
+    rate_hz: int
+    tick_ns: int
+    """0: the counter numbers the samples; -1: there is none."""
+    modulus: int
+    ppm: float = 30.0
+    first: int = 12345
+
+    def ticks(self, index: int) -> int | None:
+        """The counter of a sample."""
+        if self.tick_ns < 0:
+            return None
+        step = NS_PER_S / self.rate_hz / self.tick_ns if self.tick_ns else 1
+        return int(self.first + index * step) % self.modulus
+
+    def time_ns(self, index: int) -> int:
+        """CLOCK_MONOTONIC when a sample was measured."""
+        return BEGIN_NS + int(index * NS_PER_S / self.rate_hz * (1 - self.ppm * 1e-6))
+
+
+def make_clock(device: Device, unknown: list[int]) -> SampleClock:
+    """A clock that appends to `unknown`."""
+    return SampleClock(
+        "imu",
+        tick_ns=device.tick_ns if device.tick_ns >= 0 else NS_PER_MS,
+        tick_modulus=device.modulus,
+        byte_ns=0,
+        hold_ns=0,
+        on_unknown_gap=lambda: unknown.append(1),
+    )
+
+
+@dataclass
+class Reader:
+    """A process that reads what the kernel kept of a device's bytes, and stalls now and then."""
+
+    device: Device
+    clock: SampleClock
+    kept_bytes: int
+    random: Random
+    made: int = 0
+    delivered: int = 0
+    missed: int = 0
+    now_ns: int = BEGIN_NS
+    waiting: list[int] = field(default_factory=list)
+
+    def run(self, duration_ns: int) -> None:
+        """Read on time."""
+        end = self.now_ns + duration_ns
+        while (due := self.device.time_ns(self.made)) < end:
+            self._wait(due + 150 * NS_PER_US)
+            self._read()
+        self._wait(end)
+
+    def stall(self, duration_ns: int) -> None:
+        """Do not read for so long; then read at once what the kernel kept."""
+        self._wait(self.now_ns + duration_ns)
+        while self.waiting:
+            self._read()
+            self._wait(self.now_ns + 40 * NS_PER_US)
+
+    def starve(self, duration_ns: int, every_ns: int) -> None:
+        """Get one read now and then, as beside a process that takes all the time."""
+        end = self.now_ns + duration_ns
+        while self.now_ns < end:
+            self._wait(self.now_ns + every_ns)
+            self._read()
+
+    def finish(self) -> int:
+        """Read on until all is settled; return what is missing in truth."""
+        self.stall(0)
+        self.run(6 * NS_PER_S)
+        return self.made - self.delivered
+
+    def _wait(self, until_ns: int) -> None:
+        """Let the device send, and the kernel drop what does not fit."""
+        while self.device.time_ns(self.made) < until_ns - 100 * NS_PER_US:
+            if (len(self.waiting) + 1) * FRAME_BYTES <= self.kept_bytes:
+                self.waiting.append(self.made)
+            self.made += 1
+        self.now_ns = until_ns
+
+    def _read(self) -> None:
+        at_once = READ_BYTES // FRAME_BYTES
+        indices, self.waiting = self.waiting[:at_once], self.waiting[at_once:]
+        t_rx_ns = self.now_ns + int(self.random.expovariate(1 / (30 * NS_PER_US)))
+        for place, index in enumerate(indices):
+            trailing = (len(indices) - 1 - place) * FRAME_BYTES
+            m = Measurement(FRAME_BYTES, trailing, self.device.ticks(index), (0.0, 0.0, 9.8))
+            sample = self.clock.sample(m, t_rx_ns, 0)
+            assert sample.t_ns <= sample.t_rx_ns
+            self.delivered += 1
+            self.missed += self.clock.missed
+
+
+def reader(device: Device, kept_bytes: int, seed: int) -> tuple[Reader, list[int]]:
+    """A reader at 8 s, and what its clock reports as unknown."""
+    unknown: list[int] = []
+    one = Reader(device, make_clock(device, unknown), kept_bytes, Random(seed))
+    one.run(8 * NS_PER_S)
+    return one, unknown
+
+
+HI91 = Device(1000, NS_PER_MS, 1 << 32)
+HI91_400 = Device(400, NS_PER_MS, 1 << 32)
+IMU61X = Device(1000, NS_PER_US, 1 << 32)
+IMU61X_WRAPS = Device(1000, NS_PER_US, 1 << 24)
+NUMBERED = Device(200, 0, 1 << 16)
+NUMBERED_SHORT = Device(200, 0, 256)
+HI92 = Device(100, -1, 1 << 32)
+HI92_FAST = Device(1000, -1, 1 << 32)
+COUNTED = [HI91, HI91_400, IMU61X, IMU61X_WRAPS, NUMBERED, NUMBERED_SHORT]
+
+
+@pytest.mark.parametrize("kept_bytes", [N_TTY, FLIP_BUFFER])
+@pytest.mark.parametrize("device", COUNTED)
+def test_losses_over_stalls_are_those_of_the_device(device: Device, kept_bytes: int) -> None:
+    one, unknown = reader(device, kept_bytes, 1)
+    for _ in range(STALLS):
+        one.stall(int(one.random.choice([0.05, 0.2, 0.7, 1, 2, 5, 10]) * NS_PER_S))
+        one.run(int(one.random.choice([0.01, 0.1, 0.3, 1.5]) * NS_PER_S))
+    assert one.finish() == one.missed
+    assert not unknown
+
+
+@pytest.mark.parametrize("kept_bytes", [N_TTY, FLIP_BUFFER])
+@pytest.mark.parametrize("device", COUNTED)
+def test_losses_under_starvation_are_those_of_the_device(device: Device, kept_bytes: int) -> None:
+    """Every message is late for up to 20 s, and the fit with them; then the host catches up."""
+    one, unknown = reader(device, kept_bytes, 1)
+    for _ in range(10):
+        one.starve(int(one.random.uniform(1, 20) * NS_PER_S), int(one.random.uniform(0.05, 0.7) * NS_PER_S))
+        if one.random.random() < 0.5:
+            one.stall(0)
+        one.run(int(one.random.choice([0.1, 0.3, 1.5, 3]) * NS_PER_S))
+        if device.tick_ns:
+            assert one.clock.expected_rate_hz == pytest.approx(device.rate_hz, rel=1e-3)
+    assert one.finish() == one.missed
+    assert not unknown
+
+
+@pytest.mark.parametrize("stall_s", [0.2, 2.0, 10.0])
+@pytest.mark.parametrize("device", [HI92, HI92_FAST])
+def test_losses_of_a_device_without_counter_are_seen_by_its_pace(device: Device, stall_s: float) -> None:
+    one, unknown = reader(device, N_TTY, 2)
+    one.run(20 * NS_PER_S)
+    for _ in range(3):
+        one.stall(int(stall_s * NS_PER_S))
+        one.run(5 * NS_PER_S)
+    assert abs(one.finish() - one.missed) <= 3
+    assert not unknown
+
+
+@pytest.mark.parametrize("device", [HI92, HI92_FAST])
+def test_what_the_pace_cannot_show_is_unknown(device: Device) -> None:
+    one, unknown = reader(device, N_TTY, 1)
+    for _ in range(STALLS):
+        one.stall(int(one.random.choice([0.7, 1, 2, 5, 10]) * NS_PER_S))
+        one.run(int(one.random.choice([0.01, 0.1, 0.3, 1.5]) * NS_PER_S))
+    assert unknown or abs(one.finish() - one.missed) <= STALLS
+
+
+@pytest.mark.parametrize("device", COUNTED)
+def test_a_counter_that_ran_on_while_the_link_was_away_counts(device: Device) -> None:
+    one, unknown = reader(device, N_TTY, 3)
+    one.run(60 * NS_PER_S)
+    one.kept_bytes = 0
+    one.stall(10 * NS_PER_S)
+    one.kept_bytes = N_TTY
+    one.clock.restart()
+    one.run(NS_PER_S)
+    assert one.finish() == one.missed
+    assert not unknown
+
+
+@pytest.mark.parametrize("device", [*COUNTED[:-1], HI92])
+def test_a_device_that_began_anew_leaves_a_gap_of_unknown_size(device: Device) -> None:
+    one, unknown = reader(device, N_TTY, 3)
+    one.device = replace(device, first=device.first + 777_777_777)
+    one.kept_bytes = 0
+    one.stall(3 * NS_PER_S)
+    one.kept_bytes = N_TTY
+    one.clock.restart()
+    one.run(3 * NS_PER_S)
+    assert len(unknown) == 1
+    assert one.missed == 0
+
+
+def test_a_counter_that_jumps_between_two_samples_leaves_no_gap() -> None:
+    one, unknown = reader(HI91, N_TTY, 3)
+    one.device = replace(HI91, first=HI91.first + 777_777_777)
+    one.run(3 * NS_PER_S)
+    assert one.clock.status().resets == 1
+    assert not unknown
+    assert one.missed == 0
