@@ -1,0 +1,116 @@
+"""A process that plays many modules of several drivers into as many ptys, each at a rate of its own, and keeps count.
+
+    python -m tests.bench.fleet_writer --seconds S DRIVER:HZ …
+
+Prints one line with the slave paths, waits for a line on standard input, plays, and prints as JSON for each device how
+many frames its pty took, and how many it refused before the last one that it took: later ones leave no gap.
+What is due is sent, however late: device time goes on while this process is not run.
+"""
+
+import argparse
+import binascii
+import heapq
+import json
+import os
+import struct
+import sys
+import time
+from collections.abc import Callable
+from typing import Final
+
+from imud.devices.imu61x.uart.codec import encode_ahrs
+from imud.sim.ports.pty import sharpen_timers
+from tests.bench.writer import open_ptys, template
+
+BEGIN_NS: Final = 10_000_000
+
+
+def hi91_frames(rate_hz: float) -> Callable[[int], bytes]:
+    """Frames of a HiPNUC module by number."""
+    frame = template()
+    head = binascii.crc_hqx(bytes(frame[:4]), 0)
+
+    def make(number: int) -> bytes:
+        struct.pack_into("<I", frame, 14, int(number * 1000 / rate_hz))
+        struct.pack_into("<H", frame, 4, binascii.crc_hqx(frame[6:], head))
+        return bytes(frame)
+
+    return make
+
+
+def ahrs_frames(rate_hz: float) -> Callable[[int], bytes]:
+    """Frames of an IMU61x by number."""
+
+    def make(number: int) -> bytes:
+        return encode_ahrs(
+            timer_us=int(number * 1e6 / rate_hz), accel_m_s2=(0.1, 0.2, 9.8), gyro_rad_s=(0.01, 0.02, 0.03),
+            euler_rad=(0.1, 0.2, 0.3), temperature_c=30.0,
+        )  # fmt: skip
+
+    return make
+
+
+FRAMES: Final = {"hipnuc-uart": hi91_frames, "imu61x-uart": ahrs_frames}
+
+
+class Player:
+    """One module."""
+
+    def __init__(self, name: str, master: int) -> None:
+        driver, _, rate = name.partition(":")
+        self.taken = self.refused = 0
+        self.period_ns = 1e9 / float(rate)
+        self._make = FRAMES[driver](float(rate))
+        self._master = master
+        self._sent = self._refused_since = 0
+
+    def send(self) -> None:
+        """The next frame."""
+        data = self._make(self._sent)
+        self._sent += 1
+        try:
+            whole = os.write(self._master, data) == len(data)
+        except BlockingIOError:
+            whole = False
+        if whole:
+            self.taken += 1
+            self.refused += self._refused_since
+        self._refused_since = 0 if whole else self._refused_since + 1
+
+
+def play(players: list[Player], seconds: float) -> None:
+    """Send every frame when it is due; the devices begin at different moments."""
+    start_ns = time.monotonic_ns() + BEGIN_NS
+    end_ns = start_ns + int(seconds * 1e9)
+    due = [(start_ns + int(p.period_ns * n / len(players)), n) for n, p in enumerate(players)]
+    first_ns = [at_ns for at_ns, _ in due]
+    counts = [0] * len(players)
+    heapq.heapify(due)
+    while due[0][0] < end_ns:
+        at_ns, number = due[0]
+        wait_ns = at_ns - time.monotonic_ns()
+        if wait_ns > 0:
+            time.sleep(wait_ns / 1e9)
+        players[number].send()
+        counts[number] += 1
+        heapq.heapreplace(due, (first_ns[number] + int(counts[number] * players[number].period_ns), number))
+
+
+def main() -> None:
+    """Run as `python -m tests.bench.fleet_writer`."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seconds", type=float, required=True)
+    parser.add_argument("devices", nargs="+", metavar="DRIVER:HZ")
+    args = parser.parse_args()
+    pairs = open_ptys(len(args.devices))
+    players = [Player(name, master) for name, (master, _) in zip(args.devices, pairs, strict=True)]
+    print(*(os.ttyname(slave) for _, slave in pairs), flush=True)
+    sys.stdin.readline()
+    sharpen_timers()
+    play(players, args.seconds)
+    print(json.dumps([(player.taken, player.refused) for player in players]), flush=True)
+    sys.stdin.readline()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""`make soak ARGS=--single`: one device at 1 kHz, ten clients and one that never reads: nothing lost, memory flat."""
+
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic, sleep
+
+from tests.bench.rig import REST_CORES, Load, Process, ask, rss_mb, start_readers, start_server
+
+SLOPE_LIMIT_MB_PER_H = 2.0
+SETTLE_S = 20.0
+
+
+def slope_mb_per_h(points: list[tuple[float, float]]) -> float:
+    """Least-squares slope of resident memory over time."""
+    n = len(points)
+    mean_t = sum(t for t, _ in points) / n
+    mean_m = sum(m for _, m in points) / n
+    spread = sum((t - mean_t) ** 2 for t, _ in points)
+    return 3600 * sum((t - mean_t) * (m - mean_m) for t, m in points) / spread if spread else 0.0
+
+
+def run_single(seconds: float, encoding: str) -> int:
+    """Run for so long; 0 when nothing was lost and memory stayed flat."""
+    load = Load(clients=10, seconds=seconds, encoding=encoding, stuck=True)
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-soak-") as name, ExitStack() as stack:
+        folder = Path(name)
+        (folder / "times").write_bytes(bytes(8 * load.frames))
+        argv = [
+            "-m",
+            "tests.bench.writer",
+            "--rate",
+            "1000",
+            "--frames",
+            str(load.frames),
+            "--times",
+            str(folder / "times"),
+        ]
+        writer = stack.enter_context(Process(REST_CORES, *argv))
+        server = start_server(stack, folder, writer.line().split(), load)
+        readers = start_readers(stack, folder, load)
+        writer.say("go")
+        points: list[tuple[float, float]] = []
+        begun = monotonic()
+        while (elapsed := monotonic() - begun) < seconds:
+            sleep(min(1.0, seconds - elapsed + 0.01))
+            if elapsed > SETTLE_S:
+                points.append((elapsed, rss_mb(server.popen.pid)))
+        refused = int(writer.line())
+        sleep(0.1)
+        status = ask(folder / "s")[0]
+        readers.say("end")
+        figures = readers.line()
+    lost = sum(v for k, v in status.ledger.items() if k.startswith("lost_"))
+    slope = slope_mb_per_h(points) if len(points) > 1 else 0.0
+    print(
+        f"frames written {load.frames}, refused by the pty {refused}, samples {status.ledger['samples']}, lost {lost}"
+    )
+    print(f"first client: {figures}")
+    if points:
+        print(
+            f"RSS {points[0][1]:.2f} MB at {points[0][0]:.0f} s, {points[-1][1]:.2f} MB at the end, {slope:+.3f} MB/h"
+        )
+    good = lost == 0 and refused == 0 and status.ledger["samples"] == load.frames and slope < SLOPE_LIMIT_MB_PER_H
+    print("passed" if good and '"gaps": 0' in figures else "FAILED")
+    return 0 if good and '"gaps": 0' in figures else 1
