@@ -10,6 +10,7 @@ import logging
 import secrets
 import signal
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from time import thread_time_ns
@@ -80,7 +81,9 @@ class Daemon:
 
     async def run(self) -> None:
         """Run until stopped. Raises ServerError when an output cannot start, and the error of a device's task."""
-        asyncio.get_running_loop().set_exception_handler(self._on_loop_error)
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(self._on_loop_error)
+        loop.set_default_executor(_one_thread())
         if self._file is not None:
             self._reloader = Reloader(self._file, self, self._now_ns)
         try:
@@ -279,3 +282,10 @@ class Daemon:
         for publisher in self._publishers.values():
             publisher.tick(self._now_ns())
             publisher.close()
+
+
+def _one_thread() -> ThreadPoolExecutor:
+    """Return an executor with one thread that runs already: unplugging a device must not need to start one."""
+    executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="imud close")
+    executor.submit(int)
+    return executor

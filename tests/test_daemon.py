@@ -1,24 +1,29 @@
 """The daemon as a process: it comes back when the cable does, reads its configuration again, and dies with a reason."""
 
+import asyncio
 import os
 import pty
 import re
 import signal
 import subprocess
 import sys
+import threading
 import tty
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 import msgspec
 import pytest
 
 from imud.client import Ring
+from imud.config import Config
+from imud.daemon import Daemon
 from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
+from tests.support.event_loops import in_loop
 from tests.support.files import hi91
 
 
@@ -87,6 +92,21 @@ def test_back_within_a_second_of_the_node(tmp_path: Path) -> None:
         assert status.newest_seq == 10
         assert status.ledger["bytes_in"] == 10 * 82
         assert status.ledger["bytes_in_good_frames"] == 10 * 82
+
+
+@in_loop
+async def test_the_thread_that_closes_is_there_from_the_beginning() -> None:
+    """Unplugging starts none: it would need memory and a process number that may not be left."""
+    daemon = Daemon(Config("info", "", {}, ()))
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    threads = set(threading.enumerate())
+    assert [thread.name for thread in threads if thread.name.startswith("imud close")]
+    loop = asyncio.get_running_loop()
+    await asyncio.gather(*(loop.run_in_executor(None, sleep, 0.02) for _ in range(4)))
+    assert set(threading.enumerate()) == threads
+    daemon.stop()
+    await running
 
 
 def test_port_that_appears_later_is_taken(tmp_path: Path) -> None:
