@@ -1,5 +1,6 @@
 # make demo   one simulated sensor through the real daemon          make test   everything that needs no lab
-# make lab    tests on a booted kernel          make soak   ten minutes at 1 kHz
+# make lab    tests on a booted kernel          make chaos  random faults on a booted kernel (ARGS="--seed N --seconds S")
+# make soak   100 devices, 20 clients, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 # make pictures   the pictures of README.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
@@ -10,8 +11,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 LAB_OPTIONS ?= --steady
+CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench attack soak pictures fuzz fuzz-deps clean lab lab-deps
+.PHONY: all demo test lint check bench attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos
 
 all: check
 
@@ -63,6 +65,9 @@ lab-deps:
 
 lab: $(VENV)/made
 	tests/lab/run $(LAB_OPTIONS) -- $(ARGS)
+
+chaos: $(VENV)/made
+	tests/lab/run $(CHAOS_OPTIONS) --exec '$(BIN)/python -m tests.lab.chaos $(ARGS)'
 
 clean:
 	rm -rf build $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,297 @@
+"""The far ends of all links in one process: ports that send in one thread, buses that are polled in others.
+
+device   link                                        driver           what its truth is
+serial   pseudo-terminal, SOUT on gpio-sim           hipnuc-uart      every sample by device time
+uart     16550A pair                                 imu61x-uart      every sample by device time
+vcan     virtual CAN                                 imu61x-can       every sample by a number in its values
+can      SJA1000 pair                                imu61x-can       every sample by a number in its values
+modbus   pseudo-terminal                             hipnuc-modbus    bytes of its ledger
+i2c      i2c-dev                                     imu61x-i2c       bursts that were answered, and damaged ones
+spi      spidev, 8-bit words                         imu61x-spi       bursts that were answered, and damaged ones
+"""
+
+import errno
+import os
+import select
+import termios
+import threading
+import tty
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic_ns
+from types import TracebackType
+from typing import Any, Final, Self
+
+from imud.sim import SIMULATORS
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.ports.arrival import BARE_UART
+from imud.sim.ports.can_port import CanPort
+from imud.sim.ports.faults import FaultRates, Faults
+from imud.sim.ports.gpio_sim import PullFile, SimulatedLines
+from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults
+from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, set_baud
+from imud.sim.simulator import SimulatorOptions, StreamModule
+from tests.lab.bus import Bus, i2c_bus, spi_bus
+from tests.lab.can_interface import CanInterface, controller_pair, virtual_can
+from tests.lab.chaos.truth import LoggedModule, TruthLog, decoded, numbered_can, time_key
+from tests.lab.gpio_chip import GpioChip, simulated_chip
+from tests.lab.imu61x_bus import on_i2c, on_spi
+from tests.lab.serial_port import uart_pair
+from tests.lab.wire import I2cTransfer, SpiTransfer
+
+RATE_HZ: Final = 10.0
+BAUD: Final = 115200
+PERIOD_NS: Final = round(1e9 / RATE_HZ)
+SETTLE_S: Final = 0.012
+"""After a rising edge, as in tests/lab/imu_process.py."""
+LOOK_S: Final = 0.02
+I2C_BURST: Final = b"\x12"
+SPI_BURST: Final = b"\x80\x00"
+"""What the reading of a sample begins with on either bus."""
+Port = SimulatedPort | CanPort
+
+
+class UartNode(PtyNode):
+    """The far UART of the pair in the place of a pseudo-terminal. It cannot be unplugged."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        tty.setraw(self._fd)
+        self._baud = BAUD
+
+    def plug(self, baud: int) -> None:
+        """Set the rate."""
+        self._baud = baud
+        set_baud(self._fd, baud)
+
+    def unplug(self) -> None:
+        """Close the port; may be called twice."""
+        if self._fd >= 0:
+            termios.tcflush(self._fd, termios.TCIOFLUSH)
+            os.close(self._fd)
+            self._fd = -1
+
+    def fileno(self) -> int:
+        """The descriptor."""
+        return self._fd
+
+    @property
+    def is_open(self) -> bool:
+        """A wire carries what is sent, whether anyone listens or not."""
+        return True
+
+    @property
+    def baud(self) -> int:
+        """QEMU's UARTs are joined by a socket, which has no rate."""
+        return self._baud
+
+    def read(self) -> bytes:
+        """What the host sent."""
+        try:
+            return os.read(self._fd, 4096)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> int:
+        """Send, and return how many bytes fitted."""
+        try:
+            return os.write(self._fd, data)
+        except BlockingIOError:
+            return 0
+
+
+class CountedRegisters:
+    """A device on a polled bus, how many of its bursts were answered, and how many answers damaged."""
+
+    def __init__(self) -> None:
+        self.device = Imu61xRegisters(monotonic_ns)
+        self.good = self.damaged = 0
+
+    def counted(self, answer: Callable[[Any], bytes], is_burst: Callable[[Any], bool]) -> Callable[[Any], bytes]:
+        """The device as a bus has it."""
+
+        def counting(transfer: Any) -> bytes:
+            flips, line = self.device.faults.flips, self.device.faults.line
+            data = answer(transfer)
+            if line is None:
+                self.damaged += flips > 0
+                self.good += flips == 0 and is_burst(transfer)
+            return data
+
+        return counting
+
+
+class PortThread:
+    """Moves what the sending devices send. Synchronization: `changing` is held while anything of a port is touched."""
+
+    def __init__(self) -> None:
+        self.changing = threading.Lock()
+        self.slowest_ns = 0
+        """The longest time between two steps: so late may a burst have been."""
+        self._ports: list[tuple[Port, SimulatedLines | None]] = []
+        self._stop = threading.Event()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="ports")
+
+    def add(self, port: Port, lines: SimulatedLines | None = None) -> None:
+        """Add a port before the start."""
+        self._ports.append((port, lines))
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; raises what the thread died of."""
+        self._stop.set()
+        self._thread.join()
+        for port, _ in self._ports:
+            port.close()
+        if self._failure is not None:
+            raise self._failure
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                with self.changing:
+                    wait_s = self._step()
+                    watched = [port.node.fileno() for port, _ in self._ports if port.node.is_open]
+                select.select(watched, [], [], wait_s)
+        except BaseException as error:  # noqa: BLE001 - the main thread raises it
+            self._failure = error
+
+    def _step(self) -> float:
+        now_ns = monotonic_ns()
+        next_ns = now_ns + round(LOOK_S * 1e9)
+        for port, lines in self._ports:
+            if lines is not None:
+                lines.step(now_ns)
+                next_ns = min(next_ns, lines.next_ns(now_ns))
+            port.step(now_ns, True)
+            next_ns = min(next_ns, port.next_ns(now_ns))
+        return max(next_ns - monotonic_ns(), 0) / 1e9
+
+
+class FarSide:
+    """All devices and what can be done to them. Use as a context manager."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self._stack = ExitStack()
+        self._seed = seed
+        self.folder = folder
+        self.truth: dict[str, TruthLog] = {}
+        self.noise = {name: Faults(seed, FaultRates()) for name in ("serial", "uart")}
+        self.pin_noise = PinFaults(seed, PinFaultRates())
+        self.thread = PortThread()
+        self.streams: dict[str, SimulatedPort] = {}
+        self.polled = {name: CountedRegisters() for name in ("i2c", "spi")}
+
+    def __enter__(self) -> Self:
+        enter = self._stack.enter_context
+        try:
+            self.vcan: CanInterface = enter(virtual_can("vcan0"))
+            self.can, self.can_far = enter(controller_pair())
+            self.chip: GpioChip = enter(simulated_chip(("SOUT",)))
+            self.uart, far_uart = uart_pair()
+            self._add_stream("serial", "hipnuc-uart", PtyNode(self.folder / "serial"), sout=True)
+            self._add_stream("uart", "imu61x-uart", UartNode(far_uart))
+            self._add_stream("modbus", "hipnuc-modbus", PtyNode(self.folder / "modbus"))
+            self._add_can("vcan", self.vcan, 101)
+            self._add_can("can", self.can_far, 201)
+            self._add_polled(enter(i2c_bus(0)), enter(spi_bus(0)))
+            self.thread.start()
+            self._stack.callback(self.thread.close)
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._stack.close()
+
+    def devices(self) -> Mapping[str, Mapping[str, object]]:
+        """Their configuration, by name."""
+        uart: dict[str, object] = {"port": str(self.uart), "baud": BAUD}
+        return {
+            "serial": {
+                "driver": "hipnuc-uart",
+                "uart": {"port": str(self.folder / "serial"), "baud": BAUD},
+                "lines": {"sout": {"line": "SOUT"}},
+            },
+            "uart": {"driver": "imu61x-uart", "uart": uart},
+            "vcan": {"driver": "imu61x-can", "socketcan": {"interface": "vcan0"}, "options": {"base_id": 101}},
+            "can": {"driver": "imu61x-can", "socketcan": {"interface": "can0"}, "options": {"base_id": 201}},
+            "modbus": {
+                "driver": "hipnuc-modbus",
+                "rs485": {"line": str(self.folder / "modbus"), "rate_hz": 5, "reply_ms": 200},
+            },
+            "i2c": {"driver": "imu61x-i2c", "i2c": {"bus": 0, "address": 0x18, "rate_hz": RATE_HZ}},
+            "spi": {"driver": "imu61x-spi", "spi": {"port": "/dev/spidev0.0", "rate_hz": RATE_HZ}},
+        }
+
+    def _add_stream(self, name: str, driver: str, node: PtyNode, *, sout: bool = False) -> None:
+        now_ns = monotonic_ns()
+        options = SimulatorOptions(rate_hz=RATE_HZ, baud=BAUD, boot_ms=0, noise="none", skew_ppm=0.0, seed=self._seed)
+        module: StreamModule = SIMULATORS[driver].make(options, now_ns)
+        lines = None
+        if sout:
+            files = {Pin.SOUT: PullFile(self.chip.pull("SOUT"), SETTLE_S)}
+            lines = SimulatedLines(module, files, self.pin_noise)
+            self._stack.callback(lines.close)
+        if name in self.noise:
+            self.truth[name] = TruthLog(time_key, PERIOD_NS // 3)
+            module = LoggedModule(module, self.truth[name], now_ns)
+        port = SimulatedPort(module, node, Adapter(BARE_UART, now_ns), self.noise.get(name))
+        self.streams[name] = port
+        self.thread.add(port, lines)
+
+    def _add_can(self, name: str, interface: CanInterface, base_id: int) -> None:
+        log = self.truth[name] = TruthLog(decoded, 0)
+        module = numbered_can(monotonic_ns, RATE_HZ, base_id, log)
+        self.thread.add(CanPort(module, interface.name))
+
+    def _add_polled(self, i2c: Bus[I2cTransfer], spi: Bus[SpiTransfer]) -> None:
+        at_i2c, at_spi = self.polled["i2c"], self.polled["spi"]
+        i2c.attach(0x18, at_i2c.counted(on_i2c(at_i2c.device), _is_i2c_burst))
+        spi.attach(0, at_spi.counted(on_spi(at_spi.device), _is_spi_burst))
+
+    # --- what can be done to them ------------------------------------------------------------------------------------
+
+    def unplug(self, name: str, seconds: float) -> None:
+        """Pull the plug of a pseudo-terminal for so long."""
+        with self.thread.changing:
+            self.streams[name].unplug(monotonic_ns(), round(seconds * 1e9))
+
+    def reboot(self, name: str) -> None:
+        """Restart a module while its port stays."""
+        with self.thread.changing:
+            self.streams[name].module.reboot(monotonic_ns())
+
+    def set_noise(self, name: str, rates: FaultRates) -> None:
+        """Set what happens to the bytes of a stream."""
+        with self.thread.changing:
+            self.noise[name].rates = rates
+
+    def set_pin_noise(self, rates: PinFaultRates) -> None:
+        """Set what happens to the edges of SOUT."""
+        with self.thread.changing:
+            self.pin_noise.rates = rates
+
+    def set_registers(self, name: str, **values: object) -> None:
+        """Set what is wrong with a polled device."""
+        for key, value in values.items():
+            setattr(self.polled[name].device.faults, key, value)
+
+
+STUCK: Final = {"error": errno.ETIMEDOUT}
+"""SDA or a data line is held: every transfer times out."""
+
+
+def _is_i2c_burst(transfer: I2cTransfer) -> bool:
+    return transfer.segments[0].data == I2C_BURST
+
+
+def _is_spi_burst(transfer: SpiTransfer) -> bool:
+    return len(transfer.segments[0].mosi) == 32 and transfer.segments[0].mosi[:1] in (b"\x80", b"\x0e")

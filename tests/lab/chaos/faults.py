@@ -1,0 +1,221 @@
+"""The faults: what each does, to which resources, how long; and the plan of a run, which its seed alone decides."""
+
+import ctypes
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from signal import SIGCONT, SIGHUP, SIGSTOP
+from typing import Any, Final, NamedTuple, Protocol
+
+from imud.sim.ports.faults import FaultRates
+from imud.sim.ports.pins import PinFaultRates
+from tests.lab.chaos.daemon import Life
+from tests.lab.chaos.far_side import STUCK, FarSide
+
+DAEMON: Final = "daemon"
+"""Resource of all that needs a living daemon."""
+EVERY_S: Final = 0.8
+"""Mean time between two faults."""
+ROUND_S: Final = 15.0
+"""Of faults, then everything must be well."""
+PAUSE_S: Final = 0.3
+"""Between two faults of one resource."""
+
+
+class Scene(Protocol):
+    """What faults act on."""
+
+    @property
+    def far(self) -> FarSide:
+        """The simulated devices."""
+        ...
+
+    @property
+    def life(self) -> Life:
+        """The daemon of the moment."""
+        ...
+
+    @property
+    def state(self) -> Path:
+        """Folder on a small file system, where the daemon keeps its state."""
+        ...
+
+    def write_config(self, variant: int) -> None:
+        """Write the configuration: a good one by number, a bad one for -1."""
+        ...
+
+    def next_life(self, end: Callable[[Life], None]) -> None:
+        """Audit the daemon, end it and start another."""
+        ...
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One kind of fault."""
+
+    name: str
+    resources: frozenset[str]
+    """No other fault that has one of these goes on at the same time."""
+    begin: Callable[[Scene, float], None]
+    """Gets the time that it will last, s."""
+    end: Callable[[Scene], None] = lambda scene: None
+    shortest_s: float = 0.2
+    longest_s: float = 2.5
+    outage: tuple[str, ...] = ()
+    """Devices whose link is away meanwhile, or that begin anew."""
+    weight: float = 1.0
+
+
+class Planned(NamedTuple):
+    """One fault of a plan."""
+
+    begin_s: float
+    """Since the beginning of its round."""
+    fault: Fault
+    lasts_s: float
+
+
+def plan(seed: int, seconds: float, faults: list[Fault]) -> Iterator[list[Planned]]:
+    """Rounds of faults for about so long; the same for the same arguments."""
+    random = Random(seed)
+    for _ in range(max(round(seconds / ROUND_S), 1)):
+        yield _round(random, faults)
+
+
+def _round(random: Random, faults: list[Fault]) -> list[Planned]:
+    """Faults in the order of their beginnings, none two of which share a resource at the same time."""
+    planned: list[Planned] = []
+    free_s: dict[str, float] = {}
+    at_s = random.expovariate(1 / EVERY_S)
+    while at_s < ROUND_S:
+        fault = random.choices(faults, [fault.weight for fault in faults])[0]
+        lasts_s = random.uniform(fault.shortest_s, fault.longest_s)
+        if all(free_s.get(resource, 0.0) <= at_s for resource in fault.resources):
+            planned.append(Planned(at_s, fault, lasts_s))
+            free_s |= dict.fromkeys(fault.resources, at_s + lasts_s + PAUSE_S)
+        at_s += random.expovariate(1 / EVERY_S)
+    return planned
+
+
+# --- what they do ----------------------------------------------------------------------------------------------------
+
+STEP_MOST_S: Final = 3600.0
+ADJ_FREQUENCY: Final = 0x2
+TIMEX_BYTES: Final = 208
+FREQUENCY_AT: Final = 16
+"""Of `freq` in struct timex (64 bits), in units of 2^-16 ppm."""
+SLEW_PPM: Final = 400
+
+
+def slew(ppm: float) -> None:
+    """Let the system clock run so much faster. CLOCK_MONOTONIC runs with it. Raises OSError."""
+    timex = ctypes.create_string_buffer(TIMEX_BYTES)
+    struct.pack_into("=I", timex, 0, ADJ_FREQUENCY)
+    struct.pack_into("=q", timex, FREQUENCY_AT, round(ppm * 65536))
+    if ctypes.CDLL(None, use_errno=True).adjtimex(timex) < 0:
+        raise OSError(ctypes.get_errno(), "adjtimex")
+
+
+@dataclass
+class _Clock:
+    """Steps of CLOCK_REALTIME, forward and back in turns."""
+
+    by_s: float = STEP_MOST_S
+    moved_s: float = field(default=0.0)
+
+    def step(self, scene: Scene, lasts_s: float) -> None:
+        self.by_s = -self.by_s
+        self._move(self.by_s * lasts_s / 3)
+
+    def back(self, scene: Scene) -> None:
+        self._move(-self.moved_s)
+
+    def _move(self, by_s: float) -> None:
+        time.clock_settime(time.CLOCK_REALTIME, time.clock_gettime(time.CLOCK_REALTIME) + by_s)
+        self.moved_s += by_s
+
+
+def _noise(name: str, rates: FaultRates) -> dict[str, Any]:
+    return {
+        "begin": lambda scene, lasts_s: scene.far.set_noise(name, rates),
+        "end": lambda scene: scene.far.set_noise(name, FaultRates()),
+    }
+
+
+def _registers(name: str, **values: object) -> dict[str, Any]:
+    quiet: dict[str, object] = {"error": 0, "line": None, "flips": 0, "frozen": False}
+    return {
+        "begin": lambda scene, lasts_s: scene.far.set_registers(name, **values),
+        "end": lambda scene: scene.far.set_registers(name, **quiet),
+    }
+
+
+def _bus_off(scene: Scene, lasts_s: float) -> None:
+    scene.far.can.enter("bus-off")
+
+
+def _fill(scene: Scene, lasts_s: float) -> None:
+    with suppress(OSError), (scene.state / "full").open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+
+
+def _reload(variant: int) -> Callable[[Scene, float], None]:
+    def reload(scene: Scene, lasts_s: float) -> None:
+        scene.write_config(variant)
+        scene.life.signal(SIGHUP)
+
+    return reload
+
+
+def _good_again(scene: Scene) -> None:
+    scene.write_config(0)
+    scene.life.signal(SIGHUP)
+
+
+def all_faults(*, with_memory: bool) -> list[Fault]:
+    """Every kind; without control of memory not the one that needs it."""
+    clock = _Clock()
+    one = frozenset
+    bad_wire = FaultRates(flip=0.15, drop=0.1, insert=0.1, cut=0.1)
+    faults = [
+        Fault("pty unplugged", one({"serial"}), lambda s, t: s.far.unplug("serial", t), outage=("serial",)),
+        Fault("RS-485 pty unplugged", one({"modbus"}), lambda s, t: s.far.unplug("modbus", t), outage=("modbus",)),
+        Fault("module restarts (pty)", one({"serial"}), lambda s, t: s.far.reboot("serial"), outage=("serial",)),
+        Fault("module restarts (UART)", one({"uart"}), lambda s, t: s.far.reboot("uart"), outage=("uart",)),
+        Fault("noise on the pty", one({"serial"}), **_noise("serial", bad_wire)),
+        Fault("noise on the UART", one({"uart"}), **_noise("uart", bad_wire)),
+        Fault("pty silent", one({"serial"}), **_noise("serial", FaultRates(lose=1.0))),
+        Fault("UART silent", one({"uart"}), **_noise("uart", FaultRates(lose=1.0))),
+        Fault("edges of SOUT lost", one({"pins"}),
+              lambda s, t: s.far.set_pin_noise(PinFaultRates(lose_pulse=0.4, lose_edge=0.1)),
+              lambda s: s.far.set_pin_noise(PinFaultRates())),
+        Fault("vcan0 down", one({"vcan"}), lambda s, t: s.far.vcan.down(), lambda s: s.far.vcan.up(), outage=("vcan",)),
+        Fault("can0 down", one({"can"}), lambda s, t: s.far.can.down(), lambda s: s.far.can.up(), outage=("can",)),
+        Fault("can0 bus-off", one({"can"}), _bus_off, lambda s: s.far.can.restart()),
+        Fault("can0 error-passive", one({"can"}), lambda s, t: s.far.can.enter("error-passive"),
+              lambda s: s.far.can.enter("error-active")),
+        Fault("I2C: SDA stuck", one({"i2c"}), **_registers("i2c", **STUCK), outage=("i2c",)),
+        Fault("I2C: not acknowledged", one({"i2c"}), **_registers("i2c", error=6), outage=("i2c",)),
+        Fault("I2C: noise", one({"i2c"}), **_registers("i2c", flips=3), outage=("i2c",)),
+        Fault("I2C: registers frozen", one({"i2c"}), **_registers("i2c", frozen=True), outage=("i2c",)),
+        Fault("SPI: noise", one({"spi"}), **_registers("spi", flips=3), outage=("spi",)),
+        Fault("SPI: line high", one({"spi"}), **_registers("spi", line=0xFF), outage=("spi",)),
+        Fault("SPI: transfer fails", one({"spi"}), **_registers("spi", error=5), outage=("spi",)),
+        Fault("clock steps", one({"clock"}), clock.step, clock.back),
+        Fault("clock slews", one({"clock"}), lambda s, t: slew(SLEW_PPM), lambda s: slew(0.0)),
+        Fault("SIGHUP, another configuration", one({DAEMON}), _reload(1), _good_again),
+        Fault("SIGHUP, bad configuration", one({DAEMON}), _reload(-1), _good_again),
+        Fault("SIGSTOP", one({DAEMON}), lambda s, t: s.life.signal(SIGSTOP), lambda s: s.life.signal(SIGCONT)),
+        Fault("disk full", one({"disk"}), _fill, lambda s: (s.state / "full").unlink(missing_ok=True)),
+        Fault("kill -9", one({DAEMON}), lambda s, t: s.next_life(Life.kill), weight=0.5),
+    ]  # fmt: skip
+    if with_memory:
+        faults.append(
+            Fault("out of memory", one({DAEMON}), lambda s, t: s.next_life(Life.run_out_of_memory), weight=0.3)
+        )
+    return faults

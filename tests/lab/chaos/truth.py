@@ -1,0 +1,151 @@
+"""What simulated devices measured, in order, and how received samples are found in it.
+
+A device that sends by itself numbers its samples here, whether they arrive or not. Samples are recognised by the
+device's own time where they carry one, and by their acceleration where they do not (`encoded`).
+"""
+
+import threading
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+from imud.devices.imu61x.can.codec import encode_set
+from imud.sample import Sample, Vector3
+from imud.sim.can_module import BITRATE, PeriodicCanModule
+from imud.sim.physics.motion import Truth
+from imud.sim.sensor import SensorHardware
+from imud.sim.simulator import Burst, StreamModule
+
+BASE: Final = 512
+"""Of the number that an acceleration carries: x has the lower part, y the upper one."""
+STEP_M_S2: Final = 0.01
+
+
+class Measured(NamedTuple):
+    """One sample as the device took it."""
+
+    sample_ns: int
+    """CLOCK_MONOTONIC of the instant."""
+    key: int
+    """Device time in ns since power-on, or number of the sample (modulo BASE²)."""
+
+
+class TruthLog:
+    """All samples that a device took, by number from 0. Synchronization: one thread adds, another one reads."""
+
+    def __init__(self, key_of: Callable[[Sample], int], tolerance: int) -> None:
+        """`key_of` gives the key of a received sample; two keys that differ by no more than `tolerance` are equal."""
+        self._measured: list[Measured] = []
+        self._lock = threading.Lock()
+        self._key_of = key_of
+        self._tolerance = tolerance
+
+    def add(self, sample_ns: int, key: int) -> None:
+        """Add the next sample."""
+        with self._lock:
+            self._measured.append(Measured(sample_ns, key))
+
+    def __len__(self) -> int:
+        return len(self._measured)
+
+    def numbers_of(self, samples: Sequence[Sample]) -> list[int | None]:
+        """Return the number of each sample, which rises; None for a sample that the device did not take by then."""
+        with self._lock:
+            measured = list(self._measured)
+        found: list[int | None] = []
+        begin = 0
+        for sample in samples:
+            number = self._find(measured, begin, sample)
+            found.append(number)
+            if number is not None:
+                begin = number + 1
+        return found
+
+    def _find(self, measured: Sequence[Measured], begin: int, sample: Sample) -> int | None:
+        """The newest sample before its arrival that has its key: device time begins anew at a restart."""
+        key = self._key_of(sample)
+        for number in range(bisect_right(measured, sample.t_rx_ns, key=_instant) - 1, begin - 1, -1):
+            if abs(measured[number].key - key) <= self._tolerance:
+                return number
+        return None
+
+
+def _instant(measured: Measured) -> int:
+    return measured.sample_ns
+
+
+def time_key(sample: Sample) -> int:
+    """The device time of a sample, ns."""
+    assert sample.t_dev_ns is not None
+    return sample.t_dev_ns
+
+
+def encoded(number: int) -> Vector3:
+    """An acceleration that says which sample it is of."""
+    return (number % BASE * STEP_M_S2, number // BASE % BASE * STEP_M_S2, 9.80665)
+
+
+def decoded(sample: Sample) -> int:
+    """The number in an acceleration."""
+    assert sample.accel_m_s2 is not None
+    x, y, _ = sample.accel_m_s2
+    return round(x / STEP_M_S2) + BASE * round(y / STEP_M_S2)
+
+
+class LoggedModule:
+    """A device on a byte stream (`StreamModule`) whose samples are logged as they are taken."""
+
+    def __init__(self, module: StreamModule, log: TruthLog, now_ns: int) -> None:
+        """`now_ns` is when it was powered on."""
+        self._module, self._log, self._power_ns = module, log, now_ns
+        self.epoch_ns = module.epoch_ns
+
+    @property
+    def baud(self) -> int:
+        """Rate in force."""
+        return self._module.baud
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Pass bytes of the host on."""
+        self._module.receive(data, now_ns)
+
+    def advance(self, now_ns: int) -> list[Burst]:
+        """Return what left the wire; its samples are in the log."""
+        bursts = self._module.advance(now_ns)
+        for burst in bursts:
+            if burst.sample_ns is not None:
+                key = burst.sample_ns - self._power_ns if burst.device_ms is None else burst.device_ms * 1_000_000
+                self._log.add(burst.sample_ns, key)
+        return bursts
+
+    def next_ns(self) -> int | None:
+        """When `advance` has something next."""
+        return self._module.next_ns()
+
+    def counters(self) -> dict[str, int]:
+        """Those of the module."""
+        return self._module.counters()
+
+    def mark(self, now_ns: int) -> None:
+        """Pass the edge on."""
+        self._module.mark(now_ns)
+
+    def reboot(self, now_ns: int) -> None:
+        """Restart the module: its time begins at 0 again."""
+        self.advance(now_ns)
+        self._module.reboot(now_ns)
+        self._power_ns = now_ns
+
+
+def numbered_can(clock_ns: Callable[[], int], rate_hz: float, base_id: int, log: TruthLog) -> PeriodicCanModule:
+    """Return an IMU61x on CAN whose accelerations say which sample they are of; `clock_ns` is CLOCK_MONOTONIC."""
+
+    def encode(index: int, reading: Truth) -> Sequence[tuple[int, bytes]]:
+        number = len(log)
+        log.add(clock_ns(), number % BASE**2)
+        return encode_set(
+            index=index, accel_m_s2=encoded(number), gyro_rad_s=reading.gyro_rad_s, euler_rad=(0.0, 0.0, 0.0),
+            temperature_c=reading.temperature_c, base_id=base_id,
+        )  # fmt: skip
+
+    return PeriodicCanModule(clock_ns(), SensorHardware(boot_ms=0, skew_ppm=0.0), rate_hz, BITRATE, encode)
