@@ -106,6 +106,8 @@ class Watched:
         """Seconds, and resident anonymous memory in MB, at every scrape."""
         self.usage: list[tuple[int, int]] = []
         """Descriptors and threads before every scrape."""
+        self.unanswered = 0
+        """Scrapes that got no page: a starved daemon says 503."""
         self._pid, self._socket, self._port = pid, socket, metrics_port
         self._scrape_ms = self._scrape_kb = self._shared_mb = 0.0
         self._cpu_ns, self._samples = cpu_ns(pid), 0
@@ -115,8 +117,11 @@ class Watched:
         proc = Path(f"/proc/{self._pid}")
         self.usage.append((len(os.listdir(proc / "fd")), len(os.listdir(proc / "task"))))
         begin = monotonic()
-        with urlopen(f"http://127.0.0.1:{self._port}/metrics", timeout=30) as answer:
-            self._scrape_kb = len(answer.read()) / 1e3
+        try:
+            with urlopen(f"http://127.0.0.1:{self._port}/metrics", timeout=SCRAPE_S) as answer:
+                self._scrape_kb = len(answer.read()) / 1e3
+        except OSError:  # 503 from a daemon that is not run for seconds, or no answer
+            self.unanswered += 1
         self._scrape_ms = max(self._scrape_ms, (monotonic() - begin) * 1e3)
         anonymous_mb, self._shared_mb = resident_mb(self._pid)
         self.points.append((elapsed_s, anonymous_mb))
@@ -243,7 +248,8 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
     if any(a > b for a, b in zip(watched.usage[-1], watched.usage[0], strict=True)):
         found.append(f"descriptors and threads {watched.usage[-1]}, in the beginning {watched.usage[0]}")
     taken, refused = (sum(column) for column in zip(*counts, strict=True))
-    print(f"frames taken by ptys {taken}, refused {refused}; clients {figures}, dropped {dropped}; {words}")
+    print(f"frames taken by ptys {taken}, refused {refused}; clients {figures}, dropped {dropped}; "
+          f"scrapes {len(watched.points)}, without a page {watched.unanswered}; {words}")  # fmt: skip
     print("\n".join(found or ["passed"]))
     return 1 if found else 0
 
