@@ -28,7 +28,7 @@ from imud.ledger import bytes_open, frames_open
 from tests.bench.fleet_writer import hi91_frames
 from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Process, cpu_ns, wait_for
 from tests.bench.soak_single import run_single, slope_mb_per_h
-from tests.support.captures import CaptureWriter
+from tests.support.files import CaptureWriter
 
 RATES: Final = ((1.0, 42), (10.0, 22), (20.0, 14), (50.0, 8), (100.0, 3), (400.0, 1))
 """Rate in Hz and how many ptys have it; every other one is an IMU61x."""

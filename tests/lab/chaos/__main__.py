@@ -27,7 +27,7 @@ from tests.lab.chaos.far_side import FarSide
 from tests.lab.chaos.faults import Fault, Planned, all_faults, plan
 from tests.lab.tool import tool
 from tests.lab.waiting import wait_until
-from tests.support.running import write_config
+from tests.support.daemon_process import write_config
 
 CI_SECONDS: Final = 45.0
 STATE_SIZE: Final = "64k"
@@ -83,6 +83,7 @@ class Chaos:
 
     def settle(self, what: str) -> None:
         """Wait until every device runs, then hold the daemon to all that it promises."""
+        self.far.thread.check()
         try:
             self.life.wait_running()
         except AssertionError as error:

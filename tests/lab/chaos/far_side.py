@@ -17,7 +17,7 @@ import termios
 import threading
 import tty
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from time import monotonic_ns
 from types import TracebackType
@@ -143,14 +143,18 @@ class PortThread:
         """Begin."""
         self._thread.start()
 
+    def check(self) -> None:
+        """Raise what the thread died of, if it did."""
+        if self._failure is not None:
+            raise self._failure
+
     def close(self) -> None:
         """End; raises what the thread died of."""
         self._stop.set()
         self._thread.join()
         for port, _ in self._ports:
             port.close()
-        if self._failure is not None:
-            raise self._failure
+        self.check()
 
     def _run(self) -> None:
         try:
@@ -158,7 +162,8 @@ class PortThread:
                 with self.changing:
                     wait_s = self._step()
                     watched = [port.node.fileno() for port, _ in self._ports if port.node.is_open]
-                select.select(watched, [], [], wait_s)
+                with suppress(OSError, ValueError):  # one was unplugged meanwhile: its descriptor is closed
+                    select.select(watched, [], [], wait_s)
         except BaseException as error:  # noqa: BLE001 - the main thread raises it
             self._failure = error
 
