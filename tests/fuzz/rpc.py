@@ -89,9 +89,12 @@ class _Rig:
         return result
 
     def _close(self) -> None:
-        self.server.close()
+        self._loop.run_until_complete(self._stop())
         self._loop.close()
         self._folder.cleanup()
+
+    async def _stop(self) -> None:
+        self.server.close()
 
     async def _start(self) -> SocketServer:
         statuses = [device_status(*item) for item in DEVICES.items()]

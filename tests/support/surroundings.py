@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import takewhile
 from typing import Final
 
 import pytest
@@ -21,14 +22,27 @@ HOSTILE_UID: Final = 65533
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can run a process as another user")
 
 
+BECOME: Final = """
+import os
+os.setgroups([])
+os.setgid({uid})
+os.setuid({uid})
+"""
+
+
 @contextmanager
 def python_as(uid: int, program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A Python program of the user `uid`, without groups; killed at the end."""
-    command = [sys.executable, "-X", "dev", "-c", program, *arguments]
+    """A Python program of the user `uid`, without groups; killed at the end.
+
+    It changes to that user after its imports: the interpreter may lie in a home directory that only its owner enters.
+    """
+    lines = program.strip().splitlines()
+    imports = list(takewhile(lambda line: not line or line.startswith(("import ", "from ")), lines))
+    text = "\n".join((*imports, BECOME.format(uid=uid), *lines[len(imports) :]))
+    command = [sys.executable, "-X", "dev", "-c", text, *arguments]
     with subprocess.Popen(
-        command, cwd=ROOT, user=uid, group=uid, extra_groups=[],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    ) as process:  # fmt: skip
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
             yield process
         finally:
