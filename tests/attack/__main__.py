@@ -7,6 +7,7 @@ import argparse
 import sys
 import threading
 from dataclasses import dataclass
+from math import inf
 from time import monotonic
 
 from tests.attack.attacks import ATTACKS, Attack
@@ -39,7 +40,9 @@ def watch(stage: AttackedDaemon, peak: Peak, over: threading.Event) -> None:
             return
 
 
-def attack(name: str, entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float) -> list[str]:
+def attack(
+    name: str, entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float, p99_limit_ms: float
+) -> list[str]:
     """Run one attack, print its row, return the bounds that were exceeded."""
     stage.figures()
     before, used_ns, begun_s = stage.status(), stage.cpu_ns, monotonic()
@@ -62,8 +65,8 @@ def attack(name: str, entry: Attack, stage: AttackedDaemon, seconds: float, idle
     )
     if (seen["lost"] or seen["dropped"]) and not entry.starves:
         problems.append(f"{seen['lost']} samples lost, {seen['dropped']} of them dropped for the good client")
-    if seen["reply_p99_ms"] > P99_LIMIT_MS and not entry.starves:
-        problems.append(f"p99 of the good client {seen['reply_p99_ms']:.2f} ms, expected at most {P99_LIMIT_MS} ms")
+    if seen["reply_p99_ms"] > p99_limit_ms and not entry.starves:
+        problems.append(f"p99 of the good client {seen['reply_p99_ms']:.2f} ms, expected at most {p99_limit_ms:g} ms")
     if above_mb > RSS_LIMIT_MB:
         problems.append(f"{above_mb:.1f} MB above idle, expected at most {RSS_LIMIT_MB:.1f}")
     if after["failed"] > before["failed"]:
@@ -75,7 +78,7 @@ def main() -> int:
     """Run the attacks."""
     parser = argparse.ArgumentParser(prog="make attack")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(ATTACKS)}; all when left out")
-    parser.add_argument("--short", action="store_true", help="at most a minute in all, for CI")
+    parser.add_argument("--short", action="store_true", help="at most a minute in all, delays not judged, for CI")
     parser.add_argument("--seconds", type=float, help="of each attack")
     args = parser.parse_args()
     unknown = [name for name in args.names if name not in ATTACKS]
@@ -85,6 +88,9 @@ def main() -> int:
     if args.short:
         chosen = {name: entry for name, entry in chosen.items() if entry.short}
     seconds = args.seconds or (SHORT_S if args.short else LONG_S)
+    limit_ms = inf if args.short else P99_LIMIT_MS
+    if args.short:
+        print("delays are printed and not judged in the short form: a gate does not depend on the machine's own stalls")
     problems: list[str] = []
     with AttackedDaemon(60 + (seconds + 15) * len(chosen)) as stage:
         idle_mb = stage.rss_mb
@@ -95,7 +101,7 @@ def main() -> int:
         )
         print(f"daemon idle: {idle_mb:.1f} MB, {stage.fds} descriptors; other programs {others}\n{HEAD}", flush=True)
         for name, entry in chosen.items():
-            problems += [f"{name}: {problem}" for problem in attack(name, entry, stage, seconds, idle_mb)]
+            problems += [f"{name}: {problem}" for problem in attack(name, entry, stage, seconds, idle_mb, limit_ms)]
             if not stage.alive:
                 break
     print(*(problems or ["every bound kept"]), sep="\n")
