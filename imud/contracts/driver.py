@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from imud.contracts.action import Actions
 from imud.contracts.codec import StreamCodec
+from imud.contracts.device_settings import DeviceSettings
 from imud.contracts.lines import AlarmRanges
 from imud.contracts.session import RequestScript
 from imud.contracts.settings import Settings
@@ -48,6 +49,8 @@ class Driver:
     """The frame that `quat_wxyz` turns into, for example `ENU`."""
     actions: Actions = field(default_factory=dict)
     """Commands that the device executes, by name."""
+    device_settings: DeviceSettings | None = None
+    """Settings that the device keeps itself; None for a driver that does not know them."""
     lines: frozenset[str] = frozenset()
     """GPIO lines that such a device can have: names of `imud.contracts.lines.DeviceLines`."""
     alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
