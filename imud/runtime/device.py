@@ -199,7 +199,7 @@ class Device:
     async def _run_action(self, action: Action, arguments: Mapping[str, Any]) -> object:
         params = action.arguments(arguments)
         self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
-        return await self._transport.run_action(action, params)
+        return await self._transport.run_script(lambda target: action.script(target, params))
 
     def _require_replies(self) -> None:
         health = self._health

@@ -6,16 +6,15 @@ feeds received data to the device's sample path.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from imud.clock import SampleClock
 from imud.config import DeviceConfig
-from imud.contracts.action import Action
+from imud.contracts.action import Target
 from imud.contracts.codec import Message
 from imud.contracts.driver import Driver
 from imud.contracts.link import Link, OnEnd
 from imud.contracts.publisher import Batch
-from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceStatus
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
@@ -134,8 +133,11 @@ class Transport(Protocol):
         """Prepare for a reset of the device by its line."""
         ...
 
-    async def run_action(self, action: Action, params: Settings) -> object:
-        """Run an action of the driver. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        """Run the script that `make` makes for the device, and return its result.
+
+        Raises what the script and its making raise: CommandError, TransferError, DeviceRefused, and LinkError.
+        """
         ...
 
     def add_status(self, status: DeviceStatus) -> DeviceStatus:

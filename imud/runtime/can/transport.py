@@ -1,9 +1,10 @@
 """Transport of a device on a CAN bus: its driver is configured, or found by listening; filters select its frames."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from random import Random
+from typing import Any
 
-from imud.contracts.action import Action, Target
+from imud.contracts.action import Target
 from imud.contracts.can import CanCodec, CanDriver
 from imud.contracts.driver import Identity, of_kind
 from imud.contracts.link import CanLink, OnEnd
@@ -183,9 +184,9 @@ class CanTransport:
         if self.driver is not None and self._codec is not None:
             self.driver.apply_identity(self._codec, identity)
 
-    async def run_action(self, action: Action, params: Settings) -> object:
-        """Run an action of the driver on the device that was found, with its own node number."""
-        return await self._exchange.run(action.script(Target(self._options, self.bit_rate), params))
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        """Run a request script on the device that was found, with its own node number."""
+        return await self._exchange.run(make(Target(self._options, self.bit_rate)))
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 

@@ -8,12 +8,13 @@ Readings are decoded only between an identification and the first sign that the 
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 
-from imud.contracts.action import Action, Target
+from imud.contracts.action import Target
 from imud.contracts.codec import Message
 from imud.contracts.driver import Identity, of_kind
 from imud.contracts.link import OnEnd, PolledLink
@@ -197,13 +198,13 @@ class PolledTransport:
         last = (self._device.target,) if self._device is not None else ()
         return tuple(dict.fromkeys((*last, *driver.targets)))
 
-    async def run_action(self, action: Action, params: Settings) -> object:
-        """Run an action of the driver between two reads."""
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        """Run a transfer script between two reads."""
         member, device = self._member, self._device
         if member is None or device is None:
             raise CommandError(f"{self._config.name} is not there")
         options = self._config.options or device.driver.settings()
-        return await member.run(action.script(Target(options, self.bit_rate), params), device.target)
+        return await member.run(make(Target(options, self.bit_rate)), device.target)
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 

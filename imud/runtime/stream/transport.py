@@ -2,12 +2,12 @@
 
 import asyncio
 import logging
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
-from imud.contracts.action import Action, Target
+from imud.contracts.action import Target
 from imud.contracts.driver import Identity, StreamDriver
 from imud.contracts.link import OnEnd, StreamLink
-from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.devices import DRIVERS
 from imud.errors import CommandError
@@ -168,10 +168,10 @@ class StreamTransport:
             self.path.clock.link_changed(byte_ns=uart_byte_ns(baud), hold_ns=self.link.hold_ns)
         self._remember()
 
-    async def run_action(self, action: Action, params: Settings) -> object:
-        """Run an action of the driver."""
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        """Run a request script; one that changes the device's rate is followed."""
         options = self._config.options or (self.driver.settings() if self.driver is not None else None)
-        return await self._exchange.run(action.script(Target(options, self.bit_rate), params))
+        return await self._exchange.run(make(Target(options, self.bit_rate)))
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 
