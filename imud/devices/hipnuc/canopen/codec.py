@@ -38,6 +38,7 @@ from imud.devices.hipnuc.canopen.cia301 import (
     NmtState,
     TpdoNumber,
 )
+from imud.devices.hipnuc.common.air import pressure_of
 from imud.devices.hipnuc.common.assembly import Assembly
 from imud.devices.hipnuc.common.raw_units import M_S2_PER_G, QUAT_PER_LSB
 from imud.ledger import Ledger
@@ -158,7 +159,7 @@ def _measurement(frames: Mapping[int, bytes]) -> Measurement:
         gyro_rad_s=_vector(frames.get(2), GYRO_RAD_S_PER_LSB),
         quat_wxyz=quat,
         euler_rad=euler,
-        pressure_pa=float(ONE_LONG.unpack(frames[6])[0]) if 6 in frames else None,
+        pressure_pa=pressure_of(float(ONE_LONG.unpack(frames[6])[0])) if 6 in frames else None,
         incli_rad=incli,
     )  # fmt: skip
 

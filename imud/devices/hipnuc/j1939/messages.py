@@ -15,8 +15,8 @@ alone are read, and their sign is turned so that yaw is counter-clockwise as on 
 "Not available". J1939 sets the upper end of each unsigned range aside (FF… not available, FE… error). The values here
 are signed and use their whole range: FFFF is an honest -1 count. So a value is absent where it is out of its physical
 range (which covers both patterns in a heading and in pressure), where a quaternion has not unit length, where accel or
-field have all eight bytes FF (neither gravity nor the earth's field is that small), and where field, or pressure, or
-temperature with pressure, read zero, as in products without the sensor (a guess).
+field have all eight bytes FF (neither gravity nor the earth's field is that small), and where field, or temperature
+with pressure, read zero, as in products without the sensor (a guess). Which pressures are one: `common/air.py`.
 
 Angles stay together in a sample as they are known: where one is absent it is NaN, where all are the vector is None.
 """
@@ -27,6 +27,7 @@ from math import hypot, isfinite, nan
 from typing import Final, Literal
 
 from imud.attitude import quat_from_euler312
+from imud.devices.hipnuc.common.air import pressure_of
 from imud.devices.hipnuc.common.raw_units import (
     ACCEL_M_S2_PER_LSB,
     EULER_RAD_PER_LSB,
@@ -64,7 +65,6 @@ TURN: Final = 360_000
 HALF_TURN: Final = TURN // 2
 TEMPERATURE_MOST_C: Final = 150.0
 """Highest valid temperature: no module works beyond."""
-PRESSURE_MOST_PA: Final = 2_000_000.0
 UNIT_TOLERANCE: Final = 0.02
 YEAR_ZERO: Final = 2000
 """Of the year in FF2F (assumed)."""
@@ -138,8 +138,7 @@ class _Parts:
         celsius, pressure = celsius * TEMPERATURE_C_PER_LSB, pressure * PRESSURE_PA_PER_LSB
         if abs(celsius) <= TEMPERATURE_MOST_C and (celsius or pressure) and data != _NOTHING:
             self.temperature_c = celsius
-        if 0 < pressure <= PRESSURE_MOST_PA:
-            self.pressure_pa = pressure
+        self.pressure_pa = pressure_of(pressure)
 
     def decode_quaternion(self, data: bytes) -> None:
         w, x, y, z = QUATERNION_LAYOUT.unpack(data)

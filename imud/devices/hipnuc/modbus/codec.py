@@ -12,8 +12,8 @@ Two scales differ between modules and are decided by the values, then kept:
   products with one, so a Y that is not zero, or a negative X, means two; a Y of zero while the module is pitched means
   one. That the reserved register reads as zero is a guess. Until it is decided, and where both read as zero (a product
   without inclinometer), there is no value.
-Likewise a guess, after the manual's own example: a pressure of zero, a field of zero, and a temperature of zero
-together with a pressure of zero, are sensors that the product does not have.
+Likewise a guess, after the manual's own example: a field of zero, and a temperature of zero together with a pressure of
+zero, are sensors that the product does not have. Which pressures are one: `common/air.py`.
 """
 
 import struct
@@ -26,6 +26,7 @@ from msgspec import Meta
 from imud.contracts.codec import BadFrame, BadReason
 from imud.contracts.polling import Poll, PolledEvent, Vanished
 from imud.contracts.settings import Settings
+from imud.devices.hipnuc.common.air import pressure_of
 from imud.devices.hipnuc.common.raw_units import (
     ACCEL_M_S2_PER_LSB,
     EULER_RAD_PER_LSB,
@@ -168,7 +169,7 @@ class HipnucModbusCodec:
             (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b) if mx or my or mz else None,
             self._quaternion(qw, qx, qy, qz), (roll * angle, pitch * angle, yaw * angle),
             celsius * TEMPERATURE_C_PER_LSB if celsius or pressure else None,
-            pressure * PRESSURE_PA_PER_LSB if pressure else None,
+            pressure_of(pressure * PRESSURE_PA_PER_LSB),
             self._inclination(ix, iy, roll * angle, pitch * angle),
         ), True  # fmt: skip
 

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import msgspec
 
+from imud.devices.hipnuc.common.air import PRESSURE_MAX_PA, PRESSURE_MIN_PA, pressure_of, temperature_beside
 from imud.devices.hipnuc.common.raw_units import EULER_RAD_PER_LSB, M_S2_PER_G, MAG_T_PER_LSB, QUAT_PER_LSB
 from imud.sample import Measurement, Quaternion, Vector3
 from imud.units import RAD_PER_DEG, T_PER_UT
@@ -57,7 +58,8 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
     return Measurement(
         size, trailing, ms,
         (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
-        (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+        (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad),
+        temperature_beside(temperature, pressure), pressure_of(pressure), None,
         low + 256 * high if word_is_status else None, None if word_is_status else low + 256 * high,
     )  # fmt: skip
 
@@ -68,11 +70,14 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
     `trailing` bytes follow the first frame.
     """
     make, g, rad, tesla = Measurement, M_S2_PER_G, RAD_PER_DEG, T_PER_UT
+    low_pa, high_pa = PRESSURE_MIN_PA, PRESSURE_MAX_PA
     return [
         make(
             size, left, ms,
             (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
-            (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+            (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad),
+            temperature if low_pa <= pressure <= high_pa else temperature_beside(temperature, pressure),
+            pressure if low_pa <= pressure <= high_pa else None, None,
             low + 256 * high if word_is_status else None, None if word_is_status else low + 256 * high,
         )
         for left, (
@@ -95,8 +100,6 @@ _GROUPS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad")
 def _finite_groups(m: Measurement) -> Measurement:
     """Decode without the groups of values of which one is NaN or infinite."""
     absent = [name for name in _GROUPS if not all(map(isfinite, getattr(m, name)))]
-    if m.pressure_pa is not None and not isfinite(m.pressure_pa):
-        absent.append("pressure_pa")
     return msgspec.structs.replace(m, **dict.fromkeys(absent))
 
 
@@ -110,7 +113,7 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
         size, trailing, None,
         (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b),
         (qw * q, qx * q, qy * q, qz * q), (roll * angle, pitch * angle, yaw * angle),
-        temperature, pressure + PRESSURE_OFFSET_PA, None, status, pps_ms,
+        temperature, pressure_of(pressure + PRESSURE_OFFSET_PA), None, status, pps_ms,
     ), True  # fmt: skip
 
 

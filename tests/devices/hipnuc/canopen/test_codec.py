@@ -63,6 +63,18 @@ def test_all_tpdos_in_si_units() -> None:
     assert (event.mag_t, event.temperature_c, event.status) == (None, None, None)
 
 
+@pytest.mark.parametrize(
+    ("sent", "pressure_pa"), [(0, None), (999, None), (1000, 1000), (120_000, 120_000), (-5, None)]
+)
+def test_a_node_without_barometer_has_no_pressure(sent: int, pressure_pa: float | None) -> None:
+    codec = make()
+    for burst in range(6):
+        events = codec.feed_frame(0x688, False, sent.to_bytes(4, "little", signed=True), burst * 50 * MS)
+    (event,) = events
+    assert isinstance(event, Measurement)
+    assert event.pressure_pa == pressure_pa
+
+
 def test_what_is_not_sent_is_absent() -> None:
     event = measured([1, 2])
     assert event.accel_m_s2 is not None
@@ -230,7 +242,8 @@ def test_random_payloads_decode_alike() -> None:
             assert m.gyro_rad_s == pytest.approx(scaled(values, "Gyr_X Gyr_Y Gyr_Z", math.pi / 180), rel=1e-12)
             assert m.euler_rad == pytest.approx(scaled(values, "Roll Pitch Yaw", math.pi / 180), rel=1e-12)
             assert m.quat_wxyz == pytest.approx(scaled(values, "Quat_W Quat_X Quat_Y Quat_Z", 1), rel=1e-12)
-            assert m.pressure_pa == values["Pressure"]
+            is_pressure = 1_000 <= values["Pressure"] <= 120_000
+            assert m.pressure_pa == (values["Pressure"] if is_pressure else None)
             assert m.incli_rad == pytest.approx(scaled(values, "Incli_X Incli_Y", math.pi / 180), rel=1e-12)
             compared += len(values)
     assert len(values) == 16

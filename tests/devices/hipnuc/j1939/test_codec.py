@@ -177,6 +177,11 @@ def test_one_negative_count_is_a_value() -> None:
     assert measured(0xFF34, "ffffffffffff0000").accel_m_s2 == pytest.approx((-0.00478514,) * 3, abs=1e-8)
     assert measured(0xFF3D, "ffffffff00000000").euler_rad == pytest.approx((-1.74532925e-5, 0, math.nan), nan_ok=True)
     assert measured(0xFF43, "0000000052c59a00").temperature_c == 0.0  # with a pressure it is 0 °C
+    placeholder = measured(0xFF43, "9a090000e7030000")  # 24.58 °C, 999: a module without a barometer
+    assert placeholder.temperature_c == pytest.approx(24.58)
+    assert placeholder.pressure_pa is None
+    assert measured(0xFF43, "9a090000a0860100").pressure_pa == pytest.approx(1000)  # 100000 counts of 0.01 Pa
+    assert measured(0xFF43, "9a090000011bb700").pressure_pa is None  # 12000001 counts
 
 
 def test_packing_gives_the_golden_messages_and_clips() -> None:
@@ -214,7 +219,7 @@ def some_payload(pgn: int, random: Random) -> bytes:
     if pgn == messages.HEADING:
         return random.randint(0, 360_000).to_bytes(4, "little") + random.randbytes(4)
     if pgn == messages.TEMPERATURE:
-        return messages.TEMPERATURE_LAYOUT.pack(random.randint(-9000, 9000), 7, random.randint(1, 10**8))
+        return messages.TEMPERATURE_LAYOUT.pack(random.randint(-9000, 9000), 7, random.randint(10**5, 12 * 10**6))
     if pgn == messages.QUATERNION:
         w, x, y, z = quat_normalized((random.gauss(0, 1), random.gauss(0, 1), random.gauss(0, 1), 0.1))
         return messages.pack_quaternion((w, x, y, z))

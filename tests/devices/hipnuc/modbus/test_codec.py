@@ -94,6 +94,17 @@ def test_sensors_of_the_manual() -> None:
     assert m.pressure_pa is None
 
 
+@pytest.mark.parametrize(
+    ("counts", "pressure_pa"), [(0, None), (99_900, None), (100_000, 1_000), (12_000_000, 120_000), (12_000_001, None)]
+)
+def test_a_module_without_barometer_has_no_pressure(counts: int, pressure_pa: float | None) -> None:
+    """99,900 counts of 0.01 Pa are the placeholder 999 in Pa."""
+    words = "0000" * 9 + "0000 0000" * 3 + "09D0" + counts.to_bytes(4, "big").hex() + "2710 0000 0000 0000"
+    m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
+    assert m.temperature_c == pytest.approx(25.12)
+    assert m.pressure_pa == pressure_pa
+
+
 def test_block_of_newer_firmware() -> None:
     """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
     words = "0000 0000 0800 0000 0000 0000 0000 0000 0000" + "0000 0000" * 3 + "09D0 009A9C14" + "2710 0000 0000 0000"

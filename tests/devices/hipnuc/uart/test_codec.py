@@ -280,6 +280,43 @@ def test_not_finite_values_are_left_out_and_told() -> None:
             assert codec.ledger.closes()
 
 
+OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453FF2C53D3FDDA9CDBC54A6D5BC5E4CBEBD")
+"""Beginning of a frame in the vendor's older manual; bytes 7 … 13: reserved, 0x3B, -4.2e-25 as a float."""
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+@pytest.mark.parametrize(
+    ("pressure_pa", "temperature_c", "expected"),
+    [
+        (101_325.0, 21, (21, 101_325.0)),
+        (0.0, 21, (21, None)),  # firmware without a barometer
+        (999.0, 21, (21, None)),
+        (-4.2e-25, 59, (None, None)),  # what stood in the buffer
+        (999.9, 59, (None, None)),
+        (1000.0, 21, (21, 1000.0)),
+        (120_000.0, 21, (21, 120_000.0)),
+        (120_001.0, 59, (None, None)),
+    ],
+)
+def test_no_barometer_no_pressure(
+    pressure_pa: float, temperature_c: int, expected: tuple[float | None, float | None], frames: int
+) -> None:
+    """Alone and in a run of frames, which is decoded another way."""
+    frame = hi91(5, pressure_pa=pressure_pa, temperature_c=temperature_c)
+    events = make().feed(frame * frames)
+    assert len(events) == frames
+    for event in events:
+        assert isinstance(event, Measurement)
+        assert (event.temperature_c, event.pressure_pa) == expected
+
+
+def test_a_frame_of_older_firmware_has_neither_pressure_nor_temperature() -> None:
+    body = OLD_MANUAL[6:].ljust(76, b"\0")
+    m = one(make().feed(framed(body)))
+    assert (m.temperature_c, m.pressure_pa) == (None, None)
+    assert m.dev_ticks == 0x0004BBBD
+
+
 def test_very_late_system_time_is_no_damage() -> None:
     for top in (0x7F, 0xFF):
         assert one(make().feed(hi91(top << 24))).dev_ticks == top << 24
@@ -341,10 +378,10 @@ def test_values_are_clipped_to_what_the_format_holds() -> None:
     m = one(make().feed(encode_hi92(pps_stamp_ms=99999, **far)))
     assert m.accel_m_s2 == pytest.approx((159.994, -159.9996, 0.0), abs=1e-2)
     assert m.gyro_rad_s == pytest.approx((32.767, -32.768, 0.0))
-    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, 132767, 65535)
+    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 65535)  # 132767 Pa are no pressure
     m = one(make().feed(encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)}))))
     assert m.dev_ticks == 7
-    assert m.temperature_c == 127
+    assert (m.temperature_c, m.pressure_pa) == (None, None)  # 1e6 Pa: bytes that nothing wrote
     assert m.accel_m_s2 is not None
     assert m.accel_m_s2[0] == pytest.approx(3.4028e38 * 9.8, rel=1e-4)
 
