@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cache
 from inspect import signature
 from typing import Any, cast, get_type_hints
@@ -22,6 +23,15 @@ class Target:
     """Present bit rate of the line, bit/s; 0 on a link without one."""
 
 
+class Risk(StrEnum):
+    """What an action can do that cannot be taken back by another one. Programs for people ask before such an action."""
+
+    NONE = ""
+    CONNECTION = "the device may not be reached afterwards"
+    RESET = "all settings of the device are lost"
+    """Its settings are written to a backup before, as far as they can be read."""
+
+
 @dataclass(frozen=True, slots=True)
 class Action:
     """An action of a device: help, arguments and request script.
@@ -37,6 +47,7 @@ class Action:
 
     The script returns the result of the action, a value that JSON can carry. Both raise BadArgument.
     """
+    risk: Risk = Risk.NONE
 
     @property
     def parameters(self) -> type[Settings]:
@@ -90,6 +101,8 @@ class ActionInfo(msgspec.Struct, frozen=True):
     name: str
     help: str
     parameters: tuple[ActionParameter, ...]
+    risk: Risk = Risk.NONE
+    """Why people are asked before, one clause; empty where they are not."""
 
 
 def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
@@ -102,4 +115,4 @@ def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
 
 def described(actions: Actions) -> list[ActionInfo]:
     """Describe actions, in their order."""
-    return [ActionInfo(name, action.help, parameters_of(action)) for name, action in actions.items()]
+    return [ActionInfo(name, action.help, parameters_of(action), action.risk) for name, action in actions.items()]

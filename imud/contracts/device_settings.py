@@ -44,7 +44,8 @@ class Setting:
     effect: Effect = Effect.AT_ONCE
     connection: bool = False
     """Whether the device is reached in another way afterwards (bit rate, address, node number): such a setting is
-    written last. Its script follows the device, and goes back where the device is not heard afterwards."""
+    written last. Its script follows the device, and goes back where the device is not heard afterwards: by
+    `Request.baud` on a UART, `Request.settings` on a CAN bus, `Transfer.then_at` on RS-485 and I2C."""
     readable: bool = True
     """Whether the device tells the value; what it does not tell is `written, not verified`."""
     agrees: Callable[[Any, Any], bool] = eq

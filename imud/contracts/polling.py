@@ -30,6 +30,11 @@ class Transfer:
     """I2C: number of bytes to read after a repeated start; 0 for a write alone."""
     gap_us: int = 0
     """SPI: pause after each assertion of chip select."""
+    at: int | None = None
+    """I2C, RS-485: address of this transfer alone, for example to see whether another device has it."""
+    then_at: int | None = None
+    """I2C, RS-485: the device's address after this transfer, whatever came of it, and also when the script has ended.
+    A script that does not find the device there goes back: a transfer with the former address as `at` and `then_at`."""
 
 
 TransferScript = Generator[Transfer, bytes, T]

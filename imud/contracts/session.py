@@ -7,7 +7,7 @@ and is sent the `Outcome`. The daemon's event loop, a blocking probe and tests r
 from collections import deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from imud.contracts.codec import Message, ReplyFrame
 from imud.errors import CommandError
@@ -43,6 +43,9 @@ class Request:
     """Fewest messages of a positive reply, its end included: an earlier end belongs to a late reply."""
     baud: int = 0
     """Bit rate of the line from this request on, bit/s; 0 leaves it unchanged. Serial lines only."""
+    settings: Any = None
+    """Settings of the driver from this request on: the device has another number on its bus. None leaves them as they
+    are. CAN buses only; a script that does not hear the device there goes back by the former settings."""
     undo: bytes = b""
     """Bytes to send if the script is cancelled at this request while the link is open: a closed generator cannot send.
     No reply is awaited."""

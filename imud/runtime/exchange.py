@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from imud.contracts.codec import Message
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
@@ -23,12 +23,15 @@ class Exchange:
         write: Callable[[bytes], None],
         now_ns: Callable[[], int],
         set_baud: Callable[[int], None] | None = None,
+        follow: Callable[[Any], None] | None = None,
     ) -> None:
-        """`now_ns` reads CLOCK_MONOTONIC; `set_baud` changes the rate of the link, None where it has none."""
+        """`now_ns` reads CLOCK_MONOTONIC; `set_baud` changes the rate of the link, None where it has none; `follow`
+        listens to the device by other settings of its driver, None where it has no number on a bus."""
         self._session = Session(ledger)
         self._write = write
         self._now_ns = now_ns
         self._set_baud = set_baud
+        self._follow = follow
         self._lock = asyncio.Lock()
         self._outcome: asyncio.Future[Outcome] | None = None
 
@@ -67,6 +70,8 @@ class Exchange:
     async def _ask(self, request: Request) -> Outcome:
         if request.baud:
             self._change_rate(request)
+        if request.settings is not None:
+            self._change_number(request)
         loop = asyncio.get_running_loop()
         timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
         try:
@@ -86,6 +91,11 @@ class Exchange:
         if self._set_baud is None:
             raise CommandError(f"{request.name}: expected a serial line to set to {request.baud} baud, got none")
         self._set_baud(request.baud)
+
+    def _change_number(self, request: Request) -> None:
+        if self._follow is None:
+            raise CommandError(f"{request.name}: expected a bus on which the device has a number, got none")
+        self._follow(request.settings)
 
     def _expire(self) -> None:
         deadline_ns = self._session.deadline_ns

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from imud.contracts.action import Action, Target, described, parameters_of
+from imud.contracts.action import Action, Risk, Target, described, parameters_of
 from imud.devices import DRIVERS
 from imud.errors import BadArgument
 
@@ -41,6 +41,7 @@ def test_description_for_people() -> None:
             {"name": "angle_deg", "values": "a number", "default": None},
             {"name": "relative", "values": "true or false", "default": "false"},
         ],
+        "risk": "",
     }
 
 
@@ -54,6 +55,23 @@ def test_every_action_has_help_and_arguments_that_can_be_described(driver: str, 
     assert all(parameter.values != "keys and values" for parameter in info.parameters)
     with pytest.raises(BadArgument):
         action.arguments({"no_such_argument": 1})
+
+
+RISKS = {
+    "factory_reset": Risk.RESET,
+    "address": Risk.CONNECTION,
+    "baud": Risk.CONNECTION,
+    "bitrate": Risk.CONNECTION,
+    "node": Risk.CONNECTION,
+}
+"""Of actions by these names, whatever the driver."""
+
+
+@pytest.mark.parametrize(("driver", "name"), ACTIONS)
+def test_actions_that_lose_settings_or_contact_say_so(driver: str, name: str) -> None:
+    (info,) = described({name: DRIVERS[driver].actions[name]})
+    assert info.risk is RISKS.get(name, info.risk)
+    assert info.risk is not Risk.RESET or name == "factory_reset"
 
 
 def _turn(target: Target, *, angle_deg: Annotated[float, Meta(ge=-180, le=180)], relative: bool = False) -> str:

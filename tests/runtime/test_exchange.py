@@ -159,6 +159,27 @@ def test_a_rate_without_a_line_is_an_error() -> None:
     asyncio.run(story())
 
 
+def test_a_request_can_follow_a_device_to_another_number() -> None:
+    async def story() -> None:
+        happened: list[object] = []
+        exchange = Exchange(Ledger(), happened.append, monotonic_ns, follow=happened.append)
+        await exchange.run(ask(request("A", silent=True), replace(request("B", silent=True), settings="node 9")))
+        assert happened == [b"A\r\n", "node 9", b"B\r\n"]
+
+    asyncio.run(story())
+
+
+def test_a_number_without_a_bus_is_an_error() -> None:
+    async def story() -> None:
+        written: list[bytes] = []
+        exchange = Exchange(Ledger(), written.append, monotonic_ns)
+        with pytest.raises(CommandError, match="expected a bus"):
+            await exchange.run(ask(replace(request("A"), settings="node 9")))
+        assert written == []
+
+    asyncio.run(story())
+
+
 def test_a_pause_writes_nothing() -> None:
     async def story() -> None:
         written: list[bytes] = []

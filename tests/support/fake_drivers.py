@@ -8,13 +8,14 @@ import struct
 from collections.abc import Generator, Mapping, Sequence
 from typing import Annotated, Final
 
+import msgspec
 from msgspec import Meta
 
-from imud.contracts.action import Action
+from imud.contracts.action import Action, Target
 from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec, TextLine
 from imud.contracts.driver import SAMPLE_COUNTER, Identity, StreamDriver
-from imud.contracts.session import Outcome, Request, of_text, says_nothing
+from imud.contracts.session import Outcome, Request, RequestScript, never, of_text, says_nothing
 from imud.contracts.settings import NoSettings, Settings
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.ledger import Ledger
@@ -179,6 +180,11 @@ def _cyclic(settings: FakeCanSettings) -> Sequence[CyclicFrame]:
     return [CyclicFrame(SYNC_ID, False, b"", settings.sync_ms * 1_000_000)] if settings.sync_ms else []
 
 
+def _renumber(target: Target, *, node: int) -> RequestScript[None]:
+    settings = msgspec.structs.replace(target.settings, node=node)
+    yield Request(bytes([node]), "renumber", never, never, never, silent=True, settings=settings)
+
+
 def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
     """A row; another `base` makes it see devices that its codec does not understand."""
     return CanDriver(
@@ -202,7 +208,10 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
         sample_frames=1,
         example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)],
         cyclic=_cyclic,
-        actions={"node": Action("its number", lambda target: says_nothing(target.settings.node))},
+        actions={
+            "node": Action("its number", lambda target: says_nothing(target.settings.node)),
+            "renumber": Action("give it another number", _renumber),
+        },
     )
 
 

@@ -38,7 +38,7 @@ class CanTransport:
         self._now_ns = context.host.now_ns
         self._buses = buses
         self._remembered = remembered
-        self._exchange = Exchange(context.ledger, link.write, self._now_ns)
+        self._exchange = Exchange(context.ledger, link.write, self._now_ns, follow=self._follow)
         self._search = SearchLoop(context.health, context.attachments, context.host, self._begin_search, self._ask)
         self._round: CanRound | None = None
         """The search that frames go to; None while they go to the path."""
@@ -184,8 +184,19 @@ class CanTransport:
         if self.driver is not None and self._codec is not None:
             self.driver.apply_identity(self._codec, identity)
 
+    def _follow(self, options: Settings) -> None:
+        """Follow a script that has given the device another number: filters, codec, and what other devices know."""
+        driver = self.driver
+        if driver is None or options == self._options:
+            return
+        self._leave()
+        self._set_up(driver, options)
+        self._join()
+        self._node = None  # the next search tells it
+        self._begin()
+
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        """Run a request script on the device that was found, with its own node number."""
+        """Run a request script on the device with its own node number; one that changes the number is followed."""
         return await self._exchange.run(make(Target(self._options, self.bit_rate)))
 
     # --- the flow ----------------------------------------------------------------------------------------------------

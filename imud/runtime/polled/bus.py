@@ -35,6 +35,10 @@ OnReadings = Callable[[Sequence[Reading], LinkError | None], None]
 Callback = Callable[[], None]
 
 
+def ignore_target(_target: int) -> None:
+    """Ignore the target of a script: the version for scripts that move no device."""
+
+
 class BusMember:
     """A device on a bus, for its owner. Synchronization: the loop's thread only."""
 
@@ -48,12 +52,19 @@ class BusMember:
         self._polling = _Polling(link, deadlines, bus.now_ns, self._deliver)
         bus.command(lambda: bus.add(self._polling))
 
-    async def run(self, script: TransferScript[T], target: int) -> T:
-        """Run a transfer script with one target. Raises what it raises, TransferError and LinkError."""
+    async def run(self, script: TransferScript[T], target: int, on_target: Callable[[int], None] = ignore_target) -> T:
+        """Run a transfer script with one target. Raises what it raises, TransferError and LinkError.
+
+        `on_target` gets the target with which the script has ended, by an error as well.
+        """
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
         running = _ScriptRun(script, target, future)
         self.command(lambda: self._polling.scripts.append(running))
-        return await future
+        try:
+            return await future
+        finally:
+            if future.done() and not future.cancelled():
+                on_target(running.target)
 
     def claim(self, target: int) -> bool:
         """Claim a target of a shared bus for this device; return False if it is another's."""
@@ -176,8 +187,7 @@ class _ScriptRun:
         """Make one transfer. At the end of the script return what settles it in the loop's thread."""
         try:
             wanted = self.script.throw(self.error) if self.error else self.script.send(self.send)  # type: ignore[arg-type]  # None begins a generator
-            link.select(self.target)
-            self.error, self.send = None, link.transfer(wanted)
+            self.error, self.send = None, self._transfer(link, wanted)
         except StopIteration as end:
             return _settle(self.future, end.value, None)
         except TransferError as error:
@@ -187,6 +197,16 @@ class _ScriptRun:
         except ImudError as error:
             return _settle(self.future, None, error)
         return None
+
+    def _transfer(self, link: PolledLink, wanted: Transfer) -> bytes:
+        link.select(self.target if wanted.at is None else wanted.at)
+        try:
+            return link.transfer(wanted)
+        finally:
+            if wanted.then_at is not None:
+                self.target = wanted.then_at
+            if wanted.at is not None or wanted.then_at is not None:
+                link.select(self.target)  # reads have their turn between two transfers of a script
 
 
 def _settle(future: asyncio.Future[Any], value: object, error: Exception | None) -> Callback:

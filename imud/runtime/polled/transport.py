@@ -9,7 +9,7 @@ Readings are decoded only between an identification and the first sign that the 
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -23,6 +23,7 @@ from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
 from imud.devices import DRIVERS
 from imud.errors import CommandError, DeviceRefused, LinkError, TransferError, Trouble
+from imud.event import EventKind
 from imud.links import LINKS
 from imud.runtime.path import SamplePath
 from imud.runtime.polled.bus import BusMember, PolledBuses
@@ -192,19 +193,31 @@ class PolledTransport:
         return [driver for driver in drivers if LINKS[self._config.link].fits(driver)]
 
     def _targets(self, driver: PolledDriver) -> Sequence[int]:
-        """Return where to look, beginning where the device was."""
-        if self.link.target is not None:
-            return (self.link.target,)
+        """Return where to look, beginning where the device was: a script may have moved it from the given place."""
+        given = driver.targets if self.link.target is None else (self.link.target,)
         last = (self._device.target,) if self._device is not None else ()
-        return tuple(dict.fromkeys((*last, *driver.targets)))
+        return tuple(dict.fromkeys((*last, *given)))
 
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        """Run a transfer script between two reads."""
+        """Run a transfer script between two reads; one that changes the device's address is followed."""
         member, device = self._member, self._device
         if member is None or device is None:
             raise CommandError(f"{self._config.name} is not there")
         options = self._config.options or device.driver.settings()
-        return await member.run(make(Target(options, self.bit_rate)), device.target)
+        return await member.run(make(Target(options, self.bit_rate)), device.target, self._follow)
+
+    def _follow(self, target: int) -> None:
+        """Follow a script that has given the device another address."""
+        member, device = self._member, self._device
+        if member is None or device is None or target == device.target:
+            return
+        self._device = replace(device, target=target)
+        member.release()
+        if not member.claim(target):
+            place = self.link.place(target)
+            message = f"the device has {place} now, which another device of this configuration has"
+            self._context.notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message)
+            self._identify_again(message)
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 

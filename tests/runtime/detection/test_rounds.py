@@ -112,6 +112,27 @@ def test_commands_go_to_the_device_that_was_found() -> None:
     bus.play(story)
 
 
+@pytest.mark.parametrize("driver", ["auto", "fake-can"])
+def test_a_device_that_is_given_another_number_is_followed(driver: str) -> None:
+    bus = Bus()
+    bench = bus.add(driver=driver, options=FakeCanSettings(node=8, sync_ms=10) if driver != "auto" else None)
+    other = bus.add("bow")
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
+        await bench.device.act("renumber", {"node": 9})
+        assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 9]
+        heard = len(bench.samples)
+        await bench.until(lambda: len(bench.samples) > heard, 9)
+        assert await bench.device.act("node", {}) == 9
+        await other.until(lambda: other.samples, 8)  # the former number is free
+        assert [wanted.can_id for wanted in other.link.filters] == [BASE + 8]
+        assert bench.device.state is DeviceState.RUNNING
+        assert [sample.seq for sample in bench.samples] == list(range(1, len(bench.samples) + 1))
+
+    bus.play(story)
+
+
 def test_commands_go_to_the_device_that_is_configured() -> None:
     bus = Bus()
     bench = bus.add(driver="fake-can", options=FakeCanSettings(node=5))

@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from time import monotonic_ns
 from typing import Any
@@ -26,6 +27,9 @@ class Wire:
 
     def __init__(self) -> None:
         self.target: int | None = None
+        self.selected: int | None = None
+        self.targets: list[int | None] = []
+        """The selected target of each transfer."""
         self.count = 0
         self.fail: Exception | None = None
         self.closed = 0
@@ -35,7 +39,9 @@ class Wire:
     async def wait_present(self) -> None: ...
     def open(self) -> None: ...
     def write(self, data: bytes) -> None: ...
-    def select(self, target: int) -> None: ...
+
+    def select(self, target: int) -> None:
+        self.selected = target
 
     def kernel_counters(self) -> KernelCounters:
         return KernelCounters()
@@ -48,6 +54,7 @@ class Wire:
     def transfer(self, transfer: Transfer) -> bytes:
         self.threads.add(threading.current_thread().name)
         self.count += 1
+        self.targets.append(self.selected)
         self.takes_time()
         if self.fail is not None:
             raise self.fail
@@ -109,6 +116,30 @@ def run(body: Any) -> None:
         assert [thread for thread in threading.enumerate() if thread.name == "wire"] == []
 
     asyncio.run(whole())
+
+
+def moving() -> TransferScript[None]:
+    yield replace(ASK, at=7)
+    yield replace(ASK, then_at=9)
+    yield ASK
+    raise DeviceRefused("no")
+
+
+def test_a_script_takes_its_device_to_another_target_and_looks_at_others() -> None:
+    async def body(buses: PolledBuses) -> None:
+        wire, ended_at = Wire(), list[int]()
+        member = joined(buses, wire, Sink())
+        with pytest.raises(DeviceRefused):
+            await member.run(moving(), 5, ended_at.append)
+        assert (wire.targets, wire.selected, ended_at) == ([7, 5, 9], 9, [9])
+        await member.run(three(), 5, ended_at.append)
+        assert ended_at == [9, 5]
+        wire.fail = TransferError(Trouble.ABSENT, "no")
+        with pytest.raises(TransferError):
+            await member.run(moving(), 5)
+        assert (wire.targets[-1], wire.selected) == (7, 5)  # what is read next goes to the device
+
+    run(body)
 
 
 def test_scripts_return_raise_and_catch() -> None:

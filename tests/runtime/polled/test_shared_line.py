@@ -2,6 +2,8 @@
 
 import asyncio
 from collections.abc import Coroutine
+from contextlib import suppress
+from dataclasses import replace
 from math import dist
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,12 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
+from imud.contracts.action import Action, Target
+from imud.contracts.polling import TransferScript
 from imud.contracts.status import DeviceState
+from imud.devices.hipnuc.modbus import driver, session
+from imud.devices.hipnuc.modbus.registers import BY_NAME
+from imud.errors import TransferError
 from imud.event import EventKind
 from imud.units import NS_PER_MS
 from tests.support.device_rig import device_config, running
@@ -118,6 +125,37 @@ def test_module_is_told_something_while_it_is_read(tmp_path: Path) -> None:
                 assert (module.settings.heading_mode, other.settings.heading_mode) == (1, 0)
                 await rigs[0].until_samples(5)
                 assert rigs[0].kinds.count(EventKind.DOWN) == 0
+
+    run(body())
+
+
+def test_module_that_is_given_another_address_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def moving(_target: Target, *, address: int) -> TransferScript[None]:
+        with suppress(TransferError):
+            yield replace(next(session.set_id(address)), then_at=address)
+        yield next(session.read(BY_NAME["MD_ID"]))
+
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, actions={"move": Action("move it", moving)}))
+
+    async def body() -> None:
+        module, other = slave(1), slave(3)
+        with wired(tmp_path, module, other) as (path, _):
+            async with running(on(path, 1), on(path, 3)) as rigs:
+                for rig in rigs:
+                    await rig.until_samples(5)
+                await rigs[0].device.act("move", {"address": 2})
+                assert module.settings.slave == 2
+                assert rigs[0].device.status().link == f"{path}, address 2"
+                await rigs[0].until_samples(5)
+                assert EventKind.DOWN not in rigs[0].kinds
+                module.dead = True  # and found again at the new address, although the configuration has the old one
+                await rigs[0].until(lambda: rigs[0].state is DeviceState.SEARCHING, "given up")
+                module.dead = False
+                await rigs[0].until_samples(5)
+                module.serial = serial_of(9)
+                other.dead = True
+                await rigs[0].device.act("move", {"address": 3})
+                assert "another device of this configuration has" in rigs[0].events[-1].message
 
     run(body())
 

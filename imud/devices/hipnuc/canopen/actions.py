@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.contracts.action import Action, Actions, Target
+from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.session import RequestScript
 from imud.devices.hipnuc.canopen import session
 from imud.devices.hipnuc.canopen.cia301 import NODE_MAX, NmtCommand, TpdoNumber
@@ -21,9 +21,9 @@ _ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL
 _TRANSMISSIONS: Final = {"timer": Transmission.TIMER, "sync": Transmission.SYNC}
 
 
-def _simple(words: str, begin: Callable[[int], RequestScript[None]]) -> Action:
+def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk = Risk.NONE) -> Action:
     """An action without arguments."""
-    return Action(words, lambda target: begin(target.settings.node))
+    return Action(words, lambda target: begin(target.settings.node), risk)
 
 
 def _interval(
@@ -107,6 +107,7 @@ ACTIONS: Final[Actions] = {
         "factory settings, node 8 and 500 kbit/s included, after the next power-on: imud then hears it only where bus "
         "and `options.node` are set to that",
         session.factory_reset,
+        Risk.RESET,
     ),
     "interval": Action("how often a TPDO is sent by its timer; at once", _interval),
     "transmission": Action("send a TPDO by its timer, or when SYNC comes; at once", _transmission),
@@ -114,11 +115,13 @@ ACTIONS: Final[Actions] = {
         "set the bit rate, in force after `save` and `restart`: the node is off the bus then, and disturbs it, until "
         "interface and all other nodes have the same",
         _bitrate,
+        Risk.CONNECTION,
     ),
     "node": Action(
         "set its number, in force after `save` and `restart`: imud then hears nothing of it until `options.node` says "
         "the new one; with `driver: auto` it looks again after 15 s",
         _node,
+        Risk.CONNECTION,
     ),
     "zero": Action("make the present position the inclinometer's zero, or cancel that; at once", _zero),
     "direction": Action("turn the signs of the inclinometer, or leave them as delivered; at once", _direction),

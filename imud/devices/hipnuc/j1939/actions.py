@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.contracts.action import Action, Actions, Target
+from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.session import RequestScript
 from imud.devices.hipnuc.j1939 import session
 from imud.devices.hipnuc.j1939.messages import PgnName
@@ -25,9 +25,9 @@ from imud.devices.hipnuc.j1939.session import (
 Pgn = Annotated[PgnName, Meta(description="the last four digits of its number", extra={"section": "6.1"})]
 
 
-def _simple(words: str, begin: Callable[[J1939Node], RequestScript[None]]) -> Action:
+def _simple(words: str, begin: Callable[[J1939Node], RequestScript[None]], risk: Risk = Risk.NONE) -> Action:
     """An action without arguments."""
-    return Action(words, lambda target: begin(target.settings.peer))
+    return Action(words, lambda target: begin(target.settings.peer), risk)
 
 
 def _interval(
@@ -86,6 +86,7 @@ ACTIONS: Final[Actions] = {
         "factory settings, address 8 and its bit rate included: imud then hears it only where bus and "
         "`options.address` are set to that",
         session.factory_reset,
+        Risk.RESET,
     ),
     "interval": Action("how often a message is sent", _interval),
     "send_once": Action("send a message once, now", _send_once),
@@ -93,11 +94,13 @@ ACTIONS: Final[Actions] = {
         "set the bit rate, in force after `save` and `restart`: the module is off the bus then, and disturbs it, until "
         "interface and all others have the same",
         _bitrate,
+        Risk.CONNECTION,
     ),
     "address": Action(
         "set its address, in force after `save` and `restart`: imud then hears nothing of it until `options.address` "
         "says the new one; with `driver: auto` it looks again after 15 s",
         _address,
+        Risk.CONNECTION,
     ),
     "zero": Action("make the present position zero, or cancel that", _zero),
     "direction": Action("turn the sign of an angle", _direction),

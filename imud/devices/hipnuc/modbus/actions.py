@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.contracts.action import Action, Actions, Target
+from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.polling import TransferScript
 from imud.devices.hipnuc.modbus import session
 from imud.devices.hipnuc.modbus.registers import BY_NAME, ID_MAX, Access, BaudRate
@@ -18,9 +18,9 @@ from imud.devices.hipnuc.uart.commands import AttitudeMode, LevelReset
 from imud.errors import BadArgument
 
 
-def _simple(words: str, begin: Callable[[], TransferScript[None]]) -> Action:
+def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = Risk.NONE) -> Action:
     """An action without arguments."""
-    return Action(words, lambda _target: begin())
+    return Action(words, lambda _target: begin(), risk)
 
 
 def _address(
@@ -78,16 +78,19 @@ ACTIONS: Final[Actions] = {
     "factory_reset": _simple(
         "factory settings, address 80 and 115200 baud included: imud then hears it only where the line is set to that",
         session.factory_reset,
+        Risk.RESET,
     ),
     "address": Action(
         "set its address, in force at once and not saved: imud then looks for it, and finds it only with "
         "`address: auto`",
         _address,
+        Risk.CONNECTION,
     ),
     "baud": Action(
         "set the baud rate, in force after `save` and `restart`: imud then hears nothing of it until the line and all "
         "other modules have the same",
         _baud,
+        Risk.CONNECTION,
     ),
     "attitude_mode": Action("six axes, or nine with the magnetometer", _attitude_mode),
     "level": Action("make the present attitude level, or cancel that; the module must be at rest", _level),

@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.contracts.action import Action, Actions, Target
+from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.driver import Identity
 from imud.contracts.session import Request, RequestScript
 from imud.devices.hipnuc.uart import commands, session
@@ -45,9 +45,9 @@ _MOUNTINGS: Final = {
 }
 
 
-def _simple(words: str, make: Callable[[], Request]) -> Action:
+def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Action:
     """An action without arguments that is one command."""
-    return Action(words, lambda _target: send(make()))
+    return Action(words, lambda _target: send(make()), risk)
 
 
 def _restart(_target: Target) -> RequestScript[Identity]:
@@ -154,9 +154,9 @@ ACTIONS: Final[Actions] = {
     "save": _simple("write all settings to flash", commands.save_config),
     "restart": Action("restart it and wait until it answers; what was not saved is lost", _restart),
     "factory_reset": _simple(
-        "factory settings, the baud rate included, which `baud: auto` finds", commands.factory_reset
+        "factory settings, the baud rate included, which `baud: auto` finds", commands.factory_reset, Risk.RESET
     ),
-    "baud": Action("set the baud rate, save, restart and follow", _baud),
+    "baud": Action("set the baud rate, save, restart and follow", _baud, Risk.CONNECTION),
     "output": Action("send a message by itself at a rate, or not at all (0)", _output),
     "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
     "output_once": Action("send a message once, as a pulse on SIN would", _output_once),

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from imud.contracts.action import Action, Actions, Target
+from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.session import RequestScript
 from imud.devices.imu61x.common.family import FilterCode, I2cAddress, filter_control
 from imud.devices.imu61x.uart import session
@@ -72,8 +72,8 @@ ACTIONS: Final[Actions] = {
     "restart": Action(
         "restart it and wait until it answers; what was not saved is lost", lambda _target: session.restart()
     ),
-    "factory_reset": Action("factory settings, and follow it to their baud rate", _factory_reset),
-    "baud": Action("set and save the baud rate and follow", _baud),
+    "factory_reset": Action("factory settings, and follow it to their baud rate", _factory_reset, Risk.RESET),
+    "baud": Action("set and save the baud rate and follow", _baud, Risk.CONNECTION),
     "rate": Action("set the output rate", _rate),
     "filter": Action("set the low-pass filters", _filter),
     "i2c_address": Action("set the I2C address", _i2c_address),
