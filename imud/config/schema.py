@@ -3,12 +3,13 @@
 A new row of a table (DRIVERS, LINKS, PUBLISHERS) is configurable without a change here.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, Protocol
 
 import msgspec
 
+from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
 from imud.links import LINKS
@@ -52,6 +53,10 @@ class DriverRow(Row, Protocol):
         """GPIO lines that such a device can have."""
         ...
 
+    def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
+        """Return what does not work in the driver's options together with a link's settings."""
+        ...
+
 
 class LinkRow(Row, Protocol):
     """Row of a link, as far as the configuration needs it."""
@@ -59,6 +64,11 @@ class LinkRow(Row, Protocol):
     @property
     def searchable(self) -> bool:
         """Whether `driver: auto` can identify the device on it."""
+        ...
+
+    @property
+    def bus_of(self) -> Callable[[Any], str]:
+        """Returns the name of the bus that settings of the link name, which devices share; empty without one."""
         ...
 
     def fits(self, driver: Any) -> bool:

@@ -1,9 +1,9 @@
 """Contract of a driver, the description of one wire protocol for the rest of imud."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from random import Random
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from imud.contracts.action import Actions
 from imud.contracts.codec import StreamCodec
@@ -27,6 +27,22 @@ class Identity:
     firmware: str = ""
     details: Mapping[str, str] | None = None
     """Further properties, by the device's own names."""
+
+
+class KeyProblem(NamedTuple):
+    """A value in the configuration with which a driver cannot work."""
+
+    part: str
+    """`link` or `options`."""
+    key: str
+    """The key in that part."""
+    message: str
+    """What is expected, what came, and figures where they decide."""
+
+
+def no_problems(_options: Any, _link: Any) -> Sequence[KeyProblem]:
+    """Find no problem: the version for drivers without rules of their own."""
+    return ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +73,15 @@ class Driver:
     """Reads the meaning of the ALARM line from the device's settings; None if they have none."""
     time_bits: TimeBits = NO_TIME_BITS
     """Bits of `Measurement.status` about time."""
+    check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
+    """Finds what does not work in an instance of `settings` and in the settings of a link, each good by itself."""
+
+    def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
+        """Return what `imud check` reports of `options`, an instance of `settings`, together with a link's settings.
+
+        Links are known by the names of their keys: what a link does not have is not checked.
+        """
+        return self.check(options, link)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +103,15 @@ class StreamDriver(Driver):
     Raises NoReply where nothing answers. None for devices that cannot be silent."""
     example_frame: Callable[[Random], bytes]
     """Make one valid frame with random values, for the shared property tests and for fault injection."""
+
+    def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
+        """Return the driver's own problems, and a bit rate that such a device does not have."""
+        baud = getattr(link, "baud", 0)
+        found = list(self.check(options, link))
+        if isinstance(baud, int) and baud and baud not in self.baud_rates:
+            rates = ", ".join(map(str, sorted(self.baud_rates)))
+            found.append(KeyProblem("link", "baud", f"expected a rate of {self.name} ({rates}) or auto, got {baud}"))
+        return found
 
 
 D = TypeVar("D", bound=Driver)

@@ -135,6 +135,10 @@ class PolledLink(Link, Protocol):
         ...
 
 
+def _no_bus(_settings: Settings) -> str:
+    return ""
+
+
 def _no_bytes(_settings: Settings) -> StreamLink:
     raise LinkError("expected a link of bytes, got one without")
 
@@ -160,6 +164,8 @@ class LinkType(Generic[S]):
     """Makes a closed link to a CAN bus from its settings."""
     make_polled: Callable[[S], PolledLink] = _no_transfers
     """Makes a closed link to a polled bus from its settings."""
+    bus_of: Callable[[S], str] = _no_bus
+    """Returns the name of the bus that its settings name, which devices share; empty for links without one."""
 
     @property
     def polled(self) -> bool:

@@ -114,6 +114,9 @@ class PolledDriver(Driver):
     """Longest time between two updates of the device's registers, from the settings; 0 for not known."""
     example_reading: Callable[[Random], bytes]
     """Bytes of the first poll with random values, for the shared property tests and for fault injection."""
+    read_ns: Callable[[Any, Any], int] = lambda _options, _link: 0
+    """Shortest time that one read of the samples takes on the bus, ns, from instances of `settings` and of the link's
+    settings; 0 for not known. The sum over the devices of a bus decides whether it carries their rates."""
 
 
 def run_transfer_script(script: TransferScript[T], transfer: Callable[[Transfer], bytes]) -> T:

@@ -37,6 +37,11 @@ class I2cSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Rate of reads, per second."""
 
 
+def bus_of(settings: I2cSettings) -> str:
+    """Return the path of the bus."""
+    return f"/dev/i2c-{settings.bus}"
+
+
 class I2cBus(Protocol):
     """The part of smbus2.SMBus that the link uses."""
 
@@ -78,11 +83,11 @@ class I2cLink:
         ioctl: Callable[[int, int, int], object] = fcntl.ioctl,
     ) -> None:
         self._open_bus, self._ioctl = open_bus, ioctl
-        self._node = DeviceNode(f"/dev/i2c-{settings.bus}")
+        self._node = DeviceNode(bus_of(settings))
         self._bus: I2cBus | None = None
         self._address = 0
         self._place = ""
-        self.title = f"/dev/i2c-{settings.bus}"
+        self.title = bus_of(settings)
         self.writable = True
         self.bus = self.title
         self.target: int | None = None if settings.address == "auto" else settings.address
@@ -164,4 +169,4 @@ class I2cLink:
         return b""
 
 
-LINK = LinkType("i2c", I2cSettings, make_polled=I2cLink)
+LINK = LinkType("i2c", I2cSettings, make_polled=I2cLink, bus_of=bus_of)

@@ -52,6 +52,11 @@ class SpiSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Rate of reads, per second."""
 
 
+def bus_of(settings: SpiSettings) -> str:
+    """Return the path of the bus, without the chip select."""
+    return settings.port.partition(".")[0]
+
+
 class SpiLink:
     """A `PolledLink` on spidev. `ioctl` and `open_node` are the kernel's, or a test's."""
 
@@ -72,7 +77,7 @@ class SpiLink:
         self._place = ""
         self.title = settings.port
         self.writable = True
-        self.bus = settings.port.partition(".")[0]
+        self.bus = bus_of(settings)
         self.target: int | None = None if settings.mode == "auto" else settings.mode
         self.shared = False
         self.rate_hz = settings.rate_hz
@@ -195,4 +200,4 @@ def _byteswapped(data: bytes) -> bytes:
     return words.tobytes()
 
 
-LINK = LinkType("spi", SpiSettings, make_polled=SpiLink)
+LINK = LinkType("spi", SpiSettings, make_polled=SpiLink, bus_of=bus_of)

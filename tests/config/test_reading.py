@@ -4,7 +4,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +18,7 @@ from msgspec import Meta
 from imud import config
 from imud.config import DEVICES_MAX, PROBLEMS_SHOWN, TABLES, Config, DeviceConfig, Tables
 from imud.config.yaml_tree import EVENTS_PER_TURN
+from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import NoSettings, Settings, expected, got
 from imud.devices import DRIVERS
 from imud.errors import ConfigError
@@ -63,6 +64,14 @@ class FakeRow:
     lines: frozenset[str] = frozenset()
     refuses: type[Settings] | None = None
     """Settings of a driver that does not fit this link."""
+    faults: tuple[KeyProblem, ...] = ()
+    """Problems that a driver has with everything."""
+
+    def bus_of(self, settings: Settings) -> str:
+        return ""
+
+    def problems(self, options: Settings, link: Settings) -> Sequence[KeyProblem]:
+        return self.faults
 
     def fits(self, driver: "FakeRow") -> bool:
         return driver.settings is not self.refuses
@@ -398,6 +407,76 @@ def test_driver_and_link_must_go_together(device: str, message: str) -> None:
     with pytest.raises(ConfigError) as refused:
         config.parse(f"devices:\n  a: {device}\n", "x.yaml")
     assert message in str(refused.value)
+
+
+def problems_of(*devices: str) -> str:
+    """What `check` says of devices named a, b, …."""
+    text = "devices:\n" + "".join(f"  {name}: {device}\n" for name, device in zip("abc", devices, strict=False))
+    with pytest.raises(ConfigError) as refused:
+        config.parse(text, "x.yaml")
+    return str(refused.value)
+
+
+@pytest.mark.parametrize("part", ["link", "options"])
+def test_what_a_driver_says_of_options_and_link_stands_at_their_keys(part: str) -> None:
+    row = FakeRow(DriverSettings, faults=(KeyProblem(part, "range_g" if part == "options" else "baud", "too much"),))
+    tables = Tables({"acme-uart": row}, FAKE.links, FAKE.publishers)
+    text = "devices:\n  a:\n    driver: acme-uart\n    options: {range_g: 4}\n    port: {port: x, baud: 9600}\n"
+    (line,) = errors(text, tables)
+    assert (
+        line
+        == {
+            "link": "f.yaml:5:27: devices.a.port.baud: too much",
+            "options": "f.yaml:4:24: devices.a.options.range_g: too much",
+        }[part]
+    )
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("{driver: imu61x-uart, uart: {port: x, baud: 9600}}", "a.uart.baud: expected a rate of imu61x-uart (115200, 230400, 460800, 921600, 1500000) or auto, got 9600"),
+        ("{driver: hipnuc-uart, uart: {port: x, baud: 57600}}", "a.uart.baud: expected a rate of hipnuc-uart (9600, "),
+        ("{driver: imu61x-i2c, i2c: {address: 0x20}}", "a.i2c.address: expected an address of an IMU61x (0x18, 0x19, 0x1a, 0x1b) or auto, got 0x20"),
+    ],
+)  # fmt: skip
+def test_a_rate_or_an_address_that_the_device_does_not_have_is_refused(device: str, message: str) -> None:
+    assert message in problems_of(device)
+
+
+def test_rates_and_addresses_that_the_device_has_are_accepted() -> None:
+    config.parse("devices:\n  a: {driver: imu61x-uart, uart: {port: x, baud: 1500000}}\n", "x.yaml")
+    config.parse("devices:\n  a: {driver: imu61x-i2c, i2c: {address: 0x1B}}\n", "x.yaml")
+
+
+# I2C at 400 kHz: address, register, address, 32 bytes, nine bits each, and start, start, stop: 318 bits = 795 µs
+# SPI, standard burst: 16 words at 1 MHz = 256 µs; extended: 26 words at 200 kHz = 2080 µs
+@pytest.mark.parametrize(
+    ("devices", "message"),
+    [
+        (["{driver: imu61x-i2c, i2c: {rate_hz: 1300}}"],
+         "devices.a.i2c.rate_hz: expected at most 1257, got 1300: a read takes 795 µs of /dev/i2c-1 or more"),
+        (["{driver: imu61x-i2c, i2c: {address: 0x18, rate_hz: 1000}}", "{driver: imu61x-i2c, i2c: {address: 0x19, rate_hz: 300}}"],
+         "devices.b.i2c.rate_hz: expected at most 257, got 300: a read takes 795 µs of /dev/i2c-1 or more and 80% of it is taken by other devices"),
+        (["{driver: imu61x-spi, options: {burst: extended}, spi: {port: /dev/spidev0.0, speed_hz: 200000, rate_hz: 500}}"],
+         "devices.a.spi.rate_hz: expected at most 480, got 500: a read takes 2080 µs of /dev/spidev0 or more"),
+        (["{driver: imu61x-spi, options: {burst: registers}, spi: {port: /dev/spidev0.0, rate_hz: 3000}}"],
+         "devices.a.spi.rate_hz: expected at most 2403, got 3000: a read takes 416 µs"),
+    ],
+)  # fmt: skip
+def test_rates_that_a_bus_cannot_carry_are_refused_with_figures(devices: list[str], message: str) -> None:
+    assert message in problems_of(*devices)
+
+
+def test_rates_that_a_bus_carries_are_accepted() -> None:
+    for devices in (
+        ["{driver: imu61x-i2c, i2c: {rate_hz: 1200}}", "{driver: imu61x-i2c, i2c: {bus: 2, rate_hz: 1200}}"],
+        [
+            "{driver: imu61x-spi, spi: {port: /dev/spidev0.0, rate_hz: 3900}}",
+            "{driver: imu61x-spi, spi: {port: /dev/spidev1.0, rate_hz: 3900}}",
+        ],
+    ):
+        config.parse("devices:\n" + "".join(f"  {n}: {d}\n" for n, d in zip("ab", devices, strict=True)), "x.yaml")
 
 
 def test_a_link_on_which_nothing_is_searched_needs_a_driver() -> None:

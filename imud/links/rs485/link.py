@@ -118,4 +118,4 @@ class Rs485Link:
             self._ports.release(line)
 
 
-LINK = LinkType("rs485", Rs485Settings, make_polled=Rs485Link)
+LINK = LinkType("rs485", Rs485Settings, make_polled=Rs485Link, bus_of=lambda settings: settings.line)

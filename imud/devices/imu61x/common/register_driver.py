@@ -3,7 +3,7 @@
 Of what can be changed over these buses only the low-pass filters concern the user; all else is set over the UART.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from typing import Annotated, Any, Final, TypeVar
 
@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from imud.contracts.action import Action, Target
-from imud.contracts.driver import Identity
+from imud.contracts.driver import Identity, KeyProblem
 from imud.contracts.polling import PolledCodec, PolledDriver, TransferScript
 from imud.contracts.settings import Settings
 from imud.devices.imu61x.common.family import (
@@ -118,8 +118,19 @@ def register_driver(
     set_up: SetUp[S],
     make_codec: Callable[[Ledger, Any], PolledCodec],
     example_reading: Callable[[Random], bytes],
+    read_ns: Callable[[Any, Any], int],
 ) -> PolledDriver:
     """The row of the driver on `bus` (`i2c` or `spi`)."""
+
+    def check(_options: S, link: Any) -> Sequence[KeyProblem]:
+        address = getattr(link, "address", "auto")
+        if address == "auto" or address in targets:
+            return ()
+        known = ", ".join(f"{target:#04x}" for target in targets)
+        return (
+            KeyProblem("link", "address", f"expected an address of an IMU61x ({known}) or auto, got {address:#04x}"),
+        )
+
     return PolledDriver(
         name=f"imu61x-{bus}",
         title=f"Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B ({bus.upper()})",
@@ -134,6 +145,8 @@ def register_driver(
         make_codec=make_codec,
         update_ns=_update_ns,
         example_reading=example_reading,
+        read_ns=read_ns,
+        check=check,
         actions={"filter": _filter_action(set_up)},
     )
 
