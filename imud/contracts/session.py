@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from imud.contracts.codec import Message, ReplyFrame
 from imud.errors import CommandError
 from imud.ledger import Ledger
+from imud.sample import Measurement
 from imud.units import NS_PER_S
 
 T = TypeVar("T")
@@ -49,6 +50,10 @@ class Request:
     undo: bytes = b""
     """Bytes to send if the script is cancelled at this request while the link is open: a closed generator cannot send.
     No reply is awaited."""
+    is_sample: Callable[[Measurement], bool] | None = None
+    """Whether this measurement ends a positive reply (`Reply.sample`); None: no measurement does. It is published too.
+
+    For links of bytes: on others no measurement is passed on."""
 
 
 def never(_message: Message) -> bool:
@@ -97,6 +102,9 @@ class _Messages:
 @dataclass(frozen=True, slots=True)
 class Reply(_Messages):
     """Positive reply: its messages, the one that ends it last."""
+
+    sample: Measurement | None = None
+    """The measurement that ended it, where the request waited for one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +177,19 @@ class Session:
         if request.is_end(message):
             return self._finish(Reply)
         return None
+
+    @property
+    def wants_samples(self) -> bool:
+        """Whether the outstanding request waits for a measurement."""
+        return self._request is not None and self._request.is_sample is not None
+
+    def on_sample(self, sample: Measurement) -> Reply | None:
+        """Process one measurement; return the outcome when it ends the outstanding request."""
+        request = self._request
+        if request is None or request.is_sample is None or not request.is_sample(sample):
+            return None
+        self._request = self.deadline_ns = None
+        return Reply(tuple(self._messages), sample)
 
     def on_time(self, now_ns: int) -> Silence | None:
         """Return `Silence` when the deadline has passed."""

@@ -9,6 +9,7 @@ from imud.contracts.codec import Message
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
 from imud.errors import CommandError, LinkError
 from imud.ledger import Ledger
+from imud.sample import Measurement
 from imud.units import NS_PER_S
 
 T = TypeVar("T")
@@ -66,6 +67,15 @@ class Exchange:
     def on_message(self, message: Message, t_rx_ns: int) -> None:
         """Pass on one line of text or one reply frame from the codec."""
         self._settle(self._session.on_message(message, t_rx_ns))
+
+    @property
+    def wants_samples(self) -> bool:
+        """Whether a request waits for a measurement."""
+        return self._session.wants_samples
+
+    def on_sample(self, sample: Measurement) -> None:
+        """Pass on one measurement from the codec."""
+        self._settle(self._session.on_sample(sample))
 
     async def _ask(self, request: Request) -> Outcome:
         if request.baud:

@@ -7,6 +7,7 @@ Synchronization: the event loop's thread only.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from imud.clock import SampleClock
 from imud.config import DeviceConfig
@@ -129,6 +130,19 @@ class SamplePath(ABC):
             add(now_ns - sample.t_ns)
 
 
+class SampleListener(Protocol):
+    """Listener to measurements as a codec makes them, before they are samples: a command waits for one."""
+
+    @property
+    def wants_samples(self) -> bool:
+        """Whether it listens now."""
+        ...
+
+    def on_sample(self, sample: Measurement) -> None:
+        """Process one measurement."""
+        ...
+
+
 class StreamPath(SamplePath):
     """The path of a device that sends bytes."""
 
@@ -138,10 +152,12 @@ class StreamPath(SamplePath):
         clock: SampleClock,
         context: PathContext,
         drain_edges: Callable[[], None] | None = None,
+        listener: SampleListener | None = None,
     ) -> None:
         """`drain_edges` gives the clock the edges of lines that precede the bytes; called before they are decoded."""
         super().__init__(clock, context)
         self.codec = codec
+        self._listener = listener
         self._drain_edges = drain_edges
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
@@ -152,6 +168,13 @@ class StreamPath(SamplePath):
         events = self.codec.feed(data)
         if events:
             self.publish_events(events, t_rx_ns)
+            if self._listener is not None and self._listener.wants_samples:
+                self._pass_on(events, self._listener)
+
+    def _pass_on(self, events: Sequence[CodecEvent], listener: SampleListener) -> None:
+        for event in events:
+            if type(event) is Measurement:
+                listener.on_sample(event)
 
     def flush(self, now_ns: int) -> None:
         """Process whole frames that wait inside a longer one that never came."""

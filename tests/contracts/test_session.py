@@ -1,5 +1,7 @@
 """Request and reply: replies, refusals, silence, late replies, and text that answers nothing."""
 
+from dataclasses import replace
+
 import pytest
 
 from imud.contracts.codec import ReplyFrame
@@ -17,6 +19,7 @@ from imud.contracts.session import (
 )
 from imud.errors import CommandError
 from imud.ledger import Ledger
+from imud.sample import Measurement
 
 TIMEOUT_NS = 100
 
@@ -237,3 +240,42 @@ def test_a_pause_sends_nothing_and_late_replies_stay_late(session: Session, ledg
     assert session.on_time(TIMEOUT_NS + 50) == Silence(())
     session.on_message("OK", TIMEOUT_NS + 60)
     assert strays(ledger) == (1, 0)
+
+
+# --- measurements -----------------------------------------------------------------------------------------------------
+
+
+def measured(tick: int) -> Measurement:
+    return Measurement(54, 0, tick)
+
+
+def waiting(ledger: Ledger, tick: int) -> Session:
+    """A session whose request waits for the measurement at `tick`."""
+    session = Session(ledger)
+    session.start(replace(command("once"), is_sample=lambda sample: sample.dev_ticks == tick), 0)
+    return session
+
+
+def test_a_measurement_ends_a_request_that_waits_for_it(ledger: Ledger) -> None:
+    session = waiting(ledger, 7)
+    assert session.wants_samples
+    assert session.on_sample(measured(6)) is None
+    assert session.on_sample(measured(7)) == Reply((), measured(7))
+    assert not session.wants_samples
+    assert session.on_sample(measured(7)) is None
+    assert ledger.replies_unsolicited == ledger.replies_late == 0
+
+
+def test_a_request_that_waits_for_a_measurement_can_be_refused_or_stay_without_one(ledger: Ledger) -> None:
+    refused = waiting(ledger, 7).on_message("ERR", 1)
+    assert refused is not None
+    assert refused.lines == ("ERR",)
+    assert waiting(ledger, 7).on_time(TIMEOUT_NS) == Silence(())
+
+
+def test_other_requests_take_no_measurement(ledger: Ledger) -> None:
+    session = Session(ledger)
+    session.start(command("save"), 0)
+    assert not session.wants_samples
+    assert session.on_sample(measured(1)) is None
+    assert session.busy

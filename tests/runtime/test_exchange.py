@@ -13,6 +13,7 @@ from imud.devices import DRIVERS
 from imud.errors import CommandError, LinkMissing, NoReply
 from imud.ledger import Ledger
 from imud.runtime.exchange import Exchange
+from imud.sample import Measurement
 
 
 def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
@@ -242,5 +243,20 @@ def test_a_script_that_comes_to_its_end_is_not_undone() -> None:
         with pytest.raises(NoReply):
             await exchange.run(with_undo(failing(), b"UNDO"))
         assert written == [b"A\r\n"] * 2
+
+    asyncio.run(story())
+
+
+def test_a_script_gets_the_measurement_that_it_waits_for() -> None:
+    async def story() -> None:
+        exchange = Exchange(Ledger(), lambda data: None, monotonic_ns)
+        assert not exchange.wants_samples
+        task = asyncio.create_task(exchange.run(ask(replace(request("A"), is_sample=lambda sample: True))))
+        await asyncio.sleep(0)
+        assert exchange.wants_samples
+        exchange.on_sample(Measurement(54, 0, 3))
+        exchange.on_sample(Measurement(54, 0, 4))
+        assert await task == [Reply((), Measurement(54, 0, 3))]
+        assert not exchange.wants_samples
 
     asyncio.run(story())
