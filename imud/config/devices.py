@@ -6,11 +6,13 @@ from itertools import islice
 from re import compile as pattern
 from typing import Any, Final
 
+from imud.config.claims import clashes
 from imud.config.keys import Keys
 from imud.config.model import DeviceConfig
 from imud.config.schema import DeviceGeneral, Tables
 from imud.config.signals import lines_once, read_lines, read_rmc
 from imud.config.yaml_tree import Path as KeyPath
+from imud.contracts.can import CanDriver
 from imud.contracts.polling import PolledDriver
 from imud.contracts.settings import Settings, got, unknown_name
 from imud.units import NS_PER_S, NS_PER_US
@@ -45,7 +47,8 @@ class DeviceReader:
         devices = [self._device(name, data) for name, data in islice(found.items(), DEVICES_MAX)]
         made = [device for device in devices if device is not None]
         used = [device for device, enabled in made if enabled]
-        self._ports_once(used)
+        for clash in clashes(used, self._tables.links, self._tables.drivers, self._pause):
+            self._keys.problem(*clash)
         self._buses_carry(used)
         lines_once(self._keys, used)
         return made
@@ -72,6 +75,7 @@ class DeviceReader:
         known = general.driver == "auto" or options is not None
         if known and self._driver_fits(path, general.driver, link_name) and options is not None:
             self._go_together(path, general.driver, options, link_name, link_settings)
+        self._usable(path, general.driver, link_name, link_settings)
         line = self._keys.tree.key_mark(path).line
         own_keys = general.driver, options, general.identify, link_name, link_settings
         return DeviceConfig(name, *own_keys, line, lines, rmc), general.enabled
@@ -120,6 +124,14 @@ class DeviceReader:
             part = link if problem.part == "link" else problem.part
             self._keys.problem((*path, part, problem.key), problem.message)
 
+    def _usable(self, path: KeyPath, driver: str, link: str, settings: Settings) -> None:
+        """Refuse settings that the link itself would refuse."""
+        frames = False
+        with suppress(ImportError, KeyError):  # reported elsewhere: the driver cannot be imported, or there is none
+            frames = isinstance(self._tables.drivers[driver], CanDriver)
+        if problem := self._tables.links[link].problem(settings, frames):
+            self._keys.problem((*path, link), problem)
+
     def _fitting(self, pairs: Iterable[tuple[str, str, str]]) -> list[str]:
         """List the names of those (name, driver, link) that fit, as far as their libraries are installed."""
         found = []
@@ -128,17 +140,6 @@ class DeviceReader:
                 if self._tables.links[link].fits(self._tables.drivers[driver]):
                     found.append(name)
         return found
-
-    def _ports_once(self, devices: Sequence[DeviceConfig]) -> None:
-        """Refuse two devices on one port. Links that own a port exclusively call its key `port`."""
-        owners: dict[tuple[str, str], DeviceConfig] = {}
-        for device in devices:
-            port = getattr(device.link_settings, "port", None)
-            if isinstance(port, str):
-                first = owners.setdefault((device.link, port), device)
-                if first is not device:
-                    message = f"expected a port of its own, got {port}, which {first.name} (line {first.line}) has"
-                    self._keys.problem(("devices", device.name, device.link, "port"), message)
 
     def _buses_carry(self, devices: Sequence[DeviceConfig]) -> None:
         """Refuse rates whose reads take more time than a bus has, all of its devices together."""

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final, Literal, Protocol
 
 import msgspec
 
+from imud.contracts.claims import Claim
 from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
@@ -69,6 +70,16 @@ class LinkRow(Row, Protocol):
     @property
     def bus_of(self) -> Callable[[Any], str]:
         """Returns the name of the bus that settings of the link name, which devices share; empty without one."""
+        ...
+
+    @property
+    def claims(self) -> Callable[[Any], Sequence[Claim]]:
+        """What a link with these settings uses."""
+        ...
+
+    @property
+    def problem(self) -> Callable[[Any, bool], str]:
+        """Why these settings cannot be used, as far as that shows without opening a port."""
         ...
 
     def fits(self, driver: Any) -> bool:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from imud.contracts.can import CanDriver
+from imud.contracts.claims import Claim
 from imud.contracts.driver import Driver, StreamDriver
 from imud.contracts.polling import PolledDriver, Transfer
 from imud.contracts.settings import Settings
@@ -151,6 +152,14 @@ def _no_transfers(_settings: Settings) -> PolledLink:
     raise LinkError("expected a link to a bus that is polled, got one that is none")
 
 
+def _claims_nothing(_settings: Settings) -> Sequence[Claim]:
+    return ()
+
+
+def _knows_no_problem(_settings: Settings, _frames: bool) -> str:
+    return ""
+
+
 @dataclass(frozen=True, slots=True)
 class LinkType(Generic[S]):
     """Row of a link. Its factories decide which kinds of drivers can use it."""
@@ -166,6 +175,12 @@ class LinkType(Generic[S]):
     """Makes a closed link to a polled bus from its settings."""
     bus_of: Callable[[S], str] = _no_bus
     """Returns the name of the bus that its settings name, which devices share; empty for links without one."""
+    claims: Callable[[S], Sequence[Claim]] = _claims_nothing
+    """What a link with these settings uses, which no other device may use as well."""
+    problem: Callable[[S, bool], str] = _knows_no_problem
+    """Why `open` would refuse these settings, as far as that shows without opening a port; empty for nothing known.
+
+    The second argument says whether the link is to deliver frames of a CAN bus."""
 
     @property
     def polled(self) -> bool:

@@ -52,6 +52,10 @@ class CanFilter:
         """Whether a frame passes the filter."""
         return extended == self.extended and not (can_id ^ self.can_id) & self.mask
 
+    def overlaps(self, other: "CanFilter") -> bool:
+        """Whether some frame passes both filters."""
+        return self.extended == other.extended and not (self.can_id ^ other.can_id) & self.mask & other.mask
+
 
 @dataclass(frozen=True, slots=True)
 class CyclicFrame:

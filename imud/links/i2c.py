@@ -11,6 +11,7 @@ from typing import Annotated, Final, Literal, Protocol
 from msgspec import Meta
 from smbus2 import I2cFunc, SMBus, i2c_msg
 
+from imud.contracts.claims import Claim
 from imud.contracts.link import LinkType
 from imud.contracts.polling import Transfer
 from imud.contracts.settings import Settings
@@ -169,4 +170,9 @@ class I2cLink:
         return b""
 
 
-LINK = LinkType("i2c", I2cSettings, make_polled=I2cLink, bus_of=bus_of)
+def _claims(settings: I2cSettings) -> list[Claim]:
+    address = None if settings.address == "auto" else settings.address
+    return [Claim(place=f"/dev/i2c-{settings.bus}", key="bus", shared=True, part=address, part_key="address")]
+
+
+LINK = LinkType("i2c", I2cSettings, make_polled=I2cLink, claims=_claims, bus_of=bus_of)

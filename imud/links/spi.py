@@ -17,6 +17,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
+from imud.contracts.claims import Claim
 from imud.contracts.link import LinkType
 from imud.contracts.polling import Transfer
 from imud.contracts.settings import Settings
@@ -200,4 +201,8 @@ def _byteswapped(data: bytes) -> bytes:
     return words.tobytes()
 
 
-LINK = LinkType("spi", SpiSettings, make_polled=SpiLink, bus_of=bus_of)
+def _claims(settings: SpiSettings) -> list[Claim]:
+    return [Claim(place=settings.port, key="port")]
+
+
+LINK = LinkType("spi", SpiSettings, make_polled=SpiLink, claims=_claims, bus_of=bus_of)

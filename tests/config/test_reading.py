@@ -4,7 +4,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +18,7 @@ from msgspec import Meta
 from imud import config
 from imud.config import DEVICES_MAX, PROBLEMS_SHOWN, TABLES, Config, DeviceConfig, Tables
 from imud.config.yaml_tree import EVENTS_PER_TURN
+from imud.contracts.claims import Claim
 from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import NoSettings, Settings, expected, got
 from imud.devices import DRIVERS
@@ -73,6 +74,9 @@ class FakeRow:
     def problems(self, options: Settings, link: Settings) -> Sequence[KeyProblem]:
         return self.faults
 
+    claims: Callable[[Any], Sequence[Claim]] = lambda _settings: ()
+    problem: Callable[[Any, bool], str] = lambda _settings, _frames: ""
+
     def fits(self, driver: "FakeRow") -> bool:
         return driver.settings is not self.refuses
 
@@ -92,7 +96,10 @@ class Broken(Mapping[str, FakeRow]):
 
 FAKE = Tables(
     drivers={"acme-uart": FakeRow(DriverSettings), "plain-uart": FakeRow(NoSettings)},
-    links={"port": FakeRow(PortSettings), "file": FakeRow(FileSettings)},
+    links={
+        "port": FakeRow(PortSettings, claims=lambda port: [Claim(place=port.port, key="port")]),
+        "file": FakeRow(FileSettings),
+    },
     publishers={"out": FakeRow(OutSettings), "none": FakeRow(NoSettings)},
 )
 GOOD = """\

@@ -17,6 +17,7 @@ from typing import Annotated, Final
 
 from msgspec import Meta
 
+from imud.contracts.claims import Claim
 from imud.contracts.link import CanLink, LinkType, OnBusNews, OnEnd, OnFrames
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
@@ -283,4 +284,11 @@ def make(settings: SocketCanSettings) -> CanLink:
     return PythonCanLink(settings.backend, settings.interface, settings.bitrate)
 
 
-LINK = LinkType("socketcan", SocketCanSettings, make_can=make)
+def _claims(settings: SocketCanSettings) -> list[Claim]:
+    """A bus, which devices share; the port of a serial adapter (`slcan` and others) is for one of them."""
+    name, port = settings.interface, settings.interface.startswith("/")
+    place = name if port or settings.backend == NATIVE else f"{name} ({settings.backend})"
+    return [Claim(place=place, key="interface", shared=not port, terms={"bitrate": settings.bitrate})]
+
+
+LINK = LinkType("socketcan", SocketCanSettings, make_can=make, claims=_claims)

@@ -24,6 +24,11 @@ TURN_FRAMES: Final = 512
 log = logging.getLogger(__name__)
 
 
+def no_log(path: str) -> str:
+    """Format the error for a file without frames."""
+    return f"{path} is no CAN log: expected frames as `candump -L` writes them, found none"
+
+
 class CanReplayLink(FileReplay):
     """A log as a `CanLink`. Synchronization: the loop's thread only."""
 
@@ -51,7 +56,7 @@ class CanReplayLink(FileReplay):
                 break
         if first_ns < 0:
             self.close()
-            raise LinkError(f"{self.title} is no CAN log: expected frames as `candump -L` writes them, found none")
+            raise LinkError(no_log(self.title))
         self._span_ns = newest_ns - first_ns
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:

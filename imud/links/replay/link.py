@@ -15,13 +15,15 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from itertools import chain
 from typing import Final
 
 from imud.contracts.link import LinkType, OnData, OnEnd
-from imud.errors import ImudError, LinkError
+from imud.errors import ImudError, LinkError, LinkMissing
+from imud.formats.candump import CandumpReader
 from imud.formats.capture import CaptureReader
-from imud.links.replay.can import CanReplayLink
+from imud.links.replay.can import CanReplayLink, no_log
 from imud.links.replay.file import FileReplay, ReplaySettings, open_regular
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
@@ -31,6 +33,9 @@ PIECE_BYTES_MAX: Final = 65536
 """Bytes per chunk of a capture without times: the size of a read from a port."""
 TURN_BYTES: Final = 16384
 """Delivered in one turn of the event loop, 0.5 ms of decoding: others get their turn between."""
+
+LOOKED_AT_BYTES: Final = 65536
+"""Begin of a log in which the check of a configuration looks for a frame."""
 
 log = logging.getLogger(__name__)
 
@@ -54,10 +59,8 @@ class ReplayLink(FileReplay):
             reader = self._reader()
             self.baud = settings.baud or reader.baud
             self.hold_ns = PIECE_NS if settings.speed == "real" else reader.hold_ns
-            if settings.speed == "recorded" and not reader.stamped:
-                raise LinkError(f"{path} is a raw capture without times: use speed real with a baud, or maximum")
-            if settings.speed == "real" and not self.baud:
-                raise LinkError(f"{path} does not say its baud rate: speed real needs `baud`")
+            if unplayable := _unplayable(settings, reader):
+                raise LinkError(unplayable)
             self._span_ns = self._measure(reader) if settings.speed == "maximum" else 0
         except LinkError:
             self.close()
@@ -149,4 +152,32 @@ class ReplayLink(FileReplay):
             raise LinkError(f"{self.title}: {error}") from error
 
 
-LINK = LinkType("replay", ReplaySettings, ReplayLink, CanReplayLink)
+def _unplayable(settings: ReplaySettings, reader: CaptureReader) -> str:
+    """Return why a capture cannot be played at the speed of the settings; empty if it can."""
+    if settings.speed == "recorded" and not reader.stamped:
+        return f"{settings.path} is a raw capture without times: use speed real with a baud, or maximum"
+    if settings.speed == "real" and not (settings.baud or reader.baud):
+        return f"{settings.path} does not say its baud rate: speed real needs the key baud"
+    return ""
+
+
+def _problem(settings: ReplaySettings, frames: bool) -> str:
+    """Return why the file cannot be played; empty if it can, or if it is not there now."""
+    try:
+        with open_regular(settings.path) as file:
+            if frames:
+                return _without_frames(settings.path, file.read(LOOKED_AT_BYTES))
+            return _unplayable(settings, CaptureReader(file))
+    except LinkMissing:
+        return ""
+    except ImudError as error:
+        return str(error)
+
+
+def _without_frames(path: str, begin: bytes) -> str:
+    """Return that a log has no frames, if its begin is all of it."""
+    found = len(begin) == LOOKED_AT_BYTES or next(iter(CandumpReader(BytesIO(begin))), None) is not None
+    return "" if found else no_log(path)
+
+
+LINK = LinkType("replay", ReplaySettings, ReplayLink, CanReplayLink, problem=_problem)

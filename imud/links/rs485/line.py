@@ -26,6 +26,8 @@ from typing import Final, Literal, NamedTuple
 
 import serial
 
+from imud.contracts.claims import differing_terms
+from imud.contracts.settings import shown
 from imud.errors import LinkError, LinkMissing, TransferError, Trouble
 from imud.formats.modbus import (
     ADU_BYTES_MAX,
@@ -98,6 +100,11 @@ class PortSetup(NamedTuple):
     """Rate in bit/s."""
     direction: DirectionWish = "auto"
     echo: Echo = "auto"
+
+    @property
+    def terms(self) -> dict[str, object]:
+        """All but the path, by the keys of the configuration."""
+        return {"baud": self.baud, "direction": self.direction, "echo": self.echo}
 
 
 class LineCounters:
@@ -320,14 +327,10 @@ class SharedPorts:
 
 
 def _check_agreement(first: PortSetup, other: PortSetup) -> None:
-    path = first.path
-    if first.baud != other.baud:
-        raise LinkError(f"{path}: expected one baud rate for all its devices, got {first.baud} and {other.baud}")
-    if first != other:
-        raise LinkError(
-            f"{path}: expected the same `direction` and `echo` for all its devices, got {first.direction}, "
-            f"{first.echo} and {other.direction}, {other.echo}"
-        )
+    terms, others = first.terms, other.terms
+    for key in differing_terms(terms, others):
+        got = f"{shown(terms[key])} and {shown(others[key])}"
+        raise LinkError(f"{first.path}: expected the same {key} for all its devices, got {got}")
 
 
 SHARED_PORTS: Final = SharedPorts()

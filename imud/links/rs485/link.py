@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from imud.contracts.claims import Claim
 from imud.contracts.link import LinkType
 from imud.contracts.polling import Transfer
 from imud.contracts.settings import Settings
@@ -74,10 +75,8 @@ class Rs485Link:
 
     def open(self) -> None:
         """Open the port exclusively, or share it. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        settings = self._settings
-        setup = PortSetup(settings.line, settings.baud, settings.direction, settings.echo)
         with self._node.opening():
-            self._line = self._ports.share(setup, self._sys, self._proc)
+            self._line = self._ports.share(_setup(self._settings), self._sys, self._proc)
 
     def select(self, target: int) -> None:
         """Address the next transfers; 0 is a broadcast, which has no reply."""
@@ -118,4 +117,14 @@ class Rs485Link:
             self._ports.release(line)
 
 
-LINK = LinkType("rs485", Rs485Settings, make_polled=Rs485Link, bus_of=lambda settings: settings.line)
+def _claims(settings: Rs485Settings) -> list[Claim]:
+    address = None if settings.address == "auto" else settings.address
+    terms = _setup(settings).terms
+    return [Claim(place=settings.line, key="line", shared=True, part=address, part_key="address", terms=terms)]
+
+
+def _setup(settings: Rs485Settings) -> PortSetup:
+    return PortSetup(settings.line, settings.baud, settings.direction, settings.echo)
+
+
+LINK = LinkType("rs485", Rs485Settings, make_polled=Rs485Link, claims=_claims, bus_of=lambda settings: settings.line)

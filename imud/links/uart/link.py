@@ -14,6 +14,7 @@ from typing import Annotated, Final, Literal
 import serial
 from msgspec import Meta
 
+from imud.contracts.claims import Claim
 from imud.contracts.link import LinkType, OnData, OnEnd
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
@@ -200,4 +201,8 @@ def _ignore_end(error: LinkError | None) -> None:
     """The receiver before `start`."""
 
 
-LINK = LinkType("uart", UartSettings, UartLink)
+def _claims(settings: UartSettings) -> list[Claim]:
+    return [Claim(place=settings.port, key="port")]
+
+
+LINK = LinkType("uart", UartSettings, UartLink, claims=_claims)

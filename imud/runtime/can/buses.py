@@ -1,30 +1,29 @@
 """CAN buses shared by the devices of one daemon: the owner of each frame, and the sender of each cyclic frame.
 
+    device        joins with                          when
+    named         filters of its driver's options     before its bus is waited for, until it is closed
+    auto          filters of the node that was found  from then until it is searched again
+
 A device that searches must not choose one that is configured by another name, and two devices must not have the same
-frame sent: receivers would get it twice per period.
+frame sent: receivers would get it twice per period. What the file alone shows of this, `imud check` refuses already
+(`imud.config.claims`, by the same `CanUse`); here it is also known of devices that were found, and of a reload.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
+from imud.contracts.claims import CanUse
 from imud.formats.can import CanFilter, CyclicFrame
-
-
-class _Member(NamedTuple):
-    bus: str
-    filters: Sequence[CanFilter]
-    cyclic: Sequence[CyclicFrame]
 
 
 class CanBuses:
     """Members of all buses by the name of the device. Synchronization: one thread."""
 
     def __init__(self) -> None:
-        self._members: dict[str, _Member] = {}
+        self._members: dict[str, CanUse] = {}
 
     def join(self, name: str, bus: str, filters: Sequence[CanFilter], cyclic: Sequence[CyclicFrame]) -> None:
         """Add a device to a bus: the frames it receives, and those that it needs to be sent."""
-        self._members[name] = _Member(bus, filters, cyclic)
+        self._members[name] = CanUse(bus, filters, cyclic)
 
     def leave(self, name: str) -> None:
         """Remove the device; no-op if absent."""
@@ -35,10 +34,8 @@ class CanBuses:
 
         def is_claimed(can_id: int, extended: bool) -> bool:
             return any(
-                wanted.matches(can_id, extended)
+                other != name and member.bus == bus and member.receives(can_id, extended)
                 for other, member in self._members.items()
-                if other != name and member.bus == bus
-                for wanted in member.filters
             )
 
         return is_claimed
@@ -49,12 +46,9 @@ class CanBuses:
         Of two, the one that joined first may send.
         """
         mine = self._members.get(name)
-        wanted = {(frame.can_id, frame.extended) for frame in mine.cyclic} if mine else set()
         for other, member in self._members.items():
             if other == name or mine is None:
                 break
-            for frame in member.cyclic if member.bus == mine.bus else ():
-                if (frame.can_id, frame.extended) in wanted:
-                    frame_id = f"0x{frame.can_id:08X}" if frame.extended else f"0x{frame.can_id:03X}"
-                    return f"{other} and {name} would both send {frame_id} on {mine.bus}: let one of them do it"
+            if both := mine.both_send(member):
+                return f"{other} and {name} would both send {both} on {mine.bus}: let one of them do it"
         return ""

@@ -197,7 +197,7 @@ def test_playing_again_starts_at_the_beginning(stamped: Path) -> None:
 def test_captures_that_do_not_fit_the_speed(raw: Path) -> None:
     with pytest.raises(LinkError, match="raw capture without times"):
         ReplayLink(ReplaySettings(path=str(raw))).open()
-    with pytest.raises(LinkError, match="needs `baud`"):
+    with pytest.raises(LinkError, match="needs the key baud"):
         ReplayLink(ReplaySettings(path=str(raw), speed="real")).open()
     raw.write_bytes(b"#imud-capture 9\n")
     with pytest.raises(LinkError, match="version '9'"):
