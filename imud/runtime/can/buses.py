@@ -1,8 +1,11 @@
 """CAN buses shared by the devices of one daemon: the owner of each frame, and the sender of each cyclic frame.
 
-    device        joins with                          when
-    named         filters of its driver's options     before its bus is waited for, until it is closed
-    auto          filters of the node that was found  from then until it is searched again
+    driver of the device   joins with the frames of …             when
+    named                  the node in its options                before its bus is waited for, until it is closed
+    auto                   the node that was found by listening   from then until it is searched again
+
+    claimed(name, bus)     what a search must leave alone
+    conflict(name)         why a device may not start
 
 A device that searches must not choose one that is configured by another name, and two devices must not have the same
 frame sent: receivers would get it twice per period. What the file alone shows of this, `imud check` refuses already
@@ -41,9 +44,10 @@ class CanBuses:
         return is_claimed
 
     def conflict(self, name: str) -> str:
-        """Return which other device has a frame sent that this one needs, one sentence; empty if none has.
+        """Return which other device takes the frames of this one, or has a frame sent that it needs, one sentence.
 
-        Of two, the one that joined first may send.
+        Empty if there is none. Of two, the one that joined first may go on: one that was found by listening is not
+        stopped by a device that a reload adds.
         """
         mine = self._members.get(name)
         for other, member in self._members.items():
@@ -51,4 +55,6 @@ class CanBuses:
                 break
             if both := mine.both_send(member):
                 return f"{other} and {name} would both send {both} on {mine.bus}: let one of them do it"
+            if both := mine.both_receive(member):
+                return f"{other} and {name} would be the same device on {mine.bus}, the one that sends {both}"
         return ""

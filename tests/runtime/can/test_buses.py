@@ -36,3 +36,12 @@ def test_of_two_that_want_the_same_cyclic_frame_the_second_is_refused_with_both_
     assert "far and more would both send 0x00000080" in buses.conflict("more")
     buses.leave("front")
     assert buses.conflict("rear") == ""
+
+
+def test_of_two_that_are_the_same_device_the_second_is_refused_with_both_names() -> None:
+    buses = CanBuses()
+    buses.join("found", "can0", filters(0x181, 0x281), ())
+    buses.join("named", "can0", filters(0x381, 0x281), ())
+    buses.join("other", "can1", filters(0x281), ())
+    assert buses.conflict("named") == "found and named would be the same device on can0, the one that sends 0x281"
+    assert buses.conflict("found") == buses.conflict("other") == ""
