@@ -3,6 +3,9 @@
 The time of a sample is when its read began. What the device measured it has measured before: at most the time since
 the read before (had it been there then, this one would have repeated it), or one update of its registers, if known.
 With a data-ready line it is the edge that the read belongs to.
+
+A sample is lost where a read failed, its frame was damaged, or none was made (`schedule`). While a device is
+looked for it is not read, and nothing says what it measured meanwhile: the gap is one of unknown size.
 Synchronization: the event loop's thread only.
 """
 
@@ -21,6 +24,8 @@ from imud.signals.ready_edges import ReadyEdges, Stamp
 
 FAULTS_MAX: Final = 3
 """Number of damaged or failed reads in a row after which the device is identified again."""
+GAP_PERIODS: Final = 1.5
+"""With less time since the read before, none is missing."""
 SIGMA_OF_AGE: Final = 1 / sqrt(3)
 """Root mean square of an age that is anything from 0 to its bound."""
 
@@ -50,6 +55,12 @@ class PolledPath(SamplePath):
         self._edges = timing.edges
         self._before_ns = 0
         self._faults = 0
+        self._read_ns = 0
+        """Begin of the newest read that gave a sample, a stale one or a lost one; 0 before the first."""
+        self._is_back = False
+        """Whether the device was identified and not read since."""
+        self._gap_unknown = context.ledger.samples > 0
+        """Whether the device was not read for a while since its newest sample."""
 
     @property
     def period_ns(self) -> int:
@@ -60,6 +71,7 @@ class PolledPath(SamplePath):
         """Start: the device was identified and set up."""
         super().begin(now_ns)
         self.reset()
+        self._is_back = True
 
     def flush(self, now_ns: int) -> None:
         """No-op: what is read comes whole or not at all."""
@@ -80,7 +92,10 @@ class PolledPath(SamplePath):
             if gone:
                 self.skip(reading)
                 continue
-            stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None and reading.poll == 0 else None
+            stamp = None
+            if reading.poll == 0:
+                stamp = edges.match(reading.start_ns, reading.end_ns) if edges is not None else None
+                self._measure_gap(reading.start_ns)
             if reading.error is not None:
                 gone = self._failed(reading)
             else:
@@ -95,15 +110,18 @@ class PolledPath(SamplePath):
         self._ledger.bytes_skipped += len(reading.data)
 
     def _decode(self, reading: Reading, stamp: Stamp | None, utc_offset_ns: int, samples: list[Sample]) -> str:
-        gone = ""
+        gone, vanished = "", False
         for event in self.codec.decode(reading.poll, reading.data):
             if type(event) is Measurement:
                 self._faults = 0
+                if self._gap_unknown:
+                    self._gap_unknown = False
+                    self._ledger.add_unknown_gap()
                 t_ns, error_ns, edge_seq = stamp or (reading.start_ns, self._error_ns(reading), None)
                 sample = self.clock.sample_polled(event, t_ns, error_ns, reading.end_ns, utc_offset_ns, edge_seq)
                 samples.append(sample)
             elif type(event) is Vanished:
-                gone = event.why
+                gone, vanished = event.why, True
             elif type(event) is BadFrame:
                 self._on_bad_frame(event)
                 if event.reason is not BadReason.NOT_FINITE:  # that one comes with its sample
@@ -111,7 +129,16 @@ class PolledPath(SamplePath):
                     gone = gone or self._fault(f"{FAULTS_MAX} damaged frames in a row, the last by {event.reason}")
         if reading.poll == 0:
             self._before_ns = reading.start_ns
+            if not vanished:
+                self._read_ns = reading.start_ns
         return gone
+
+    def _measure_gap(self, start_ns: int) -> None:
+        """Look at a read of a sample: where the device was looked for right before, it ends a gap of unknown size."""
+        if self._is_back:
+            self._is_back = False
+            if self._read_ns and start_ns - self._read_ns >= GAP_PERIODS * self._period_ns:
+                self._gap_unknown = True
 
     def _failed(self, reading: Reading) -> str:
         error = reading.error
@@ -120,6 +147,7 @@ class PolledPath(SamplePath):
         self._before_ns = 0
         if reading.poll == 0:
             self._ledger.lost_gap_device += 1
+            self._read_ns = reading.start_ns
         if error.trouble is Trouble.DISTURBED:
             return self._fault(str(error))
         return str(error)

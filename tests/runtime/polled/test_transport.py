@@ -2,6 +2,7 @@
 
 import asyncio
 import errno
+from itertools import pairwise
 from math import dist, sqrt
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,49 @@ def test_single_damage_costs_its_sample_and_nothing_else(bench: PolledBusBench) 
             assert rig.device.ledger.lost_crc == 2
             assert EventKind.DOWN not in rig.kinds
             assert EventKind.BAD_FRAME in rig.kinds
+
+    bench.run(body())
+
+
+def test_time_in_which_it_was_looked_for_is_a_gap_of_unknown_size(bench: PolledBusBench) -> None:
+    """One gap, however often the device was found and gone again before its next sample."""
+    device = bench.registers()
+    is_absent = False
+
+    def answer(selections: Any, mode: int) -> list[bytes]:
+        miso = device.spi(selections, mode)
+        return [b"\xff" * 32] if is_absent and selections[0][:1] == b"\x80" else miso
+
+    bench.spi.device = answer
+
+    async def body() -> None:
+        nonlocal is_absent
+        async with bench.running(bench.on_spi()) as (rig,):
+            await rig.until_samples(5)
+            assert rig.ledger.lost_unknown == 0
+            for gaps in (1, 2):
+                is_absent, found = True, device.transactions
+                await rig.until(lambda begin=found: device.transactions > begin + 30, "found and gone, repeatedly")  # type: ignore[misc]  # bound per round
+                is_absent = False
+                await rig.until_samples(5)
+                assert (rig.ledger.lost_unknown, rig.ledger.lost()) == (gaps, 0)
+
+    bench.run(body())
+
+
+def test_device_that_is_found_again_at_once_has_lost_what_was_damaged(bench: PolledBusBench) -> None:
+    device = bench.registers()
+    bench.spi.device = device.spi
+
+    async def body() -> None:
+        async with bench.running(bench.on_spi()) as (rig,):
+            await rig.until_samples(5)
+            device.faults.flips = 3
+            await rig.until(lambda: EventKind.DOWN in rig.kinds, "gone")
+            await rig.until_samples(5)
+            assert (rig.ledger.lost_crc, rig.ledger.lost(), rig.ledger.lost_unknown) == (3, 3, 0)
+        steps = [round((b.t_ns - a.t_ns) * RATE_HZ / 1e9) for a, b in pairwise(rig.samples)]
+        assert max(steps) <= 4
 
     bench.run(body())
 
