@@ -21,6 +21,8 @@ class Target:
     """Settings of the device's driver."""
     baud: int
     """Present bit rate of the line, bit/s; 0 on a link without one."""
+    fixed_baud: int = 0
+    """Bit rate that the configuration fixes, bit/s; 0 where it fixes none."""
 
 
 class Risk(StrEnum):

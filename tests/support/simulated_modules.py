@@ -1,24 +1,28 @@
 """Simulated modules in virtual time without a link: bytes and frames go in and out by calls, requests run as scripts.
 
-`HipnucUartBench`, `CanopenBench` and `Imu61xBench` each hold a module and the host's end of its line; registers behind
-I2C and SPI are read by single transfers.
+`HipnucUartBench`, `HipnucLine`, `CanopenBench` and `Imu61xBench` each hold a module and the host's end of its line;
+registers behind I2C and SPI are read by single transfers.
 """
 
 import struct
 from collections.abc import Callable
 from dataclasses import replace
 from math import radians
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+from imud.contracts.action import Target
 from imud.contracts.codec import CodecEvent, message_of
 from imud.contracts.polling import Transfer
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings
+from imud.devices.hipnuc.uart.actions import ACTIONS
+from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings
 from imud.devices.imu61x.uart.codec import Imu61xCodec
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
+from imud.sim.hipnuc.uart.behaviour import Behaviour
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.imu61x.registers import Imu61xRegisters
@@ -32,6 +36,8 @@ from imud.units import NS_PER_MS, NS_PER_US
 T = TypeVar("T")
 
 BEGIN_NS = 1_234_567_890_123
+UART_STEP_MS = 2
+"""How often the host looks."""
 AT_REST = Still(radians(2), radians(-3), radians(40))
 
 
@@ -109,6 +115,65 @@ class HipnucUartBench:
         self.wait(self.module.hardware.boot_ms)
 
 
+def hardware_of(behaviour: Behaviour, **hardware: Any) -> HipnucHardware:
+    """A module at rest of a variant."""
+    return replace(HIPNUC_STILL, behaviour=behaviour, **hardware)
+
+
+class HipnucLine:
+    """A module that has booted, and the host's end of its line: requests of scripts go out, replies come in."""
+
+    def __init__(self, settings: ModuleSettings | None = None, hardware: HipnucHardware = HIPNUC_STILL) -> None:
+        self.now_ns = BEGIN_NS
+        self.module = HipnucModule(BEGIN_NS, settings, hardware)
+        self.baud = self.module.baud
+        """Rate of the host's end."""
+        self.ledger = Ledger()
+        self.codec = HipnucCodec(self.ledger, HipnucSettings())
+        self.session = Session(self.ledger)
+        self.asked: list[str] = []
+        """Names of the requests sent, pauses left out."""
+        self.wait(hardware.boot_ms)
+
+    def wait(self, duration_ms: float) -> list[CodecEvent]:
+        """Let time pass; return what the host heard."""
+        events: list[CodecEvent] = []
+        end_ns = self.now_ns + round(duration_ms * NS_PER_MS)
+        while self.now_ns < end_ns:
+            self.now_ns = min(self.now_ns + UART_STEP_MS * NS_PER_MS, end_ns)
+            baud = self.module.baud
+            for burst in self.module.advance(self.now_ns):
+                events += self.codec.feed(heard(burst.data, baud, self.baud))
+        assert self.ledger.closes()
+        return events
+
+    def ask(self, request: Request) -> Outcome:
+        """One request to its outcome."""
+        if request.baud:
+            self.baud = request.baud
+        payload = self.session.start(request, self.now_ns)
+        if payload:
+            self.asked.append(request.name)
+            self.module.receive(heard(payload, self.baud, self.module.baud), self.now_ns)
+        if request.silent:
+            return Reply(())
+        while True:
+            messages = [message for event in self.wait(UART_STEP_MS) if (message := message_of(event)) is not None]
+            outcomes = [self.session.on_message(message, self.now_ns) for message in messages]
+            for outcome in (*outcomes, self.session.on_time(self.now_ns)):
+                if outcome is not None:
+                    return outcome
+
+    def run(self, script: RequestScript[T]) -> T:
+        """Run a request script to its end; return its value, raise what it raises."""
+        return run_script(script, self.ask)
+
+    def act(self, name: str, *, fixed_baud: int = 0, **arguments: Any) -> Any:
+        """Carry out an action of the driver; return its answer, raise what it raises."""
+        action = ACTIONS[name]
+        return self.run(action.script(Target(None, self.baud, fixed_baud), action.arguments(arguments)))
+
+
 # --- HiPNUC on CANopen ------------------------------------------------------------------------------------------------
 
 CAN_STEP_NS = 250 * NS_PER_US
@@ -179,8 +244,6 @@ class CanopenBench:
 # --- IMU61x -----------------------------------------------------------------------------------------------------------
 
 IMU61X_STILL = Imu61xHardware(motion=AT_REST, skew_ppm=0)
-UART_STEP_MS = 2
-"""How often the host looks."""
 
 
 class Imu61xBench:

@@ -1,7 +1,7 @@
 """A simulated HiPNUC module with pins, wired to a device, in virtual time: bytes and edges come in step."""
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,7 @@ from imud.config import DeviceConfig
 from imud.contracts.lines import DeviceLines, LineFactory, OutputSettings
 from imud.event import Event, EventKind
 from imud.formats.rmc import build
-from imud.links.memory import MemorySettings
+from imud.links.memory import MemoryLink, MemorySettings
 from imud.runtime import utc_keeper
 from imud.sample import Sample
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
@@ -19,15 +19,18 @@ from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.ports.faults import Faults
 from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
 from imud.sim.ports.pins import OnEdge, Pin, PinFaults, Pins
+from imud.sim.ports.uart_wire import heard
 from imud.units import NS_PER_MS, NS_PER_S
 from imud.utc.source import RmcSettings
 from imud.utc.system_clock import KernelClock
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
 from tests.support.rmc_sources import FakeSource
+from tests.support.simulated_modules import HIPNUC_STILL
 
 BEGIN_NS = 1000 * NS_PER_S + 123_456_789
 BAUD = 115_200
+STEP_S = 0.002
 TICK_S = 0.1
 WAKE_NS = 30_000
 """From the last byte to the program that reads it."""
@@ -199,3 +202,98 @@ class WiredDevice:
         while True:
             self.device.tick(self.clock.now_ns())
             await asyncio.sleep(TICK_S)
+
+
+# --- a module on a line of which both ends have a rate ----------------------------------------------------------------
+
+
+class LinkedModule(MemoryLink):
+    """A link of the daemon with a module at its far end."""
+
+    def __init__(self, settings: MemorySettings, module: HipnucModule, clock: VirtualClock) -> None:
+        super().__init__(settings)
+        self.module = module
+        self.clock = clock
+        self.sent_at: list[tuple[int, bytes]] = []
+        """Rate of the line, and the bytes sent at it."""
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        self.sent_at.append((self.baud, data))
+        self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
+
+    async def carry(self) -> None:
+        """Bring what the module sends, as it leaves the wire."""
+        while True:
+            baud = self.module.baud
+            for burst in self.module.advance(self.clock.now_ns()):
+                self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
+            await asyncio.sleep(STEP_S)
+
+
+class LinkedDevice:
+    """A device of the daemon whose module is simulated."""
+
+    def __init__(
+        self, clock: VirtualClock, settings: ModuleSettings | None, hardware: HipnucHardware, **config: Any
+    ) -> None:
+        self.clock = clock
+        driver, identify = config.pop("driver", "hipnuc-uart"), config.pop("identify", True)
+        lines: DeviceLines | None = config.pop("lines", None)
+        memory = MemorySettings(**{"baud": 115200, **config})
+        self.module = HipnucModule(clock.now_ns(), settings, hardware)
+        self.link = LinkedModule(memory, self.module, clock)
+        self.rigs = DeviceRigs(clock.host)
+        self.rig = self.rigs.add(DeviceConfig("bow", driver, None, identify, "memory", memory, lines=lines), self.link)
+        self.device = self.rig.device
+        self.samples, self.events = self.rig.samples, self.rig.events
+
+    @property
+    def problem(self) -> str:
+        """What is wrong now."""
+        return self.rig.problem
+
+    @property
+    def messages(self) -> list[str]:
+        """Texts of the events so far."""
+        return [event.message for event in self.events]
+
+    async def until(self, condition: Callable[[], object], what: str = "", limit_s: float = 30.0) -> None:
+        """Let time pass until it holds."""
+        await self.rig.until(condition, what or str(self.link.sent_at[-5:]), limit_s, step_s=0.01)
+
+    async def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        end_ns = self.clock.now_ns() + int(seconds * 1e9)
+        await self.until(lambda: self.clock.now_ns() >= end_ns, limit_s=seconds + 1)
+
+    async def act(self, name: str, **arguments: Any) -> object:
+        """Carry out an action; the device looks at its state meanwhile."""
+        acting = asyncio.ensure_future(self.device.act(name, arguments))
+        await self.until(acting.done, f"the end of {name}", 60)
+        return acting.result()
+
+
+def play_linked(
+    story: Callable[[LinkedDevice], Awaitable[None]],
+    settings: ModuleSettings | None = None,
+    hardware: HipnucHardware = HIPNUC_STILL,
+    **config: Any,
+) -> LinkedDevice:
+    """Run a device during a story; at the end its ledger closes."""
+    clock = VirtualClock()
+    made: list[LinkedDevice] = []
+
+    async def both() -> None:
+        one = LinkedDevice(clock, settings, hardware, **config)
+        made.append(one)
+        carrying = asyncio.create_task(one.link.carry())
+        try:
+            async with one.rigs.at_work():
+                await story(one)
+        finally:
+            carrying.cancel()
+            await asyncio.gather(carrying, return_exceptions=True)
+
+    run_virtually(clock, both())
+    return made[0]

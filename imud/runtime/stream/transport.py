@@ -50,6 +50,7 @@ class StreamTransport:
         self._search = SearchLoop(context.health, context.attachments, context.host, self._begin_search, self._ask)
         self._discard = _Discard(context.ledger)
         self._receiver: DataReceiver = self._discard
+        self._fixed_baud = 0 if link.auto_baud else link.baud
         self._samples_before = 0
         """Samples made before the link was opened."""
 
@@ -171,7 +172,7 @@ class StreamTransport:
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
         """Run a request script; one that changes the device's rate is followed."""
         options = self._config.options or (self.driver.settings() if self.driver is not None else None)
-        return await self._exchange.run(make(Target(options, self.bit_rate)))
+        return await self._exchange.run(make(Target(options, self.bit_rate, self._fixed_baud)))
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 

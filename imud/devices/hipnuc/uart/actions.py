@@ -13,7 +13,6 @@ from imud.contracts.driver import Identity
 from imud.contracts.session import Request, RequestScript
 from imud.devices.hipnuc.uart import commands, session
 from imud.devices.hipnuc.uart.commands import (
-    BAUD_RATES,
     PIN_MAX,
     SOUT_DIVIDER_MAX,
     AlarmAxis,
@@ -28,21 +27,14 @@ from imud.devices.hipnuc.uart.commands import (
 )
 from imud.devices.hipnuc.uart.session import send
 
+MountingName = Literal[
+    "level", "y_down", "y_up", "z_down", "x_up", "x_down", "z_down_x_back", "level_x_left", "level_x_right"
+]
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
 Degrees = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°", "section": "2.2.4"})]
 Enabled = Annotated[bool, Meta(extra={"section": "2.2.4"})]
 
-_MOUNTINGS: Final = {
-    "level": Mounting.LEVEL,
-    "x-90": Mounting.X_MINUS_90,
-    "x+90": Mounting.X_PLUS_90,
-    "x180": Mounting.X_180,
-    "y+90": Mounting.Y_PLUS_90,
-    "y-90": Mounting.Y_MINUS_90,
-    "y180": Mounting.Y_180,
-    "z+90": Mounting.Z_PLUS_90,
-    "z-90": Mounting.Z_MINUS_90,
-}
+_MOUNTINGS: Final = {mounting.name.lower(): mounting for mounting in Mounting}
 
 
 def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Action:
@@ -50,16 +42,33 @@ def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> 
     return Action(words, lambda _target: send(make()), risk)
 
 
-def _restart(_target: Target) -> RequestScript[Identity]:
-    return session.restart()
+def _restart(target: Target) -> RequestScript[Identity]:
+    return session.restart(target.baud)
+
+
+def _factory_reset(target: Target) -> RequestScript[dict[str, int | str]]:
+    return _followed(target, session.reset_to_factory(target.baud))
+
+
+def _followed(target: Target, script: RequestScript[int]) -> RequestScript[dict[str, int | str]]:
+    """Answer the baud rate at which the module is now, and what to change in the configuration."""
+    baud = yield from script
+    answer: dict[str, int | str] = {"baud": baud}
+    if advice := session.advice(baud, target.fixed_baud):
+        answer["configuration"] = advice
+    return answer
+
+
+def _wake(target: Target) -> RequestScript[str]:
+    return session.wake_by_force(target.baud)
 
 
 def _baud(
     target: Target,
     *,
     baud: Annotated[BaudRate, Meta(description="rate of the line", extra={"unit": "bit/s", "section": "2.2.3"})],
-) -> RequestScript[int]:
-    return session.change_baud(baud, target.baud)
+) -> RequestScript[dict[str, int | str]]:
+    return _followed(target, session.change_baud(baud, target.baud))
 
 
 def _output(
@@ -70,8 +79,7 @@ def _output(
         OutputRate, Meta(description="output rate, 0 for off", extra={"unit": "Hz", "section": "2.2.5"})
     ],
 ) -> RequestScript[None]:
-    baud = target.baud if target.baud in BAUD_RATES else None
-    return send(commands.log_ontime(message, rate_hz, baud))
+    return session.set_output(message, rate_hz, target.baud)
 
 
 def _output_on_mark(_target: Target, *, message: Message) -> RequestScript[None]:
@@ -111,10 +119,9 @@ def _mounting(
     _target: Target,
     *,
     turned: Annotated[
-        Literal["level", "x-90", "x+90", "x180", "y+90", "y-90", "y180", "z+90", "z-90"]
-        | Annotated[list[float], Meta(min_length=9, max_length=9)],
+        MountingName | Annotated[list[float], Meta(min_length=9, max_length=9)],
         Meta(
-            description="turned about one of the old axes, or the nine numbers C00 … C22 of URFR",
+            description="new axis that points up or down where Z pointed up, or the nine numbers C00 … C22 of URFR",
             extra={"section": "2.2.4"},
         ),
     ],
@@ -153,10 +160,15 @@ def _sout_divider(
 ACTIONS: Final[Actions] = {
     "save": _simple("write all settings to flash", commands.save_config),
     "restart": Action("restart it and wait until it answers; what was not saved is lost", _restart),
-    "factory_reset": _simple(
-        "factory settings, the baud rate included, which `baud: auto` finds", commands.factory_reset, Risk.RESET
+    "factory_reset": Action(
+        "factory settings, the baud rate (115200) included: restart it, so that they are in force, and follow",
+        _factory_reset,
+        Risk.RESET,
     ),
-    "baud": Action("set the baud rate, save, restart and follow", _baud, Risk.CONNECTION),
+    "wake": Action(
+        "let frames out, and send HI91 where no message has a rate, also in place of output on mark; not saved", _wake
+    ),
+    "baud": Action("set the baud rate, save, restart if it takes that, and follow", _baud, Risk.CONNECTION),
     "output": Action("send a message by itself at a rate, or not at all (0)", _output),
     "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
     "output_once": Action("send a message once, as a pulse on SIN would", _output_once),

@@ -7,10 +7,10 @@ r"""ASCII commands of HiPNUC modules (replies: `replies.py`). Manual "IMU配置�
 
 Each function returns a `Request`. Types say what an argument can be; ranges are those of the actions (`actions.py`),
 and what no range can express raises BadArgument here. Settings last until power is off unless `save_config` follows;
-`mounting`, `serial_config` take effect after `save_config` and `reboot`.
+`mounting` takes effect after `save_config` and `reboot`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum, StrEnum
 from typing import Final, Literal, get_args
 
@@ -18,18 +18,21 @@ from imud.attitude import Matrix3, is_rotation
 from imud.contracts.session import Request, of_text
 from imud.devices.hipnuc.uart.replies import is_end, is_rejection, is_setting_line, is_version_line
 from imud.errors import BadArgument
-from imud.units import NS_PER_S
+from imud.units import BITS_PER_UART_BYTE, NS_PER_S
 
 LINE_END: Final = "\r\n"
 BaudRate = Literal[115200, 921600, 460800, 256000, 230400, 9600]
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
 """Rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory default first."""
 REPLY_TIMEOUT_NS: Final = NS_PER_S // 2
-FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S  # erasing a flash page takes longer than a reply; the manual gives no time
+FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # erasing flash can take 2 s and more; the manual gives no time
 
-OutputRate = Literal[0, 1, 2, 5, 10, 20, 50, 100, 200, 250, 500, 1000]
+OutputRate = Literal[0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000]
 RATES_HZ: Final[tuple[OutputRate, ...]] = get_args(OutputRate)[1:]
-"""Output rates of section 2.2.5 and of table 3.7, and 5 Hz, which "and so on" is read to include."""
+"""Output rates: section 2.2.5 lists some periods "and so on", which is read as every whole rate with a period of whole
+milliseconds, up to table 3.7."""
+LINE_SHARE_MAX: Final = 0.95
+"""Share of the line that frames may take: table 3.7 goes up to 94 % (HI92 with 200 Hz at 115200 baud)."""
 SOUT_DIVIDER_MAX: Final = 64
 PIN_MAX: Final = 9
 ROTATION_TOLERANCE: Final = 1e-3
@@ -50,6 +53,8 @@ MAX_RATE_HZ: Final = {
     OutputMessage.HI92: {9600: 10, 115200: 200, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
 }
 """Highest output rate by baud rate (table 3.7)."""
+FRAME_BYTES: Final = {OutputMessage.HI91: 6 + 76, OutputMessage.HI92: 6 + 48}
+"""Size of a frame with its header (sections 3.1, 3.3)."""
 
 
 class AttitudeMode(Enum):
@@ -104,26 +109,30 @@ class AlarmAxis(StrEnum):
 
 
 class Mounting(Enum):
-    """The nine mountings of section 2.2.4. The value is the URFR matrix, from new sensor axes to the old ones."""
+    """The nine mountings of section 2.2.4. The value is the URFR matrix, from new sensor axes to the old ones.
+
+    Each is named by the new axis that points up, or down, while the old Z axis does; that is what the third row of the
+    matrix says, and what the manual's words in brackets say. Its "turned by ±90° about Y" has the other sign.
+    """
 
     LEVEL = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-    """Z up: the default."""
-    X_MINUS_90 = ((1, 0, 0), (0, 0, 1), (0, -1, 0))
-    """Turned by -90° about X: Y down."""
-    X_PLUS_90 = ((1, 0, 0), (0, 0, -1), (0, 1, 0))
-    """Turned by 90° about X: Y up."""
-    X_180 = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
-    """Turned by 180° about X."""
-    Y_PLUS_90 = ((0, 0, -1), (0, 1, 0), (1, 0, 0))
-    """Turned by 90° about Y: X up."""
-    Y_MINUS_90 = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))
-    """Turned by -90° about Y: X down."""
-    Y_180 = ((-1, 0, 0), (0, 1, 0), (0, 0, -1))
-    """Turned by 180° about Y."""
-    Z_PLUS_90 = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
-    """Turned by 90° about Z."""
-    Z_MINUS_90 = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
-    """Turned by -90° about Z."""
+    """Z up, nothing turned: the default."""
+    Y_DOWN = ((1, 0, 0), (0, 0, 1), (0, -1, 0))
+    """Printed as turned by -90° about X: Y down."""
+    Y_UP = ((1, 0, 0), (0, 0, -1), (0, 1, 0))
+    """Printed as turned by 90° about X: Y up."""
+    Z_DOWN = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+    """Turned by 180° about X: Z down, X as before."""
+    X_UP = ((0, 0, -1), (0, 1, 0), (1, 0, 0))
+    """Printed as turned by 90° about Y: X up."""
+    X_DOWN = ((0, 0, 1), (0, 1, 0), (-1, 0, 0))
+    """Printed as turned by -90° about Y: X down."""
+    Z_DOWN_X_BACK = ((-1, 0, 0), (0, 1, 0), (0, 0, -1))
+    """Turned by 180° about Y: Z down, X where -X was."""
+    LEVEL_X_LEFT = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
+    """Turned by 90° about Z: Z up, X where Y was."""
+    LEVEL_X_RIGHT = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+    """Turned by -90° about Z: Z up, X where -Y was."""
 
 
 class Query(StrEnum):
@@ -149,7 +158,7 @@ def save_config() -> Request:
 
 
 def factory_reset() -> Request:
-    """Restore the factory settings, the baud rate included."""
+    """Restore the factory settings, the baud rate included. When they come into force is not known: `session.py`."""
     return _command("FRESET", timeout_ns=FLASH_TIMEOUT_NS)
 
 
@@ -159,7 +168,7 @@ def unlog_all() -> Request:
 
 
 def serial_config(baud: BaudRate) -> Request:
-    """Set the baud rate. A module at a rate that the host does not expect is lost: keep contact or roll back."""
+    """Set the baud rate: at once, even before the answer, or after `save_config` and `reboot` (`session.py`)."""
     return _command(f"SERIALCONFIG {baud}")
 
 
@@ -222,15 +231,9 @@ def log_disable() -> Request:
     return _command("LOG DISABLE")
 
 
-def log_ontime(message: OutputMessage, rate_hz: OutputRate, baud: int | None = None) -> Request:
-    """Send `message` at a rate, or not at all (0). With `baud`, raises BadArgument for more than the line carries."""
-    name = f"LOG {message} ONTIME"
-    if baud is not None and rate_hz > max_rate_hz(message, baud):
-        raise BadArgument(
-            f"{name}: expected at most {max_rate_hz(message, baud)} Hz at {baud} baud, got {rate_hz} Hz; "
-            f"set a higher baud rate first"
-        )
-    return _command(f"{name} {_text(1 / rate_hz if rate_hz else 0)}")
+def log_ontime(message: OutputMessage, rate_hz: OutputRate) -> Request:
+    """Send `message` at a rate, or not at all (0). Whether the line carries it is for `require_room`."""
+    return _command(f"LOG {message} ONTIME {_text(1 / rate_hz if rate_hz else 0)}")
 
 
 def log_onmark(message: OutputMessage) -> Request:
@@ -256,6 +259,23 @@ def max_rate_hz(message: OutputMessage, baud: int) -> int:
         known = ", ".join(map(str, sorted(rates)))
         raise BadArgument(f"baud rate: expected one of {known}, got {baud!r}")
     return rates[baud]
+
+
+def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
+    """Raise BadArgument where the line does not carry all messages together, or one of them is above table 3.7."""
+    for message, rate_hz in rates_hz.items():
+        if rate_hz > max_rate_hz(message, baud):
+            raise BadArgument(
+                f"{message}: expected at most {max_rate_hz(message, baud)} Hz at {baud} baud, got {rate_hz:g} Hz; "
+                f"set a lower rate or a higher baud rate first"
+            )
+    bits = sum(rate_hz * FRAME_BYTES[message] for message, rate_hz in rates_hz.items()) * BITS_PER_UART_BYTE
+    if bits > LINE_SHARE_MAX * baud:
+        all_rates = " and ".join(f"{message} at {rate_hz:g} Hz" for message, rate_hz in rates_hz.items() if rate_hz)
+        raise BadArgument(
+            f"expected at most {LINE_SHARE_MAX * baud:.0f} bit/s of frames at {baud} baud, got {bits:.0f} bit/s by "
+            f"{all_rates}; set lower rates or a higher baud rate first"
+        )
 
 
 def _never(_line: str) -> bool:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
+from imud.attitude import Matrix3
 from imud.contracts.codec import TextLine
 from imud.ledger import Ledger
 from imud.sample import Vector3
@@ -24,6 +25,9 @@ _VERSION_NAMES: Final = ("PNAME", "BUILD", "UUID", "APP_VER", "BL_VER")
 _VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s*")
 _COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
 _OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
+_MARKED: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONMARK\s+1\b")
+_PIN: Final = re.compile(r"IO([1-9])\b")
+_DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
 
 def is_end(line: str) -> bool:
@@ -77,6 +81,13 @@ class UserConfig:
 
     att_mode: int | None
     """0: 6-axis, 1: 9-axis."""
+    urfr: Matrix3 | None
+    """Rotation from new sensor axes to the old ones."""
+    magnetic_calibration: bool | None
+    """Whether calibration runs in the background (EN_MCAL)."""
+    pins: Mapping[int, int]
+    """Pin (1 for IO1) by the number of its function (1 for PMUX1)."""
+    sout_divisor: int | None
     report: Report
 
 
@@ -86,6 +97,9 @@ class ComConfig:
 
     periods_s: Mapping[str, float]
     """Output periods by message (`HI91`, `HI92`); 0 is off."""
+    on_mark: frozenset[str]
+    """Messages that are sent for each pulse on SIN."""
+    baud: int | None
     report: Report
 
 
@@ -125,13 +139,26 @@ def parse_version(lines: Sequence[str]) -> Version:
 def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
     """Parse the reply to LOG USRCONFIG."""
     report = parse_report(lines)
-    return UserConfig(_whole(report.values.get("ATT_MODE")), report)
+    get = report.values.get
+    pins = {number: _PIN.match(get(f"PMUX{number}", "")) for number in range(1, 6)}
+    divisor = _DIVISOR.match(get("SOUT_DIV", ""))
+    calibrates = _whole(get("EN_MCAL"))
+    return UserConfig(
+        _whole(get("ATT_MODE")),
+        _matrix(get("URFR", "")),
+        None if calibrates is None else calibrates != 0,
+        {number: int(pin[1]) for number, pin in pins.items() if pin},
+        int(divisor[1]) if divisor else None,
+        report,
+    )
 
 
 def parse_comconfig(lines: Sequence[str]) -> ComConfig:
     """Parse the reply to LOG COMCONFIG."""
     periods_s = {f"HI{message}": float(period) for line in lines for message, period in _OUTPUT.findall(line)}
-    return ComConfig(periods_s, parse_report(lines))
+    on_mark = frozenset(f"HI{message}" for line in lines for message in _MARKED.findall(line))
+    report = parse_report(lines)
+    return ComConfig(periods_s, on_mark, _whole(report.values.get("BAUD")), report)
 
 
 def parse_magconfig(lines: Sequence[str]) -> MagConfig:
@@ -144,12 +171,25 @@ def _whole(text: str | None) -> int | None:
     return int(text) if text is not None and text.isdecimal() else None
 
 
-def _vector(text: str) -> Vector3 | None:
+def _numbers(text: str, count: int) -> tuple[float, ...] | None:
     try:
-        x, y, z = map(float, text.split(","))
+        numbers = tuple(map(float, text.split(",")))
     except ValueError:
         return None
-    return (x, y, z) if isfinite(x) and isfinite(y) and isfinite(z) else None
+    return numbers if len(numbers) == count and all(map(isfinite, numbers)) else None
+
+
+def _vector(text: str) -> Vector3 | None:
+    numbers = _numbers(text, 3)
+    return None if numbers is None else (numbers[0], numbers[1], numbers[2])
+
+
+def _matrix(text: str) -> Matrix3 | None:
+    numbers = _numbers(text, 9)
+    if numbers is None:
+        return None
+    a, b, c, d, e, f, g, h, i = numbers
+    return ((a, b, c), (d, e, f), (g, h, i))
 
 
 LINE_CHARACTERS_MAX: Final = 255

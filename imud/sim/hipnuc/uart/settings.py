@@ -12,6 +12,7 @@ from typing import Final
 from imud.attitude import Matrix3, is_rotation
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
 from imud.sample import Quaternion, Vector3
+from imud.sim.hipnuc.uart.behaviour import AS_IN_MANUAL, Behaviour
 from imud.sim.hipnuc.uart.utc import Epoch
 from imud.sim.physics.motion import Truth
 from imud.sim.sensor import SensorHardware
@@ -216,6 +217,8 @@ class HipnucHardware(SensorHardware):
     """Device time at the first power-on, to begin near the end of a counter's range."""
     mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
     """Result of its magnetic calibration; zero: never calibrated."""
+    behaviour: Behaviour = AS_IN_MANUAL
+    """What it does where the manual leaves it open."""
 
 
 STATIC_GYRO_RAD_S: Final = 0.02

@@ -7,7 +7,8 @@ module sent with `advance`. What it does as a real one does:
 - A frame leaves `processing_ns` after its sample, when the wire is free; text goes between whole frames. What does not
   fit the transmit buffer is never sent: at 115200 baud and 1 kHz six frames of seven are missing.
 - Commands are lines of ASCII, obeyed at once; a known one is answered with `OK` or `ERR`, an unknown one not at all.
-  URFR and SERIALCONFIG act after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved.
+  URFR acts after SAVECONFIG and REBOOT only. What is not saved is lost at a reboot. YAW is never saved. When
+  SERIALCONFIG and FRESET act, and other things that the manual leaves open, is in `behaviour.py`.
 - SOUT pulses before every frame, a rising edge on SIN sends messages set to ONMARK, the other pins and UTC are in
   `pins.py` and `utc.py`; `pins` returns edges as `advance` returns bytes.
 - LOG DISABLE silences frames, not replies, and is forgotten at a reboot (assumed; the manual calls ENABLE the default).
@@ -23,6 +24,7 @@ from typing import Final
 
 from imud.devices.hipnuc.uart.codec import encode_hi91, encode_hi92
 from imud.devices.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMessage
+from imud.sim.hipnuc.uart.behaviour import RateChange, ResetEffect
 from imud.sim.hipnuc.uart.pins import ALARM_PERIOD_MS, SOUT_HIGH_NS, HipnucPins, is_alarming
 from imud.sim.hipnuc.uart.settings import (
     CommandRefused,
@@ -52,6 +54,9 @@ COMMAND_BYTES_MAX: Final = 128
 """Assumed; the longest command of the manual, URFR, has 123 with nine decimals."""
 REPLY_NS: Final = 200_000
 """Time from the end of a command to its reply (assumed)."""
+WRITES_FLASH: Final = ("SAVECONFIG", "FRESET")
+RATE_CHANGE_NS: Final = 5 * NS_PER_MS
+"""From an answer to the change of the rate, where that follows the answer (assumed)."""
 PPS_MODULUS_MS: Final = 8192
 """The PPS stamp free-runs 0 … 8191 without edges (recorded so)."""
 NEAR_LEVEL_RAD: Final = radians(5)
@@ -83,7 +88,7 @@ class HipnucModule:
 
     @property
     def baud(self) -> int:
-        """Rate in bit/s in force; SERIALCONFIG changes it at the next reboot."""
+        """Rate in bit/s in force."""
         return self._wire.baud
 
     def reboot(self, now_ns: int) -> None:
@@ -163,6 +168,7 @@ class HipnucModule:
         self._on_ns, self._on_ms = now_ns, uptime_ms
         self._ready_ns = now_ns + hardware.boot_ms * NS_PER_MS
         self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
+        self._rate_at_ns = self._quiet_until_ns = 0
         self._pps_ns = 0
         self._utc = UtcTime(hardware.utc_epoch)
         self._enabled = True
@@ -196,6 +202,8 @@ class HipnucModule:
 
     def _sample(self, now_ns: int) -> None:
         """Sample up to now and queue the frames; check the angles for ALARM as often as is due."""
+        if 0 < self._rate_at_ns <= now_ns:
+            self._change_rate(self._rate_at_ns)
         self._watch_angles(now_ns)
         while self._next_ms:
             message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
@@ -221,7 +229,7 @@ class HipnucModule:
         """Queue a frame; `later_ns`: its delay in addition to the usual one."""
         processing_ns = max(self.hardware.processing_ns + later_ns, 0)
         ready_ns, size = sample_ns + processing_ns, _FRAME_BYTES[message]
-        if not self._wire.fits(ready_ns, size):
+        if ready_ns < self._quiet_until_ns or not self._wire.fits(ready_ns, size):
             self.frames_dropped += 1
             return
         self.frames_sent += 1
@@ -267,25 +275,45 @@ class HipnucModule:
         if line.startswith("$"):
             self._utc.sentence(line.encode("ascii"), self._device_ns(now_ns))
             return
+        behaviour = self.hardware.behaviour
+        if line.startswith(behaviour.ignores):
+            return
         try:
+            if line.startswith(behaviour.refuses):
+                raise CommandRefused(line)
             settings = changed(self.settings, line, self.hardware.firmware)
             if settings is not None:
-                if settings.sout_div != self.settings.sout_div:
-                    self._pins.restart_divider()
-                self.settings = settings
                 reply: list[str] | None = []
-                self._settings_changed(now_ns)
+                self._change(settings, now_ns)
             else:
                 reply = self._act(line, now_ns)
         except CommandRefused:
             self._say(["ERR"], now_ns)
             return
         if reply is not None:
-            self._say([*reply, "OK"], now_ns)
+            self._say([*reply, "OK"], now_ns + behaviour.flash_ms * NS_PER_MS * (line in WRITES_FLASH))
+            if line.startswith("SERIALCONFIG") and behaviour.rate_change is RateChange.AFTER_ANSWER:
+                self._rate_at_ns = self._wire.due_ns(now_ns, 0) + RATE_CHANGE_NS
+
+    def _change(self, settings: ModuleSettings, now_ns: int) -> None:
+        """Put settings in force that a command has changed."""
+        before, self.settings = self.settings, settings
+        if settings.sout_div != before.sout_div:
+            self._pins.restart_divider()
+        if settings.baud != before.baud and self.hardware.behaviour.rate_change is RateChange.BEFORE_ANSWER:
+            self._change_rate(now_ns)
+        self._settings_changed(now_ns)
+
+    def _change_rate(self, now_ns: int) -> None:
+        """Put the baud rate in force; what waits for the wire is lost."""
+        self._rate_at_ns = 0
+        self._before_reboot += self._wire.stopped(now_ns)
+        self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, now_ns)
 
     def _say(self, lines: list[str], now_ns: int) -> None:
         data = "".join(f"{line}\r\n" for line in lines).encode("ascii")
         self._wire.send(now_ns + REPLY_NS, data)
+        self._quiet_until_ns = now_ns + self.hardware.behaviour.quiet_ms * NS_PER_MS
 
     def _make_actions(self) -> dict[str, Callable[[int], list[str] | None]]:
         """Commands without a value that do more than change settings: reply lines before `OK`, None for no reply."""
@@ -329,8 +357,13 @@ class HipnucModule:
         return []
 
     def _factory_reset(self, now_ns: int) -> list[str]:
-        self.flash = self.settings = ModuleSettings()
-        self._settings_changed(now_ns)
+        self.flash = ModuleSettings()
+        effect = self.hardware.behaviour.factory_reset
+        if effect is not ResetEffect.AFTER_RESTART:
+            self.settings = self.flash
+            if effect is ResetEffect.BEFORE_ANSWER:
+                self._change_rate(now_ns)
+            self._settings_changed(now_ns)
         return []
 
     def _enable(self, enabled: bool, now_ns: int) -> list[str]:

@@ -27,14 +27,14 @@ PRINTED = [
     (c.yaw(c.YawMode.RELATIVE, 1.5), "CONFIG YAW 0 1.5"),
     (c.yaw(c.YawMode.ABSOLUTE, -0.0), "CONFIG YAW 1 0"),
     (c.yaw(c.YawMode.RELATIVE, 1e-5), "CONFIG YAW 0 0.00001"),
-    (c.mounting(c.Mounting.X_MINUS_90), "CONFIG IMU URFR 1,0,0,0,0,1,0,-1,0"),
-    (c.mounting(c.Mounting.X_PLUS_90), "CONFIG IMU URFR 1,0,0,0,0,-1,0,1,0"),
-    (c.mounting(c.Mounting.X_180), "CONFIG IMU URFR 1,0,0,0,-1,0,0,0,-1"),
-    (c.mounting(c.Mounting.Y_PLUS_90), "CONFIG IMU URFR 0,0,-1,0,1,0,1,0,0"),
-    (c.mounting(c.Mounting.Y_MINUS_90), "CONFIG IMU URFR 0,0,1,0,1,0,-1,0,0"),
-    (c.mounting(c.Mounting.Y_180), "CONFIG IMU URFR -1,0,0,0,1,0,0,0,-1"),
-    (c.mounting(c.Mounting.Z_PLUS_90), "CONFIG IMU URFR 0,-1,0,1,0,0,0,0,1"),
-    (c.mounting(c.Mounting.Z_MINUS_90), "CONFIG IMU URFR 0,1,0,-1,0,0,0,0,1"),
+    (c.mounting(c.Mounting.Y_DOWN), "CONFIG IMU URFR 1,0,0,0,0,1,0,-1,0"),
+    (c.mounting(c.Mounting.Y_UP), "CONFIG IMU URFR 1,0,0,0,0,-1,0,1,0"),
+    (c.mounting(c.Mounting.Z_DOWN), "CONFIG IMU URFR 1,0,0,0,-1,0,0,0,-1"),
+    (c.mounting(c.Mounting.X_UP), "CONFIG IMU URFR 0,0,-1,0,1,0,1,0,0"),
+    (c.mounting(c.Mounting.X_DOWN), "CONFIG IMU URFR 0,0,1,0,1,0,-1,0,0"),
+    (c.mounting(c.Mounting.Z_DOWN_X_BACK), "CONFIG IMU URFR -1,0,0,0,1,0,0,0,-1"),
+    (c.mounting(c.Mounting.LEVEL_X_LEFT), "CONFIG IMU URFR 0,-1,0,1,0,0,0,0,1"),
+    (c.mounting(c.Mounting.LEVEL_X_RIGHT), "CONFIG IMU URFR 0,1,0,-1,0,0,0,0,1"),
     (c.mounting(c.Mounting.LEVEL), "CONFIG IMU URFR 1,0,0,0,1,0,0,0,1"),
     (c.mounting(((0.8, -0.6, 0), (0.6, 0.8, 0), (0, 0, 1))), "CONFIG IMU URFR 0.8,-0.6,0,0.6,0.8,0,0,0,1"),
     (c.magnetic_calibration(True), "CONFIG IMU EN_MCAL 1"),
@@ -52,7 +52,9 @@ PRINTED = [
     (c.log_ontime(H91, 1), "LOG HI91 ONTIME 1"),
     (c.log_ontime(H91, 500), "LOG HI91 ONTIME 0.002"),
     (c.log_ontime(H91, 250), "LOG HI91 ONTIME 0.004"),
-    (c.log_ontime(H91, 1000, 921600), "LOG HI91 ONTIME 0.001"),
+    (c.log_ontime(H91, 1000), "LOG HI91 ONTIME 0.001"),
+    (c.log_ontime(H91, 25), "LOG HI91 ONTIME 0.04"),
+    (c.log_ontime(H92, 125), "LOG HI92 ONTIME 0.008"),
     (c.log_onmark(H91), "LOG HI91 ONMARK 1"),
     (c.log_once(H91), "LOG HI91 ONMARK ONCE"),
     (c.ask(c.Query.VERSION), "LOG VERSION"),
@@ -71,7 +73,7 @@ def test_commands_are_as_printed(request_: Request, text: str) -> None:
 IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 two_rows: Any = IDENTITY[:2]  # of a wrong type on purpose
 
-REFUSED: list[tuple[Callable[[], Request], str]] = [
+REFUSED: list[tuple[Callable[[], object], str]] = [
     (lambda: c.mounting(((1, 0, 0), (0, 1, 0), (0, 0, -1))), "determinant"),
     (lambda: c.mounting(((2, 0, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
     (lambda: c.mounting(((1, 0.01, 0), (0, 1, 0), (0, 0, 1))), "orthonormal"),
@@ -79,13 +81,13 @@ REFUSED: list[tuple[Callable[[], Request], str]] = [
     (lambda: c.mounting(two_rows), "three rows"),
     (lambda: c.alarm(c.AlarmAxis.X, 5, -5, True), "minimum below the maximum"),
     (lambda: c.alarm(c.AlarmAxis.X, 5, 5, True), "minimum below the maximum"),
-    (lambda: c.log_ontime(H91, 200, 115200), "at most 100 Hz at 115200 baud, got 200 Hz"),
-    (lambda: c.log_ontime(H91, 10, 4800), "one of 9600"),
+    (lambda: c.require_room({H91: 200}, 115200), "at most 100 Hz at 115200 baud, got 200 Hz"),
+    (lambda: c.require_room({H91: 10}, 4800), "one of 9600"),
 ]
 
 
 @pytest.mark.parametrize(("make", "message"), REFUSED)
-def test_bad_arguments_are_refused_with_what_was_expected(make: Callable[[], Request], message: str) -> None:
+def test_bad_arguments_are_refused_with_what_was_expected(make: Callable[[], object], message: str) -> None:
     with pytest.raises(BadArgument, match=message) as caught:
         make()
     assert "expected" in str(caught.value)

@@ -5,12 +5,14 @@ from typing import TypeVar
 
 import pytest
 
-from imud.contracts.session import Outcome, Rejection, Reply, RequestScript, Session, Silence
-from imud.devices.hipnuc.uart.commands import OutputMessage, Query, ask, log_ontime
-from imud.devices.hipnuc.uart.session import identify, read_settings
-from imud.errors import NoReply, Rejected
+from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript, Session, Silence
+from imud.devices.hipnuc.uart.commands import BAUD_RATES, OutputMessage, Query, ask, log_ontime
+from imud.devices.hipnuc.uart.session import advice, identify, read_settings, wake
+from imud.errors import BadArgument, NoReply, Rejected
 from imud.ledger import Ledger
-from tests.support.simulated_modules import run_script
+from imud.sim.hipnuc.uart.behaviour import VARIANTS, Behaviour, RateChange
+from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from tests.support.simulated_modules import HipnucLine, hardware_of, run_script
 
 T = TypeVar("T")
 VERSION = ("PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK")
@@ -97,3 +99,165 @@ def test_the_late_ok_of_a_command_does_not_end_a_report() -> None:
     outcomes = [session.on_message(line, 10**9 + 1) for line in ("OK", *VERSION)]
     assert outcomes == [None] * 6 + [Reply(VERSION)]
     assert ledger.replies_late == 1
+
+
+# --- on the simulated module, in every way that the manual can be read ----------------------------------------------
+
+every_variant = pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
+
+
+@every_variant
+@pytest.mark.parametrize("baud", [9600, 230400, 921600])
+def test_another_baud_rate_is_followed_and_saved(behaviour: Behaviour, baud: int) -> None:
+    line = HipnucLine(ModuleSettings(hi91=Output(200)), hardware_of(behaviour))
+    assert line.act("baud", baud=baud) == {"baud": baud}
+    assert line.baud == line.module.baud == line.module.flash.baud == baud
+    line.module.reboot(line.now_ns)
+    line.wait(line.module.hardware.boot_ms)
+    assert line.run(identify()).product == "HI14R3"
+
+
+@every_variant
+def test_a_module_that_refuses_another_rate_stays_reachable(behaviour: Behaviour) -> None:
+    refusing = Behaviour(flash_ms=behaviour.flash_ms, quiet_ms=behaviour.quiet_ms, refuses=("SERIALCONFIG",))
+    line = HipnucLine(hardware=hardware_of(refusing))
+    with pytest.raises(Rejected, match="SERIALCONFIG 921600: the module refused: ERR"):
+        line.act("baud", baud=921600)
+    assert line.run(identify()).product == "HI14R3"
+
+
+def test_a_module_that_does_not_know_the_command_is_found_at_its_old_rate() -> None:
+    line = HipnucLine(hardware=hardware_of(Behaviour(ignores=("SERIALCONFIG",))))
+    with pytest.raises(NoReply, match="stays at 115200 baud"):
+        line.act("baud", baud=921600)
+    assert "SAVECONFIG" not in line.asked
+    assert line.run(identify()).product == "HI14R3"
+
+
+class Forgetful(HipnucLine):
+    """A module that answers OK to SAVECONFIG and saves nothing."""
+
+    def ask(self, request: Request) -> Outcome:
+        outcome = super().ask(request)
+        self.module.flash = ModuleSettings()
+        return outcome
+
+
+def test_a_rate_that_was_not_saved_after_all_is_reported_after_the_restart() -> None:
+    line = Forgetful()
+    with pytest.raises(Rejected, match="stays at 115200 baud"):
+        line.act("baud", baud=921600)
+    assert line.baud == 115200
+    assert line.run(identify()).product == "HI14R3"
+
+
+@pytest.mark.parametrize(
+    ("settings", "baud", "words"),
+    [
+        (ModuleSettings(hi91=Output(10)), 9600, "HI91: expected at most 10 Hz at 9600 baud, got 100 Hz"),
+        (ModuleSettings(baud=921600, hi91=Output(1)), 460800, "at most 500 Hz at 460800 baud, got 1000 Hz"),
+        (ModuleSettings(hi91=Output(100), hi92=Output(200)), 9600, r"9120 bit/s of frames at 9600 baud, got 10900"),
+    ],
+)
+def test_a_baud_rate_that_does_not_carry_the_present_output_is_refused(
+    settings: ModuleSettings, baud: int, words: str
+) -> None:
+    """10 Hz of HI91 are 8200 bit/s, 5 Hz of HI92 2700 bit/s."""
+    line = HipnucLine(settings)
+    with pytest.raises(BadArgument, match=words):
+        line.act("baud", baud=baud)
+    assert line.asked == ["LOG COMCONFIG"]
+
+
+def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None:
+    """100 Hz of HI91 take 82000 bit/s of 115200; HI92 takes 540 bit per frame: 95 % leave 50 Hz and not 100."""
+    line = HipnucLine()
+    with pytest.raises(BadArgument, match="got 136000 bit/s by HI91 at 100 Hz and HI92 at 100 Hz"):
+        line.act("output", message="HI92", rate_hz=100)
+    assert "LOG HI92 ONTIME 0.01" not in line.asked
+    line.act("output", message="HI92", rate_hz=50)
+    assert line.module.settings.hi92 == Output(20)
+
+
+def test_a_period_of_the_rule_and_so_on_is_accepted() -> None:
+    line = HipnucLine()
+    line.act("output", message="HI91", rate_hz=25)
+    assert line.module.settings.hi91 == Output(40)
+
+
+@every_variant
+@pytest.mark.parametrize("baud", BAUD_RATES)
+def test_a_factory_reset_is_in_force_and_followed(behaviour: Behaviour, baud: int) -> None:
+    line = HipnucLine(ModuleSettings(baud=baud, att_mode=1, hi91=Output(200)), hardware_of(behaviour))
+    answer = line.act("factory_reset", fixed_baud=baud)
+    assert answer["baud"] == line.baud == line.module.baud == 115200
+    assert ("configuration" in answer) is (baud != 115200)
+    assert line.module.settings == line.module.flash == ModuleSettings()
+
+
+def test_a_factory_reset_that_is_refused_or_unknown_changes_nothing() -> None:
+    before = ModuleSettings(baud=921600, att_mode=1)
+    with pytest.raises(Rejected, match="FRESET: the module refused: ERR"):
+        HipnucLine(before, hardware_of(Behaviour(refuses=("FRESET",)))).act("factory_reset")
+    line = HipnucLine(before, hardware_of(Behaviour(ignores=("FRESET",))))
+    with pytest.raises(NoReply, match="FRESET: expected OK, got nothing"):
+        line.act("factory_reset")
+    assert (line.baud, line.module.settings) == (921600, before)
+
+
+def test_a_rate_that_was_not_saved_is_followed_back_over_a_restart() -> None:
+    line = HipnucLine(hardware=hardware_of(Behaviour(rate_change=RateChange.AFTER_ANSWER)))
+    line.run(_send(line, "SERIALCONFIG 460800"))
+    line.baud = 460800
+    assert line.act("restart").product == "HI14R3"
+    assert line.baud == line.module.baud == 115200
+
+
+def _send(line: HipnucLine, command: str) -> RequestScript[None]:
+    line.module.receive(command.encode() + b"\r\n", line.now_ns)
+    line.wait(20)
+    return None
+    yield  # makes it a generator
+
+
+@pytest.mark.parametrize(
+    ("settings", "done", "hi91"),
+    [
+        (ModuleSettings(), "LOG ENABLE", Output(10)),
+        (ModuleSettings(hi91=Output()), "LOG ENABLE; HI91 at 100 Hz, which is not saved", Output(10)),
+        (ModuleSettings(baud=9600, hi91=Output()), "LOG ENABLE; HI91 at 10 Hz, which is not saved", Output(100)),
+        (ModuleSettings(hi91=Output(on_mark=True)), "LOG ENABLE; HI91 at 100 Hz, which is not saved", Output(10)),
+    ],
+)
+def test_a_silent_module_is_woken_by_an_action(settings: ModuleSettings, done: str, hi91: Output) -> None:
+    line = HipnucLine(settings)
+    line.module.receive(b"LOG DISABLE\r\n", line.now_ns)
+    line.wait(300)
+    assert line.act("wake") == done
+    assert line.module.settings.hi91 == hi91
+    assert line.module.flash == settings
+    line.wait(300)
+    assert line.ledger.frames_in_samples > 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "woken"),
+    [
+        (ModuleSettings(), True),
+        (ModuleSettings(hi91=Output()), None),
+        (ModuleSettings(hi91=Output(on_mark=True)), None),
+        (ModuleSettings(hi91=Output(on_mark=True), hi92=Output(100)), None),
+    ],
+)
+def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSettings, woken: bool | None) -> None:
+    line = HipnucLine(settings)
+    line.module.receive(b"LOG DISABLE\r\n", line.now_ns)
+    line.wait(300)
+    assert line.run(wake()) is woken
+    assert ("LOG ENABLE" in line.asked) is (woken is True)
+    assert line.module.settings == settings
+
+
+def test_advice_is_given_where_the_configuration_fixes_another_rate() -> None:
+    assert advice(921600, 0) == advice(921600, 921600) == ""
+    assert advice(921600, 115200).startswith("change `baud: 115200` in the configuration to 921600 or auto")
