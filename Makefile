@@ -2,6 +2,7 @@
 # make lab    tests on a booted kernel          make chaos  random faults on a booted kernel (ARGS="--seed N --seconds S")
 # make soak   100 devices, 20 clients, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
+# make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make pictures   the pictures of README.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
 # make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
@@ -13,7 +14,7 @@ ARGS ?=
 LAB_OPTIONS ?= --steady
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos
+.PHONY: all demo test lint check bench bench-instructions bench-deps attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos
 
 all: check
 
@@ -38,6 +39,13 @@ check: lint test
 
 bench: $(VENV)/made
 	$(BIN)/python -m tests.bench $(ARGS)
+
+bench-instructions: $(VENV)/made
+	$(BIN)/python -m tests.bench.instructions $(ARGS)
+
+# valgrind, which counts instructions
+bench-deps:
+	apt-get install --yes --no-install-recommends valgrind
 
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)

@@ -1,0 +1,111 @@
+"""`make bench-instructions`: instructions per sample and stage, counted by callgrind, beside those kept in the tree.
+
+The count does not depend on what else the machine does: two runs agree within 0.5 %. It has the instructions of the
+process, not those of the kernel, and says nothing about caches. It fails when a stage takes 5 % more than its figure in
+`figures.json`; a commit that lowers one writes them anew: ARGS=--update. Words choose stages: ARGS="clock slot".
+
+Figures hold for one build of Python on one architecture; for others it prints what it counted, and judges nothing.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from tests.bench.instructions import figures
+from tests.bench.instructions.measured import MARK, MARKS_PER_STAGE
+
+LIMIT_S: Final = 900.0
+ROOT: Final = Path(__file__).parents[3]
+PASSED_ON: Final = ("PATH", "PYTHONPATH", "TMPDIR")
+"""All else of the environment is left out: its size moves the stack."""
+
+
+class MeasurementError(Exception):
+    """The program that is measured failed, or left other dumps than it should."""
+
+
+def total(dump: str) -> int:
+    """The instructions of one dump of callgrind. Raises MeasurementError."""
+    found = re.search(r"^totals: (\d+)$", dump, re.MULTILINE)
+    if found is None:
+        raise MeasurementError("a dump of callgrind without totals; was it interrupted?")
+    return int(found[1])
+
+
+def per_operation(names: Sequence[str], totals: Sequence[int]) -> dict[str, int]:
+    """Instructions by stage. `names` are the lines that the program printed, `totals` those of the dumps, in order."""
+    if len(totals) != MARKS_PER_STAGE * len(names):
+        raise MeasurementError(f"{len(totals)} dumps for {len(names)} stages, expected {MARKS_PER_STAGE} each")
+    found = {}
+    for number, line in enumerate(names):
+        count, _, name = line.partition(" ")
+        once, twice = totals[MARKS_PER_STAGE * number + 1 : MARKS_PER_STAGE * (number + 1)]
+        found[name] = round((twice - once) / int(count))
+    return found
+
+
+def measure(words: Sequence[str]) -> dict[str, int]:
+    """Count the stages whose names have one of `words`; all without any. Raises MeasurementError."""
+    environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+    environment |= {"PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
+    with tempfile.TemporaryDirectory(prefix="imud-instructions-") as name:
+        dumps = Path(name) / "dump"
+        valgrind = ["valgrind", "--quiet", "--tool=callgrind", f"--dump-before={MARK}", f"--callgrind-out-file={dumps}"]
+        python = [sys.executable, "-m", "tests.bench.instructions.measured", *words]
+        done = subprocess.run(
+            [*valgrind, *python], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT_S,
+            check=False,
+        )  # fmt: skip
+        if done.returncode:
+            raise MeasurementError(done.stderr)
+        names = done.stdout.splitlines()
+        count = len(list(dumps.parent.glob("dump.*")))
+        totals = [total(Path(f"{dumps}.{number}").read_text()) for number in range(1, count + 1)]
+    return per_operation(names, totals)
+
+
+def main() -> int:
+    """Run as `python -m tests.bench.instructions`."""
+    parser = argparse.ArgumentParser(prog="make bench-instructions")
+    parser.add_argument("words", nargs="*", metavar="WORD", help="stages with a WORD in their names; all without any")
+    parser.add_argument("--update", action="store_true", help="keep what is counted as the figures of this Python")
+    args = parser.parse_args()
+    if shutil.which("valgrind") is None:
+        print("valgrind is not installed: `make bench-deps` installs it, as root", file=sys.stderr)
+        return 2
+    try:
+        measured = measure([*args.words, figures.INTERPRETER] if args.words else [])
+    except MeasurementError as error:
+        print(f"nothing was counted: {error}", file=sys.stderr)
+        return 1
+    build = figures.python_build()
+    kept = figures.load().get(build)
+    known = kept is not None and figures.is_same_build(kept, measured)
+    print(f"# instructions per sample or frame; {build}")
+    lines = figures.compare(kept if known and kept else {}, measured)
+    for line in lines:
+        print(line if known else f"{line.stage:58} {line.now:8}")
+    if args.update:
+        figures.keep(build, measured)
+        print(f"# kept in {figures.FILE.relative_to(ROOT)}")
+        return 0
+    if not known:
+        print("# no figures for this Python, or it is built with other options: nothing is judged")
+        return 0
+    bad = [line.stage for line in lines if not line.is_good]
+    if any(line.growth < -figures.LESS_NOTED for line in lines):
+        print('# some are lower than kept: keep them with ARGS="--update"')
+    if bad:
+        print(f"# {len(bad)} stages take more than {figures.GROWTH_MOST:.0%} above their figure, or have none")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,146 @@
+"""The real daemon on a pseudo-terminal, in virtual time: each wake-up of its event loop finds one read of the port.
+
+The module and the clients' reads have their turn where the loop would sleep (`_Feeder.select`), so the turns of the
+loop, its ticks included, are those of a daemon in service.
+"""
+
+import asyncio
+import grp
+import os
+import select
+import selectors
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from imud import config
+from imud.daemon import Daemon
+from imud.formats.jsonrpc import encode_request, line_of
+from imud.units import NS_PER_MS
+from tests.bench.instructions import virtual_time
+from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
+
+DRAIN_EVERY: Final = 16
+"""Wake-ups between two reads of the clients: no socket is full by then."""
+START_MS: Final = 1000
+CONNECT_MS: Final = 10
+BUFFER: Final = bytearray(1 << 20)
+
+
+class _Feeder(selectors.EpollSelector):
+    """Gives the loop its next read when it would sleep; where none is left, the loop stops."""
+
+    def __init__(self, master: int, slave: int) -> None:
+        super().__init__()
+        self.loop: asyncio.AbstractEventLoop | None = None
+        self.reads: Iterator[Read] = iter(())
+        self.clients: list[socket.socket] = []
+        self._master = master
+        self._readable = select.poll()
+        self._readable.register(slave, select.POLLIN)
+        self.wakes = 0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is None or timeout > 0:
+            read = next(self.reads, None)
+            if read is None:
+                assert self.loop is not None
+                self.loop.stop()
+            else:
+                self._feed(read)
+        return super().select(0)
+
+    def _feed(self, read: Read) -> None:
+        virtual_time.set_now(read.t_rx_ns)
+        os.write(self._master, read.data)
+        self._readable.poll()  # a kernel thread carries the bytes over
+        self.wakes += 1
+        if not self.wakes % DRAIN_EVERY:
+            self.drain()
+
+    def drain(self) -> None:
+        """Read what the clients have got."""
+        for client in self.clients:
+            client.recv_into(BUFFER)
+
+
+class VirtualDaemon:
+    """A daemon with one device and its clients, in the caller's thread."""
+
+    def __init__(self, directory: Path) -> None:
+        self._master, slave = os.openpty()
+        self._socket_path = str(directory / "s")
+        self._module = Module()
+        self._feeder = _Feeder(self._master, slave)
+        self._loop = asyncio.SelectorEventLoop(self._feeder)
+        self._feeder.loop = self._loop
+        self._running = self._loop.create_task(Daemon(_settings(directory, os.ttyname(slave))).run())
+        self._pass_time(START_MS)
+        self.process(self._module.first_minute())
+
+    def connect(self, clients: int, encoding: str) -> None:
+        """Have so many clients that get every sample, in place of those before."""
+        for client in self._feeder.clients:
+            client.close()
+        self._feeder.clients = []
+        self._pass_time(CONNECT_MS)
+        watch = line_of(encode_request("watch", {"encoding": encoding}, 1))
+        for _ in range(clients):
+            client = socket.socket(socket.AF_UNIX)
+            client.connect(self._socket_path)
+            client.sendall(watch)
+            client.setblocking(False)
+            self._feeder.clients.append(client)
+        self._pass_time(CONNECT_MS)
+        self._feeder.drain()
+        self._feeder.wakes = 0
+        self.process(self._module.reads(SETTLE_READS))
+
+    def prepare(self, count: int, frames: int) -> list[Read]:
+        """`count` reads of so many frames each, for `process`."""
+        return self._module.reads(count, frames)
+
+    def process(self, reads: list[Read]) -> None:
+        """Have the daemon read, process and publish; a wake-up each."""
+        self._run(iter(reads))
+
+    def close(self) -> None:
+        """End the daemon."""
+        self._running.cancel()
+        self._loop.run_until_complete(asyncio.gather(self._running, return_exceptions=True))
+        self._loop.close()
+        for client in self._feeder.clients:
+            client.close()
+
+    def _run(self, reads: Iterator[Read]) -> None:
+        self._feeder.reads = reads
+        self._loop.run_forever()
+        if self._running.done():
+            self._running.result()
+
+    def _pass_time(self, duration_ms: int) -> None:
+        """Have the daemon do what it does without data."""
+        for _ in range(duration_ms):
+            virtual_time.set_now(virtual_time.now_ns() + NS_PER_MS)
+            self._run(iter(()))
+        self._module.skip(duration_ms)
+
+
+def _settings(directory: Path, port: str) -> config.Config:
+    tree = {
+        "log_level": "error",
+        "state_dir": str(directory),
+        "socket": {"path": str(directory / "s"), "group": own_group()},
+        "shm": {"directory": str(directory), "group": own_group()},
+        "metrics": {"port": 0},
+        "devices": {"d0": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": BAUD}}},
+    }
+    return config.parse(msgspec.json.encode(tree), "measurement")
+
+
+def own_group() -> str:
+    """A group that files may be given to without any right."""
+    return grp.getgrgid(os.getegid()).gr_name

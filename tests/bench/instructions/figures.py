@@ -1,0 +1,75 @@
+"""The figures that are kept in the tree, by build of Python, and what a new measurement is beside them."""
+
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+
+FILE: Final = Path(__file__).with_name("figures.json")
+GROWTH_MOST: Final = 0.05
+"""Two runs of the same code agree within 0.5 %."""
+LESS_NOTED: Final = 0.005
+BUILD_MOST: Final = 0.01
+"""The same Python without imud: with a larger difference it is built with other options."""
+INTERPRETER: Final = "interpreter: a loop without imud"
+"""The stage that shows how Python itself was built."""
+
+Figures = dict[str, int]
+"""Instructions per sample or frame, by stage."""
+
+
+class Line(NamedTuple):
+    """One stage of a measurement."""
+
+    stage: str
+    now: int
+    kept: int | None
+    """None where there is no figure."""
+
+    @property
+    def growth(self) -> float:
+        """Share by which it has grown."""
+        return self.now / self.kept - 1 if self.kept else 0.0
+
+    @property
+    def is_good(self) -> bool:
+        """Whether there is a figure, and it is not exceeded."""
+        return self.kept is not None and self.now <= self.kept * (1 + GROWTH_MOST)
+
+    def __str__(self) -> str:
+        if self.kept is None:
+            return f"{self.stage:58} {self.now:8}  NO FIGURE"
+        mark = "" if self.is_good else "  TOO MANY"
+        return f"{self.stage:58} {self.now:8} {self.kept:8} {self.growth:+8.1%}{mark}"
+
+
+def python_build() -> str:
+    """What figures depend on beside our own code."""
+    python = f"{platform.python_implementation()} {platform.python_version()}"
+    return f"{python}, {platform.python_compiler()}, {platform.machine()}"
+
+
+def load() -> dict[str, Figures]:
+    """All figures, by build of Python."""
+    return msgspec.json.decode(FILE.read_bytes(), type=dict[str, Figures])
+
+
+def keep(build: str, measured: Mapping[str, int]) -> None:
+    """Write the figures of one build; those of stages that were not measured stay."""
+    kept = load()
+    kept[build] = {**kept.get(build, {}), **measured}
+    FILE.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=1) + b"\n")
+
+
+def is_same_build(kept: Figures | None, measured: Mapping[str, int]) -> bool:
+    """Whether the figures are those of this Python: it takes the same instructions for the same loop."""
+    if kept is None or INTERPRETER not in kept:
+        return False
+    return abs(measured[INTERPRETER] / kept[INTERPRETER] - 1) <= BUILD_MOST
+
+
+def compare(kept: Figures, measured: Mapping[str, int]) -> list[Line]:
+    """Each stage that was measured beside its figure."""
+    return [Line(stage, now, kept.get(stage)) for stage, now in measured.items()]

@@ -1,0 +1,79 @@
+"""The device of the measurements: an HI91 module at 1 kHz.
+
+Its first minute passes quickly: most of its frames are lost, so that the fit of arrivals becomes old at little cost.
+
+Frames, their times of arrival and the small delays in them are the same in every run.
+"""
+
+import struct
+from typing import Final, NamedTuple
+
+from imud.devices.hipnuc.uart.codec import encode_frame, encode_hi91
+from imud.units import NS_PER_MS, uart_byte_ns
+from tests.bench.instructions.virtual_time import BEGIN_NS
+
+BAUD: Final = 921600
+PAIRS: Final = 350
+"""Frames that come while most are lost, two by two, so that 1 ms remains the period that the clock learns."""
+PAIR_STEP_MS: Final = 200
+"""The bins of the fit are 1 s wide after 64 s, and a new fit is rare from then on."""
+SETTLE_READS: Final = 300
+"""After a gap the clock watches the next 256 samples closely."""
+PPM: Final = 40
+DELAY_NS: Final = (20_000, 90_000, 35_000, 150_000, 60_000, 25_000, 110_000)
+HEADER_BYTES: Final = 6
+TIME_AT: Final = 8
+"""Where an HI91 payload has its time, u32 in ms."""
+HI91: Final = encode_hi91(
+    system_time_ms=0, accel_m_s2=(0.1226, -0.4903, 9.787), gyro_rad_s=(0.00175, -0.0035, 0.0052),
+    mag_t=(2.13e-5, -3.4e-6, -4.27e-5), euler_rad=(0.0123, -0.0235, 0.7854),
+    quat_wxyz=(0.9239, 0.0012, -0.0034, 0.3827), temperature_c=31, pressure_pa=101_325.25,
+)  # fmt: skip
+
+
+class Read(NamedTuple):
+    """Bytes that are there at one time."""
+
+    data: bytes
+    t_rx_ns: int
+
+
+def hi91(time_ms: int) -> bytes:
+    """The frame of this time."""
+    payload = bytearray(HI91[HEADER_BYTES:])
+    struct.pack_into("<I", payload, TIME_AT, time_ms)
+    return encode_frame(bytes(payload))
+
+
+def arrival_ns(time_ms: int, number: int) -> int:
+    """When the last byte of the frame of this time is read."""
+    true_ns = time_ms * NS_PER_MS + time_ms * PPM
+    return BEGIN_NS + true_ns + len(HI91) * uart_byte_ns(BAUD) + DELAY_NS[number % len(DELAY_NS)]
+
+
+class Module:
+    """Makes the reads of a port in the order of time."""
+
+    def __init__(self) -> None:
+        self._time_ms = 1000
+
+    def first_minute(self) -> list[Read]:
+        """Reads until the fit is old and nothing is watched any more."""
+        found = self.reads(SETTLE_READS)
+        for _ in range(PAIRS):
+            self.skip(PAIR_STEP_MS)
+            found += self.reads(2)
+        return found + self.reads(SETTLE_READS)
+
+    def skip(self, duration_ms: int) -> None:
+        """Lose the frames of this time."""
+        self._time_ms += duration_ms
+
+    def reads(self, count: int, frames: int = 1) -> list[Read]:
+        """`count` reads of so many frames each, at 1 kHz."""
+        found = []
+        for number in range(count):
+            times = range(self._time_ms + 1, self._time_ms + frames + 1)
+            self._time_ms += frames
+            found.append(Read(b"".join(map(hi91, times)), arrival_ns(self._time_ms, number)))
+        return found

@@ -1,0 +1,354 @@
+"""What is counted: stages of the way of a sample, each on fixed input, and the whole daemon.
+
+A stage makes `run`, which carries out its first so many operations that are still to be done; the instructions of 2 n
+less those of n are n operations without all that surrounds them.
+"""
+
+import asyncio
+import atexit
+import shutil
+import socket
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import islice
+from pathlib import Path
+from random import Random
+from typing import Final
+
+from imud.clock import SampleClock
+from imud.contracts.codec import StreamCodec
+from imud.contracts.publisher import Batch, PublisherContext
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
+from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings
+from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.devices.imu61x.uart.codec import Imu61xCodec, encode_ahrs
+from imud.formats.jsonrpc import encode_request, line_of
+from imud.formats.slot import encode_slot
+from imud.host_clock import HostClock
+from imud.ledger import Ledger
+from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
+from imud.publishers.socket.publisher import SocketServer, SocketSettings
+from imud.runtime.path import PathContext, StreamPath
+from imud.sample import Measurement, Sample
+from imud.units import NS_PER_MS, uart_byte_ns
+from tests.bench.instructions import virtual_time
+from tests.bench.instructions.daemon import BUFFER, DRAIN_EVERY, VirtualDaemon, own_group
+from tests.bench.instructions.figures import INTERPRETER
+from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
+
+Run = Callable[[int], None]
+
+READ_BYTES: Final = 4096
+WARM: Final = 64
+"""Operations before the first that is counted: the interpreter specialises its instructions."""
+
+
+@dataclass(frozen=True, slots=True)
+class CountedStage:
+    """A part of the way of a sample."""
+
+    name: str
+    make: Callable[[int], Run]
+    """Makes `run` for so many operations in all."""
+    count: int
+    """Operations that are counted; twice as many the second time."""
+    per: int = 1
+    """Samples, or frames, of an operation."""
+
+    @property
+    def total(self) -> int:
+        """Operations in all."""
+        return WARM + 3 * self.count
+
+
+def _taking(operations: Sequence[Callable[[], object]]) -> Run:
+    """Carries out operations, each once."""
+    left = iter(operations)
+
+    def run(count: int) -> None:
+        for operation in islice(left, count):
+            operation()
+
+    return run
+
+
+def _interpreter(total: int) -> Run:
+    """What depends on how Python was built, and on nothing else: calls, a dictionary, integers and floats."""
+
+    def loop(count: int) -> float:
+        seen: dict[int, float] = {}
+        for number in range(count):
+            seen[number & 15] = seen.get(number & 7, 0.5) * 0.75 + number
+        return sum(seen.values())
+
+    return _taking([partial(loop, 100)] * total)
+
+
+# --- decoding -------------------------------------------------------------------------------------------------------
+
+
+def _feeding(codec: StreamCodec, reads: Sequence[bytes]) -> Run:
+    return _taking([partial(codec.feed, read) for read in reads])
+
+
+def _hi91_frames(count: int) -> list[bytes]:
+    return [read.data for read in Module().reads(count)]
+
+
+def _hi91_single(total: int) -> Run:
+    return _feeding(HipnucCodec(Ledger(), HipnucSettings()), _hi91_frames(total))
+
+
+HI91_BLOCK: Final = 50
+"""Frames in 4100 bytes: reads of that size have a cut frame at each end, as those of 4096 have."""
+
+
+def _hi91_bulk(total: int) -> Run:
+    stream = b"".join(_hi91_frames(total * HI91_BLOCK + 1))
+    size = len(stream) // (total * HI91_BLOCK + 1) * HI91_BLOCK
+    return _feeding(HipnucCodec(Ledger(), HipnucSettings()), _cut(stream, size))
+
+
+def _cut(stream: bytes, size: int) -> list[bytes]:
+    """Reads of `size` bytes, of which the first has 30 more."""
+    return [stream[: size + 30], *(stream[at : at + size] for at in range(size + 30, len(stream), size))]
+
+
+def _ahrs_frames(count: int) -> list[bytes]:
+    random = Random(7)
+    values = [random.gauss(0, 1) for _ in range(100)]
+    return [
+        encode_ahrs(
+            timer_us=5000 * n, accel_m_s2=(values[n % 97], values[n % 89], 9.8),
+            gyro_rad_s=(values[n % 83], values[n % 79], values[n % 73]),
+            euler_rad=(values[n % 71] / 2, values[n % 67] / 2, values[n % 61]), temperature_c=31.5,
+        )
+        for n in range(count)
+    ]  # fmt: skip
+
+
+def _ahrs_single(total: int) -> Run:
+    return _feeding(Imu61xCodec(Ledger()), _ahrs_frames(total))
+
+
+AHRS_BLOCK: Final = 75
+
+
+def _ahrs_bulk(total: int) -> Run:
+    stream = b"".join(_ahrs_frames(total * AHRS_BLOCK + 1))
+    size = len(stream) // (total * AHRS_BLOCK + 1) * AHRS_BLOCK
+    return _feeding(Imu61xCodec(Ledger()), _cut(stream, size))
+
+
+VECTOR: Final = (0.125, -0.25, 0.5)
+TPDO_IDS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
+
+
+def _imu61x_can(total: int) -> Run:
+    codec = Imu61xCanCodec(Ledger(), Imu61xCanSettings())
+    frames = [
+        (can_id, data, number * 5 * NS_PER_MS + place * 200_000)
+        for number in range(total // 5 + 1)
+        for place, (can_id, data) in enumerate(
+            encode_set(index=number, accel_m_s2=VECTOR, gyro_rad_s=VECTOR, euler_rad=VECTOR, temperature_c=31.5)
+        )
+    ]
+    return _taking([partial(codec.feed_frame, can_id, False, data, t_ns) for can_id, data, t_ns in frames])
+
+
+def _canopen(total: int) -> Run:
+    codec = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings())
+    tpdos = encode_tpdos(
+        accel_m_s2=VECTOR, gyro_rad_s=VECTOR, euler_rad=VECTOR, quat_wxyz=(1.0, 0.0, 0.0, 0.0), pressure_pa=101_325.0,
+        incli_rad=VECTOR[:2],
+    )  # fmt: skip
+    frames = [
+        (TPDO_IDS[number] + 8, data, sample * 10 * NS_PER_MS + place * 250_000)
+        for sample in range(total // len(tpdos) + 1)
+        for place, (number, data) in enumerate(tpdos.items())
+    ]
+    return _taking([partial(codec.feed_frame, can_id, False, data, t_ns) for can_id, data, t_ns in frames])
+
+
+# --- clock, slot, ring ----------------------------------------------------------------------------------------------
+
+
+def _measured(reads: Sequence[Read]) -> list[tuple[Measurement, int]]:
+    codec = HipnucCodec(Ledger(), HipnucSettings())
+    return [(event, read.t_rx_ns) for read in reads for event in codec.feed(read.data) if type(event) is Measurement]
+
+
+def _clock_of_module() -> SampleClock:
+    return SampleClock("d0", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=uart_byte_ns(BAUD), hold_ns=0)
+
+
+def _clock(total: int) -> Run:
+    module, clock = Module(), _clock_of_module()
+    for m, t_rx_ns in _measured(module.first_minute()):
+        clock.sample(m, t_rx_ns, 0)
+    calls = _measured(module.reads(total))
+    return _taking([partial(clock.sample, m, t_rx_ns, virtual_time.UTC_AHEAD_NS) for m, t_rx_ns in calls])
+
+
+def _samples(count: int) -> list[Sample]:
+    """Samples one ms apart, with the values of a whole HI91 message."""
+    module, clock = Module(), _clock_of_module()
+    reads = module.reads(SETTLE_READS + count)
+    return [clock.sample(m, t_rx_ns, virtual_time.UTC_AHEAD_NS) for m, t_rx_ns in _measured(reads)][-count:]
+
+
+def _slot(total: int) -> Run:
+    return _taking([partial(encode_slot, sample, 1) for sample in _samples(total)])
+
+
+def _directory() -> Path:
+    """A new directory, for files of one stage."""
+    path = tempfile.mkdtemp(dir="/dev/shm", prefix="imud-bench-")
+    atexit.register(shutil.rmtree, path)
+    return Path(path)
+
+
+def _context() -> PublisherContext:
+    return PublisherContext(list, 1, virtual_time.now_ns, cpu_ns=virtual_time.now_ns)
+
+
+def _ring_publisher() -> ShmPublisher:
+    publisher = ShmPublisher(ShmSettings(directory=str(_directory()), group=own_group()), _context())
+    publisher.add_device("d0", 0)
+    return publisher
+
+
+def _ring(frames: int, total: int) -> Run:
+    publisher = _ring_publisher()
+    samples = _samples(total * frames)
+    batches = [Batch("d0", 0, samples[at : at + frames]) for at in range(0, len(samples), frames)]
+    for batch in batches:
+        batch.slots()
+    return _taking([partial(publisher.publish, batch) for batch in batches])
+
+
+# --- socket ---------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _loop() -> asyncio.AbstractEventLoop:
+    loop = asyncio.new_event_loop()
+    atexit.register(loop.close)
+    return loop
+
+
+async def _serve(clients: int, encoding: str) -> tuple[SocketServer, list[socket.socket]]:
+    """A server whose clients watch `d0`, over real sockets."""
+    path = str(_directory() / f"{clients}-{encoding}")
+    server = SocketServer(SocketSettings(path=path, group=own_group()), _context())
+    server.start()
+    server.add_device("d0", 0)
+    socks = []
+    for _ in range(clients):
+        sock = socket.socket(socket.AF_UNIX)
+        sock.connect(path)
+        sock.sendall(line_of(encode_request("watch", {"encoding": encoding}, 1)))
+        sock.setblocking(False)
+        socks.append(sock)
+    while sum(bool(status.encoding) for status in server.hub.clients()) < clients:
+        await asyncio.sleep(0)
+    for sock in socks:
+        sock.recv_into(BUFFER)
+    return server, socks
+
+
+def _socket(clients: int, encoding: str, frames: int, total: int) -> Run:
+    server, socks = _loop().run_until_complete(_serve(clients, encoding))
+    samples = _samples(total * frames)
+    made = [Batch("d0", 0, samples[at : at + frames]) for at in range(0, len(samples), frames)]
+    if encoding == "binary":
+        for batch in made:
+            batch.slots()
+    batches = iter(made)
+
+    async def publish(count: int) -> None:
+        for number, batch in enumerate(islice(batches, count)):
+            server.publish(batch)
+            if number % DRAIN_EVERY == DRAIN_EVERY - 1:
+                for sock in socks:
+                    sock.recv_into(BUFFER)
+
+    def run(count: int) -> None:
+        _loop().run_until_complete(publish(count))
+        assert not any(status.dropped or status.queue_samples for status in server.hub.clients())
+
+    return run
+
+
+# --- all of it ------------------------------------------------------------------------------------------------------
+
+
+def _path(frames: int, total: int) -> Run:
+    """From the bytes of a read to shared memory and one binary client, without the event loop."""
+    server, (sock,) = _loop().run_until_complete(_serve(1, "binary"))
+    publishers = (_ring_publisher(), server)
+
+    def publish(batch: Batch) -> None:
+        for publisher in publishers:
+            publisher.publish(batch)
+
+    ledger, module = Ledger(), Module()
+    context = PathContext("d0", 0, ledger, publish, _ignore, _ignore, int, HostClock())
+    path = StreamPath(HipnucCodec(ledger, HipnucSettings()), _clock_of_module(), context)
+
+    def process(reads: Sequence[Read]) -> None:
+        for number, (data, t_rx_ns) in enumerate(reads):
+            virtual_time.set_now(t_rx_ns)
+            path.on_data(data, t_rx_ns)
+            if number % DRAIN_EVERY == DRAIN_EVERY - 1:
+                sock.recv_into(BUFFER)
+
+    first = module.first_minute()
+    process([*first, *module.reads(-len(first) % DRAIN_EVERY)])
+    reads = iter(module.reads(total, frames))
+    return lambda count: process(list(islice(reads, count)))
+
+
+def _ignore(*_arguments: object) -> None:
+    """Of what the stream has beside samples: nothing."""
+
+
+@cache
+def _daemon_process() -> VirtualDaemon:
+    daemon = VirtualDaemon(_directory())
+    atexit.register(daemon.close)
+    return daemon
+
+
+def _daemon(clients: int, encoding: str, frames: int, total: int) -> Run:
+    daemon = _daemon_process()
+    daemon.connect(clients, encoding)
+    reads = iter(daemon.prepare(total, frames))
+    return lambda count: daemon.process(list(islice(reads, count)))
+
+
+STAGES: Final = (
+    CountedStage(INTERPRETER, _interpreter, 10, 100),
+    CountedStage("decode HI91, reads of 4096 bytes", _hi91_bulk, 4, HI91_BLOCK),
+    CountedStage("decode HI91, a frame per read", _hi91_single, 200),
+    CountedStage("decode AHRS, reads of 4096 bytes", _ahrs_bulk, 3, AHRS_BLOCK),
+    CountedStage("decode AHRS, a frame per read", _ahrs_single, 200),
+    CountedStage("decode IMU61x CAN, a frame", _imu61x_can, 250),
+    CountedStage("decode CANopen, a frame", _canopen, 240),
+    CountedStage("clock, a sample", _clock, 1000),
+    CountedStage("slot, a sample", _slot, 200),
+    CountedStage("ring, a sample", partial(_ring, 1), 200),
+    CountedStage("ring, 20 samples in a batch", partial(_ring, 20), 20, 20),
+    CountedStage("socket, 1 binary client", partial(_socket, 1, "binary", 1), 160),
+    CountedStage("socket, 10 binary clients", partial(_socket, 10, "binary", 1), 96),
+    CountedStage("socket, 10 JSON clients", partial(_socket, 10, "json", 1), 96),
+    CountedStage("socket, 10 binary clients, 20 samples in a batch", partial(_socket, 10, "binary", 20), 16, 20),
+    CountedStage("bytes to publishers, a sample per read", partial(_path, 1), 1000),
+    CountedStage("bytes to publishers, 20 samples per read", partial(_path, 20), 50, 20),
+    CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1), 1000),
+    CountedStage("daemon, 10 binary clients, a sample per wake-up", partial(_daemon, 10, "binary", 1), 200),
+    CountedStage("daemon, 10 JSON clients, a sample per wake-up", partial(_daemon, 10, "json", 1), 200),
+    CountedStage("daemon, 1 client, 20 samples per wake-up", partial(_daemon, 1, "binary", 20), 50, 20),
+)

@@ -1,0 +1,35 @@
+"""Clocks that stand still until they are set, in place of the machine's, for a program whose instructions are counted.
+
+Under valgrind a program runs fifty times as long, and never twice the same: ticks and time-outs would come at other
+samples in each run. `install` is called before anything of imud is imported, because modules bind the clocks by name.
+"""
+
+import time
+from functools import partial
+from typing import Final
+
+from imud.units import NS_PER_S
+
+BEGIN_NS: Final = 1000 * NS_PER_S
+UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S
+
+_ns = [BEGIN_NS, BEGIN_NS + UTC_AHEAD_NS]
+_s = [BEGIN_NS / NS_PER_S]
+
+
+def install() -> None:
+    """Replace the clocks of `time`; they are C functions as before, so that reading one costs about the same."""
+    time.monotonic_ns = time.thread_time_ns = partial(_ns.__getitem__, 0)
+    time.time_ns = partial(_ns.__getitem__, 1)
+    time.monotonic = partial(_s.__getitem__, 0)
+
+
+def now_ns() -> int:
+    """CLOCK_MONOTONIC as it was set."""
+    return _ns[0]
+
+
+def set_now(now_ns: int) -> None:
+    """Set all clocks."""
+    _ns[:] = now_ns, now_ns + UTC_AHEAD_NS
+    _s[0] = now_ns / NS_PER_S
