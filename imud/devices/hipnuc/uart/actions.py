@@ -20,16 +20,15 @@ from imud.devices.hipnuc.uart.commands import (
     BaudRate,
     LevelReset,
     Mounting,
+    MountingName,
     OutputMessage,
     OutputRate,
     PinFunction,
+    PinName,
     YawMode,
 )
 from imud.devices.hipnuc.uart.session import send
 
-MountingName = Literal[
-    "level", "y_down", "y_up", "z_down", "x_up", "x_down", "z_down_x_back", "level_x_left", "level_x_right"
-]
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
 Degrees = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°", "section": "2.2.4"})]
 Enabled = Annotated[bool, Meta(extra={"section": "2.2.4"})]
@@ -139,7 +138,7 @@ def _magnetic_calibration(_target: Target, *, enabled: Enabled) -> RequestScript
 def _pin(
     _target: Target,
     *,
-    function: Annotated[Literal["sin", "sout", "led", "sout_div", "alarm"], Meta(extra={"section": "2.2.4"})],
+    function: Annotated[PinName, Meta(extra={"section": "2.2.4"})],
     pin: Annotated[int, Meta(ge=1, le=PIN_MAX, description="1 for IO1, and so on", extra={"section": "2.2.4"})],
 ) -> RequestScript[None]:
     return send(commands.pin_function(PinFunction[function.upper()], pin))

@@ -101,6 +101,10 @@ class PinFunction(Enum):
     """High while an angle is out of range, see `alarm`; IO9."""
 
 
+PinName = Literal["sin", "sout", "led", "sout_div", "alarm"]
+"""Names of `PinFunction`."""
+
+
 class AlarmAxis(StrEnum):
     """The axis whose angle the alarm watches."""
 
@@ -133,6 +137,12 @@ class Mounting(Enum):
     """Turned by 90° about Z: Z up, X where Y was."""
     LEVEL_X_RIGHT = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
     """Turned by -90° about Z: Z up, X where -Y was."""
+
+
+MountingName = Literal[
+    "level", "y_down", "y_up", "z_down", "x_up", "x_down", "z_down_x_back", "level_x_left", "level_x_right"
+]
+"""Names of `Mounting`."""
 
 
 class Query(StrEnum):

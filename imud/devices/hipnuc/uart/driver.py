@@ -21,6 +21,7 @@ from imud.devices.hipnuc.uart.codec import (
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
 from imud.devices.hipnuc.uart.packets import PPS_STAMP_MODULUS_MS
 from imud.devices.hipnuc.uart.session import identify, read_settings
+from imud.devices.hipnuc.uart.settings import SETTINGS
 from imud.units import NS_PER_MS
 
 
@@ -63,6 +64,7 @@ DRIVER: Final = StreamDriver(
     alarm_ranges=alarm_ranges,
     time_bits=TIME_BITS,
     actions=ACTIONS,
+    device_settings=SETTINGS,
     identify=identify,
     read_settings=read_settings,
     apply_identity=_apply_identity,

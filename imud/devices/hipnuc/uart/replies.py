@@ -127,6 +127,11 @@ def parse_report(lines: Sequence[str]) -> Report:
     return Report(values, tuple(other))
 
 
+def lines_of(values: Mapping[str, str]) -> list[str]:
+    """Return settings as one flat mapping (`session.read_settings`) in lines again, for the functions below."""
+    return [text if name.startswith("COMCONFIG ") else f"{name}: {text}" for name, text in values.items()]
+
+
 def parse_version(lines: Sequence[str]) -> Version:
     """Parse the reply to LOG VERSION."""
     report = parse_report(lines)
