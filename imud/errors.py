@@ -16,7 +16,12 @@ ImudError
  └─ ServerError          the daemon's own interfaces: socket in use, shared memory not writable, protocol violated
 """
 
+import os
+import re
 from enum import StrEnum
+
+_NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), ['\"]")
+"""An error number inside the text of a library's error."""
 
 
 class ImudError(Exception):
@@ -88,3 +93,18 @@ class NothingHeard(ImudError):
 
 class ServerError(ImudError):
     """One of the daemon's own interfaces cannot be used. Example: the socket belongs to another running daemon."""
+
+
+def reason_of(error: BaseException) -> str:
+    """Describe an error of the operating system or of a library in its words, without numbers, types and tuples.
+
+    Also where a library has put the system's error into a text of its own, as pyserial and asyncio do.
+    """
+    number = next((argument for argument in error.args if isinstance(argument, int)), None)
+    found = _NUMBER.search(str(error))
+    if number is None and found is not None:
+        number = int(found[1] or found[2])
+    if number is not None and number > 0:
+        return os.strerror(number)
+    strerror = getattr(error, "strerror", None)
+    return strerror or str(error) or type(error).__doc__ or "unknown"

@@ -18,7 +18,7 @@ def notify(state: str) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK) as sock:
             sock.sendto(state.encode(), address)
     except OSError as error:
-        log.warning("cannot notify the service manager of %s: %s", state.partition("\n")[0], error)
+        log.warning("cannot notify the service manager of %s: %s", state.partition("\n")[0], error.strerror)
 
 
 def watchdog_interval_s() -> float | None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from imud import __version__
 from imud.cli.streams import complain, discard_output, open_standard_streams
-from imud.errors import ImudError
+from imud.errors import ConfigError, ImudError, reason_of
 
 if TYPE_CHECKING:
     from imud.cli.arguments import CliCommand
@@ -75,11 +75,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as with `imud watch | head`
         discard_output()
         return 0
+    except ConfigError as error:  # each line begins with its place in the file, for editors and scripts
+        complain(str(error))
     except ImudError as error:
         complain(f"imud {name}: {error}")
     except OSError as error:
         discard_output()
-        complain(f"imud {name}: {error.filename or 'standard output'}: {error.strerror or error}")
+        complain(f"imud {name}: {error.filename or 'standard output'}: {reason_of(error)}")
     except KeyboardInterrupt:
         return 130
     return 2

@@ -9,7 +9,7 @@ import msgspec
 from imud.client import Client
 from imud.client.connection import default_path
 from imud.contracts.driver import Driver
-from imud.contracts.settings import Settings, expected, got, unknown_name
+from imud.contracts.settings import Settings, unknown_name, value_problem, wrong_values
 from imud.contracts.status import DeviceStatus
 from imud.errors import BadArgument
 
@@ -78,16 +78,13 @@ def given_options(driver: Driver, words: Sequence[str]) -> dict[str, object]:
     for name, value in options.items():
         if name not in fields:
             raise BadArgument(f"--option {name}: {unknown_name(f'an option of {driver.name}', name, list(fields))}")
-        try:
-            msgspec.convert(value, fields[name].type)
-        except msgspec.ValidationError:
-            raise BadArgument(f"--option {name}: expected {expected(fields[name].type)}, got {got(value)}") from None
+        if problem := value_problem(value, fields[name].type):
+            raise BadArgument(f"--option {name}: {problem}")
     return options
 
 
 def driver_settings(driver: Driver, options: Mapping[str, object]) -> Settings:
     """Make the driver's settings from these options. Raises BadArgument for options that exclude each other."""
-    try:
-        return msgspec.convert(options, driver.settings)
-    except msgspec.ValidationError as error:
-        raise BadArgument(f"--option: {error}") from None
+    for wrong in wrong_values(driver.settings, options, "option"):
+        raise BadArgument(f"--option {wrong}")
+    return msgspec.convert(options, driver.settings)

@@ -29,7 +29,7 @@ def run_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until SIGTERM or SIGINT; 1 after a mistake of imud's own, which is in the log."""
-    settings = config.load(args.config)
+    settings = config.load(args.config, missing="give the file with --config")
     with log_to(STDERR, settings.log_level):
         try:
             asyncio.run(serve(settings, args.config))

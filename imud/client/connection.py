@@ -21,7 +21,7 @@ from typing import Any, Final, Self
 import msgspec
 
 from imud.client.watch import EventStream, Watch, sample_of
-from imud.errors import LinkDenied, LinkError, LinkMissing, ServerError
+from imud.errors import LinkDenied, LinkError, LinkMissing, ServerError, reason_of
 from imud.formats.jsonrpc import (
     DEFAULT_PATH,
     FRAME_HEADER,
@@ -208,7 +208,7 @@ class Client:
         try:
             hello = msgspec.convert(message.get("params"), Hello)
         except msgspec.ValidationError as error:
-            raise ServerError(f"{self.path}: hello that is not understood: {error}") from error
+            raise ServerError(f"{self.path}: expected the greeting of an imud daemon, got another one") from error
         if hello.protocol != PROTOCOL:
             raise ServerError(f"{self.path}: the daemon speaks protocol {hello.protocol}, this client {PROTOCOL}")
         return hello
@@ -320,8 +320,8 @@ def _unreachable(path: str, error: OSError) -> LinkError:
         return LinkMissing(f"no daemon at {path}: is imud running? (systemctl status imud, or imud run)")
     if error.errno in (errno.EACCES, errno.EPERM):
         return LinkDenied(f"no permission for {path}: is this user in group imud? (adduser USER imud, log in again)")
-    return LinkError(f"cannot connect to {path}: {error}")
+    return LinkError(f"cannot connect to {path}: {reason_of(error)}")
 
 
 def _lost(path: str, error: OSError) -> LinkMissing:
-    return LinkMissing(f"{path}: the connection to the daemon is lost: {error.strerror or error}")
+    return LinkMissing(f"{path}: the connection to the daemon is lost: {reason_of(error)}")

@@ -6,6 +6,7 @@ from typing import Any, Final, Protocol, Self, cast
 
 import msgspec
 
+from imud.contracts.settings import wrong_values
 from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
@@ -117,7 +118,8 @@ def sample_of(params: Mapping[str, Any]) -> Sample:
     try:
         return msgspec.convert(values, Sample)
     except msgspec.ValidationError as error:
-        raise ServerError(f"a sample that is not understood: {error}") from error
+        wrong = "; ".join(map(str, wrong_values(Sample, values, "member")))
+        raise ServerError(f"a sample that is not understood: {wrong}") from error
 
 
 def event_of(params: Mapping[str, Any]) -> Event:

@@ -9,7 +9,7 @@ import msgspec
 from imud.config.schema import Row
 from imud.config.yaml_tree import PROBLEMS_MAX, Problem, YamlTree
 from imud.config.yaml_tree import Path as KeyPath
-from imud.contracts.settings import Settings, expected, got, unknown_name
+from imud.contracts.settings import Settings, disagreements, expected, got, unknown_name, value_problem
 
 S = TypeVar("S", bound=Settings)
 
@@ -70,16 +70,10 @@ class Keys:
                 good = False
         if not good:
             return None
-        try:
-            return msgspec.convert(keys, schema)
-        except msgspec.ValidationError as error:  # what __post_init__ says of keys that do not go together
-            message = str(error).partition(" - at `$")[0]
-            key = message.partition(":")[0]
-            if key in keys:
-                self.problem((*path, key), message.removeprefix(f"{key}:").strip())
-            else:
-                self.problem(path, message)
+        for name, message in disagreements(schema, keys):
+            self.problem((*path, name) if name else path, message)
             return None
+        return msgspec.convert(keys, schema)
 
     def problem(self, path: KeyPath, message: str, *, at_key: bool = False) -> None:
         """Add a problem at `path`, with its value or with the key itself."""
@@ -87,12 +81,8 @@ class Keys:
         self.problems.append(Problem(mark, path, message))
 
     def _value_fits(self, path: KeyPath, value: object, field_type: Any) -> bool:
-        try:
-            msgspec.convert(value, field_type)
-        except msgspec.ValidationError as error:
-            inside = str(error).partition(" - at `$")[2].rstrip("`")
-            detail = f" ({error})" if inside else ""
-            self.problem(path, f"expected {expected(field_type)}, got {got(value)}{detail}")
+        if problem := value_problem(value, field_type):
+            self.problem(path, problem)
             return False
         text = _controlling(value)
         if text is not None:

@@ -15,15 +15,20 @@ from imud.files import read_regular
 PROBLEMS_SHOWN: Final = 20
 
 
-def load(path: Path | str, tables: Tables = TABLES, pause: Callable[[], None] = no_pause) -> Config:
+def load(
+    path: Path | str,
+    tables: Tables = TABLES,
+    pause: Callable[[], None] = no_pause,
+    missing: str = "is the path right?",
+) -> Config:
     """Read a configuration file. Raises ConfigError with every problem that was found, one per line.
 
-    `pause` is called after every piece of work of less than a millisecond.
+    `pause` is called after every piece of work of less than a millisecond; `missing` is the hint where no file is.
     """
     try:
         content = read_regular(path, FILE_BYTES_MAX + 1)
     except OSError as error:
-        hint = "give the file with --config" if isinstance(error, FileNotFoundError) else "look at its owner and mode"
+        hint = missing if isinstance(error, FileNotFoundError) else "look at its owner and mode"
         raise ConfigError(f"{path}: cannot be read: {error.strerror}; {hint}") from None
     return parse(content, str(path), tables, pause)
 

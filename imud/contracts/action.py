@@ -9,7 +9,7 @@ from typing import Any, cast, get_type_hints
 
 import msgspec
 
-from imud.contracts.settings import Settings, expected, shown
+from imud.contracts.settings import Settings, expected, shown, wrong_values
 from imud.errors import BadArgument
 
 
@@ -58,11 +58,10 @@ class Action:
 
     def arguments(self, given: Mapping[str, Any]) -> Settings:
         """Check and convert the arguments of a call. Raises BadArgument naming what was expected and what came."""
-        try:
-            return msgspec.convert(dict(given), self.parameters)
-        except msgspec.ValidationError as error:
+        if wrong := wrong_values(self.parameters, given, "argument"):
             known = ", ".join(str(parameter) for parameter in parameters_of(self)) or "none"
-            raise BadArgument(f"{error}; arguments: {known}") from None
+            raise BadArgument(f"{'; '.join(map(str, wrong))}; arguments: {known}")
+        return msgspec.convert(dict(given), self.parameters)
 
     def script(self, target: Target, arguments: Settings) -> Any:
         """Make the script of the action, from the result of `arguments`."""

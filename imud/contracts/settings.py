@@ -3,17 +3,27 @@
 A part declares its own struct: frozen, keyword-only, unknown keys refused, each field with a default where there is
 one. `imud.config` fills it from YAML through msgspec, which checks types and `msgspec.Meta` bounds. The docstring below
 a field is what docs/configuration.md says of the key; the words are those of errors and of that table.
+Where a pattern says nothing to people, `Meta(extra={"words": "an absolute path"})` does.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from typing import Any
+from ipaddress import ip_address
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import inspect
 
 SHOWN_CHARACTERS = 60
 """Of a text in an error."""
+HOST_CHARACTERS = 253
+"""Of a host name (RFC 1035, section 2.3.4)."""
+_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
+_STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+)\]")
+"""A step of msgspec's path to what is wrong."""
+UNKNOWN_STEP = "..."
+"""The step to a value of a mapping, whose key msgspec does not tell."""
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -22,6 +32,16 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 class NoSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of parts that have none."""
+
+
+def is_host(text: str) -> bool:
+    """Whether a text is an IP address or a host name (RFC 1123, section 2.1), which has a letter in its last label."""
+    try:
+        ip_address(text)
+    except ValueError:
+        labels = text.rstrip(".").split(".")
+        return len(text) <= HOST_CHARACTERS and all(map(_LABEL.fullmatch, labels)) and not labels[-1].isdecimal()
+    return True
 
 
 def expected(field_type: Any) -> str:
@@ -48,6 +68,74 @@ def shown(value: object) -> str:
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
 
 
+class WrongValue(NamedTuple):
+    """What is wrong with one of some named values."""
+
+    name: str
+    """Name of the value; empty where the values as a whole are wrong."""
+    message: str
+    """What was expected and what came."""
+
+    def __str__(self) -> str:
+        """Format both, for example `rate_hz: expected a number, got "fast"`."""
+        return f"{self.name}: {self.message}" if self.name else self.message
+
+
+def wrong_values(schema: type[msgspec.Struct], given: Mapping[str, Any], what: str = "key") -> list[WrongValue]:
+    """List all that is wrong with values for the fields of `schema`. `what` they are, for people: keys, arguments, …
+
+    What `__post_init__` says of values that do not go together is asked only where each by itself is right.
+    """
+    fields = {field.name: field for field in msgspec.structs.fields(schema)}
+    found = []
+    if schema.__struct_config__.forbid_unknown_fields:
+        article = "an" if what[0] in "aeiou" else "a"
+        unknown = [name for name in given if name not in fields]
+        found += [WrongValue("", unknown_name(f"{article} {what}", name, list(fields))) for name in unknown]
+    for name, field in fields.items():
+        if name in given:
+            if problem := value_problem(given[name], field.type):
+                found.append(WrongValue(name, problem))
+        elif field.required:
+            found.append(WrongValue("", f"expected the {what} {name} ({expected(field.type)}), got none"))
+    return found or disagreements(schema, given)
+
+
+def disagreements(schema: type[msgspec.Struct], given: Mapping[str, Any]) -> list[WrongValue]:
+    """List what `__post_init__` says of values of the right types that do not go together, at most one."""
+    try:
+        msgspec.convert(given, schema)
+    except msgspec.ValidationError as error:
+        message = str(error).partition(" - at `$")[0]
+        name, colon, rest = message.partition(": ")
+        return [WrongValue(name, rest) if colon and name in given else WrongValue("", message)]
+    return []
+
+
+def value_problem(value: object, field_type: Any) -> str:
+    """Return what is wrong with a value of a field, empty if it fits: what was expected, and what came."""
+    try:
+        msgspec.convert(value, field_type)
+    except msgspec.ValidationError as error:
+        place = str(error).partition(" - at `$")[2].removesuffix("`")
+        return f"expected {expected(field_type)}, got {got(value)}{_inside(value, place)}"
+    return ""
+
+
+def _inside(value: object, place: str) -> str:
+    """Describe the part of `value` at the place that msgspec gives, for example `[1]` or `.a[0]`; empty for none."""
+    if UNKNOWN_STEP in place:
+        return ""
+    for key, index in _STEP.findall(place):
+        if isinstance(value, Mapping) and key in value:
+            value = value[key]
+        elif isinstance(value, Sequence) and index and int(index) < len(value):
+            value = value[int(index)]
+        else:
+            return ""
+    return f" with {got(value)} at {place.removeprefix('.')}" if place else ""
+
+
 def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
     """Format the error for a name that is not among `known`, with the nearest one. `what`: for example `a driver`."""
     near = get_close_matches(name, known, n=1, cutoff=0.5)
@@ -58,8 +146,8 @@ def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
 def _words(info: inspect.Type) -> str:
     words = "keys and values"
     match info:
-        case inspect.Metadata(type=inner):
-            words = _words(inner)
+        case inspect.Metadata(type=inner, extra=extra):
+            words = (extra or {}).get("words") or _words(inner)
         case inspect.UnionType(types=types):
             words = ", or ".join(_words(one) for one in types)
         case inspect.LiteralType(values=values):
@@ -80,6 +168,8 @@ def _words(info: inspect.Type) -> str:
             words = "true or false"
         case inspect.NoneType():
             words = "null"
+        case inspect.AnyType():
+            words = "any value"
     return words
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
+from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble, reason_of
 from imud.links.inotify import wait_until
 from imud.log import printable
 from imud.permissions import group_of, user_name
@@ -92,7 +92,7 @@ def open_problem(error: Exception, path: str, missing: str, proc: Path = PROC) -
 
 def bus_open_problem(error: OSError, path: str, missing: str) -> LinkError:
     """The LinkError for an I2C or SPI bus that cannot be opened; `missing` as for `open_problem`."""
-    return open_problem(error, path, missing) or LinkError(f"{path} cannot be used: {error}")
+    return open_problem(error, path, missing) or LinkError(f"{path} cannot be used: {reason_of(error)}")
 
 
 def errno_of(error: Exception) -> int | None:

@@ -19,7 +19,7 @@ import time
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
-from imud.errors import LinkError
+from imud.errors import LinkError, reason_of
 from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.can_module import CanModules
 from imud.sim.command_line import ADAPTERS, DEVICE, make_parser, module_options
@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
         faults = Faults(options.seed, rates_from(options.faults)) if options.faults else None
         lines = _lines(options, module)
     except (ValueError, OSError) as error:
-        print(f"imud.sim: {error}", file=sys.stderr)
+        print(f"imud.sim: {reason_of(error)}", file=sys.stderr)
         return 2
     sharpen_timers()
     with closing(lines), ExitStack() as stack:

@@ -14,7 +14,7 @@ from typing import Final
 import msgspec
 
 from imud.contracts.link import StreamLink
-from imud.errors import LinkError
+from imud.errors import LinkError, reason_of
 from imud.utc.sentence_stream import ReconnectingSource, Retry
 from imud.utc.source import RmcSettings, SourceContext
 
@@ -40,7 +40,8 @@ class GpsdSource(ReconnectingSource):
             async with asyncio.timeout(CONNECT_LIMIT_S):
                 reader, writer = await asyncio.open_connection(*self._address)
         except (OSError, TimeoutError) as error:
-            self.problem = f"{self.title} cannot be reached: {error or 'no answer'}; is gpsd running?"
+            reason = "no answer" if isinstance(error, TimeoutError) else reason_of(error)
+            self.problem = f"{self.title} cannot be reached: {reason}; is gpsd running?"
             return
         self._writer = writer
         try:
@@ -51,7 +52,7 @@ class GpsdSource(ReconnectingSource):
                 self._on_data(data, self._now_ns())
             self.problem = f"{self.title} closed the connection"
         except OSError as error:
-            self.problem = f"{self.title} broke the connection: {error}"
+            self.problem = f"{self.title} broke the connection: {reason_of(error)}"
         finally:
             self._disconnect()
             with suppress(OSError):

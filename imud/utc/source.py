@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple, Protocol
 from msgspec import Meta
 
 from imud.contracts.link import StreamLink
-from imud.contracts.settings import Settings
+from imud.contracts.settings import Settings, is_host, shown
 
 OnSentence = Callable[[bytes, int], None]
 """Called with one RMC sentence, including its line end, and CLOCK_MONOTONIC (ns) right after its arrival."""
@@ -37,8 +37,10 @@ class RmcSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     200 ms after its begin, so that such an error does no harm."""
 
     def __post_init__(self) -> None:
+        if not is_host(self.host):
+            raise ValueError(f"host: expected an IP address or a host name, got {shown(self.host)}")
         if self.source == "nmea" and not self.port:
-            raise ValueError("an NMEA source needs the path of its serial port (`port`)")
+            raise ValueError("expected the key port beside source nmea, the path of the receiver's port, got none")
 
 
 class RmcSource(Protocol):

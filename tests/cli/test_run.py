@@ -16,5 +16,47 @@ def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, caps
     bad.write_text("devices:\n  bow:\n    uart:\n      port: /dev/ttyUSB0\n      baut: 9600\n")
     assert main(["check", str(bad)]) == 2
     error = capsys.readouterr().err
-    assert "bad.yaml:5:" in error
-    assert "baud" in error
+    assert error.startswith(f"{bad}:5:7: devices.bow.uart.baut: expected a key that imud knows")
+    assert "did you mean baud?" in error
+
+
+@pytest.mark.parametrize(("words", "hint"), [(["check"], "is the path right?"), (["run", "--config"], "--config")])
+def test_a_file_that_is_not_there(
+    words: list[str], hint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The hint names an argument that the command has."""
+    assert main([*words, str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"{tmp_path}/none: cannot be read: No such file or directory; ")
+    assert hint in error
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        (
+            "metrics: {address: 127.0.0.300}",
+            "1:20: metrics.address: expected an IP address such as 127.0.0.1 or ::1, got",
+        ),
+        ("metrics: {address: not an address}", "1:20: metrics.address: expected an IP address"),
+        ("metrics: {address: '::1'}", ""),
+        ("metrics: {address: localhost}", ""),
+        ("socket: {path: imud.sock}", '1:16: socket.path: expected an absolute path, got "imud.sock"'),
+    ],
+)
+def test_an_address_that_is_none(text: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "imud.yaml"
+    file.write_text(text + "\ndevices: {}\n")
+    assert main(["check", str(file)]) == (2 if place else 0)
+    assert capsys.readouterr().err.startswith(f"{file}:{place}" if place else "")
+
+
+@pytest.mark.parametrize(
+    ("host", "good"), [("10.1.2.3", True), ("gps.local", True), ("10.1.2.300", False), ("a b", False), ("", False)]
+)
+def test_the_host_of_gpsd(host: str, good: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "imud.yaml"
+    rmc = f"{{source: gpsd, host: '{host}'}}"
+    file.write_text(f"devices:\n  a: {{driver: hipnuc-uart, uart: {{port: x}}, rmc: {rmc}}}\n")
+    assert main(["check", str(file)]) == (0 if good else 2)
+    assert ("devices.a.rmc.host: expected" in capsys.readouterr().err) is not good

@@ -222,7 +222,7 @@ def test_the_daemon_goes_away(tmp_path: Path) -> None:
         (b"SSH-2.0\n", ServerError, "expected a JSON object"),
         (b"{}\n", ServerError, "expected the daemon's hello"),
         (HELLO.replace(b'"protocol":1', b'"protocol":2'), ServerError, "speaks protocol 2, this client 1"),
-        (HELLO.replace(b'"epoch":7', b'"epoch":"x"'), ServerError, "not understood"),
+        (HELLO.replace(b'"epoch":7', b'"epoch":"x"'), ServerError, "expected the greeting of an imud daemon"),
         (b"", TimeoutError, "waited in vain for hello"),
         (HELLO + b'{"id":1,"result":{"devices":{}}}\n\xff\xff\xff\xff', ServerError, "boundary"),
         (HELLO + b'{"id":1,"result":{"devices":{"a":0}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "CRC"),

@@ -202,7 +202,7 @@ def test_each_rmc_source() -> None:
     [
         ("{}", "expected the key source"),
         ("{source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
-        ("{source: nmea}", "needs the path of its serial port"),
+        ("{source: nmea}", "expected the key port beside source nmea"),
         ("{source: gpsd, rate_hz: 11}", "f:2:"),
         ("{source: gpsd, rate_hz: 0}", "rate_hz"),
         ("{source: gpsd, tcp_port: 0}", "tcp_port"),

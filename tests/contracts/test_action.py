@@ -85,7 +85,7 @@ def test_arguments_are_described_by_the_parameters_of_begin() -> None:
         "relative (true or false; default false)",
     ]
     assert action.script(Target(None, 9600), action.arguments({"angle_deg": 12})) == "9600 12.0 False"
-    with pytest.raises(BadArgument, match=r"Expected `float` <= 180.0 - at `\$.angle_deg`; arguments: angle_deg \("):
+    with pytest.raises(BadArgument, match=r"angle_deg: expected a number from -180 to 180, got 181; arguments: a"):
         action.arguments({"angle_deg": 181})
     with pytest.raises(BadArgument, match="angle"):
         action.arguments({"angle": 1})

@@ -15,7 +15,7 @@ from can.typechecking import CanFilters
 
 from imud.contracts.link import OnBusNews, OnEnd, OnFrames
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkError
+from imud.errors import LinkError, reason_of
 from imud.formats.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilter, CanFrame, CyclicFrame
 from imud.links.can.cyclic_sender import LoopSender
 
@@ -65,7 +65,7 @@ class PythonCanLink:
         try:
             self._bus = can.Bus(self._channel, self._backend, can_filters=filters, ignore_config=True, **rate)
         except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-            raise LinkError(f"{self.title} cannot be opened: {error}") from error
+            raise LinkError(f"{self.title} cannot be opened: {reason_of(error)}") from error
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Deliver frames from now on; python-can reports no changes of the bus state."""
@@ -88,7 +88,7 @@ class PythonCanLink:
                 )
                 self._bus.send(message, timeout=0)
         except can.CanError as error:
-            raise LinkError(f"{self.title} does not send: {error}") from error
+            raise LinkError(f"{self.title} does not send: {reason_of(error)}") from error
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
         """Send these from the event loop; the link ends when one cannot be sent. Raises LinkError.
@@ -145,7 +145,7 @@ class PythonCanLink:
                     loop.call_soon_threadsafe(deliver, frames)
         except (can.CanError, OSError) as error:
             if not stop.is_set():
-                loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {error}"))
+                loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {reason_of(error)}"))
 
 
 def _as_python_can(filters: Sequence[CanFilter]) -> CanFilters:

@@ -30,7 +30,7 @@ class ReplaySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         """Raises ValueError for keys that exclude each other."""
         if self.repeat and self.speed == "maximum":
-            raise ValueError("repeat needs speed recorded or real: virtual time would run into the future")
+            raise ValueError("repeat: expected false at speed maximum, whose time would run into the future, got true")
 
 
 class FileReplay:

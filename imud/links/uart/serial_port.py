@@ -22,7 +22,7 @@ from typing import Final
 import serial
 
 from imud.contracts.status import KernelCounters
-from imud.errors import LinkError
+from imud.errors import LinkError, reason_of
 from imud.links.device_node import PROC, errno_of, open_problem
 from imud.units import NS_PER_MS
 
@@ -86,9 +86,10 @@ def port_problem(error: Exception, path: str, proc: Path = PROC) -> LinkError:
         return known
     if errno_of(error) == errno.EIO:
         return LinkError(f"{path} has a node but no hardware behind it: is this the right port, is it enabled?")
-    if os.path.exists(path) and not Path(path).is_char_device():
-        return LinkError(f"{path} is not a serial port: expected a character device such as /dev/ttyUSB0")
-    return LinkError(f"{path} cannot be used as a serial port: {error}")
+    reason = reason_of(error)
+    if (os.path.exists(path) and not Path(path).is_char_device()) or reason == os.strerror(errno.ENOTTY):
+        return LinkError(f"{path} is not a serial port: expected one such as /dev/ttyUSB0")
+    return LinkError(f"{path} cannot be used as a serial port: {reason}")
 
 
 def _finish_raw(fd: int) -> None:

@@ -28,6 +28,8 @@ class Hub:
 
     def __init__(self, path: str, context: PublisherContext, quota: Quota, time: TokenBucket, pool: Pool) -> None:
         self.path = path
+        self.control_group = "the control group"
+        """Whose members may change things, for people."""
         self.context = context
         self._quota = quota
         self._time = time

@@ -184,7 +184,11 @@ def _set_access(file: Path, path: Path, group: str) -> None:
     file.chmod(SOCKET_MODE)
     gid = gid_of(group)
     if gid is None:
-        log.warning("no group %r: only root and the daemon's own user can read from %s", group, path)
+        log.warning(
+            "no group %r (socket.group): only root and the daemon's own user can read from %s; "
+            "`sudo groupadd --system %s` makes it, then imud has to be restarted",
+            group, path, group,
+        )  # fmt: skip
         return
     try:
         os.chown(file, -1, gid)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from imud.contracts.publisher import Batch
+from imud.errors import reason_of
 from imud.publishers.socket.encoding import Encoding
 
 CHUNK_BYTES: Final = 32768
@@ -211,7 +212,7 @@ class Outbox:
             except BlockingIOError:
                 count = 0
             except OSError as error:
-                outbox._owner.on_broken(str(error))
+                outbox._owner.on_broken(reason_of(error))
                 continue
             if count == size:
                 outbox.sent += samples
@@ -332,7 +333,7 @@ class Outbox:
             self._owner.on_full()
             return False
         except OSError as error:
-            self._owner.on_broken(str(error))
+            self._owner.on_broken(reason_of(error))
             return False
         self._partial = self._partial[count:]
         if self._partial or self._samples or self._replies:

@@ -19,6 +19,7 @@ import msgspec
 
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.settings import Settings
+from imud.errors import reason_of
 from imud.event import Event
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
 from imud.publishers.socket.connection import Connection, ServerSide
@@ -43,7 +44,7 @@ class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
     enabled: bool = True
     """Whether imud serves the socket."""
-    path: Annotated[str, msgspec.Meta(pattern="^/.*[^/]$")] = DEFAULT_PATH
+    path: Annotated[str, msgspec.Meta(pattern="^/.*[^/]$", extra={"words": "an absolute path"})] = DEFAULT_PATH
     """Where the socket is, an absolute path."""
     group: str = "imud"
     """Members of this group may read; the socket file belongs to it."""
@@ -82,6 +83,7 @@ class SocketServer:
         """Listen. Raises ServerError and leaves nothing behind when that is not possible."""
         settings = self._settings
         self._guard = Guard(os.geteuid(), gid_of(settings.group), gid_of(settings.control_group))
+        self._name_control_group(settings.control_group)
         self._listener = Listener(Path(settings.path), settings.group, settings.control_group)
         self._side = ServerSide(
             self._on_line,
@@ -94,6 +96,14 @@ class SocketServer:
         )
         asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
         self._context.client_sources.append(self.hub.clients)
+
+    def _name_control_group(self, group: str) -> None:
+        """Name the group in refusals, and say what to do where it does not exist."""
+        self.hub.control_group = f"group {group!r}"
+        if self._guard.control_gid is None:
+            hint = f"`sudo groupadd --system {group}` makes it, then imud has to be restarted"
+            self.hub.control_group += f", which does not exist on this machine: {hint}"
+            log.warning("no group %r (socket.control_group): only root can change things; %s", group, hint)
 
     def add_device(self, name: str, device_id: int) -> None:
         """A device appears."""
@@ -193,7 +203,7 @@ def _refuse(sock: socket.socket, error: RpcError) -> None:
     try:
         sock.send(line_of(encode_error(error)))
     except OSError as problem:
-        log.debug("a refused client left first: %s", problem)
+        log.debug("a refused client left first: %s", reason_of(problem))
     sock.close()
 
 

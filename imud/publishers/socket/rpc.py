@@ -7,6 +7,7 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from imud import __version__
+from imud.contracts.settings import wrong_values
 from imud.errors import ImudError
 from imud.formats.jsonrpc import (
     PROTOCOL,
@@ -157,13 +158,14 @@ def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Lat
         message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
         raise RpcError(Code.METHOD_NOT_FOUND, message)
     if method.right not in connection.rights:
-        raise RpcError(Code.DENIED, f"{request.method}: expected root or a member of the control group")
+        raise RpcError(Code.DENIED, f"{request.method}: expected root or a member of {hub.control_group}")
     if not request.wants_reply and not method.acts:
         return None
     try:
         params = msgspec.convert(request.params, method.params)
-    except msgspec.ValidationError as error:
-        raise RpcError(Code.INVALID_PARAMS, f"{request.method}: {error}") from None
+    except msgspec.ValidationError:
+        wrong = "; ".join(map(str, wrong_values(method.params, request.params, "parameter")))
+        raise RpcError(Code.INVALID_PARAMS, f"{request.method}: {wrong}") from None
     return method.run(hub, connection, params)
 
 

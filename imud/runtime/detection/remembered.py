@@ -11,6 +11,7 @@ from pathlib import Path
 
 import msgspec
 
+from imud.errors import reason_of
 from imud.files import read_regular, replace_file
 
 log = logging.getLogger(__name__)
@@ -75,7 +76,8 @@ class Remembered:
         except FileNotFoundError:
             return {}
         except (OSError, msgspec.DecodeError, UnicodeError, RecursionError) as error:
-            log.warning("%s cannot be used (%s): devices are searched for from the beginning", self._file, error)
+            reason = reason_of(error) if isinstance(error, OSError) else "it is not what imud wrote"
+            log.warning("%s cannot be used: %s; devices are searched for from the beginning", self._file, reason)
             return {}
 
     def _save(self, file: Path) -> None:
@@ -93,4 +95,7 @@ class Remembered:
         try:
             replace_file(file, content)
         except OSError as error:
-            log.warning("%s cannot be written (%s): the next start searches again", file, error)
+            log.warning(
+                "%s cannot be written: %s; the next start searches again; may this user write to state_dir?",
+                file, reason_of(error),
+            )  # fmt: skip

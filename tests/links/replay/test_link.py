@@ -230,5 +230,5 @@ def test_the_row_and_its_settings() -> None:
     row = LINKS["replay"]
     link: StreamLink = row.make(msgspec.convert({"path": "a", "speed": "maximum"}, row.settings))
     assert (link.title, link.auto_baud) == ("a", False)
-    with pytest.raises(msgspec.ValidationError, match="repeat needs speed"):
+    with pytest.raises(msgspec.ValidationError, match="repeat: expected false at speed maximum"):
         msgspec.convert({"path": "a", "speed": "maximum", "repeat": True}, row.settings)

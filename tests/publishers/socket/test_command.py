@@ -44,9 +44,9 @@ def test_other_requests_are_answered_before_a_late_reply(tmp_path: Path) -> None
     ("name", "arguments", "words"),
     [
         ("explode", {}, "imu0 refuses explode"),
-        ("output", {}, "missing required field `rate_hz`; arguments: rate_hz (a whole number)"),
-        ("output", {"rate_hz": "x"}, "got `str`"),
-        ("output", {"rate_hz": 1, "speed": 2}, "unknown field `speed`"),
+        ("output", {}, "expected the argument rate_hz (a whole number), got none; arguments: rate_hz (a whole number)"),
+        ("output", {"rate_hz": "x"}, 'rate_hz: expected a whole number, got "x"'),
+        ("output", {"rate_hz": 1, "speed": 2}, 'expected an argument that imud knows, got "speed"'),
     ],
 )
 def test_what_fails_says_why(tmp_path: Path, name: str, arguments: dict[str, Any], words: str) -> None:
@@ -67,12 +67,26 @@ def test_reading_is_not_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
 
     async def body() -> None:
-        async with serving(tmp_path) as server:
+        async with serving(tmp_path, control_group="imud-test-control") as server:
             peer = await Peer.greeted(server)
             assert (await peer.result("actions", device="imu0"))[0]["name"] == "output"
             code, message = await peer.error("command", device="imu0", name="output")
             assert code == -32001
-            assert "control group" in message
+            assert message.startswith("command: expected root or a member of group 'imud-test-control', which does not")
+            assert "`sudo groupadd --system imud-test-control` makes it" in message
+            peer.close()
+
+    run(body)
+
+
+def test_a_group_that_exists_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
+
+    async def body() -> None:
+        async with serving(tmp_path, control_group="root") as server:
+            peer = await Peer.greeted(server)
+            _, message = await peer.error("command", device="imu0", name="output")
+            assert message == "command: expected root or a member of group 'root'"
             peer.close()
 
     run(body)

@@ -88,12 +88,13 @@ def test_a_failed_start_leaves_nothing_bound(tmp_path: Path, monkeypatch: pytest
 
 def test_a_missing_group_is_a_warning_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async def body() -> None:
-        async with serving(tmp_path, group="no-such-group-here") as server:
+        async with serving(tmp_path, group="no-such-group-here", control_group="root") as server:
             assert os.stat(server.hub.path).st_mode & 0o777 == 0o660
 
     run(body)
     assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "no-such-group-here" in caplog.text
+    assert "no group 'no-such-group-here' (socket.group)" in caplog.text
+    assert "`sudo groupadd --system no-such-group-here` makes it" in caplog.text
 
 
 GROUP = "no-such-group-here"
