@@ -23,6 +23,9 @@ class Target:
     """Present bit rate of the line, bit/s; 0 on a link without one."""
     fixed_baud: int = 0
     """Bit rate that the configuration fixes, bit/s; 0 where it fixes none."""
+    places: tuple[int, ...] = ()
+    """Addresses at which the device can be on a bus that is polled: the present one, the former one, the configured
+    one; empty on other links."""
 
 
 class Risk(StrEnum):

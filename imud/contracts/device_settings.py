@@ -25,6 +25,16 @@ class Effect(StrEnum):
     AFTER_RESTART = "after save and restart"
 
 
+class Written(StrEnum):
+    """Results of a script that writes a setting: how far it is known that the device has the value."""
+
+    VERIFIED = "written and read back"
+    UNVERIFIED = "written, not verified"
+    """The device confirmed, and does not tell its value."""
+    PENDING = "written and read back, in force after save and restart"
+    UNVERIFIED_PENDING = "written, not verified; in force after save and restart"
+
+
 def nothing_wrong(_target: Target, _values: Mapping[str, Any]) -> None:
     """Accept every combination of values: the version for devices without such rules."""
 

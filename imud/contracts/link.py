@@ -118,6 +118,8 @@ class PolledLink(Link, Protocol):
     """Whether targets distinguish the devices of one bus (I2C), so that each may be used once only."""
     rate_hz: float
     """Polls per second."""
+    bit_rate: int
+    """Rate of the line in bit/s; 0 for buses whose clock the host makes."""
 
     def select(self, target: int) -> None:
         """Use this address, or this mode, in all transfers from now on. Raises LinkError."""

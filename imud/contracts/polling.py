@@ -35,6 +35,10 @@ class Transfer:
     then_at: int | None = None
     """I2C, RS-485: the device's address after this transfer, whatever came of it, and also when the script has ended.
     A script that does not find the device there goes back: a transfer with the former address as `at` and `then_at`."""
+    holds: bool = False
+    """Whether the device is not read between this transfer and the script's next one: it may be elsewhere just then."""
+    reply_ms: int = 0
+    """RS-485: longest time to the beginning of the reply; 0, or less than that of the link, for that of the link."""
 
 
 TransferScript = Generator[Transfer, bytes, T]
@@ -87,6 +91,10 @@ class PolledCodec(Protocol):
 
     def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
         """Decode the bytes of one transfer. Never raises for any bytes, of any length."""
+        ...
+
+    def on_silence(self, poll: int) -> Sequence[PolledEvent]:
+        """Process a poll whose transfer failed; return what follows from it. Most codecs have nothing to do."""
         ...
 
     def reset(self) -> None:

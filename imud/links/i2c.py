@@ -94,6 +94,7 @@ class I2cLink:
         self.target: int | None = None if settings.address == "auto" else settings.address
         self.shared = True
         self.rate_hz = settings.rate_hz
+        self.bit_rate = 0
 
     async def wait_present(self) -> None:
         """Return when the node is there."""

@@ -82,6 +82,7 @@ class SpiLink:
         self.target: int | None = None if settings.mode == "auto" else settings.mode
         self.shared = False
         self.rate_hz = settings.rate_hz
+        self.bit_rate = 0
 
     async def wait_present(self) -> None:
         """Return when the node is there."""

@@ -47,9 +47,21 @@ def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
 
 
 def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[FoundModule]:
-    """Ask at every address which module is there. Raises LinkError."""
-    found = (_look(link, baud, address) for address in addresses)
-    return [one for one in found if one is not None]
+    """Ask at every address which module is there. Raises LinkError.
+
+    Where none answers, or not clearly, it is asked once more after all others; and a third time on a line on which
+    something was heard. Noise, or a module that is just busy, costs single answers.
+    """
+    asked = list(addresses)
+    found: dict[int, FoundModule | None] = dict.fromkeys(asked)
+    for number in range(TRIES):
+        if number == TRIES - 1 and not any(found.values()):
+            break
+        for address in asked:
+            before = found[address]
+            if before is None or before.problem:
+                found[address] = _look(link, baud, address) or before
+    return [one for one in found.values() if one is not None]
 
 
 def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int) -> FoundModule:

@@ -63,6 +63,7 @@ class Rs485Link:
         self.target: int | None = None if settings.address == "auto" else settings.address
         self.shared = True
         self.rate_hz = settings.rate_hz
+        self.bit_rate = settings.baud
 
     @property
     def heard(self) -> LineCounters:
@@ -92,7 +93,8 @@ class Rs485Link:
         if line is None:
             raise LinkError(f"{self.title} is not open")
         try:
-            return line.transfer(self._address, request, transfer.read_bytes, self._reply_ns)
+            reply_ns = max(self._reply_ns, transfer.reply_ms * NS_PER_MS)
+            return line.transfer(self._address, request, transfer.read_bytes, reply_ns)
         except LinkMissing:
             self._ports.discard(line)
             raise

@@ -110,6 +110,8 @@ class _Polling:
         """Transfer scripts that wait for their transfers, the running one first."""
         self.schedule: Timetable | None = None
         """Timetable of its reads; None while it is not read."""
+        self.held = False
+        """Whether a script keeps it from being read until its next transfer."""
         self._deadlines = deadlines
         self._now_ns = now_ns
         self._deliver = deliver
@@ -141,6 +143,7 @@ class _Polling:
     def step_script(self) -> Callback | None:
         """Make one transfer of the running script; at its end return what settles it in the loop's thread."""
         settle = self.scripts[0].step(self.link)
+        self.held = settle is None and self.scripts[0].holds
         if settle is not None:
             self.scripts.popleft()
         return settle
@@ -174,7 +177,7 @@ class _Polling:
 class _ScriptRun:
     """A transfer script that is running, one transfer at a time."""
 
-    __slots__ = ("error", "future", "script", "send", "target")
+    __slots__ = ("error", "future", "holds", "script", "send", "target")
 
     def __init__(self, script: TransferScript[Any], target: int, future: asyncio.Future[Any]) -> None:
         self.script = script
@@ -182,6 +185,7 @@ class _ScriptRun:
         self.future = future
         self.send: bytes | None = None
         self.error: TransferError | None = None
+        self.holds = False
 
     def step(self, link: PolledLink) -> Callback | None:
         """Make one transfer. At the end of the script return what settles it in the loop's thread."""
@@ -199,6 +203,7 @@ class _ScriptRun:
         return None
 
     def _transfer(self, link: PolledLink, wanted: Transfer) -> bytes:
+        self.holds = wanted.holds
         link.select(self.target if wanted.at is None else wanted.at)
         try:
             return link.transfer(wanted)
@@ -304,7 +309,7 @@ class PolledBus:
         first, earliest = None, None
         for polling in self._polling:
             schedule = polling.schedule
-            if schedule is not None and (earliest is None or schedule.due_ns < earliest.due_ns):
+            if schedule is not None and not polling.held and (earliest is None or schedule.due_ns < earliest.due_ns):
                 first, earliest = polling, schedule
         return first, earliest
 

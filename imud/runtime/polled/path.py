@@ -148,6 +148,9 @@ class PolledPath(SamplePath):
         if reading.poll == 0:
             self._ledger.lost_gap_device += 1
             self._read_ns = reading.start_ns
+        for event in self.codec.on_silence(reading.poll):
+            if type(event) is Vanished:
+                return event.why
         if error.trouble is Trouble.DISTURBED:
             return self._fault(str(error))
         return str(error)

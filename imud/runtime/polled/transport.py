@@ -67,6 +67,8 @@ class PolledTransport:
         self._deadlines = Deadlines()
         self._device: IdentifiedDevice | None = None
         """The device that was read last."""
+        self._former: tuple[int, ...] = ()
+        """Target of the device before a script moved it: an unsaved address is lost when the device restarts."""
         self._identified = False
         """Whether what is read is that of the identified device."""
         self._gone: asyncio.Future[str] | None = None
@@ -196,7 +198,7 @@ class PolledTransport:
         """Return where to look, beginning where the device was: a script may have moved it from the given place."""
         given = driver.targets if self.link.target is None else (self.link.target,)
         last = (self._device.target,) if self._device is not None else ()
-        return tuple(dict.fromkeys((*last, *given)))
+        return tuple(dict.fromkeys((*last, *self._former, *given)))
 
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
         """Run a transfer script between two reads; one that changes the device's address is followed."""
@@ -204,14 +206,19 @@ class PolledTransport:
         if member is None or device is None:
             raise CommandError(f"{self._config.name} is not there")
         options = self._config.options or device.driver.settings()
-        return await member.run(make(Target(options, self.bit_rate)), device.target, self._follow)
+        script = make(Target(options, self.bit_rate, places=self._places(device)))
+        return await member.run(script, device.target, self._follow)
+
+    def _places(self, device: IdentifiedDevice) -> tuple[int, ...]:
+        given = () if self.link.target is None else (self.link.target,)
+        return tuple(dict.fromkeys((device.target, *self._former, *given)))
 
     def _follow(self, target: int) -> None:
         """Follow a script that has given the device another address."""
         member, device = self._member, self._device
         if member is None or device is None or target == device.target:
             return
-        self._device = replace(device, target=target)
+        self._device, self._former = replace(device, target=target), (device.target,)
         member.release()
         if not member.claim(target):
             place = self.link.place(target)
@@ -268,8 +275,8 @@ class PolledTransport:
 
     @property
     def bit_rate(self) -> int:
-        """0: the rate of a bus is set for all of its devices."""
-        return 0
+        """Rate of the line in bit/s, the same for all of its devices; 0 on a bus with a clock."""
+        return self.link.bit_rate
 
     @property
     def receiving(self) -> bool:

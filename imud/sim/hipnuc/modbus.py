@@ -6,19 +6,19 @@ Without I/O and without a clock of its own. What the line does as a real one doe
   answers `processing_ns` later. With `chunk_bytes` a reply arrives in pieces of so many bytes, each when it is through.
 - Two modules with the same ID answer at the same time: what arrives is the AND of both, as on a line that either pulls.
 - Requests to address 0 are obeyed by all and answered by none. A frame with a wrong CRC is not answered.
-- A new ID is in force at once, a new baud rate too (assumed; the confirmation has the old one). What is not saved is
-  lost at a restart.
+- A new ID is in force at once, a new baud rate after saving and restarting. What is not saved is lost at a restart.
+- What no manual settles is in `SlaveVariant`.
 
 Assumed of a module: firmware from 1.6.9 on has MAIN_STATUS, UPTIME and a quaternion of 0.0001 per count, older has not.
 The attitude is the truth; mounting and levelling are confirmed and change nothing.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from math import atan2, cos, degrees, sin
 from random import Random
-from typing import Final
+from typing import Final, Literal
 
 from imud.devices.hipnuc.common.raw_units import QUAT_PER_LSB
 from imud.devices.hipnuc.modbus.codec import pack_block
@@ -30,6 +30,7 @@ from imud.devices.hipnuc.modbus.frames import (
     RANDOMISE_IDS,
     READ,
     SET_ID_BY_SERIAL,
+    WRITE,
     pack_identity,
     registers_reply,
 )
@@ -63,9 +64,10 @@ from imud.sim.simulator import Burst, Simulator, SimulatorOptions
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 NEW_FIRMWARE: Final = 169
-ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
+ILLEGAL_FUNCTION, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 3, 4
 SETTINGS_FIRST: Final = BY_NAME["UART1_BAUD"].address
 STATUS_AT: Final = BY_NAME["MAIN_STATUS"].address
+SHORT_BLOCK_END: Final = BY_NAME["UPTIME"].address
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,44 @@ class SlaveSettings:
     heading_mode: int = 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlaveVariant:
+    """Behaviour that differs between modules, or that no manual settles."""
+
+    long_block: Literal["answered", "illegal_address", "failure", "silent"] = "answered"
+    """Answer of new firmware to a block that reaches beyond 0x4B; older firmware has illegal_address or worse."""
+    address_at_once: bool = True
+    """Whether a new ID is in force at once, as the manual says; else after saving and restarting."""
+    address_reply: Literal["old", "new", "none"] = "old"
+    """From which address the confirmation of a new ID comes, where it is in force at once."""
+    rate_at_once: bool = False
+    flash_ms: int = 0
+    """Time that saving takes before it is confirmed."""
+    refuses: frozenset[str] = frozenset()
+    """Names of registers that answer a write with exception 3."""
+    ignores: frozenset[str] = frozenset()
+    """Names of registers whose write is confirmed and changes nothing."""
+    confirms_restart: bool = True
+    boot_ms: int = 0
+    """Silence after a restart."""
+
+
+SLAVE_VARIANTS: Final[Mapping[str, SlaveVariant]] = {
+    "manual": SlaveVariant(),
+    "no long block": SlaveVariant(long_block="illegal_address"),
+    "failure for the long block": SlaveVariant(long_block="failure"),
+    "silence for the long block": SlaveVariant(long_block="silent"),
+    "address after restart": SlaveVariant(address_at_once=False),
+    "confirms from the new address": SlaveVariant(address_reply="new"),
+    "does not confirm an address": SlaveVariant(address_reply="none"),
+    "rate at once": SlaveVariant(rate_at_once=True),
+    "slow flash": SlaveVariant(flash_ms=1900),
+    "restarts without a word": SlaveVariant(confirms_restart=False, boot_ms=800),
+    "slow to boot": SlaveVariant(boot_ms=1500),
+}
+"""One for each behaviour that is not settled: drivers work with all of them."""
+
+
 @dataclass(slots=True)
 class Slave:
     """A simulated module. Its fault settings may be changed at any time."""
@@ -86,6 +126,7 @@ class Slave:
     product: str = "HI14R2N-485-000"
     firmware: int = NEW_FIRMWARE
     loader: int = 107
+    variant: SlaveVariant = field(default_factory=SlaveVariant)
     motion: Motion = field(default_factory=swing)
     noise: Noise | None = None
     skew_ppm: float = 20.0
@@ -100,15 +141,43 @@ class Slave:
     """Number of next requests without a reply."""
     answered: int = 0
     flash: SlaveSettings = field(init=False)
+    writes_to_flash: int = field(init=False, default=0)
+    address: int = field(init=False)
+    """Address that it answers to now."""
+    baud: int = field(init=False)
+    """Rate that it has now."""
     since_ns: int = field(init=False, default=0)
     """Power-on time (CLOCK_MONOTONIC)."""
+    ready_ns: int = field(init=False, default=0)
+    """Until then it boots, and hears nothing."""
 
     def __post_init__(self) -> None:
         self.flash = self.settings
+        self.address, self.baud = self.settings.slave, self.settings.baud
 
     def restart(self, now_ns: int) -> None:
         """Restart: unsaved settings are lost."""
         self.settings, self.since_ns = self.flash, now_ns
+        self.address, self.baud = self.settings.slave, self.settings.baud
+        self.ready_ns = now_ns + self.variant.boot_ms * NS_PER_MS
+
+    def delay_ns(self, request: bytes) -> int:
+        """Time from the end of a request to the beginning of its reply."""
+        saves = request == WRITE.pack(WRITE_SINGLE, BY_NAME["CTRL"].address, SAVE)
+        return self.processing_ns + (self.variant.flash_ms * NS_PER_MS if saves else 0)
+
+    def replies_from(self, request: bytes, before: int) -> int | None:
+        """Address from which a request is answered that was obeyed; None where it is not. `before`: address before."""
+        if request[0] == WRITE_SINGLE and len(request) == WRITE.size:
+            _, register, value = WRITE.unpack(request)
+            if register == BY_NAME["CTRL"].address and value == RESTART and not self.variant.confirms_restart:
+                return None
+            if register == BY_NAME["MD_ID"].address and self.address != before:
+                return {"old": before, "new": self.address, "none": None}[self.variant.address_reply]
+        elif request[0] == READ_HOLDING and len(request) == READ.size and self.variant.long_block == "silent":
+            _, first, count = READ.unpack(request)
+            return None if first < SHORT_BLOCK_END < first + count <= IDENTITY_FIRST else before
+        return before
 
     def uptime_ms(self, now_ns: int) -> int:
         """Time since power-on, ms of its own crystal."""
@@ -119,6 +188,8 @@ class Slave:
         match request[0]:
             case function if function == READ_HOLDING and len(request) == READ.size:
                 _, first, count = READ.unpack(request)
+                if self.variant.long_block == "failure" and first < SHORT_BLOCK_END < first + count <= IDENTITY_FIRST:
+                    return self._refusal(function, DEVICE_FAILURE)
                 data = self._read(first, count, now_ns, epoch_ns)
                 return registers_reply(data) if data else self._refusal(function, ILLEGAL_ADDRESS)
             case function if function == WRITE_SINGLE and len(request) == READ.size:
@@ -153,12 +224,13 @@ class Slave:
 
     def _block(self, now_ns: int, epoch_ns: int, *, new: bool) -> bytes:
         t_s = (now_ns - epoch_ns) / NS_PER_S
+        has_time = new and self.variant.long_block == "answered"
         truth = self.motion.at(t_s)
         accel, gyro, mag, euler, quat, celsius, pascal = self.noise.add(truth, t_s) if self.noise else truth
         return pack_block(
             accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat, temperature_c=celsius,
             pressure_pa=pascal, incli_counts=incli_counts(truth, self.inclinometer),
-            uptime_ms=self.uptime_ms(now_ns) if new else None,
+            uptime_ms=self.uptime_ms(now_ns) if has_time else None,
             quat_per_lsb=QUAT_PER_LSB if new else QUAT_OLD_PER_LSB,
         )  # fmt: skip
 
@@ -167,11 +239,14 @@ class Slave:
         known = [one for one in BY_NAME.values() if one.address == register and "W" in one.access]
         if not known:
             return ILLEGAL_ADDRESS
-        if value not in known[0].values:
+        if value not in known[0].values or known[0].name in self.variant.refuses:
             return ILLEGAL_VALUE
+        if known[0].name in self.variant.ignores:
+            return 0
         match known[0].name:
             case "CTRL" if value == SAVE:
                 self.flash = self.settings
+                self.writes_to_flash += 1
             case "CTRL" if value == FACTORY_RESET:
                 self.flash = SlaveSettings()
                 self.restart(now_ns)
@@ -179,8 +254,9 @@ class Slave:
                 self.restart(now_ns)
             case "UART1_BAUD":
                 self.settings = replace(self.settings, baud=BAUD_RATES[value])
+                self.baud = self.settings.baud if self.variant.rate_at_once else self.baud
             case "MD_ID":
-                self.settings = replace(self.settings, slave=value)
+                self._number(value)
             case "HEADING_MODE":
                 self.settings = replace(self.settings, heading_mode=value)
         return 0
@@ -189,10 +265,15 @@ class Slave:
         if len(request) == BY_SERIAL.size and request[1:3] == SET_ID_BY_SERIAL.to_bytes(2, "big"):
             *_, serial, slave = BY_SERIAL.unpack(request)
             if serial == self.serial:
-                self.settings = replace(self.settings, slave=slave)
+                self._number(slave)
         elif len(request) == BY_CHANCE.size and request[1:3] == RANDOMISE_IDS.to_bytes(2, "big"):
             *_, low, high, _ = BY_CHANCE.unpack(request)
-            self.settings = replace(self.settings, slave=random.randint(low, high))
+            self._number(random.randint(low, high))
+
+    def _number(self, address: int) -> None:
+        self.settings = replace(self.settings, slave=address)
+        if self.variant.address_at_once:
+            self.address = address
 
 
 def incli_counts(truth: Truth, kind: str) -> tuple[int, int]:
@@ -218,7 +299,7 @@ class ModbusLine:
         self.epoch_ns = now_ns
         self.echo, self.chunk_bytes = echo, chunk_bytes
         self.requests = self.damaged = 0
-        self._baud = slaves[0].settings.baud if slaves else FACTORY_BAUD
+        self._baud = slaves[0].baud if slaves else FACTORY_BAUD
         self._random = Random(seed)
         self._heard = b""
         self._heard_ns = now_ns
@@ -272,7 +353,7 @@ class ModbusLine:
 
     def _agree(self) -> None:
         if self.slaves:
-            self._baud = self.slaves[0].settings.baud
+            self._baud = self.slaves[0].baud
 
     def _finish(self, now_ns: int) -> None:
         """Finish the frame if the line was silent for long enough."""
@@ -285,20 +366,22 @@ class ModbusLine:
         replies: list[tuple[int, bytes]] = []
         is_good = False
         for slave in self.slaves:
-            request = heard(frame, self.baud, slave.settings.baud)
+            request = heard(frame, self.baud, slave.baud)
             if not is_whole(request) or len(request) < 2 + CRC_BYTES:
                 continue
             is_good = True
-            if request[0] not in (BROADCAST, slave.settings.slave) or slave.dead:
+            if request[0] not in (BROADCAST, slave.address) or slave.dead or now_ns < slave.ready_ns:
                 continue
             if slave.mute:
                 slave.mute -= 1
                 continue
-            begin_ns = now_ns + slave.processing_ns
-            address, baud = slave.settings.slave, slave.settings.baud
-            reply = framed(address, slave.obey(request[1:-CRC_BYTES], begin_ns, self.epoch_ns, self._random))
-            if request[0] != BROADCAST:
-                replies.append((begin_ns, heard(self._spoilt(slave, reply), baud, self.baud)))
+            asked = request[1:-CRC_BYTES]
+            begin_ns = now_ns + slave.delay_ns(asked)
+            address, baud = slave.address, slave.baud
+            reply = slave.obey(asked, begin_ns, self.epoch_ns, self._random)
+            source = slave.replies_from(asked, address)
+            if request[0] != BROADCAST and source is not None:
+                replies.append((begin_ns, heard(self._spoilt(slave, framed(source, reply)), baud, self.baud)))
         self.requests += is_good
         self.damaged += not is_good
         if replies:

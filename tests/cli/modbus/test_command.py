@@ -11,7 +11,7 @@ from tests.support.pty_port import BAUD, serial_of, slave, wired
 
 ON = ("--baud", str(BAUD), "--reply-ms", "30")
 PATIENT = ("--baud", str(BAUD), "--reply-ms", "400")
-"""For a scan, which asks once: the line is moved along by a thread that the machine may hold up."""
+"""For a scan, where each missing reply takes time: the line is moved along by a thread that the machine may hold up."""
 
 
 @pytest.fixture(autouse=True)
@@ -41,6 +41,21 @@ def test_scan_lists_who_answers(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert serial_of(7).hex().upper() in out
         assert main(["modbus", "scan", str(path), *ON, "--addresses", "8"]) == 1
         assert "no module answers" in capsys.readouterr().out
+
+
+def test_scan_asks_again_what_did_not_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One answer is lost, one damaged, and one lost twice on a line where others answer."""
+    modules = slave(1), slave(2, mute=1), slave(3, bad_crc=1), slave(4, mute=2)
+    with wired(tmp_path, *modules) as (path, _):
+        status, found = scanned(path, capsys, *PATIENT, "--addresses", "1-4")
+        assert status == 0
+        assert [(one["address"], one.get("problem", "")) for one in found] == [(n, "") for n in (1, 2, 3, 4)]
+
+
+def test_a_module_alone_on_its_line_is_asked_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with wired(tmp_path, slave(2, mute=1)) as (path, _):
+        status, found = scanned(path, capsys, *PATIENT, "--addresses", "2")
+        assert (status, [one["address"] for one in found]) == (0, [2])
 
 
 def test_scan_at_every_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

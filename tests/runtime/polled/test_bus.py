@@ -23,7 +23,7 @@ ASK = Transfer((b"\x01",), 1)
 class Wire:
     """A link whose answers are the number of the transfer."""
 
-    title, writable, bus, shared, rate_hz = "wire", True, "wire", True, 2000.0
+    title, writable, bus, shared, rate_hz, bit_rate = "wire", True, "wire", True, 2000.0, 0
 
     def __init__(self) -> None:
         self.target: int | None = None
@@ -239,5 +239,31 @@ def test_targets_are_taken_once() -> None:
         assert b.claim(0x18)
         b.leave()
         assert a.claim(0x18)
+
+    run(body)
+
+
+def holding(log: list[int], wire: Wire) -> TransferScript[None]:
+    yield replace(ASK, holds=True)
+    held_from = wire.count
+    yield replace(ASK, holds=True)
+    log.append(wire.count - held_from)
+    yield ASK
+
+
+def test_a_script_can_keep_its_device_from_being_read() -> None:
+    async def body(buses: PolledBuses) -> None:
+        wire, log = Wire(), list[int]()
+        wire.rate_hz = 0.0  # a read is due at any time
+        member = joined(buses, wire, Sink())
+        member.start([Poll(ASK)])
+        while wire.count < 20:
+            await asyncio.sleep(0)
+        await member.run(holding(log, wire), 5)
+        assert log == [1]  # the script's own
+        read = wire.count
+        while wire.count < read + 20:
+            await asyncio.sleep(0)
+        member.leave()
 
     run(body)

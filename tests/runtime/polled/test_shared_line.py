@@ -16,8 +16,9 @@ from imud.contracts.polling import TransferScript
 from imud.contracts.status import DeviceState
 from imud.devices.hipnuc.modbus import driver, session
 from imud.devices.hipnuc.modbus.registers import BY_NAME
-from imud.errors import TransferError
+from imud.errors import BadArgument, TransferError
 from imud.event import EventKind
+from imud.sim.hipnuc.modbus import SLAVE_VARIANTS
 from imud.units import NS_PER_MS
 from tests.support.device_rig import device_config, running
 from tests.support.pty_port import BAUD, serial_of, slave, wired
@@ -193,5 +194,44 @@ def test_fixed_rate_on_a_line(tmp_path: Path) -> None:
             async with running(on(path, 1, rate_hz=20)) as (rig,):
                 await rig.until_samples(5)
                 assert rig.device.status().expected_rate_hz == 20
+
+    run(body())
+
+
+@pytest.mark.parametrize("variant", SLAVE_VARIANTS)
+def test_modules_of_every_kind_are_read(tmp_path: Path, variant: str) -> None:
+    async def body() -> None:
+        module = slave(1, variant=SLAVE_VARIANTS[variant])
+        with wired(tmp_path, module) as (path, _):
+            async with running(on(path, 1)) as (rig,):
+                await rig.until_samples(10)
+                assert rig.kinds.count(EventKind.UP) == 1
+                lost = rig.ledger.lost_gap_device
+                assert lost == (2 if module.variant.long_block == "silent" else 0)
+
+    run(body())
+
+
+@pytest.mark.parametrize("variant", ["manual", "address after restart", "confirms from the new address"])
+def test_a_module_is_followed_to_another_address_and_back(tmp_path: Path, variant: str) -> None:
+    async def body() -> None:
+        module, other = slave(1, variant=SLAVE_VARIANTS[variant]), slave(2)
+        with wired(tmp_path, module, other) as (path, _):
+            async with running(on(path, 1), on(path, 2)) as (rig, beside):
+                await rig.until_samples(5)
+                await beside.until_samples(5)
+                with pytest.raises(BadArgument, match="address 2 is taken"):
+                    await rig.device.act("address", {"address": 2})
+                await rig.device.act("address", {"address": 9})
+                await rig.device.act("save", {})
+                await rig.device.act("restart", {})
+                await rig.until_samples(10)
+                assert rig.device.status().link == f"{path}, address 9"
+                assert module.address == module.flash.slave == 9
+                await rig.device.act("address", {"address": 1})
+                await rig.device.act("restart", {})  # not saved: it is at 9 again
+                await rig.until_samples(10)
+                assert rig.device.status().link == f"{path}, address 9"
+                assert beside.kinds.count(EventKind.DOWN) == 0
 
     run(body())

@@ -1,7 +1,7 @@
 """Actions of a HiPNUC module on RS-485: every command of section 4.3 of the manual by name.
 
-The parameters of each function describe the arguments of its action: type, range, unit and section of the manual. After
-another address or baud rate imud does not follow; `imud modbus assign` looks for the module where it has gone.
+The parameters of each function describe the arguments of its action: type, range, unit and section of the manual. imud
+follows the module to another address. A baud rate is the whole line's, so imud does not follow there.
 """
 
 from collections.abc import Callable
@@ -24,27 +24,35 @@ def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = 
 
 
 def _address(
-    _target: Target,
+    target: Target,
     *,
     address: Annotated[
         int,
         Meta(ge=1, le=ID_MAX, description="one that no other module of the line has", extra={"section": "4.3.3"}),
     ],
-) -> TransferScript[None]:
-    return session.set_id(address)
+) -> TransferScript[str]:
+    return session.change_address(session.places_of(target)[0], address)
+
+
+def _restart(target: Target) -> TransferScript[str]:
+    return session.restart(session.places_of(target), target.baud)
+
+
+def _factory_reset(target: Target) -> TransferScript[str]:
+    return session.factory_reset(session.places_of(target), target.baud)
 
 
 def _baud(
     _target: Target,
     *,
     baud: Annotated[BaudRate, Meta(description="rate of the line", extra={"unit": "bit/s", "section": "4.3.2"})],
-) -> TransferScript[None]:
+) -> TransferScript[str]:
     return session.set_baud(baud)
 
 
 def _attitude_mode(
     _target: Target, *, axes: Annotated[Literal[6, 9], Meta(extra={"section": "4.3.6"})]
-) -> TransferScript[None]:
+) -> TransferScript[str]:
     return session.set_heading_mode(AttitudeMode.NINE_AXIS if axes == 9 else AttitudeMode.SIX_AXIS)
 
 
@@ -58,7 +66,7 @@ def _mounting(
     _target: Target,
     *,
     mounting: Annotated[Literal["level", "y_down", "y_up", "x_up", "x_down"], Meta(extra={"section": "4.3.4"})],
-) -> TransferScript[None]:
+) -> TransferScript[str]:
     return session.set_mounting(LineMounting[mounting.upper()])
 
 
@@ -74,15 +82,15 @@ def _read(
 
 ACTIONS: Final[Actions] = {
     "save": _simple("write all settings to flash", session.save),
-    "restart": _simple("restart, as by power-on; what is not saved is lost", session.restart),
-    "factory_reset": _simple(
-        "factory settings, address 80 and 115200 baud included: imud then hears it only where the line is set to that",
-        session.factory_reset,
+    "restart": Action("restart, as by power-on, and wait until it answers; what is not saved is lost", _restart),
+    "factory_reset": Action(
+        "factory settings, and restart: imud follows it to address 80 if no other module has that and the line has the "
+        "factory's 115200 baud",
+        _factory_reset,
         Risk.RESET,
     ),
     "address": Action(
-        "set its address, in force at once and not saved: imud then looks for it, and finds it only with "
-        "`address: auto`",
+        "set its address and follow it there; not saved. Refused if another module of the line answers there",
         _address,
         Risk.CONNECTION,
     ),

@@ -3,8 +3,10 @@
     50 03 00 34 00 1A crc  →  50 03 34 | accel 3 | gyro 3 | mag 3 | roll pitch yaw i32 | °C | Pa i32 | quaternion 4 |
                                          inclinometer 2 | uptime ms u32 | crc      i16 where not said, high byte first
 
-Firmware that has no UPTIME answers with exception 2: from then on 24 registers are read. Nothing else than the first
-reading can decide it, because a codec alone keeps what was learned.
+The manual's block ends at 0x4B; UPTIME is of newer firmware. A module that answers the longer block with an exception,
+or does not answer it, is asked for the manual's 24 registers. "Illegal data address" decides it until another module is
+there. Other exceptions, and silence, can have other causes: they count only before the longer block was ever answered,
+and it is tried again when the module is identified the next time.
 
 Two scales differ between modules and are decided by the values, then kept:
 - the quaternion: the one of the two that gives unit length;
@@ -37,9 +39,7 @@ from imud.devices.hipnuc.common.raw_units import (
     TEMPERATURE_C_PER_LSB,
     counts_of,
 )
-from imud.devices.hipnuc.modbus.frames import (
-    read_registers,
-)
+from imud.devices.hipnuc.modbus.frames import read_registers
 from imud.devices.hipnuc.modbus.registers import (
     BLOCK_FIRST,
     BLOCK_REGISTERS,
@@ -55,6 +55,7 @@ from imud.formats.modbus import (
     ILLEGAL_ADDRESS,
     READ_HOLDING,
     READ_OVERHEAD_BYTES,
+    exception_text,
     is_exception,
     is_whole,
 )
@@ -69,6 +70,8 @@ UPTIME: Final = struct.Struct(">I")
 DATA_AT: Final = 3
 CHECK_NS: Final = 10 * NS_PER_S
 """Interval of reading the serial number again: another module can take a place on the line unnoticed."""
+SILENT_MAX: Final = 2
+"""Replies in a row that may be missing before the shorter block is tried; the device is given up after three."""
 UNIT_TOLERANCE: Final = 0.02
 """Tolerance of a quaternion's length: the two scales are a factor of 3.3 apart, rounding costs 1e-4."""
 PITCHED_RAD: Final = radians(1.0)
@@ -98,16 +101,16 @@ def update_ns(settings: HipnucModbusSettings) -> int:
 class HipnucModbusCodec:
     """Decoder of blocks of registers. Synchronization: one thread.
 
-    What was learned of the firmware stays, after `reset` too; scales and serial number are learned anew.
+    What the module said of its registers stays, after `reset` too; scales and serial number are learned anew.
     """
 
     def __init__(self, ledger: Ledger, settings: HipnucModbusSettings) -> None:
         self.ledger = ledger
-        self.polls: Sequence[Poll] = _polls(short=False)
         self._fixed_incli = _INCLI[settings.inclinometer]
-        self._size = READ_BLOCK.read_bytes
-        self._book = PolledFrameDecoder(ledger, self._size)
         self._stale_before = 0
+        self._just_shortened = False
+        self._book = PolledFrameDecoder(ledger, READ_BLOCK.read_bytes)
+        self._read_block(short=False)
         self.reset()
 
     @property
@@ -119,27 +122,54 @@ class HipnucModbusCodec:
         """Decode one reply. Never raises."""
         if poll != _SAMPLE:
             return self._decode_serial(data)
+        self._silent = 0
         if is_exception(data):
             return self._decode_exception(data)
         return self._book.decode(data, self._bad, self._measure)
 
+    def on_silence(self, poll: int) -> Sequence[PolledEvent]:
+        """Try the shorter block after SILENT_MAX missing replies to a longer one that was never answered."""
+        if poll != _SAMPLE or self._short or self._answered:
+            return ()
+        self._silent += 1
+        if self._silent < SILENT_MAX:
+            return ()
+        return self._shorten(sure=False, why="it does not answer to the registers up to 0x4D")
+
     def reset(self) -> None:
         """Forget scales and serial number: another module may be there."""
+        if self._short and not self._sure and not self._just_shortened:
+            self._read_block(short=False)
+        self._just_shortened = False
+        self._silent = 0
         self._book.reset()
         self._quat_scale = 0.0
         self._incli_scale = self._fixed_incli
         self._serial = b""
 
     def _decode_exception(self, data: bytes) -> Sequence[PolledEvent]:
-        if data[2] == ILLEGAL_ADDRESS and self._size == READ_BLOCK.read_bytes:
+        missing = data[2] == ILLEGAL_ADDRESS
+        if not self._short and (missing or not self._answered):
             self._book.add_reply(data, good=True)
-            self.polls, self._size = _polls(short=True), READ_SHORT_BLOCK.read_bytes
-            self._stale_before, self._book = self.stale, PolledFrameDecoder(self.ledger, self._size)
-            return (Vanished("this firmware has no register 0x4C: reading without the device's time from now on"),)
+            return self._shorten(sure=missing, why=f"it answers {exception_text(data[2])} to the registers up to 0x4D")
         self.ledger.bytes_in += len(data)
         self.ledger.bytes_in_bad_frames += len(data)
         self.ledger.frames_bad_content += 1
         return (BadFrame(BadReason.CONTENT, data),)
+
+    def _shorten(self, *, sure: bool, why: str) -> Sequence[PolledEvent]:
+        self._read_block(short=True, sure=sure)
+        self._just_shortened = True
+        return (Vanished(f"{why}: reading up to 0x4B, without the device's time"),)
+
+    def _read_block(self, *, short: bool, sure: bool = False) -> None:
+        """Read this block from now on; `sure`: the module said that it has no other."""
+        self._short, self._sure = short, sure
+        self._just_shortened = self._answered = False
+        self._silent = 0
+        self.polls: Sequence[Poll] = _polls(short=short)
+        self._stale_before = self.stale
+        self._book = PolledFrameDecoder(self.ledger, (READ_SHORT_BLOCK if short else READ_BLOCK).read_bytes)
 
     def _decode_serial(self, data: bytes) -> Sequence[PolledEvent]:
         whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)
@@ -150,6 +180,7 @@ class HipnucModbusCodec:
         self._serial = serial
         if not before or serial == before:
             return ()
+        self._read_block(short=False)
         return (Vanished(f"serial number {serial.hex().upper()}, was {before.hex().upper()}: another module"),)
 
     def _bad(self, data: bytes) -> BadReason | None:
@@ -163,6 +194,7 @@ class HipnucModbusCodec:
             ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, celsius, pressure, qw, qx, qy, qz, ix, iy,
         ) = BLOCK.unpack_from(data, DATA_AT)  # fmt: skip
         has_time = len(data) == READ_BLOCK.read_bytes
+        self._answered = True
         a, w, b, angle = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB
         return Measurement(
             len(data), 0, UPTIME.unpack_from(data, DATA_AT + BLOCK.size)[0] if has_time else None,

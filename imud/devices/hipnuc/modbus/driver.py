@@ -9,6 +9,7 @@ from imud.devices.hipnuc.modbus.actions import ACTIONS
 from imud.devices.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings, pack_block, update_ns
 from imud.devices.hipnuc.modbus.frames import FACTORY_ID, registers_reply
 from imud.devices.hipnuc.modbus.session import probe, set_up
+from imud.devices.hipnuc.modbus.settings import SETTINGS
 from imud.formats.modbus import SLAVES, framed
 from imud.sample import Vector3
 from imud.units import NS_PER_MS
@@ -45,4 +46,5 @@ DRIVER: Final = PolledDriver(
     update_ns=update_ns,
     example_reading=_example_reading,
     actions=ACTIONS,
+    device_settings=SETTINGS,
 )

@@ -53,9 +53,9 @@ QUAT_OLD_PER_LSB: Final = 2.0**-15
 INCLI_SINGLE_RAD_PER_LSB: Final = tau / 32768
 INCLI_DUAL_RAD_PER_LSB: Final = tau / 2 / 32768
 
-BaudRate = Literal[4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600]
+BaudRate = Literal[4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600, 256000]
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
-"""By their code in UART1_BAUD (section 4.3.2)."""
+"""By their code in UART1_BAUD (section 4.3.2); code 9 is not in the manual, the vendor's own programs have it."""
 FACTORY_BAUD: Final[BaudRate] = 115200
 ID_MAX: Final = 128
 """Highest ID that register MD_ID takes; more by serial number only."""
@@ -65,7 +65,7 @@ _R, _W, _RW = Access.READ, Access.WRITE, Access.BOTH
 REGISTERS: Final = (
     Register("CTRL", 0x00, "u16", 1, _W, "0 saves all settings, 1 restores the factory's, 0xFF restarts",
              values=(0x0000, 0x0001, 0x00FF)),
-    Register("UART1_BAUD", 0x04, "u16", 1, _RW, "baud rate by code", values=range(len(BAUD_RATES))),
+    Register("UART1_BAUD", 0x04, "u16", 1, _RW, "baud rate by code, after a restart", values=range(len(BAUD_RATES))),
     Register("MD_ID", 0x05, "u16", 1, _RW, "address on the line, at once in force", values=range(1, ID_MAX + 1)),
     Register("HEADING_MODE", 0x06, "u16", 1, _RW, "0 six axes, heading from power-on; 1 nine axes", values=(0, 1)),
     Register("MAIN_STATUS", 0x09, "u16", 1, _R, "status bits, as in HI91"),

@@ -53,6 +53,10 @@ class Imu61xI2cCodec:
         self._frames.add_reply(data, good=not why)
         return (Vanished(why),) if why else ()
 
+    def on_silence(self, poll: int) -> Sequence[PolledEvent]:
+        """No-op: nothing follows from one failed transfer."""
+        return ()
+
     def reset(self) -> None:
         """Forget the last burst: the next one is not compared with it."""
         self._frames.reset()

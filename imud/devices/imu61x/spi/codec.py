@@ -108,6 +108,10 @@ class Imu61xSpiCodec:
             return self._frames.decode(data[PIPELINE_BYTES:], self._bad, self._measure)
         return self._on_state(data) if poll == _STATE else self._on_temperature(data)
 
+    def on_silence(self, poll: int) -> Sequence[PolledEvent]:
+        """No-op: nothing follows from one failed transfer."""
+        return ()
+
     def reset(self) -> None:
         """Forget the last frame: the next one is not compared with it."""
         self._frames.reset()

@@ -3,18 +3,17 @@
 import pytest
 
 from imud.contracts.action import Target, parameters_of
-from imud.contracts.polling import run_transfer_script
 from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings
 from imud.devices.hipnuc.modbus.driver import DRIVER
 from imud.errors import BadArgument
-from tests.devices.hipnuc.modbus.test_session import Wire
+from tests.support.simulated_modules import ModbusBench
+from tests.support.simulated_modules import modbus_slave as module
 
-TARGET = Target(HipnucModbusSettings(), 0)
 
-
-def act(wire: Wire, name: str, **given: object) -> object:
+def act(bench: ModbusBench, name: str, **given: object) -> object:
     action = DRIVER.actions[name]
-    return run_transfer_script(action.script(TARGET, action.arguments(given)), wire.transfer)
+    result: object = bench.run(action.script(bench.target, action.arguments(given)))
+    return result
 
 
 @pytest.mark.parametrize(
@@ -27,6 +26,7 @@ def act(wire: Wire, name: str, **given: object) -> object:
         ("address", {"address": 128}, "0600050080"),
         ("baud", {"baud": 4800}, "0600040000"),
         ("baud", {"baud": 921600}, "0600040008"),
+        ("baud", {"baud": 256000}, "0600040009"),
         ("attitude_mode", {"axes": 9}, "0600060001"),
         ("attitude_mode", {"axes": 6}, "0600060000"),
         ("level", {"level": "relative"}, "0600a50002"),
@@ -40,18 +40,24 @@ def act(wire: Wire, name: str, **given: object) -> object:
     ],
 )
 def test_what_is_sent(name: str, given: dict[str, object], sent: str) -> None:
-    wire = Wire()
-    act(wire, name, **given)
-    assert wire.asked[0].hex() == sent
+    bench = ModbusBench()
+    act(bench, name, **given)
+    assert next(request.hex() for _, request in bench.sent if request[0] == 6) == sent
+
+
+def test_without_an_address_nothing_can_be_followed() -> None:
+    action = DRIVER.actions["address"]
+    with pytest.raises(BadArgument, match="expected the address of the module"):
+        action.script(Target(HipnucModbusSettings(), 0), action.arguments({"address": 9}))
 
 
 def test_registers_are_read_by_name() -> None:
-    wire = Wire()
-    assert act(wire, "read", register="MD_ID") == (7,)
-    assert act(wire, "read", register="sn") == (0x0001, 0x0203, 0x0405, 0x0607)
+    bench = ModbusBench(module(7))
+    assert act(bench, "read", register="MD_ID") == (7,)
+    assert act(bench, "read", register="sn") == (0xA000, 0, 0, 7)
     for name in ("CTRL", "nothing"):
         with pytest.raises(BadArgument, match="HEADING_MODE"):
-            act(wire, "read", register=name)
+            act(bench, "read", register=name)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +66,7 @@ def test_registers_are_read_by_name() -> None:
         ("address", {"address": 129}, "from 1 to 128"),
         ("address", {"address": 0}, "from 1 to 128"),
         ("address", {}, "from 1 to 128"),
-        ("baud", {"baud": 256000}, "4800, 9600"),
+        ("baud", {"baud": 12345}, "4800, 9600"),
         ("baud", {"baud": True}, "4800, 9600"),
         ("mounting", {"mounting": 1}, "level"),
         ("attitude_mode", {"axes": 1}, "6, 9"),
@@ -68,10 +74,10 @@ def test_registers_are_read_by_name() -> None:
     ],
 )
 def test_what_a_module_cannot_take_is_not_sent(name: str, given: dict[str, object], names: str) -> None:
-    wire = Wire()
+    bench = ModbusBench()
     with pytest.raises(BadArgument, match=names):
-        act(wire, name, **given)
-    assert wire.asked == []
+        act(bench, name, **given)
+    assert bench.sent == []
 
 
 def test_all_are_described() -> None:

@@ -135,12 +135,53 @@ def test_firmware_without_uptime_is_read_without_it_from_then_on() -> None:
     assert made.ledger.closes()
 
 
-def test_an_exception_of_another_kind_is_a_bad_frame() -> None:
+@pytest.mark.parametrize("code", [1, 3, 4, 6, 0x0A])
+def test_any_exception_to_the_first_reading_leads_to_the_block_of_the_manual(code: int) -> None:
     made = codec()
+    (event,) = made.decode(0, framed(0x50, bytes([0x83, code])))
+    assert isinstance(event, Vanished)
+    assert "up to 0x4B" in event.why
+    made.reset()
+    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    assert measured(made, SENSORS).dev_ticks is None
+    made.reset()  # identified again: it may have been busy the first time
+    assert made.polls[0].transfer == READ_BLOCK
+    assert made.ledger.closes()
+
+
+def test_no_answer_to_the_first_readings_leads_to_the_block_of_the_manual() -> None:
+    made = codec()
+    assert made.on_silence(0) == made.on_silence(1) == ()
+    (event,) = made.on_silence(0)
+    assert isinstance(event, Vanished)
+    made.reset()
+    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    assert [made.on_silence(0) for _ in range(5)] == [()] * 5
+    made.reset()
+    assert made.polls[0].transfer == READ_BLOCK
+
+
+def test_a_module_that_has_answered_the_longer_block_keeps_it() -> None:
+    made = codec()
+    measured(made, block())
     busy = framed(0x50, b"\x83\x06")
     assert list(made.decode(0, busy)) == [BadFrame(BadReason.CONTENT, busy)]
+    assert [made.on_silence(0) for _ in range(5)] == [()] * 5
     assert made.polls[0].transfer == READ_BLOCK
     assert made.ledger.frames_bad_content == 1
+
+
+def test_another_module_is_asked_for_the_longer_block_again() -> None:
+    made = codec()
+    made.decode(0, EXCEPTION)
+    made.reset()
+    first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
+    made.decode(1, first)
+    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    (event,) = made.decode(1, second)
+    assert isinstance(event, Vanished)
+    made.reset()
+    assert made.polls[0].transfer == READ_BLOCK
 
 
 def test_reply_of_another_function_or_count_is_no_block() -> None:

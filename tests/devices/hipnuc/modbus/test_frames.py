@@ -15,11 +15,12 @@ from imud.devices.hipnuc.modbus.frames import (
 )
 from imud.devices.hipnuc.modbus.registers import BAUD_RATES, BY_NAME, REGISTERS, Access
 from imud.devices.hipnuc.modbus.session import (
+    FACTORY_RESET,
+    RESTART,
     LineMounting,
     auto_level,
-    factory_reset,
-    restart,
     save,
+    send_control,
     set_baud,
     set_heading_mode,
     set_id,
@@ -31,8 +32,8 @@ from imud.formats.modbus import framed
 
 PRINTED = [  # sections 4.3.1 to 4.5, in their order
     ("50 06 00 00 00 00 84 4B", save()),
-    ("50 06 00 00 00 01 45 8B", factory_reset()),
-    ("50 06 00 00 00 FF C4 0B", restart()),
+    ("50 06 00 00 00 01 45 8B", send_control(FACTORY_RESET)),
+    ("50 06 00 00 00 FF C4 0B", send_control(RESTART)),
     ("50 06 00 04 00 00 C5 8A", set_baud(4800)),
     ("50 06 00 04 00 01 04 4A", set_baud(9600)),
     ("50 06 00 04 00 02 44 4B", set_baud(19200)),
@@ -131,5 +132,6 @@ def test_table_of_registers() -> None:
     assert {0x00, 0x04, 0x05, 0x06, 0x09, 0x0A, 0x0B, 0x70, 0x78, 0x79, 0x7F, 0x82, 0xA5, 0xA6} <= set(taken)
     assert all(register.values for register in REGISTERS if register.access is not Access.READ)
     assert all(register.meaning for register in REGISTERS)
-    assert len(BAUD_RATES) == 9
+    assert BAUD_RATES[5] == 115200
+    assert BAUD_RATES[8:] == (921600, 256000)
     assert BY_NAME["CTRL"].values == (0, 1, 255)

@@ -1,14 +1,18 @@
-"""Dialogues that change a module, held with the simulated one."""
+"""Scripts that change a module, run on the simulated line, over everything that no manual settles."""
 
-from random import Random
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from imud.contracts.device_settings import Written
 from imud.contracts.polling import Transfer, TransferScript, run_transfer_script
 from imud.devices.hipnuc.modbus.registers import BY_NAME
 from imud.devices.hipnuc.modbus.session import (
     LineMounting,
     auto_level,
+    change_address,
     factory_reset,
     read,
     restart,
@@ -19,86 +23,200 @@ from imud.devices.hipnuc.modbus.session import (
     set_mounting,
 )
 from imud.devices.hipnuc.uart.commands import AttitudeMode, LevelReset
-from imud.errors import DeviceRefused, TransferError, Trouble
+from imud.errors import BadArgument, DeviceRefused, NoReply, TransferError
 from imud.formats.modbus import framed
-from imud.sim.hipnuc.modbus import Slave, SlaveSettings
+from imud.sim.hipnuc.modbus import SLAVE_VARIANTS, SlaveSettings, SlaveVariant
+from tests.support.simulated_modules import LINE_BAUD as BAUD
+from tests.support.simulated_modules import ModbusBench
+from tests.support.simulated_modules import modbus_slave as module
+
+NINE = AttitudeMode.NINE_AXIS
 
 
-class Wire:
-    """One module at the end of a perfect line, and what it was asked."""
-
-    def __init__(self) -> None:
-        self.slave = Slave(bytes(range(8)), SlaveSettings(7, 115200))
-        self.asked: list[bytes] = []
-        self.replace: bytes | None = None
-        self.silent = False
-
-    def transfer(self, transfer: Transfer) -> bytes:
-        self.asked.append(transfer.sends[0])
-        if self.silent:
-            raise TransferError(Trouble.DISTURBED, "silence")
-        reply = self.slave.obey(transfer.sends[0], 10**9, 0, Random(1))
-        return framed(7, self.replace or reply)
-
-    def hold(self, dialogue: TransferScript[object]) -> object:
-        return run_transfer_script(dialogue, self.transfer)
+@pytest.fixture(params=SLAVE_VARIANTS)
+def bench(request: pytest.FixtureRequest) -> ModbusBench:
+    """A module of each kind, and another module on the line."""
+    return ModbusBench(module(7, variant=SLAVE_VARIANTS[request.param]), module(12))
 
 
-def test_what_is_written_is_read_back_and_saved_only_when_told() -> None:
-    wire = Wire()
-    wire.hold(set_heading_mode(AttitudeMode.NINE_AXIS))
-    assert [asked[0] for asked in wire.asked] == [6, 3]
-    assert wire.slave.settings.heading_mode == 1
-    assert wire.hold(read(BY_NAME["HEADING_MODE"])) == (1,)
-    wire.hold(restart())
-    assert wire.slave.settings.heading_mode == 0
-    wire.hold(set_heading_mode(AttitudeMode.NINE_AXIS))
-    wire.hold(save())
-    wire.hold(restart())
-    assert wire.slave.settings.heading_mode == 1
-    wire.hold(factory_reset())
-    assert wire.slave.settings == SlaveSettings()
+def restarted(bench: ModbusBench) -> str:
+    return bench.run(restart((bench.at, 7), BAUD))
 
 
-def test_id_and_baud_rate() -> None:
-    wire = Wire()
-    wire.hold(set_id(9))
-    wire.hold(set_baud(921600))
-    assert wire.slave.settings == SlaveSettings(9, 921600)
+def test_what_is_written_is_read_back_and_saved_only_when_told(bench: ModbusBench) -> None:
+    assert bench.run(set_heading_mode(NINE)) is Written.VERIFIED
+    assert [request[0] for _, request in bench.sent] == [6, 3]
+    assert bench.run(read(BY_NAME["HEADING_MODE"])) == (1,)
+    restarted(bench)
+    assert bench.slave.settings.heading_mode == 0
+    bench.run(set_heading_mode(NINE))
+    bench.run(save())
+    restarted(bench)
+    assert bench.slave.settings.heading_mode == 1
+    assert bench.slave.writes_to_flash == 1
 
 
-def test_mounting_and_level_are_confirmed_only() -> None:
-    wire = Wire()
-    wire.hold(set_mounting(LineMounting.X_UP))
-    wire.hold(auto_level(LevelReset.AUTOMATIC))
-    assert [asked.hex() for asked in wire.asked] == ["0600a60003", "0600a50003"]
+def test_a_save_may_take_two_seconds(bench: ModbusBench) -> None:
+    before_ns = bench.now_ns
+    bench.run(save())
+    assert bench.now_ns - before_ns >= bench.slave.variant.flash_ms * 1_000_000
+    with pytest.raises(TransferError):
+        ModbusBench(module(7, variant=SlaveVariant(flash_ms=2600))).run(save())
+
+
+def test_a_module_is_followed_to_another_address(bench: ModbusBench) -> None:
+    written = bench.run(change_address(7, 9))
+    if bench.slave.variant.address_at_once:
+        assert (written, bench.at, bench.slave.address) == (Written.VERIFIED, 9, 9)
+    else:
+        assert (written, bench.at, bench.slave.address) == (Written.PENDING, 7, 7)
+    bench.run(save())
+    assert restarted(bench) == "restarted, at address 9"
+    assert (bench.at, bench.slave.address) == (9, 9)
+    assert bench.run(read(BY_NAME["MD_ID"])) == (9,)
+
+
+def test_an_unsaved_address_is_left_at_a_restart(bench: ModbusBench) -> None:
+    bench.run(change_address(7, 9))
+    assert restarted(bench) == "restarted, at address 7"
+    assert bench.at == bench.slave.address == 7
+
+
+def test_an_address_that_another_module_has_is_refused_before_anything_is_written(bench: ModbusBench) -> None:
+    with pytest.raises(BadArgument, match="address 12 is taken: the module with serial number A00000000000000C"):
+        bench.run(change_address(7, 12))
+    assert not any(request[0] == 6 for _, request in bench.sent)
+    assert bench.at == 7
+
+
+def test_two_at_an_address_are_taken_as_well() -> None:
+    bench = ModbusBench(module(7), module(12, serial=0x0F), module(12, serial=0xF0))
+    with pytest.raises(BadArgument, match="address 12 is taken: something answers"):
+        bench.run(change_address(7, 12))
+
+
+def test_one_lost_request_makes_no_address_free() -> None:
+    bench = ModbusBench(module(7), module(12, mute=2))
+    with pytest.raises(BadArgument, match="taken"):
+        bench.run(change_address(7, 12))
+
+
+def test_the_address_it_has_already_is_written_all_the_same(bench: ModbusBench) -> None:
+    assert bench.run(change_address(7, 7)) is Written.VERIFIED
+    assert bench.at == 7
+
+
+def test_a_module_that_is_heard_nowhere_is_sent_back() -> None:
+    bench = ModbusBench(module(7))
+    script = change_address(7, 9)
+
+    def transfer(transfer: Transfer) -> bytes:
+        answer = bench.transfer(transfer)
+        if transfer.sends[0][0] == 6:
+            bench.slave.mute = 6  # three tries at either address: noise hides it
+        return answer
+
+    with pytest.raises(NoReply, match="neither at address 9 nor at 7"):
+        run_transfer_script(script, transfer)
+    assert bench.sent[-1] == (9, bytes.fromhex("0600050007"))
+    assert bench.slave.address == 9 or bench.slave.settings.slave == 7
+
+
+def test_an_address_that_did_not_take_is_told() -> None:
+    bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"MD_ID"}))))
+    with pytest.raises(DeviceRefused, match="wrote 9, the module has 7"):
+        bench.run(change_address(7, 9))
+    bench = ModbusBench(module(7, variant=SlaveVariant(refuses=frozenset({"MD_ID"}))))
+    with pytest.raises(DeviceRefused, match="the value is not allowed"):
+        bench.run(change_address(7, 9))
+
+
+def test_addresses_beyond_the_register_go_by_serial_number_only() -> None:
+    with pytest.raises(BadArgument, match=r"1 … 128, got 129"):
+        ModbusBench().run(change_address(7, 129))
+
+
+def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> None:
+    if bench.slave.variant.rate_at_once:
+        with pytest.raises(NoReply, match="it has 9600 baud at once"):
+            bench.run(set_baud(9600))
+        return
+    assert bench.run(set_baud(9600)) is Written.PENDING
+    assert bench.slave.baud == BAUD
+    bench.run(save())
+    assert restarted(bench) == "restarted; it has 9600 baud now, which this line has not"
+    assert bench.slave.baud == 9600
+
+
+def test_code_nine_is_256000(bench: ModbusBench) -> None:
+    if not bench.slave.variant.rate_at_once:
+        bench.run(set_baud(256000))
+        assert bench.sent[0] == (7, bytes.fromhex("0600040009"))
+        assert bench.slave.settings.baud == 256000
+
+
+def test_factory_settings_and_where_the_module_is_then(bench: ModbusBench) -> None:
+    bench.run(set_heading_mode(NINE))
+    assert bench.run(factory_reset((7,), BAUD)) == "restarted, at address 80"
+    assert bench.slave.settings == SlaveSettings()
+    assert bench.at == 80
+
+
+def test_no_factory_reset_onto_the_address_of_another_module() -> None:
+    bench = ModbusBench(module(7), module(80))
+    with pytest.raises(BadArgument, match="address 80 is taken"):
+        bench.run(factory_reset((7,), BAUD))
+    assert not any(request[0] == 6 for _, request in bench.sent)
+
+
+def test_after_a_factory_reset_on_a_line_of_another_rate_it_is_not_waited_for() -> None:
+    made = module(7)
+    made.settings = made.flash = replace(made.settings, baud=9600)
+    made.baud = 9600
+    bench = ModbusBench(made, baud=9600)
+    assert "115200 baud and address 80" in bench.run(factory_reset((7,), 9600))
+
+
+def test_mounting_and_level_are_confirmed_only(bench: ModbusBench) -> None:
+    assert bench.run(set_mounting(LineMounting.X_UP)) is Written.UNVERIFIED
+    bench.run(auto_level(LevelReset.AUTOMATIC))
+    assert [request.hex() for _, request in bench.sent] == ["0600a60003", "0600a50003"]
 
 
 def test_a_value_that_did_not_take_is_told() -> None:
-    wire = Wire()
-    wire.replace = bytes.fromhex("06 0006 0001")  # confirmed, and then the reply to reading back is none
-    with pytest.raises(DeviceRefused):
-        wire.hold(set_heading_mode(AttitudeMode.NINE_AXIS))
-
-    def answer(transfer: Transfer) -> bytes:
-        return framed(7, transfer.sends[0] if transfer.sends[0][0] == 6 else b"\x03\x02\x00\x00")
-
+    bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"HEADING_MODE"}))))
     with pytest.raises(DeviceRefused, match="wrote 1, the module has 0"):
-        run_transfer_script(set_heading_mode(AttitudeMode.NINE_AXIS), answer)
+        bench.run(set_heading_mode(NINE))
 
 
-def test_silence_is_no_failure_where_the_module_may_have_gone() -> None:
-    wire = Wire()
-    wire.silent = True
-    for dialogue in (restart(), factory_reset(), set_id(9), set_baud(9600)):
-        wire.hold(dialogue)
-    with pytest.raises(TransferError):
-        wire.hold(save())
+def test_a_register_that_cannot_be_read_is_written_and_not_verified() -> None:
+    def answer(transfer: Transfer) -> bytes:
+        request = transfer.sends[0]
+        return framed(7, request if request[0] == 6 else b"\x83\x02")
+
+    assert run_transfer_script(set_heading_mode(NINE), answer) is Written.UNVERIFIED
 
 
-def test_a_refusal_is_always_told() -> None:
-    wire = Wire()
-    wire.replace = b"\x86\x03"
-    for dialogue in (restart(), set_id(9), save()):
-        with pytest.raises(DeviceRefused, match="the value is not allowed"):
-            wire.hold(dialogue)
+@pytest.mark.parametrize(
+    "begin", [lambda: restart((7,), BAUD), lambda: set_baud(9600), lambda: change_address(7, 9), save]
+)
+def test_a_module_that_is_not_there_is_told(begin: Callable[[], TransferScript[Any]]) -> None:
+    bench = ModbusBench(module(7, dead=True))
+    with pytest.raises((TransferError, NoReply)):
+        bench.run(begin())
+
+
+def test_a_module_that_does_not_come_back_is_told() -> None:
+    bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=60_000)))
+    with pytest.raises(NoReply, match="does not answer at address 7 after its restart"):
+        restarted(bench)
+
+
+@pytest.mark.parametrize("name", ["CTRL", "MD_ID", "HEADING_MODE"])
+def test_a_refusal_is_always_told(name: str) -> None:
+    scripts: dict[str, Callable[[], TransferScript[Any]]] = {
+        "CTRL": lambda: restart((7,), BAUD), "MD_ID": lambda: set_id(9), "HEADING_MODE": lambda: set_heading_mode(NINE),
+    }  # fmt: skip
+    bench = ModbusBench(module(7, variant=SlaveVariant(refuses=frozenset({name}))))
+    with pytest.raises(DeviceRefused, match="the value is not allowed"):
+        bench.run(scripts[name]())
