@@ -14,18 +14,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from time import thread_time_ns
-from typing import Any, cast
+from typing import cast
 
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
-from imud.contracts.action import ActionInfo, described
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import Batch, Publisher, PublisherContext, PublisherSettings
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
 from imud.host_clock import HostClock
-from imud.log import printable, shown
 from imud.notify import notify, watchdog_interval_s
 from imud.publishers import PUBLISHERS
 from imud.reload import Reloader
@@ -63,13 +61,13 @@ class Daemon:
         host = HostClock()
         self._now_ns = host.now_ns
         self._factory = DeviceFactory(self._publish, self._send_event, host, state_dir=state_dir, lines=lines)
+        self._devices: dict[str, Device] = {}
         self._context = PublisherContext(
-            self.status, secrets.randbits(63) | 1, host.now_ns, self.actions, self.act, thread_time_ns
+            self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns
         )
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
-        self._devices: dict[str, Device] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
@@ -183,15 +181,6 @@ class Daemon:
     def status(self) -> list[DeviceStatus]:
         """Return the state of every device."""
         return [device.status() for device in self._devices.values()]
-
-    def actions(self, device: str) -> list[ActionInfo]:
-        """Return the actions of a device."""
-        return described(self._devices[device].actions)
-
-    async def act(self, device: str, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action of a device. Raises ImudError."""
-        log.info("%s: run %s %s", device, printable(name), shown(arguments) if arguments else "")
-        return await self._devices[device].act(name, arguments)
 
     def _start_configured(self, name: str) -> None:
         settings = self.config.publishers[name]

@@ -25,6 +25,8 @@ class EventKind(StrEnum):
     """A pulse came on SOUT_DIV: `detail` has its time, its number, and the `seq` of the sample it belongs to."""
     LINK = "link"
     """The state of the port or bus changed, though the device may go on: a CAN controller became error-passive."""
+    CALIBRATION = "calibration"
+    """Progress of a guided calibration; `detail` has kind, phase, and what was measured. At most twice a second."""
     BAD_FRAME = "bad-frame"
     """A damaged or unknown frame was heard. Sent at most once a second and device."""
 

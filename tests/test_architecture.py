@@ -282,6 +282,7 @@ CROSS_CUTTING = {
     "cli/test_main.py": "`main` of imud/cli/__init__.py",
     "clock/test_accuracy.py": "every part of the clock against the truth of a simulation",
     "devices/test_every_row.py": "every driver",
+    "devices/test_every_calibration.py": "the calibrations of every driver",
     "devices/test_every_stream_driver.py": "every driver of byte streams",
     "devices/test_every_can_driver.py": "every driver on CAN",
     "devices/test_every_polled_driver.py": "every driver that is polled",

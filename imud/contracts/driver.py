@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from imud.contracts.action import Actions
 from imud.contracts.codec import StreamCodec
+from imud.contracts.control.calibration import Calibrations
 from imud.contracts.device_settings import DeviceSettings
 from imud.contracts.lines import AlarmRanges
 from imud.contracts.session import RequestScript
@@ -65,6 +66,8 @@ class Driver:
     """The frame that `quat_wxyz` turns into, for example `ENU`."""
     actions: Actions = field(default_factory=dict)
     """Commands that the device executes, by name."""
+    calibrations: Calibrations = field(default_factory=dict)
+    """Guided calibrations, by kind."""
     device_settings: DeviceSettings | None = None
     """Settings that the device keeps itself; None for a driver that does not know them."""
     lines: frozenset[str] = frozenset()

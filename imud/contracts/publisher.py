@@ -1,10 +1,11 @@
 """Contract of a publisher: it outputs samples and events, and never makes the pipeline wait."""
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from imud.contracts.action import ActionInfo
+from imud.contracts.action import Actions
+from imud.contracts.control.calibration import CalibrationResult, Calibrations
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.errors import CommandError
@@ -68,8 +69,34 @@ class Publisher(Protocol):
         ...
 
 
-async def _no_actions(device: str, _name: str, _arguments: Mapping[str, Any]) -> object:
-    raise CommandError(f"{device}: no device here has actions")
+class DeviceControl(Protocol):
+    """What clients with the permission may do to one device. Answers are values that JSON can carry."""
+
+    @property
+    def actions(self) -> Actions:
+        """Its actions now, by name."""
+        ...
+
+    async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
+        """Run an action and return its answer. Raises ImudError."""
+        ...
+
+    @property
+    def calibrations(self) -> Calibrations:
+        """Its guided calibrations now, by kind."""
+        ...
+
+    async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
+        """Run a guided calibration to its end. Raises ImudError."""
+        ...
+
+    def stop_calibration(self) -> bool:
+        """End the calibration that runs; return whether there was one."""
+        ...
+
+
+def _no_device(name: str) -> DeviceControl:
+    raise CommandError(f"{name}: no such device")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +108,8 @@ class PublisherContext:
     """Random number of this start of the daemon, 64 bits: readers see a restart by it."""
     now_ns: Callable[[], int]
     """CLOCK_MONOTONIC."""
-    actions: Callable[[str], Sequence[ActionInfo]] = lambda _device: ()
-    """The actions of a device."""
-    act: Callable[[str, str, Mapping[str, Any]], Awaitable[object]] = _no_actions
-    """Run an action of a device: its name, the action's, arguments. Raises ImudError; the answer is JSON values."""
+    control: Callable[[str], DeviceControl] = _no_device
+    """A device by its name, to command it."""
     cpu_ns: Callable[[], int] = lambda: 0
     """CPU time of the event loop's thread."""
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)

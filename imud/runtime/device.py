@@ -9,11 +9,13 @@ A device is composed of a transport, which owns the link and the sample path, an
 """
 
 import asyncio
+import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from imud.config import DeviceConfig
 from imud.contracts.action import Action, Actions
+from imud.contracts.control.calibration import CalibrationResult, Calibrations
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
 from imud.contracts.publisher import Batch
@@ -22,7 +24,9 @@ from imud.errors import BadArgument, CommandError, LinkError, LinkMissing
 from imud.event import Event
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
+from imud.log import printable, shown
 from imud.runtime.attachments import AttachmentHooks, Attachments
+from imud.runtime.calibration.guide import Guide
 from imud.runtime.health import Health
 from imud.runtime.identity import KnownIdentity, identity_words
 from imud.runtime.meters import LatencyMeter, RateMeter
@@ -31,6 +35,8 @@ from imud.runtime.path import SamplePath
 from imud.runtime.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.runtime.utc_keeper import DevicePort
 from imud.units import NS_PER_MS, NS_PER_S
+
+log = logging.getLogger(__name__)
 
 RETRY_S = 0.5
 """Pause before a port that refused is opened again: short enough to be back within a second of its coming back."""
@@ -75,6 +81,8 @@ class Device:
                 publish,
             )
         )  # fmt: skip
+        self._guide = Guide(self._transport.run_script, self._notices)
+        self._attachments.add(self._guide)
         self._rate = RateMeter()
         self._connects = 0
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -188,6 +196,7 @@ class Device:
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
         """Run an action and return its answer. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        log.info("%s: run %s %s", self.config.name, printable(name), shown(arguments) if arguments else "")
         action = self.actions.get(name)
         if action is None:
             raise BadArgument(f"{self.config.name}: no action {name[:64]!r}; there are: {self._known_actions()}")
@@ -195,6 +204,26 @@ class Device:
             return await self._attachments.run_action(name, arguments)
         self._require_replies()
         return await self._run_action(action, arguments)
+
+    @property
+    def calibrations(self) -> Calibrations:
+        """Calibrations of the device by kind; none while its driver is not known."""
+        driver = self._transport.driver
+        return driver.calibrations if driver is not None else {}
+
+    async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
+        """Run a guided calibration. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        calibration = self.calibrations.get(kind)
+        if calibration is None:
+            known = ", ".join(self.calibrations) or "none"
+            raise BadArgument(f"{self.config.name}: no calibration {kind[:64]!r}; there are: {known}")
+        log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
+        self._require_replies()
+        return await self._guide.run(kind, calibration, save=save)
+
+    def stop_calibration(self) -> bool:
+        """End the calibration that runs; return whether there was one."""
+        return self._guide.cancel()
 
     async def _run_action(self, action: Action, arguments: Mapping[str, Any]) -> object:
         params = action.arguments(arguments)

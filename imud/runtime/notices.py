@@ -15,8 +15,8 @@ log = logging.getLogger(__name__)
 INTERVAL_NS = NS_PER_S
 """At most one loss and one bad-frame event a second and device."""
 RAW_SHOWN_BYTES = 32
-LEVELS = {EventKind.UP: logging.INFO, EventKind.MARK: logging.DEBUG}
-"""Events below a warning; marks are as frequent as camera triggers."""
+LEVELS = {EventKind.UP: logging.INFO, EventKind.MARK: logging.DEBUG, EventKind.CALIBRATION: logging.DEBUG}
+"""Events below a warning; marks are as frequent as camera triggers, progress of a calibration comes twice a second."""
 
 
 class Notices:

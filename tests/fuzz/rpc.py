@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from imud.contracts.action import described
 from imud.contracts.publisher import PublisherContext
 from imud.devices import DRIVERS
 from imud.errors import Rejected
@@ -21,7 +20,7 @@ from imud.formats.jsonrpc import RpcError, encode_error, encode_result, parse_ob
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.sample import SAMPLE_FIELDS
 from tests.fuzz.target import Target
-from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, batch, device_status
+from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, FakeControl, batch, device_status
 
 T = TypeVar("T")
 
@@ -30,6 +29,7 @@ REPLIES_PER_LINE_MAX: Final = 1
 ERROR_CHARACTERS_MAX: Final = 1024
 METHODS: Final = (
     "devices", "status", "schema", "watch", "unwatch", "poll", "events", "notify", "actions", "command",
+    "calibrations", "calibrate", "stop_calibration",
 )  # fmt: skip
 ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
 
@@ -98,7 +98,7 @@ class _Rig:
 
     async def _start(self) -> SocketServer:
         statuses = [device_status(*item) for item in DEVICES.items()]
-        context = PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, lambda _device: described(ACTIONS), _act)
+        context = PublisherContext(lambda: statuses, EPOCH, lambda: NOW_NS, _Control)
         server = SocketServer(SocketSettings(path=str(Path(self._folder.name, "s")), group=_own_group()), context)
         server.start()
         for name, number in DEVICES.items():
@@ -137,12 +137,16 @@ def _rig() -> _Rig:
     return _Rig()
 
 
-async def _act(device: str, name: str, arguments: Mapping[str, Any]) -> object:
-    """Check the arguments of an action as the daemon does; no device is there."""
-    if name not in ACTIONS:
-        raise Rejected(f"{device} has no such action")
-    ACTIONS[name].arguments(arguments)
-    return {"done": name}
+class _Control(FakeControl):
+    """A device with the actions of a real driver, whose arguments are checked as the daemon does; nothing is done."""
+
+    actions = ACTIONS
+
+    async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
+        if name not in ACTIONS:
+            raise Rejected(f"no action {name}")
+        ACTIONS[name].arguments(arguments)
+        return {"done": name}
 
 
 def _check_received(received: bytes, data: bytes) -> None:

@@ -1,7 +1,7 @@
 """Makes the generated parts of the documents from the code: `python -m tests.support.references`.
 
-The tables of docs/configuration.md come from the settings classes, those of docs/commands.md from the drivers' actions,
-and those of docs/shm.md from the layout of shared memory.
+The tables of docs/configuration.md come from the settings classes, those of docs/commands.md and docs/calibration.md
+from the drivers' actions and calibrations, and those of docs/shm.md from the layout of shared memory.
 """
 
 import ast
@@ -14,6 +14,7 @@ import msgspec
 
 from imud.config import TABLES, DeviceGeneral, General
 from imud.contracts.action import Action, Actions, parameters_of
+from imud.contracts.control.calibration import Handling
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.settings import Settings, expected, shown
@@ -143,6 +144,19 @@ def actions_tables() -> str:
     return "\n".join([*lines, *by_lines])
 
 
+# --- docs/calibration.md ----------------------------------------------------------------------------------------------
+
+
+def calibrations_table() -> str:
+    """A row for each calibration of each driver."""
+    rows = ["| driver | kind | effect | section of the manual | device | result lasts |", "|---|---|---|---|---|---|"]
+    for driver in DRIVERS.values():
+        for kind, one in driver.calibrations.items():
+            hold = {Handling.REST: "at rest", Handling.TURN: "turned"}[one.handling]
+            rows.append(f"| `{driver.name}` | `{kind}` | {cell(one.help)} | {one.section} | {hold} | {one.kept} |")
+    return "\n".join(rows)
+
+
 # --- docs/shm.md ------------------------------------------------------------------------------------------------------
 
 C_TYPES = {
@@ -176,6 +190,7 @@ def layout_tables() -> dict[str, str]:
 PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/configuration.md": lambda: {"keys": "\n" + settings_tables()},
     "docs/commands.md": lambda: {"actions": "\n" + actions_tables()},
+    "docs/calibration.md": lambda: {"calibrations": calibrations_table()},
     "docs/shm.md": layout_tables,
 }
 """The generated parts of each page by the name that their marks have."""

@@ -13,7 +13,8 @@ from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from imud.contracts.action import Action, Target, described
+from imud.contracts.action import Action, Actions, Target
+from imud.contracts.control.calibration import Calibration, CalibrationResult, Calibrations, Check, Handling, Kept
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.errors import Rejected
@@ -82,7 +83,7 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
 def context(now_ns: Callable[[], int] = lambda: NOW_NS) -> PublisherContext:
     """A daemon with the devices of `DEVICES`; its clock stands still if no other is given."""
     statuses = [device_status(*item) for item in DEVICES.items()]
-    return PublisherContext(lambda: statuses, EPOCH, now_ns, lambda _device: described(ACTIONS), act)
+    return PublisherContext(lambda: statuses, EPOCH, now_ns, FakeControl)
 
 
 def set_rate(_target: Target, *, rate_hz: int) -> None:
@@ -90,21 +91,53 @@ def set_rate(_target: Target, *, rate_hz: int) -> None:
 
 
 ACTIONS = {"output": Action("send at a rate", set_rate)}
+CALIBRATIONS = {
+    "heading": Calibration(
+        help="make the present heading zero",
+        section="2.2.4",
+        handling=Handling.REST,
+        instructions=("Do not touch it.",),
+        begin=lambda _target: None,
+        kept=Kept.BY_SAVE,
+    )
+}
 done_late = asyncio.Event()
 """`wait` is done when this is set."""
 
 
-async def act(device: str, name: str, arguments: Mapping[str, Any]) -> object:
-    """A device that obeys `output`, waits on `wait`, and refuses everything else."""
-    if name == "wait":
-        await done_late.wait()
-        return {"waited": device}
-    if name == "break":
-        raise ZeroDivisionError("a mistake in an action")
-    if name != "output":
-        raise Rejected(f"{device} refuses {name}")
-    ACTIONS[name].arguments(arguments)
-    return None
+class FakeControl:
+    """A device that obeys `output`, waits on `wait`, and refuses everything else; so with its calibrations."""
+
+    actions: Actions = ACTIONS
+    calibrations: Calibrations = CALIBRATIONS
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+
+    async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
+        """Run an action."""
+        if name == "wait":
+            await done_late.wait()
+            return {"waited": self._device}
+        if name == "break":
+            raise ZeroDivisionError("a mistake in an action")
+        if name != "output":
+            raise Rejected(f"{self._device} refuses {name}")
+        ACTIONS[name].arguments(arguments)
+        return None
+
+    async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
+        """Run a calibration."""
+        if kind == "wait":
+            await done_late.wait()
+        if kind not in CALIBRATIONS:
+            raise Rejected(f"{self._device} refuses {kind}")
+        check = Check("yaw", 0.001, 0.017, "rad", passed=True)
+        return CalibrationResult(kind, True, "", "", (check,), save, Kept.BY_SAVE)
+
+    def stop_calibration(self) -> bool:
+        """Nothing runs."""
+        return False
 
 
 def run(body: Callable[[], Awaitable[T]]) -> T:

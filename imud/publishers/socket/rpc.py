@@ -7,6 +7,8 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from imud import __version__
+from imud.contracts.action import described
+from imud.contracts.control.calibration import infos
 from imud.contracts.settings import wrong_values
 from imud.errors import ImudError
 from imud.formats.jsonrpc import (
@@ -78,6 +80,14 @@ class CommandParams(msgspec.Struct):
     device: str
     name: str
     arguments: dict[str, Any] = {}  # msgspec copies a mutable default
+
+
+class CalibrateParams(msgspec.Struct):
+    """Parameters of `calibrate`."""
+
+    device: str
+    kind: str
+    save: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,21 +282,53 @@ def _notify(hub: Hub, connection: Connection, params: DeviceParams) -> Answer:
 def _actions(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
     """The actions of a device."""
     _known_devices(hub, [params.device])
-    return Answer(hub.context.actions(params.device))
+    return Answer(described(hub.context.control(params.device).actions))
 
 
 def _command(hub: Hub, connection: Connection, params: CommandParams) -> Later:
     """Run an action of a device; the reply comes when it is done."""
     _known_devices(hub, [params.device])
-    if hub.busy(connection):
-        raise RpcError(Code.UNAVAILABLE, "command: the one before is not done yet; wait for its reply")
-    if len(params.name) > NAME_MAX or not params.name.isprintable():
-        raise RpcError(Code.INVALID_PARAMS, f"command: expected a name of at most {NAME_MAX} printable characters")
+    _refuse_second(hub, connection, "command")
+    _check_name("command", params.name)
     return _done(hub, params)
 
 
 async def _done(hub: Hub, params: CommandParams) -> object:
-    return await hub.context.act(params.device, params.name, params.arguments)
+    return await hub.context.control(params.device).act(params.name, params.arguments)
+
+
+def _calibrations(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
+    """The guided calibrations of a device."""
+    _known_devices(hub, [params.device])
+    return Answer(infos(hub.context.control(params.device).calibrations))
+
+
+def _calibrate(hub: Hub, connection: Connection, params: CalibrateParams) -> Later:
+    """Run a guided calibration; its progress goes out as events, and the reply comes at its end."""
+    _known_devices(hub, [params.device])
+    _refuse_second(hub, connection, "calibrate")
+    _check_name("calibrate", params.kind)
+    return _calibrated(hub, params)
+
+
+async def _calibrated(hub: Hub, params: CalibrateParams) -> object:
+    return await hub.context.control(params.device).calibrate(params.kind, save=params.save)
+
+
+def _stop_calibration(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
+    """End the calibration that runs, whoever began it."""
+    _known_devices(hub, [params.device])
+    return Answer({"stopped": hub.context.control(params.device).stop_calibration()})
+
+
+def _refuse_second(hub: Hub, connection: Connection, method: str) -> None:
+    if hub.busy(connection):
+        raise RpcError(Code.UNAVAILABLE, f"{method}: the one before is not done yet; wait for its reply")
+
+
+def _check_name(method: str, name: str) -> None:
+    if len(name) > NAME_MAX or not name.isprintable():
+        raise RpcError(Code.INVALID_PARAMS, f"{method}: expected a name of at most {NAME_MAX} printable characters")
 
 
 METHODS: Final[Mapping[str, Method[Any]]] = {
@@ -300,6 +342,9 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "notify": Method(DeviceParams, _notify),
     "actions": Method(DeviceParams, _actions),
     "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
+    "calibrations": Method(DeviceParams, _calibrations),
+    "calibrate": Method(CalibrateParams, _calibrate, Rights.CONTROL, acts=True),
+    "stop_calibration": Method(DeviceParams, _stop_calibration, Rights.CONTROL, acts=True),
 }
 
 

@@ -56,6 +56,8 @@ from imud.formats.modbus import (
     framed,
     is_whole,
 )
+from imud.sample import Vector3
+from imud.sim.hipnuc.magnetometer import SelfCalibration
 from imud.sim.physics.motion import Motion, Truth, swing
 from imud.sim.physics.noise import Noise
 from imud.sim.ports.uart_wire import heard
@@ -140,6 +142,9 @@ class Slave:
     mute: int = 0
     """Number of next requests without a reply."""
     answered: int = 0
+    hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
+    """Field of what turns with it."""
+    magnetometer: SelfCalibration = field(init=False)
     flash: SlaveSettings = field(init=False)
     writes_to_flash: int = field(init=False, default=0)
     address: int = field(init=False)
@@ -154,6 +159,7 @@ class Slave:
     def __post_init__(self) -> None:
         self.flash = self.settings
         self.address, self.baud = self.settings.slave, self.settings.baud
+        self.magnetometer = SelfCalibration(self.hard_iron_t, (0.0, 0.0, 0.0))
 
     def restart(self, now_ns: int) -> None:
         """Restart: unsaved settings are lost."""
@@ -208,7 +214,8 @@ class Slave:
         """Read registers; empty where one of them does not exist."""
         new = self.firmware >= NEW_FIRMWARE
         settings = self.settings
-        words = [BAUD_RATES.index(settings.baud), settings.slave, settings.heading_mode, 0, 0, 0x0800, 0, 0]
+        state, percent = self.magnetometer.state, int(100 * self.magnetometer.progress)
+        words = [BAUD_RATES.index(settings.baud), settings.slave, settings.heading_mode, 0, 0, 0x0800, state, percent]
         low = b"".join(word.to_bytes(2, "big") for word in words)
         areas = [
             (SETTINGS_FIRST, low if new else low[: 2 * (STATUS_AT - SETTINGS_FIRST)]),
@@ -227,6 +234,9 @@ class Slave:
         has_time = new and self.variant.long_block == "answered"
         truth = self.motion.at(t_s)
         accel, gyro, mag, euler, quat, celsius, pascal = self.noise.add(truth, t_s) if self.noise else truth
+        if self.settings.heading_mode:
+            self.magnetometer.sample(now_ns, gyro)
+        mag = self.magnetometer.measured(mag)
         return pack_block(
             accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat, temperature_c=celsius,
             pressure_pa=pascal, incli_counts=incli_counts(truth, self.inclinometer),

@@ -156,6 +156,14 @@ def swing(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
     )
 
 
+def tumble(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
+    """A slow turning by hand into all directions, as for the calibration of a magnetometer: within a minute about each
+    axis through more than 360°."""
+    return Swing(
+        roll=(Sine(3.4, 0.043),), pitch=(Sine(1.4, 0.071),), yaw=(Sine(4.0, 0.029),), gravity_m_s2=gravity_m_s2
+    )
+
+
 class Still:
     """A sensor at rest in a fixed attitude; only its temperature moves."""
 
@@ -179,6 +187,7 @@ class Still:
 
 MOTIONS: Final[dict[str, Callable[[float], Motion]]] = {
     "swing": swing,
+    "tumble": tumble,
     "still": lambda gravity_m_s2: Still(gravity_m_s2=gravity_m_s2),
 }
 """Motions by name; each is made with the local gravity in m/s²."""

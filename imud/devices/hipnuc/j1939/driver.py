@@ -6,6 +6,7 @@ from typing import Final
 from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import SAMPLE_COUNTER
+from imud.devices.hipnuc.common.calibrations import inclinometer_zero
 from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.actions import ACTIONS
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, encode
@@ -56,6 +57,7 @@ DRIVER: Final = CanDriver(
     "NaN for an angle that the module does not send",
     navigation_frame="ENU",
     actions=ACTIONS,
+    calibrations=inclinometer_zero("6.2.2", ACTIONS),
     node_of=_node_of,
     node_settings=lambda address: HipnucJ1939Settings(address=address),
     node_title=lambda address: f"address {address}",

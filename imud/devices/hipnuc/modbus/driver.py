@@ -6,6 +6,7 @@ from typing import Final
 from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.polling import PolledDriver
 from imud.devices.hipnuc.modbus.actions import ACTIONS
+from imud.devices.hipnuc.modbus.calibrations import CALIBRATIONS
 from imud.devices.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings, pack_block, update_ns
 from imud.devices.hipnuc.modbus.frames import FACTORY_ID, registers_reply
 from imud.devices.hipnuc.modbus.session import probe, set_up
@@ -47,4 +48,5 @@ DRIVER: Final = PolledDriver(
     example_reading=_example_reading,
     actions=ACTIONS,
     device_settings=SETTINGS,
+    calibrations=CALIBRATIONS,
 )

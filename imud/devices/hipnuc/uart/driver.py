@@ -9,6 +9,7 @@ from imud.contracts.codec import StreamCodec
 from imud.contracts.driver import Identity, StreamDriver
 from imud.devices.hipnuc.uart.actions import ACTIONS
 from imud.devices.hipnuc.uart.alarm import alarm_ranges
+from imud.devices.hipnuc.uart.calibrations import CALIBRATIONS
 from imud.devices.hipnuc.uart.codec import (
     HEADER,
     TIME_BITS,
@@ -65,6 +66,7 @@ DRIVER: Final = StreamDriver(
     time_bits=TIME_BITS,
     actions=ACTIONS,
     device_settings=SETTINGS,
+    calibrations=CALIBRATIONS,
     identify=identify,
     read_settings=read_settings,
     apply_identity=_apply_identity,

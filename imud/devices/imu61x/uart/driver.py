@@ -7,6 +7,7 @@ from imud.contracts.driver import StreamDriver
 from imud.contracts.settings import NoSettings
 from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector
 from imud.devices.imu61x.uart.actions import ACTIONS
+from imud.devices.imu61x.uart.calibrations import CALIBRATIONS
 from imud.devices.imu61x.uart.codec import TIMER_MODULUS, Imu61xCodec, encode_ahrs
 from imud.devices.imu61x.uart.commands import BAUD_RATES
 from imud.devices.imu61x.uart.session import identify, read_settings, wake
@@ -36,6 +37,7 @@ DRIVER: Final = StreamDriver(
     navigation_frame=NAVIGATION_FRAME,
     lines=frozenset({"reset"}),
     actions=ACTIONS,
+    calibrations=CALIBRATIONS,
     identify=identify,
     read_settings=read_settings,
     wake=wake,

@@ -216,7 +216,9 @@ class HipnucHardware(SensorHardware):
     uptime_ms: int = 0
     """Device time at the first power-on, to begin near the end of a counter's range."""
     mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
-    """Result of its magnetic calibration; zero: never calibrated."""
+    """Result of its magnetic calibration before it was powered on; zero: never calibrated."""
+    hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
+    """Field of what turns with it: the result of a calibration while it is powered on."""
     behaviour: Behaviour = AS_IN_MANUAL
     """What it does where the manual leaves it open."""
 

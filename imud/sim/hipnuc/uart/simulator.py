@@ -24,6 +24,7 @@ from typing import Final
 
 from imud.devices.hipnuc.uart.codec import encode_hi91, encode_hi92
 from imud.devices.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMessage
+from imud.sim.hipnuc.magnetometer import SelfCalibration
 from imud.sim.hipnuc.uart.behaviour import RateChange, ResetEffect
 from imud.sim.hipnuc.uart.pins import ALARM_PERIOD_MS, SOUT_HIGH_NS, HipnucPins, is_alarming
 from imud.sim.hipnuc.uart.settings import (
@@ -83,6 +84,7 @@ class HipnucModule:
         self._pins = HipnucPins()
         self._random = Random(self.hardware.mark_seed)
         self._line = bytearray()
+        self._magnetometer = SelfCalibration(self.hardware.hard_iron_t, self.hardware.mag_bias_t)
         self._actions = self._make_actions()
         self._power_on(now_ns, self.hardware.uptime_ms)
 
@@ -241,6 +243,9 @@ class HipnucModule:
         reading = self._reading(sample_ns)
         accel, gyro, mag, euler, quat, temperature_c, pressure_pa = reading
         device_ns = self._device_ns(sample_ns)
+        if self.settings.att_mode == 1 and self.settings.mag_calibration:
+            self._magnetometer.sample(device_ns, gyro)
+        mag = self._magnetometer.measured(mag)
         pps_ms = (device_ns - self._pps_ns) // NS_PER_MS % PPS_MODULUS_MS
         has_status = self.hardware.firmware >= MAIN_STATUS_FIRMWARE
         status = 0
@@ -325,7 +330,6 @@ class HipnucModule:
             f"APP_VER={hardware.firmware}",
             f"BL_VER={hardware.bootloader}",
         ]
-        bias = "MB=" + ", ".join(f"{value / T_PER_UT:.2f}" for value in hardware.mag_bias_t)
         return {
             "REBOOT": self.reboot,
             "SAVECONFIG": self._save,
@@ -335,7 +339,9 @@ class HipnucModule:
             "LOG VERSION": lambda _: version,
             "LOG USRCONFIG": lambda _: self.settings.user_lines(),
             "LOG COMCONFIG": lambda _: self.settings.port_lines(),
-            "LOG MAGCONFIG": lambda _: [bias],
+            "LOG MAGCONFIG": lambda _: [
+                "MB=" + ", ".join(f"{value / T_PER_UT:.2f}" for value in self._magnetometer.found_t)
+            ],
         }
 
     def _act(self, line: str, now_ns: int) -> list[str] | None:

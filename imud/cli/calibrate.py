@@ -1,0 +1,154 @@
+"""`imud calibrate`: list the calibrations of a device, or be guided through one."""
+
+import argparse
+import sys
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from typing import Final, TextIO
+
+import msgspec
+
+from imud.cli.arguments import CliCommand, add_socket
+from imud.cli.output import table
+from imud.client import Client
+from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, Handling
+from imud.errors import BadArgument
+from imud.event import Event, EventKind
+from imud.units import RAD_PER_DEG
+
+HEAD: Final = ("CALIBRATION", "HANDLING", "RESULT LASTS", "EFFECT")
+LIMIT_S: Final = 600.0
+"""Longer than the daemon lets any calibration run."""
+LOOK_S: Final = 0.5
+BAR: Final = 30
+"""Characters of the bar."""
+CLEAR_LINE: Final = "\r\x1b[2K"
+T_PER_UT: Final = 1e-6
+
+
+def calibrate_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud calibrate`."""
+    add_socket(parser)
+    parser.add_argument("device", metavar="DEVICE")
+    parser.add_argument("kind", nargs="?", metavar="KIND", help="without it: list the calibrations of the device")
+    parser.add_argument("--save", action="store_true", help="save the result when it is verified")
+    parser.add_argument("--yes", action="store_true", help="begin without asking, for scripts")
+    parser.add_argument("--json", action="store_true", help="print events and the result as JSON lines")
+
+
+def calibrate(args: argparse.Namespace) -> int:
+    """Guide through a calibration; 0 when it is verified, 1 when it is not. Needs permission to control."""
+    with Client(args.socket) as watching:
+        found = msgspec.convert(watching.call("calibrations", device=args.device), list[CalibrationInfo])
+        if args.kind is None:
+            print(table(HEAD, [(one.kind, one.handling, one.kept, one.help) for one in found]))
+            return 0
+        known = {one.kind: one for one in found}
+        if args.kind not in known:
+            raise BadArgument(f"no calibration {args.kind!r}; there are: {', '.join(known) or 'none'}")
+        if not args.json:
+            _instruct(known[args.kind])
+        if not args.yes and not _agreed(known[args.kind]):
+            print("nothing was done")
+            return 1
+        result = _follow(args, watching)
+    print(msgspec.json.encode(result).decode() if args.json else _account(result, asked_to_save=args.save))
+    return 0 if result.verified else 1
+
+
+def _instruct(calibration: CalibrationInfo) -> None:
+    print(f"{calibration.kind}: {calibration.help} (manual, section {calibration.section})")
+    for number, sentence in enumerate(calibration.instructions, start=1):
+        print(f"  {number}. {sentence}")
+
+
+def _agreed(calibration: CalibrationInfo) -> bool:
+    """Ask whether to begin. Raises BadArgument where there is no terminal to ask on."""
+    if not sys.stdin.isatty():
+        raise BadArgument("expected a terminal to ask on, or --yes")
+    doing = "Begin to turn it, and press Enter" if calibration.handling is Handling.TURN else "Press Enter"
+    return input(f"{doing} to begin, or type n: ").strip().lower() in ("", "y", "yes")
+
+
+def _follow(args: argparse.Namespace, watching: Client) -> CalibrationResult:
+    """Run the calibration on a connection of its own, and show its events meanwhile."""
+    events = watching.events([args.device], timeout_s=LOOK_S)
+    with Client(args.socket, timeout_s=LIMIT_S) as asking, ThreadPoolExecutor(1) as pool:
+        reply: Future[object] = pool.submit(
+            asking.call, "calibrate", device=args.device, kind=args.kind, save=args.save
+        )
+        try:
+            while not reply.done():
+                with suppress(TimeoutError):
+                    _show(next(events), sys.stdout, as_json=args.json)
+        except BaseException:
+            watching.call("stop_calibration", device=args.device)
+            raise
+        finally:
+            if not args.json and sys.stdout.isatty():
+                sys.stdout.write("\n")
+        return msgspec.convert(reply.result(), CalibrationResult)
+
+
+def _show(event: Event, out: TextIO, *, as_json: bool) -> None:
+    """Show one event of the device, if it is of a calibration."""
+    if event.kind is not EventKind.CALIBRATION:
+        return
+    if as_json:
+        print(msgspec.json.encode(event).decode(), file=out, flush=True)
+    elif out.isatty():
+        out.write(CLEAR_LINE + progress_line(event))
+        out.flush()
+    elif event.detail.get("phase") != "turn":
+        print(event.message, file=out, flush=True)
+
+
+def progress_line(event: Event) -> str:
+    """Format the progress of turning as a bar with what was measured, other events as their message."""
+    progress, field_t, residual = (event.detail.get(name) for name in ("progress", "field_t", "residual"))
+    if not isinstance(progress, float):
+        return event.message
+    filled = int(progress * BAR)
+    words = [f"[{'#' * filled}{'.' * (BAR - filled)}] {progress:4.0%}"]
+    if isinstance(field_t, float) and isinstance(residual, float):
+        words.append(f"field {field_t / T_PER_UT:.1f} µT, residual {residual:.1%}")
+    if device := event.detail.get("device"):
+        words.append(str(device))
+    return "  ".join(words)
+
+
+def _account(result: CalibrationResult, *, asked_to_save: bool) -> str:
+    """Format the result for people."""
+    lines = ["verified" if result.verified else f"NOT verified: {result.problem}"]
+    if result.device:
+        lines.append(f"  the device says: {result.device}")
+    for check in result.checks:
+        mark = "passed" if check.passed else "NOT passed"
+        lines.append(
+            f"  {check.name}: {_value(check.value, check.unit)}, limit {_value(check.limit, check.unit)}: {mark}"
+        )
+    if result.saved:
+        lines.append("  saved")
+    else:
+        hint = "" if asked_to_save or not result.verified else "; `--save` saves it"
+        lines.append(f"  not saved: lasts {result.kept}{hint if result.kept.endswith('saved') else ''}")
+    return "\n".join(lines)
+
+
+def _value(value: float | None, unit: str) -> str:
+    """Format a value in the units that people use."""
+    if value is None:
+        return "not told"
+    match unit:
+        case "rad":
+            return f"{value / RAD_PER_DEG:.3g}°"
+        case "rad/s":
+            return f"{value / RAD_PER_DEG:.3g} °/s"
+        case "T":
+            return f"{value / T_PER_UT:.3g} µT"
+        case "":
+            return f"{value:.1%}"
+    return f"{value:.3g} {unit}"
+
+
+CALIBRATE = CliCommand(calibrate_arguments, calibrate)

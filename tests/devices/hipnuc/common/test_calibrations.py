@@ -1,0 +1,56 @@
+"""The zero of an inclinometer on a bus: made of the driver's actions."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from imud.contracts.action import Action, Target
+from imud.contracts.control.calibration import RestMeans
+from imud.devices import DRIVERS
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.devices.hipnuc.common.calibrations import inclinometer_zero
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from tests.support.simulated_modules import CanopenBench
+
+
+@dataclass(frozen=True)
+class Began:
+    """What was begun."""
+
+    name: str
+    zero: str = ""
+
+
+ACTIONS = {
+    "zero": Action("zero", lambda _target, *, zero: Began("zero", zero)),
+    "save": Action("save", lambda _target: Began("save")),
+}
+
+
+def test_it_is_made_of_actions() -> None:
+    zero = inclinometer_zero("5.4.1", ACTIONS)["zero"]
+    target = Target(None, 0)
+    assert zero.begin(target) == Began("zero", "here")
+    assert zero.save is not None
+    assert zero.save(target) == Began("save")
+    (expectation,) = zero.expected
+    assert expectation.value(RestMeans(None, None, None, (0.001, -0.02))) == 0.02
+    assert expectation.value(RestMeans(None, None, (0.0, 0.0, 0.0))) is None
+
+
+def test_on_canopen() -> None:
+    bench = CanopenBench()
+    zero = DRIVERS["hipnuc-canopen"].calibrations["zero"]
+    bench.run_script(zero.begin(Target(HipnucCanopenSettings(node=bench.module.node), 500_000)))
+    assert len(bench.sent) >= 1
+
+
+def test_on_j1939() -> None:
+    zero = DRIVERS["hipnuc-j1939"].calibrations["zero"]
+    request = next(zero.begin(Target(HipnucJ1939Settings(), 250_000)))
+    assert request.payload
+
+
+@pytest.mark.parametrize("driver", ["hipnuc-canopen", "hipnuc-j1939"])
+def test_sections(driver: str) -> None:
+    assert DRIVERS[driver].calibrations["zero"].section[0] in "56"

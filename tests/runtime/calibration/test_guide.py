@@ -1,0 +1,403 @@
+"""The guide with a device made of functions, and with a simulated module, in virtual time."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import replace
+from math import radians
+from typing import Any
+
+import pytest
+
+from imud.contracts.action import Target
+from imud.contracts.control.calibration import GYRO_ZERO, Calibration, CalibrationResult, Handling, Kept, Verdict
+from imud.contracts.lines import DeviceLines
+from imud.errors import BadArgument, CommandError, Rejected
+from imud.event import Event, EventKind
+from imud.ledger import Ledger
+from imud.runtime.calibration.guide import Guide
+from imud.runtime.notices import Notices
+from imud.sample import Sample, Sync, Vector3
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
+from imud.sim.physics.motion import Motion, Still, Truth, tumble
+from imud.units import NS_PER_S
+from tests.support.event_loops import VirtualClock, run_virtually
+from tests.support.wired_device import WiredDevice
+
+TICK_S = 0.1
+HARD_IRON_T: Vector3 = (14.14e-6, -2.08e-6, -8.75e-6)
+
+
+class GuideRig:
+    """A guide, the samples it sees, and what it runs on the device."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.events: list[Event] = []
+        self.ran: list[str] = []
+        self.guide = Guide(self._run, Notices("bow", Ledger(), self.events.append))
+        self.motion: Callable[[float], Vector3] = lambda _t_s: (0.0, 0.0, 0.0)
+        """Angular rate by the time since the beginning."""
+        self.mag_t: Callable[[float], Vector3 | None] = lambda _t_s: None
+        self.silent = False
+        self._begin_ns = self.clock.now_ns()
+
+    async def _run(self, make: Callable[[Target], Any]) -> Any:
+        made = make(Target(None, 115200))
+        return await made if isinstance(made, Awaitable) else made
+
+    def does(self, name: str, answer: object = None, seconds: float = 0.0) -> Callable[[Target], Any]:
+        """A script that is noted, takes so long, and gives that answer."""
+
+        async def run() -> object:
+            self.ran.append(name)
+            await asyncio.sleep(seconds)
+            return answer
+
+        return lambda _target: run()
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the story while samples come."""
+        run_virtually(self.clock, self._play(story))
+
+    async def _play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        ticking = asyncio.create_task(self._tick())
+        try:
+            await story()
+        finally:
+            ticking.cancel()
+
+    async def _tick(self) -> None:
+        seq = 0
+        while True:
+            now_ns = self.clock.now_ns()
+            t_s = (now_ns - self._begin_ns) / NS_PER_S
+            seq += not self.silent
+            self.guide.tick(
+                now_ns,
+                Sample(
+                    "bow", seq, now_ns, 0, Sync.ARRIVAL, now_ns, now_ns, accel_m_s2=(0.0, 0.0, 9.81),
+                    gyro_rad_s=self.motion(t_s), mag_t=self.mag_t(t_s),
+                )
+                if seq
+                else None,
+            )  # fmt: skip
+            await asyncio.sleep(TICK_S)
+
+    def phases(self) -> list[object]:
+        """Phases of the events."""
+        assert all(event.kind is EventKind.CALIBRATION for event in self.events)
+        return [event.detail["phase"] for event in self.events]
+
+
+def gyro(rig: GuideRig, **changes: Any) -> Calibration:
+    """A calibration of the gyroscope."""
+    made = Calibration(
+        help="measure the bias", section="1.6", handling=Handling.REST, instructions=(),
+        begin=rig.does("begin", (0.1, 0.2, 0.3), 3.0), expected=(GYRO_ZERO,), kept=Kept.BY_SAVE,
+        save=rig.does("save"),
+    )  # fmt: skip
+    return replace(made, **changes)
+
+
+def magnetometer(rig: GuideRig, verdicts: Callable[[], Verdict], **changes: Any) -> Calibration:
+    """A calibration by turning."""
+    return gyro(
+        rig, handling=Handling.TURN, begin=rig.does("begin"), expected=(), kept=Kept.BY_DEVICE, save=None,
+        verdict=lambda _target: verdicts(), **changes,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def rig() -> GuideRig:
+    """A guide."""
+    return GuideRig()
+
+
+# --- at rest ----------------------------------------------------------------------------------------------------------
+
+
+def test_rest_calibrated_verified_and_saved(rig: GuideRig) -> None:
+    async def story() -> None:
+        result = await rig.guide.run("gyro", gyro(rig), save=True)
+        (check,) = result.checks
+        assert check.name == "mean angular rate"
+        assert check.passed
+        assert result == CalibrationResult("gyro", True, "", "0.1, 0.2, 0.3", (check,), True, Kept.BY_SAVE)
+
+    rig.play(story)
+    assert rig.ran == ["begin", "save"]
+    assert rig.phases() == ["begin", "end"]
+    assert rig.events[-1].detail["saved"] is True
+
+
+def test_it_is_not_saved_unless_it_is_asked_for(rig: GuideRig) -> None:
+    async def story() -> None:
+        result = await rig.guide.run("gyro", gyro(rig), save=False)
+        assert result.verified
+        assert not result.saved
+
+    rig.play(story)
+    assert rig.ran == ["begin"]
+
+
+def test_a_bias_that_stays_is_told_and_not_saved(rig: GuideRig) -> None:
+    rig.motion = lambda _t_s: (0.0, radians(0.3), 0.0)
+
+    async def story() -> None:
+        result = await rig.guide.run("gyro", gyro(rig), save=True)
+        assert not result.verified
+        assert result.problem == "mean angular rate: expected at most 0.00175 rad/s, got 0.00524 rad/s"
+        assert not result.saved
+
+    rig.play(story)
+    assert rig.ran == ["begin"]
+
+
+def test_what_samples_do_not_tell_is_not_verified(rig: GuideRig) -> None:
+    expectation = replace(GYRO_ZERO, value=lambda _means: None)
+
+    async def story() -> None:
+        result = await rig.guide.run("gyro", gyro(rig, expected=(expectation,)), save=False)
+        assert result.problem == "mean angular rate: the samples do not tell it"
+
+    rig.play(story)
+
+
+def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
+    rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
+
+    async def story() -> None:
+        with pytest.raises(
+            CommandError, match=r"expected the device at rest, got: it turns at 28\.6 °/s .* put it down"
+        ):
+            await rig.guide.run("gyro", gyro(rig), save=False)
+
+    rig.play(story)
+    assert rig.ran == []
+    assert "rest" in rig.phases()
+
+
+def test_rest_is_waited_for(rig: GuideRig) -> None:
+    rig.motion = lambda t_s: (0.0, 0.0, 0.5 if t_s < 5 else 0.0)
+
+    async def story() -> None:
+        assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified
+
+    rig.play(story)
+    assert rig.phases()[:2] == ["begin", "rest"]
+
+
+def test_motion_while_it_runs_spoils_it(rig: GuideRig) -> None:
+    rig.motion = lambda t_s: (0.0, 0.0, 0.5 if 4 < t_s < 4.5 else 0.0)
+
+    async def story() -> None:
+        result = await rig.guide.run("gyro", gyro(rig), save=True)
+        assert result.problem.startswith("the device moved while it was calibrated: the angular rate changes by 2")
+        assert not result.saved
+
+    rig.play(story)
+    assert rig.ran == ["begin"]
+
+
+def test_no_samples(rig: GuideRig) -> None:
+    rig.silent = True
+
+    async def story() -> None:
+        with pytest.raises(CommandError, match="gyro: expected samples of the device, got none for 20 s"):
+            await rig.guide.run("gyro", gyro(rig), save=False)
+
+    rig.play(story)
+
+
+def test_refusals(rig: GuideRig) -> None:
+    async def refuse() -> None:
+        raise Rejected("no")
+
+    async def story() -> None:
+        with pytest.raises(CommandError, match="heading: expected no `save`, for its result lasts until power-off"):
+            await rig.guide.run("heading", gyro(rig, kept=Kept.NEVER), save=True)
+        with pytest.raises(CommandError, match="gyro: set the mode first"):
+            await rig.guide.run("gyro", gyro(rig, unready=rig.does("ready?", "set the mode first")), save=False)
+        with pytest.raises(Rejected):
+            await rig.guide.run("gyro", gyro(rig, begin=lambda _target: refuse()), save=False)
+        first = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+        await asyncio.sleep(1)
+        with pytest.raises(CommandError, match="another calibration of this device is running"):
+            await rig.guide.run("gyro", gyro(rig), save=False)
+        assert (await first).verified
+
+    rig.play(story)
+
+
+@pytest.mark.parametrize("end", ["stop", "cancel", "close"])
+def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
+    async def story() -> None:
+        running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+        await asyncio.sleep(1)
+        getattr(rig.guide, end)()
+        with pytest.raises(CommandError, match="link ended" if end == "stop" else "was cancelled"):
+            await running
+        assert not rig.guide.cancel()
+        assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified  # and begun anew
+
+    rig.play(story)
+
+
+# --- turned -----------------------------------------------------------------------------------------------------------
+
+
+def turned_by_hand(rig: GuideRig, hard_iron_t: Vector3 = (0.0, 0.0, 0.0)) -> None:
+    """Turn it in all directions."""
+    a, b, c = hard_iron_t
+
+    def mag_t(t_s: float) -> Vector3:
+        x, y, z = tumble().at(t_s).mag_t
+        return (x + a, y + b, z + c)
+
+    rig.motion, rig.mag_t = lambda t_s: tumble().at(t_s).gyro_rad_s, mag_t
+
+
+def turned_where_it_is_disturbed(rig: GuideRig) -> None:
+    """A field that depends on the place: stronger where the module points to one side."""
+    turned_by_hand(rig)
+
+    def mag_t(t_s: float) -> Vector3:
+        x, y, z = tumble().at(t_s).mag_t
+        factor = 1.4 if tumble().at(t_s).euler_rad[2] > 0 else 0.8
+        return (x * factor, y * factor, z * factor)
+
+    rig.mag_t = mag_t
+
+
+def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
+    turned_by_hand(rig, HARD_IRON_T)
+
+    def verdict() -> Verdict:
+        done = rig.clock.now_ns() > 1060 * NS_PER_S
+        return Verdict(done, "bias 14.1, -2.1, -8.8 µT" if done else "bias 0, 0, 0 µT")
+
+    async def story() -> None:
+        result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
+        assert result.verified
+        assert result.saved
+        assert result.device == "bias 14.1, -2.1, -8.8 µT"
+        residual, field = result.checks
+        assert residual.value == pytest.approx(0.0, abs=1e-6)
+        assert field.value == pytest.approx(45.1e-6, rel=1e-3)
+
+    rig.play(story)
+    assert rig.clock.now_ns() > 1060 * NS_PER_S
+    turning = [event.detail for event in rig.events if event.detail["phase"] == "turn"]
+    assert len(turning) <= 2 * (rig.clock.now_ns() // NS_PER_S - 1000) + 2  # the first and the last one
+    assert turning[-1]["progress"] == 1.0
+    assert int(str(turning[-1]["cells"]), 16).bit_count() == round(48 * float(turning[-1]["coverage"] or 0))
+
+
+def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: GuideRig) -> None:
+    turned_by_hand(rig)
+
+    async def story() -> None:
+        result = await rig.guide.run("magnetometer", magnetometer(rig, lambda: Verdict(True, "x")), save=False)
+        assert result.verified
+
+    rig.play(story)
+    assert 1010 * NS_PER_S < rig.clock.now_ns() < 1060 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("prepare", "words"),
+    [
+        (lambda _rig: None, "its samples have no magnetic field"),
+        (lambda rig: setattr(rig, "mag_t", lambda _t_s: (3e-5, 0.0, 0.0)), "turned into 2% of the directions"),
+        (lambda rig: setattr(rig, "mag_t", lambda t_s: tumble().at(t_s).mag_t), "turned by less than 360°"),
+        (turned_by_hand, "the field is good: repeat it more slowly"),
+        (turned_where_it_is_disturbed, "the field is disturbed: go outdoors"),
+    ],
+    ids=["no field", "at rest", "gyroscope at rest", "not accepted", "disturbed"],
+)
+def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], words: str) -> None:
+    prepare(rig)
+
+    async def story() -> None:
+        calibration = magnetometer(rig, lambda: Verdict(False, "bias 0, 0, 0 µT"))
+        result = await rig.guide.run("magnetometer", calibration, save=False)
+        assert not result.verified
+        assert not result.saved
+        assert result.problem.startswith("the device did not end the calibration within 300 s; ")
+        assert words in result.problem
+
+    rig.play(story)
+
+
+# --- a simulated module -----------------------------------------------------------------------------------------------
+
+
+class ByHand:
+    """A module that is turned by hand from a certain time on, after resting."""
+
+    def __init__(self, from_s: float) -> None:
+        self._from_s = from_s
+
+    def at(self, t_s: float) -> Truth:
+        """At rest, then turned."""
+        return Still(0.05, -0.03, 0.4).at(t_s) if t_s < self._from_s else tumble().at(t_s)
+
+
+def module(monkeypatch: pytest.MonkeyPatch, motion: Motion, att_mode: int, story: Callable[[WiredDevice], Any]) -> None:
+    """Run a story with a device that has a simulated module."""
+    hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T)
+    it = WiredDevice(DeviceLines(), ModuleSettings(att_mode=att_mode), hardware)
+    it.play(monkeypatch, lambda: story(it))
+
+
+def test_magnetometer_of_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(it: WiredDevice) -> None:
+        await it.wait(2)
+        result = await it.device.calibrate("magnetometer", save=False)
+        assert result.verified, result.problem
+        assert result.device == "bias 14.14, -2.08, -8.75 µT"
+        assert any(event.kind is EventKind.CALIBRATION for event in it.events)
+
+    module(monkeypatch, ByHand(5.0), 1, story)
+
+
+def test_six_axes_have_no_use_for_the_magnetometer(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(it: WiredDevice) -> None:
+        await it.wait(2)
+        with pytest.raises(CommandError, match=r"magnetometer: expected 9-axis mode, .* action mode, axes=9"):
+            await it.device.calibrate("magnetometer", save=False)
+        with pytest.raises(BadArgument, match=r"no calibration 'gyro'; there are: magnetometer, .*, heading"):
+            await it.device.calibrate("gyro", save=False)
+
+    module(monkeypatch, tumble(), 0, story)
+
+
+def test_level_and_heading_of_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(it: WiredDevice) -> None:
+        await it.wait(2)
+        level = await it.device.calibrate("level", save=True)
+        assert level.verified, level.problem
+        assert level.saved
+        assert [check.name for check in level.checks] == ["roll", "pitch"]
+        heading = await it.device.calibrate("heading", save=False)
+        assert heading.verified, heading.problem
+        it.module.reboot(it.clock.now_ns())
+        await it.wait(5)
+        newest = it.samples[-1].euler_rad
+        assert newest is not None
+        assert abs(newest[0]) < 0.01  # the level was saved
+        assert abs(newest[2]) > 0.3  # the heading cannot be
+
+    module(monkeypatch, Still(0.05, -0.03, 0.4), 0, story)
+
+
+def test_a_module_that_moves_is_not_levelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(it: WiredDevice) -> None:
+        await it.wait(2)
+        before = it.module.settings.level
+        with pytest.raises(CommandError, match="expected the device at rest"):
+            await it.device.calibrate("level", save=True)
+        assert it.module.settings.level == before
+        assert not it.device.stop_calibration()
+
+    module(monkeypatch, tumble(), 0, story)
