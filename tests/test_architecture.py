@@ -295,6 +295,7 @@ CROSS_CUTTING = {
     "runtime/polled/test_in_daemon.py": "a bus thread in the daemon",
     "runtime/polled/test_shared_line.py": "modules on one RS-485 line, from the port to samples",
     "runtime/stream/test_wake.py": "a device that is silent, from the line to its state",
+    "runtime/stream/test_silent.py": "every simulated variant of a module, from the line to its state",
     "signals/test_end_to_end.py": "pins of a simulated module through the whole device",
     "sim/hipnuc/uart/test_commands.py": "the simulator's replies by the chapters of the manual",
     "sim/test_main.py": "imud/sim/__main__.py as a process",

@@ -101,9 +101,12 @@ class StreamDriver(Driver):
     """Reads back the device's own settings, by the device's own names, and leaves it as it was."""
     apply_identity: Callable[[StreamCodec, Identity], None] = lambda _codec, _identity: None
     """Passes the identity to the codec, where the meaning of a field depends on the firmware."""
-    wake: Callable[[], RequestScript[bool]] | None = None
+    wake: Callable[[], RequestScript[bool | None]] | None = None
     """Makes a device send samples that answers and sends none, and says whether it acknowledged; nothing is saved.
-    Raises NoReply where nothing answers. None for devices that cannot be silent."""
+    Returns None and changes nothing where the device is meant to be silent by its own settings. Raises NoReply where
+    nothing answers. None for devices that cannot be silent."""
+    why_silent: Callable[[Mapping[str, str]], str] = lambda _settings: "its output is off"
+    """Says in one clause why a device that answers sends no samples, from its settings as `read_settings` returns."""
     example_frame: Callable[[Random], bytes]
     """Make one valid frame with random values, for the shared property tests and for fault injection."""
 

@@ -20,7 +20,7 @@ from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
 from imud.contracts.publisher import Batch
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
-from imud.errors import BadArgument, CommandError, LinkError, LinkMissing
+from imud.errors import BadArgument, CommandError, ImudError, LinkError, LinkMissing
 from imud.event import Event
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
@@ -71,7 +71,7 @@ class Device:
         self._host = host
         self._notices = Notices(config.name, self.ledger, send_event)
         self._health = Health(self._notices)
-        port = DevicePort(self._write, lambda: self._transport.bit_rate, lambda: self._transport.busy)
+        port = DevicePort(self._write, lambda: self._transport.bit_rate, self._is_busy)
         hooks = AttachmentHooks(port, self._on_reset)
         self._attachments = Attachments(config, lines, hooks, self._notices, host)
         self._identity = KnownIdentity(self._notices, host.now_ns, self._on_settings)
@@ -177,6 +177,10 @@ class Device:
     def _write(self, data: bytes) -> None:
         self._transport.link.write(data)
 
+    def _is_busy(self) -> bool:
+        """Whether nothing may be sent in between: a script runs, or a search sets other rates."""
+        return self._transport.busy or not self._transport.receiving
+
     def _on_reset(self) -> None:
         self._transport.on_reset()
 
@@ -228,7 +232,13 @@ class Device:
     async def _run_action(self, action: Action, arguments: Mapping[str, Any]) -> object:
         params = action.arguments(arguments)
         self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
-        return await self._transport.run_script(lambda target: action.script(target, params))
+        try:
+            answer = await self._transport.run_script(lambda target: action.script(target, params))
+        except ImudError:
+            await self._transport.read_back()
+            raise
+        await self._transport.read_back()
+        return answer
 
     def _require_replies(self) -> None:
         health = self._health
@@ -244,7 +254,9 @@ class Device:
 
     def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
         state, quiet_ns = self._health.state, now_ns - max(path.last_sample_ns, path.begun_ns)
-        if (state is DeviceState.SEARCHING and path.fresh) or (state is DeviceState.SILENT and quiet_ns < SILENCE_NS):
+        if (state is DeviceState.SEARCHING and path.fresh) or (
+            state is DeviceState.SILENT and now_ns - path.last_sample_ns < SILENCE_NS
+        ):
             self._up(now_ns)
         elif state is DeviceState.RUNNING and quiet_ns > max(SILENCE_NS, SILENCE_PERIODS * path.period_ns):
             words = f"no sample for {quiet_ns / NS_PER_S:.1f} s, though the link is there"

@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 from imud.contracts.codec import Message
-from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session, Silence
 from imud.errors import CommandError, LinkError
 from imud.ledger import Ledger
 from imud.sample import Measurement
@@ -33,6 +33,8 @@ class Exchange:
         self._now_ns = now_ns
         self._set_baud = set_baud
         self._follow = follow
+        self.answered_ns = 0
+        """CLOCK_MONOTONIC of the newest complete reply; 0 before the first."""
         self._lock = asyncio.Lock()
         self._outcome: asyncio.Future[Outcome] | None = None
 
@@ -56,7 +58,7 @@ class Exchange:
             finally:
                 script.close()
                 if undo:
-                    with suppress(LinkError):  # the device is gone, and its state with it
+                    with suppress(LinkError, CommandError):  # the device is gone, and its state with it
                         self._write(undo)
 
     @property
@@ -115,3 +117,5 @@ class Exchange:
     def _settle(self, outcome: Outcome | None) -> None:
         if outcome is not None and self._outcome is not None and not self._outcome.done():
             self._outcome.set_result(outcome)
+            if not isinstance(outcome, Silence):
+                self.answered_ns = self._now_ns()

@@ -48,16 +48,21 @@ class KnownIdentity:
         identify: Callable[[], RequestScript[Identity]],
         read_settings: Callable[[], RequestScript[Mapping[str, str]]],
         apply: Callable[[Identity], None],
-    ) -> None:
-        """Ask for identity and settings; `apply` gets the identity. A device that does not answer is left as it is."""
-        for attempt in range(1, IDENTIFY_TRIES + 1):
+        tries: int = IDENTIFY_TRIES,
+    ) -> bool:
+        """Ask for identity and settings; `apply` gets the identity. Return whether the device answered.
+
+        What is known of a device that does not answer is left as it is.
+        """
+        for attempt in range(1, tries + 1):
             try:
                 identity = await exchange.run(identify())
                 apply(identity)
                 self.update(identity, await exchange.run(read_settings()))
-                return
+                return True
             except CommandError as error:
-                log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, IDENTIFY_TRIES)
+                log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, tries)
+        return False
 
     def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
         """Keep what the device said; raise an event for what differs from before."""

@@ -4,7 +4,8 @@
       ▲                │ nothing: report, reset line          │
       └────────────────┴──────────────────────────────────────┘
 
-Where driver and rate are configured there is no round: `begin` has set up the device at once.
+Where driver and rate are configured there is no round: `begin` has set up the device at once. A device that sends
+nothing and answers is not searched again: `answers` asks it where it is, before its rate is left.
 """
 
 import asyncio
@@ -29,6 +30,11 @@ class BegunRound(Protocol):
         ...
 
 
+async def never_answers() -> bool:
+    """Return False: the version for devices that cannot be asked before a search."""
+    return False
+
+
 class SearchLoop:
     """Loop of search rounds on one link. Synchronization: the loop's thread only."""
 
@@ -39,13 +45,18 @@ class SearchLoop:
         host: HostClock,
         begin: Callable[[], BegunRound | None],
         ask: Callable[[], Awaitable[None]],
+        answers: Callable[[], Awaitable[bool]] = never_answers,
     ) -> None:
-        """`begin` starts a round, or sets up the configured device and returns None; `ask` is called after each."""
+        """`begin` starts a round, or sets up the configured device and returns None; `ask` is called after each.
+
+        `answers` is called when another search was requested, and returns whether none is needed.
+        """
         self._health = health
         self._attachments = attachments
         self._host = host
         self._begin = begin
         self._ask = ask
+        self._answers = answers
         self._round: BegunRound | None = None
         self._again = asyncio.Event()
 
@@ -77,10 +88,18 @@ class SearchLoop:
             searched = self._round is not None
             await self._finish_search()
             await self._ask()
-            await self._again.wait()
+            await self._needed()
             if not searched:
                 await self._report_absence()
             self.start()
+
+    async def _needed(self) -> None:
+        """Return when another search is needed."""
+        while True:
+            await self._again.wait()
+            self._again.clear()
+            if not await self._answers():
+                return
 
     async def _finish_search(self) -> None:
         while self._round is not None:

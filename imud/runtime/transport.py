@@ -140,6 +140,10 @@ class Transport(Protocol):
         """
         ...
 
+    async def read_back(self) -> None:
+        """Ask for identity and settings again, after something was changed; a device that does not answer is left."""
+        ...
+
     def add_status(self, status: DeviceStatus) -> DeviceStatus:
         """Return the status with the fields of this kind of transport."""
         ...

@@ -216,18 +216,21 @@ class LinkedModule(MemoryLink):
         self.clock = clock
         self.sent_at: list[tuple[int, bytes]] = []
         """Rate of the line, and the bytes sent at it."""
+        self.module_is_on = True
 
     def write(self, data: bytes) -> None:
         super().write(data)
         self.sent_at.append((self.baud, data))
-        self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
+        if self.module_is_on:
+            self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
 
     async def carry(self) -> None:
         """Bring what the module sends, as it leaves the wire."""
         while True:
             baud = self.module.baud
             for burst in self.module.advance(self.clock.now_ns()):
-                self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
+                if self.module_is_on:
+                    self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
             await asyncio.sleep(STEP_S)
 
 

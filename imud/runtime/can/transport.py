@@ -1,6 +1,7 @@
 """Transport of a device on a CAN bus: its driver is configured, or found by listening; filters select its frames."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from random import Random
 from typing import Any
 
@@ -18,6 +19,7 @@ from imud.runtime.detection import CanFound, CanSearch
 from imud.runtime.detection.remembered import Remembered, RememberedDevice
 from imud.runtime.detection.rounds import EVERYTHING, CanRound
 from imud.runtime.exchange import Exchange
+from imud.runtime.identity import IDENTIFY_TRIES
 from imud.runtime.path import CanPath, SamplePath
 from imud.runtime.search_loop import SearchLoop
 from imud.runtime.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext
@@ -175,9 +177,22 @@ class CanTransport:
             return
         if frames := driver.cyclic(options):
             self.link.send_cyclic(frames)
-        if self._config.identify:
+        await self._identify(IDENTIFY_TRIES)
+
+    async def read_back(self) -> None:
+        """Ask for identity and settings again."""
+        with suppress(LinkError):  # whoever waits for the link's end is told by it
+            await self._identify(1)
+
+    async def _identify(self, tries: int) -> None:
+        driver, options = self.driver, self._options
+        if driver is not None and self.link.writable and self._config.identify:
             await self._context.identity.ask(
-                self._exchange, lambda: driver.identify(options), lambda: driver.read_settings(options), self._apply
+                self._exchange,
+                lambda: driver.identify(options),
+                lambda: driver.read_settings(options),
+                self._apply,
+                tries,
             )
 
     def _apply(self, identity: Identity) -> None:

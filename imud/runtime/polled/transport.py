@@ -213,6 +213,9 @@ class PolledTransport:
         given = () if self.link.target is None else (self.link.target,)
         return tuple(dict.fromkeys((device.target, *self._former, *given)))
 
+    async def read_back(self) -> None:
+        """No-op: such a device is set up again, and asked, whenever it returns."""
+
     def _follow(self, target: int) -> None:
         """Follow a script that has given the device another address."""
         member, device = self._member, self._device

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Protocol
 
 from imud.contracts.action import Target
@@ -10,13 +11,14 @@ from imud.contracts.driver import Identity, StreamDriver
 from imud.contracts.link import OnEnd, StreamLink
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.devices import DRIVERS
-from imud.errors import CommandError
+from imud.errors import CommandError, LinkError
 from imud.event import EventKind
 from imud.ledger import Ledger
 from imud.runtime.detection import StreamFound
 from imud.runtime.detection.remembered import Remembered, RememberedDevice
 from imud.runtime.detection.rounds import StreamRound
 from imud.runtime.exchange import Exchange
+from imud.runtime.identity import IDENTIFY_TRIES
 from imud.runtime.path import SamplePath, StreamPath
 from imud.runtime.search_loop import SearchLoop
 from imud.runtime.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext
@@ -46,11 +48,15 @@ class StreamTransport:
         self._ledger = context.ledger
         self._now_ns = context.host.now_ns
         self._remembered = remembered
-        self._exchange = Exchange(context.ledger, link.write, self._now_ns, self._change_rate)
-        self._search = SearchLoop(context.health, context.attachments, context.host, self._begin_search, self._ask)
+        self._exchange = Exchange(context.ledger, self._send, self._now_ns, self._change_rate)
+        self._search = SearchLoop(
+            context.health, context.attachments, context.host, self._begin_search, self._ask, self._still_answers
+        )
         self._discard = _Discard(context.ledger)
         self._receiver: DataReceiver = self._discard
         self._fixed_baud = 0 if link.auto_baud else link.baud
+        self._asked_ns = 0
+        """CLOCK_MONOTONIC when identity and settings were asked for last."""
         self._samples_before = 0
         """Samples made before the link was opened."""
 
@@ -131,13 +137,46 @@ class StreamTransport:
         """Ask for identity and settings, and start the streaming of a silent device, where asking is allowed."""
         driver = self.driver
         if self._may_ask and driver is not None:
-            await self._context.identity.ask(self._exchange, driver.identify, driver.read_settings, self._apply)
+            await self._identify(IDENTIFY_TRIES)
             await self._wake(driver)
+
+    async def _identify(self, tries: int) -> bool:
+        """Ask for identity and settings; return whether the device answered."""
+        driver = self.driver
+        if not self._may_ask or driver is None:
+            return False
+        self._asked_ns = self._now_ns()
+        return await self._context.identity.ask(
+            self._exchange, driver.identify, driver.read_settings, self._apply, tries
+        )
+
+    async def read_back(self) -> None:
+        """Ask for identity and settings again."""
+        with suppress(LinkError):  # whoever waits for the link's end is told by it
+            await self._identify(1)
+
+    async def _still_answers(self) -> bool:
+        """Ask a silent device where it was heard last; return whether no search is needed.
+
+        Where driver and rate are configured a search finds nothing else: it is only for the reset line.
+        """
+        path, samples = self.path, self._ledger.samples
+        if path is None or (self._searchable and self._is_unheard(path)):
+            return False
+        waits = self._now_ns() - self._silent_since_ns(path) < SILENT_SEARCH_NS
+        if await self._identify(1) and self.driver is not None:
+            await self._wake(self.driver)
+            return True
+        if self._ledger.samples != samples:
+            return True
+        searching = self._health.state is DeviceState.SEARCHING
+        return not ((self._searchable and not waits) or (self._resettable and searching))
 
     async def _wake(self, driver: StreamDriver) -> None:
         """Until its first sample since the link was opened: make a device stream that answers and sends none.
 
-        One that has streamed is left alone when it falls silent: that may have been commanded.
+        One that has streamed is left alone when it falls silent: that may have been commanded. So is one that is meant
+        to be silent by its own settings, as its driver finds.
         """
         reported = False
         while driver.wake is not None:
@@ -149,6 +188,8 @@ class StreamTransport:
             except CommandError as error:
                 log.debug("%s: not woken: %s", self._config.name, error)
                 continue
+            if acknowledged is None:
+                return
             if not reported:
                 reported = True
                 message = "it answered and sent no samples: commanded to stream, which is not saved"
@@ -160,8 +201,18 @@ class StreamTransport:
         if self.driver is not None and self.path is not None:
             self.driver.apply_identity(self.path.codec, identity)
 
+    def _send(self, data: bytes) -> None:
+        """Send a request at the rate of the device. Raises CommandError while a search sets other rates, LinkError."""
+        self._require_device()
+        self.link.write(data)
+
+    def _require_device(self) -> None:
+        if not self.receiving:
+            raise CommandError(f"{self._config.name} is searched for at all baud rates now: try again in some seconds")
+
     def _change_rate(self, baud: int) -> None:
         """Follow a script that has changed the device's rate: port, clock and remembered rate."""
+        self._require_device()
         if baud == self.link.baud:
             return
         self.link.set_baud(baud)
@@ -171,6 +222,7 @@ class StreamTransport:
 
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
         """Run a request script; one that changes the device's rate is followed."""
+        self._require_device()
         options = self._config.options or (self.driver.settings() if self.driver is not None else None)
         return await self._exchange.run(make(Target(options, self.bit_rate, self._fixed_baud)))
 
@@ -183,18 +235,59 @@ class StreamTransport:
         """No-op: bytes come by themselves."""
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
-        """Report the received bytes, and search anew where that can help."""
+        """Report what is received or answered instead, and search anew where that can help."""
         health = self._health
-        unheard = path.last_data_ns - max(path.last_sample_ns, path.begun_ns) > UNHEARD_NS
+        unheard = self._is_unheard(path)
         if unheard:
-            health.report(f"bytes come on {self.where}, but no valid frame: wrong baud rate or device?")
+            problem = f"bytes come on {self.where}, but no valid frame: wrong baud rate or device?"
+            self._report_silence(problem, now_ns, ended=health.state is DeviceState.RUNNING)
+        elif self._has_answered(path):
+            self._report_silence(self._words_of_silence(), now_ns, ended=health.state is DeviceState.SEARCHING)
         elif health.state is DeviceState.SEARCHING:
             health.report(f"nothing is heard on {self.where}: is it powered, are TX and RX swapped?")
-            if self._context.attachments.can_reset and path.last_data_ns <= path.begun_ns:
+            if self._resettable and path.last_data_ns <= path.begun_ns:
                 self._search.search_again()
-        silent_long = health.state is DeviceState.SILENT and now_ns - health.silent_since_ns > SILENT_SEARCH_NS
-        if self._searchable and (unheard or silent_long):
+        if not self.busy and ((unheard and self._searchable) or self._is_overdue(path, now_ns)):
             self._search.search_again()
+
+    def _is_overdue(self, path: SamplePath, now_ns: int) -> bool:
+        """Whether it is time to ask a silent device, or to search for it: when it falls silent, and later again."""
+        if not (self._searchable or self._may_ask):
+            return False
+        just_silent = self._health.state is DeviceState.SILENT and self._asked_ns < self._health.silent_since_ns
+        if just_silent and self._may_ask and not self._has_answered(path):
+            return True
+        return now_ns - max(self._silent_since_ns(path), self._asked_ns) > SILENT_SEARCH_NS
+
+    def _silent_since_ns(self, path: SamplePath) -> int:
+        """CLOCK_MONOTONIC since when neither samples nor answers came."""
+        return max(self._health.silent_since_ns, self._exchange.answered_ns, path.begun_ns)
+
+    def _report_silence(self, problem: str, now_ns: int, *, ended: bool) -> None:
+        """Show why no samples come; `ended`: the state ends with it."""
+        if ended:
+            self._health.down(now_ns, DeviceState.SILENT, problem)
+        else:
+            self._health.report(problem)
+
+    def _is_unheard(self, path: SamplePath) -> bool:
+        """Whether bytes come that are neither samples nor answers."""
+        understood_ns = max(path.last_sample_ns, path.begun_ns, self._exchange.answered_ns)
+        return path.last_data_ns - understood_ns > UNHEARD_NS
+
+    def _has_answered(self, path: SamplePath) -> bool:
+        """Whether the device has answered a request since its last sample, or since it was found."""
+        return self._exchange.answered_ns >= max(path.begun_ns, path.last_sample_ns) > 0
+
+    def _words_of_silence(self) -> str:
+        """Describe a device that answers and sends no samples."""
+        driver, identity = self.driver, self._context.identity.identity
+        assert driver is not None
+        firmware = f"firmware {identity.firmware}" if identity.firmware else ""
+        names = ", ".join(filter(None, (identity.product, firmware)))
+        why = driver.why_silent(self._context.identity.settings)
+        hint = "; the action wake makes it send" if "wake" in driver.actions else ""
+        return f"it answers{f' ({names})' if names else ''} and sends no samples: {why}{hint}"
 
     def on_reset(self) -> None:
         """No-op: the device streams again by itself."""
@@ -218,8 +311,8 @@ class StreamTransport:
 
     @property
     def hears_replies(self) -> bool:
-        """Whether replies are heard before samples: while rate and driver are uncertain, they are not."""
-        return False
+        """Whether replies are heard before samples: once it has answered; before, rate and driver are uncertain."""
+        return self.path is not None and self.receiving and self._has_answered(self.path)
 
     @property
     def busy(self) -> bool:
@@ -233,6 +326,10 @@ class StreamTransport:
     @property
     def _searchable(self) -> bool:
         return self.link.auto_baud or self._config.driver == "auto"
+
+    @property
+    def _resettable(self) -> bool:
+        return self._context.attachments.can_reset
 
     @property
     def _may_ask(self) -> bool:

@@ -21,7 +21,7 @@ from imud.devices.hipnuc.uart.codec import (
 )
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
 from imud.devices.hipnuc.uart.packets import PPS_STAMP_MODULUS_MS
-from imud.devices.hipnuc.uart.session import identify, read_settings
+from imud.devices.hipnuc.uart.session import identify, read_settings, wake, why_silent
 from imud.devices.hipnuc.uart.settings import SETTINGS
 from imud.units import NS_PER_MS
 
@@ -70,5 +70,7 @@ DRIVER: Final = StreamDriver(
     identify=identify,
     read_settings=read_settings,
     apply_identity=_apply_identity,
+    wake=wake,
+    why_silent=why_silent,
     example_frame=_example_frame,
 )

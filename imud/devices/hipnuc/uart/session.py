@@ -12,7 +12,7 @@ from imud.contracts.driver import Identity
 from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript, Silence, pause
 from imud.devices.hipnuc.uart import commands
 from imud.devices.hipnuc.uart.commands import BAUD_RATES, BaudRate, OutputMessage, OutputRate, Query, ask
-from imud.devices.hipnuc.uart.replies import ComConfig, parse_comconfig, parse_report, parse_version
+from imud.devices.hipnuc.uart.replies import ComConfig, lines_of, parse_comconfig, parse_report, parse_version
 from imud.errors import NoReply, Rejected
 from imud.units import NS_PER_S
 
@@ -114,6 +114,17 @@ def wake() -> RequestScript[bool | None]:
         return None
     yield from send(commands.log_enable())
     return True
+
+
+def why_silent(settings: Mapping[str, str]) -> str:
+    """Say why it answers and sends no samples, from its settings (`read_settings`)."""
+    config = parse_comconfig(lines_of(settings))
+    if rates := rates_hz(config):
+        message, rate_hz = max(rates.items(), key=lambda item: item[1])
+        return f"its output is off (LOG DISABLE), though {message} has {rate_hz:g} Hz"
+    if config.on_mark:
+        return f"{' and '.join(sorted(config.on_mark))} on mark, one for each pulse on SIN"
+    return "no message has a rate" if config.periods_s else "its output is off, or on mark"
 
 
 def wake_by_force(baud: int) -> RequestScript[str]:

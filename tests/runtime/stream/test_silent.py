@@ -1,0 +1,193 @@
+"""A simulated HiPNUC module on a line in virtual time: silent and told things, changed, read back, never lost."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from imud.contracts.status import DeviceState
+from imud.errors import CommandError
+from imud.event import EventKind
+from imud.runtime.stream.transport import StreamTransport
+from imud.sim.hipnuc.uart.behaviour import VARIANTS, Behaviour
+from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from tests.support.simulated_modules import hardware_of
+from tests.support.wired_device import LinkedDevice, play_linked
+
+NO_RATE = ModuleSettings(hi91=Output())
+ON_MARK = ModuleSettings(hi91=Output(on_mark=True))
+FAST = ModuleSettings(baud=921600, hi91=Output())
+LINKS: list[dict[str, Any]] = [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}]
+UP_AND_DOWN = (EventKind.UP, EventKind.DOWN)
+
+every_link = pytest.mark.parametrize("link", LINKS, ids=str)
+
+
+def turns(device: LinkedDevice) -> list[EventKind]:
+    """The events up and down so far."""
+    return [event.kind for event in device.events if event.kind in UP_AND_DOWN]
+
+
+@every_link
+@pytest.mark.parametrize(
+    ("settings", "why"), [(NO_RATE, "no message has a rate"), (ON_MARK, "HI91 on mark, one for each pulse on SIN")]
+)
+def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
+    settings: ModuleSettings, why: str, link: dict[str, Any]
+) -> None:
+    async def story(device: LinkedDevice) -> None:
+        await device.wait(60)
+        assert device.rig.is_in(DeviceState.SILENT)
+        assert device.problem == (
+            f"it answers (HI14R3, firmware 1.5.6) and sends no samples: {why}; the action wake makes it send"
+        )
+        assert device.device.status().identity["serial_number"] == "043995698D6E1708"
+        assert device.module.settings == settings
+        assert turns(device) == []
+        await device.act("mode", axes=9)
+        assert device.module.settings.att_mode == 1
+        assert device.device.status().settings["ATT_MODE"] == "1"
+        await device.act("wake")
+        await device.until(lambda: len(device.samples) > 20)
+        assert device.rig.is_in(DeviceState.RUNNING)
+        assert device.problem == ""
+        assert turns(device) == [EventKind.UP]
+
+    play_linked(story, settings, **link)
+
+
+def test_commands_are_accepted_as_soon_as_it_has_answered() -> None:
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: device.device.actions, limit_s=0.1)
+        with pytest.raises(CommandError, match="bow is searching"):
+            await device.device.act("wake", {})
+        await device.until(lambda: device.device.status().settings, limit_s=1.9)
+        assert device.rig.is_in(DeviceState.SEARCHING)
+        await device.act("output", message="HI91", rate_hz=50)
+        await device.until(lambda: device.samples)
+
+    play_linked(story, NO_RATE)
+
+
+@every_link
+def test_output_that_is_only_switched_off_is_switched_on(link: dict[str, Any]) -> None:
+    async def story(device: LinkedDevice) -> None:
+        device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
+        await device.until(lambda: len(device.samples) > 20)
+        assert "it answered and sent no samples: commanded to stream, which is not saved" in device.messages
+        assert device.module.settings == device.module.flash == ModuleSettings()
+        assert turns(device) == [EventKind.UP]
+
+    play_linked(story, hardware=hardware_of(Behaviour(), boot_ms=0), **link)
+
+
+@every_link
+def test_a_module_that_was_silenced_stays_so_and_is_asked_at_its_own_rate(link: dict[str, Any]) -> None:
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        await device.act("output_none")
+        count, sent = len(device.samples), len(device.link.sent_at)
+        await device.wait(100)
+        assert len(device.samples) <= count + 2
+        assert device.rig.is_in(DeviceState.SILENT)
+        assert "no message has a rate" in device.problem
+        assert turns(device) == [EventKind.UP, EventKind.DOWN]
+        asked = device.link.sent_at[sent:]
+        assert {baud for baud, _ in asked} == {115200}
+        assert 4 <= sum(data.startswith(b"LOG VERSION") for _, data in asked) <= 8  # once in 15 s
+        await device.act("output", message="HI91", rate_hz=100)
+        await device.until(lambda: len(device.samples) > count + 20)
+        assert turns(device) == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+
+    play_linked(story, **link)
+
+
+def test_while_a_lost_module_is_searched_for_no_command_goes_out() -> None:
+    """It is switched off: the search asks at all rates, and nothing else does."""
+
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        device.module.receive(b"UNLOGALL\r\n", device.clock.now_ns())
+        await device.wait(0.1)
+        device.link.module_is_on = False
+        await device.until(lambda: device.rig.is_in(DeviceState.SEARCHING), limit_s=60)
+        bauds, refused = set(), 0
+        for _ in range(200):
+            bauds.add(device.link.baud)
+            try:
+                await device.device.act("output", {"message": "HI91", "rate_hz": 50})
+            except CommandError:
+                refused += 1
+            await device.wait(0.05)
+        assert refused == 200
+        assert len(bauds) > 4
+        assert {data for _, data in device.link.sent_at if data.startswith(b"LOG HI91")} == set()
+        assert turns(device) == [EventKind.UP, EventKind.DOWN]
+
+    play_linked(story, baud="auto")
+
+
+def test_a_script_under_way_ends_when_a_search_begins_under_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if the search did not wait for it, it would send nothing at the rates of the search."""
+    monkeypatch.setattr(StreamTransport, "busy", property(lambda _transport: False))
+
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20)
+        device.link.module_is_on = False
+        acting = [asyncio.ensure_future(device.device.act("restart", {})) for _ in range(3)]
+        await device.until(lambda: all(one.done() for one in acting), limit_s=90)
+        assert all(isinstance(one.exception(), CommandError) for one in acting)
+        assert any("is searched for at all baud rates now" in str(one.exception()) for one in acting)
+        reboots = [baud for baud, data in device.link.sent_at if data.startswith(b"REBOOT")]
+        assert set(reboots) == {115200}
+
+    play_linked(story, baud="auto", identify=False)
+
+
+@every_link
+@pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
+def test_every_variant_is_followed_to_another_rate_and_back(behaviour: Behaviour, link: dict[str, Any]) -> None:
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        answer = await device.act("baud", baud=921600)
+        assert isinstance(answer, dict)
+        assert answer["baud"] == device.link.baud == device.module.baud == device.module.flash.baud == 921600
+        assert ("configuration" in answer) is (not link)
+        count = len(device.samples)
+        await device.until(lambda: len(device.samples) > count + 20)
+        assert device.device.status().settings["BAUD"] == "921600"
+        answer = await device.act("factory_reset")
+        assert answer == {"baud": 115200}
+        count = len(device.samples)
+        await device.until(lambda: len(device.samples) > count + 20)
+        assert device.device.status().settings["BAUD"] == "115200"
+        assert device.module.settings == ModuleSettings()
+        assert device.device.ledger.frames_bad() < 10
+
+    play_linked(story, hardware=hardware_of(behaviour), **link)
+
+
+def test_settings_are_read_again_after_each_action() -> None:
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        await device.act("pin", function="led", pin=7)
+        await device.act("mounting", turned="y_up")
+        await device.act("output", message="HI91", rate_hz=25)
+        settings = device.device.status().settings
+        assert (settings["PMUX3"], settings["URFR"]) == ("IO7", "1,0,0,0,0,-1,0,1,0")
+        assert settings["COMCONFIG 1"] == "LOG HI91 ONTIME 0.04"
+        assert "settings of the device changed: PMUX3 is IO7, was IO5" in device.messages
+
+    play_linked(story)
+
+
+def test_after_an_action_that_fails_the_settings_are_what_the_module_has() -> None:
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by somebody else
+        await device.wait(0.1)
+        with pytest.raises(CommandError, match="the module refused"):
+            await device.act("level", level="automatic")
+        assert device.device.status().settings["ATT_MODE"] == "1"
+
+    play_linked(story, hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",))))
