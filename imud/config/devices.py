@@ -7,6 +7,7 @@ from re import compile as pattern
 from typing import Any, Final
 
 from imud.config.claims import clashes
+from imud.config.declared import DeclaredReader
 from imud.config.keys import Keys
 from imud.config.model import DeviceConfig
 from imud.config.schema import DeviceGeneral, Tables
@@ -30,6 +31,7 @@ class DeviceReader:
         """`pause` is called after every device."""
         self._keys = keys
         self._tables = tables
+        self._declared = DeclaredReader(keys, tables.drivers)
         self._pause = pause
 
     def devices(self, top: Mapping[str, Any]) -> list[tuple[DeviceConfig, bool]] | None:
@@ -63,9 +65,10 @@ class DeviceReader:
         if keys is None:
             return None
         own = DeviceGeneral.__struct_fields__
-        self._keys.unknown_keys(path, keys, [*own, "options", "lines", "rmc", *self._tables.links])
+        self._keys.unknown_keys(path, keys, [*own, "options", "settings", "lines", "rmc", *self._tables.links])
         general = self._keys.settings(DeviceGeneral, path, {key: keys[key] for key in own if key in keys})
         options = self._options(path, keys)
+        declared = self._declared.read(path, keys)
         link = self._link(path, keys)
         lines = read_lines(self._keys, (*path, "lines"), keys, self._tables.drivers)
         rmc = read_rmc(self._keys, (*path, "rmc"), keys, self._tables.drivers)
@@ -76,9 +79,11 @@ class DeviceReader:
         if known and self._driver_fits(path, general.driver, link_name) and options is not None:
             self._go_together(path, general.driver, options, link_name, link_settings)
         self._usable(path, general.driver, link_name, link_settings)
+        if declared is not None:
+            self._declared.check(path, general.driver, declared, options, link_settings)
         line = self._keys.tree.key_mark(path).line
         own_keys = general.driver, options, general.identify, link_name, link_settings
-        return DeviceConfig(name, *own_keys, line, lines, rmc), general.enabled
+        return DeviceConfig(name, *own_keys, line, lines, rmc, declared, general.on_difference), general.enabled
 
     def _options(self, path: KeyPath, keys: Mapping[str, Any]) -> Settings | None:
         driver = keys.get("driver", "auto")

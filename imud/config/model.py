@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
+from imud.contracts.device_settings import OnDifference
 from imud.contracts.lines import DeviceLines
 from imud.contracts.settings import Settings
 from imud.utc.source import RmcSettings
@@ -27,6 +28,10 @@ class DeviceConfig:
     """GPIO lines of the device; None without any."""
     rmc: RmcSettings | None = None
     """Source of the RMC sentences that are sent to it; None for none."""
+    declared: Settings | None = None
+    """Values that its own settings should have, an instance of `DeviceSettings.declarable`; None for no declaration."""
+    on_difference: OnDifference = OnDifference.REPORT
+    """What imud does where they are others."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final, Literal, Protocol
 import msgspec
 
 from imud.contracts.claims import Claim
+from imud.contracts.device_settings import DeviceSettings, OnDifference
 from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
@@ -35,6 +36,9 @@ class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Whether imud uses the device; if not, its keys are checked all the same."""
     identify: bool = True
     """Whether imud may send queries (nothing that changes the device) to learn product, serial number and firmware."""
+    on_difference: OnDifference = OnDifference.REPORT
+    """What imud does where the device is not as `settings` declare: report it, apply them, or apply and save to the
+    device's flash."""
 
 
 class Row(Protocol):
@@ -52,6 +56,11 @@ class DriverRow(Row, Protocol):
     @property
     def lines(self) -> frozenset[str]:
         """GPIO lines that such a device can have."""
+        ...
+
+    @property
+    def device_settings(self) -> DeviceSettings | None:
+        """Settings that the device keeps itself; None for a driver that does not know them."""
         ...
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:

@@ -2,7 +2,7 @@
 
 A driver has one table of them. From it come the keys of `settings:` in the configuration, `imud settings`, help, the
 checks and docs/settings.md. A script here is what the driver's transport runs: a request script on a UART or CAN, a
-transfer script on a polled bus.
+transfer script on a polled bus. The second half is what imud says of them: declared, actual, planned and done.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,8 +14,19 @@ from typing import Any, cast
 
 import msgspec
 
-from imud.contracts.action import Target
+from imud.contracts.action import Risk, Target
 from imud.contracts.settings import Settings
+
+
+class OnDifference(StrEnum):
+    """What imud does where the device's settings are not those that the configuration declares."""
+
+    REPORT = "report"
+    """Say so: an event, the status, a metric."""
+    APPLY = "apply"
+    """Set what comes into force at once; it holds until the device restarts, and is set again then."""
+    APPLY_AND_SAVE = "apply_and_save"
+    """Set everything, save it to the device's flash, and restart the device where that is needed."""
 
 
 class Effect(StrEnum):
@@ -56,6 +67,9 @@ class Setting:
     """Whether the device is reached in another way afterwards (bit rate, address, node number): such a setting is
     written last. Its script follows the device, and goes back where the device is not heard afterwards: by
     `Request.baud` on a UART, `Request.settings` on a CAN bus, `Transfer.then_at` on RS-485 and I2C."""
+    saves: bool = False
+    """Whether its script saves all settings to flash, and restarts the device, itself in order to follow it. It is
+    written only where saving is wanted, counts as a write to flash, and needs no `save` after it."""
     readable: bool = True
     """Whether the device tells the value; what it does not tell is `written, not verified`."""
     agrees: Callable[[Any, Any], bool] = eq
@@ -78,7 +92,8 @@ class DeviceSettings:
     check: Callable[[Target, Mapping[str, Any]], None] = nothing_wrong
     """Raises BadArgument for values that do not go together, for example more output than the bit rate carries.
 
-    `values` are the declared ones on top of the present ones as far as these are known."""
+    `values` are the declared ones on top of the present ones as far as these are known: of a configuration that is
+    checked the declared ones alone. `target.baud` is 0 where it is not known."""
 
     @property
     def declarable(self) -> type[Settings]:
@@ -90,6 +105,13 @@ class DeviceSettings:
         return id(self)
 
 
+def declared_values(declared: Settings | None) -> dict[str, Any]:
+    """Return the values of an instance of `declarable` by name, without those that are not declared."""
+    if declared is None:
+        return {}
+    return {name: value for name, value in msgspec.structs.asdict(declared).items() if value is not None}
+
+
 @cache
 def _declarable(settings: DeviceSettings) -> type[Settings]:
     fields = [(name, one.type | None, None) for name, one in settings.table.items() if one.write is not None]
@@ -97,3 +119,144 @@ def _declarable(settings: DeviceSettings) -> type[Settings]:
         "Declared", fields, bases=(Settings,), frozen=True, kw_only=True, forbid_unknown_fields=True
     )
     return cast(type[Settings], made)
+
+
+# --- what imud says of them -------------------------------------------------------------------------------------------
+
+
+class SettingsState(StrEnum):
+    """Result of the newest comparison of declared and actual settings."""
+
+    UNDECLARED = "undeclared"
+    """Nothing is declared for the device."""
+    UNKNOWN = "unknown"
+    """The device has not told its settings since its link was opened."""
+    AGREE = "agree"
+    """All that can be read is as declared."""
+    DIFFER = "differ"
+
+
+class SettingDifference(msgspec.Struct, frozen=True):
+    """One setting that is not as declared."""
+
+    declared: Any
+    actual: Any = None
+    """Null where the device does not tell it."""
+
+
+class SettingsStatus(msgspec.Struct, frozen=True):
+    """How declared and actual settings of one device compare."""
+
+    state: SettingsState
+    on_difference: OnDifference
+    problem: str = ""
+    """Why the settings could not be read or set, one sentence; empty for none."""
+    differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
+    unverified: tuple[str, ...] = ()
+    """Declared settings that the device takes and does not tell."""
+    read_ns: int | None = None
+    """CLOCK_MONOTONIC when they were read last; null before."""
+    repairs: int = 0
+    """Times that imud has set them by itself since start, successful or not."""
+    flash_writes: int = 0
+    """Writes to the flash of this module by imud, also in earlier runs; by commands and by itself."""
+    flash_writes_day: int = 0
+    """Of these, those of the last 24 hours."""
+
+
+class SettingInfo(msgspec.Struct, frozen=True):
+    """One setting of a device: its description, and its values as far as they are known."""
+
+    name: str
+    values: str
+    """The accepted values, for example `a whole number from 1 to 127`."""
+    description: str
+    unit: str
+    section: str
+    """Section of the vendor's manual."""
+    effect: Effect
+    connection: bool
+    """Whether the device is reached in another way after a change."""
+    readable: bool
+    declarable: bool
+    """Whether it can be set; others can only be read."""
+    declared: Any = None
+    actual: Any = None
+    """Null where the device did not tell it."""
+    differs: bool = False
+
+
+class SettingsReport(msgspec.Struct, frozen=True):
+    """All settings of a device."""
+
+    device: str
+    driver: str
+    identity: dict[str, str]
+    status: SettingsStatus
+    settings: tuple[SettingInfo, ...]
+
+
+class PlannedStep(msgspec.Struct, frozen=True):
+    """One setting that is to be written."""
+
+    name: str
+    value: Any
+    before: Any = None
+    """Null where it is not known."""
+    effect: Effect = Effect.AT_ONCE
+    connection: bool = False
+    saves: bool = False
+    """Whether this step writes the flash itself and restarts the device."""
+
+
+class SettingsPlan(msgspec.Struct, frozen=True):
+    """What would be done to make a device as wanted, in this order: steps, save, restart, comparison."""
+
+    steps: tuple[PlannedStep, ...] = ()
+    save: bool = False
+    restart: bool = False
+    left_out: dict[str, str] = {}  # msgspec copies a mutable default
+    """Settings that differ and are not written, each with why not."""
+    risk: Risk = Risk.NONE
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to do."""
+        return not self.steps and not self.save
+
+
+class StepOutcome(StrEnum):
+    """What became of one step."""
+
+    DONE = "done"
+    """Written, and read back as wanted."""
+    WRITTEN = "written, in force after a restart"
+    NOT_VERIFIED = "written, not verified"
+    """The device does not tell this setting."""
+    FAILED = "failed"
+    NOT_DONE = "not done"
+    """A step before it failed."""
+
+
+class AppliedStep(msgspec.Struct, frozen=True):
+    """One step and what became of it."""
+
+    name: str
+    value: Any
+    before: Any
+    outcome: StepOutcome
+    message: str = ""
+    """Why it failed; empty otherwise."""
+
+
+class AppliedSettings(msgspec.Struct, frozen=True):
+    """What was done, and how the device is now."""
+
+    steps: tuple[AppliedStep, ...] = ()
+    saved: bool = False
+    restarted: bool = False
+    problem: str = ""
+    """What went wrong, one sentence; empty when all that was planned is done."""
+    left_out: dict[str, str] = {}  # msgspec copies a mutable default
+    differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
+    """What is not as wanted now."""

@@ -4,6 +4,7 @@ from enum import StrEnum
 
 import msgspec
 
+from imud.contracts.device_settings import SettingsStatus
 from imud.sample import Sync
 
 
@@ -208,6 +209,9 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     """None for a device without lines."""
     utc: UtcStatus | None = None
     """None for a device that is neither fed sentences nor has its pulse per second at the host."""
+    declared: SettingsStatus | None = None
+    """How its own settings compare with those that the configuration declares; None for a driver that does not know
+    them, or is not known."""
 
 
 class ClientStatus(msgspec.Struct, frozen=True):

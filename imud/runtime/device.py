@@ -14,8 +14,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from imud.config import DeviceConfig
-from imud.contracts.action import Action, Actions
+from imud.contracts.action import Action, Actions, Risk
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
+from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
 from imud.contracts.publisher import Batch
@@ -32,6 +33,8 @@ from imud.runtime.identity import KnownIdentity, identity_words
 from imud.runtime.meters import LatencyMeter, RateMeter
 from imud.runtime.notices import Notices
 from imud.runtime.path import SamplePath
+from imud.runtime.settings.backup import SettingsFiles
+from imud.runtime.settings.keeper import SettingsKeeper
 from imud.runtime.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.runtime.utc_keeper import DevicePort
 from imud.units import NS_PER_MS, NS_PER_S
@@ -64,6 +67,7 @@ class Device:
         send_event: Callable[[Event], None],
         host: HostClock,
         lines: LineFactory,
+        files: SettingsFiles,
     ) -> None:
         self.config = config
         self.device_id = device_id
@@ -83,6 +87,12 @@ class Device:
         )  # fmt: skip
         self._guide = Guide(self._transport.run_script, self._notices)
         self._attachments.add(self._guide)
+        transport = self._transport
+        self._settings = SettingsKeeper(
+            config, transport.run_script, lambda: transport.driver, self._identity, self._notices, host, files,
+            self._can_be_asked, transport.read_back,
+        )  # fmt: skip
+        self._attachments.add(self._settings)
         self._rate = RateMeter()
         self._connects = 0
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -150,16 +160,22 @@ class Device:
         self._health.link_opened()
         ended = self._ended = asyncio.get_running_loop().create_future()
         transport.start(self._on_end)
-        working = asyncio.create_task(transport.work(), name=f"{self.config.name} work")
+        tasks = [
+            asyncio.create_task(transport.work(), name=f"{self.config.name} work"),
+            asyncio.create_task(self._settings.run(), name=f"{self.config.name} settings"),
+        ]
         try:
-            await asyncio.wait({working, ended}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({*tasks, ended}, return_when=asyncio.FIRST_COMPLETED)
             if not ended.done():
-                await working  # it ends before its link only by an error
+                for task in tasks:
+                    if task.done():
+                        await task  # it ends before its link only by an error
             elif error := ended.result():
                 raise error
         finally:
-            working.cancel()
-            await asyncio.gather(working, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             transport.stop()
             self._attachments.stop()
             if transport.path is not None:
@@ -207,7 +223,7 @@ class Device:
         if name in self._attachments.actions:
             return await self._attachments.run_action(name, arguments)
         self._require_replies()
-        return await self._run_action(action, arguments)
+        return await self._run_action(name, action, arguments)
 
     @property
     def calibrations(self) -> Calibrations:
@@ -223,22 +239,59 @@ class Device:
             raise BadArgument(f"{self.config.name}: no calibration {kind[:64]!r}; there are: {known}")
         log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
         self._require_replies()
-        return await self._guide.run(kind, calibration, save=save)
+        async with self._settings.exclusive():
+            try:
+                return await self._guide.run(kind, calibration, save=save)
+            finally:
+                self._settings.commanded()
 
     def stop_calibration(self) -> bool:
         """End the calibration that runs; return whether there was one."""
         return self._guide.cancel()
 
-    async def _run_action(self, action: Action, arguments: Mapping[str, Any]) -> object:
+    async def _run_action(self, name: str, action: Action, arguments: Mapping[str, Any]) -> object:
         params = action.arguments(arguments)
-        self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
-        try:
-            answer = await self._transport.run_script(lambda target: action.script(target, params))
-        except ImudError:
+        async with self._settings.exclusive():
+            if action.risk is Risk.RESET:
+                await self._settings.back_up(name)
+            self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
+            try:
+                answer = await self._transport.run_script(lambda target: action.script(target, params))
+            except ImudError:
+                await self._transport.read_back()
+                raise
+            finally:
+                self._settings.commanded()
             await self._transport.read_back()
-            raise
-        await self._transport.read_back()
-        return answer
+            return answer
+
+    # --- settings -----------------------------------------------------------------------------------------------------
+
+    async def settings_report(self, *, fresh: bool) -> SettingsReport:
+        """Return the device's settings: asked for now if `fresh`, otherwise as told last.
+
+        Raises CommandError, TransferError, DeviceRefused, LinkError.
+        """
+        if fresh:
+            self._require_replies()
+        return await self._settings.report(fresh=fresh)
+
+    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
+        """Plan to make the device as `given` (None: as declared). Raises what `settings_report` does."""
+        self._require_replies()
+        return await self._settings.plan(given, save=save)
+
+    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+        """Make the device as `given` (None: as declared). Raises what `settings_report` does, with nothing written."""
+        self._require_replies()
+        self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
+        return await self._settings.apply(given, save=save)
+
+    def _can_be_asked(self) -> bool:
+        """Whether a script can be run on the device now, and no other one is."""
+        transport = self._transport
+        searching = self._health.state is DeviceState.SEARCHING and transport.hears_replies
+        return transport.link.writable and (self._health.streaming or searching) and not transport.busy
 
     def _require_replies(self) -> None:
         health = self._health
@@ -302,5 +355,6 @@ class Device:
             connects=self._connects,
             lines=self._attachments.lines_status(),
             utc=self._attachments.utc_status(),
+            declared=self._settings.status(),
         )
         return transport.add_status(status)

@@ -22,6 +22,7 @@ from imud.runtime.device import Device, MakeTransport
 from imud.runtime.polled.bus import PolledBuses
 from imud.runtime.polled.data_ready import DataReady
 from imud.runtime.polled.transport import PolledTransport
+from imud.runtime.settings.backup import SettingsFiles
 from imud.runtime.stream.transport import StreamTransport
 from imud.runtime.transport import DeviceContext
 from imud.signals.gpio import GPIO_LINES
@@ -49,6 +50,7 @@ class DeviceFactory:
         self._send_event = send_event
         self._host = host
         self._lines = lines
+        self._files = SettingsFiles(state_dir, lambda: host.now_ns() + host.utc_offset_ns(host.now_ns()))
         self._polled_buses = PolledBuses(host.now_ns, start_worker)
         self._can_buses = CanBuses()
 
@@ -66,12 +68,22 @@ class DeviceFactory:
 
     def make_on(self, config: DeviceConfig, device_id: int, make_transport: MakeTransport) -> Device:
         """Make a device on a transport of the caller's (`on_stream`, `on_can`, `on_polled`)."""
-        return Device(config, device_id, make_transport, self._publish, self._send_event, self._host, self._lines)
+        return Device(
+            config,
+            device_id,
+            make_transport,
+            self._publish,
+            self._send_event,
+            self._host,
+            self._lines,
+            self._files,
+        )
 
     def close(self) -> None:
         """Stop what serves the polled buses, and have what was found written; may be called twice."""
         self._polled_buses.end()
         self.remembered.close()
+        self._files.close()
 
     def on_stream(self, link: StreamLink) -> MakeTransport:
         """Return a maker of transports on a link of bytes, for `make_on`."""

@@ -19,6 +19,7 @@ from imud import config
 from imud.config import DEVICES_MAX, PROBLEMS_SHOWN, TABLES, Config, DeviceConfig, Tables
 from imud.config.yaml_tree import EVENTS_PER_TURN
 from imud.contracts.claims import Claim
+from imud.contracts.device_settings import DeviceSettings
 from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import NoSettings, Settings, expected, got
 from imud.devices import DRIVERS
@@ -67,6 +68,7 @@ class FakeRow:
     """Settings of a driver that does not fit this link."""
     faults: tuple[KeyProblem, ...] = ()
     """Problems that a driver has with everything."""
+    device_settings: DeviceSettings | None = None
 
     def bus_of(self, settings: Settings) -> str:
         return ""

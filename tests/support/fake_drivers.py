@@ -1,24 +1,40 @@
-"""Two small drivers for tests. `fake-uart`: frames of `5A A5`, u16 length, u16 CRC (XMODEM over all else) and payload,
+"""Three small drivers for tests. `fake-uart`: frames of `5A A5`, u16 length, u16 CRC (XMODEM over all else), payload;
 and text lines. `fake-can`: a device of node n sends 0x180 + n, eight bytes, each frame a sample.
+`fake-module`: lines of text, and settings of every kind (`FakeModule` is the device).
 """
 
+import asyncio
 import binascii
 import re
 import struct
-from collections.abc import Generator, Mapping, Sequence
-from typing import Annotated, Final
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta
 
-from imud.contracts.action import Action, Target
+from imud.contracts.action import Action, Risk, Target
 from imud.contracts.can import CanDriver
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec, TextLine
+from imud.contracts.device_settings import DeviceSettings, Effect, Setting
 from imud.contracts.driver import SAMPLE_COUNTER, Identity, StreamDriver
-from imud.contracts.session import Outcome, Request, RequestScript, never, of_text, says_nothing
+from imud.contracts.session import (
+    Outcome,
+    Rejection,
+    Request,
+    RequestScript,
+    Silence,
+    never,
+    of_text,
+    pause,
+    says_nothing,
+)
 from imud.contracts.settings import NoSettings, Settings
+from imud.errors import BadArgument, NoReply, Rejected
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.ledger import Ledger
+from imud.links.memory import MemoryLink, MemorySettings
 from imud.sample import Measurement
 
 SYNC: Final = b"\x5a\xa5"
@@ -218,3 +234,262 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
 def fake_can_frame(node: int, number: int = 0, t_ns: int = 0) -> CanFrame:
     """A frame of a device; number 255 is one that is no sample."""
     return CanFrame(BASE + node, False, bytes([number, *bytes(7)]), t_ns)
+
+
+# --- a module with settings of its own --------------------------------------------------------------------------------
+
+FACTORY: Final[Mapping[str, Any]] = {
+    "mode": "6-axis",
+    "output": {"a": 100, "b": 0},
+    "offset_deg": 0.0,
+    "mounting": "level",
+    "secret": 1,
+    "hours": 7,
+    "baud": 115200,
+}
+"""Settings as delivered; `hours` can only be read, `secret` only be written."""
+TOLD: Final = tuple(name for name in FACTORY if name != "secret")
+
+
+class LinesCodec:
+    """Lines that end with CR LF: `S` and ticks of 1 ms is a sample, everything else is text."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        self._pending = b""
+
+    def feed(self, data: bytes) -> Sequence[CodecEvent]:
+        """What the lines that became complete say."""
+        *lines, self._pending = (self._pending + data).split(b"\r\n")
+        ledger = self.ledger
+        ledger.bytes_in += len(data)
+        ledger.bytes_in_good_frames += sum(len(line) + 2 for line in lines)
+        ledger.bytes_pending = len(self._pending)
+        ledger.frames_good += len(lines)
+        return [self._event(line.decode()) for line in lines]
+
+    def _event(self, line: str) -> CodecEvent:
+        if line.startswith("S "):
+            self.ledger.frames_in_samples += 1
+            return Measurement(len(line) + 2, 0, int(line[2:]), temperature_c=20.0)
+        self.ledger.frames_in_replies += 1
+        return TextLine(line)
+
+    def flush(self) -> Sequence[CodecEvent]:
+        """Nothing waits."""
+        return ()
+
+    def reset(self) -> None:
+        """Forget the beginning of a line."""
+        self.ledger.bytes_skipped += len(self._pending)
+        self.ledger.bytes_pending = 0
+        self._pending = b""
+
+
+class FakeModule(MemoryLink):
+    """A module at the far end of a line: settings in force, settings set, settings in flash.
+
+    `mounting` comes into force by save and restart, everything else at once.
+    """
+
+    def __init__(self, now_ns: Callable[[], int], *, serial: str = "A1", baud: int | Literal["auto"] = 115200) -> None:
+        super().__init__(MemorySettings(name="/dev/fake", baud=baud))
+        self.baud = self.baud or 115200
+        self.serial = serial
+        self.set = dict(FACTORY)
+        self.flash = dict(FACTORY)
+        self.mounting = "level"
+        """The mounting in force."""
+        self.refuses: set[str] = set()
+        """Names of settings that it answers with ERR."""
+        self.forgets: set[str] = set()
+        """Names of settings that it confirms and does not keep."""
+        self.silent: set[str] = set()
+        """Commands that it does not answer."""
+        self.commands: list[str] = []
+        self.saves = 0
+        self._now_ns = now_ns
+        self._boot_ns = now_ns()
+
+    def restart(self) -> None:
+        """What is not in flash is lost."""
+        self.set = dict(self.flash)
+        self.mounting = self.set["mounting"]
+        self._boot_ns = self._now_ns()
+
+    def sample(self) -> None:
+        """Send a sample."""
+        self._send(f"S {(self._now_ns() - self._boot_ns) // 1_000_000}")
+
+    def write(self, data: bytes) -> None:
+        """Take commands that come at its rate."""
+        super().write(data)
+        if self.baud == self.set["baud"]:
+            for line in data.decode().splitlines():
+                self.commands.append(line)
+                asyncio.get_running_loop().call_soon(self._take, line)
+
+    def _take(self, line: str) -> None:
+        command, _, rest = line.partition(" ")
+        answers: dict[str, Callable[[], list[str]]] = {
+            "WHO": self._who, "GET": self._get, "SAVE": self._save, "SET": lambda: self._set(rest),
+        }  # fmt: skip
+        if command == "RESTART":
+            self.restart()
+        elif command not in self.silent:
+            for answer in answers[command]():
+                self._send(answer)
+
+    def _who(self) -> list[str]:
+        return ["NAME=FAKE", f"SN={self.serial}", "OK"]
+
+    def _get(self) -> list[str]:
+        values = {**self.set, "mounting": self.mounting}
+        return [*(f"{name}={msgspec.json.encode(values[name]).decode()}" for name in TOLD), "OK"]
+
+    def _save(self) -> list[str]:
+        self.saves += 1
+        self.flash = {**self.set, "baud": self.flash["baud"]}
+        return ["OK"]
+
+    def _set(self, words: str) -> list[str]:
+        name, _, text = words.partition("=")
+        value = msgspec.json.decode(text)
+        if name in self.refuses:
+            return ["ERR"]
+        if name == "output":
+            value = {**self.set[name], **value}
+        elif name == "offset_deg":
+            value = round(value, 2)
+        if name == "baud" and name not in self.forgets:
+            self.flash[name] = value  # in force by the restart, whatever is saved
+        elif name != "baud" and name not in self.forgets:
+            self.set[name] = value
+        return ["OK"]
+
+    def _send(self, line: str) -> None:
+        if self.baud == self.set["baud"]:
+            self.feed(line.encode() + b"\r\n", self._now_ns())
+
+
+def _send_command(line: str) -> RequestScript[Mapping[str, str]]:
+    """Send a command, and return the values of its answer."""
+    outcome = yield replace(_query(line.encode() + b"\r\n", line.partition(" ")[0]), messages_min=1)
+    if isinstance(outcome, Silence):
+        raise NoReply(f"{line}: expected OK, got nothing")
+    if isinstance(outcome, Rejection):
+        raise Rejected(f"{line}: the module refused")
+    return dict(text.split("=", 1) for text in outcome.lines if "=" in text)
+
+
+def _who() -> RequestScript[Identity]:
+    found = yield from _send_command("WHO")
+    return Identity(found["NAME"], found["SN"], "1.0")
+
+
+def _get_words() -> RequestScript[Mapping[str, str]]:
+    return (yield from _send_command("GET"))
+
+
+def _get_values(_target: Target) -> RequestScript[Mapping[str, Any]]:
+    found = yield from _send_command("GET")
+    return {name: msgspec.json.decode(text) for name, text in found.items()}
+
+
+def _setter(name: str) -> Callable[[Target, Any], RequestScript[None]]:
+    def write(_target: Target, value: Any) -> RequestScript[None]:
+        yield from _send_command(f"SET {name}={msgspec.json.encode(value).decode()}")
+
+    return write
+
+
+def _save_all(_target: Target) -> RequestScript[None]:
+    yield from _send_command("SAVE")
+
+
+def _restart(_target: Target) -> RequestScript[None]:
+    yield Request(b"RESTART\r\n", "RESTART", never, never, never, silent=True)
+    yield pause(1_000_000_000)
+
+
+def _write_baud(target: Target, baud: int) -> RequestScript[None]:
+    """Set, save, restart and follow; back where it is not heard."""
+    yield from _send_command(f"SET baud={baud}")
+    yield from _send_command("SAVE")
+    yield from _restart(target)
+    yield pause(1_000_000, baud=baud)
+    try:
+        yield from _who()
+    except NoReply:
+        yield pause(1_000_000, baud=target.baud)
+        raise Rejected(f"the module is not heard at {baud} baud; the line is at {target.baud} again") from None
+
+
+def _parts_agree(declared: Mapping[str, int], actual: Mapping[str, int]) -> bool:
+    return declared.items() <= actual.items()
+
+
+def _carried(target: Target, values: Mapping[str, Any]) -> None:
+    rate_hz, baud = sum(values.get("output", {}).values()), values.get("baud", target.baud)
+    if baud and rate_hz * 100 > baud:
+        raise BadArgument(f"output: expected at most {baud // 100} Hz in all at {baud} baud, got {rate_hz} Hz")
+
+
+def _told(words: str, section: str, unit: str = "") -> Meta:
+    return Meta(description=words, extra={"section": section, "unit": unit})
+
+
+OutputRates = dict[Literal["a", "b"], Annotated[int, Meta(ge=0, le=1000)]]
+FAKE_SETTINGS: Final = DeviceSettings(
+    table={
+        "baud": Setting(
+            type=Annotated[Literal[9600, 115200, 921600], _told("rate of the line", "3.1", "bit/s")],
+            write=_write_baud, connection=True, saves=True,
+        ),
+        "mode": Setting(
+            type=Annotated[Literal["6-axis", "9-axis"], _told("axes that make the attitude", "2.1")],
+            write=_setter("mode"),
+        ),
+        "output": Setting(
+            type=Annotated[OutputRates, _told("messages sent per second", "2.2", "Hz")], write=_setter("output"),
+            agrees=_parts_agree,
+        ),
+        "mounting": Setting(
+            type=Annotated[Literal["level", "x_up"], _told("what points up", "2.4")], write=_setter("mounting"),
+            effect=Effect.AFTER_RESTART,
+        ),
+        "offset_deg": Setting(
+            type=Annotated[float, Meta(ge=-180, le=180), _told("added to the heading", "2.3", "°")],
+            write=_setter("offset_deg"), agrees=lambda declared, actual: abs(declared - actual) < 0.01,
+        ),
+        "secret": Setting(
+            type=Annotated[int, Meta(ge=0, le=9), _told("a number that is not told", "2.5")], write=_setter("secret"),
+            readable=False,
+        ),
+        "hours": Setting(type=Annotated[int, _told("time in use", "2.6", "h")]),
+    },
+    read=_get_values, save=_save_all, restart=_restart, check=_carried,
+)  # fmt: skip
+"""Settings of every kind."""
+
+
+def _factory_reset(_target: Target) -> RequestScript[None]:
+    yield Request(b"RESTART\r\n", "RESTART", never, never, never, silent=True)
+
+
+def _set_mode(target: Target, *, mode: str) -> RequestScript[None]:
+    return _setter("mode")(target, mode)
+
+
+FAKE_MODULE_DRIVER: Final = replace(
+    FAKE_DRIVER,
+    name="fake-module",
+    make_codec=lambda ledger, options: LinesCodec(ledger),
+    identify=_who,
+    read_settings=_get_words,
+    device_settings=FAKE_SETTINGS,
+    actions={
+        "set_mode": Action("set it", _set_mode),
+        "factory_reset": Action("forget all", _factory_reset, Risk.RESET),
+    },
+)

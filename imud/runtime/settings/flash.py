@@ -1,0 +1,114 @@
+"""Store of the writes to the flash of each module, which are counted over all runs of imud and limited per day.
+
+Flash of the controllers in such modules endures some ten thousand erasures. A device that forgets what it was told, or
+a configuration that contradicts it, must not use them up: imud by itself writes a module LIMIT_ITSELF times within 24
+hours, which is a life of some seven years even so; people and programs may write it LIMIT_ASKED times.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from imud.runtime.state_file import StateFile
+from imud.units import NS_PER_S
+
+FILE_NAME: Final = "settings.json"
+DAY_S: Final = 24 * 3600
+LIMIT_ITSELF: Final = 4
+"""Writes within 24 hours after which imud writes no more by itself; those that were asked for count."""
+LIMIT_ASKED: Final = 40
+"""Writes within 24 hours after which imud writes no more even when it is asked to."""
+MODULES_MAX: Final = 1024
+"""Modules that are remembered, those written last; a daemon has 256 devices at most."""
+
+
+class ModuleRecord(msgspec.Struct):
+    """What is known of one module."""
+
+    writes: int = 0
+    """Writes to its flash by imud."""
+    times_s: list[int] = []  # msgspec copies a mutable default
+    """Seconds of UTC of the newest, oldest first, LIMIT_ASKED at most."""
+    told: dict[str, Any] = {}  # msgspec copies a mutable default
+    """Values saved in its flash of settings that it does not tell, as JSON."""
+
+
+class FlashWrites:
+    """Writes to the flash of all modules. Synchronization: the event loop's thread only."""
+
+    def __init__(self, folder: Path | None, utc_ns: Callable[[], int]) -> None:
+        """With None as `folder` they are known during this run only; `utc_ns` reads CLOCK_REALTIME."""
+        self._file = StateFile(
+            folder / FILE_NAME if folder else None, "settings", "writes to flash are counted from the beginning"
+        )
+        self._modules = self._file.read(dict[str, ModuleRecord])
+        self._utc_ns = utc_ns
+
+    def writes(self, module: str) -> int:
+        """Writes to the flash of a module in all runs."""
+        return self._record(module).writes
+
+    def writes_day(self, module: str) -> int:
+        """Writes within the last 24 hours. Those that a wrong clock dated later than now count as of now."""
+        now_s, record = self._utc_ns() // NS_PER_S, self._record(module)
+        record.times_s = [min(time_s, now_s) for time_s in record.times_s]
+        return sum(time_s > now_s - DAY_S for time_s in record.times_s)
+
+    def refusal(self, module: str, *, asked: bool) -> str:
+        """Return why the flash of a module may not be written now, one sentence; empty if it may."""
+        limit, written = LIMIT_ASKED if asked else LIMIT_ITSELF, self.writes_day(module)
+        if written < limit:
+            return ""
+        who = "" if asked else " by imud itself"
+        return f"its flash was written {written} times within 24 hours, and {limit} are allowed{who}: it wears out"
+
+    def count(self, module: str) -> None:
+        """Count a write that is about to be made."""
+        record = self._modules.pop(module, None) or ModuleRecord()
+        record.writes += 1
+        record.times_s = [*record.times_s, self._utc_ns() // NS_PER_S][-LIMIT_ASKED:]
+        self._keep(module, record)
+
+    def told(self, module: str) -> Mapping[str, Any]:
+        """Values saved in the flash of a module of settings that it does not tell, as JSON."""
+        return self._record(module).told
+
+    def keep_told(self, module: str, told: Mapping[str, Any]) -> None:
+        """Remember such values: they are in the module's flash now."""
+        if self.told(module) != told:
+            record = self._modules.pop(module, None) or ModuleRecord()
+            record.told = dict(told)
+            self._keep(module, record)
+
+    def close(self) -> None:
+        """Wait until the file is written, for a limited time; may be called twice."""
+        self._file.close()
+
+    def _record(self, module: str) -> ModuleRecord:
+        return self._modules.get(module) or ModuleRecord()
+
+    def _keep(self, module: str, record: ModuleRecord) -> None:
+        """Keep a record as the newest, and no more than MODULES_MAX."""
+        self._modules[module] = record
+        while len(self._modules) > MODULES_MAX:
+            del self._modules[next(iter(self._modules))]
+        self._file.write(self._modules)
+
+
+class ModuleFlash:
+    """The flash of one module, as asked for by people (`asked`) or by imud itself: a `FlashBudget`."""
+
+    def __init__(self, writes: FlashWrites, module: str, *, asked: bool) -> None:
+        self._writes = writes
+        self._module = module
+        self._asked = asked
+
+    def refusal(self) -> str:
+        """Return why it may not be written now, one sentence; empty if it may."""
+        return self._writes.refusal(self._module, asked=self._asked)
+
+    def count(self) -> None:
+        """Count a write that is about to be made."""
+        self._writes.count(self._module)

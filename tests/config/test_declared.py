@@ -1,0 +1,102 @@
+"""`settings:` of a device: typed by the driver's table, refused with their place, compared on reload."""
+
+# ruff: noqa: E501 - a row of the table has the whole message
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import pytest
+from msgspec import Meta
+
+from imud import config
+from imud.config import Config, Tables, differences
+from imud.contracts.claims import Claim
+from imud.contracts.device_settings import OnDifference, declared_values
+from imud.contracts.driver import Driver
+from imud.contracts.settings import Settings
+from imud.errors import ConfigError
+from tests.support.fake_drivers import FAKE_DRIVER, FAKE_MODULE_DRIVER
+
+
+class WireSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    port: str
+    baud: Annotated[int, Meta(ge=50)] | Literal["auto"] = "auto"
+
+
+@dataclass(frozen=True)
+class Wire:
+    settings: type[Settings] = WireSettings
+    searchable: bool = True
+
+    def bus_of(self, _settings: Any) -> str:
+        return ""
+
+    def claims(self, settings: WireSettings) -> list[Claim]:
+        return [Claim(place=settings.port, key="port")]
+
+    def problem(self, _settings: Any, _frames: bool) -> str:
+        return ""
+
+    def fits(self, _driver: Driver) -> bool:
+        return True
+
+
+TABLES = Tables({"fake-module": FAKE_MODULE_DRIVER, "fake-uart": FAKE_DRIVER}, {"wire": Wire()}, {})
+HEAD = "devices:\n  bow:\n    driver: {driver}\n    wire: {{port: x, baud: {baud}}}\n"
+
+
+def text(*lines: str, driver: str = "fake-module", baud: str = "115200") -> str:
+    return HEAD.format(driver=driver, baud=baud) + "".join(f"    {line}\n" for line in lines)
+
+
+def parse(*lines: str, driver: str = "fake-module", baud: str = "115200") -> Config:
+    return config.parse(text(*lines, driver=driver, baud=baud), "f", TABLES)
+
+
+def test_declared_values_have_the_types_of_the_table() -> None:
+    (device,) = parse(
+        "settings: {mode: 9-axis, output: {a: 10}, offset_deg: 5}", "on_difference: apply_and_save"
+    ).devices
+    assert declared_values(device.declared) == {"mode": "9-axis", "output": {"a": 10}, "offset_deg": 5.0}
+    assert device.on_difference is OnDifference.APPLY_AND_SAVE
+
+
+@pytest.mark.parametrize("lines", [[], ["settings:"], ["settings: {}"], ["settings: {mode: null}"]])
+def test_nothing_is_declared(lines: list[str]) -> None:
+    (device,) = parse(*lines).devices
+    assert declared_values(device.declared) == {}
+    assert device.on_difference is OnDifference.REPORT
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [
+        ({"lines": ["settings: {mod: 9-axis}"]}, '5:16: devices.bow.settings.mod: expected a key that imud knows, got "mod"; did you mean mode? known: baud, mode, mounting, offset_deg, output, secret'),
+        ({"lines": ["settings: {hours: 3}"]}, '5:16: devices.bow.settings.hours: expected a key that imud knows, got "hours"; known: baud, mode, mounting, offset_deg, output, secret'),
+        ({"lines": ["settings: {offset_deg: 181}"]}, "5:28: devices.bow.settings.offset_deg: expected a number from -180 to 180, or null, got 181"),
+        ({"lines": ["settings: 5"]}, "5:15: devices.bow.settings: expected keys and values, got 5"),
+        ({"lines": ["settings: {mode: 9-axis}"], "driver": "auto"}, "5:5: devices.bow.settings: expected settings only beside a named driver, got them with driver auto; drivers with settings: fake-module"),
+        ({"lines": ["settings: {mode: 9-axis}"], "driver": "fake-uart"}, "5:5: devices.bow.settings: expected settings only of a driver that knows those of its device, got them with fake-uart; drivers with settings: fake-module"),
+        ({"lines": ["settings: {mode: 9-axis}", "identify: false"]}, "5:5: devices.bow.settings: expected identify: true, without which imud does not read settings, got false"),
+        ({"lines": ["settings: {output: {a: 1000, b: 500}}"]}, "5:15: devices.bow.settings: output: expected at most 1152 Hz in all at 115200 baud, got 1500 Hz"),
+        ({"lines": ["settings: {baud: 921600}"]}, "5:22: devices.bow.settings.baud: expected 115200, where imud is told to find the device, got 921600; `imud command bow baud …` changes it, or let imud search for it where it can (auto)"),
+        ({"lines": ["on_difference: repair"]}, '5:20: devices.bow.on_difference: expected one of "report", "apply", "apply_and_save", got "repair"'),
+    ],
+)  # fmt: skip
+def test_errors_with_their_place(given: dict[str, Any], error: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(*given.pop("lines"), **given)
+    assert str(caught.value).splitlines() == ["f:" + error]
+
+
+def test_what_may_be_declared_where_imud_searches() -> None:
+    assert parse("settings: {baud: 921600}", baud="auto").devices[0].declared is not None
+    assert parse("settings: {baud: 115200}").devices[0].declared is not None
+    parse("settings: {output: {a: 1000, b: 500}}", baud="auto")  # no rate is known to judge by
+
+
+def test_a_change_of_settings_is_a_change_of_the_device() -> None:
+    old = parse("settings: {mode: 9-axis}")
+    assert differences(old, parse("settings: {mode: 6-axis}")).devices_changed == ("bow",)
+    assert differences(old, parse("settings: {mode: 9-axis}", "on_difference: apply")).devices_changed == ("bow",)
+    assert str(differences(old, parse("settings: {mode: 9-axis}"))) == "nothing differs"

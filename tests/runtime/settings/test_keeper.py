@@ -1,0 +1,563 @@
+"""The settings of a module behind a line, in virtual time: compared at start, replug and restart, applied and kept."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.device_settings import AppliedSettings, OnDifference, SettingsState, SettingsStatus, StepOutcome
+from imud.contracts.status import DeviceState
+from imud.devices import DRIVERS
+from imud.errors import BadArgument, CommandError
+from imud.event import Event, EventKind
+from imud.links.memory import MemorySettings
+from imud.runtime.settings.flash import LIMIT_ITSELF
+from imud.runtime.settings.keeper import READ_TRIES
+from imud.runtime.stream import transport as stream_transport
+from tests.support.device_rig import DeviceRig, DeviceRigs
+from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock
+from tests.support.fake_drivers import FACTORY, FAKE_MODULE_DRIVER, FAKE_SETTINGS, FakeModule
+
+STEP_S, LONG_STEP_S = 0.05, 0.5
+"""Time from one sample to the next, and while long times pass."""
+
+
+@pytest.fixture(autouse=True)
+def fake_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fake driver beside the real ones."""
+    monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": FAKE_MODULE_DRIVER})
+
+
+class AtOnce(ThreadPoolExecutor):
+    """What would be done by a thread is done at once: virtual time does not wait for threads."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        try:
+            done.set_result(fn(*args, **kwargs))
+        except OSError as error:
+            done.set_exception(error)
+        return done
+
+
+class ModuleBench:
+    """One module with what is declared for it, and all that is told of it."""
+
+    def __init__(
+        self, on_difference: str = "report", declared: dict[str, Any] | None = None, state_dir: Path | None = None
+    ) -> None:
+        self.clock = VirtualClock()
+        self.module = FakeModule(self.clock.now_ns)
+        self.rigs = DeviceRigs(self.clock.host, state_dir=state_dir)
+        config = DeviceConfig(
+            "bow", "fake-module", None, True, "memory", MemorySettings(name="/dev/fake"),
+            declared=msgspec.convert(declared, FAKE_SETTINGS.declarable) if declared else None,
+            on_difference=OnDifference(on_difference),
+        )  # fmt: skip
+        self.rig = self.rigs.add(config, self.module)
+        self.device = self.rig.device
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the device while the story is told."""
+
+        async def told(_made: list[DeviceRig]) -> None:
+            asyncio.get_running_loop().set_default_executor(AtOnce())
+            await self.rig.turn(lambda: self.module.listening)
+            await story()
+
+        play_rigs(self.rigs, told, self.clock)
+
+    async def until(self, holds: Callable[[], object], what: str = "the condition", limit_s: float = 30.0) -> None:
+        """Let time pass, with a sample in every step."""
+        step_s = STEP_S if limit_s < 100 else LONG_STEP_S
+        await self.rig.until(holds, what, limit_s, step=self.module.sample, step_s=step_s)
+
+    async def pass_s(self, duration_s: float) -> None:
+        """Let so much time pass."""
+        end_ns = self.clock.now_ns() + int(duration_s * 1e9)
+        await self.until(lambda: self.clock.now_ns() >= end_ns, limit_s=duration_s + 10)
+
+    async def doing(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """The result of something that takes its time, with samples all the while."""
+        task = asyncio.ensure_future(work)
+        await self.until(task.done)
+        return task.result()
+
+    @property
+    def status(self) -> SettingsStatus:
+        """How declared and actual settings compare."""
+        found = self.device.status().declared
+        assert found is not None
+        return found
+
+    def is_in(self, state: SettingsState) -> bool:
+        """Whether that is the state."""
+        return self.status.state is state
+
+    @property
+    def told(self) -> list[Event]:
+        """Events about settings."""
+        return [e for e in self.rig.events if e.kind is EventKind.CONFIGURATION and "settings" in e.message]
+
+    @property
+    def messages(self) -> list[str]:
+        """What they say, without what the daemon has always said of changed settings."""
+        return [e.message for e in self.told if not e.message.startswith("settings of the device changed")]
+
+    def repaired(self, times: int) -> bool:
+        """Whether imud has set the settings so often."""
+        return self.status.repairs == times
+
+    def saved(self, times: int) -> bool:
+        """Whether they were saved so often."""
+        return self.module.saves == times
+
+    def written(self) -> list[str]:
+        """Commands that set or save something."""
+        return [one for one in self.module.commands if one.startswith(("SET", "SAVE", "RESTART"))]
+
+
+# --- report -----------------------------------------------------------------------------------------------------------
+
+
+def test_without_a_declaration_nothing_is_asked_and_nothing_told() -> None:
+    bench = ModuleBench()
+
+    async def story() -> None:
+        await bench.pass_s(5)
+        assert bench.is_in(SettingsState.UNDECLARED)
+        assert bench.module.commands == ["WHO", "GET"]  # identity, and settings as text
+        assert bench.messages == []
+
+    bench.play(story)
+
+
+def test_what_agrees_is_said_to() -> None:
+    bench = ModuleBench(declared={"mode": "6-axis", "output": {"a": 100}, "secret": 5})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        assert bench.is_in(SettingsState.UNKNOWN)
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+        assert bench.status.unverified == ("secret",)
+        assert (bench.messages, bench.written()) == ([], [])
+
+    bench.play(story)
+
+
+def test_a_difference_is_told_once_and_nothing_is_written() -> None:
+    bench = ModuleBench(declared={"mode": "9-axis", "offset_deg": 1.5})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.is_in(SettingsState.DIFFER))
+        await bench.pass_s(100)
+        message = 'settings are not as declared: mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
+        assert bench.messages == [message]
+        assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
+        assert bench.status.differences["mode"].declared == "9-axis"
+        assert bench.written() == []
+
+    bench.play(story)
+
+
+def test_compared_again_after_a_replug_a_restart_and_a_command() -> None:
+    bench = ModuleBench(declared={"mode": "6-axis"})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+        await bench.pass_s(20)
+        bench.module.disappear()
+        await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+        assert bench.is_in(SettingsState.UNKNOWN)
+        bench.module.set["mode"] = "9-axis"
+        bench.module.appear()
+        await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a replug")
+        await bench.pass_s(20)
+        bench.module.restart()  # by itself: flash has what is declared
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after a restart")
+        await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
+        await bench.until(lambda: bench.is_in(SettingsState.DIFFER), "after a command")
+        await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE), "after another one")
+        differ = 'settings are not as declared: mode is "9-axis", declared "6-axis"'
+        assert bench.messages == [differ, differ, "settings are as declared again"]
+
+    bench.play(story)
+
+
+def test_a_device_that_does_not_tell_its_settings_is_asked_a_few_times() -> None:
+    bench = ModuleBench(declared={"mode": "6-axis"})
+    bench.module.silent = {"GET"}
+
+    async def story() -> None:
+        await bench.until(lambda: bench.messages)
+        assert bench.messages == ["settings could not be read, asked 3 times: GET: expected OK, got nothing"]
+        asked = len(bench.module.commands)
+        await bench.pass_s(300)
+        assert len(bench.module.commands) == asked
+        assert bench.is_in(SettingsState.UNKNOWN)
+        assert "could not be read" in bench.status.problem
+        bench.module.silent = set()
+        bench.module.restart()
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+        assert bench.status.problem == ""
+
+    bench.play(story)
+    assert READ_TRIES == 3
+
+
+# --- apply ------------------------------------------------------------------------------------------------------------
+
+
+def test_apply_sets_what_is_in_force_at_once_and_leaves_flash_alone() -> None:
+    bench = ModuleBench("apply", {"mode": "9-axis", "mounting": "x_up", "secret": 5})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.status.repairs)
+        await bench.until(lambda: list(bench.status.differences) == ["mounting"])
+        await bench.pass_s(50)
+        assert bench.written() == ['SET mode="9-axis"', "SET secret=5"]
+        assert bench.module.flash == FACTORY
+        assert bench.status.flash_writes == 0
+        assert "mounting comes into force by save and restart only" in bench.status.problem
+        last = bench.told[-1]
+        assert last.message == ('settings: mode set to "9-axis" (was "6-axis"), secret set to 5: written, not verified')
+        assert last.detail == {"saved": False, "mode": "done", "secret": "written, not verified"}
+        bench.module.restart()
+        await bench.until(lambda: bench.module.set["mode"] == "9-axis", "set again after a restart")
+        await bench.until(lambda: bench.module.set["secret"] == 5)
+
+    bench.play(story)
+
+
+def test_apply_and_save_does_everything_once() -> None:
+    declared = {"mode": "9-axis", "mounting": "x_up", "output": {"b": 50}, "secret": 5}
+    bench = ModuleBench("apply_and_save", declared)
+
+    async def story() -> None:
+        await bench.until(lambda: bench.status.repairs)
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+        assert bench.written() == [
+            'SET mode="9-axis"', 'SET output={"b":50}', 'SET mounting="x_up"', "SET secret=5", "SAVE", "RESTART",
+        ]  # fmt: skip
+        assert (bench.module.mounting, bench.module.flash["output"]) == ("x_up", {"a": 100, "b": 50})
+        await bench.pass_s(300)
+        assert bench.module.saves == bench.status.flash_writes == bench.status.repairs == 1
+        assert bench.told[-1].message.endswith("; saved to flash; restarted")
+        bench.module.restart()
+        await bench.pass_s(300)
+        assert bench.module.saves == 1
+
+    bench.play(story)
+
+
+def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_path: Path) -> None:
+    modules = []
+    for _run in range(2):
+        bench = ModuleBench("apply_and_save", {"secret": 5}, tmp_path)
+
+        async def story(bench: ModuleBench = bench) -> None:
+            await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+            await bench.pass_s(30)
+            assert bench.status.flash_writes == 1
+
+        bench.play(story)
+        modules.append(bench.module)
+    assert [module.saves for module in modules] == [1, 0]
+
+
+def test_another_module_is_brought_to_the_same_settings() -> None:
+    bench = ModuleBench("apply_and_save", {"mode": "9-axis", "secret": 5})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.module.saves == 1)
+        bench.module.disappear()
+        await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+        bench.module.serial, bench.module.flash = "B2", dict(FACTORY)
+        bench.module.restart()
+        bench.module.appear()
+        await bench.until(lambda: bench.module.saves == 2)
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+        assert (bench.module.flash["mode"], bench.module.flash["secret"]) == ("9-axis", 5)
+        assert bench.status.flash_writes == 1  # of this module
+
+    bench.play(story)
+
+
+def test_a_device_that_forgets_is_set_again_after_growing_pauses() -> None:
+    bench = ModuleBench("apply", {"mode": "9-axis"})
+    bench.module.forgets = {"mode"}
+
+    async def story() -> None:
+        await bench.until(lambda: bench.status.repairs == 1)
+        assert bench.messages[-1].endswith(
+            'mode: wrote "9-axis", read back "6-axis"; what was written before holds until the device restarts'
+        )
+        times_s = []
+        for number in range(2, 5):
+            before_ns = bench.clock.now_ns()
+            await bench.until(partial(bench.repaired, number), limit_s=1000)
+            times_s.append((bench.clock.now_ns() - before_ns) / 1e9)
+        assert [round(time_s, -1) for time_s in times_s] == [10, 60, 600]
+        bench.module.forgets = set()
+        bench.module.restart()
+        await bench.pass_s(20)
+        assert "does not keep its settings" in bench.status.problem
+        assert bench.is_in(SettingsState.DIFFER)
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE), limit_s=3700)
+
+    bench.play(story)
+
+
+def test_flash_is_written_a_few_times_a_day_by_itself_and_still_for_people() -> None:
+    bench = ModuleBench("apply_and_save", {"mode": "9-axis"})
+
+    async def story() -> None:
+        for number in range(1, LIMIT_ITSELF + 1):
+            await bench.until(partial(bench.saved, number), limit_s=4000)
+            await bench.pass_s(3)
+            bench.module.flash = dict(FACTORY)
+            bench.module.restart()
+        await bench.until(lambda: "not saved" in bench.messages[-1], limit_s=4000)
+        assert "allowed by imud itself" in bench.status.problem
+        assert bench.module.saves == LIMIT_ITSELF
+        assert bench.module.set["mode"] == "9-axis"  # it is set all the same
+        applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
+        assert applied.saved
+        assert bench.status.flash_writes_day == LIMIT_ITSELF + 1
+
+    bench.play(story)
+
+
+# --- asked for --------------------------------------------------------------------------------------------------------
+
+
+def test_plan_and_apply_of_given_values() -> None:
+    bench = ModuleBench()
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        plan = await bench.doing(bench.device.settings_plan({"mode": "9-axis", "baud": 921600}, save=True))
+        assert [step.name for step in plan.steps] == ["mode", "baud"]
+        assert bench.written() == []
+        applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+        assert [(one.name, one.before, one.outcome) for one in applied.steps] == [("mode", "6-axis", StepOutcome.DONE)]
+        assert (applied.problem, applied.saved, applied.differences) == ("", False, {})
+        saved = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+        assert (saved.steps, saved.saved) == ((), True)  # what was set before is saved
+        again = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+        assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
+
+    bench.play(story)
+
+
+def test_a_report_has_what_was_told_last_or_asks_now() -> None:
+    bench = ModuleBench(declared={"mode": "9-axis"})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        known = await bench.device.settings_report(fresh=False)
+        assert {one.actual for one in known.settings} == {None}
+        fresh = await bench.doing(bench.device.settings_report(fresh=True))
+        assert (fresh.device, fresh.driver, fresh.identity["serial_number"]) == ("bow", "fake-module", "A1")
+        assert {one.name: one.actual for one in fresh.settings if one.readable} == {
+            name: value for name, value in FACTORY.items() if name != "secret"
+        }
+        assert [one.name for one in fresh.settings if one.differs] == ["mode"]
+
+    bench.play(story)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        ({"mode": "x"}, BadArgument, 'mode: expected one of "6-axis", "9-axis", got "x"'),
+        (None, BadArgument, "expected values, or `settings` in the configuration, got neither"),
+        ({"output": {"a": 1000, "b": 1000}}, BadArgument, "at most 1152 Hz in all"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(given: Any, error: type[Exception], message: str) -> None:
+    bench = ModuleBench()
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        with pytest.raises(error, match=message):
+            await bench.doing(bench.device.settings_apply(given, save=True))
+        assert bench.written() == []
+
+    bench.play(story)
+
+
+def test_a_device_that_is_not_there_is_not_asked() -> None:
+    bench = ModuleBench()
+
+    async def story() -> None:
+        bench.module.disappear()
+        await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+        for work in (
+            bench.device.settings_report(fresh=True), bench.device.settings_plan({}, save=False),
+            bench.device.settings_apply({}, save=False),
+        ):  # fmt: skip
+            with pytest.raises(CommandError, match="bow is missing"):
+                await work
+
+    bench.play(story)
+
+
+# --- steps that fail --------------------------------------------------------------------------------------------------
+
+Outcomes = dict[str, StepOutcome]
+
+
+def applied_with(
+    given: dict[str, Any], prepare: Callable[[FakeModule], object], *, save: bool = True
+) -> tuple[ModuleBench, AppliedSettings]:
+    """Values applied to a module that `prepare` has changed."""
+    bench, answers = ModuleBench(), list[AppliedSettings]()
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        await bench.pass_s(1)
+        prepare(bench.module)
+        answers.append(await bench.doing(bench.device.settings_apply(given, save=save)))
+
+    bench.play(story)
+    return bench, answers[0]
+
+
+def outcomes(applied: AppliedSettings) -> Outcomes:
+    return {step.name: step.outcome for step in applied.steps}
+
+
+WANTED = {"mode": "9-axis", "output": {"a": 10}, "mounting": "x_up", "offset_deg": 1.5}
+
+
+def test_a_refused_step_ends_it_and_nothing_is_saved() -> None:
+    bench, applied = applied_with(WANTED, lambda module: module.refuses.add("output"))
+    assert outcomes(applied) == {
+        "mode": StepOutcome.DONE, "output": StepOutcome.FAILED, "mounting": StepOutcome.NOT_DONE,
+        "offset_deg": StepOutcome.NOT_DONE,
+    }  # fmt: skip
+    assert applied.problem == (
+        'output: SET output={"a":10}: the module refused; what was written before holds until the device restarts'
+    )
+    assert not applied.saved
+    assert not applied.restarted
+    assert list(applied.differences) == ["output", "mounting", "offset_deg"]  # how it is now
+    assert bench.module.flash == FACTORY
+    assert bench.module.set == {**FACTORY, "mode": "9-axis"}
+
+
+def test_a_refused_first_step_leaves_all_as_it_was() -> None:
+    bench, applied = applied_with(WANTED, lambda module: module.refuses.add("mode"))
+    assert applied.problem == 'mode: SET mode="9-axis": the module refused; the device is as it was'
+    assert bench.module.set == FACTORY
+
+
+def test_a_step_that_reads_back_another_value_has_failed() -> None:
+    _bench, applied = applied_with(WANTED, lambda module: module.forgets.add("offset_deg"))
+    assert outcomes(applied)["offset_deg"] is StepOutcome.FAILED
+    assert applied.steps[-1].message == "wrote 1.5, read back 0.0"
+    assert not applied.saved
+
+
+def test_a_device_that_falls_silent_in_the_middle() -> None:
+    class Dying(set[str]):
+        """Commands not answered: none until the second setting."""
+
+        def __contains__(self, command: object) -> bool:
+            return any(one.startswith("SET output") for one in bench_of[0].commands)
+
+    bench_of: list[FakeModule] = []
+
+    def prepare(module: FakeModule) -> None:
+        bench_of.append(module)
+        module.silent = Dying()
+
+    _bench, applied = applied_with(WANTED, prepare)
+    assert outcomes(applied)["output"] is StepOutcome.FAILED
+    assert applied.problem == 'output: SET output={"a":10}: expected OK, got nothing; what it has now is not known'
+
+
+def test_a_setting_that_does_not_come_into_force_by_the_restart_has_failed() -> None:
+    _bench, applied = applied_with(
+        {"mounting": "x_up", "mode": "9-axis"}, lambda module: module.forgets.add("mounting")
+    )
+    assert outcomes(applied) == {"mode": StepOutcome.DONE, "mounting": StepOutcome.FAILED}
+    assert applied.problem == 'mounting: wrote "x_up", read back "level"'
+    assert (applied.saved, applied.restarted) == (True, True)
+
+
+def test_a_save_that_fails_says_that_all_is_set_and_not_saved() -> None:
+    _bench, applied = applied_with({"mode": "9-axis"}, lambda module: module.silent.add("SAVE"))
+    assert outcomes(applied) == {"mode": StepOutcome.DONE}
+    assert applied.problem == (
+        "not saved: SAVE: expected OK, got nothing; what was written before holds until the device restarts"
+    )
+
+
+def test_another_rate_is_followed() -> None:
+    bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda _module: None)
+    assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.DONE}
+    assert (bench.module.baud, bench.module.set["baud"], bench.module.saves) == (921600, 921600, 1)
+    assert (applied.problem, applied.saved) == ("", True)
+    assert bench.status.flash_writes == 1
+    assert bench.rig.kinds.count(EventKind.UP) == 1
+
+
+def test_a_rate_at_which_the_device_is_not_heard_is_left_again() -> None:
+    bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda module: module.forgets.add("baud"))
+    assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.FAILED}
+    assert "is not heard at 921600 baud; the line is at 115200 again" in applied.problem
+    assert bench.module.baud == 115200
+    assert list(applied.differences) == ["baud"]  # it was asked after it, and told
+    assert bench.status.flash_writes == 1  # the attempt counts
+
+
+def test_without_saving_nothing_is_written_that_saves() -> None:
+    bench, applied = applied_with({"baud": 921600, "mounting": "x_up", "mode": "9-axis"}, lambda _: None, save=False)
+    assert list(applied.left_out) == ["baud", "mounting"]
+    assert outcomes(applied) == {"mode": StepOutcome.DONE}
+    assert bench.module.flash == FACTORY
+
+
+# --- a backup before all is lost --------------------------------------------------------------------------------------
+
+
+def test_a_backup_is_made_before_a_factory_reset(tmp_path: Path) -> None:
+    bench = ModuleBench(state_dir=tmp_path)
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        bench.module.set["mode"] = "9-axis"
+        await bench.doing(bench.device.act("factory_reset", {}))
+        (file,) = (tmp_path / "backups").iterdir()
+        assert 'mode: "9-axis"' in file.read_text()
+        assert 'serial_number: "A1"' in file.read_text()
+        assert bench.told[-1].message == f"settings before factory_reset are in {file}"
+        assert bench.module.commands[-4:] == ["GET", "RESTART", "WHO", "GET"]  # then it is asked what it has now
+
+    bench.play(story)
+
+
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_reset_without_a_backup_says_so(silent: bool) -> None:
+    bench = ModuleBench()
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        await bench.pass_s(1)
+        bench.module.silent = {"GET"} if silent else set()
+        await bench.doing(bench.device.act("factory_reset", {}))
+        why = "GET: expected OK, got nothing" if silent else "there is no state directory"
+        assert bench.told[-1].message == f"no backup of the settings before factory_reset: {why}"
+        assert "RESTART" in bench.module.commands
+
+    bench.play(story)
