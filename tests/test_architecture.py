@@ -345,7 +345,6 @@ TESTED_IN = {
     "imud.runtime.health": "runtime/stream/test_transport.py",
     "imud.runtime.path": "runtime/stream/test_transport.py",
     "imud.runtime.polled.path": "runtime/polled/test_transport.py",
-    "imud.runtime.settings.apply": "runtime/settings/test_keeper.py",
     "imud.runtime.state_file": "runtime/detection/test_remembered.py",
     "imud.runtime.search_loop": "runtime/stream/test_transport.py",
     "imud.runtime.transport": "runtime/stream/test_transport.py",

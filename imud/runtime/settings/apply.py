@@ -17,6 +17,7 @@ from imud.contracts.device_settings import (
     Setting,
     SettingsPlan,
     StepOutcome,
+    Written,
 )
 from imud.contracts.settings import shown
 from imud.errors import CommandError, DeviceRefused, LinkError, TransferError
@@ -24,6 +25,9 @@ from imud.runtime.settings.difference import Values, as_json, differences
 
 DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
 """Raised where a device does not answer, does not take a value, or is gone."""
+
+UNVERIFIED: Final = (Written.UNVERIFIED, Written.UNVERIFIED_PENDING)
+PENDING: Final = (Written.PENDING, Written.UNVERIFIED_PENDING)
 
 RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]
 """`run_script` of a transport."""
@@ -56,6 +60,8 @@ class Applying:
     restarted: bool = False
     changed: bool = False
     """Whether anything was written."""
+    pending: bool = False
+    """Whether a script said that what it wrote comes into force by a restart, whatever the table says."""
     heard: bool = True
     """Whether the device answered to the newest question."""
     problem: str = ""
@@ -67,7 +73,7 @@ class Applying:
             done.append(await self._do(step) if not self.problem else _applied(step, StepOutcome.NOT_DONE))
         if not self.problem and plan.save:
             await self._save()
-        if not self.problem and plan.restart:
+        if not self.problem and (plan.restart or (self.pending and self.saved and self.table.restart is not None)):
             done = await self._restart(done)
         found = differences(self.table, self.wanted, self.actual, self.told)
         return AppliedSettings(
@@ -83,7 +89,7 @@ class Applying:
         try:
             if step.saves:
                 self.flash.count()
-            await self.run(lambda target: write(target, value))
+            result = await self.run(lambda target: write(target, value))
         except DEVICE_ERRORS as error:
             await self._read_again()
             return self._failed(step, str(error))
@@ -91,9 +97,12 @@ class Applying:
         self.saved |= step.saves
         if not await self._read_again():
             return self._failed(step, "written, and the device does not tell its settings since")
-        if not setting.readable:
+        if not setting.readable or (result in UNVERIFIED and step.name not in self.actual):
             self.told[step.name] = value
             return _applied(step, StepOutcome.NOT_VERIFIED)
+        if result in PENDING:
+            self.pending = True
+            return _applied(step, StepOutcome.WRITTEN)
         return self._judged(step, setting)
 
     def _judged(self, step: PlannedStep, setting: Setting) -> AppliedStep:
@@ -164,7 +173,7 @@ class Applying:
         if not self.heard:
             return "; what it has now is not known"
         if not self.changed:
-            return "; the device is as it was"
+            return "; nothing else was written"
         return "" if self.saved else "; what was written before holds until the device restarts"
 
 

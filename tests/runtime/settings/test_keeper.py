@@ -457,7 +457,7 @@ def test_a_refused_step_ends_it_and_nothing_is_saved() -> None:
 
 def test_a_refused_first_step_leaves_all_as_it_was() -> None:
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("mode"))
-    assert applied.problem == 'mode: SET mode="9-axis": the module refused; the device is as it was'
+    assert applied.problem == 'mode: SET mode="9-axis": the module refused; nothing else was written'
     assert bench.module.set == FACTORY
 
 

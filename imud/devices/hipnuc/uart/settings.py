@@ -305,6 +305,7 @@ SETTINGS: Final = DeviceSettings(
             type=_described(BaudRate, "rate of the line; saves all other settings too", "2.2.3", "bit/s"),
             write=_baud,
             connection=True,
+            saves=True,
         ),
     },
     read=_read,
