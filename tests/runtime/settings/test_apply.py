@@ -80,7 +80,7 @@ def test_written_read_back_saved_in_this_order() -> None:
         True,
         False,
         {},
-    )  # noqa: E501
+    )
     assert flash.counted == 1
 
 
