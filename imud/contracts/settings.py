@@ -161,7 +161,7 @@ def _words(info: inspect.Type) -> str:
         case inspect.StrType():
             words = "text" + _text_rules(info)
         case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item) | inspect.SetType(item_type=item):
-            words = f"a list, each of it {_words(item)}"
+            words = f"a list{_length(info)}, each of it {_words(item)}"
         case inspect.DictType(value_type=item):
             words = f"keys, each with {_words(item)}"
         case inspect.BoolType():
@@ -188,6 +188,13 @@ def _range(info: inspect.IntType | inspect.FloatType) -> str:
 
 def _bound(value: float | None) -> str:
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _length(info: inspect.ListType | inspect.VarTupleType | inspect.SetType) -> str:
+    low, high = info.min_length or 0, info.max_length
+    if high is None:
+        return f" of at least {low}" if low else ""
+    return f" of {high}" if low == high else f" of {low} to {high}"
 
 
 def _text_rules(info: inspect.StrType) -> str:

@@ -49,7 +49,8 @@ def main(arguments: list[str] | None = None) -> int:
         faults = Faults(options.seed, rates_from(options.faults)) if options.faults else None
         lines = _lines(options, module)
     except (ValueError, OSError) as error:
-        print(f"imud.sim: {reason_of(error)}", file=sys.stderr)
+        file = f"{error.filename}: " if isinstance(error, OSError) and error.filename else ""
+        print(f"imud.sim: {file}{reason_of(error)}", file=sys.stderr)
         return 2
     sharpen_timers()
     with closing(lines), ExitStack() as stack:

@@ -160,7 +160,7 @@ def tumble(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
     """A slow turning by hand into all directions, as for the calibration of a magnetometer: within a minute about each
     axis through more than 360°."""
     return Swing(
-        roll=(Sine(3.4, 0.043),), pitch=(Sine(1.4, 0.071),), yaw=(Sine(4.0, 0.029),), gravity_m_s2=gravity_m_s2
+        roll=(Sine(3.1, 0.043),), pitch=(Sine(1.4, 0.071),), yaw=(Sine(3.1, 0.037),), gravity_m_s2=gravity_m_s2
     )
 
 
