@@ -3,7 +3,7 @@
 # make soak   100 devices, 20 clients, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
-# make pictures   the pictures of README.md, into docs/pictures
+# make pictures   the pictures of README.md and docs/frames.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
 # make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
 SHELL := /bin/sh

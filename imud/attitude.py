@@ -20,6 +20,7 @@ from imud.sample import Quaternion, Vector3
 
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 """Rows of a 3 × 3 matrix."""
+IDENTITY: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 GIMBAL_COS_PITCH: Final = 1e-8
 """Below this cos(pitch), roll and yaw turn about the same axis: all of the turn is given to yaw. The error of doing so
@@ -136,6 +137,36 @@ def is_rotation(matrix: Matrix3, tolerance: float = 1e-6) -> bool:
     # written so that NaN is no rotation
     orthonormal = all(abs(_dot(a, b) - wanted) <= tolerance for a, b, wanted in products)
     return orthonormal and _dot(x, _cross(y, z)) > 0
+
+
+def matrix_product(a: Matrix3, b: Matrix3) -> Matrix3:
+    """a · b: first b, then a."""
+    columns = transposed(b)
+    first, second, third = (matrix_times(columns, row) for row in a)
+    return (first, second, third)
+
+
+def matrix_times(matrix: Matrix3, vector: Vector3) -> Vector3:
+    """matrix · vector."""
+    return (_dot(matrix[0], vector), _dot(matrix[1], vector), _dot(matrix[2], vector))
+
+
+def transposed(matrix: Matrix3) -> Matrix3:
+    """The transpose; of a rotation, the rotation back."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    return ((a, d, g), (b, e, h), (c, f, i))
+
+
+def quat_product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """a ⊗ b: first b, then a."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
 
 
 def _dot(a: Vector3, b: Vector3) -> float:

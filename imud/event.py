@@ -27,6 +27,8 @@ class EventKind(StrEnum):
     """The state of the port or bus changed, though the device may go on: a CAN controller became error-passive."""
     CALIBRATION = "calibration"
     """Progress of a guided calibration; `detail` has kind, phase, and what was measured. At most twice a second."""
+    ATTITUDE = "attitude"
+    """Gravity contradicts the attitude or the mounting at rest; the message says what is likely wrong."""
     BAD_FRAME = "bad-frame"
     """A damaged or unknown frame was heard. Sent at most once a second and device."""
 

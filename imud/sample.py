@@ -105,6 +105,7 @@ class FieldInfo(msgspec.Struct, frozen=True):
 
 
 _SENSOR: Final = "sensor frame, right-handed"
+_VECTORS: Final = "frame of the device, right-handed"
 _MONOTONIC: Final = "CLOCK_MONOTONIC"
 
 SAMPLE_SCHEMA: Final = (
@@ -116,9 +117,9 @@ SAMPLE_SCHEMA: Final = (
     FieldInfo("t_rx_ns", "integer", "ns", _MONOTONIC, "when the last byte was read", True),
     FieldInfo("utc_ns", "integer", "ns", "CLOCK_REALTIME", "t_ns as time since 1970-01-01 UTC", True),
     FieldInfo("t_dev_ns", "integer", "ns", "device clock", "device time, unwrapped", False),
-    FieldInfo("accel_m_s2", "number[3]", "m/s²", _SENSOR, "specific force; +g on the axis that points up", False),
-    FieldInfo("gyro_rad_s", "number[3]", "rad/s", _SENSOR, "angular rate", False),
-    FieldInfo("mag_t", "number[3]", "T", _SENSOR, "magnetic flux density", False),
+    FieldInfo("accel_m_s2", "number[3]", "m/s²", _VECTORS, "specific force; +g on the axis that points up", False),
+    FieldInfo("gyro_rad_s", "number[3]", "rad/s", _VECTORS, "angular rate", False),
+    FieldInfo("mag_t", "number[3]", "T", _VECTORS, "magnetic flux density", False),
     FieldInfo("quat_wxyz", "number[4]", "", "body to navigation_frame of the device", "attitude, scalar first", False),
     FieldInfo("euler_rad", "number[3]", "rad", "euler_convention of the device", "roll, pitch, yaw", False),
     FieldInfo("temperature_c", "number", "°C", "", "temperature of the sensor", False),

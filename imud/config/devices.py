@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from imud.config.claims import clashes
 from imud.config.declared import DeclaredReader
+from imud.config.frames import check_declination, read_frame
 from imud.config.keys import Keys
 from imud.config.model import DeviceConfig
 from imud.config.schema import DeviceGeneral, Tables
@@ -65,13 +66,14 @@ class DeviceReader:
         if keys is None:
             return None
         own = DeviceGeneral.__struct_fields__
-        self._keys.unknown_keys(path, keys, [*own, "options", "settings", "lines", "rmc", *self._tables.links])
+        self._keys.unknown_keys(path, keys, [*own, "options", "settings", "lines", "rmc", "frame", *self._tables.links])
         general = self._keys.settings(DeviceGeneral, path, {key: keys[key] for key in own if key in keys})
         options = self._options(path, keys)
         declared = self._declared.read(path, keys)
         link = self._link(path, keys)
         lines = read_lines(self._keys, (*path, "lines"), keys, self._tables.drivers)
         rmc = read_rmc(self._keys, (*path, "rmc"), keys, self._tables.drivers)
+        frame = read_frame(self._keys, (*path, "frame"), keys)
         if general is None or link is None:
             return None
         link_name, link_settings = link
@@ -81,9 +83,11 @@ class DeviceReader:
         self._usable(path, general.driver, link_name, link_settings)
         if declared is not None:
             self._declared.check(path, general.driver, declared, options, link_settings)
+        check_declination(self._keys, path, general, options, self._tables.drivers)
         line = self._keys.tree.key_mark(path).line
         own_keys = general.driver, options, general.identify, link_name, link_settings
-        return DeviceConfig(name, *own_keys, line, lines, rmc, declared, general.on_difference), general.enabled
+        more = declared, general.on_difference, frame, general.convention, general.declination_deg
+        return DeviceConfig(name, *own_keys, line, lines, rmc, *more), general.enabled
 
     def _options(self, path: KeyPath, keys: Mapping[str, Any]) -> Settings | None:
         driver = keys.get("driver", "auto")

@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 from imud.contracts.device_settings import OnDifference
 from imud.contracts.lines import DeviceLines
 from imud.contracts.settings import Settings
+from imud.frames.conventions import Convention
+from imud.frames.settings import FrameSettings
 from imud.utc.source import RmcSettings
 
 
@@ -32,6 +34,12 @@ class DeviceConfig:
     """Values that its own settings should have, an instance of `DeviceSettings.declarable`; None for no declaration."""
     on_difference: OnDifference = OnDifference.REPORT
     """What imud does where they are others."""
+    frame: FrameSettings | None = None
+    """How the sensor lies in its body; None to publish its own axes."""
+    convention: Convention | None = None
+    """Convention of what is published; None for the device's own, and for enu-flu beside `frame`."""
+    declination_deg: float | None = None
+    """True heading minus magnetic heading; None to leave the heading as it is."""
 
 
 @dataclass(frozen=True, slots=True)

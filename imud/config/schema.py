@@ -14,6 +14,7 @@ from imud.contracts.device_settings import DeviceSettings, OnDifference
 from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
+from imud.frames.conventions import Convention, Heading
 from imud.links import LINKS
 from imud.publishers import PUBLISHERS
 
@@ -39,6 +40,10 @@ class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
     on_difference: OnDifference = OnDifference.REPORT
     """What imud does where the device is not as `settings` declare: report it, apply them, or apply and save to the
     device's flash."""
+    convention: Convention | None = None
+    """Axes and angles of what is published; null for the device's own, or with `frame` for enu-flu (docs/frames.md)."""
+    declination_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)] | None = None
+    """True north as seen from magnetic north, east positive: makes a magnetic heading true; null to leave it."""
 
 
 class Row(Protocol):
@@ -65,6 +70,11 @@ class DriverRow(Row, Protocol):
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
         """Return what does not work in the driver's options together with a link's settings."""
+        ...
+
+    @property
+    def heading(self) -> Callable[[Any, Mapping[str, str]], Heading]:
+        """Reference of yaw, from an instance of `settings` and the device's own settings (empty: not known yet)."""
         ...
 
 

@@ -13,6 +13,7 @@ from imud.contracts.lines import AlarmRanges
 from imud.contracts.session import RequestScript
 from imud.contracts.settings import Settings
 from imud.contracts.timing import NO_TIME_BITS, TimeBits
+from imud.frames.conventions import RFU_ENU, DeviceAxes, Heading
 from imud.ledger import Ledger
 
 SAMPLE_COUNTER = 0
@@ -46,6 +47,10 @@ def no_problems(_options: Any, _link: Any) -> Sequence[KeyProblem]:
     return ()
 
 
+def _unknown_heading(_settings: object, _read_back: Mapping[str, str]) -> Heading:
+    return Heading.UNKNOWN
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Driver:
     """Fields that drivers of all wire protocols have; the links that a driver can use follow from its kind."""
@@ -64,6 +69,10 @@ class Driver:
     """Order, axes and signs of `euler_rad`, in words."""
     navigation_frame: str
     """The frame that `quat_wxyz` turns into, for example `ENU`."""
+    axes: DeviceAxes = RFU_ENU
+    """The same of its axes, angles and navigation frame, for conversions."""
+    heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
+    """Reference of yaw, from an instance of `settings` and the device's own settings as read back (empty: none yet)."""
     actions: Actions = field(default_factory=dict)
     """Commands that the device executes, by name."""
     calibrations: Calibrations = field(default_factory=dict)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from imud.contracts.action import Actions
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
@@ -11,8 +11,12 @@ from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.errors import CommandError
 from imud.event import Event
 from imud.formats.slot import encode_slot
+from imud.frames.conventions import Convention
+from imud.frames.published import PublishedFrame, as_sent
 from imud.sample import Sample
 
+AS_SENT: Final = as_sent()
+"""Axes and angles of HiPNUC modules: what a batch has of which nothing else is said."""
 StatusSource = Callable[[], Sequence[DeviceStatus]]
 """The state of every device now. To be called in the event loop's thread only."""
 
@@ -20,14 +24,17 @@ StatusSource = Callable[[], Sequence[DeviceStatus]]
 class Batch:
     """Samples completed by one read of one device, oldest first, at least one; shared by all publishers, immutable."""
 
-    __slots__ = ("_slots", "device", "device_id", "samples")
+    __slots__ = ("_converted", "_slots", "device", "device_id", "frame", "samples")
 
-    def __init__(self, device: str, device_id: int, samples: Sequence[Sample]) -> None:
+    def __init__(self, device: str, device_id: int, samples: Sequence[Sample], frame: PublishedFrame = AS_SENT) -> None:
         self.device = device
         self.device_id = device_id
         """The daemon's number of the device, as in slots."""
         self.samples = samples
+        self.frame = frame
+        """Axes and angles of the samples."""
         self._slots: list[bytes] | None = None
+        self._converted: dict[Convention, Batch] | None = None
 
     def slots(self) -> list[bytes]:
         """The samples as slots (`imud.formats.slot`), encoded on first use."""
@@ -35,6 +42,19 @@ class Batch:
             device_id = self.device_id
             self._slots = [encode_slot(sample, device_id) for sample in self.samples]
         return self._slots
+
+    def converted(self, convention: Convention | None) -> "Batch":
+        """Return the samples in a convention, turned on first use; None is as they are published."""
+        rotation = None if convention is None else self.frame.rotation_to(convention)
+        if convention is None or rotation is None:
+            return self
+        if self._converted is None:
+            self._converted = {}
+        made = self._converted.get(convention)
+        if made is None:
+            made = Batch(self.device, self.device_id, rotation.samples(self.samples), self.frame)
+            self._converted[convention] = made
+        return made
 
 
 class Publisher(Protocol):

@@ -5,6 +5,8 @@ from enum import StrEnum
 import msgspec
 
 from imud.contracts.device_settings import SettingsStatus
+from imud.frames.conventions import Heading
+from imud.frames.published import FrameWords
 from imud.sample import Sync
 
 
@@ -152,6 +154,27 @@ class UtcStatus(msgspec.Struct, frozen=True):
     chrony_refused: int = 0
 
 
+class FrameStatus(msgspec.Struct, frozen=True):
+    """Axes, angles and heading of the samples of one device."""
+
+    frame: str
+    """Axes of vectors: those of the sensor, or of the body that it is mounted in."""
+    convention: str
+    """`enu-flu` or `ned-frd`; `device`: as the device sends them."""
+    euler_convention: str
+    """Order, axes and signs of `euler_rad`."""
+    navigation_frame: str
+    """The frame that `quat_wxyz` turns into."""
+    heading: Heading
+    """Reference of yaw."""
+    declination_deg: float | None
+    """Added to the heading; None without one."""
+    conventions: dict[str, FrameWords]
+    """What a client gets that asks for a convention, by its name."""
+    problem: str = ""
+    """Contradiction of gravity to attitude or mounting, or of the heading to the configuration; empty for none."""
+
+
 LATENCY_BOUNDS_NS = (
     50_000,
     100_000,
@@ -198,9 +221,11 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     connects: int
     """Times the link was opened since start."""
     euler_convention: str = ""
-    """Order, axes and signs of `euler_rad`, from the driver; empty while the driver is not known."""
+    """Order, axes and signs of `euler_rad` as published; empty while the driver is not known."""
     navigation_frame: str = ""
     """The frame that `quat_wxyz` turns into; empty while the driver is not known."""
+    frame: FrameStatus | None = None
+    """Axes and angles of what is published; None while the driver is not known."""
     polling: PollingStatus | None = None
     """None for a device that sends by itself."""
     serial_line: SerialLineCounters | None = None

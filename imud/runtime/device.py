@@ -28,6 +28,7 @@ from imud.ledger import Ledger
 from imud.log import printable, shown
 from imud.runtime.attachments import AttachmentHooks, Attachments
 from imud.runtime.calibration.guide import Guide
+from imud.runtime.frame_watch import FrameWatch
 from imud.runtime.health import Health
 from imud.runtime.identity import KnownIdentity, identity_words
 from imud.runtime.meters import LatencyMeter, RateMeter
@@ -93,6 +94,7 @@ class Device:
             self._can_be_asked, transport.read_back,
         )  # fmt: skip
         self._attachments.add(self._settings)
+        self._frame = FrameWatch(config, self._notices)
         self._rate = RateMeter()
         self._connects = 0
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -130,6 +132,7 @@ class Device:
             path.flush(now_ns)
         if transport.receiving:
             self._watch_flow(path, now_ns)
+        self._frame.tick(now_ns, path)
         self._notices.tick(now_ns, path.newest.sync if path.newest else None)
 
     def close(self) -> None:
@@ -331,12 +334,14 @@ class Device:
         path, driver = transport.path, transport.driver
         newest = path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
+        frame = self._frame.status(driver, path, self._identity.settings)
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,
             driver=driver.name if driver else self.config.driver,
-            euler_convention=driver.euler_convention if driver else "",
-            navigation_frame=driver.navigation_frame if driver else "",
+            euler_convention=frame.euler_convention if frame else "",
+            navigation_frame=frame.navigation_frame if frame else "",
+            frame=frame,
             link=transport.where,
             state=health.state,
             problem=health.problem,

@@ -14,8 +14,9 @@ from imud.config import DeviceConfig
 from imud.contracts.can import CanCodec
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, Message, ReplyFrame, StreamCodec, TextLine
 from imud.contracts.driver import Driver
-from imud.contracts.publisher import Batch
+from imud.contracts.publisher import AS_SENT, Batch
 from imud.formats.can import CanFrame
+from imud.frames.published import PublishedFrame
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.runtime.meters import LatencyMeter, LossMeter
@@ -38,6 +39,8 @@ class PathContext:
     overruns: Callable[[], int]
     """Overruns that the kernel counted since the link was opened."""
     host: HostClock
+    frame: PublishedFrame = AS_SENT
+    """Axes and angles of what is published."""
 
 
 class SamplePath(ABC):
@@ -48,6 +51,8 @@ class SamplePath(ABC):
         self.latency = LatencyMeter()
         self.loss = LossMeter(context.ledger)
         self.newest: Sample | None = None
+        """As the device sent it, in the sensor's own axes."""
+        self.frame = context.frame
         self.begun_ns = 0
         """CLOCK_MONOTONIC when the link was last given to this path."""
         self.last_data_ns = 0
@@ -56,6 +61,7 @@ class SamplePath(ABC):
         self._device = context.device
         self._device_id = context.device_id
         self._ledger = context.ledger
+        self._rotation = context.frame.rotation
         self._publish = context.publish
         self._on_message = context.on_message
         self._on_bad_frame = context.on_bad_frame
@@ -123,7 +129,9 @@ class SamplePath(ABC):
         self._ledger.samples += len(samples)
         self.newest = samples[-1]
         self.last_sample_ns = t_rx_ns
-        self._publish(Batch(self._device, self._device_id, samples))
+        if self._rotation is not None:
+            samples = self._rotation.samples(samples)
+        self._publish(Batch(self._device, self._device_id, samples, self.frame))
         now_ns = self._now_ns()
         add = self.latency.add
         for sample in samples:

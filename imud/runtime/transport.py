@@ -16,6 +16,7 @@ from imud.contracts.driver import Driver
 from imud.contracts.link import Link, OnEnd
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
+from imud.frames.settings import published_frame
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.runtime.attachments import Attachments
@@ -45,15 +46,16 @@ class DeviceContext:
     attachments: Attachments
     publish: Callable[[Batch], None]
 
-    def path_context(self, link: Link, on_message: Callable[[Message, int], None]) -> PathContext:
-        """Return what every sample path of the device needs; messages of the device go to `on_message`."""
+    def path_context(self, driver: Driver, link: Link, on_message: Callable[[Message, int], None]) -> PathContext:
+        """Return what the sample path of what `driver` decodes needs; messages of the device go to `on_message`."""
+        config = self.config
 
         def overruns() -> int:
             return link.kernel_counters().overrun
 
         return PathContext(
-            self.config.name, self.device_id, self.ledger, self.publish, on_message, self.notices.bad_frame, overruns,
-            self.host,
+            config.name, self.device_id, self.ledger, self.publish, on_message, self.notices.bad_frame, overruns,
+            self.host, published_frame(config.frame, config.convention, config.declination_deg, driver.axes),
         )  # fmt: skip
 
     def new_clock(self, driver: Driver, path: SamplePath | None) -> SampleClock:

@@ -24,6 +24,7 @@ from imud.contracts.driver import KeyProblem
 from imud.contracts.settings import NoSettings, Settings, expected, got
 from imud.devices import DRIVERS
 from imud.errors import ConfigError
+from imud.frames.conventions import Heading
 from imud.links import LINKS
 from imud.publishers import PUBLISHERS
 from tests.support import references
@@ -64,6 +65,7 @@ class FakeRow:
     settings: type[Settings]
     searchable: bool = True
     lines: frozenset[str] = frozenset()
+    heading: Callable[[Any, Mapping[str, str]], Heading] = lambda _settings, _read_back: Heading.UNKNOWN
     refuses: type[Settings] | None = None
     """Settings of a driver that does not fit this link."""
     faults: tuple[KeyProblem, ...] = ()

@@ -1,7 +1,8 @@
-"""Draws the pictures of README.md into docs/pictures: `python -m tests.support.pictures` (`make pictures`).
+"""Draws the pictures of README.md and docs/frames.md: `python -m tests.support.pictures` (`make pictures`).
 
 `terminal.svg` is what the commands print, run on a simulated module; `time_stamps.svg` is a simulation whose truth is
-known: a module at 100 Hz behind a USB adapter that holds bytes for up to 16 ms.
+known: a module at 100 Hz behind a USB adapter that holds bytes for up to 16 ms. `frame_axes.svg` and
+`frame_mountings.svg` of docs/frames.md are drawn from the rotations that imud uses.
 """
 
 import subprocess
@@ -10,11 +11,16 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
+from math import hypot
 from pathlib import Path
 from typing import NamedTuple
 
+from imud.attitude import IDENTITY, Matrix3, matrix_times, transposed
 from imud.cli.demo.command import daemon, device, simulator
 from imud.client import Client
+from imud.frames.conventions import FLU_LEVEL, RFU_ENU, Convention, body_axes
+from imud.frames.mounting import matrix_from_axes
+from imud.sample import Vector3
 from imud.sim.ports.arrival import USB_16MS, ArrivalModel, Crystal
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.clock import run
@@ -179,6 +185,142 @@ def time_stamps(samples: Sequence[Stamp]) -> str:
     return svg(760, 540, "Error of time stamps behind a USB adapter with a latency timer of 16 ms", parts)
 
 
+# --- axes and mountings -----------------------------------------------------------------------------------------------
+
+COLOURS = ("#c0392b", "#2e8b57", "#1f5fa8")
+"""Of x, y, z."""
+FORWARD, LEFT, UP = (0.80, -0.42), (-0.76, -0.34), (0.0, -0.95)
+"""Where the body's axes point on the page, per unit of length."""
+BODY_PANEL, MOUNTING_PANEL = (250, 275), (250, 260)
+
+
+def on_page(vector: Vector3, scale: float) -> tuple[float, float]:
+    """Place on the page of a vector in the body (x forward, y left, z up), seen from behind, right and above."""
+    x, y, z = vector
+    return (
+        scale * (x * FORWARD[0] + y * LEFT[0] + z * UP[0]),
+        scale * (x * FORWARD[1] + y * LEFT[1] + z * UP[1]),
+    )
+
+
+def arrow(centre: tuple[float, float], vector: Vector3, scale: float, label: str, fill: str) -> Iterator[str]:
+    """An arrow from the centre along a vector of the body, with a label at its head."""
+    dx, dy = on_page(vector, scale)
+    x, y = centre[0] + dx, centre[1] + dy
+    length = hypot(dx, dy)
+    ux, uy = dx / length, dy / length
+    head = [(x, y), (x - 11 * ux - 4.5 * uy, y - 11 * uy + 4.5 * ux), (x - 11 * ux + 4.5 * uy, y - 11 * uy - 4.5 * ux)]
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in head)
+    line = f"M{centre[0]:.1f} {centre[1]:.1f}L{x - 8 * ux:.1f} {y - 8 * uy:.1f}"
+    yield f"<path d='{line}' stroke='{fill}' stroke-width='3'/>"
+    yield f"<polygon points='{points}' fill='{fill}'/>"
+    yield text(x + 13 * ux, y + 13 * uy + 5, label, f"text-anchor='middle' style='fill:{fill};font-weight:bold'")
+
+
+def block(centre: tuple[float, float], mounting: Matrix3, size: Vector3, scale: float, fill: str) -> Iterator[str]:
+    """A flat box in the sensor's axes as it lies in the body; the dot is on its top, at the end of its x axis."""
+    corners = {
+        (i, j, k): on_page(matrix_times(mounting, (i * size[0], j * size[1], k * size[2])), scale)
+        for i in (-1, 1)
+        for j in (-1, 1)
+        for k in (-1, 1)
+    }
+    faces = []
+    for axis in range(3):
+        for side in (-1, 1):
+            normal = [0.0, 0.0, 0.0]
+            normal[axis] = side
+            outward = matrix_times(mounting, (normal[0], normal[1], normal[2]))
+            if outward[0] * -0.55 + outward[1] * -0.55 + outward[2] * 0.6 > 0.01:  # towards the eye
+                faces.append([corners[key] for key in _around(axis, side)])
+    for face in faces:
+        points = " ".join(f"{centre[0] + x:.1f},{centre[1] + y:.1f}" for x, y in face)
+        yield f"<polygon points='{points}' fill='{fill}' fill-opacity='0.75' stroke='#555' stroke-linejoin='round'/>"
+
+
+def _around(axis: int, side: int) -> list[tuple[int, int, int]]:
+    """The corners of one face, around it."""
+    found = []
+    for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1)):
+        key = [a, b]
+        key.insert(axis, side)
+        found.append((key[0], key[1], key[2]))
+    return found
+
+
+def columns(matrix: Matrix3) -> Matrix3:
+    """The sensor's x, y, z axes in the body."""
+    return transposed(matrix)
+
+
+def axes_panel(left: float, title: str, lines: Sequence[str], to_body: Matrix3) -> Iterator[str]:
+    """A body that points forward, with the axes of vectors in it."""
+    centre = (left + BODY_PANEL[0] / 2, 132.0)
+    yield text(left + 12, 24, title, "style='font-weight:bold'")
+    yield from block(centre, IDENTITY, (0.45, 0.28, 0.12), 70, "#e8edf3")
+    nose = on_page((0.45, 0.0, 0.12), 70)
+    yield f"<circle cx='{centre[0] + nose[0]:.1f}' cy='{centre[1] + nose[1]:.1f}' r='4' fill='#555'/>"
+    for axis, name, fill in zip(columns(to_body), "xyz", COLOURS, strict=True):
+        yield from arrow(centre, axis, 84, name, fill)
+    for number, line in enumerate(lines):
+        yield text(left + 12, 258 + 18 * number, line)
+
+
+def frame_axes() -> str:
+    """The axes of both families and of both conventions, on a body that points to the upper right."""
+    panels = (
+        ("HiPNUC, as sent", ("roll about y: right side down", "pitch about x: nose up", "yaw 0 north, + to the left"),
+         RFU_ENU.to_body),
+        ("IMU61x, as sent (assumed)", ("roll about x: left side up", "pitch about y: nose down", "yaw + to the left"),
+         FLU_LEVEL.to_body),
+        ("enu-flu", ("roll about x: left side up", "pitch about y: nose down", "yaw 0 east, + to the left"),
+         transposed(body_axes(Convention.ENU_FLU))),
+        ("ned-frd", ("roll about x: right side down", "pitch about y: nose up", "yaw 0 north, + to the right"),
+         transposed(body_axes(Convention.NED_FRD))),
+    )  # fmt: skip
+    width, height = BODY_PANEL[0] * len(panels), BODY_PANEL[1] + 40
+    parts = [f"<rect width='{width}' height='{height}' fill='#fff'/>"]
+    for number, (title, lines, to_body) in enumerate(panels):
+        parts += axes_panel(BODY_PANEL[0] * number, title, lines, to_body)
+    return svg(
+        width, height, "Axes of devices and of both conventions; the dot is the front, positive angles below", parts
+    )
+
+
+MOUNTINGS = (
+    ("lies straight", "x", "y", "z"),
+    ("upside down", "x", "-y", "-z"),
+    ("turned 90° to the left", "-y", "x", "z"),
+    ("turned 90° to the right", "y", "-x", "z"),
+    ("on its right side", "x", "-z", "y"),
+    ("its x axis points up", "-z", "y", "x"),
+)
+"""Title and `axes` of a sensor whose own axes are x forward, y left, z up on its top."""
+
+
+def frame_mountings() -> str:
+    """Sensors in a body that points to the upper right, with the axes that are printed on them."""
+    per_row = 3
+    rows = -(-len(MOUNTINGS) // per_row)
+    width, height = MOUNTING_PANEL[0] * per_row, MOUNTING_PANEL[1] * rows
+    parts = [f"<rect width='{width}' height='{height}' fill='#fff'/>"]
+    for number, (title, x, y, z) in enumerate(MOUNTINGS):
+        left, top = MOUNTING_PANEL[0] * (number % per_row), MOUNTING_PANEL[1] * (number // per_row)
+        centre = (left + MOUNTING_PANEL[0] / 2, top + 118.0)
+        matrix = matrix_from_axes(x, y, z)
+        parts.append(text(left + 12, top + 22, title, "style='font-weight:bold'"))
+        parts += arrow((left + 22, top + 212), (1.0, 0.0, 0.0), 46, "front", "#999")
+        parts += block(centre, matrix, (0.45, 0.35, 0.12), 70, "#f3ecd9")
+        for axis, name, fill in zip(columns(matrix), "xyz", COLOURS, strict=True):
+            parts += arrow(centre, axis, 74, name, fill)
+        parts.append(text(left + 12, top + 240, f"axes: {{x: {x}, y: {y}, z: {z}}}"))
+    return svg(
+        width, height, "Mountings of a sensor and the axes to configure; x, y, z are printed on the sensor", parts
+    )
+
+
 if __name__ == "__main__":
+    (FOLDER / "frame_axes.svg").write_text(frame_axes())
+    (FOLDER / "frame_mountings.svg").write_text(frame_mountings())
     (FOLDER / "terminal.svg").write_text(terminal(session()))
     (FOLDER / "time_stamps.svg").write_text(time_stamps(stamps()))

@@ -21,6 +21,7 @@ from imud.contracts.settings import Settings, expected, shown
 from imud.devices import DRIVERS
 from imud.formats.ring import HEADER_FIELDS
 from imud.formats.slot import PRESENT_BITS, SLOT_FIELDS, SYNC_CODES, SlotField
+from imud.frames.settings import FrameSettings, MountingAngles, MountingAxes
 from imud.ledger import LEDGER_FIELDS
 from imud.signals.line_actions import RESET, TRIGGER
 from imud.utc.source import RmcSettings
@@ -66,6 +67,9 @@ def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
         yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
     for name, schema in LINE_SCHEMAS.items():
         yield f"Line `{name}`: {LINE_TITLES[name]}", f"devices.NAME.lines.{name}.", schema
+    yield "How the sensor lies in its body (`docs/frames.md`)", "devices.NAME.frame.", FrameSettings
+    yield "Axes of the sensor in the body", "devices.NAME.frame.axes.", MountingAxes
+    yield "Angles of the sensor in the body", "devices.NAME.frame.euler.", MountingAngles
     yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcSettings
 
 

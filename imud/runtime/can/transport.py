@@ -129,7 +129,7 @@ class CanTransport:
         self.driver = driver
         self._options = options
         self._codec = driver.make_codec(context.ledger, options)
-        self.path = CanPath(self._codec, clock, context.path_context(self.link, self._exchange.on_message))
+        self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self._exchange.on_message))
 
     def _begin(self) -> None:
         """Give frames that come from now on to the device's codec."""

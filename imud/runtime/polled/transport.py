@@ -186,7 +186,7 @@ class PolledTransport:
             self._ready.edges if self._ready is not None else None,
         )
         self.driver = driver
-        self.path = PolledPath(codec, timing, clock, context.path_context(self.link, _ignore_message))
+        self.path = PolledPath(codec, timing, clock, context.path_context(driver, self.link, _ignore_message))
         return self.path
 
     def _candidates(self) -> list[PolledDriver]:

@@ -122,7 +122,7 @@ class StreamTransport:
         context = self._context
         clock = context.new_clock(driver, self.path)
         codec = driver.make_codec(self._ledger, self._config.options or driver.settings())
-        path_context = context.path_context(self.link, self._exchange.on_message)
+        path_context = context.path_context(driver, self.link, self._exchange.on_message)
         self.driver = driver
         self.path = StreamPath(codec, clock, path_context, context.attachments.drain_edges, self._exchange)
         return self.path

@@ -7,7 +7,7 @@ CONFIG YAW turns it about the vertical.
 
 from math import cos, hypot, pi, sin
 
-from imud.attitude import Matrix3, euler312_from_quat, quat_from_euler312, quat_from_matrix
+from imud.attitude import Matrix3, euler312_from_quat, quat_from_euler312, quat_from_matrix, quat_product
 from imud.sample import Quaternion, Vector3
 from imud.sim.physics.motion import Truth
 
@@ -26,15 +26,15 @@ class MountingRotation:
     ) -> None:
         self.active = yaw_rad != 0.0 or frame != UPRIGHT or level != UPRIGHT
         self._frame = frame
-        self._accel = multiplied(frame, level) if level_accel else frame
-        self._body = multiplied(frame, level)
+        self._accel = quat_product(frame, level) if level_accel else frame
+        self._body = quat_product(frame, level)
         self._heading = (cos(yaw_rad / 2), 0.0, 0.0, sin(yaw_rad / 2))
 
     def turned(self, truth: Truth) -> Truth:
         """Rotate a truth from the chip's frame to that of the mounted module."""
         if not self.active:
             return truth
-        quat_wxyz = multiplied(multiplied(self._heading, truth.quat_wxyz), self._body)
+        quat_wxyz = quat_product(quat_product(self._heading, truth.quat_wxyz), self._body)
         return truth._replace(
             accel_m_s2=turned_back(self._accel, truth.accel_m_s2),
             gyro_rad_s=turned_back(self._frame, truth.gyro_rad_s),
@@ -55,25 +55,13 @@ def level_of(quat_wxyz: Quaternion, upside_down: bool = False) -> Quaternion:
     """The turn about the body after which roll and pitch read 0° (or 180° and 0°) and yaw what it was."""
     yaw = euler312_from_quat(quat_wxyz)[2]
     w, x, y, z = quat_wxyz
-    return multiplied((w, -x, -y, -z), quat_from_euler312((pi if upside_down else 0.0, 0.0, yaw)))
-
-
-def multiplied(a: Quaternion, b: Quaternion) -> Quaternion:
-    """a ⊗ b: first b, then a."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
+    return quat_product((w, -x, -y, -z), quat_from_euler312((pi if upside_down else 0.0, 0.0, yaw)))
 
 
 def turned_back(quat_wxyz: Quaternion, vector: Vector3) -> Vector3:
     """Cᵀ · v, where C is the matrix of the unit quaternion."""
     w, x, y, z = quat_wxyz
-    _, vx, vy, vz = multiplied(multiplied((w, -x, -y, -z), (0.0, *vector)), quat_wxyz)
+    _, vx, vy, vz = quat_product(quat_product((w, -x, -y, -z), (0.0, *vector)), quat_wxyz)
     return vx, vy, vz
 
 

@@ -4,16 +4,16 @@ from math import pi, radians
 
 import pytest
 
-from imud.attitude import euler312_from_quat, matrix_from_quat, quat_from_euler312
+from imud.attitude import euler312_from_quat, matrix_from_quat, quat_from_euler312, quat_product
 from imud.sim.physics.motion import Still, swing
-from imud.sim.physics.mounting import UPRIGHT, MountingRotation, frame_of, level_of, multiplied, turned_back
+from imud.sim.physics.mounting import UPRIGHT, MountingRotation, frame_of, level_of, turned_back
 
 A = quat_from_euler312((0.3, -0.5, 2.0))
 B = quat_from_euler312((-1.0, 0.2, -0.7))
 
 
 def test_product_is_the_product_of_the_matrices() -> None:
-    a, b, ab = matrix_from_quat(A), matrix_from_quat(B), matrix_from_quat(multiplied(A, B))
+    a, b, ab = matrix_from_quat(A), matrix_from_quat(B), matrix_from_quat(quat_product(A, B))
     for i in range(3):
         for j in range(3):
             assert ab[i][j] == pytest.approx(sum(a[i][k] * b[k][j] for k in range(3)), abs=1e-12)
@@ -41,7 +41,7 @@ def test_nearly_orthonormal_matrices_become_rotations() -> None:
 
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_level_keeps_yaw(upside_down: bool) -> None:
-    roll, pitch, yaw = euler312_from_quat(multiplied(A, level_of(A, upside_down)))
+    roll, pitch, yaw = euler312_from_quat(quat_product(A, level_of(A, upside_down)))
     assert abs(roll) == pytest.approx(pi if upside_down else 0.0, abs=1e-12)
     assert pitch == pytest.approx(0.0, abs=1e-12)
     assert yaw == pytest.approx(2.0, abs=1e-12)

@@ -1,5 +1,6 @@
 """Table: the row `DRIVER` of heading and attitude sensors on NMEA 2000."""
 
+from collections.abc import Mapping
 from random import Random
 from typing import Final
 
@@ -12,6 +13,7 @@ from imud.devices.hipnuc.nmea2000.codec import HipnucNmea2000Codec, HipnucNmea20
 from imud.devices.hipnuc.nmea2000.messages import Reference
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import filter_of, sender_of
+from imud.frames.conventions import Heading
 
 EXAMPLE_SOURCE: Final = 35
 
@@ -40,6 +42,12 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     return sender_of(can_id, extended, data, messages.PGNS)
 
 
+def _heading(settings: object, _read_back: Mapping[str, str]) -> Heading:
+    """By the heading that is used; with `auto` the first that is received, which is not known beforehand."""
+    chosen = settings.heading if isinstance(settings, HipnucNmea2000Settings) else "auto"
+    return Heading.UNKNOWN if chosen == "auto" else Heading(chosen)
+
+
 DRIVER: Final = CanDriver(
     name="hipnuc-nmea2000",
     title="HiPNUC CH0x0, CH10x, HI14, other heading and attitude sensors (CAN, NMEA 2000)",
@@ -51,6 +59,7 @@ DRIVER: Final = CanDriver(
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above, "
     "0 with the bow to the north of the heading's reference; NaN for an angle that is not sent",
     navigation_frame="ENU",
+    heading=_heading,
     node_of=_node_of,
     node_settings=lambda source: HipnucNmea2000Settings(source=source),
     node_title=lambda source: f"source {source}",

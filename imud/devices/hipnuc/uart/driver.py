@@ -7,6 +7,7 @@ from typing import Any, Final
 from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.codec import StreamCodec
 from imud.contracts.driver import Identity, StreamDriver
+from imud.devices.hipnuc.common.heading import heading_by_mode
 from imud.devices.hipnuc.uart.actions import ACTIONS
 from imud.devices.hipnuc.uart.alarm import alarm_ranges
 from imud.devices.hipnuc.uart.calibrations import CALIBRATIONS
@@ -61,6 +62,7 @@ DRIVER: Final = StreamDriver(
     tick_modulus=2**32,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
     navigation_frame="ENU",
+    heading=heading_by_mode,
     lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
     alarm_ranges=alarm_ranges,
     time_bits=TIME_BITS,

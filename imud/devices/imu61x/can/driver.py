@@ -15,8 +15,9 @@ from imud.devices.imu61x.can.codec import (
     Imu61xCanSettings,
     encode_set,
 )
-from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector
+from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector, relative_heading
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
+from imud.frames.conventions import FLU_LEVEL
 
 
 def _example_frames(random: Random) -> list[CanFrame]:
@@ -52,6 +53,8 @@ DRIVER: Final = CanDriver(
     tick_modulus=INDEX_MODULUS,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
+    axes=FLU_LEVEL,
+    heading=relative_heading,
     node_of=_node_of,
     node_settings=lambda base_id: Imu61xCanSettings(base_id=base_id),
     node_title=lambda base_id: f"base_id {base_id}",

@@ -13,6 +13,7 @@ from typing import Annotated, Final, Literal, get_args
 
 from msgspec import Meta
 
+from imud.frames.conventions import Heading
 from imud.sample import Vector3
 from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 
@@ -58,6 +59,12 @@ NAVIGATION_FRAME: Final = (
     "level, Z up; heading from power-on or the last heading reset (assumed, the manual states none)"
 )
 """The frame that `quat_wxyz`, computed from the Euler angles, turns into."""
+
+
+def relative_heading(_settings: object, _read_back: Mapping[str, str]) -> Heading:
+    """Return the reference of yaw: the module has no magnetometer (assumed, as NAVIGATION_FRAME)."""
+    return Heading.RELATIVE
+
 
 # --- identity (tables 22 and 28) --------------------------------------------------------------------------------------
 

@@ -22,9 +22,11 @@ from imud.devices.imu61x.common.family import (
     filter_codes,
     filter_control,
     product_of,
+    relative_heading,
 )
 from imud.devices.polled_frames import absence
 from imud.errors import BadArgument, DeviceRefused
+from imud.frames.conventions import FLU_LEVEL
 from imud.ledger import Ledger
 from imud.units import NS_PER_S
 
@@ -137,6 +139,8 @@ def register_driver(
         settings=settings,
         euler_convention=EULER_CONVENTION,
         navigation_frame=NAVIGATION_FRAME,
+        axes=FLU_LEVEL,
+        heading=relative_heading,
         lines=frozenset({"reset", "data_ready"}),
         link=bus,
         targets=targets,

@@ -5,12 +5,13 @@ from typing import Final
 
 from imud.contracts.driver import StreamDriver
 from imud.contracts.settings import NoSettings
-from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector
+from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector, relative_heading
 from imud.devices.imu61x.uart.actions import ACTIONS
 from imud.devices.imu61x.uart.calibrations import CALIBRATIONS
 from imud.devices.imu61x.uart.codec import TIMER_MODULUS, Imu61xCodec, encode_ahrs
 from imud.devices.imu61x.uart.commands import BAUD_RATES
 from imud.devices.imu61x.uart.session import identify, read_settings, wake
+from imud.frames.conventions import FLU_LEVEL
 from imud.units import NS_PER_US
 
 
@@ -35,6 +36,8 @@ DRIVER: Final = StreamDriver(
     tick_modulus=TIMER_MODULUS,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
+    axes=FLU_LEVEL,
+    heading=relative_heading,
     lines=frozenset({"reset"}),
     actions=ACTIONS,
     calibrations=CALIBRATIONS,

@@ -1,0 +1,111 @@
+"""The keys frame, convention and declination_deg: every way to give a rotation, and every mistake with its place."""
+
+import pytest
+
+from imud import config
+from imud.config import DeviceConfig
+from imud.errors import ConfigError
+from imud.frames.conventions import Convention, EulerOrder
+from imud.frames.settings import FrameSettings, MountingAngles, MountingAxes
+
+HEAD = """\
+devices:
+  bow:
+    driver: {driver}
+    uart: {{port: /dev/ttyUSB0}}
+"""
+
+
+def device(keys: str, driver: str = "hipnuc-uart") -> DeviceConfig:
+    """The device with more keys."""
+    (made,) = config.parse(HEAD.format(driver=driver) + keys, "f.yaml").devices
+    return made
+
+
+def problem(keys: str, driver: str = "hipnuc-uart") -> str:
+    """The only problem that these keys make."""
+    with pytest.raises(ConfigError) as caught:
+        device(keys, driver)
+    (line,) = str(caught.value).splitlines()
+    return line
+
+
+def test_without_the_keys_nothing_is_turned() -> None:
+    plain = device("")
+    assert (plain.frame, plain.convention, plain.declination_deg) == (None, None, None)
+
+
+def test_every_way() -> None:
+    axes = device("    frame: {axes: {x: y, y: -x, z: z}}\n    convention: ned-frd\n    declination_deg: -3.5\n")
+    assert axes.frame == FrameSettings(axes=MountingAxes(x="y", y="-x", z="z"))
+    assert (axes.convention, axes.declination_deg) == (Convention.NED_FRD, -3.5)
+    angles = device("    frame: {euler: {roll_deg: 90, yaw_deg: -30.5}, level_roll_deg: 0.4}\n").frame
+    assert angles == FrameSettings(euler=MountingAngles(roll_deg=90.0, yaw_deg=-30.5), level_roll_deg=0.4)
+    quat = device("    frame: {quat_wxyz: [0, 1, 0, 0], heading_offset_deg: 3, level_at_rest: false}\n").frame
+    assert quat == FrameSettings(quat_wxyz=[0.0, 1.0, 0.0, 0.0], heading_offset_deg=3.0, level_at_rest=False)
+    down = device("    frame: {z_down: true, euler_order: zxy}\n", "imu61x-uart").frame
+    assert down == FrameSettings(z_down=True, euler_order=EulerOrder.ZXY)
+    assert device("    frame: {}\n").frame == FrameSettings()
+
+
+def test_two_ways_are_refused() -> None:
+    assert problem("    frame: {axes: {x: x, y: y, z: z}, quat_wxyz: [1, 0, 0, 0]}\n") == (
+        "f.yaml:5:39: devices.bow.frame.quat_wxyz: expected one way to give the rotation (axes, euler, quat_wxyz), got "
+        "axes and quat_wxyz"
+    )
+
+
+def test_a_mirror_image_is_refused() -> None:
+    line = problem("    frame:\n      axes: {x: y, y: x, z: z}\n")
+    assert line.startswith("f.yaml:6:13: devices.bow.frame.axes: expected right-handed axes, got a mirror image")
+    assert line.endswith("with these x and y, z is -z")
+
+
+def test_axes_that_are_not_at_right_angles_are_refused() -> None:
+    assert "three different axes" in problem("    frame: {axes: {x: x, y: x, z: z}}\n")
+    assert "of length 1" in problem("    frame: {quat_wxyz: [1, 1, 0, 0]}\n")
+
+
+def test_unknown_words_are_refused_with_the_known_ones() -> None:
+    assert problem("    frame: {axes: {x: u, y: x, z: z}}\n") == (
+        'f.yaml:5:23: devices.bow.frame.axes.x: expected one of "-x", "-y", "-z", "x", "y", "z", got "u"'
+    )
+    assert "expected the key z" in problem("    frame: {axes: {x: y, y: x}}\n")
+    assert "did you mean yaw_deg?" in problem("    frame: {euler: {yaw: 3}}\n")
+    assert "did you mean level_roll_deg?" in problem("    frame: {roll_deg: 3}\n")
+    assert 'expected one of "enu-flu", "ned-frd", or null, got "enu"' in problem("    convention: enu\n")
+    assert "expected keys and values" in problem("    frame: upside-down\n")
+    assert "expected keys and values" in problem("    frame: {axes: z_up}\n")
+    assert "from -45 to 45" in problem("    frame: {level_pitch_deg: 90}\n")
+    assert "quat_wxyz" in problem("    frame: {quat_wxyz: [1, 0, 0]}\n")
+    assert "from -180 to 180" in problem("    declination_deg: 181\n")
+
+
+def test_a_declination_needs_a_magnetic_heading() -> None:
+    assert device("    declination_deg: 3\n").declination_deg == 3.0
+    line = problem("    declination_deg: 3\n", "imu61x-uart")
+    assert line.endswith("got it with imu61x-uart, whose heading counts from power-on")
+    assert line.startswith("f.yaml:5:5: devices.bow.declination_deg: ")
+    assert "only beside a named driver" in problem("    declination_deg: 3\n", "auto")
+    nmea = "devices:\n  bow:\n    driver: hipnuc-nmea2000\n    socketcan: {interface: can0}\n    declination_deg: 1\n"
+    assert config.parse(nmea, "f.yaml").devices[0].declination_deg == 1
+    with pytest.raises(ConfigError, match="whose heading is true already"):
+        config.parse(nmea + "    options: {heading: 'true'}\n", "f.yaml")
+
+
+def test_a_change_of_the_frame_is_a_change_of_the_device() -> None:
+    before, after = (config.parse(HEAD.format(driver="auto") + keys, "f.yaml") for keys in ("", "    frame: {}\n"))
+    assert config.differences(before, after).devices_changed == ("bow",)
+
+
+def test_the_shipped_examples_show_the_defaults() -> None:
+    from tests.config.test_reading import SHIPPED, uncommented
+
+    devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
+    frames = {device.name: device.frame for device in devices if device.frame is not None}
+    assert frames == {
+        "crane": FrameSettings(axes=MountingAxes(x="y", y="-x", z="z")),
+        "pole": FrameSettings(euler=MountingAngles()),
+        "mirror": FrameSettings(quat_wxyz=[1.0, 0.0, 0.0, 0.0]),
+    }
+    assert {(device.convention, device.declination_deg) for device in devices} == {(None, None)}

@@ -1,0 +1,262 @@
+"""The check of gravity at rest: silent for right conventions and in motion, a cause for each mistake."""
+
+from collections.abc import Iterator
+from math import cos, radians, sin
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from imud.attitude import (
+    Matrix3,
+    matrix_from_quat,
+    matrix_times,
+    quat_from_euler312,
+    quat_from_euler_zyx,
+    transposed,
+)
+from imud.frames.conventions import FLU_LEVEL, RFU_ENU, DeviceAxes, EulerOrder
+from imud.frames.gravity import SAMPLES_MIN, WINDOW_NS, Contradiction, Finding, GravityCheck, nearest_axis
+from imud.frames.mounting import matrix_from_axes
+from imud.sample import Sample, Sync, Vector3
+from imud.units import NS_PER_S
+
+G = 9.80665
+TICK_NS = NS_PER_S // 10
+FRD = DeviceAxes(order=EulerOrder.ZYX, has_north=False, z_down=True)
+
+
+def zyx(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0, z_down: bool = False) -> Sample:
+    """A sample at rest of a device with ZYX whose attitude is true."""
+    euler = (radians(roll_deg), radians(pitch_deg), radians(yaw_deg))
+    quat = quat_from_euler_zyx(euler)
+    x, y, z = matrix_times(transposed(matrix_from_quat(quat)), (0, 0, -G if z_down else G))
+    return Sample(
+        "bow", 1, 0, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(x, y, z), gyro_rad_s=(0, 0, 0), quat_wxyz=quat, euler_rad=euler
+    )
+
+
+def zxy(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0) -> Sample:
+    """A sample at rest of a device with ZXY (312) whose attitude is true."""
+    euler = (radians(roll_deg), radians(pitch_deg), radians(yaw_deg))
+    quat = quat_from_euler312(euler)
+    accel = matrix_times(transposed(matrix_from_quat(quat)), (0, 0, G))
+    return replace(zyx(0, 0), accel_m_s2=accel, quat_wxyz=quat, euler_rad=euler)
+
+
+def ticks(sample: Sample, seconds: float = 5.2, start: int = 1) -> Iterator[Sample]:
+    """The same values ten times a second."""
+    for number in range(start, start + int(seconds * 10)):
+        yield replace(sample, seq=number, t_ns=number * TICK_NS)
+
+
+def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -> Finding | None:
+    """What a window of rest finds; one window is judged in it."""
+    check = GravityCheck(device, mounting)
+    assert sum(check.add(one) for one in ticks(sample)) == 1
+    return check.finding
+
+
+@given(st.floats(-179, 179), st.floats(-89, 89), st.floats(-180, 180))
+def test_nothing_is_found_in_any_attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> None:
+    assert found(FLU_LEVEL, zyx(roll_deg, pitch_deg, yaw_deg)) is None
+    assert found(FRD, zyx(roll_deg, pitch_deg, yaw_deg, z_down=True)) is None
+    assert found(RFU_ENU, zxy(roll_deg, pitch_deg, yaw_deg)) is None
+
+
+@pytest.mark.parametrize("member", ["quat_wxyz", "euler_rad"])
+@pytest.mark.parametrize(("roll", "pitch"), [(0, 0), (25, 0), (10, -30), (170, 20)])
+def test_the_z_axis_points_down(member: str, roll: float, pitch: float) -> None:
+    """Seen from one of the two members; the other one is absent."""
+    one = zyx(roll, pitch, z_down=True)
+    one = replace(one, quat_wxyz=None) if member == "euler_rad" else replace(one, euler_rad=None)
+    finding = found(FLU_LEVEL, one)
+    assert finding is not None
+    assert finding.kind is Contradiction.Z_AXIS
+    assert "set frame: {z_down: true}" in finding.message
+    assert member in finding.message
+    assert finding.angle_deg == pytest.approx(180)
+
+
+def test_z_down_is_said_of_a_device_whose_z_axis_points_up() -> None:
+    finding = found(FRD, zyx(10, 5))
+    assert finding is not None
+    assert (finding.kind, "take z_down out of frame" in finding.message) == (Contradiction.Z_AXIS, True)
+
+
+def test_the_words_name_the_axes() -> None:
+    finding = found(FLU_LEVEL, zyx(0, 0, z_down=True))
+    assert finding is not None
+    assert finding.message == (
+        "at rest the acceleration says that up is -z of the sensor, quat_wxyz says +z, 180° away: its z axis points "
+        "the other way; set frame: {z_down: true} (docs/frames.md)"
+    )
+
+
+@pytest.mark.parametrize(("roll", "pitch"), [(30, 0), (0, 30), (25, -35)])
+def test_the_angles_turn_about_other_axes(roll: float, pitch: float) -> None:
+    """A device with ZXY that is taken for one with ZYX, and the reverse."""
+    said = zxy(roll, pitch)
+    assert said.euler_rad is not None
+    finding = found(FLU_LEVEL, replace(said, quat_wxyz=quat_from_euler_zyx(said.euler_rad)))
+    assert finding is not None
+    assert (finding.kind, "{euler_order: zxy}" in finding.message) == (Contradiction.ORDER, True)
+    said = zyx(roll, pitch)
+    assert said.euler_rad is not None
+    finding = found(RFU_ENU, replace(said, quat_wxyz=quat_from_euler312(said.euler_rad)))
+    assert finding is not None
+    assert (finding.kind, "{euler_order: zyx}" in finding.message) == (Contradiction.ORDER, True)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [((-1, 1), "roll has the opposite sign"), ((1, -1), "pitch has the opposite sign"),
+     ((-1, -1), "roll and pitch have the opposite sign")],
+)  # fmt: skip
+@pytest.mark.parametrize("device", [FLU_LEVEL, RFU_ENU], ids=["zyx", "zxy"])
+def test_an_angle_has_the_opposite_sign(device: DeviceAxes, wrong: tuple[int, int], words: str) -> None:
+    right, said = [
+        (zyx if device is FLU_LEVEL else zxy)(30 * roll, 40 * pitch) for roll, pitch in ((1, 1), wrong)
+    ]  # fmt: skip
+    finding = found(device, replace(said, accel_m_s2=right.accel_m_s2))
+    assert finding is not None
+    assert (finding.kind, words in finding.message) == (Contradiction.SIGN, True), finding.message
+
+
+def test_roll_and_pitch_are_exchanged() -> None:
+    finding = found(FLU_LEVEL, replace(zyx(20, 60), accel_m_s2=zyx(60, 20).accel_m_s2))
+    assert finding is not None
+    assert "roll and pitch are exchanged" in finding.message
+
+
+def test_no_simple_cause_is_said_to_be_none() -> None:
+    finding = found(FLU_LEVEL, replace(zyx(0, 0), accel_m_s2=(0.5 * G, 0.6 * G, (1 - 0.25 - 0.36) ** 0.5 * G)))
+    assert finding is not None
+    assert finding.kind is Contradiction.ATTITUDE
+    assert "(+0.50, +0.60, +0.62)" in finding.message
+
+
+def test_euler_angles_that_contradict_are_found_beside_a_quaternion_that_agrees() -> None:
+    finding = found(FLU_LEVEL, replace(zyx(0, 0), euler_rad=(radians(30), 0.0, 0.0)))
+    assert finding is not None
+    assert "euler_rad says" in finding.message
+
+
+# --- the mounting -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("axes", "sample", "side"),
+    [
+        (("x", "y", "z"), zyx(180, 0), "bottom"),  # mounted upside down, and the file says nothing of it
+        (("x", "-y", "-z"), zyx(0, 0), "bottom"),  # the file says so, and it is not
+        (("x", "-z", "y"), zyx(-90, 0), "bottom"),  # on the other side than the file says
+        (("x", "y", "z"), zyx(90, 0), "left"),
+        (("x", "y", "z"), zyx(0, -90), "front"),
+        (("-y", "x", "z"), zyx(0, 90), "right"),  # its x axis points down, and the body's left is that axis
+    ],
+)
+def test_a_body_that_does_not_stand_level(axes: tuple[str, str, str], sample: Sample, side: str) -> None:
+    finding = found(FLU_LEVEL, sample, matrix_from_axes(*axes))
+    assert finding is not None
+    assert finding.kind is Contradiction.MOUNTING
+    assert f"makes the {side} of the body" in finding.message
+    up = nearest_axis(sample.accel_m_s2 or (0, 0, 0))
+    assert f"axes needs z: {up};" in finding.message
+    assert found(FLU_LEVEL, sample) is None, "without a mounting nothing is known of a body"
+
+
+@pytest.mark.parametrize(
+    ("axes", "sample"),
+    [
+        (("x", "-y", "-z"), zyx(180, 0)), (("x", "-z", "y"), zyx(90, 0)), (("z", "y", "-x"), zyx(0, 90)),
+        (("-y", "x", "z"), zyx(30, 20)), (("x", "y", "z"), zyx(40, 0)),
+    ],
+)  # fmt: skip
+def test_a_right_mounting(axes: tuple[str, str, str], sample: Sample) -> None:
+    """On a slope of 40° too."""
+    assert found(FLU_LEVEL, sample, matrix_from_axes(*axes)) is None
+
+
+def test_a_mounting_between_two_axes_names_none() -> None:
+    tilted = replace(zyx(0, 0), accel_m_s2=(0, -0.6 * G, -0.8 * G), quat_wxyz=None, euler_rad=None)
+    finding = found(FLU_LEVEL, tilted, matrix_from_axes("x", "y", "z"))
+    assert finding is not None
+    assert "up is the sensor's -z axis" in finding.message
+    between = replace(tilted, accel_m_s2=(0.57735 * G, -0.57735 * G, -0.57735 * G))
+    finding = found(FLU_LEVEL, between, matrix_from_axes("x", "y", "z"))
+    assert finding is not None
+    assert "correct the mounting" in finding.message
+
+
+# --- rest and motion --------------------------------------------------------------------------------------------------
+
+WRONG = zyx(0, 0, z_down=True)
+
+
+def judged(samples: Iterator[Sample]) -> int:
+    """Number of windows that are judged."""
+    check = GravityCheck(FLU_LEVEL)
+    return sum(check.add(one) for one in samples)
+
+
+def test_motion_is_not_judged() -> None:
+    assert judged(ticks(WRONG, 60)) == 60 // 5 - 1, "each takes a tick more than 5 s"
+    turning = (0.0, 0.06, 0.0)
+    assert judged(replace(one, gyro_rad_s=turning) for one in ticks(WRONG, 60)) == 0
+    driving: Vector3 = (0.0, 2.7, -G)  # 1.04 g
+    assert judged(replace(one, accel_m_s2=driving) for one in ticks(WRONG, 60)) == 0
+    swinging = (replace(one, gyro_rad_s=(sin(one.t_ns / 1e9), 0, 0)) for one in ticks(WRONG, 60))
+    assert judged(swinging) == 0, "slow for moments only"
+
+
+def test_a_bias_of_gyroscope_and_accelerometer_is_rest() -> None:
+    biased = (replace(one, gyro_rad_s=(0.02, -0.02, 0.01), accel_m_s2=(0.1, 0.1, -9.7)) for one in ticks(WRONG))
+    assert judged(biased) == 1
+
+
+def test_one_sample_in_motion_begins_anew() -> None:
+    samples = list(ticks(WRONG, 9.9))
+    samples[49] = replace(samples[49], gyro_rad_s=(1.0, 0, 0))
+    assert judged(iter(samples)) == 0, "4.9 s before it and 5 s after it"
+    assert judged(iter(list(ticks(WRONG, 10.3)))) == 2
+
+
+def test_a_pause_begins_anew() -> None:
+    early, late = list(ticks(WRONG, 4)), list(ticks(WRONG, 4, start=80))
+    assert judged(iter([*early, *late])) == 0
+
+
+def test_the_same_sample_counts_once() -> None:
+    """Between two samples of a slow device the check is called several times."""
+    check = GravityCheck(FLU_LEVEL)
+    assert not any(check.add(replace(WRONG, t_ns=number * NS_PER_S)) for number in range(20))
+    slow = [replace(WRONG, seq=number, t_ns=number * NS_PER_S) for number in range(7)]
+    assert judged(one for one in slow for _ in range(10)) == 1
+    assert WINDOW_NS // NS_PER_S >= SAMPLES_MIN
+
+
+def test_what_has_no_vectors_is_left_out() -> None:
+    assert judged(replace(one, gyro_rad_s=None) for one in ticks(WRONG, 20)) == 0
+    assert judged(replace(one, accel_m_s2=None) for one in ticks(WRONG, 20)) == 0
+    assert found(FLU_LEVEL, replace(WRONG, quat_wxyz=None, euler_rad=None)) is None
+    unknown = replace(WRONG, quat_wxyz=(0, 0, 0, 0), euler_rad=(float("nan"), 0.0, 0.0))
+    assert found(FLU_LEVEL, unknown) is None
+
+
+def test_the_finding_ends_when_rest_shows_no_contradiction() -> None:
+    check = GravityCheck(FLU_LEVEL)
+    assert any(check.add(one) for one in ticks(WRONG))
+    assert check.finding is not None
+    right = ticks(zyx(0, 0), start=100)
+    assert any(check.add(one) for one in right)
+    assert check.finding is None
+
+
+def test_an_error_of_a_sensor_is_no_contradiction() -> None:
+    """15° of difference come from acceleration and from a filter that is not settled; 25° do not."""
+    for angle_deg, is_found in ((15, False), (25, True)):
+        tilt = radians(angle_deg)
+        one = replace(zyx(0, 0), accel_m_s2=(G * sin(tilt), 0, G * cos(tilt)))
+        assert (found(FLU_LEVEL, one) is not None) == is_found
