@@ -8,6 +8,7 @@ import msgspec
 from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import table
 from imud.devices import DRIVERS
+from imud.frames.conventions import Convention
 from imud.sample import SAMPLE_SCHEMA, Sample
 from imud.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
 
@@ -22,6 +23,10 @@ def watch_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rate", type=float, default=None, metavar="HZ", help="at most this many samples a second each"
     )
+    parser.add_argument(
+        "--convention", choices=[str(one) for one in Convention], default=None,
+        help="axes and angles of the samples (default: as configured)",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="one JSON object per line, SI units")
     parser.add_argument("--count", type=int, default=None, metavar="N", help="stop after N samples")
 
@@ -30,7 +35,7 @@ def watch(args: argparse.Namespace) -> int:
     """Print until interrupted, until N samples came, or until the daemon ends."""
     show = as_json if args.json else as_text
     with connect(args) as client:
-        samples = client.watch(args.device or None, rate_hz=args.rate)
+        samples = client.watch(args.device or None, rate_hz=args.rate, convention=args.convention)
         for number, sample in enumerate(samples, start=1):
             print(show(sample), flush=True)
             if number == args.count:

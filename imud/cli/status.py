@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect, statuses
-from imud.contracts.status import DeviceStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
+from imud.contracts.status import DeviceStatus, FrameStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.ledger import bytes_open, frames_open, lost
 from imud.units import NS_PER_MS, NS_PER_US
 
@@ -49,7 +49,17 @@ def block(status: DeviceStatus) -> str:
         f" + {ledger['bytes_pending']} pending: {'closed' if closes(ledger) else 'DOES NOT CLOSE'}",
         f"  kernel    {status.kernel.overrun} overruns, {status.kernel.framing} framing, {status.kernel.parity} parity",
     ]
+    if status.frame is not None:
+        lines.insert(3, f"  axes      {axes(status.frame)}")
     return "\n".join([*lines, *(f"  {name:<10}{words}" for name, words in parts(status))])
+
+
+def axes(frame: FrameStatus) -> str:
+    """Format axes, heading, and what contradicts them."""
+    words = f"{frame.convention}: {frame.frame}; heading {frame.heading}"
+    if frame.declination_deg is not None:
+        words += f" by a declination of {frame.declination_deg:g}°"
+    return words + (f" ({frame.problem})" if frame.problem else "")
 
 
 def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:

@@ -12,7 +12,7 @@ import errno
 import os
 import socket
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from time import monotonic
 from types import TracebackType
@@ -112,9 +112,10 @@ class Client:
         """Descriptions of the members of samples: `fields`, `devices`, `slot`."""
         return msgspec.convert(self.call("schema"), dict[str, Any])
 
-    def poll(self, devices: Iterable[str] | None = None) -> list[Sample]:
-        """Request the newest sample of each device that has one."""
-        reply = self.call("poll", devices=_listed(devices))
+    def poll(self, devices: Iterable[str] | None = None, convention: str | None = None) -> list[Sample]:
+        """Request the newest sample of each device that has one; `convention` as for `watch`."""
+        reply = self.call("poll", devices=_listed(devices), convention=convention)
+        _check_convention(reply, convention)
         return [sample_of(params) for params in reply["samples"]]
 
     def call(self, method: str, **params: object) -> Any:
@@ -141,16 +142,21 @@ class Client:
         rate_hz: float | None = None,
         encoding: str = "binary",
         timeout_s: float | None = None,
+        convention: str | None = None,
     ) -> Watch:
         """Subscribe to samples; an endless iterator that replaces an earlier one. None asks for all.
 
         `fields` names the values that are wanted of JSON samples, the others are None then; binary ones are complete
-        always. Waiting longer than `timeout_s` for a sample raises TimeoutError.
+        always. `convention` is `enu-flu` or `ned-frd`, None for what the configuration says; ServerError where the
+        daemon does not know it. Waiting longer than `timeout_s` for a sample raises TimeoutError.
         """
         wanted = None if fields is None else sorted({*fields, "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
-        reply = self.call("watch", devices=_listed(devices), fields=wanted, rate_hz=rate_hz, encoding=encoding)
+        reply = self.call(
+            "watch", devices=_listed(devices), fields=wanted, rate_hz=rate_hz, encoding=encoding, convention=convention
+        )
         if encoding == "binary":
             self._framed = True
+        _check_convention(reply, convention)
         self._end_watch()
         while self.kept_message(Watch.NAMES) is not None:
             pass  # of the earlier one
@@ -296,6 +302,12 @@ def rpc_error(error: object) -> RpcError:
 
 def _is_one_of(message: Message, names: frozenset[str]) -> bool:
     return "sample" in names if isinstance(message, bytes) else message.get("method") in names
+
+
+def _check_convention(reply: Mapping[str, Any], convention: str | None) -> None:
+    """Raise ServerError where the daemon ignored the convention."""
+    if convention is not None and reply.get("convention") != convention:
+        raise ServerError(f"the daemon gives no samples as {convention}: it is older than this client")
 
 
 def _listed(names: Iterable[str] | None) -> list[str] | None:

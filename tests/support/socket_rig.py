@@ -15,9 +15,10 @@ from typing import Any, Self, TypeVar
 
 from imud.contracts.action import Action, Actions, Target
 from imud.contracts.control.calibration import Calibration, CalibrationResult, Calibrations, Check, Handling, Kept
-from imud.contracts.publisher import Batch, PublisherContext
-from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
+from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, FrameStatus, KernelCounters
 from imud.errors import Rejected
+from imud.frames.conventions import Convention, Heading
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.sample import Sample, Sync
 
@@ -77,6 +78,15 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
         connects=1,
         euler_convention="roll, pitch, yaw; 312 order",
         navigation_frame="ENU",
+        frame=FrameStatus(
+            frame=AS_SENT.device.words,
+            convention="device",
+            euler_convention="roll, pitch, yaw; 312 order",
+            navigation_frame="ENU",
+            heading=Heading.MAGNETIC,
+            declination_deg=None,
+            conventions={str(one): AS_SENT.words_of(one) for one in Convention},
+        ),
     )
 
 

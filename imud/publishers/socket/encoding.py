@@ -7,6 +7,7 @@ from typing import Final, Protocol
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import FRAME_HEADER, encode, encode_notification, frame_of, line_of
 from imud.formats.slot import SLOT_BYTES
+from imud.frames.conventions import Convention
 from imud.sample import Sample
 
 ALWAYS_FIELDS: Final = ("device", "seq", "t_ns")
@@ -92,6 +93,31 @@ class BinaryEncoding:
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
         """Put `dropped` notifications before the slot."""
         return b"".join((*(_dropped_notice(name, count, frame_of) for name, count in dropped.items()), message))
+
+
+class ConvertedEncoding:
+    """Another encoding, of samples in a convention that the client asked for."""
+
+    def __init__(self, encoding: Encoding, convention: Convention) -> None:
+        self._encoding = encoding
+        self._convention = convention
+
+    @property
+    def message_bytes(self) -> int:
+        """Size of the message that was encoded last."""
+        return self._encoding.message_bytes
+
+    def encode(self, batch: Batch) -> list[bytes]:
+        """Every sample of the batch as a message."""
+        return self._encoding.encode(batch.converted(self._convention))
+
+    def encode_one(self, batch: Batch, index: int) -> bytes:
+        """One sample of the batch as a message."""
+        return self._encoding.encode_one(batch.converted(self._convention), index)
+
+    def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
+        """Add the number of samples dropped, as the other encoding does."""
+        return self._encoding.with_dropped(message, device, dropped)
 
 
 def selector(fields: tuple[str, ...]) -> Callable[[Sample], dict[str, object]]:

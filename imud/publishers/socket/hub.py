@@ -14,7 +14,6 @@ from imud.publishers.socket.outbox import Pool
 from imud.publishers.socket.quota import Quota, Seldom
 from imud.publishers.socket.serving import TokenBucket
 from imud.publishers.socket.subscription import DeliveryPlan, FormKey, Subscription
-from imud.sample import Sample
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ class Hub:
         self._time = time
         self._pool = pool
         self._devices: dict[str, int] = {}
-        self._newest: dict[str, Sample] = {}
+        self._newest: dict[str, Batch] = {}
         self._connections: dict[int, Connection] = {}
         self._subscriptions: dict[int, Subscription] = {}
         self._events: dict[int, Collection[str] | None] = {}
@@ -59,8 +58,8 @@ class Hub:
         return self._devices
 
     @property
-    def newest(self) -> Mapping[str, Sample]:
-        """The newest sample of each device that has one."""
+    def newest(self) -> Mapping[str, Batch]:
+        """The newest sample of each device that has one: the last of its batch."""
         return self._newest
 
     @property
@@ -86,7 +85,7 @@ class Hub:
     def publish(self, batch: Batch) -> None:
         """Send a batch to all clients that watch its device."""
         device = batch.device
-        self._newest[device] = batch.samples[-1]
+        self._newest[device] = batch
         plan = self._plans.get(device)
         if plan is None:
             plan = self._plans[device] = self._new_plan(device)

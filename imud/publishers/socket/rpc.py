@@ -9,7 +9,9 @@ import msgspec
 from imud import __version__
 from imud.contracts.action import described
 from imud.contracts.control.calibration import infos
+from imud.contracts.publisher import Batch
 from imud.contracts.settings import wrong_values
+from imud.contracts.status import DeviceStatus
 from imud.errors import ImudError
 from imud.formats.jsonrpc import (
     PROTOCOL,
@@ -22,13 +24,14 @@ from imud.formats.jsonrpc import (
     parse_request,
 )
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
+from imud.frames.conventions import Convention
 from imud.publishers.socket.connection import Connection
 from imud.publishers.socket.encoding import selector
 from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.outbox import NO_FD
 from imud.publishers.socket.rights import Rights
 from imud.publishers.socket.subscription import Form, Subscription
-from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA
+from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
 
 RATE_MIN_HZ: Final = 0.001
 """Slower than one sample in 1,000 s is a mistake of units more likely than a wish; `poll` serves it."""
@@ -46,12 +49,13 @@ class NoParams(msgspec.Struct):
 
 
 class WatchParams(msgspec.Struct):
-    """Parameters of `watch`; what is left out or null means all, all, every sample, JSON."""
+    """Parameters of `watch`; what is left out or null means all, all, every sample, JSON, as the device is set."""
 
     devices: list[str] | None = None
     fields: list[str] | None = None
     rate_hz: float | None = None
     encoding: Form = Form.JSON
+    convention: Convention | None = None
 
 
 class PollParams(msgspec.Struct):
@@ -59,6 +63,7 @@ class PollParams(msgspec.Struct):
 
     devices: list[str] | None = None
     fields: list[str] | None = None
+    convention: Convention | None = None
 
 
 class EventsParams(msgspec.Struct):
@@ -209,15 +214,27 @@ def _status(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
 
 def _schema(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
     """What the members of samples mean, per device where that differs, and how a slot is laid out."""
-    devices = {
-        device.name: {
-            "driver": device.driver,
-            "euler_convention": device.euler_convention,
-            "navigation_frame": device.navigation_frame,
-        }
-        for device in hub.context.status()
-    }
+    devices = {device.name: _frame_of(device) for device in hub.context.status()}
     return Answer({"protocol": PROTOCOL, "fields": SAMPLE_SCHEMA, "devices": devices, "slot": SLOT_SCHEMA})
+
+
+def _frame_of(device: DeviceStatus) -> dict[str, object]:
+    """Axes and angles of a device's samples; without a known driver only that."""
+    known: dict[str, object] = {
+        "driver": device.driver,
+        "euler_convention": device.euler_convention,
+        "navigation_frame": device.navigation_frame,
+    }
+    frame = device.frame
+    if frame is not None:
+        known |= {
+            "frame": frame.frame,
+            "convention": frame.convention,
+            "heading": frame.heading,
+            "declination_deg": frame.declination_deg,
+            "conventions": frame.conventions,
+        }
+    return known
 
 
 SLOT_SCHEMA: Final = {
@@ -239,9 +256,12 @@ def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
     fields = _known_fields(params.fields)
     rate_hz = _rate(params.rate_hz)
     framed = connection.framed or params.encoding is Form.BINARY
-    hub.subscribe(connection, Subscription(devices, fields, rate_hz, params.encoding, framed))
+    wanted = Subscription(devices, fields, rate_hz, params.encoding, framed, params.convention)
+    hub.subscribe(connection, wanted)
     numbers = hub.devices if devices is None else {name: hub.devices[name] for name in devices}
-    result = {"encoding": params.encoding, "devices": numbers, "rate_hz": rate_hz}
+    result = {
+        "encoding": params.encoding, "devices": numbers, "rate_hz": rate_hz, **_convention_of(params.convention)
+    }  # fmt: skip
     return Answer(result, framed_from_here=params.encoding is Form.BINARY)
 
 
@@ -255,9 +275,21 @@ def _poll(hub: Hub, _connection: Connection, params: PollParams) -> Answer:
     """The newest sample of each device that has one."""
     names = _known_devices(hub, params.devices) or tuple(hub.devices)
     fields = _known_fields(params.fields)
-    newest = [hub.newest[name] for name in names if name in hub.newest]
+    newest = [_newest_of(hub.newest[name], params.convention) for name in names if name in hub.newest]
     samples = newest if fields is None else list(map(selector(fields), newest))
-    return Answer({"now_ns": hub.context.now_ns(), "samples": samples})
+    return Answer({"now_ns": hub.context.now_ns(), "samples": samples, **_convention_of(params.convention)})
+
+
+def _convention_of(convention: Convention | None) -> dict[str, object]:
+    """The convention that the client asked for, as a member of the reply."""
+    return {} if convention is None else {"convention": convention}
+
+
+def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
+    """The last sample of a batch, in the convention that is asked for."""
+    rotation = None if convention is None else batch.frame.rotation_to(convention)
+    sample = batch.samples[-1]
+    return sample if rotation is None else rotation.sample(sample)
 
 
 def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:

@@ -8,7 +8,8 @@ from itertools import chain
 from typing import Final
 
 from imud.contracts.publisher import Batch
-from imud.publishers.socket.encoding import BinaryEncoding, Encoding, JsonEncoding
+from imud.frames.conventions import Convention
+from imud.publishers.socket.encoding import BinaryEncoding, ConvertedEncoding, Encoding, JsonEncoding
 from imud.publishers.socket.outbox import Delivery, Outbox
 from imud.publishers.socket.serving import TokenBucket
 from imud.units import NS_PER_S
@@ -59,8 +60,8 @@ class Pace:
         return True
 
 
-FormKey = tuple[Form, tuple[str, ...] | None, bool]
-"""What clients that get the same messages have in common: encoding, fields, frames or lines."""
+FormKey = tuple[Form, tuple[str, ...] | None, bool, Convention | None]
+"""What clients that get the same messages have in common: encoding, fields, frames or lines, axes and angles."""
 
 
 @dataclass(slots=True)
@@ -76,12 +77,19 @@ class Subscription:
     form: Form
     framed: bool = False
     """Whether messages go out as frames."""
+    convention: Convention | None = None
+    """Axes and angles of samples; None for those of the device's configuration."""
     _paces: dict[str, Pace] = field(default_factory=dict)
 
     @property
     def key(self) -> FormKey:
         """What clients have in common that get the same messages."""
-        return self.form, self.fields if self.form is Form.JSON else None, self.framed
+        return self.form, self.fields if self.form is Form.JSON else None, self.framed, self.convention
+
+    def encoding(self) -> Encoding:
+        """Make the encoding of these messages."""
+        encoding: Encoding = _BINARY if self.form is Form.BINARY else JsonEncoding(self.fields, self.framed)
+        return encoding if self.convention is None else ConvertedEncoding(encoding, self.convention)
 
     def matches(self, device: str) -> bool:
         """Whether samples of `device` are wanted."""
@@ -204,8 +212,7 @@ class DeliveryPlan:
         key = wanted.key
         group = self._groups.get(key)
         if group is None:
-            encoding: Encoding = _BINARY if wanted.form is Form.BINARY else JsonEncoding(wanted.fields, wanted.framed)
-            group = self._groups[key] = DeliveryGroup(encoding, self._next_order)
+            group = self._groups[key] = DeliveryGroup(wanted.encoding(), self._next_order)
             self._order = tuple(self._groups.values())
         group.add(outbox, wanted.pace_of(device))
 
