@@ -26,6 +26,8 @@ class Target:
     places: tuple[int, ...] = ()
     """Addresses at which the device can be on a bus that is polled: the present one, the former one, the configured
     one; empty on other links."""
+    other_bits_per_s: float = 0.0
+    """What other devices of the configuration send on the same CAN bus, bit/s without stuff bits."""
 
 
 class Risk(StrEnum):

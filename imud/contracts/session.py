@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from imud.contracts.codec import Message, ReplyFrame
 from imud.errors import CommandError
+from imud.formats.can import CanFilter
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.units import NS_PER_S
@@ -47,6 +48,9 @@ class Request:
     settings: Any = None
     """Settings of the driver from this request on: the device has another number on its bus. None leaves them as they
     are. CAN buses only; a script that does not hear the device there goes back by the former settings."""
+    also: tuple[CanFilter, ...] = ()
+    """CAN buses only: further frames that can answer, whichever device they are of, each a `ReplyFrame`. They are
+    counted as the codec counts them, those of other devices as skipped."""
     undo: bytes = b""
     """Bytes to send if the script is cancelled at this request while the link is open: a closed generator cannot send.
     No reply is awaited."""

@@ -1,13 +1,14 @@
 """Execution of request scripts: their requests are sent over the link, the device's messages are passed to them."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
 from imud.contracts.codec import Message
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session, Silence
 from imud.errors import CommandError, LinkError
+from imud.formats.can import CanFilter
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.units import NS_PER_S
@@ -25,9 +26,11 @@ class Exchange:
         now_ns: Callable[[], int],
         set_baud: Callable[[int], None] | None = None,
         follow: Callable[[Any], None] | None = None,
+        listen: Callable[[Sequence[CanFilter]], None] | None = None,
     ) -> None:
         """`now_ns` reads CLOCK_MONOTONIC; `set_baud` changes the rate of the link, None where it has none; `follow`
-        listens to the device by other settings of its driver, None where it has no number on a bus."""
+        listens to the device by other settings of its driver, `listen` for further frames of a CAN bus, None where the
+        device has no number on a bus."""
         self._session = Session(ledger)
         self._write = write
         self._now_ns = now_ns
@@ -35,6 +38,7 @@ class Exchange:
         self._follow = follow
         self.answered_ns = 0
         """CLOCK_MONOTONIC of the newest complete reply; 0 before the first."""
+        self._listen = listen
         self._lock = asyncio.Lock()
         self._outcome: asyncio.Future[Outcome] | None = None
 
@@ -84,6 +88,8 @@ class Exchange:
             self._change_rate(request)
         if request.settings is not None:
             self._change_number(request)
+        if request.also:
+            self._hear(request, request.also)
         loop = asyncio.get_running_loop()
         timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
         try:
@@ -98,6 +104,13 @@ class Exchange:
             timer.cancel()
             self._outcome = None
             self._session.cancel()
+            if request.also:
+                self._hear(request, ())
+
+    def _hear(self, request: Request, filters: Sequence[CanFilter]) -> None:
+        if self._listen is None:
+            raise CommandError(f"{request.name}: expected a CAN bus, on which other devices are heard, got none")
+        self._listen(filters)
 
     def _change_rate(self, request: Request) -> None:
         if self._set_baud is None:

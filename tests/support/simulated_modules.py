@@ -11,7 +11,7 @@ from math import radians
 from typing import Any, NamedTuple, TypeVar
 
 from imud.contracts.action import Target
-from imud.contracts.codec import CodecEvent, message_of
+from imud.contracts.codec import CodecEvent, ReplyFrame, message_of
 from imud.contracts.polling import Transfer, TransferScript
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings
@@ -20,11 +20,12 @@ from imud.devices.hipnuc.uart.actions import ACTIONS
 from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings
 from imud.devices.imu61x.uart.codec import Imu61xCodec
 from imud.errors import TransferError, Trouble
-from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
+from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter
 from imud.formats.modbus import BROADCAST, ReplyFinder, frame_gap_ns, framed
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
+from imud.sim.can_module import SentFrame
+from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings, NodeVariant
 from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings, SlaveVariant
 from imud.sim.hipnuc.uart.behaviour import Behaviour
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
@@ -192,49 +193,81 @@ def unpack(payload: bytes) -> tuple[int, bytes]:
 
 
 class CanopenBench:
-    """A module, a codec that hears it, and a session."""
+    """A module, others on its bus, a codec that hears it, and a session."""
 
-    def __init__(self, factory: NodeSettings | None = None, boot_ms: int = 0) -> None:
+    def __init__(
+        self,
+        factory: NodeSettings | None = None,
+        boot_ms: int = 0,
+        variant: NodeVariant | None = None,
+        others: tuple[int, ...] = (),
+    ) -> None:
+        """`others`: numbers of other nodes, which send."""
         self.now_ns = BEGIN_NS
-        hardware = HipnucCanopenHardware(factory=factory or QUIET, boot_ms=boot_ms, skew_ppm=0)
+        made = NodeVariant() if variant is None else variant
+        hardware = HipnucCanopenHardware(factory=factory or QUIET, boot_ms=boot_ms, skew_ppm=0, variant=made)
         self.module = HipnucCanopenModule(BEGIN_NS, hardware)
-        self.codec = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings(node=self.module.node))
+        self.others = [
+            HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=NodeSettings(node=node), boot_ms=0))
+            for node in others
+        ]
+        self.settings = HipnucCanopenSettings(node=self.module.node)
+        """Settings of the driver, which scripts change when they follow the module."""
+        self.codec = HipnucCanopenCodec(Ledger(), self.settings)
         self.session = Session(self.codec.ledger)
         self.sent: list[tuple[int, bytes]] = []
         """What the host sent."""
         self.heard: list[tuple[int, bytes]] = []
         """What the module sent."""
         self.measured: list[Measurement] = []
+        self._also: tuple[CanFilter, ...] = ()
+
+    def target(self, bit_rate: int = 500_000, others_bit_s: float = 0.0) -> Target:
+        """What actions and settings get."""
+        return Target(self.settings, bit_rate, other_bits_per_s=others_bit_s)
 
     def run(self, duration_ns: int) -> Outcome | None:
         """Let time pass, up to the end of the outstanding request."""
         end_ns = self.now_ns + duration_ns
         while self.now_ns < end_ns:
             self.now_ns += CAN_STEP_NS
-            for frame in self.module.advance(self.now_ns):
-                self.heard.append((frame.can_id, frame.data))
-                for event in self.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
-                    if isinstance(event, Measurement):
-                        self.measured.append(event)
-                    message = message_of(event)
-                    outcome = self.session.on_message(message, self.now_ns) if message is not None else None
-                    if outcome is not None:
-                        return outcome
+            frames = self.module.advance(self.now_ns)
+            self.heard += [(frame.can_id, frame.data) for frame in frames]
+            for frame in [*frames, *(frame for other in self.others for frame in other.advance(self.now_ns))]:
+                if (outcome := self._hear(frame)) is not None:
+                    return outcome
             silence = self.session.on_time(self.now_ns)
             if silence is not None:
                 return silence
         return None
 
+    def _hear(self, frame: SentFrame) -> Outcome | None:
+        for event in self.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
+            if isinstance(event, Measurement):
+                self.measured.append(event)
+            message = message_of(event)
+            outcome = self.session.on_message(message, self.now_ns) if message is not None else None
+            if outcome is not None:
+                return outcome
+        if any(wanted.matches(frame.can_id, frame.extended) for wanted in self._also):
+            return self.session.on_message(ReplyFrame(frame.can_id, frame.data), self.now_ns)
+        return None
+
     def send(self, can_id: int, data: bytes) -> None:
         """A frame of the host."""
         self.sent.append((can_id, data))
-        self.module.receive(can_id, False, data, self.now_ns)
+        for module in (self.module, *self.others):
+            module.receive(can_id, False, data, self.now_ns)
 
     def run_script(self, script: RequestScript[T]) -> T:
         """Run a request script to its end."""
         return run_script(script, self._ask)
 
     def _ask(self, request: Request) -> Outcome:
+        if request.settings is not None:
+            self.settings = request.settings
+            self.codec = HipnucCanopenCodec(self.codec.ledger, self.settings)
+        self._also = request.also
         payload = self.session.start(request, self.now_ns)
         if payload:
             self.send(*unpack(payload))

@@ -23,14 +23,29 @@ class CanBuses:
 
     def __init__(self) -> None:
         self._members: dict[str, CanUse] = {}
+        self._loads: dict[str, Callable[[], float]] = {}
 
-    def join(self, name: str, bus: str, filters: Sequence[CanFilter], cyclic: Sequence[CyclicFrame]) -> None:
-        """Add a device to a bus: the frames it receives, and those that it needs to be sent."""
+    def join(
+        self,
+        name: str,
+        bus: str,
+        filters: Sequence[CanFilter],
+        cyclic: Sequence[CyclicFrame],
+        bits_per_s: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        """Add a device to a bus: the frames it receives, those that it needs to be sent, and how much it sends now."""
         self._members[name] = CanUse(bus, filters, cyclic)
+        self._loads[name] = bits_per_s
 
     def leave(self, name: str) -> None:
         """Remove the device; no-op if absent."""
         self._members.pop(name, None)
+        self._loads.pop(name, None)
+
+    def bits_per_s(self, name: str, bus: str) -> float:
+        """Return what the other devices of a bus send, in bit/s without stuff bits."""
+        others = [other for other, member in self._members.items() if other != name and member.bus == bus]
+        return sum(self._loads[other]() for other in others)
 
     def claimed(self, name: str, bus: str) -> Callable[[int, bool], bool]:
         """Return a test of an identifier (and 29 bits or not): whether another device of the bus receives it."""

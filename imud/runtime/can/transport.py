@@ -7,13 +7,14 @@ from typing import Any
 
 from imud.contracts.action import Target
 from imud.contracts.can import CanCodec, CanDriver
+from imud.contracts.codec import ReplyFrame
 from imud.contracts.driver import Identity, of_kind
 from imud.contracts.link import CanLink, OnEnd
 from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.devices import DRIVERS
 from imud.errors import LinkError
-from imud.formats.can import CanFrame, frame_bits
+from imud.formats.can import CanFilter, CanFrame, frame_bits
 from imud.runtime.can.buses import CanBuses
 from imud.runtime.detection import CanFound, CanSearch
 from imud.runtime.detection.remembered import Remembered, RememberedDevice
@@ -40,7 +41,9 @@ class CanTransport:
         self._now_ns = context.host.now_ns
         self._buses = buses
         self._remembered = remembered
-        self._exchange = Exchange(context.ledger, link.write, self._now_ns, follow=self._follow)
+        self._exchange = Exchange(context.ledger, link.write, self._now_ns, follow=self._follow, listen=self._listen)
+        self._also: Sequence[CanFilter] = ()
+        """Frames that can answer the outstanding request although they are none of the device's replies."""
         self._search = SearchLoop(context.health, context.attachments, context.host, self._begin_search, self._ask)
         self._round: CanRound | None = None
         """The search that frames go to; None while they go to the path."""
@@ -152,8 +155,15 @@ class CanTransport:
         driver, options = self.driver, self._options
         assert driver is not None
         cyclic = driver.cyclic(options) if self.link.writable else ()
-        self._buses.join(self._config.name, self.link.bus, driver.filters(options), cyclic)
+        self._buses.join(self._config.name, self.link.bus, driver.filters(options), cyclic, self._bits_per_s)
         self._joined = True
+
+    def _bits_per_s(self) -> float:
+        """What the device's samples take of the bus now, without stuff bits."""
+        if self.path is None or self.driver is None:
+            return 0.0
+        bits = sum(frame_bits(one.extended, len(one.data)) for one in self.driver.example_frames(Random(0)))
+        return bits * self.path.clock.expected_rate_hz
 
     def _leave(self) -> None:
         if self._joined:
@@ -210,9 +220,16 @@ class CanTransport:
         self._node = None  # the next search tells it
         self._begin()
 
+    def _listen(self, filters: Sequence[CanFilter]) -> None:
+        """Receive further frames, as long as a request can be answered by them."""
+        self._also = filters
+        if self.driver is not None and self._round is None:
+            self.link.filters = (*self.driver.filters(self._options), *filters)
+
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
         """Run a request script on the device with its own node number; one that changes the number is followed."""
-        return await self._exchange.run(make(Target(self._options, self.bit_rate)))
+        others = self._buses.bits_per_s(self._config.name, self.link.bus)
+        return await self._exchange.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others)))
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 
@@ -221,6 +238,13 @@ class CanTransport:
             self._round.on_frames(frames)
         elif self.path is not None:
             self.path.on_frames(frames)
+        if self._also:
+            self._answer(frames)
+
+    def _answer(self, frames: Sequence[CanFrame]) -> None:
+        for frame in frames:
+            if any(wanted.matches(frame.can_id, frame.extended) for wanted in self._also):
+                self._exchange.on_message(ReplyFrame(frame.can_id, frame.data), frame.t_rx_ns)
 
     def _on_news(self, news: str, problem: str) -> None:
         """Show trouble of the bus, or its end."""

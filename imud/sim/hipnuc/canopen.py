@@ -7,13 +7,14 @@ delivered.
 
 Section 5.4 names no object for reading; that settings can be read, and that 0x2000 and 0x20A5 cannot, is a guess. TPDO
 parameters, signs, zero and heartbeat apply at once; node number and bit rate when the module starts again. What is not
-saved is lost then. A factory reset clears the flash and changes nothing before that.
+saved is lost then. A factory reset clears the flash and changes nothing before that. Other behaviour that no manual
+rules out is in `NodeVariant`.
 """
 
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from imud.attitude import euler312_from_quat
 from imud.devices.hipnuc.canopen import session as objects
@@ -78,6 +79,40 @@ class Control(Enum):
     RESTART = auto()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeVariant:
+    """Behaviour that differs between modules, or that no manual settles."""
+
+    reads: Literal["answered", "ignored", "aborted"] = "answered"
+    """Answer to SDO uploads."""
+    number_at_once: bool = False
+    """Whether a new node number is in force at once; else after saving and restarting, as the manual says."""
+    confirms_from: Literal["old", "new"] = "old"
+    """Number from which a new number is confirmed that is in force at once."""
+    sends_boot_up: bool = True
+    confirms_restart: bool = True
+    flash_ms: int = 0
+    """Time that saving takes before it is confirmed."""
+    refuses: frozenset[int] = frozenset()
+    """Objects of which a write is aborted."""
+    ignores: frozenset[int] = frozenset()
+    """Objects of which a write is confirmed and changes nothing."""
+
+
+NODE_VARIANTS: Final[Mapping[str, NodeVariant]] = {
+    "manual": NodeVariant(),
+    "ignores reads": NodeVariant(reads="ignored"),
+    "aborts reads": NodeVariant(reads="aborted"),
+    "number at once": NodeVariant(number_at_once=True),
+    "number at once, confirmed from there": NodeVariant(number_at_once=True, confirms_from="new"),
+    "number at once, ignores reads": NodeVariant(number_at_once=True, confirms_from="new", reads="ignored"),
+    "no boot-up message": NodeVariant(sends_boot_up=False),
+    "restarts without a word": NodeVariant(sends_boot_up=False, confirms_restart=False),
+    "slow flash": NodeVariant(flash_ms=1900),
+}
+"""One for each behaviour that is not settled: drivers work with all of them."""
+
+
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
     """Settings that can be saved."""
@@ -108,16 +143,18 @@ class _Entry(NamedTuple):
 class ObjectDictionary:
     """Live settings, those in flash, and the SDO server in front of them."""
 
-    def __init__(self, factory: NodeSettings) -> None:
-        self.settings = factory
-        self._factory = self._saved = factory
+    def __init__(self, factory: NodeSettings, variant: NodeVariant | None = None) -> None:
+        self.settings = self.saved = factory
+        self.writes_to_flash = 0
+        self._factory = factory
+        self._variant = variant or NodeVariant()
 
     def restore(self) -> None:
         """Restore the saved settings: the module starts."""
-        self.settings = self._saved
+        self.settings = self.saved
 
     def serve(self, data: bytes) -> tuple[bytes, Control]:
-        """Answer an SDO request of eight bytes: the reply's data, and its side effect."""
+        """Answer an SDO request of eight bytes: the reply's data, empty for none, and its side effect."""
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
         entry = _ENTRIES.get((index, sub))
         if entry is None:
@@ -125,12 +162,16 @@ class ObjectDictionary:
             return abort_frame(index, sub, NO_SUCH_SUB_INDEX if known else NO_SUCH_OBJECT), Control.NONE
         if data[0] == READ:
             return self._read(data, entry), Control.NONE
+        if data[0] in WRITE.values() and index in self._variant.refuses:
+            return _abort(data, BAD_VALUE), Control.NONE
         if data[0] in WRITE.values():
             return self._write(data, entry)
         return abort_frame(index, sub, BAD_COMMAND), Control.NONE
 
     def _read(self, data: bytes, entry: _Entry) -> bytes:
-        if entry.read is None:
+        if self._variant.reads == "ignored":
+            return b""
+        if entry.read is None or self._variant.reads == "aborted":
             return _abort(data, WRITE_ONLY)
         value = entry.read(self.settings).to_bytes(entry.size, "little")
         return bytes([_COMMANDS[entry.size]]) + data[1:4] + value.ljust(4, b"\0")
@@ -143,7 +184,7 @@ class ObjectDictionary:
         value = int.from_bytes(data[4 : 4 + entry.size], "little")
         if value not in entry.values:
             return _abort(data, BAD_VALUE), Control.NONE
-        if entry.write is not None:
+        if entry.write is not None and int.from_bytes(data[1:3], "little") not in self._variant.ignores:
             self.settings = entry.write(self.settings, value)
         control = self._control(int.from_bytes(data[1:3], "little"), value)
         return bytes([WRITTEN]) + data[1:4] + bytes(4), control
@@ -154,7 +195,8 @@ class ObjectDictionary:
         if index == objects.CONTROL:
             if value == objects.RESTART:
                 return Control.RESTART
-            self._saved = self.settings if value == objects.SAVE else self._factory
+            self.saved = self.settings if value == objects.SAVE else self._factory
+            self.writes_to_flash += 1
         return Control.NONE
 
 
@@ -225,6 +267,7 @@ class HipnucCanopenHardware(SensorHardware):
     """Hardware and factory settings of a module."""
 
     factory: NodeSettings = field(default_factory=NodeSettings)
+    variant: NodeVariant = field(default_factory=NodeVariant)
 
 
 class HipnucCanopenModule:
@@ -234,7 +277,7 @@ class HipnucCanopenModule:
         self.hardware = hardware or HipnucCanopenHardware()
         self.epoch_ns = now_ns
         self.samples_sent = self.frames_sent = 0
-        self.objects = ObjectDictionary(self.hardware.factory)
+        self.objects = ObjectDictionary(self.hardware.factory, self.hardware.variant)
         self._leaving = FrameWire(0, now_ns)
         self._power_on(now_ns)
 
@@ -290,7 +333,8 @@ class HipnucCanopenModule:
         self._state = NmtState.OPERATIONAL
         self._incli_zero: Pair = (0.0, 0.0)
         self._wire = FrameWire(settings.bit_rate, self._begin_ns)
-        self._send(self._begin_ns, HEARTBEAT + self._node, bytes([NmtState.BOOT_UP.value]))
+        if self.hardware.variant.sends_boot_up:
+            self._send(self._begin_ns, HEARTBEAT + self._node, bytes([NmtState.BOOT_UP.value]))
 
     def _tick_ns(self, tick: int) -> int:
         return self._begin_ns + round(tick * NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6))
@@ -356,8 +400,16 @@ class HipnucCanopenModule:
     # --- requests ------------------------------------------------------------------------------------------------
 
     def _serve(self, data: bytes, now_ns: int) -> None:
+        variant, before, saved = self.hardware.variant, self._node, self.objects.writes_to_flash
         reply, control = self.objects.serve(data)
-        self._send(now_ns + self.hardware.processing_ns, SDO_REPLY + self._node, reply)
+        if variant.number_at_once:
+            self._node = self.objects.settings.node
+        if control is Control.RESTART and not variant.confirms_restart:
+            reply = b""
+        source = before if variant.confirms_from == "old" else self._node
+        wait_ns = variant.flash_ms * NS_PER_MS if self.objects.writes_to_flash > saved else 0
+        if reply:
+            self._send(now_ns + self.hardware.processing_ns + wait_ns, SDO_REPLY + source, reply)
         if control is Control.ZERO:
             self._incli_zero = self._tilt(self._reading(now_ns))
         elif control is Control.CANCEL_ZERO:

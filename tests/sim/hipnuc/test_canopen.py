@@ -127,7 +127,7 @@ def test_what_applies_at_once_and_what_after_a_restart() -> None:
     bench.run(120 * MS)
     assert [can_id for can_id, _ in bench.heard] in ([0x188] * 2, [0x188] * 3)
     assert bench.module.node == 8
-    bench.run_script(session.restart(8))
+    bench.send(0x608, cia301.write_frame(0x2000, 0, b"\xff\0\0\0"))
     assert bench.module.node == 8  # nothing was saved
     assert bench.module.objects.settings == QUIET
 
@@ -137,7 +137,7 @@ def test_saved_settings_survive_and_a_factory_reset_clears_them_at_power_on() ->
     bench.run_script(session.set_node_id(8, 20))
     bench.run_script(session.set_tpdo_period(8, 2, 100))
     bench.run_script(session.save(8))
-    bench.run_script(session.restart(8))
+    bench.send(0x608, cia301.write_frame(0x2000, 0, b"\xff\0\0\0"))
     assert bench.module.node == 20
     assert bench.module.objects.settings.periods_ms[2] == 100
     bench.send(0x614, cia301.write_frame(0x2000, 0, b"\1\0\0\0"))

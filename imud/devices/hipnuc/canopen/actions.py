@@ -10,15 +10,15 @@ from msgspec import Meta
 
 from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.session import RequestScript
-from imud.devices.hipnuc.canopen import session
+from imud.devices.hipnuc.canopen import moves, session
 from imud.devices.hipnuc.canopen.cia301 import NODE_MAX, NmtCommand, TpdoNumber
-from imud.devices.hipnuc.canopen.session import PERIOD_MAX_MS, BitRate, InclinometerZero, Transmission
+from imud.devices.hipnuc.canopen.session import PERIOD_MAX_MS, BitRate, InclinometerZero
+from imud.devices.hipnuc.canopen.settings import TRANSMISSIONS, set_interval
 
 Tpdo = Annotated[TpdoNumber, Meta(extra={"section": "5.2"})]
 Reversed = Annotated[bool, Meta(extra={"section": "5.4.1"})]
 
 _ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL}
-_TRANSMISSIONS: Final = {"timer": Transmission.TIMER, "sync": Transmission.SYNC}
 
 
 def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk = Risk.NONE) -> Action:
@@ -39,8 +39,8 @@ def _interval(
             extra={"unit": "ms", "section": "5.4.1"},
         ),
     ],
-) -> RequestScript[None]:
-    return session.set_tpdo_period(target.settings.node, tpdo, interval_ms)
+) -> RequestScript[str]:
+    return set_interval(target, tpdo, interval_ms)
 
 
 def _transmission(
@@ -54,15 +54,15 @@ def _transmission(
             extra={"section": "5.4.2"},
         ),
     ],
-) -> RequestScript[None]:
-    return session.set_tpdo_type(target.settings.node, tpdo, _TRANSMISSIONS[by])
+) -> RequestScript[str]:
+    return session.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by])
 
 
 def _bitrate(
     target: Target,
     *,
     bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "5.4.1"})],
-) -> RequestScript[None]:
+) -> RequestScript[str]:
     return session.set_bit_rate(target.settings.node, bitrate)
 
 
@@ -72,8 +72,8 @@ def _node(
     node: Annotated[
         int, Meta(ge=1, le=NODE_MAX, description="one that no other node of the bus has", extra={"section": "5.4.1"})
     ],
-) -> RequestScript[None]:
-    return session.set_node_id(target.settings.node, node)
+) -> RequestScript[str]:
+    return moves.change_node(target.settings, node)
 
 
 def _zero(
@@ -82,7 +82,7 @@ def _zero(
     return session.set_inclinometer_zero(target.settings.node, _ZEROS[zero])
 
 
-def _direction(target: Target, *, x_reversed: Reversed, y_reversed: Reversed) -> RequestScript[None]:
+def _direction(target: Target, *, x_reversed: Reversed, y_reversed: Reversed) -> RequestScript[str]:
     return session.set_inclinometer_signs(target.settings.node, invert_x=x_reversed, invert_y=y_reversed)
 
 
@@ -96,20 +96,26 @@ def _nmt(
             extra={"section": "CiA 301, 7.2.8.2"},
         ),
     ],
-) -> RequestScript[bool]:
-    return session.nmt(target.settings.node, NmtCommand[command.upper()])
+) -> RequestScript[str | None]:
+    made = NmtCommand[command.upper()]
+    if made in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
+        return moves.reset(target.settings, target.baud, made)
+    return session.nmt(target.settings.node, made)
 
 
 ACTIONS: Final[Actions] = {
     "save": _simple("write all settings to flash", session.save),
-    "restart": _simple("restart it; what was not saved is lost", session.restart),
-    "factory_reset": _simple(
-        "factory settings, node 8 and 500 kbit/s included, after the next power-on: imud then hears it only where bus "
-        "and `options.node` are set to that",
-        session.factory_reset,
+    "restart": Action(
+        "restart it and wait until it is heard, also under another number; what was not saved is lost",
+        lambda target: moves.restart(target.settings, target.baud),
+    ),
+    "factory_reset": Action(
+        "factory settings, node 8 and 500 kbit/s included, in force after a restart; refused if another node of the "
+        "bus has number 8",
+        lambda target: moves.factory_reset(target.settings),
         Risk.RESET,
     ),
-    "interval": Action("how often a TPDO is sent by its timer; at once", _interval),
+    "interval": Action("how often a TPDO is sent by its timer; at once. Refused if the bus cannot carry it", _interval),
     "transmission": Action("send a TPDO by its timer, or when SYNC comes; at once", _transmission),
     "bitrate": Action(
         "set the bit rate, in force after `save` and `restart`: the node is off the bus then, and disturbs it, until "
@@ -118,12 +124,12 @@ ACTIONS: Final[Actions] = {
         Risk.CONNECTION,
     ),
     "node": Action(
-        "set its number, in force after `save` and `restart`: imud then hears nothing of it until `options.node` says "
-        "the new one; with `driver: auto` it looks again after 15 s",
+        "set its number, in force after `save` and `restart`, in some modules at once: imud follows. Refused if "
+        "something on the bus has it already",
         _node,
         Risk.CONNECTION,
     ),
     "zero": Action("make the present position the inclinometer's zero, or cancel that; at once", _zero),
     "direction": Action("turn the signs of the inclinometer, or leave them as delivered; at once", _direction),
-    "nmt": Action("start or stop its TPDOs, or reset it; of a reset, whether its boot-up message came", _nmt),
+    "nmt": Action("start or stop its TPDOs, or reset it, and follow it then", _nmt),
 }

@@ -22,13 +22,14 @@ A longer value comes in segments (0x41, 0x40); that transfer is aborted, and the
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from enum import Enum
 from typing import Final, Literal
 
 from imud.contracts.codec import Message, ReplyFrame
 from imud.contracts.session import Outcome, Rejection, Request, RequestScript, Silence, never
 from imud.errors import NoReply, Rejected
-from imud.formats.can import pack_frame
+from imud.formats.can import CanFilter, pack_frame
 from imud.units import NS_PER_S
 
 TpdoNumber = Literal[1, 2, 3, 4, 6, 7]
@@ -174,26 +175,29 @@ def read_object(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
 
 
 def write_object(
-    node: int, index: int, sub: int, value: int, size: int, *, timeout_ns: int = TIMEOUT_NS
+    node: int,
+    index: int,
+    sub: int,
+    value: int,
+    size: int,
+    *,
+    timeout_ns: int = TIMEOUT_NS,
+    also: tuple[CanFilter, ...] = (),
 ) -> RequestScript[None]:
-    """Write an unsigned object of 1 … 4 bytes. Raises Aborted, NoReply."""
+    """Write an unsigned object of 1 … 4 bytes. Raises Aborted, NoReply.
+
+    `also` has the replies of a node that imud does not listen to.
+    """
     name = f"node {node}, write 0x{index:04X}.{sub} = {value}"
     ends = _answers(node, index, sub, (WRITTEN,))
     frame = write_frame(index, sub, value.to_bytes(size, "little"))
-    _reply(name, (yield _request(node, name, frame, ends, index, sub, timeout_ns)))
+    request = replace(_request(node, name, frame, ends, index, sub), timeout_ns=timeout_ns, also=also)
+    _reply(name, (yield request))
 
 
-def _request(
-    node: int,
-    name: str,
-    frame: bytes,
-    ends: Callable[[Message], bool],
-    index: int,
-    sub: int,
-    timeout_ns: int = TIMEOUT_NS,
-) -> Request:
+def _request(node: int, name: str, frame: bytes, ends: Callable[[Message], bool], index: int, sub: int) -> Request:
     refuses = _answers(node, index, sub, (ABORT,))
-    return Request(pack_frame(SDO_REQUEST + node, False, frame), name, ends, refuses, never, timeout_ns)
+    return Request(pack_frame(SDO_REQUEST + node, False, frame), name, ends, refuses, never, TIMEOUT_NS)
 
 
 def _reply(name: str, outcome: Outcome) -> bytes:

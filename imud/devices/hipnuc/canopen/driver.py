@@ -18,6 +18,7 @@ from imud.devices.hipnuc.canopen.cia301 import (
 )
 from imud.devices.hipnuc.canopen.codec import LAYOUTS, HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
 from imud.devices.hipnuc.canopen.session import identify, read_settings
+from imud.devices.hipnuc.canopen.settings import SETTINGS
 from imud.devices.hipnuc.common.calibrations import inclinometer_zero
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.units import NS_PER_S, NS_PER_US
@@ -66,6 +67,7 @@ DRIVER: Final = CanDriver(
     navigation_frame="ENU",
     actions=ACTIONS,
     calibrations=inclinometer_zero("5.4.1", ACTIONS),
+    device_settings=SETTINGS,
     node_of=_node_of,
     node_settings=lambda node: HipnucCanopenSettings(node=node),
     node_title=lambda node: f"node {node}",

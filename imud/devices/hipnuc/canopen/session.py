@@ -2,15 +2,20 @@
 
 Manual "IMU配置手冊" V1.5.9, section 5.4; objects of CiA 301 where it names none. Settings last until power is off
 unless `save` follows. TPDO rate and type, inclinometer signs and zero apply at once; node number and bit rate need
-`save` and a restart. What is written is read back where the node lets it be read. All raise NoReply and Aborted; ranges
-of arguments are those of the actions (`actions.py`), and what no range can express raises BadArgument here.
+`save` and a restart. All raise NoReply and Aborted; ranges of arguments are those of the actions (`actions.py`), and
+what no range can express raises BadArgument here.
+
+The manual names no object that can be read. What is written is read back all the same; a node that does not answer
+reads, or refuses them, has then taken the value as far as it confirmed the write: `Written.UNVERIFIED`. Where a node is
+after its number was written, or after a restart, is in `moves.py`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final, Literal
 
 from imud.contracts.codec import Message, ReplyFrame
+from imud.contracts.device_settings import Written
 from imud.contracts.driver import Identity
 from imud.contracts.session import Reply, Request, RequestScript, never
 from imud.devices.hipnuc.canopen.cia301 import (
@@ -22,14 +27,13 @@ from imud.devices.hipnuc.canopen.cia301 import (
     TPDO_FUNCTIONS,
     Aborted,
     NmtCommand,
-    NmtState,
     TpdoNumber,
     read_object,
     state_name,
     write_frame,
     write_object,
 )
-from imud.errors import BadArgument, DeviceRefused
+from imud.errors import BadArgument, DeviceRefused, NoReply
 from imud.formats.can import pack_frame
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -50,13 +54,19 @@ NODE_ID: Final = 0x20A0
 INCLI_ZERO: Final = 0x20A5
 
 BitRate = Literal[1_000_000, 500_000, 250_000, 125_000]
-BIT_RATES: Final = {1_000_000: 0, 500_000: 2, 250_000: 3, 125_000: 4}
+BIT_RATES: Final[Mapping[int, int]] = {1_000_000: 0, 500_000: 2, 250_000: 3, 125_000: 4}
 """Codes of 0x209A by bit/s; 1 is not given."""
+BIT_RATE_OF: Final = {code: bit_s for bit_s, code in BIT_RATES.items()}
+Place = tuple[int, int]
+"""Index and sub-index of an object."""
+SETTING_PLACES: Final[tuple[Place, ...]] = (
+    *((index, sub) for index in TPDO_OBJECTS.values() for sub in (TPDO_TYPE, TPDO_TIMER)),
+    *((index, 0) for index in (NODE_ID, BIT_RATE, INCLI_SIGN_X, INCLI_SIGN_Y, HEARTBEAT_TIME)),
+)
+"""Objects that can be set and that may be readable."""
 PERIOD_MIN_MS, PERIOD_MAX_MS = 5, 1000
 """200 Hz … 1 Hz for each TPDO (section 5.1)."""
 SAVE, FACTORY_RESET, RESTART = 0x00, 0x01, 0xFF
-BOOT_NS: Final = 3 * NS_PER_S
-"""Longest time to the boot-up message; the manual gives none."""
 HEARTBEAT_WAIT_NS: Final = 3 * NS_PER_S // 2
 
 
@@ -103,14 +113,26 @@ def identify(node: int) -> RequestScript[Identity]:
 
 def read_settings(node: int) -> RequestScript[Mapping[str, str]]:
     """Ask for all settings by their object and sub-index; those that cannot be read are left out. Raises NoReply."""
-    places = [(index, sub) for index in TPDO_OBJECTS.values() for sub in (TPDO_TYPE, TPDO_TIMER)]
-    places += [(index, 0) for index in (NODE_ID, BIT_RATE, INCLI_SIGN_X, INCLI_SIGN_Y, HEARTBEAT_TIME)]
-    settings: dict[str, str] = {}
+    values = yield from read_values(node, SETTING_PLACES)
+    return {f"{index:04X}.{sub}": str(value) for (index, sub), value in values.items()}
+
+
+def read_values(node: int, places: Sequence[Place], *, silent_is_fine: bool = False) -> RequestScript[dict[Place, int]]:
+    """Read objects as numbers; those that the node refuses to read are left out.
+
+    Raises NoReply; with `silent_is_fine` what comes after a first missing reply is left out instead.
+    """
+    values: dict[Place, int] = {}
     for index, sub in places:
-        value = yield from _try_read(node, index, sub)
+        try:
+            value = yield from _try_read(node, index, sub)
+        except NoReply:
+            if silent_is_fine:
+                return values
+            raise
         if value is not None:
-            settings[f"{index:04X}.{sub}"] = str(_number(value))
-    return settings
+            values[index, sub] = _number(value)
+    return values
 
 
 def _heartbeat_state(node: int) -> RequestScript[str]:
@@ -126,32 +148,48 @@ def _heartbeat_state(node: int) -> RequestScript[str]:
 # --- setting ----------------------------------------------------------------------------------------------------------
 
 
-def set_node_id(node: int, new_node: int) -> RequestScript[None]:
+def set_node_id(node: int, new_node: int) -> RequestScript[Written]:
     """Give the node another number, 1 … 127; in force after `save` and a restart."""
-    yield from _set(node, NODE_ID, 0, new_node, 4)
+    return (yield from _set(node, NODE_ID, 0, new_node, 4, pending=True))
 
 
-def set_bit_rate(node: int, bit_s: BitRate) -> RequestScript[None]:
+def set_bit_rate(node: int, bit_s: BitRate) -> RequestScript[Written]:
     """Set the rate of the bus in bit/s; in force after `save` and a restart."""
-    yield from _set(node, BIT_RATE, 0, BIT_RATES[bit_s], 4)
+    return (yield from _set(node, BIT_RATE, 0, BIT_RATES[bit_s], 4, pending=True))
 
 
-def set_tpdo_period(node: int, tpdo: TpdoNumber, period_ms: int) -> RequestScript[None]:
+def set_tpdo_period(node: int, tpdo: TpdoNumber, period_ms: int) -> RequestScript[Written]:
     """Send a TPDO every 5 … 1000 ms by its timer, or never (0); at once. Raises BadArgument for 1 … 4."""
+    check_period(period_ms)
+    return (yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TIMER, period_ms, 2))
+
+
+def check_period(period_ms: int) -> None:
+    """Raises BadArgument for a period between never and the shortest."""
     if 0 < period_ms < PERIOD_MIN_MS:
         raise BadArgument(f"interval_ms: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS}, got {period_ms}")
-    yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TIMER, period_ms, 2)
 
 
-def set_tpdo_type(node: int, tpdo: TpdoNumber, transmission: Transmission) -> RequestScript[None]:
+def set_tpdo_type(node: int, tpdo: TpdoNumber, transmission: Transmission) -> RequestScript[Written]:
     """Send a TPDO by its timer, or when SYNC comes; at once."""
-    yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TYPE, transmission.value, 1)
+    return (yield from _set(node, TPDO_OBJECTS[tpdo], TPDO_TYPE, transmission.value, 1))
 
 
-def set_inclinometer_signs(node: int, *, invert_x: bool, invert_y: bool) -> RequestScript[None]:
-    """Turn the signs of the inclinometer around, or leave them as delivered; at once."""
-    yield from _set(node, INCLI_SIGN_X, 0, int(invert_x), 4)
-    yield from _set(node, INCLI_SIGN_Y, 0, int(invert_y), 4)
+def set_inclinometer_sign(node: int, axis: Literal["x", "y"], *, invert: bool) -> RequestScript[Written]:
+    """Turn the sign of one axis of the inclinometer around, or leave it as delivered; at once."""
+    return (yield from _set(node, INCLI_SIGN_X if axis == "x" else INCLI_SIGN_Y, 0, int(invert), 4))
+
+
+def set_inclinometer_signs(node: int, *, invert_x: bool, invert_y: bool) -> RequestScript[Written]:
+    """Set the signs of both axes; at once."""
+    x = yield from set_inclinometer_sign(node, "x", invert=invert_x)
+    y = yield from set_inclinometer_sign(node, "y", invert=invert_y)
+    return Written.VERIFIED if x is y is Written.VERIFIED else Written.UNVERIFIED
+
+
+def set_heartbeat(node: int, period_ms: int) -> RequestScript[Written]:
+    """Send the heartbeat of CiA 301 every so many ms, or never (0); at once. The manual does not name the object."""
+    return (yield from _set(node, HEARTBEAT_TIME, 0, period_ms, 2))
 
 
 def set_inclinometer_zero(node: int, zero: InclinometerZero) -> RequestScript[None]:
@@ -169,28 +207,41 @@ def factory_reset(node: int) -> RequestScript[None]:
     yield from write_object(node, CONTROL, 0, FACTORY_RESET, 4, timeout_ns=FLASH_TIMEOUT_NS)
 
 
-def restart(node: int) -> RequestScript[None]:
-    """Restart, as by power-on. Whether it is confirmed is not stated, so no reply is waited for."""
+def restart_request(node: int) -> Request:
+    """The request for a restart, as by power-on. Whether it is confirmed is not stated, so no reply is waited for."""
     frame = write_frame(CONTROL, 0, RESTART.to_bytes(4, "little"))
     payload = pack_frame(SDO_REQUEST + node, False, frame)
-    yield Request(payload, f"node {node}, restart", never, never, never, silent=True)
+    return Request(payload, f"node {node}, restart", never, never, never, silent=True)
 
 
-def nmt(node: int, command: NmtCommand) -> RequestScript[bool]:
-    """Send an NMT command, which no node confirms; for a reset, return whether the boot-up message came."""
-    resets = command in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
-    ends = _is_heartbeat(node, NmtState.BOOT_UP) if resets else never
+def nmt(node: int, command: NmtCommand) -> RequestScript[None]:
+    """Send an NMT command, which no node confirms. What follows a reset is for `moves.reset`."""
+    yield nmt_request(node, command)
+
+
+def nmt_request(node: int, command: NmtCommand) -> Request:
+    """The request of an NMT command."""
     payload = pack_frame(NMT, False, bytes([command.value, node]))
-    outcome = yield Request(payload, f"node {node}, NMT {command.name}", ends, never, never, BOOT_NS, silent=not resets)
-    return resets and isinstance(outcome, Reply)
+    return Request(payload, f"node {node}, NMT {command.name}", never, never, never, silent=True)
 
 
-def _set(node: int, index: int, sub: int, value: int, size: int) -> RequestScript[None]:
+def _set(node: int, index: int, sub: int, value: int, size: int, *, pending: bool = False) -> RequestScript[Written]:
     """Write, and read back where that is possible. Raises DeviceRefused where something else stands there then."""
     yield from write_object(node, index, sub, value, size)
-    found = yield from _try_read(node, index, sub)
-    if found is not None and _number(found) != value:
+    return (yield from verify(node, index, sub, value, pending=pending))
+
+
+def verify(node: int, index: int, sub: int, value: int, *, pending: bool = False) -> RequestScript[Written]:
+    """Read back what was written. Raises DeviceRefused where something else stands there."""
+    try:
+        found = yield from _try_read(node, index, sub)
+    except NoReply:
+        found = None
+    if found is None:
+        return Written.UNVERIFIED_PENDING if pending else Written.UNVERIFIED
+    if _number(found) != value:
         raise DeviceRefused(f"node {node}: expected 0x{index:04X}.{sub} = {value}, reads back {_number(found)}")
+    return Written.PENDING if pending else Written.VERIFIED
 
 
 def _try_read(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
@@ -205,13 +256,7 @@ def _number(value: bytes) -> int:
     return int.from_bytes(value, "little")
 
 
-def _is_heartbeat(node: int, state: NmtState | None = None) -> Callable[[Message], bool]:
-    """A test for heartbeats of a node, of one state if that is given."""
+def _is_heartbeat(node: int) -> Callable[[Message], bool]:
+    """A test for heartbeats of a node."""
     can_id = HEARTBEAT + node
-
-    def holds(message: Message) -> bool:
-        if not isinstance(message, ReplyFrame) or message.frame_id != can_id:
-            return False
-        return state is None or message.payload == bytes([state.value])
-
-    return holds
+    return lambda message: isinstance(message, ReplyFrame) and message.frame_id == can_id

@@ -5,12 +5,13 @@ from typing import Any
 import pytest
 
 from imud.contracts.action import Target
+from imud.contracts.device_settings import Written
 from imud.contracts.session import RequestScript
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.devices.hipnuc.canopen.driver import DRIVER
 from imud.errors import BadArgument
 from imud.sim.hipnuc.canopen import NodeSettings
-from tests.support.simulated_modules import QUIET, CanopenBench, unpack
+from tests.support.simulated_modules import QUIET, CanopenBench
 
 
 def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
@@ -47,7 +48,10 @@ ROWS: list[tuple[str, dict[str, object], str]] = [
 def test_commands_of_the_manual_go_to_the_node_of_the_settings(
     name: str, given: dict[str, object], data: str, node: int
 ) -> None:
-    assert unpack(next(begun(name, node, **given)).payload) == (0x600 + node, bytes.fromhex(data))
+    bench = CanopenBench(NodeSettings(node=node))
+    bench.run_script(begun(name, node, **given))
+    writes = [frame for frame in bench.sent if frame[1][0] != 0x40]
+    assert writes[0] == (0x600 + node, bytes.fromhex(data))
 
 
 @pytest.mark.parametrize(
@@ -55,7 +59,9 @@ def test_commands_of_the_manual_go_to_the_node_of_the_settings(
     [("start", 1), ("stop", 2), ("pre_operational", 0x80), ("reset_node", 0x81), ("reset_communication", 0x82)],
 )
 def test_network_management(command: str, code: int) -> None:
-    assert unpack(next(begun("nmt", 5, command=command)).payload) == (0, bytes([code, 5]))
+    bench = CanopenBench(NodeSettings(node=5))
+    bench.run_script(begun("nmt", 5, command=command))
+    assert (0, bytes([code, 5])) in bench.sent
 
 
 def test_every_action_is_tried_here() -> None:
@@ -95,7 +101,7 @@ def test_the_module_obeys() -> None:
     assert 0x288 in {can_id for can_id, _ in bench.heard}
     assert bench.module.objects.settings.invert_y
     assert not bench.module.objects.settings.invert_x
-    assert bench.run_script(begun("nmt", command="reset_node")) is True  # the boot-up message came
+    assert bench.run_script(begun("nmt", command="reset_node")) == "restarted, as node 8"
     assert not bench.module.objects.settings.invert_y  # nothing was saved
 
 
@@ -104,6 +110,20 @@ def test_a_new_node_number_is_in_force_after_saving_and_restarting() -> None:
     bench.run_script(begun("node", node=9))
     assert bench.module.node == 8
     bench.run_script(begun("save"))
-    bench.run_script(begun("restart"))
-    bench.run(10_000_000)
-    assert bench.module.node == 9
+    assert bench.run_script(begun("restart")) == "restarted, as node 9"
+    assert bench.module.node == bench.settings.node == 9
+
+
+def test_an_interval_that_the_bus_cannot_carry_says_what_it_costs() -> None:
+    bench = CanopenBench(NodeSettings(node=8))
+
+    def interval(bit_rate: int, others_bit_s: float) -> object:
+        action = DRIVER.actions["interval"]
+        target = bench.target(bit_rate, others_bit_s)
+        return bench.run_script(action.script(target, action.arguments({"tpdo": 1, "interval_ms": 5})))
+
+    # 95 bits · 200 + (95 + 95 + 111 + 111) · 100 + 79 · 20 = 61,780 bit/s: 49.4 % of 125 kbit/s, of which TPDO1 15.2 %
+    assert interval(125_000, 63_000.0) is Written.VERIFIED
+    with pytest.raises(BadArgument, match=r"got 101 % of that: TPDO1 every 5 ms 15.2 %, .*; other devices 51.2 %"):
+        interval(125_000, 64_000.0)
+    assert interval(0, 1e9) is Written.VERIFIED  # a virtual bus has no rate

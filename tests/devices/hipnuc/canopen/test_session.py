@@ -1,22 +1,23 @@
 """Every SDO command that the manual prints, and conversations with the simulated module."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import pytest
 
 from imud.contracts.codec import ReplyFrame
+from imud.contracts.device_settings import Written
 from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript
 from imud.devices.hipnuc.canopen import cia301, session
 from imud.devices.hipnuc.canopen.cia301 import Aborted, NmtCommand, TpdoNumber
 from imud.devices.hipnuc.canopen.session import InclinometerZero, Transmission
 from imud.errors import BadArgument, DeviceRefused, NoReply
-from imud.sim.hipnuc.canopen import NodeSettings
+from imud.sim.hipnuc.canopen import NodeSettings, NodeVariant
 from tests.support.simulated_modules import QUIET, CanopenBench, run_script, unpack
 
-MANUAL: list[tuple[str, Callable[[], RequestScript[None]]]] = [
+MANUAL: list[tuple[str, Callable[[], RequestScript[object]]]] = [
     ("23 A0 20 00 09 00 00 00", lambda: session.set_node_id(8, 9)),
     ("23 00 20 00 00 00 00 00", lambda: session.save(8)),
-    ("23 00 20 00 FF 00 00 00", lambda: session.restart(8)),
     ("23 00 20 00 01 00 00 00", lambda: session.factory_reset(8)),
     ("23 9A 20 00 00 00 00 00", lambda: session.set_bit_rate(8, 1_000_000)),
     ("23 9A 20 00 02 00 00 00", lambda: session.set_bit_rate(8, 500_000)),
@@ -34,8 +35,12 @@ PERIODS = {0: "00", 5: "05", 10: "0A", 20: "14", 50: "32", 100: "64"}
 
 
 @pytest.mark.parametrize(("text", "make"), MANUAL)
-def test_commands_of_the_manual(text: str, make: Callable[[], RequestScript[None]]) -> None:
+def test_commands_of_the_manual(text: str, make: Callable[[], RequestScript[object]]) -> None:
     assert unpack(next(make()).payload) == (0x608, bytes.fromhex(text))
+
+
+def test_the_restart_of_the_manual() -> None:
+    assert unpack(session.restart_request(8).payload) == (0x608, bytes.fromhex("23 00 20 00 FF 00 00 00"))
 
 
 @pytest.mark.parametrize("tpdo", TPDO_OBJECTS)
@@ -110,7 +115,7 @@ def test_a_node_that_is_not_there_does_not_answer() -> None:
 
 def test_settings_are_read_back() -> None:
     bench = CanopenBench()
-    bench.run_script(session.set_tpdo_period(8, 7, 20))
+    assert bench.run_script(session.set_tpdo_period(8, 7, 20)) is Written.VERIFIED
     assert bench.sent[-1] == (0x608, bytes.fromhex("40 05 18 05 00 00 00 00"))
     assert bench.module.objects.settings.periods_ms[7] == 20
 
@@ -131,14 +136,23 @@ def test_a_refused_write_says_why() -> None:
         bench.run_script(cia301.write_object(8, 0x20A0, 0, 200, 4))
 
 
+@pytest.mark.parametrize("reads", ["ignored", "aborted"])
+def test_a_node_that_cannot_be_read_has_taken_what_it_confirmed(reads: Literal["ignored", "aborted"]) -> None:
+    bench = CanopenBench(variant=NodeVariant(reads=reads))
+    assert bench.run_script(session.set_tpdo_period(8, 7, 20)) is Written.UNVERIFIED
+    assert bench.module.objects.settings.periods_ms[7] == 20
+    assert bench.run_script(session.set_inclinometer_signs(8, invert_x=True, invert_y=False)) is Written.UNVERIFIED
+    assert bench.run_script(session.set_bit_rate(8, 250_000)) is Written.UNVERIFIED_PENDING
+
+
+def test_a_save_may_take_two_seconds() -> None:
+    bench = CanopenBench(variant=NodeVariant(flash_ms=1900))
+    bench.run_script(session.save(8))
+    assert bench.module.objects.writes_to_flash == 1
+
+
 @pytest.mark.parametrize("command", NmtCommand)
 def test_nmt_commands(command: NmtCommand) -> None:
-    bench = CanopenBench(boot_ms=100)
-    bench.run(200_000_000)
-    booted = bench.run_script(session.nmt(8, command))
+    bench = CanopenBench()
+    bench.run_script(session.nmt(8, command))
     assert bench.sent[-1] == (0x000, bytes([command.value, 8]))
-    assert booted == command.name.startswith("RESET")
-
-
-def test_a_reset_without_boot_up_message() -> None:
-    assert CanopenBench().run_script(session.nmt(9, NmtCommand.RESET_NODE)) is False
