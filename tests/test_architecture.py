@@ -340,7 +340,6 @@ TESTED_IN = {
     "imud.publishers.metrics.family": "publishers/metrics/test_families.py",
     "imud.publishers.shm.ring": "publishers/shm/test_publisher.py",
     "imud.publishers.socket.connection": "publishers/socket/test_publisher.py",
-    "imud.publishers.socket.encoding": "publishers/socket/test_outbox.py",
     "imud.publishers.socket.hub": "publishers/socket/test_publisher.py",
     "imud.runtime.detection.steps": "runtime/detection/test_stream.py",
     "imud.runtime.device_factory": "runtime/test_device.py",

@@ -11,9 +11,22 @@ from pathlib import Path
 
 import pytest
 
+from imud.attitude import (
+    Matrix3,
+    euler312_from_quat,
+    matrix_from_quat,
+    matrix_product,
+    matrix_times,
+    quat_from_euler_zyx,
+    quat_from_matrix,
+    transposed,
+)
 from imud.client import Ring
 from imud.devices.hipnuc.uart.codec import encode_hi91
 from imud.sample import Sample
+from imud.sim.hipnuc.uart.settings import HipnucHardware
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.physics.motion import FIELD_ENU_T, Still
 from tests.support.daemon_process import running_daemon, wait_until
 from tests.support.files import SHARED
 
@@ -103,3 +116,57 @@ def test_every_row_of_a_real_recording_arrives_on_both_ways(port: tuple[int, str
     assert ledger["bytes_in"] == ledger["bytes_in_good_frames"] == 1000 * 82
     assert ledger["frames_good"] == ledger["frames_in_samples"] == ledger["samples"] == 1000
     assert sum(ledger[name] for name in ledger if name.startswith("lost_")) == 0
+
+
+# --- a module of known attitude in a body -----------------------------------------------------------------------------
+
+BODY = (radians(5.0), radians(-10.0), radians(30.0))
+"""Roll, pitch, yaw of the body in enu-flu: left side up by 5°, nose up by 10°, its front 30° to the left of east."""
+IN_NED = (radians(5.0), radians(10.0), radians(60.0))
+"""The same in ned-frd, by hand: right side down by 5°, nose up by 10°, 60° clockwise from north."""
+MOUNTINGS: dict[str, tuple[dict[str, object], Matrix3]] = {
+    # what stands in the configuration; rows: the axis of the sensor that points forward, left, up
+    "on its side": ({"axes": {"x": "y", "y": "z", "z": "x"}}, ((0, 1, 0), (0, 0, 1), (1, 0, 0))),
+    "upside down": ({"quat_wxyz": [0, 1, 0, 0]}, ((1, 0, 0), (0, -1, 0), (0, 0, -1))),
+    "turned 90° to the left": ({"euler": {"yaw_deg": 90}}, ((0, -1, 0), (1, 0, 0), (0, 0, 1))),
+}
+
+
+@pytest.mark.parametrize("name", MOUNTINGS)
+def test_a_simulated_module_in_a_body_of_known_attitude(port: tuple[int, str], tmp_path: Path, name: str) -> None:
+    """The ring and a plain client get enu-flu; a binary one and `poll` ask for ned-frd. Everything is turned once."""
+    keys, mounting = MOUNTINGS[name]
+    body = matrix_from_quat(quat_from_euler_zyx(BODY))
+    sensor = quat_from_matrix(matrix_product(body, mounting))
+    module = HipnucModule(0, None, HipnucHardware(motion=Still(*euler312_from_quat(sensor)), skew_ppm=0))
+    data = b"".join(burst.data for burst in module.advance(int(1.5e9)))
+    up_m_s2 = (body[2][0] * G, body[2][1] * G, body[2][2] * G)
+    field_t = matrix_times(transposed(body), FIELD_ENU_T)
+    master, path = port
+    device = {
+        "driver": "hipnuc-uart", "identify": False, "uart": {"port": path, "baud": 921600}, "frame": keys,
+    }  # fmt: skip
+    with running_daemon(tmp_path, {"bow": device}) as daemon, daemon.client() as plain, daemon.client() as other:
+        daemon.wait_for("bow", "searching")
+        with Ring(tmp_path / "imud.bow") as ring:
+            as_configured = plain.watch(timeout_s=10, encoding="json")
+            asked = other.watch(timeout_s=10, convention="ned-frd")
+            os.write(master, data)
+            first, down = next(as_configured), next(asked)
+            wait_until(lambda: ring.newest_seq >= 90, "the ring has what was sent")
+            by_shm = ring.read().samples[0]
+            (polled,) = other.poll(convention="ned-frd")
+        schema = plain.schema()["devices"]["bow"]
+        status = daemon.statuses()["bow"]
+    for one in (first, by_shm):
+        assert one.euler_rad == pytest.approx(BODY, abs=1e-5)
+        assert one.accel_m_s2 == pytest.approx(up_m_s2, abs=1e-4)
+        assert one.mag_t == pytest.approx(field_t, abs=1e-10)
+    for one in (down, polled):
+        assert one.euler_rad == pytest.approx(IN_NED, abs=1e-5)
+        assert one.accel_m_s2 == pytest.approx((up_m_s2[0], -up_m_s2[1], -up_m_s2[2]), abs=1e-4)
+        assert one.mag_t == pytest.approx((field_t[0], -field_t[1], -field_t[2]), abs=1e-10)
+    assert (schema["convention"], schema["navigation_frame"]) == ("enu-flu", "ENU")
+    assert schema["frame"] == "body: x forward, y left, z up (FLU)"
+    assert status.frame is not None
+    assert (status.frame.problem, status.euler_convention) == ("", schema["euler_convention"])

@@ -37,7 +37,7 @@ def send(served: Daemon, seq: int) -> None:
     served.do(lambda server: server.publish(batch("imu0", seq)))
 
 
-@pytest.mark.parametrize("form", [[], ["--json"]])
+@pytest.mark.parametrize("form", [[], ["--json"], ["--convention", "ned-frd"]])
 def test_watch_ends_after_count_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: list[str]) -> None:
     with daemon(tmp_path) as served:
         ended = Event()
@@ -58,7 +58,10 @@ def test_watch_ends_after_count_samples(tmp_path: Path, capsys: pytest.CaptureFi
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3
     assert all("imu0" in line for line in lines)
-    if form:
+    turned = "--convention" in form
+    values = "-0.500   0.125  -9.750" if turned else " 0.125  -0.500   9.750"
+    assert "--json" in form or all(line.endswith(f"accel  {values} m/s²") for line in lines), lines
+    if "--json" in form:
         seqs = [json.loads(line)["seq"] for line in lines]
         assert seqs == [seqs[0], seqs[0] + 1, seqs[0] + 2]
 

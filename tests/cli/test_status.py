@@ -2,15 +2,26 @@
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
-from imud.cli.status import block, driven, parts, utc, watched
-from imud.contracts.status import LinesStatus, UtcStatus
+from imud.cli.status import axes, block, driven, parts, utc, watched
+from imud.contracts.status import FrameStatus, LinesStatus, UtcStatus
+from imud.frames.conventions import Heading
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 
 
 def test_a_device_without_parts_has_no_rows_of_them() -> None:
     assert list(parts(device("bow"))) == []
     assert block(device("bow")).splitlines()[-1].startswith("  kernel ")
+
+
+def test_axes_heading_and_what_contradicts_them() -> None:
+    frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
+    lines = block(replace(device("bow"), frame=frame)).splitlines()
+    assert lines[3] == (
+        "  axes      ned-frd: body: x forward; heading true by a declination of -3.5° (its z axis points down)"
+    )
+    assert axes(replace(frame, declination_deg=None, problem="")) == "ned-frd: body: x forward; heading true"
 
 
 def test_polling_is_shown_for_a_device_that_is_polled() -> None:

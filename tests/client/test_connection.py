@@ -5,6 +5,7 @@ import os
 import socket
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
@@ -48,6 +49,19 @@ def test_questions(served: Daemon) -> None:
         publish(served, batch("imu0", 4), batch("imu1", 5))
         assert client.poll() == [sample("imu0", 4), sample("imu1", 5)]
         assert client.poll(["imu1"]) == [sample("imu1", 5)]
+
+
+def test_a_convention_is_asked_for(served: Daemon) -> None:
+    """A module with x right, y forward, z up: its y is the front."""
+    with Client(served.path) as client:
+        publish(served, batch("imu0", 4))
+        (newest,) = client.poll(convention="enu-flu")
+        assert newest.accel_m_s2 == (-0.5, -0.125, 9.75)
+        watch = client.watch(convention="ned-frd", timeout_s=5)
+        publish(served, batch("imu0", 5))
+        assert next(watch).accel_m_s2 == (-0.5, 0.125, -9.75)
+        with pytest.raises(RpcError):
+            client.watch(convention="up")
 
 
 def test_what_the_daemon_refuses_is_raised_and_the_connection_lives_on(served: Daemon) -> None:
@@ -215,6 +229,29 @@ def test_the_daemon_goes_away(tmp_path: Path) -> None:
     client.close()
 
 
+@contextmanager
+def answering(path: Path, answer: bytes) -> Iterator[None]:
+    """A server that sends this to its first client, whatever that asks."""
+    done = threading.Event()
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def serve() -> None:
+            sock, _ = listener.accept()
+            with sock:
+                sock.sendall(answer)
+                done.wait(10)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+
+
 @pytest.mark.parametrize(
     ("answer", "error", "words"),
     [
@@ -231,22 +268,15 @@ def test_the_daemon_goes_away(tmp_path: Path) -> None:
 )
 def test_servers_that_misbehave(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:
     path = tmp_path / "s"
-    done = threading.Event()
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
+    with answering(path, answer), pytest.raises(error, match=words), Client(path, timeout_s=0.2) as client:
+        next(client.watch(timeout_s=0.2))
 
-        def serve() -> None:
-            sock, _ = listener.accept()
-            with sock:
-                sock.sendall(answer)
-                done.wait(10)
 
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
-            with pytest.raises(error, match=words), Client(path, timeout_s=0.2) as client:
-                next(client.watch(timeout_s=0.2))
-        finally:
-            done.set()
-            thread.join()
+@pytest.mark.parametrize("method", ["watch", "poll"])
+def test_a_daemon_that_does_not_know_conventions_is_no_silent_mistake(tmp_path: Path, method: str) -> None:
+    """An older one ignores the parameter, and would give the axes of the device."""
+    path = tmp_path / "s"
+    with answering(path, HELLO + b'{"id":1,"result":{"devices":{},"samples":[]}}\n'), Client(path) as client:
+        ask = client.watch if method == "watch" else client.poll
+        with pytest.raises(ServerError, match="gives no samples as ned-frd: it is older"):
+            ask(convention="ned-frd")
