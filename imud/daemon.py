@@ -60,7 +60,10 @@ class Daemon:
         self._reloader: Reloader | None = None
         host = HostClock()
         self._now_ns = host.now_ns
-        self._factory = DeviceFactory(self._publish, self._send_event, host, state_dir=state_dir, lines=lines)
+        self._factory = DeviceFactory(
+            self._publish, self._send_event, host, state_dir=state_dir, lines=lines,
+            configured=lambda: self.config.devices,
+        )  # fmt: skip
         self._devices: dict[str, Device] = {}
         self._context = PublisherContext(
             self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns

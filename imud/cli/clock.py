@@ -13,7 +13,7 @@ import msgspec
 from imud.cli.arguments import CliCommand, add_socket, connect, statuses
 from imud.cli.output import histogram
 from imud.client import Client
-from imud.contracts.status import ClockStatus, DeviceStatus
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.sample import Sync
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
             print(msgspec.json.encode(clocks).decode())
             return 0
         behind: dict[str, deque[int]] = {name: deque(maxlen=KEPT) for name in chosen}
-        with connect(args) as listening, suppress(TimeoutError):  # silence longer than `--duration`
+        with connect(args) as listening:
             for _ in listen(listening, behind, args.duration):
                 sys.stdout.write(CLEAR + page(statuses(asking), behind) + "\n")
                 sys.stdout.flush()
@@ -62,11 +62,14 @@ def run(args: argparse.Namespace) -> int:
 def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | None) -> Iterator[None]:
     """Record how long after its measurement each sample was read; yield whenever a report is due.
 
-    With a duration it ends then, and nothing is drawn. Raises TimeoutError when no sample comes for as long.
+    With a duration it ends then, and nothing is drawn. Reports are due in silence, too.
     """
     begun = drawn = monotonic()
-    for sample in client.watch(list(behind), timeout_s=duration_s):
-        behind[sample.device].append(sample.t_rx_ns - sample.t_ns)
+    samples = client.watch(list(behind), timeout_s=REFRESH_S if duration_s is None else duration_s)
+    while True:
+        with suppress(TimeoutError):
+            sample = next(samples)
+            behind[sample.device].append(sample.t_rx_ns - sample.t_ns)
         now = monotonic()
         if duration_s is not None and now - begun >= duration_s:
             return
@@ -76,14 +79,17 @@ def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | No
 
 
 def page(devices: list[DeviceStatus], behind: dict[str, deque[int]]) -> str:
-    """Format the blocks of all shown devices."""
-    return "\n\n".join(block(status, behind[status.name]) for status in devices if status.name in behind)
+    """Format the blocks of all shown devices; those that left the configuration have a line."""
+    gone = [f"{name}: not in the configuration any more" for name in behind if name not in {d.name for d in devices}]
+    shown = [block(status, behind[status.name]) for status in devices if status.name in behind]
+    return "\n\n".join([*shown, *gone])
 
 
 def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
     """Format the block of one device."""
     clock = status.clock
-    lines = [
+    lines = [] if status.state is DeviceState.RUNNING else [f"{status.name} is {status.state}: {status.problem}"]
+    lines += [
         f"{status.name}: time stamps by {clock.sync}, error {clock.t_err_ns / NS_PER_US:.1f} µs (one sigma)",
         f"  offset    {clock.offset_ns / NS_PER_S:+.9f} s (host - device), skew {clock.skew_ppm:+.3f} ppm, "
         f"{clock.resets} resets",

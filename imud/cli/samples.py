@@ -1,17 +1,24 @@
 """`imud watch`: print samples as they come; `imud schema`: what their fields mean, in which units and frames."""
 
 import argparse
-from typing import Final
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from time import monotonic
+from typing import Any, Final, Protocol
 
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import table
+from imud.cli.streams import complain
+from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
 from imud.frames.conventions import Convention
 from imud.sample import SAMPLE_SCHEMA, Sample
 from imud.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
 
+LOOK_S: Final = 2.0
+"""Time between two looks at the states of the watched devices."""
 FIELD_HEAD: Final = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
 DRIVER_HEAD: Final = ("DRIVER", "NAVIGATION FRAME", "EULER ANGLES")
 
@@ -35,12 +42,52 @@ def watch(args: argparse.Namespace) -> int:
     """Print until interrupted, until N samples came, or until the daemon ends."""
     show = as_json if args.json else as_text
     with connect(args) as client:
-        samples = client.watch(args.device or None, rate_hz=args.rate, convention=args.convention)
-        for number, sample in enumerate(samples, start=1):
-            print(show(sample), flush=True)
-            if number == args.count:
-                break
+        samples = client.watch(args.device or None, rate_hz=args.rate, timeout_s=LOOK_S, convention=args.convention)
+        states = DeviceNotes(client, args.device)
+        shown = 0
+        while args.count is None or shown < args.count:
+            states.look(monotonic())
+            with suppress(TimeoutError):  # silence: its reason is looked for
+                print(show(next(samples)), flush=True)
+                shown += 1
     return 0
+
+
+class DeviceLister(Protocol):
+    """What lists the devices of a daemon, as `imud.client.Client` does."""
+
+    def devices(self) -> Sequence[Mapping[str, Any]]:
+        """Each with its name, state and problem."""
+        ...
+
+
+class DeviceNotes:
+    """Lines on standard error for devices that are watched and send no samples now, with the reason."""
+
+    def __init__(self, client: DeviceLister, names: Sequence[str]) -> None:
+        """No `names` are all devices."""
+        self._client = client
+        self._names = list(names)
+        self._due_s = 0.0
+        self._noted: dict[str, str] = {}
+
+    def look(self, now_s: float) -> None:
+        """Ask for the devices, once in LOOK_S at most, and note what has changed."""
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + LOOK_S
+        found = {str(device["name"]): device for device in self._client.devices()}
+        for name in self._names or sorted({*found, *self._noted}):
+            words = _why_silent(found[name]) if name in found else "not in the configuration any more"
+            if words != self._noted.get(name, ""):
+                complain(f"imud watch: {name} is {words or 'running'}")
+            self._noted[name] = words
+
+
+def _why_silent(device: Mapping[str, Any]) -> str:
+    """Describe state and problem of a device; empty for one that runs."""
+    state, problem = device["state"], device["problem"]
+    return "" if state == DeviceState.RUNNING else f"{state}: {problem}" if problem else str(state)
 
 
 def as_json(sample: Sample) -> str:

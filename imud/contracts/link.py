@@ -37,6 +37,10 @@ class Link(Protocol):
     writable: bool
     """Whether a device listens at the far end (a replay has none)."""
 
+    def absence(self) -> str:
+        """Return why `wait_present` would wait now, one sentence; empty when it would not. Raises LinkError."""
+        ...
+
     async def wait_present(self) -> None:
         """Return when the port is there; at once if it is. Waits on the kernel's events, never polls busily."""
         ...
@@ -86,10 +90,6 @@ class CanLink(Link, Protocol):
     """Frames to deliver, effective when set. Other frames may be delivered as well."""
     bitrate: int
     """Rate of the bus in bit/s, known once open; 0 where there is none (virtual buses) or it is unknown."""
-
-    def absence(self) -> str:
-        """Return the reason why `wait_present` would wait now, one sentence; empty when it would not."""
-        ...
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Deliver frames from now on. Needs a running loop and an open bus."""

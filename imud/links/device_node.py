@@ -7,8 +7,6 @@ processes that have it open, read from the file system and /proc.
 import asyncio
 import errno
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -29,42 +27,42 @@ NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
 STUCK: Final = frozenset({errno.ETIMEDOUT})
 
 ACCESS_WAIT_S: Final = 1.0
-"""Time to wait for access after a refusal: udev sets a node's group some ms after it makes the node."""
+"""Time to wait for access before a refusal counts: udev sets a node's group some ms after it makes the node."""
 SERIAL_GROUP: Final = "dialout"
 """Group of serial ports and buses on Debian and its relatives; named where only root may open the node."""
 PROC: Final = Path("/proc")
+OWN_PROCESS: Final = "this imud"
+COMMAND_BYTES: Final = 1024
+"""Of a command line that are looked at."""
+CABLE: Final = "is the cable plugged in, and is the path right?"
+"""Question to a user whose serial port is absent."""
 
 
 class DeviceNode:
     """The node of one link: waits until it can be opened. Synchronization: the loop's thread only."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, missing: str) -> None:
+        """`missing` is the question to a user whose node is absent."""
         self._path = Path(path)
-        self._denied = False
+        self._missing = missing
+
+    def absence(self) -> str:
+        """Return that the node is not there, one sentence; empty when it is."""
+        return "" if self._path.exists() else f"{self._path} is not there: {self._missing}"
 
     async def wait_present(self) -> None:
-        """Return when the node exists; after a refused open, when access is granted or after ACCESS_WAIT_S.
+        """Return when the node exists and may be opened, ACCESS_WAIT_S after it exists at the latest.
 
         Raises LinkError when inotify cannot be had, LinkDenied when the directory may not be read.
         """
         await wait_until(self._path, self._path.exists)
-        if not self._denied:
+        if self._accessible():
             return
         try:
             async with asyncio.timeout(ACCESS_WAIT_S):
                 await wait_until(self._path, self._accessible)
         except TimeoutError:
             return
-
-    @contextmanager
-    def opening(self) -> Iterator[None]:
-        """Open the node in this block: a LinkDenied raised in it makes the next wait one for access."""
-        self._denied = False
-        try:
-            yield
-        except LinkDenied:
-            self._denied = True
-            raise
 
     def _accessible(self) -> bool:
         return os.access(self._path, os.R_OK | os.W_OK, effective_ids=True)
@@ -123,6 +121,14 @@ def holders_of(path: str, proc: Path = PROC) -> str:
     return ", ".join(holders)
 
 
+def _words(process: Path) -> list[str]:
+    """Return the command line of a process, its first words; empty where that cannot be read."""
+    try:
+        return (process / "cmdline").read_bytes()[:COMMAND_BYTES].decode("utf-8", "replace").split("\0")
+    except OSError:
+        return []
+
+
 def _has_open(process: Path, target: str) -> bool:
     try:
         descriptors = os.listdir(process / "fd")
@@ -139,6 +145,12 @@ def _target(descriptor: Path) -> str:
 
 
 def _name(process: Path) -> str:
+    if process.name == str(os.getpid()):
+        return OWN_PROCESS
+    words = _words(process)
+    for place, word in enumerate(words[:-1]):
+        if os.path.basename(word) == "imud":  # an interpreter may stand before it, and its options
+            return f"imud {printable(words[place + 1])}"
     try:
         return printable((process / "comm").read_text("utf-8", "backslashreplace").strip())
     except OSError:

@@ -23,6 +23,7 @@ I2C_TIMEOUT: Final = 0x0702
 """ioctl: time-out of the adapter in units of 10 ms (<linux/i2c-dev.h>)."""
 TIMEOUT_10MS: Final = 5
 """50 ms: 40 times the 1.2 ms that 48 bytes take at 400 kHz."""
+SWITCHED_ON: Final = "is I2C switched on (`dtparam=i2c_arm=on` on a Raspberry Pi), is module i2c-dev loaded?"
 BLOCK_BYTES_MAX: Final = 32
 """Longest I2C block read of SMBus controllers."""
 
@@ -84,7 +85,7 @@ class I2cLink:
         ioctl: Callable[[int, int, int], object] = fcntl.ioctl,
     ) -> None:
         self._open_bus, self._ioctl = open_bus, ioctl
-        self._node = DeviceNode(bus_of(settings))
+        self._node = DeviceNode(bus_of(settings), SWITCHED_ON)
         self._bus: I2cBus | None = None
         self._address = 0
         self._place = ""
@@ -96,14 +97,17 @@ class I2cLink:
         self.rate_hz = settings.rate_hz
         self.bit_rate = 0
 
+    def absence(self) -> str:
+        """Return why the port cannot be opened now; empty when it is there."""
+        return self._node.absence()
+
     async def wait_present(self) -> None:
         """Return when the node is there."""
         await self._node.wait_present()
 
     def open(self) -> None:
         """Open the node. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        with self._node.opening():
-            self._open()
+        self._open()
 
     def select(self, target: int) -> None:
         """Address the next transfers, 7 bits."""
@@ -149,8 +153,7 @@ class I2cLink:
             self._ioctl(self._bus.fd or 0, I2C_TIMEOUT, TIMEOUT_10MS)
         except OSError as error:
             self.close()
-            hint = "is I2C switched on (`dtparam=i2c_arm=on` on a Raspberry Pi), is module i2c-dev loaded?"
-            raise bus_open_problem(error, self.title, hint) from error
+            raise bus_open_problem(error, self.title, SWITCHED_ON) from error
 
     def _combined(self, bus: I2cBus, sent: bytes, read_bytes: int) -> bytes:
         write = i2c_msg.write(self._address, sent)

@@ -34,6 +34,7 @@ ROW: Final = struct.Struct("=QQIIHBBBBBB")
 word_delay_usecs, pad."""
 ROWS_MAX: Final = 32
 """fcntl.ioctl lets other threads run for arguments of up to 1024 bytes only."""
+SWITCHED_ON: Final = "is SPI switched on (`dtparam=spi=on` on a Raspberry Pi)?"
 PREPARED_MAX: Final = 64
 """Transfers whose buffers are kept; a device has some ten different ones."""
 
@@ -71,7 +72,7 @@ class SpiLink:
     ) -> None:
         self._settings = settings
         self._ioctl, self._open_node, self._close_node = ioctl, open_node, close_node
-        self._node = DeviceNode(settings.port)
+        self._node = DeviceNode(settings.port, SWITCHED_ON)
         self._fd = -1
         self._bits = 16
         self._prepared: dict[Transfer, _Message] = {}
@@ -84,14 +85,17 @@ class SpiLink:
         self.rate_hz = settings.rate_hz
         self.bit_rate = 0
 
+    def absence(self) -> str:
+        """Return why the port cannot be opened now; empty when it is there."""
+        return self._node.absence()
+
     async def wait_present(self) -> None:
         """Return when the node is there."""
         await self._node.wait_present()
 
     def open(self) -> None:
         """Open the node and set the clock. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        with self._node.opening():
-            self._open()
+        self._open()
 
     def select(self, target: int) -> None:
         """Use an SPI mode, 0 to 3. Raises LinkError."""
@@ -142,9 +146,7 @@ class SpiLink:
             self._set_bits(self._accepted_bits())
         except OSError as error:
             self.close()
-            raise bus_open_problem(
-                error, self.title, "is SPI switched on (`dtparam=spi=on` on a Raspberry Pi)?"
-            ) from error
+            raise bus_open_problem(error, self.title, SWITCHED_ON) from error
 
     def _accepted_bits(self) -> int:
         """16 if the controller has such words, otherwise 8."""

@@ -21,7 +21,7 @@ from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
 from imud.contracts.publisher import Batch
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
-from imud.errors import BadArgument, CommandError, ImudError, LinkError, LinkMissing
+from imud.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
 from imud.event import Event
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
@@ -69,7 +69,10 @@ class Device:
         host: HostClock,
         lines: LineFactory,
         files: SettingsFiles,
+        port_owner: Callable[[], str],
     ) -> None:
+        """`port_owner` names the device of this configuration that has the port, empty for none."""
+        self._port_owner = port_owner
         self.config = config
         self.device_id = device_id
         self.ledger = Ledger()
@@ -152,7 +155,7 @@ class Device:
                 self._down(DeviceState.MISSING, error)
                 await asyncio.sleep(GONE_S)
             except LinkError as error:
-                self._down(DeviceState.FAILED, error)
+                self._down(DeviceState.FAILED, self._with_owner(error))
                 await asyncio.sleep(RETRY_S)
 
     async def _serve(self) -> None:
@@ -187,6 +190,13 @@ class Device:
     def _on_end(self, error: LinkError | None) -> None:
         if self._ended is not None and not self._ended.done():
             self._ended.set_result(error)
+
+    def _with_owner(self, error: LinkError) -> LinkError:
+        """Name the device that has the port, where it is one of this configuration."""
+        owner = self._port_owner() if isinstance(error, LinkBusy) else ""
+        if not owner:
+            return error
+        return LinkBusy(f"{self._transport.link.title} is in use by {owner}, another device of this configuration")
 
     def _down(self, state: DeviceState, error: LinkError) -> None:
         self._health.down(self._host.now_ns(), state, str(error))
@@ -315,7 +325,9 @@ class Device:
         ):
             self._up(now_ns)
         elif state is DeviceState.RUNNING and quiet_ns > max(SILENCE_NS, SILENCE_PERIODS * path.period_ns):
-            words = f"no sample for {quiet_ns / NS_PER_S:.1f} s, though the link is there"
+            words = (
+                f"no sample for {quiet_ns / NS_PER_S:.1f} s, though the link is there: is it powered, was it stopped?"
+            )
             self._health.down(now_ns, DeviceState.SILENT, words)
         elif quiet_ns > UNHEARD_NS:
             self._transport.on_no_samples(path, now_ns)

@@ -3,10 +3,11 @@
 What the devices of a daemon share (time, buses, remembered devices, GPIO lines) is kept here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from imud.config import DeviceConfig
+from imud.config.claims import owner_of
 from imud.contracts.can import CanDriver
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import CanLink, PolledLink, StreamLink
@@ -41,9 +42,11 @@ class DeviceFactory:
         state_dir: Path | None = None,
         lines: LineFactory = GPIO_LINES,
         start_worker: StartWorker = BusThread,
+        configured: Callable[[], Sequence[DeviceConfig]] = lambda: (),
     ) -> None:
         """Found devices are remembered in `state_dir` (None: not beyond this run); `lines` makes the GPIO lines, and
-        `start_worker` starts what serves a polled bus."""
+        `start_worker` starts what serves a polled bus; `configured` are all devices of the present configuration."""
+        self._configured = configured
         self.remembered = Remembered(state_dir)
         """Last known driver and rate of each device."""
         self._publish = publish
@@ -77,6 +80,7 @@ class DeviceFactory:
             self._host,
             self._lines,
             self._files,
+            lambda: owner_of(config, self._configured(), LINKS),
         )
 
     def close(self) -> None:

@@ -13,6 +13,8 @@ from imud.runtime.notices import Notices
 
 log = logging.getLogger(__name__)
 
+SEARCH_BEGUN = "no sample has come yet: wait until the search has listened for a while"
+"""The problem of a device whose link was opened just now."""
 STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
 
 
@@ -41,6 +43,7 @@ class Health:
     def searching(self) -> None:
         """Enter SEARCHING; the problem stays shown until a device is found."""
         self.state = DeviceState.SEARCHING
+        self.problem = self.problem or SEARCH_BEGUN
 
     def finished(self) -> None:
         """Enter FINISHED: a replay came to its end."""
@@ -63,6 +66,11 @@ class Health:
             self._notices.raise_event(now_ns, EventKind.DOWN, problem, state=str(state))
         elif changed:
             log.warning("%s: %s", self._notices.device, problem)
+
+    def missing(self, now_ns: int, reason: str) -> None:
+        """Enter MISSING for `reason`, empty for a link that is there; how a link went stays shown until it is back."""
+        if reason and not (self.state is DeviceState.MISSING and self.problem):
+            self.down(now_ns, DeviceState.MISSING, reason)
 
     def report(self, problem: str) -> None:
         """Show what is wrong while the state stays; trouble of the link takes precedence."""

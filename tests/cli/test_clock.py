@@ -63,7 +63,9 @@ def test_silence_ends_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
     with running_daemon(tmp_path, {"bow": device}) as daemon:
         assert main(["clock", "--socket", str(daemon.socket), "--duration", "0.1"]) == 1
-    assert "0 samples" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "0 samples" in out
+    assert f"bow is missing: {tmp_path}/none is not there: is the cable plugged in" in out
 
 
 def test_what_tells_the_time_besides_arrivals_has_rows() -> None:

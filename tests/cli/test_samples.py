@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from imud.cli import main
-from imud.cli.samples import as_json, as_text
+from imud.cli.samples import DeviceNotes, as_json, as_text
 from imud.sample import Sample, Sync
 from tests.support.socket_rig import Daemon, batch, daemon
 
@@ -71,3 +71,32 @@ def test_schema_names_every_field_with_its_unit(capsys: pytest.CaptureFixture[st
     text = capsys.readouterr().out
     for word in ("accel_m_s2", "m/s²", "gyro_rad_s", "rad/s", "hipnuc-uart", "ENU"):
         assert word in text
+
+
+def test_a_device_that_is_gone_is_told_once_and_when_it_is_back(capsys: pytest.CaptureFixture[str]) -> None:
+    class Answers:
+        """A client whose daemon's devices are these."""
+
+        def __init__(self) -> None:
+            self.found = [{"name": "bow", "state": "running", "problem": ""}]
+
+        def devices(self) -> list[dict[str, str]]:
+            return self.found
+
+    client = Answers()
+    notes = DeviceNotes(client, ["bow"])
+    notes.look(0.0)
+    assert capsys.readouterr().err == ""
+    client.found = [{"name": "bow", "state": "missing", "problem": "/dev/x is not there"}]
+    notes.look(1.0)
+    assert capsys.readouterr().err == ""
+    for now_s in (2.0, 4.0):
+        notes.look(now_s)
+    assert capsys.readouterr().err == "imud watch: bow is missing: /dev/x is not there\n"
+    client.found = []
+    notes.look(6.0)
+    client.found = [{"name": "bow", "state": "running", "problem": ""}]
+    notes.look(8.0)
+    assert (
+        capsys.readouterr().err == "imud watch: bow is not in the configuration any more\nimud watch: bow is running\n"
+    )

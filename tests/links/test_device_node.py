@@ -1,5 +1,6 @@
 """What is reported of a node that cannot be opened, with holders from a made-up /proc."""
 
+import asyncio
 import errno
 import os
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from imud.errors import LinkBusy, LinkDenied, LinkMissing
-from imud.links.device_node import SERIAL_GROUP, holders_of, open_problem
+from imud.links.device_node import SERIAL_GROUP, DeviceNode, holders_of, open_problem
 from imud.permissions import user_name
 
 
@@ -30,6 +31,50 @@ def test_every_holder_is_named_by_program_and_pid(tmp_path: Path) -> None:
     (proc / "self").mkdir()
     assert holders_of(str(link), proc) == "minicom (pid 10), screen (pid 12)"
     assert holders_of("/dev/ttyUSB9", proc) == ""
+
+
+@pytest.mark.parametrize(
+    "command", [["/opt/imud/bin/imud", "probe", "--active"], ["/usr/bin/python3", "-I", "-m", "imud", "probe"]]
+)
+def test_another_imud_is_named_by_what_it_does(tmp_path: Path, command: list[str]) -> None:
+    process(tmp_path, 10, "python3", "/dev/ttyUSB0")
+    (tmp_path / "10" / "cmdline").write_text("\0".join(command) + "\0")
+    process(tmp_path, os.getpid(), "imud", "/dev/ttyUSB0")
+    named = holders_of("/dev/ttyUSB0", tmp_path)
+    assert sorted(named.split(", ")) == ["imud probe (pid 10)", f"this imud (pid {os.getpid()})"]
+
+
+def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """udev sets the group of a node after the kernel has made it; a refusal counts only when that time is over."""
+    path, granted = tmp_path / "tty", False
+
+    def access(_path: object, _mode: int, **_more: bool) -> bool:
+        return granted
+
+    monkeypatch.setattr("imud.links.device_node.os.access", access)
+    node = DeviceNode(str(path), "is it plugged in?")
+    assert node.absence() == f"{path} is not there: is it plugged in?"
+
+    async def appear() -> None:
+        nonlocal granted
+        waiting = asyncio.create_task(node.wait_present())
+        await asyncio.sleep(0)
+        path.touch()
+        for _ in range(50):
+            await asyncio.sleep(0)
+        assert not waiting.done()
+        assert node.absence() == ""
+        granted = True
+        path.chmod(0o660)
+        await asyncio.wait_for(waiting, 5)
+
+    asyncio.run(appear())
+
+
+def test_access_that_is_not_granted_is_waited_for_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.links.device_node.os.access", lambda *_arguments, **_more: False)
+    monkeypatch.setattr("imud.links.device_node.ACCESS_WAIT_S", 0.01)
+    asyncio.run(asyncio.wait_for(DeviceNode(str(tmp_path), "").wait_present(), 5))
 
 
 def test_a_process_without_a_name(tmp_path: Path) -> None:

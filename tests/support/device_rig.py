@@ -4,7 +4,7 @@
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -125,12 +125,19 @@ class DeviceRigs:
         state_dir: Path | None = None,
         lines: LineFactory = GPIO_LINES,
         start_worker: StartWorker = BusThread,
+        configured: Sequence[DeviceConfig] = (),
     ) -> None:
-        """Time, lines and workers are the real ones unless given."""
+        """Time, lines and workers are the real ones unless given; `configured` are all devices of the file."""
         self.host = host or HostClock()
         self.rigs: dict[str, DeviceRig] = {}
         self.factory = DeviceFactory(
-            self._publish, self._send_event, self.host, state_dir=state_dir, lines=lines, start_worker=start_worker
+            self._publish,
+            self._send_event,
+            self.host,
+            state_dir=state_dir,
+            lines=lines,
+            start_worker=start_worker,
+            configured=lambda: configured,
         )
 
     def add(self, config: DeviceConfig, link: MemoryLink | MemoryCanLink | None = None) -> DeviceRig:

@@ -87,6 +87,10 @@ class PolledBusBench:
 class _ReadyI2c(I2cLink):
     """Its node need not be waited for."""
 
+    def absence(self) -> str:
+        """It is there."""
+        return ""
+
     async def wait_present(self) -> None:
         """It is there."""
         await asyncio.sleep(0)

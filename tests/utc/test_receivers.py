@@ -168,6 +168,10 @@ class Port:
         self.started = asyncio.Event()
         self._refusals = refusals
 
+    def absence(self) -> str:
+        """It is there."""
+        return ""
+
     async def wait_present(self) -> None:
         await asyncio.sleep(0)
 

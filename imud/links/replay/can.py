@@ -8,7 +8,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Final
 
 from imud.contracts.link import OnBusNews, OnEnd, OnFrames
@@ -39,10 +38,6 @@ class CanReplayLink(FileReplay):
         self.filters: Sequence[CanFilter] = ()
         self.bus = settings.path
         self.bitrate = 0
-
-    def absence(self) -> str:
-        """Whether the file is missing."""
-        return "" if Path(self.title).exists() else f"{self.title} is not there: expected a candump log"
 
     def open(self) -> None:
         """Open the log and check that it has frames. Raises LinkMissing, LinkDenied, LinkError."""

@@ -48,6 +48,10 @@ class FileReplay:
         self._file: BinaryIO | None = None
         self._timer: asyncio.Handle | None = None
 
+    def absence(self) -> str:
+        """Return that the file is missing; empty when it is there."""
+        return "" if Path(self.title).exists() else f"{self.title} is not there: expected a capture file"
+
     async def wait_present(self) -> None:
         """Return when the file is there."""
         path = Path(self.title)

@@ -15,7 +15,7 @@ from imud.contracts.polling import Transfer
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters, SerialLineCounters
 from imud.errors import LinkError, LinkMissing
-from imud.links.device_node import PROC, DeviceNode
+from imud.links.device_node import CABLE, PROC, DeviceNode
 from imud.links.rs485.line import SHARED_PORTS, LineCounters, PortSetup, Rs485Line, SharedPorts
 from imud.units import NS_PER_MS
 
@@ -54,7 +54,7 @@ class Rs485Link:
         self._settings = settings
         self._ports, self._sys, self._proc = ports, sys, proc
         self._line: Rs485Line | None = None
-        self._node = DeviceNode(settings.line)
+        self._node = DeviceNode(settings.line, CABLE)
         self._address = 0
         self._reply_ns = settings.reply_ms * NS_PER_MS
         self.title = settings.line
@@ -70,14 +70,17 @@ class Rs485Link:
         """Bytes other than replies, received on the line since it was opened."""
         return self._line.counters if self._line else LineCounters()
 
+    def absence(self) -> str:
+        """Return why the port cannot be opened now; empty when it is there."""
+        return self._node.absence()
+
     async def wait_present(self) -> None:
         """Return when the port is there."""
         await self._node.wait_present()
 
     def open(self) -> None:
         """Open the port exclusively, or share it. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
-        with self._node.opening():
-            self._line = self._ports.share(_setup(self._settings), self._sys, self._proc)
+        self._line = self._ports.share(_setup(self._settings), self._sys, self._proc)
 
     def select(self, target: int) -> None:
         """Address the next transfers; 0 is a broadcast, which has no reply."""

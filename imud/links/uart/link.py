@@ -19,7 +19,7 @@ from imud.contracts.link import LinkType, OnData, OnEnd
 from imud.contracts.settings import Settings
 from imud.contracts.status import KernelCounters
 from imud.errors import LinkError, LinkMissing
-from imud.links.device_node import PROC, DeviceNode
+from imud.links.device_node import CABLE, PROC, DeviceNode
 from imud.links.uart.serial_port import (
     TtyCounters,
     change_baud,
@@ -62,7 +62,7 @@ class UartLink:
         self._port: serial.Serial | None = None
         self._fd = -1
         self._counters: TtyCounters | None = None
-        self._node = DeviceNode(settings.port)
+        self._node = DeviceNode(settings.port, CABLE)
         self._on_data: OnData = _ignore_data
         self._on_end: OnEnd = _ignore_end
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -75,15 +75,18 @@ class UartLink:
         self.baud: int = DEFAULT_BAUD if settings.baud == "auto" else settings.baud
         self.hold_ns = 0
 
+    def absence(self) -> str:
+        """Return why the port cannot be opened now; empty when it is there."""
+        return self._node.absence()
+
     async def wait_present(self) -> None:
-        """Return when the port is there; after a refused `open`, when access is granted or after ACCESS_WAIT_S."""
+        """Return when the port is there and may be opened, ACCESS_WAIT_S after it is there at the latest."""
         await self._node.wait_present()
 
     def open(self) -> None:
         """Open the port exclusively, raw 8N1. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
         path = self._settings.port
-        with self._node.opening():
-            self._port = open_port(path, self.baud, self._proc)
+        self._port = open_port(path, self.baud, self._proc)
         self._fd = self._port.fileno()
         self._counters = TtyCounters(self._fd)
         if self._settings.low_latency:

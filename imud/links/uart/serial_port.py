@@ -23,7 +23,7 @@ import serial
 
 from imud.contracts.status import KernelCounters
 from imud.errors import LinkError, reason_of
-from imud.links.device_node import PROC, errno_of, open_problem
+from imud.links.device_node import CABLE, PROC, errno_of, open_problem
 from imud.units import NS_PER_MS
 
 TCGETS2: Final = 0x802C542A
@@ -82,7 +82,7 @@ def baud_of(fd: int) -> int:
 
 def port_problem(error: Exception, path: str, proc: Path = PROC) -> LinkError:
     """The LinkError for what the system reports of a serial port, with what to check."""
-    if known := open_problem(error, path, "is the cable plugged in, and is the path right?", proc):
+    if known := open_problem(error, path, CABLE, proc):
         return known
     if errno_of(error) == errno.EIO:
         return LinkError(f"{path} has a node but no hardware behind it: is this the right port, is it enabled?")

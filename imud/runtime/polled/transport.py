@@ -81,6 +81,7 @@ class PolledTransport:
 
     async def wait_present(self) -> None:
         """Return when the bus is there."""
+        self._health.missing(self._now_ns(), self.link.absence())
         await self.link.wait_present()
 
     def start(self, on_end: OnEnd) -> None:

@@ -64,6 +64,7 @@ class StreamTransport:
 
     async def wait_present(self) -> None:
         """Return when the port is there."""
+        self._health.missing(self._now_ns(), self.link.absence())
         await self.link.wait_present()
 
     def start(self, on_end: OnEnd) -> None:

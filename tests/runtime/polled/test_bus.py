@@ -36,6 +36,10 @@ class Wire:
         self.threads: set[str] = set()
         self.takes_time: Callable[[], None] = lambda: None
 
+    def absence(self) -> str:
+        """It is there."""
+        return ""
+
     async def wait_present(self) -> None: ...
     def open(self) -> None: ...
     def write(self, data: bytes) -> None: ...

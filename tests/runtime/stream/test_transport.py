@@ -7,6 +7,7 @@ from functools import partial
 from time import monotonic_ns
 from typing import Any
 
+import msgspec
 import pytest
 
 from imud.config import DeviceConfig
@@ -16,11 +17,13 @@ from imud.contracts.status import DeviceState, KernelCounters
 from imud.devices.hipnuc.uart import driver
 from imud.errors import LinkBusy, LinkError
 from imud.event import EventKind
+from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemorySettings
 from imud.runtime import device as device_module
 from imud.runtime.detection.remembered import RememberedDevice
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock
 from tests.support.files import hi91
 
 MS = 1_000_000
@@ -269,9 +272,81 @@ def test_nothing_heard_says_what_to_look_at() -> None:
 def test_a_device_that_has_just_been_opened_is_given_time() -> None:
     async def story(rig: DeviceRig) -> None:
         rig.tick()
+        assert rig.problem == "no sample has come yet: wait until the search has listened for a while"
+        feed(rig, hi91(10))
+        rig.tick()
         assert rig.problem == ""
 
     play(story)
+
+
+@pytest.mark.parametrize("baud", [115200, "auto"])
+def test_the_time_unplugged_is_no_silence(baud: Any) -> None:
+    """A device that was away for 6 s and needs another 3 s to start again is up once, and was never silent."""
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured(baud=baud))
+    ms = 0
+
+    def send() -> None:
+        nonlocal ms
+        ms += 10
+        assert rig.link.feed(hi91(ms), clock.now_ns())
+
+    async def until_after(duration_ms: int, step: Callable[[], object] = lambda: None, step_s: float = 0.1) -> None:
+        end_ns = clock.now_ns() + duration_ms * MS
+        await rig.until(lambda: clock.now_ns() > end_ns, step=step, step_s=step_s)
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.until(lambda: rig.link.listening)
+        for _ in range(2):
+            await rig.until(lambda: rig.state is DeviceState.RUNNING, step=send, step_s=0.01)
+            await until_after(300, send, 0.01)
+            rig.link.disappear()
+            await until_after(6000)
+            assert "gone" in rig.problem
+            rig.link.appear()
+            await until_after(3000)
+        kinds = [kind for kind in rig.kinds if kind in (EventKind.UP, EventKind.DOWN)]
+        assert kinds == [EventKind.UP, EventKind.DOWN] * 2
+        assert not [event for event in rig.events if "no sample for" in event.message]
+
+    play_rigs(rigs, story, clock)
+
+
+def test_a_port_that_is_not_there_says_so_and_what_to_look_at(caplog: pytest.LogCaptureFixture) -> None:
+    rigs = DeviceRigs()
+    rig = rigs.add(configured())
+    rig.link.disappear()
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.turn(lambda: rig.problem)
+        assert (rig.state, rig.problem) == (DeviceState.MISSING, "memory is not there: the test pulled it out")
+        assert rig.kinds == []
+        rig.link.appear()
+        await rig.turn(lambda: rig.link.listening)
+        assert not rig.is_in(DeviceState.MISSING)
+
+    play_rigs(rigs, story)
+    assert caplog.text.count("is not there") == 1
+
+
+def test_a_port_that_another_device_of_the_configuration_has_names_it() -> None:
+    class Busy(MemoryLink):
+        def open(self) -> None:
+            raise LinkBusy("memory is in use by this imud (pid 4711): stop that first")
+
+    first = DeviceConfig(
+        "mast", "auto", None, True, "uart", msgspec.convert({"port": "/dev/x"}, LINKS["uart"].settings)
+    )
+    rigs = DeviceRigs(configured=[first, replace(first, name="bow")])
+    rig = rigs.add(replace(first, name="bow"), Busy(MemorySettings(baud=115200)))
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.turn(lambda: rig.state is DeviceState.FAILED)
+        assert rig.problem == "memory is in use by mast, another device of this configuration"
+
+    play_rigs(rigs, story)
 
 
 def test_bytes_without_frames_say_so() -> None:
