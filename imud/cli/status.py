@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
 def block(status: DeviceStatus) -> str:
     """Format the block of one device."""
     clock, ledger = status.clock, status.ledger
-    words = " ".join(dict.fromkeys(status.identity.values())) or "not known"
+    words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
     lines = [
         f"{status.name}: {status.state}" + (f" ({status.problem})" if status.problem else ""),
         f"  link      {status.link}, driver {status.driver}, opened {status.connects} times",

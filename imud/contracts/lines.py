@@ -134,6 +134,8 @@ class ResetSettings(OutputSettings, frozen=True, kw_only=True, forbid_unknown_fi
     """Length of the reset pulse, ms."""
     wait_s: Annotated[float, Meta(ge=0, le=60)] = 3.0
     """Start-up time of the device after the pulse, s: 3 s for an IMU61x (manual, note 1 of 2.2)."""
+    at_start: bool = False
+    """Whether to pulse it once at the start of imud, before the device is asked for the first time."""
 
 
 class DeviceLines(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -84,6 +84,7 @@ class SearchLoop:
 
     async def run(self) -> None:
         """Search and ask, again and again; the first search has begun. Ends only by an error of the link."""
+        await self._attachments.reset_settled()
         while True:
             searched = self._round is not None
             await self._finish_search()

@@ -1,11 +1,13 @@
 """The reset line of a device: pulsed on request, and after a long unsuccessful search for the device.
 
-A pulse is the last resort: a device that restarts by itself is absent for `wait_s` as well, and one that was unplugged
-is not helped. It needs ROUNDS failed rounds of search and more than `wait_s`, and comes once a minute at most.
+With `at_start` it is also pulsed once, before the first search. Otherwise a pulse is the last resort: a device that
+restarts by itself is absent for `wait_s` as well, and one that was unplugged is not helped. It needs ROUNDS failed
+rounds of search and more than `wait_s`, and comes once a minute at most.
 """
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import Final
 
 from imud.clock import SampleClock
@@ -66,6 +68,7 @@ class ResetLine:
         self._since_ns = 0
         self._again_ns = 0
         self._pulsing = asyncio.Lock()
+        self._due_at_start = settings.at_start
 
     def start(self, clock: SampleClock) -> None:
         """Do nothing: a device counts as found when its first sample comes (`found`)."""
@@ -103,7 +106,12 @@ class ResetLine:
                 raise CommandError(f"reset: {error}") from error
 
     async def settled(self) -> None:
-        """Wait until no pulse and no start-up is in progress."""
+        """Wait until no pulse and no start-up is in progress; at the start pulse first, if that is wanted."""
+        if self._due_at_start and self._is_open:
+            self._due_at_start = False
+            self._raise_event(self._now_ns(), EventKind.LINK, "reset by its line at the start", line="reset")
+            with suppress(CommandError):  # `pulse` has raised the event
+                await self.pulse()
         async with self._pulsing:
             return
 

@@ -19,8 +19,8 @@ from imud.config import DeviceConfig
 from imud.contracts.lines import DeviceLines, LineFactory, ReadySettings
 from imud.contracts.link import LinkType
 from imud.contracts.publisher import Batch
-from imud.devices.imu61x.spi import codec as spi
-from imud.devices.imu61x.spi.session import PIPELINE_BYTES
+from imud.devices.imu61x.spi import bursts as spi
+from imud.devices.imu61x.spi.words import PIPELINE_BYTES
 from imud.host_clock import HostClock
 from imud.links.spi import SpiLink, SpiSettings
 from imud.runtime.device_factory import DeviceFactory

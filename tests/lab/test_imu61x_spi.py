@@ -8,7 +8,7 @@ import pytest
 from imud.contracts.polling import Poll
 from imud.contracts.status import DeviceState
 from imud.devices.imu61x.spi import codec as spi
-from imud.devices.imu61x.spi.session import READ_STATE
+from imud.devices.imu61x.spi.words import READ_STATE
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes

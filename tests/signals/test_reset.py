@@ -61,12 +61,12 @@ async def test_a_line_that_is_gone() -> None:
 class Scene:
     """A reset line in virtual time."""
 
-    def __init__(self) -> None:
+    def __init__(self, settings: ResetSettings = SETTINGS) -> None:
         signals = SignalBench()
         self.clock, self.events = signals.clock, signals.events
         self.announced = 0
         made = make_reset(
-            DEVICE, DeviceLines(reset=SETTINGS), signals.factory, signals.raise_event, self.clock.now_ns, self._on_pulse
+            DEVICE, DeviceLines(reset=settings), signals.factory, signals.raise_event, self.clock.now_ns, self._on_pulse
         )
         assert made is not None
         self.reset: ResetLine = made
@@ -180,3 +180,33 @@ async def test_a_line_that_fails_when_it_is_driven() -> None:
     assert not it.line.is_open
     it.tick(1)
     assert it.line.is_open
+
+
+@pytest.mark.parametrize("at_start", [True, False])
+def test_at_the_start_it_is_pulsed_once_before_the_device_is_asked(at_start: bool) -> None:
+    scene = Scene(ResetSettings(line="RESET", hold_ms=20, at_start=at_start))
+
+    async def story() -> None:
+        scene.tick()
+        await scene.reset.settled()
+        waited_ns = scene.clock.now_ns() - 1000 * NS_PER_S
+        assert waited_ns == pytest.approx(3.02 * NS_PER_S if at_start else 0, abs=1e8)
+        await scene.reset.settled()
+        assert scene.clock.now_ns() - 1000 * NS_PER_S - waited_ns < 1e8
+
+    run_virtually(scene.clock, story())
+    assert scene.announced == len(scene.pulses_s) == at_start
+    assert [event.message for event in scene.events] == ["reset by its line at the start"] * at_start
+
+
+def test_a_line_that_cannot_be_driven_at_the_start_holds_nothing_up() -> None:
+    scene = Scene(ResetSettings(line="RESET", at_start=True))
+    scene.line.set_error = LinkMissing("gone")
+
+    async def story() -> None:
+        scene.tick()
+        await scene.reset.settled()
+
+    run_virtually(scene.clock, story())
+    assert scene.clock.now_ns() - 1000 * NS_PER_S < 1e8
+    assert [event.message for event in scene.events][-1] == "line reset: gone"

@@ -6,9 +6,11 @@ registers behind I2C and SPI are read by single transfers.
 
 import struct
 from collections.abc import Callable, Generator
-from dataclasses import replace
+from dataclasses import fields, replace
 from math import radians
 from typing import Any, NamedTuple, TypeVar
+
+import pytest
 
 from imud.contracts.action import Target
 from imud.contracts.codec import CodecEvent, ReplyFrame, message_of
@@ -30,6 +32,7 @@ from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings, SlaveVarian
 from imud.sim.hipnuc.uart.behaviour import Behaviour
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.imu61x.behaviour import VARIANTS, Imu61xBehaviour
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
@@ -413,8 +416,10 @@ class Imu61xBench:
         if request.silent:
             return Reply(())
         while True:
-            messages = [message for event in self.wait(UART_STEP_MS) if (message := message_of(event)) is not None]
-            outcomes = [self.session.on_message(message, self.now_ns) for message in messages]
+            events = self.wait(UART_STEP_MS)
+            messages = [message for event in events if (message := message_of(event)) is not None]
+            outcomes: list[Outcome | None] = [self.session.on_message(message, self.now_ns) for message in messages]
+            outcomes += [self.session.on_sample(event) for event in events if isinstance(event, Measurement)]
             for outcome in (*outcomes, self.session.on_time(self.now_ns)):
                 if outcome is not None:
                     return outcome
@@ -429,9 +434,33 @@ class Imu61xBench:
         self.wait(self.module.hardware.boot_ms + 1)
 
 
-def imu61x_bench(settings: Imu61xSettings | None = None, **hardware: object) -> Imu61xBench:
-    """A bench with a device at rest that differs in `hardware`."""
-    return Imu61xBench(settings, replace(IMU61X_STILL, **hardware))  # type: ignore[arg-type]  # names of fields
+def imu61x_hardware(**more: object) -> Imu61xHardware:
+    """A device at rest that differs in `more`: fields of its hardware or of its behaviour."""
+    names = {field.name for field in fields(Imu61xBehaviour)}
+    behaviour = {name: value for name, value in more.items() if name in names}
+    hardware = {name: value for name, value in more.items() if name not in names}
+    if behaviour:
+        hardware["behaviour"] = replace(IMU61X_STILL.behaviour, **behaviour)  # type: ignore[arg-type]  # names of fields
+    return replace(IMU61X_STILL, **hardware)  # type: ignore[arg-type]  # the same
+
+
+def imu61x_bench(settings: Imu61xSettings | None = None, **more: object) -> Imu61xBench:
+    """A bench with a device of `imu61x_hardware`."""
+    return Imu61xBench(settings, imu61x_hardware(**more))
+
+
+every_variant = pytest.mark.parametrize("variant", VARIANTS)
+"""Calls a test with the name of each variant that the manual leaves open."""
+
+
+def variant_bench(variant: str, settings: Imu61xSettings | None = None, **more: object) -> Imu61xBench:
+    """A bench with a device that behaves as the variant of this name."""
+    return imu61x_bench(settings, behaviour=VARIANTS[variant], **more)
+
+
+def done(variant: str) -> int:
+    """The result that means done, which the configuration must say of a variant."""
+    return VARIANTS[variant].result_done
 
 
 def over_i2c(device: Imu61xRegisters, transfer: Transfer) -> bytes:

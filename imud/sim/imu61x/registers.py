@@ -20,8 +20,9 @@ from imud.attitude import euler_zyx_from_quat
 from imud.devices.imu61x.common import registers
 from imud.devices.imu61x.common.family import FILTER_DEFAULT, product_id_of
 from imud.devices.imu61x.i2c import codec as i2c
-from imud.devices.imu61x.spi import codec as spi
-from imud.devices.imu61x.spi.session import PIPELINE_BYTES, PIPELINE_WORDS, write
+from imud.devices.imu61x.spi import bursts as spi
+from imud.devices.imu61x.spi.words import PIPELINE_BYTES, PIPELINE_WORDS, write
+from imud.sim.imu61x.behaviour import RegisterBehaviour
 from imud.sim.physics.motion import Motion, Truth, swing
 from imud.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
 
@@ -59,10 +60,12 @@ class Imu61xRegisters:
         product: str = "IMU614",
         modes: frozenset[int] = frozenset({0, 3}),
         update_ns: int = UPDATE_NS,
+        behaviour: RegisterBehaviour | None = None,
         seed: int = 1,
     ) -> None:
         """`now_ns` is CLOCK_MONOTONIC; `modes` are the SPI modes that it understands."""
         self.faults = RegisterFaults()
+        self.behaviour = behaviour or RegisterBehaviour()
         self.epoch_ns = now_ns()
         """Zero of its motion: truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
         self.motion = motion or swing(STANDARD_GRAVITY_M_S2)
@@ -129,10 +132,12 @@ class Imu61xRegisters:
             self._write(address, word & 0xFF)
             return 0
         if address == registers.WIN_CTRL:
-            return self.window
+            return self.window | self.behaviour.window_bits
         return self._configuration(address) if self.window == _WINDOW_1 else self._value(address)
 
     def _write(self, address: int, value: int) -> None:
+        if self.faults.ignores_writes and address != registers.WIN_CTRL:
+            return
         if address == registers.WIN_CTRL:
             self.window = value & 1
         elif self.window == _WINDOW_1 and address == registers.FILTER_CTRL:
@@ -143,8 +148,8 @@ class Imu61xRegisters:
     def _configuration(self, address: int) -> int:
         if address == registers.FILTER_CTRL:
             return self.filter
-        if address == registers.BURST_CTRL:
-            return self.extended << 8
+        if address in (registers.BURST_CTRL, registers.BURST_CTRL + 1):
+            return self.behaviour.burst_ctrl(address, self.extended)
         at = address - registers.PROD_ID
         return int.from_bytes(self.product_id[at : at + 2], "big") if 0 <= at < 8 and not at % 2 else 0
 

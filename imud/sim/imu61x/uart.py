@@ -5,17 +5,19 @@ device sent with `advance`. What it does, and what of it is assumed because the 
 
 - In stream mode it sends AHRS frames at 1 … 400 Hz, at whole multiples of the period of its own timer, which runs
   `skew_ppm` fast and counts µs from power-on. What does not fit the transmit buffer is never sent.
-- In command mode it only replies. Whether it also replies while it streams is assumed (`Imu61xHardware`).
-- Questions are answered with S1, P1 or an AHRS frame, orders with K1: result 0 done, 1 refused (assumed).
-- A baud rate acts once its acknowledgement has left the wire, or at the next start (`Imu61xHardware`; assumed).
-- CMD 5 saves everything, the mode included. CMD 9 and power-off lose what was not saved. CMD 15 restores RAM and flash.
-- CMD 7 takes some seconds and finds the attitude it stands in; CMD 8 says 1 until it is done, then 0. The angles found
-  can be read but turn nothing. CMD 10 takes the gyroscope's bias off and is refused while it moves (all assumed).
+- In command mode it only replies. Questions are answered with S1, P1 or an AHRS frame, orders with K1. What else it
+  does, and when, is one of several ways to read the manual (`imud.sim.imu61x.behaviour`).
+- A baud rate acts once its acknowledgement has left the wire, or at the next start.
+- CMD 5 saves everything, the mode included. CMD 9 and power-off lose what was not saved. CMD 15 restores flash, and RAM
+  at once or at the next start.
+- CMD 7 takes some seconds and finds the attitude it stands in; meanwhile S1 says that it calibrates, and CMD 8 with a
+  result other than that for done. The angles found can be read but turn nothing. CMD 10 takes as long, takes the
+  gyroscope's bias off, and is refused while it moves (all assumed).
 - Heading starts as the truth has it and is not saved.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import degrees, pi, radians, remainder
 from typing import Final
 
@@ -23,9 +25,9 @@ from imud.attitude import euler_zyx_from_quat
 from imud.devices.imu61x.uart.codec import encode_acknowledgement, encode_ahrs, encode_parameter, encode_status
 from imud.devices.imu61x.uart.commands import AHRS_FRAME_BYTES, BAUD_RATES, RATES_HZ, Command, OutputMode, max_rate_hz
 from imud.devices.imu61x.uart.framing import HOST_SYNC, Frame, FrameFinder
-from imud.devices.imu61x.uart.replies import PARAMETERS, RESULT_DONE, Status
+from imud.devices.imu61x.uart.replies import PARAMETERS, Status
 from imud.ledger import Ledger
-from imud.sample import Vector3
+from imud.sim.imu61x.behaviour import CALIBRATION_NS, Imu61xBehaviour
 from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
 from imud.sim.physics.motion import Truth
 from imud.sim.ports.uart_wire import Transmitter
@@ -37,11 +39,12 @@ TX_BUFFER_BYTES: Final = 512
 """A frame that would make more than this wait for the wire is not sent."""
 REPLY_NS: Final = 200_000
 """Time from the end of a command to its reply (assumed)."""
-CALIBRATION_NS: Final = 3 * NS_PER_S
-RESULT_REFUSED: Final = 1
 CALIBRATING: Final = 1
+"""`calibration_status` of S1 during a calibration, otherwise 0 (assumed)."""
+RESULT_BUSY: Final = 9
+"""Result of CMD 8 during a calibration."""
 STATIC_GYRO_RAD_S: Final = 0.02
-GYRO_CALIBRATION_SAMPLES: Final = 64
+GYRO_CALIBRATION_SAMPLES: Final = 512
 US_PER_S: Final = 1_000_000
 
 
@@ -55,19 +58,12 @@ STATUS: Final = Status(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imu61xHardware(SensorHardware):
-    """A device, and its assumed behaviour where the manual is silent."""
+    """A device, and its behaviour where the manual is silent."""
 
     status: Status = STATUS
     uptime_us: int = 0
     """Timer at the first power-on, to begin near the end of its range."""
-    answers_while_streaming: bool = True
-    """Whether it obeys more than CMD 3 in stream mode."""
-    baud_acts_at_start: bool = False
-    """Whether a new baud rate waits for the next start."""
-    changes_mode: bool = True
-    """Whether it obeys the output mode it acknowledges."""
-    acknowledges: bool = True
-    """Whether it sends K1 at all."""
+    behaviour: Imu61xBehaviour = field(default_factory=Imu61xBehaviour)
 
 
 class Imu61xModule:
@@ -105,12 +101,12 @@ class Imu61xModule:
     def receive(self, data: bytes, now_ns: int) -> None:
         """Receive bytes that the host sent, already sampled at the device's rate."""
         self._sample(now_ns)
-        if now_ns < self._ready_ns:  # still booting
+        if now_ns < max(self._ready_ns, self._busy_ns):  # still booting, or writing to flash
             return
         for frame in self._finder.feed(data):
             if isinstance(frame, Frame) and len(frame.payload) == PARAMETERS.size:
                 self._obey(frame, now_ns)
-            if now_ns < self._ready_ns:  # a command restarted it
+            if now_ns < max(self._ready_ns, self._busy_ns):  # a command restarted it, or takes its time
                 return
 
     def advance(self, now_ns: int) -> list[Burst]:
@@ -142,7 +138,8 @@ class Imu61xModule:
         self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, self._ready_ns)
         self._finder = FrameFinder(Ledger(), HOST_SYNC)
         self._heading_rad = 0.0
-        self._calibrated_ns: int | None = None
+        self._calibration: tuple[Command, int] | None = None
+        self._busy_ns = now_ns
         self._restart_ns: int | None = None
         self._new_baud_ns: int | None = None
         self._schedule(self._ready_ns)
@@ -173,8 +170,8 @@ class Imu61xModule:
         if self._new_baud_ns is not None and now_ns > self._new_baud_ns and self._wire.next_ns() is None:
             self._new_baud_ns = None
             self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, now_ns)
-        if self._calibrated_ns is not None and now_ns >= self._calibrated_ns:
-            self._finish_installation(self._calibrated_ns)
+        if self._calibration is not None and now_ns >= self._calibration[1]:
+            self._finish_calibration(*self._calibration)
         if self._restart_ns is not None and now_ns > self._restart_ns and self._wire.next_ns() is None:
             self.settings = self.flash
             self._power_on(self._restart_ns, 0)
@@ -183,8 +180,8 @@ class Imu61xModule:
 
     def _queue_ahrs(self, sample_ns: int, device_us: int) -> None:
         ready_ns = sample_ns + self.hardware.processing_ns
-        if self._new_baud_ns is not None or self._restart_ns is not None:
-            self.frames_dropped += 1  # the port is being set up anew
+        if self._new_baud_ns is not None or self._restart_ns is not None or sample_ns < self._busy_ns:
+            self.frames_dropped += 1  # the port is being set up anew, or the device has no time
             return
         if not self._wire.fits(ready_ns, AHRS_FRAME_BYTES):
             self.frames_dropped += 1
@@ -219,38 +216,59 @@ class Imu61xModule:
             command = Command(frame.frame_id)
         except ValueError:
             return
+        behaviour = self.hardware.behaviour
         streaming = self.settings.mode is OutputMode.STREAM
-        if streaming and command is not Command.OUTPUT_MODE and not self.hardware.answers_while_streaming:
+        if streaming and command is not Command.OUTPUT_MODE and not behaviour.answers_while_streaming:
+            return
+        if command in behaviour.ignores:
             return
         param1, _, param3, *_ = PARAMETERS.unpack(frame.payload)
         try:
+            if command in behaviour.refuses:
+                raise ParameterRefused(command.name)
             answer = self._questions(command, param3, now_ns)
             if answer is not None:
                 self._say(answer, now_ns)
                 return
             self._order(command, param1, param3, now_ns)
-            result = RESULT_DONE
+            result = behaviour.result_done
         except ParameterRefused:
-            result = RESULT_REFUSED
-        if self.hardware.acknowledges:
-            self._say(encode_acknowledgement(frame.frame_id, result), now_ns)
+            self._acknowledge(command, behaviour.result_refused, now_ns)
+            return
+        calibrates = command in (Command.CALIBRATE_GYRO, Command.CALIBRATE_INSTALLATION)
+        if not (calibrates and behaviour.acknowledges_at_end):
+            self._acknowledge(command, result, now_ns)
         self._after(command, now_ns)
+
+    def _acknowledge(self, command: Command, result: int, now_ns: int) -> None:
+        """Answer an order, after the time that it takes, and be quiet for a while."""
+        behaviour = self.hardware.behaviour
+        flash = command in (Command.SAVE, Command.FACTORY_RESET) and result == behaviour.result_done
+        done_ns = now_ns + (behaviour.flash_ms if flash else 0) * NS_PER_MS
+        if behaviour.acknowledges:
+            self._say(encode_acknowledgement(command.value, result), done_ns)
+        if behaviour.flash_ms or behaviour.quiet_ms:
+            self._busy_ns = max(self._busy_ns, done_ns + behaviour.quiet_ms * NS_PER_MS)
 
     def _questions(self, command: Command, param3: int, now_ns: int) -> bytes | None:
         """The answer to a question; None for an order. Raises ParameterRefused."""
         match command:
             case Command.STATUS:
-                return encode_status(replace(self.hardware.status, calibration_status=self._calibration_status()))
+                return encode_status(self._status())
             case Command.AHRS:
                 return self._encode(now_ns, self._device_us(now_ns))
             case Command.READ_PARAMETER:
                 return encode_parameter(param3, self.settings.value(param3))
             case Command.INSTALLATION_STATUS:
-                return encode_acknowledgement(command.value, self._calibration_status())
+                done = self.hardware.behaviour.result_done
+                return encode_acknowledgement(command.value, done if self._calibration is None else RESULT_BUSY)
         return None
 
-    def _calibration_status(self) -> int:
-        return RESULT_DONE if self._calibrated_ns is None else CALIBRATING
+    def _status(self) -> Status:
+        status = self.hardware.status
+        if not self.hardware.behaviour.reports_calibration:
+            return replace(status, system_status=None)
+        return replace(status, calibration_status=CALIBRATING if self._calibration is not None else 0)
 
     def _order(self, command: Command, param1: float, param3: int, now_ns: int) -> None:
         """Carry out a command without an answer of its own. Raises ParameterRefused."""
@@ -258,8 +276,8 @@ class Imu61xModule:
             Command.OUTPUT_MODE: lambda: self._set_mode(param1, now_ns),
             Command.HEADING: lambda: self._set_heading(param1, now_ns),
             Command.SAVE: self._save,
-            Command.CALIBRATE_INSTALLATION: lambda: self._start_installation(now_ns),
-            Command.CALIBRATE_GYRO: lambda: self._calibrate_gyro(now_ns),
+            Command.CALIBRATE_INSTALLATION: lambda: self._calibrate(Command.CALIBRATE_INSTALLATION, now_ns),
+            Command.CALIBRATE_GYRO: lambda: self._calibrate(Command.CALIBRATE_GYRO, now_ns),
             Command.SET_PARAMETER: lambda: self._set_parameter(param3, param1, now_ns),
             Command.FACTORY_RESET: lambda: self._factory_reset(now_ns),
             Command.RESTART: lambda: None,
@@ -271,13 +289,13 @@ class Imu61xModule:
         if command is Command.RESTART:
             self._next_us = None
             self._restart_ns = self._wire.due_ns(now_ns, 0)
-        elif self.settings.baud != self._wire.baud and not self.hardware.baud_acts_at_start:
+        elif self.settings.baud != self._wire.baud and not self.hardware.behaviour.baud_acts_at_start:
             self._new_baud_ns = self._wire.due_ns(now_ns, 0)
 
     def _set_mode(self, mode: float, now_ns: int) -> None:
         if mode not in [known.value for known in OutputMode]:
             raise ParameterRefused(f"mode {mode}")
-        if self.hardware.changes_mode:
+        if self.hardware.behaviour.changes_mode:
             self.settings = replace(self.settings, mode=OutputMode(int(mode)))
         self._schedule(now_ns)
 
@@ -288,7 +306,7 @@ class Imu61xModule:
 
     def _save(self) -> None:
         """Save all but command mode where CMD 5 is obeyed in that only: the device would never start streaming."""
-        keeps_mode = self.hardware.answers_while_streaming
+        keeps_mode = self.hardware.behaviour.answers_while_streaming
         self.flash = self.settings if keeps_mode else replace(self.settings, mode=self.flash.mode)
 
     def _set_parameter(self, index: int, value: float, now_ns: int) -> None:
@@ -296,24 +314,28 @@ class Imu61xModule:
         self._schedule(now_ns)
 
     def _factory_reset(self, now_ns: int) -> None:
-        self.flash = self.settings = Imu61xSettings()
+        self.flash = Imu61xSettings()
+        if not self.hardware.behaviour.reset_acts_at_start:
+            self.settings = self.flash
         self._schedule(now_ns)
 
-    def _calibrate_gyro(self, now_ns: int) -> None:
-        if max(map(abs, self.hardware.motion.at((now_ns - self.epoch_ns) / NS_PER_S).gyro_rad_s)) > STATIC_GYRO_RAD_S:
+    def _calibrate(self, command: Command, now_ns: int) -> None:
+        moving = max(map(abs, self.hardware.motion.at((now_ns - self.epoch_ns) / NS_PER_S).gyro_rad_s))
+        if command is Command.CALIBRATE_GYRO and moving > STATIC_GYRO_RAD_S:
             raise ParameterRefused("moving")
-        readings = [self._reading(now_ns).gyro_rad_s for _ in range(GYRO_CALIBRATION_SAMPLES)]
-        x, y, z = (degrees(sum(axis) / len(readings)) for axis in zip(*readings, strict=True))
-        self.settings = replace(self.settings, gyro_off_deg_s=(x, y, z))
+        self._calibration = (command, now_ns + CALIBRATION_NS)
 
-    def _start_installation(self, now_ns: int) -> None:
-        self._calibrated_ns = now_ns + CALIBRATION_NS
-
-    def _finish_installation(self, done_ns: int) -> None:
-        self._calibrated_ns = None
-        roll, pitch, _ = euler_zyx_from_quat(self._reading(done_ns).quat_wxyz)
-        angles: Vector3 = (degrees(roll), degrees(pitch), 0.0)
-        self.settings = replace(self.settings, install_off_deg=angles)
+    def _finish_calibration(self, command: Command, done_ns: int) -> None:
+        self._calibration = None
+        if command is Command.CALIBRATE_GYRO:
+            readings = [self._reading(done_ns).gyro_rad_s for _ in range(GYRO_CALIBRATION_SAMPLES)]
+            x, y, z = (degrees(sum(axis) / len(readings)) for axis in zip(*readings, strict=True))
+            self.settings = replace(self.settings, gyro_off_deg_s=(x, y, z))
+        else:
+            roll, pitch, _ = euler_zyx_from_quat(self._reading(done_ns).quat_wxyz)
+            self.settings = replace(self.settings, install_off_deg=(degrees(roll), degrees(pitch), 0.0))
+        if self.hardware.behaviour.acknowledges_at_end:
+            self._acknowledge(command, self.hardware.behaviour.result_done, done_ns)
 
 
 def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,7 +16,7 @@ from imud.sim.imu61x.uart import Imu61xModule
 from imud.sim.ports.uart_wire import heard
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import VirtualClock, run_virtually
-from tests.support.simulated_modules import IMU61X_STILL
+from tests.support.simulated_modules import imu61x_hardware
 
 STEP_S = 0.001
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
@@ -51,7 +50,7 @@ class WakeBench:
         self.clock = clock
         driver, identify = link.pop("driver", "imu61x-uart"), link.pop("identify", True)
         memory = MemorySettings(**{"baud": 115200, **link})
-        self.module = Imu61xModule(clock.now_ns(), settings, replace(IMU61X_STILL, **hardware))
+        self.module = Imu61xModule(clock.now_ns(), settings, imu61x_hardware(**hardware))
         self.line = Line(memory, self.module, clock)
         self.rigs = DeviceRigs(clock.host)
         self.rig = self.rigs.add(DeviceConfig("bow", driver, None, identify, "memory", memory), self.line)

@@ -4,8 +4,10 @@ import errno
 
 import pytest
 
-from imud.devices.imu61x.spi import codec as spi
-from imud.devices.imu61x.spi.session import READ_STATE, State
+from imud.devices.imu61x.spi import bursts as spi
+from imud.devices.imu61x.spi.session import State
+from imud.devices.imu61x.spi.words import READ_STATE
+from imud.sim.imu61x.behaviour import RegisterBehaviour
 from imud.sim.imu61x.registers import Imu61xRegisters
 
 MS = 1_000_000
@@ -100,3 +102,21 @@ def test_restart_forgets_what_was_set() -> None:
     assert (one.filter, one.extended, one.window) == (0x44, 1, 1)
     one.restart()
     assert (one.filter, one.extended, one.window) == (0xBB, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "low", "high"),
+    [
+        (RegisterBehaviour(), 0x0100, 0x0001),
+        (RegisterBehaviour(high_address=False), 0x0100, 0),
+        (RegisterBehaviour(low_address=False), 0, 0x0001),
+    ],
+)
+def test_burst_ctrl_reads_back_where_the_variant_has_it(behaviour: RegisterBehaviour, low: int, high: int) -> None:
+    one, _ = device(behaviour=behaviour)
+    assert spoken(one, 0xFE01, 0x8D01, 0x0C00, 0x0D00, 0x7E00, 0x7E00)[4:] == [low, high]
+
+
+def test_undefined_bits_of_the_window() -> None:
+    one, _ = device(behaviour=RegisterBehaviour(window_bits=0xA5FE))
+    assert spoken(one, 0xFE01, 0x7E00, 0xFE00, 0x7E00, 0, 0)[3::2] == [0xA5FF, 0xA5FE]

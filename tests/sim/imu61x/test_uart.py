@@ -19,9 +19,10 @@ from imud.devices.imu61x.uart.replies import (
     parse_parameter,
     parse_status,
 )
+from imud.sample import Measurement
 from imud.sim import SIMULATORS
 from imud.sim.imu61x.settings import Imu61xSettings, ParameterRefused, changed
-from imud.sim.imu61x.uart import Imu61xModule, make
+from imud.sim.imu61x.uart import CALIBRATING, RESULT_BUSY, Imu61xModule, make
 from imud.sim.physics.motion import swing
 from imud.sim.physics.noise import Noise
 from imud.sim.simulator import SimulatorOptions
@@ -115,10 +116,12 @@ def test_command_mode_is_silent_but_for_replies() -> None:
     assert isinstance(outcome, Reply)
     assert parse_status(outcome.messages[-1]) == far.module.hardware.status
     assert parameter(far, Parameter.AHRS_RATE) == 100
-    far.ask(c.ask_ahrs())
-    assert len(far.samples(500)) == 1
+    outcome = far.ask(c.ask_ahrs())
+    assert isinstance(outcome, Reply)
+    assert outcome.sample is not None
+    assert far.samples(500) == []
     assert acknowledged(far, c.output_mode(c.OutputMode.STREAM)) == 0
-    assert len(far.samples(1000)) == 100
+    assert len(far.samples(1000)) in (99, 100)
 
 
 def test_a_device_that_listens_in_command_mode_only() -> None:
@@ -175,7 +178,7 @@ def test_every_parameter_of_the_manual_can_be_asked_and_no_other() -> None:
     far.send(c.encode_command(c.Command.READ_PARAMETER, 0.0, 4))
     (reply,) = far.wait(50)
     assert isinstance(reply, ReplyFrame)
-    assert parse_acknowledgement(reply) == Acknowledgement(6, 1)
+    assert parse_acknowledgement(reply) == Acknowledgement(6, 2)
 
 
 @pytest.mark.parametrize("param1", [2.0, 0.0, float("nan")])
@@ -184,7 +187,7 @@ def test_an_unknown_mode_is_refused(param1: float) -> None:
     far.send(c.encode_command(c.Command.OUTPUT_MODE, param1))
     (reply,) = far.wait(50)
     assert isinstance(reply, ReplyFrame)
-    assert parse_acknowledgement(reply) == Acknowledgement(3, 1)
+    assert parse_acknowledgement(reply) == Acknowledgement(3, 2)
 
 
 def test_the_acknowledgement_of_a_new_rate_comes_at_the_old_one() -> None:
@@ -216,14 +219,84 @@ def test_damaged_and_unknown_commands_are_not_answered() -> None:
     assert len(far.wait(100)) == 1
 
 
+def calibration_status(far: Imu61xBench) -> int | None:
+    """What S1 says."""
+    outcome = far.ask(c.ask_status())
+    assert isinstance(outcome, Reply)
+    status = parse_status(outcome.messages[-1])
+    assert status is not None
+    return status.calibration_status
+
+
+def heard(far: Imu61xBench, request: Request, duration_ms: float) -> list[tuple[float, int]]:
+    """Send a request without waiting for it; when its acknowledgements come (ms) and their results."""
+    far.send(request.payload)
+    begun_ns = far.now_ns
+    found = []
+    while far.now_ns < begun_ns + duration_ms * 1e6:
+        for event in far.wait(2):
+            reply = parse_acknowledgement(event) if isinstance(event, ReplyFrame) else None
+            if reply is not None:
+                found.append(((far.now_ns - begun_ns) / 1e6, reply.result))
+    return found
+
+
+def test_slow_flash_answers_late_and_sends_nothing_meanwhile() -> None:
+    far = imu61x_bench(flash_ms=2000)
+    far.send(c.save().payload)
+    assert len(far.samples(1990)) <= 1  # the frame that was on its way
+    ((at_ms, result),) = heard(far, c.ask_status(), 100)
+    assert (at_ms < 30, result) == (True, 0)  # the status request was not heard
+    assert len(far.samples(500)) >= 48
+
+
+def test_quiet_after_an_answer() -> None:
+    far = imu61x_bench(quiet_ms=700)
+    ((at_ms, _),) = heard(far, c.reset_heading(0), 20)
+    assert at_ms < 10
+    far.send(c.ask_status().payload)
+    assert [event for event in far.wait(650) if not isinstance(event, Measurement)] == []
+    assert far.samples(200)
+
+
+def test_acknowledgement_at_the_begin_or_at_the_end_of_a_calibration() -> None:
+    for at_end, expected_ms in ((False, 0), (True, 3000)):
+        far = imu61x_bench(acknowledges_at_end=at_end)
+        ((at_ms, result),) = heard(far, c.calibrate_gyro(), 3500)
+        assert at_ms == pytest.approx(expected_ms, abs=20)
+        assert result == 0
+
+
+def test_codes_and_refusals_are_those_of_the_variant() -> None:
+    far = imu61x_bench(result_done=1, result_refused=0, refuses=frozenset({c.Command.SAVE}))
+    assert [result for _, result in heard(far, c.reset_heading(0), 20)] == [1]
+    assert [result for _, result in heard(far, c.save(), 20)] == [0]
+    far = imu61x_bench(ignores=frozenset({c.Command.SAVE}))
+    assert heard(far, c.save(), 20) == []
+
+
+def test_factory_reset_at_the_next_start_changes_flash_only() -> None:
+    far = imu61x_bench(Imu61xSettings(rate_hz=50), reset_acts_at_start=True)
+    assert acknowledged(far, c.factory_reset()) == 0
+    assert (far.module.settings.rate_hz, far.module.flash.rate_hz) == (50, 100)
+    far.restart()
+    assert far.module.settings.rate_hz == 100
+
+
+def test_short_status_has_no_calibration_status() -> None:
+    assert calibration_status(imu61x_bench(reports_calibration=False)) is None
+
+
 def test_installation_calibration_takes_its_time() -> None:
     far = imu61x_bench()
     assert acknowledged(far, c.ask_installation_status()) == 0
     assert acknowledged(far, c.start_installation_calibration()) == 0
-    assert acknowledged(far, c.ask_installation_status()) == 1
+    assert acknowledged(far, c.ask_installation_status()) == RESULT_BUSY
+    assert calibration_status(far) == CALIBRATING
     assert parameter(far, Parameter.INSTALL_X_OFF) == 0
     far.wait(3000)
     assert acknowledged(far, c.ask_installation_status()) == 0
+    assert calibration_status(far) == 0
     assert parameter(far, Parameter.INSTALL_X_OFF) == pytest.approx(-2.998, abs=0.01)
 
 

@@ -52,11 +52,17 @@ def random_vector(random: Random, spread: float) -> Vector3:
 
 
 EULER_CONVENTION: Final = (
-    "ZYX, assumed (the manual states none): yaw about Z, then pitch about Y, then roll about X; right-handed"
+    "ZYX, assumed (the manual states none): yaw about Z, then pitch about Y, then roll about X; right-handed; "
+    "whether Z points up or down is not settled"
 )
-"""Of `euler_rad`. Both the order and the signs are those that the vendor's own driver takes the angles for."""
+"""Of `euler_rad`. The order is that for which the vendor's own driver takes the angles.
+
+The vendor contradicts itself about the axes: its driver for ROS 1 turns Y and Z, pitch and yaw about, as for a device
+whose Z points down; its driver for ROS 2 and its serial library do not. Values are passed on as sent. A device that
+lies level and shows -9.8 m/s² in Z has its Z down."""
 NAVIGATION_FRAME: Final = (
-    "level, Z up; heading from power-on or the last heading reset (assumed, the manual states none)"
+    "level, Z up (assumed, the manual states none; with the device's Z down it is Z down); "
+    "heading from power-on or the last heading reset"
 )
 """The frame that `quat_wxyz`, computed from the Euler angles, turns into."""
 
@@ -93,15 +99,39 @@ def product_id_of(product: str) -> bytes:
 
 # --- filters (table 21; parameter 31 of the UART has the same codes) --------------------------------------------------
 
-FILTERS: Final = (
+FilterName = Literal[
     "0.2 Hz", "1 Hz", "2 Hz", "5 Hz", "10 Hz", "15 Hz", "20 Hz", "25 Hz", "30 Hz", "35 Hz", "40 Hz", "47 Hz",
     "average 4", "average 16", "average 32", "average 64",
-)  # fmt: skip
-"""Low-pass filters by code 0 … 15: corner frequency of an IIR filter, or number of samples of a moving average."""
+]  # fmt: skip
+"""A low-pass filter: corner frequency of an IIR filter, or number of samples of a moving average."""
+FILTERS: Final[tuple[FilterName, ...]] = get_args(FilterName)
+"""Low-pass filters by code 0 … 15."""
 FILTER_DEFAULT: Final = 0xBB
 """47 Hz for both, as delivered."""
-FilterCode = Annotated[int, Meta(ge=0, le=len(FILTERS) - 1, extra={"section": "2.4.2, table 21"})]
+FILTER_CODES: Final = ", ".join(f"{code} {name}" for code, name in enumerate(FILTERS))
+"""Table 21 in a line, for help and documents."""
+FilterCode = Annotated[int, Meta(ge=0, le=len(FILTERS) - 1)]
 """An index of FILTERS."""
+FilterChoice = FilterName | FilterCode
+"""A filter by name, or by its code of table 21."""
+ACCEL_FILTER: Final = Meta(
+    description=f"low-pass filter of the accelerometer, by name or by code: {FILTER_CODES}",
+    extra={"section": "2.4.2, table 21"},
+)
+GYRO_FILTER: Final = Meta(
+    description="low-pass filter of the gyroscope, by name or by code as that of the accelerometer",
+    extra={"section": "2.4.2, table 21"},
+)
+
+
+def filter_code(choice: FilterChoice) -> int:
+    """The code of a filter. Raises ValueError for a name that is none."""
+    return choice if isinstance(choice, int) else FILTERS.index(choice)
+
+
+def same_filter(declared: FilterChoice, actual: FilterChoice) -> bool:
+    """Whether two choices are the same filter, by name or by code."""
+    return filter_code(declared) == filter_code(actual)
 
 
 def filter_control(accel: int, gyro: int) -> int:
@@ -122,3 +152,15 @@ I2cAddress = Literal[0x18, 0x19, 0x1A, 0x1B]
 """A 7-bit address that a device can have."""
 I2C_ADDRESSES: Final[tuple[I2cAddress, ...]] = get_args(I2cAddress)
 """All I2C addresses, the factory setting first."""
+I2cAddressChoice = Literal["0x18", "0x19", "0x1a", "0x1b", "0x1A", "0x1B", 0x18, 0x19, 0x1A, 0x1B]
+"""An I2C address as it is shown, in hexadecimal, or as a number."""
+
+
+def i2c_address(choice: int | str) -> int:
+    """The address of a choice."""
+    return choice if isinstance(choice, int) else int(choice, 16)
+
+
+def same_address(declared: int | str, actual: int | str) -> bool:
+    """Whether two choices are the same address."""
+    return i2c_address(declared) == i2c_address(actual)

@@ -5,24 +5,29 @@ Of what can be changed over these buses only the low-pass filters concern the us
 
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Meta
 
 from imud.contracts.action import Action, Target
+from imud.contracts.device_settings import DeviceSettings, Setting
 from imud.contracts.driver import Identity, KeyProblem
 from imud.contracts.polling import PolledCodec, PolledDriver, TransferScript
 from imud.contracts.settings import Settings
 from imud.devices.imu61x.common.family import (
+    ACCEL_FILTER,
     EULER_CONVENTION,
     FILTERS,
+    GYRO_FILTER,
     NAVIGATION_FRAME,
-    FilterCode,
+    FilterChoice,
+    filter_code,
     filter_codes,
     filter_control,
     product_of,
     relative_heading,
+    same_filter,
 )
 from imud.devices.polled_frames import absence
 from imud.errors import BadArgument, DeviceRefused
@@ -37,9 +42,10 @@ CHECK_NS: Final = 10 * NS_PER_S
 class RegisterSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of an IMU61x on a polled bus."""
 
-    accel_filter: FilterCode | None = None
-    """Low-pass filter of the accelerometer, code 0 to 15 of table 21 (11: 47 Hz); null leaves it as it is."""
-    gyro_filter: FilterCode | None = None
+    accel_filter: FilterChoice | None = None
+    """Low-pass filter of the accelerometer, by name, or by its code in the order of these names (11: 47 Hz); null
+    leaves it as it is."""
+    gyro_filter: FilterChoice | None = None
     """The same of the gyroscope."""
     update_hz: Annotated[float, Meta(ge=0, le=10000)] = 0.0
     """Rate at which the device renews its registers, per second, for the error of time stamps; 0 if not known."""
@@ -65,8 +71,8 @@ def wanted_filter(settings: RegisterSettings, present: int) -> int:
     """The value that FILTER_CTRL should have, from the value that it has."""
     accel, gyro = filter_codes(present)
     return filter_control(
-        accel if settings.accel_filter is None else settings.accel_filter,
-        gyro if settings.gyro_filter is None else settings.gyro_filter,
+        accel if settings.accel_filter is None else filter_code(settings.accel_filter),
+        gyro if settings.gyro_filter is None else filter_code(settings.gyro_filter),
     )
 
 
@@ -82,34 +88,79 @@ def filter_words(control: int) -> Mapping[str, str]:
     return {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
 
 
-# --- action and row --------------------------------------------------------------------------------------------------
+# --- settings and action ----------------------------------------------------------------------------------------------
 
-AccelFilter = Annotated[
-    FilterCode | None,
-    Meta(description="low-pass filter of the accelerometer, code of table 21 (11: 47 Hz); null leaves it as it is"),
-]
-GyroFilter = Annotated[FilterCode | None, Meta(description="the same of the gyroscope")]
+AccelFilter = Annotated[FilterChoice, ACCEL_FILTER]
+GyroFilter = Annotated[FilterChoice, GYRO_FILTER]
+_AccelFilterOrNone = Annotated[FilterChoice | None, ACCEL_FILTER]
+_GyroFilterOrNone = Annotated[FilterChoice | None, GYRO_FILTER]
+
+
+class FilterControl(NamedTuple):
+    """Scripts of a bus that read and write FILTER_CTRL."""
+
+    read: Callable[[], TransferScript[int]]
+    write: Callable[[int], TransferScript[None]]
+    """Reads back what it wrote. Raises DeviceRefused."""
+
+
+def filter_settings(control: FilterControl) -> Mapping[str, Setting]:
+    """The two filters as settings. The device loses them when it restarts: over the UART they are saved."""
+
+    def write(target: Target, accel: FilterChoice | None, gyro: FilterChoice | None) -> TransferScript[None]:
+        _require_as_configured(target.settings, accel_filter=accel, gyro_filter=gyro)
+        present_accel, present_gyro = filter_codes((yield from control.read()))
+        yield from control.write(
+            filter_control(
+                present_accel if accel is None else filter_code(accel),
+                present_gyro if gyro is None else filter_code(gyro),
+            )
+        )
+
+    return {
+        "accel_filter": Setting(
+            type=AccelFilter, write=lambda target, choice: write(target, choice, None), agrees=same_filter
+        ),
+        "gyro_filter": Setting(
+            type=GyroFilter, write=lambda target, choice: write(target, None, choice), agrees=same_filter
+        ),
+    }
+
+
+def _require_as_configured(settings: RegisterSettings, **wanted: FilterChoice | None) -> None:
+    """Raise BadArgument for a filter that `options` fix otherwise: they would soon be written again."""
+    for name, choice in wanted.items():
+        configured: FilterChoice | None = getattr(settings, name)
+        if choice is not None and configured is not None and not same_filter(choice, configured):
+            raise BadArgument(
+                f"{name}: expected {_shown(configured)}, which `options.{name}` says, got {_shown(choice)}"
+            )
+
+
+def _shown(choice: FilterChoice) -> str:
+    return f"{FILTERS[filter_code(choice)]} (code {filter_code(choice)})"
 
 
 def _filter_action(set_up: SetUp[S]) -> Action:
     """Set the filters by the driver's own `set_up`, which reads them back."""
 
     def set_filter(
-        target: Target, *, accel_filter: AccelFilter = None, gyro_filter: GyroFilter = None
+        target: Target, *, accel_filter: _AccelFilterOrNone = None, gyro_filter: _GyroFilterOrNone = None
     ) -> TransferScript[Mapping[str, str]]:
         settings: S = target.settings
         given = {"accel_filter": accel_filter, "gyro_filter": gyro_filter}
-        wanted = {name: code for name, code in given.items() if code is not None}
-        for name, code in wanted.items():
-            if (configured := getattr(settings, name)) not in (None, code):
-                raise BadArgument(f"{name}: expected {configured}, which `options.{name}` says, got {code}")
+        _require_as_configured(settings, **given)
+        wanted = {name: choice for name, choice in given.items() if choice is not None}
         return set_up(msgspec.structs.replace(settings, **wanted))
 
     return Action(
-        "set the low-pass filters until the device restarts, and answer what they are; "
+        "set the low-pass filters until the device restarts, null leaves one as it is; answers what they are; "
         "`options` set them at every start",
         set_filter,
     )
+
+
+# --- row --------------------------------------------------------------------------------------------------------------
 
 
 def register_driver(
@@ -121,6 +172,7 @@ def register_driver(
     make_codec: Callable[[Ledger, Any], PolledCodec],
     example_reading: Callable[[Random], bytes],
     read_ns: Callable[[Any, Any], int],
+    device_settings: DeviceSettings,
 ) -> PolledDriver:
     """The row of the driver on `bus` (`i2c` or `spi`)."""
 
@@ -151,6 +203,7 @@ def register_driver(
         example_reading=example_reading,
         read_ns=read_ns,
         check=check,
+        device_settings=device_settings,
         actions={"filter": _filter_action(set_up)},
     )
 

@@ -1,1 +1,1 @@
-"""IMU61x on I2C. To read in order: codec, session, driver."""
+"""IMU61x on I2C. To read in order: codec, session, settings, driver."""

@@ -7,6 +7,7 @@ from imud.devices.imu61x.common.family import I2C_ADDRESSES, random_vector
 from imud.devices.imu61x.common.register_driver import RegisterSettings, register_driver
 from imud.devices.imu61x.i2c.codec import READ_BURST, Imu61xI2cCodec, encode_burst
 from imud.devices.imu61x.i2c.session import probe, set_up
+from imud.devices.imu61x.i2c.settings import SETTINGS
 from imud.units import NS_PER_S
 
 
@@ -32,5 +33,5 @@ def _read_ns(_options: RegisterSettings, _link: Any) -> int:
 
 
 DRIVER: Final = register_driver(
-    "i2c", RegisterSettings, I2C_ADDRESSES, probe, set_up, Imu61xI2cCodec, _example_reading, _read_ns
+    "i2c", RegisterSettings, I2C_ADDRESSES, probe, set_up, Imu61xI2cCodec, _example_reading, _read_ns, SETTINGS
 )

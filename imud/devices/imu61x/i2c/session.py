@@ -35,12 +35,22 @@ def probe(_settings: RegisterSettings) -> TransferScript[Identity]:
 
 def set_up(settings: RegisterSettings) -> TransferScript[Mapping[str, str]]:
     """Write FILTER_CTRL where it differs, read it back. Raises DeviceRefused if it is not the value written."""
-    present = _only((yield READ_FILTER))
+    present = yield from read_control()
     wanted = wanted_filter(settings, present)
     if present != wanted:
-        yield write_filter(wanted)
-        check_filter(wanted, _only((yield READ_FILTER)))
+        yield from write_control(wanted)
     return filter_words(wanted)
+
+
+def read_control() -> TransferScript[int]:
+    """Read FILTER_CTRL."""
+    return _only((yield READ_FILTER))
+
+
+def write_control(control: int) -> TransferScript[None]:
+    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it is not the value written."""
+    yield write_filter(control)
+    check_filter(control, (yield from read_control()))
 
 
 def id_problem(data: bytes) -> str:

@@ -1,1 +1,1 @@
-"""IMU61x on SPI. To read in order: codec, session, driver."""
+"""IMU61x on SPI. To read in order: words, bursts, codec, session, settings, driver."""

@@ -1,15 +1,5 @@
-"""Forsense IMU61x on SPI: bursts and single registers. Manual "IMU61X Interface Protocol and Instructions", chapter 2.
-
-    MOSI   0x8000   0x0000   0x0000   0x0000   …                burst: chip select is held low through all of it
-    MISO    any      any     word 1   word 2   …   word n
-
-    standard, 14 words   gyro 3, accel 3, all i32, low word first | sum of these twelve words, low word first
-    extended, 24 words   gyro 3 °/s | accel 3 g | temperature °C | roll pitch yaw ° | status u32 | CRC-32, all f32 else
-
-The manual prints 13 words for the standard burst, with a checksum of 16 bits; devices send 14, with one of 32 bits
-(`checksum_bits: 16` looks at the low word only). The extended burst, which the manual mentions and does not define, is
-as the vendor's own program reads it; the order of its angles is assumed. How words are written and read, and the
-messages for identity and settings, are in `session.py`.
+"""Forsense IMU61x on SPI: decoding of bursts and single registers. Manual "IMU61X Interface Protocol and Instructions",
+chapter 2. Layouts and check values are in `bursts.py`, words in `words.py`, identity and settings in `session.py`.
 """
 
 import struct
@@ -19,29 +9,30 @@ from typing import Final
 
 from imud.attitude import quat_from_euler_zyx
 from imud.contracts.codec import BadReason
-from imud.contracts.polling import Poll, PolledEvent, Transfer, Vanished
-from imud.devices.imu61x.common.family import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, scaled
+from imud.contracts.polling import Poll, PolledEvent, Vanished
+from imud.devices.imu61x.common.family import M_S2_PER_G, RAD_S_PER_DEG_S, scaled
 from imud.devices.imu61x.common.register_driver import CHECK_NS, identity_of
 from imud.devices.imu61x.common.registers import (
-    BURST,
     M_S2_PER_COUNT,
     M_S2_PER_COUNT_REGISTER,
     RAD_S_PER_COUNT,
-    TEMP_HIGH,
-    ZACCEL_LOW,
     temperature_c,
 )
-from imud.devices.imu61x.spi.session import (
-    PIPELINE_BYTES,
-    PIPELINE_WORDS,
-    READ_STATE,
-    SpiDeviceSettings,
-    State,
-    answers,
-    message,
-    read,
-    write,
+from imud.devices.imu61x.spi.bursts import (
+    EXTENDED,
+    EXTENDED_WORDS,
+    READ_EXTENDED,
+    READ_REGISTERS,
+    READ_STANDARD,
+    READ_TEMPERATURE,
+    REGISTER_WORDS,
+    STANDARD_WORDS,
+    crc_matches,
+    little_endian,
+    sum_matches,
 )
+from imud.devices.imu61x.spi.session import SpiDeviceSettings, State
+from imud.devices.imu61x.spi.words import PIPELINE_BYTES, READ_STATE, answers
 from imud.devices.polled_frames import Measured, PolledFrameDecoder
 from imud.errors import DeviceRefused
 from imud.ledger import Ledger
@@ -51,23 +42,6 @@ from imud.units import NS_PER_S, RAD_PER_DEG
 TEMPERATURE_NS: Final = NS_PER_S
 """Interval of reading the temperature where the burst has none."""
 
-STANDARD_WORDS: Final = 14
-EXTENDED_WORDS: Final = 24
-REGISTER_WORDS: Final = (ZACCEL_LOW - TEMP_HIGH) // 2 + 1
-EXTENDED: Final = struct.Struct("<10fII")
-"""gyro 3 °/s, accel 3 g, temperature °C, roll pitch yaw °, status, CRC-32 of the 44 bytes before."""
-CRC_OFFSET: Final = 44
-
-
-def _burst(words: int) -> Transfer:
-    """0x8000 and as many zeros as bring `words` words through the pipeline, in one selection."""
-    return Transfer((write(BURST, 0).to_bytes(2, "big") + bytes(2 * (PIPELINE_WORDS + words - 1)),))
-
-
-READ_STANDARD: Final = _burst(STANDARD_WORDS)
-READ_EXTENDED: Final = _burst(EXTENDED_WORDS)
-READ_REGISTERS: Final = message(*(read(address) for address in range(TEMP_HIGH, ZACCEL_LOW + 1, 2)))
-READ_TEMPERATURE: Final = message(read(TEMP_HIGH), read(TEMP_HIGH + 2))
 POLLS: Final = {
     "standard": (Poll(READ_STANDARD), Poll(READ_STATE, CHECK_NS), Poll(READ_TEMPERATURE, TEMPERATURE_NS)),
     "extended": (Poll(READ_EXTENDED), Poll(READ_STATE, CHECK_NS)),
@@ -75,6 +49,9 @@ POLLS: Final = {
 }
 """Polls by the setting `burst`, in the order of the codec's polls."""
 _BURST, _STATE, _TEMPERATURE = range(3)
+DEVICE_STATUS: Final = 0x7FFF_FFFF
+"""The bits of the extended burst's status that are passed on: bit 31 of a sample's status is imud's own. The manual
+gives none of them a meaning."""
 
 
 class Imu61xSpiCodec:
@@ -135,17 +112,13 @@ class Imu61xSpiCodec:
         return ()
 
     def _bad_sum(self, frame: bytes) -> BadReason | None:
-        *words, low, high = _STANDARD.unpack(frame)
-        total = sum(words)
-        good = low == total & 0xFFFF and (self._settings.checksum_bits == 16 or high == total >> 16)
-        return None if good else BadReason.CRC
+        return None if sum_matches(frame, self._settings.checksum_bits) else BadReason.CRC
 
     def _standard(self, frame: bytes) -> Measured:
         gyro, accel = _in_si(_joined(frame, 0), RAD_S_PER_COUNT), _in_si(_joined(frame, 12), M_S2_PER_COUNT)
         return Measurement(len(frame), 0, None, accel, gyro, temperature_c=self._temperature_c), True
 
 
-_STANDARD: Final = struct.Struct(">14H")
 _SIX: Final = struct.Struct(">6H")
 _THREE: Final = struct.Struct(">3i")
 
@@ -177,18 +150,12 @@ def _never_bad(_frame: bytes) -> BadReason | None:
     return None
 
 
-def _little(frame: bytes) -> bytes:
-    """The words as they lie in the memory of a little-endian host."""
-    return struct.pack("<24H", *struct.unpack(">24H", frame))
-
-
 def _bad_crc(frame: bytes) -> BadReason | None:
-    memory = _little(frame)
-    return None if crc32(memory[:CRC_OFFSET]) == EXTENDED.unpack(memory)[11] else BadReason.CRC
+    return None if crc_matches(little_endian(frame)) else BadReason.CRC
 
 
 def _extended(frame: bytes) -> Measured:
-    values = EXTENDED.unpack(_little(frame))
+    values = EXTENDED.unpack(little_endian(frame))
     gyro, accel, euler = (
         scaled(part, factor)
         for part, factor in (
@@ -199,33 +166,6 @@ def _extended(frame: bytes) -> Measured:
     measurement = Measurement(
         len(frame), 0, None, accel, gyro,
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
-        euler_rad=euler, temperature_c=temperature, status=values[10],
+        euler_rad=euler, temperature_c=temperature, status=values[10] & DEVICE_STATUS,
     )  # fmt: skip
     return measurement, None not in (accel, gyro, euler, temperature)
-
-
-# --- the device's side ------------------------------------------------------------------------------------------------
-
-
-def encode_standard(*, accel_m_s2: Vector3, gyro_rad_s: Vector3) -> bytes:
-    """The 14 words of a standard burst from SI values; values beyond 32 bits are cut off."""
-    counts = [*(round(w / RAD_S_PER_COUNT) for w in gyro_rad_s), *(round(a / M_S2_PER_COUNT) for a in accel_m_s2)]
-    words = [word for count in counts for word in (count & 0xFFFF, count >> 16 & 0xFFFF)]
-    total = sum(words)
-    return _STANDARD.pack(*words, total & 0xFFFF, total >> 16)
-
-
-def encode_extended(
-    *, accel_m_s2: Vector3, gyro_rad_s: Vector3, temperature_c: float, euler_rad: Vector3, status: int = 0
-) -> bytes:
-    """The 24 words of an extended burst from SI values. Raises OverflowError beyond f32."""
-    memory = struct.pack(
-        "<10fI",
-        *(w / RAD_S_PER_DEG_S for w in gyro_rad_s),
-        *(a / M_S2_PER_G for a in accel_m_s2),
-        temperature_c,
-        *(angle / RAD_PER_DEG for angle in euler_rad),
-        status,
-    )
-    memory += struct.pack("<I", crc32(memory))
-    return struct.pack(">24H", *struct.unpack("<24H", memory))

@@ -5,8 +5,11 @@ from typing import Any, Final
 
 from imud.devices.imu61x.common.family import random_vector
 from imud.devices.imu61x.common.register_driver import register_driver
-from imud.devices.imu61x.spi.codec import POLLS, Imu61xSpiCodec, encode_standard
-from imud.devices.imu61x.spi.session import MODES, PIPELINE_BYTES, SpiDeviceSettings, probe, set_up
+from imud.devices.imu61x.spi.bursts import encode_standard
+from imud.devices.imu61x.spi.codec import POLLS, Imu61xSpiCodec
+from imud.devices.imu61x.spi.session import MODES, SpiDeviceSettings, probe, set_up
+from imud.devices.imu61x.spi.settings import SETTINGS
+from imud.devices.imu61x.spi.words import PIPELINE_BYTES
 from imud.units import NS_PER_S, NS_PER_US
 
 
@@ -25,5 +28,5 @@ def _read_ns(options: SpiDeviceSettings, link: Any) -> int:
 
 
 DRIVER: Final = register_driver(
-    "spi", SpiDeviceSettings, MODES, probe, set_up, Imu61xSpiCodec, _example_reading, _read_ns
+    "spi", SpiDeviceSettings, MODES, probe, set_up, Imu61xSpiCodec, _example_reading, _read_ns, SETTINGS
 )

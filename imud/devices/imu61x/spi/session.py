@@ -1,17 +1,13 @@
-"""Words and transfer scripts of the Forsense IMU61x on SPI: identity, filters, kind of burst. Manual, chapter 2.
-
-Words of 16 bits, high byte first: bit 15 set writes the byte in bits 7-0 to the address in bits 14-8, bit 15 clear
-reads the word at that address. The answer to a word comes with the second word after it:
-
-    MOSI   word 1   word 2   word 3   word 4   …        chip select is released after every word
-    MISO    any      any     answer 1 answer 2 …
+"""Transfer scripts of the Forsense IMU61x on SPI: identity, filters, kind of burst. Manual, chapter 2.
 
 WIN_CTRL is 0 outside of this file's messages: a message that opens window 1 closes it again, and one that fails is
-followed by one that closes it. Between the words of a message chip select is released for GAP_US (assumed; the manual
-draws one word per selection and says nothing of the pause).
+followed by one that closes it. How words are written and read is in `words.py`.
+
+BURST_CTRL is the pair 0x0D, 0x0C (table 16): its high byte is written at 0x0D. The manual's layout has it read back in
+the word at 0x0C, the vendor's program in that at 0x0D: both are read, either is accepted, and a burst of the right kind
+decides.
 """
 
-import struct
 from collections.abc import Mapping
 from typing import Final, Literal
 
@@ -24,14 +20,17 @@ from imud.devices.imu61x.common.register_driver import (
     identity_of,
     wanted_filter,
 )
-from imud.devices.imu61x.common.registers import BURST_CTRL, FILTER_CTRL, PROD_ID, WIN_CTRL
+from imud.devices.imu61x.common.registers import BURST_CTRL, FILTER_CTRL
+from imud.devices.imu61x.spi.bursts import BURSTS, BurstKind, burst_problem
+from imud.devices.imu61x.spi.words import CLOSE, CLOSE_ONLY, OPEN, READ_STATE, answers, message, write
 from imud.errors import DeviceRefused, TransferError
 
 MODES: Final = (0, 3)
 """The manual's, and the one of the vendor's own program: both sample on the rising edge."""
-PIPELINE_WORDS: Final = 2
-PIPELINE_BYTES: Final = 2 * PIPELINE_WORDS
-GAP_US: Final = 10
+WINDOW_ID: Final = 0x01
+"""The bit of WIN_CTRL in which the two codes of table 24 differ; no other is defined."""
+BURST_TRIES: Final = 3
+"""One damaged burst, or one write that was lost, is no refusal."""
 
 
 class SpiDeviceSettings(RegisterSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -43,59 +42,32 @@ class SpiDeviceSettings(RegisterSettings, frozen=True, kw_only=True, forbid_unkn
     """Checksum of the standard burst: all 32 bits, or only the 16 that the manual has."""
 
 
-# --- words -----------------------------------------------------------------------------------------------------------
-
-
-def read(address: int) -> int:
-    """The word that reads a register."""
-    return address << 8
-
-
-def write(address: int, value: int) -> int:
-    """The word that writes one byte."""
-    return 0x8000 | address << 8 | value
-
-
-def message(*words: int) -> Transfer:
-    """Words with chip select released between them, and two more for the answers to the last ones."""
-    pipeline = (read(WIN_CTRL),) * PIPELINE_WORDS  # answers with the window, which must be 0 again by then
-    return Transfer(tuple(word.to_bytes(2, "big") for word in (*words, *pipeline)), gap_us=GAP_US)
-
-
-def answers(data: bytes) -> tuple[int, ...]:
-    """The answer to each word of a message, without the two of the pipeline itself."""
-    words = memoryview(data)[PIPELINE_BYTES:]
-    return struct.unpack(f">{len(words) // 2}H", words[: len(words) // 2 * 2])
-
-
-OPEN: Final = write(WIN_CTRL, 1)
-CLOSE: Final = write(WIN_CTRL, 0)
-CLOSE_ONLY: Final = message(CLOSE)
-READ_STATE: Final = message(
-    OPEN, *(read(PROD_ID + 2 * n) for n in range(4)), read(FILTER_CTRL), read(BURST_CTRL), CLOSE, read(WIN_CTRL)
-)  # fmt: skip
-"""Identity and settings in one message, and the window after it was closed."""
-_EXTENDED_ON: Final = {"standard": 0, "extended": 1}
+# --- state -----------------------------------------------------------------------------------------------------------
 
 
 class State:
     """State as READ_STATE reads it. Missing bytes count as zeros."""
 
     def __init__(self, data: bytes) -> None:
-        _, *words, _, self.window = (*answers(data), *(0,) * 9)[:9]
+        _, *words, _, window = (*answers(data), *(0,) * 10)[:10]
         self.product_id = b"".join(word.to_bytes(2, "big") for word in words[:4])
         self.filter = words[4] & 0xFF
-        self.extended = words[5] >> 8
+        self.burst_ctrl = (words[5], words[6])
+        """The words at 0x0C and 0x0D."""
+        self.window = window & WINDOW_ID
 
     def differences(self, settings: SpiDeviceSettings) -> str:
-        """Compare the state with the settings; an empty string if all agrees."""
+        """Compare filter and window with the settings; an empty string if all agrees. Bursts show by themselves."""
         wanted = wanted_filter(settings, self.filter)
         if self.filter != wanted:
             return f"FILTER_CTRL is {self.filter:#04x}, expected {wanted:#04x}"
-        burst = _EXTENDED_ON.get(settings.burst, self.extended)
-        if self.extended != burst:
-            return f"BURST_CTRL is {self.extended}, expected {burst}"
         return f"WIN_CTRL is {self.window}, expected 0" if self.window else ""
+
+    @property
+    def kind(self) -> BurstKind:
+        """The kind of burst by BURST_CTRL: extended if any of the places where it may be read says so."""
+        halves = {byte for word in self.burst_ctrl for byte in word.to_bytes(2, "big")}
+        return "extended" if 1 in halves else "standard"
 
 
 # --- scripts ---------------------------------------------------------------------------------------------------------
@@ -103,22 +75,56 @@ class State:
 
 def probe(_settings: SpiDeviceSettings) -> TransferScript[Identity]:
     """Read PROD_ID1 … 4, and close the window in any case. Raises DeviceRefused for anything but an IMU61x."""
-    data = yield from _in_window_1(READ_STATE)
-    return identity_of(State(data).product_id)
+    return identity_of((yield from read_state()).product_id)
 
 
 def set_up(settings: SpiDeviceSettings) -> TransferScript[Mapping[str, str]]:
-    """Write FILTER_CTRL and BURST_CTRL where they differ, read them back. Raises DeviceRefused if they differ still."""
-    state = State((yield from _in_window_1(READ_STATE)))
+    """Write FILTER_CTRL and BURST_CTRL where they differ and read back. Raises DeviceRefused if they differ still.
+
+    Where BURST_CTRL reads back is not certain, so a burst itself decides which kind is selected.
+    """
+    state = yield from read_state()
     wanted = wanted_filter(settings, state.filter)
-    if state.differences(settings):
-        extended = _EXTENDED_ON.get(settings.burst, state.extended)
-        yield from _in_window_1(message(OPEN, write(FILTER_CTRL, wanted), write(BURST_CTRL + 1, extended), CLOSE))
-        state = State((yield from _in_window_1(READ_STATE)))
-        check_filter(wanted, state.filter)
-        if why := state.differences(settings):
-            raise DeviceRefused(f"{why} after it was written; is the bus too fast?")
-    return {**filter_words(state.filter), "burst": "extended" if state.extended else "standard"}
+    if state.filter != wanted:
+        yield from write_control(wanted)
+    if state.window:
+        yield CLOSE_ONLY
+    if settings.burst != "registers":
+        yield from _select(settings.burst, state, settings.checksum_bits)
+    return {**filter_words(wanted), "burst": state.kind if settings.burst == "registers" else settings.burst}
+
+
+def read_state() -> TransferScript[State]:
+    """Read identity and settings."""
+    return State((yield from _in_window_1(READ_STATE)))
+
+
+def read_control() -> TransferScript[int]:
+    """Read FILTER_CTRL."""
+    return (yield from read_state()).filter
+
+
+def write_control(control: int) -> TransferScript[None]:
+    """Write FILTER_CTRL and read it back. Raises DeviceRefused if it is not the value written."""
+    yield from _in_window_1(message(OPEN, write(FILTER_CTRL, control), CLOSE))
+    check_filter(control, (yield from read_control()))
+
+
+def _select(kind: BurstKind, state: State, checksum_bits: int) -> TransferScript[None]:
+    """Select a kind of burst if it is not, until a burst is of that kind. Raises DeviceRefused."""
+    why = ""
+    for attempt in range(BURST_TRIES):
+        if attempt or state.kind != kind:
+            on = 1 if kind == "extended" else 0
+            yield from _in_window_1(message(OPEN, write(BURST_CTRL + 1, on), CLOSE))
+        why = burst_problem(kind, (yield BURSTS[kind]), checksum_bits)
+        if not why:
+            return
+    low, high = (yield from read_state()).burst_ctrl
+    raise DeviceRefused(
+        f"expected a burst of kind {kind}, which was selected: {why}; BURST_CTRL reads {low:#06x} at 0x0C and "
+        f"{high:#06x} at 0x0D; is the bus too fast?"
+    )
 
 
 def _in_window_1(transfer: Transfer) -> TransferScript[bytes]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from imud.attitude import quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
-from imud.contracts.settings import NoSettings
+from imud.contracts.settings import Settings
 from imud.devices.imu61x.common.family import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, scaled
 from imud.devices.imu61x.uart.commands import AHRS_FRAME_BYTES
 from imud.devices.imu61x.uart.framing import CRC_BYTES, DEVICE_SYNC, HEADER, Frame, FrameFinder, encode_frame
@@ -50,7 +50,7 @@ class Imu61xCodec:
     reports it; its bytes and itself count as good.
     """
 
-    def __init__(self, ledger: Ledger, _settings: NoSettings | None = None) -> None:
+    def __init__(self, ledger: Ledger, _settings: Settings | None = None) -> None:
         self.ledger = ledger
         self._finder = FrameFinder(ledger, DEVICE_SYNC)
 

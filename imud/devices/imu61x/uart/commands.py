@@ -8,7 +8,7 @@ follows. Whether the device accepts more than `output_mode` while it streams is 
 depend on it.
 
 Commands that change something are acknowledged (K1). Its result is not judged here, because its codes are not
-documented: any K1 for the command ends the reply.
+documented: any K1 for the command ends the reply. `contact.py` judges it, by one option of the driver.
 """
 
 from collections.abc import Callable
@@ -27,6 +27,7 @@ from imud.devices.imu61x.uart.replies import (
     parse_status,
 )
 from imud.errors import BadArgument
+from imud.sample import Measurement
 from imud.units import BITS_PER_UART_BYTE, NS_PER_MS, NS_PER_S
 
 BaudRate = Literal[115200, 921600, 460800, 230400, 1500000]
@@ -40,9 +41,10 @@ RATES_HZ: Final[tuple[RateHz, ...]] = get_args(RateHz)
 AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + 44
 REPLY_TIMEOUT_NS: Final = 300 * NS_PER_MS
 """A reply of 76 bytes takes 7 ms at 115200 baud, and a USB adapter holds it for 16 ms; the manual gives no time."""
-FLASH_TIMEOUT_NS: Final = 2 * NS_PER_S  # erasing a flash page takes longer than a reply; the manual gives no time
+FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S
+"""Erasing and writing flash may take 2 s; the manual gives no time."""
 CALIBRATION_TIMEOUT_NS: Final = 10 * NS_PER_S
-"""Static calibration of the gyroscope until its acknowledgement; assumed."""
+"""A calibration until its acknowledgement, which may come at its begin or at its end; assumed."""
 
 
 class Command(Enum):
@@ -91,8 +93,21 @@ def ask_status() -> Request:
 
 
 def ask_ahrs() -> Request:
-    """Ask for one AHRS frame (CMD 2). It comes as a sample, so nothing is waited for."""
-    return _command(Command.AHRS, "AHRS once", silent=True)
+    """Ask for one AHRS frame (CMD 2). It comes as a measurement, which ends the reply, and is published as any other.
+
+    While the device streams, the measurement may be the next of the stream.
+    """
+    return _command(Command.AHRS, "AHRS once", is_end=never, is_sample=any_sample)
+
+
+def await_sample(timeout_ns: int) -> Request:
+    """Wait for the next measurement without a command."""
+    return Request(b"", "sample", never, never, never, timeout_ns, is_sample=any_sample)
+
+
+def any_sample(_sample: Measurement) -> bool:
+    """Return True: every measurement of the device will do."""
+    return True
 
 
 def read_parameter(parameter: Parameter) -> Request:
@@ -139,7 +154,7 @@ def save() -> Request:
 
 def start_installation_calibration() -> Request:
     """Begin to measure the mounting error (CMD 7); `ask_installation_status` asks for its progress."""
-    return _command(Command.CALIBRATE_INSTALLATION, "installation calibration")
+    return _command(Command.CALIBRATE_INSTALLATION, "installation calibration", timeout_ns=CALIBRATION_TIMEOUT_NS)
 
 
 def restart() -> Request:
@@ -157,13 +172,10 @@ def set_baud(baud: int) -> Request:
     return _set(Parameter.BAUD, baud)
 
 
-def set_rate(rate_hz: int, *, baud: int | None = None) -> Request:
+def set_rate(rate_hz: int, *, baud: int = 0) -> Request:
     """Set the AHRS output rate (CMD 14, parameter 21). With `baud`, raises BadArgument if it does not fit."""
-    if baud is not None and rate_hz > max_rate_hz(baud):
-        raise BadArgument(
-            f"AHRS rate: expected at most {max_rate_hz(baud)} Hz at {baud} baud, got {rate_hz} Hz; "
-            "set a higher baud rate first"
-        )
+    if baud:
+        require_fit(rate_hz, baud)
     return _set(Parameter.AHRS_RATE, rate_hz)
 
 
@@ -192,6 +204,21 @@ def max_rate_hz(baud: int) -> int:
     return max(rate_hz for rate_hz in RATES_HZ if rate_hz * AHRS_FRAME_BYTES * BITS_PER_UART_BYTE <= baud)
 
 
+def min_baud(rate_hz: float) -> int:
+    """Lowest baud rate of the device that carries an output rate; its highest where none does."""
+    return next((baud for baud in sorted(BAUD_RATES) if rate_hz <= max_rate_hz(baud)), max(BAUD_RATES))
+
+
+def require_fit(rate_hz: float, baud: int) -> None:
+    """Raise BadArgument, with figures and what to change, for an output rate that the line does not carry."""
+    if rate_hz > max_rate_hz(baud):
+        needed = round(rate_hz * AHRS_FRAME_BYTES * BITS_PER_UART_BYTE)
+        raise BadArgument(
+            f"expected at most {max_rate_hz(baud)} Hz at {baud} baud, got {rate_hz:g} Hz, which is {needed} bit/s on "
+            f"the wire: samples would be lost; {rate_hz:g} Hz need {min_baud(rate_hz)} baud"
+        )
+
+
 # --- encoding ---------------------------------------------------------------------------------------------------------
 
 
@@ -212,13 +239,14 @@ def _command(
     param3: int = 0,
     is_end: Callable[[Message], bool] | None = None,
     timeout_ns: int = REPLY_TIMEOUT_NS,
-    silent: bool = False,
     baud: int = 0,
+    is_sample: Callable[[Measurement], bool] | None = None,
 ) -> Request:
     acknowledged = _acknowledges(command)
     payload = encode_command(command, param1, param3)
     # an acknowledgement of a question is part of its reply but does not end it
-    return Request(payload, name, is_end or acknowledged, never, acknowledged, timeout_ns, silent, baud=baud)
+    ends = is_end or acknowledged
+    return Request(payload, name, ends, never, acknowledged, timeout_ns, baud=baud, is_sample=is_sample)
 
 
 def _acknowledges(command: Command) -> Callable[[Message], bool]:

@@ -4,13 +4,14 @@ from random import Random
 from typing import Final
 
 from imud.contracts.driver import StreamDriver
-from imud.contracts.settings import NoSettings
 from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector, relative_heading
 from imud.devices.imu61x.uart.actions import ACTIONS
 from imud.devices.imu61x.uart.calibrations import CALIBRATIONS
 from imud.devices.imu61x.uart.codec import TIMER_MODULUS, Imu61xCodec, encode_ahrs
 from imud.devices.imu61x.uart.commands import BAUD_RATES
+from imud.devices.imu61x.uart.contact import Imu61xUartSettings
 from imud.devices.imu61x.uart.session import identify, read_settings, wake
+from imud.devices.imu61x.uart.settings import SETTINGS
 from imud.frames.conventions import FLU_LEVEL
 from imud.units import NS_PER_US
 
@@ -30,7 +31,7 @@ DRIVER: Final = StreamDriver(
     name="imu61x-uart",
     title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (UART)",
     baud_rates=BAUD_RATES,
-    settings=NoSettings,
+    settings=Imu61xUartSettings,
     make_codec=Imu61xCodec,
     tick_ns=NS_PER_US,
     tick_modulus=TIMER_MODULUS,
@@ -41,6 +42,7 @@ DRIVER: Final = StreamDriver(
     lines=frozenset({"reset"}),
     actions=ACTIONS,
     calibrations=CALIBRATIONS,
+    device_settings=SETTINGS,
     identify=identify,
     read_settings=read_settings,
     wake=wake,

@@ -1,10 +1,13 @@
 """Transfer scripts of the IMU61x on SPI: identity, filters and kind of burst, on the simulated device."""
 
+from typing import Literal
+
 import pytest
 
 from imud.contracts.polling import Transfer, run_transfer_script
 from imud.devices.imu61x.spi.session import SpiDeviceSettings, probe, set_up
 from imud.errors import DeviceRefused, TransferError, Trouble
+from imud.sim.imu61x.behaviour import REGISTER_VARIANTS, RegisterBehaviour
 from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.support.simulated_modules import over_spi
 
@@ -12,8 +15,8 @@ from tests.support.simulated_modules import over_spi
 class Wire:
     """A simulated device with a failure at one of its transfers."""
 
-    def __init__(self, *, fail_at: int = -1, deaf: bool = False) -> None:
-        self.device = Imu61xRegisters(lambda: 0)
+    def __init__(self, *, fail_at: int = -1, deaf: bool = False, behaviour: RegisterBehaviour | None = None) -> None:
+        self.device = Imu61xRegisters(lambda: 0, behaviour=behaviour)
         self.sent: list[str] = []
         self._fail_at = fail_at
         self._deaf = deaf
@@ -41,11 +44,13 @@ def test_set_up_writes_what_differs_only() -> None:
     wire = Wire()
     words = run_transfer_script(set_up(SpiDeviceSettings()), wire.transfer)
     assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
-    assert len(wire.sent) == 1
+    assert len(wire.sent) == 2  # the state, and a burst
     settings = SpiDeviceSettings(accel_filter=4, gyro_filter=4, burst="extended")
     words = run_transfer_script(set_up(settings), wire.transfer)
     assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
-    assert wire.sent[2] == "fe01 8644 8d01 fe00 7e00 7e00"  # the manual's example of 10 Hz: 0x8644
+    assert wire.sent[3] == "fe01 8644 fe00 7e00 7e00"  # the manual's example of 10 Hz: 0x8644
+    assert wire.sent[5] == "fe01 8d01 fe00 7e00 7e00"
+    assert len(wire.sent) == 7
     assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
 
 
@@ -61,8 +66,39 @@ def test_window_is_closed_after_a_failure(fail_at: int) -> None:
 def test_setting_that_does_not_take_is_refused() -> None:
     with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xb1, read back 0xbb"):
         run_transfer_script(set_up(SpiDeviceSettings(gyro_filter=1)), Wire(deaf=True).transfer)
-    with pytest.raises(DeviceRefused, match="BURST_CTRL is 0, expected 1"):
+    words = (
+        "expected a burst of kind extended, .* check value does not match: .* reads 0x0000 at 0x0C and 0x0000 at 0x0D"
+    )
+    with pytest.raises(DeviceRefused, match=words):
         run_transfer_script(set_up(SpiDeviceSettings(burst="extended")), Wire(deaf=True).transfer)
+
+
+@pytest.mark.parametrize("variant", REGISTER_VARIANTS)
+@pytest.mark.parametrize("before", [0, 1])
+@pytest.mark.parametrize("burst", ["standard", "extended", "registers"])
+def test_kind_of_burst_wherever_it_reads_back(
+    variant: str, before: int, burst: Literal["standard", "extended", "registers"]
+) -> None:
+    wire = Wire(behaviour=REGISTER_VARIANTS[variant])
+    wire.device.extended = before
+    words = run_transfer_script(set_up(SpiDeviceSettings(burst=burst)), wire.transfer)
+    if burst != "registers":
+        assert words["burst"] == burst
+        assert wire.device.extended == (burst == "extended")
+    assert wire.device.window == 0
+
+
+def test_one_damaged_burst_is_no_refusal() -> None:
+    wire = Wire()
+    wire.device.extended = 1
+    flips = iter([0, 0, 1, 0, 0])  # the first burst after it was selected
+
+    def transfer(one: Transfer) -> bytes:
+        wire.device.faults.flips = next(flips)
+        return wire.transfer(one)
+
+    assert run_transfer_script(set_up(SpiDeviceSettings()), transfer)["burst"] == "standard"
+    assert wire.device.extended == 0
 
 
 @pytest.mark.parametrize(

@@ -7,55 +7,143 @@ import pytest
 
 from imud.contracts.action import Target
 from imud.devices.imu61x.uart.actions import ACTIONS
-from imud.devices.imu61x.uart.session import BaudChange
-from imud.errors import BadArgument
-from tests.support.simulated_modules import Imu61xBench, imu61x_bench
+from imud.devices.imu61x.uart.contact import Imu61xUartSettings
+from imud.devices.imu61x.uart.following import BaudChange
+from imud.errors import BadArgument, CommandError
+from imud.sim.imu61x.behaviour import REFUSING
+from imud.sim.imu61x.settings import Imu61xSettings
+from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, variant_bench
 
 
-def act(far: Imu61xBench, name: str, **arguments: Any) -> object:
+def act(far: Imu61xBench, name: str, options: Imu61xUartSettings | None = None, **arguments: Any) -> Any:
     """Have the device do it."""
     action = ACTIONS[name]
-    return far.run(action.script(Target(None, far.line_baud), action.arguments(arguments)))
+    return far.run(action.script(Target(options, far.line_baud), action.arguments(arguments)))
+
+
+ARGUMENTS: dict[str, dict[str, Any]] = {
+    "rate": {"rate_hz": 50},
+    "filter": {"accel_filter": "5 Hz", "gyro_filter": 13},
+    "i2c_address": {"address": "0x1A"},
+    "bus": {"bus": "i2c"},
+    "heading": {"heading_deg": 90},
+    "baud": {"baud": 230400},
+}
+WITHOUT_K1 = ("save", "heading", "calibrate_gyro", "calibrate_installation", "installation_status")
+"""What only an acknowledgement can tell of; where CMD 8 has no other answer, it is one of them."""
+
+
+@every_variant
+@pytest.mark.parametrize("name", ACTIONS)
+def test_every_action_in_every_variant(variant: str, name: str) -> None:
+    far = variant_bench(variant, uptime_us=20_000_000)
+    options = Imu61xUartSettings(result_done=done(variant))
+    if variant == "no K1" and name in WITHOUT_K1 and name != "installation_status":
+        with pytest.raises(CommandError, match="whether it is done is not known"):
+            act(far, name, options, **ARGUMENTS.get(name, {}))
+    else:
+        act(far, name, options, **ARGUMENTS.get(name, {}))
+    far.samples(1000)
+    assert bool(far.samples(100)) is (name != "stop_streaming")
+    assert far.line_baud == far.module.baud
+
+
+ORDERS = (
+    "stop_streaming", "save", "restart", "baud", "rate", "filter", "i2c_address", "bus", "heading", "calibrate_gyro",
+    "calibrate_installation", "factory_reset",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_every_order_to_a_device_that_refuses_is_an_error(name: str) -> None:
+    """It keeps what it had, and streams on."""
+    settings = Imu61xSettings(rate_hz=200)
+    far = imu61x_bench(settings, behaviour=REFUSING, uptime_us=20_000_000)
+    with pytest.raises(CommandError):
+        act(far, name, **ARGUMENTS.get(name, {}))
+    assert far.module.settings == far.module.flash == settings
+    assert far.line_baud == 115200
+    assert len(far.samples(100)) >= 15
 
 
 def test_stop_and_start() -> None:
     far = imu61x_bench()
-    act(far, "stop_streaming")
+    answer = act(far, "stop_streaming")
+    assert answer["output_mode"] == "command"
+    assert "start_streaming" in answer["configuration"]
     assert not far.samples(50)
-    assert act(far, "start_streaming") is True
+    act(far, "start_streaming")
     assert far.samples(50)
 
 
 def test_parameters_are_set_and_stay() -> None:
     far = imu61x_bench()
     act(far, "rate", rate_hz=200)
-    act(far, "filter", accel_filter=3, gyro_filter=5)
-    act(far, "i2c_address", address=0x19)
-    act(far, "bus", bus="i2c")
-    assert act(far, "save") is True
+    assert act(far, "filter", accel_filter=3, gyro_filter="15 Hz") == {"accel_filter": "5 Hz", "gyro_filter": "15 Hz"}
+    address, bus = act(far, "i2c_address", address=0x19), act(far, "bus", bus="i2c")
+    assert address["i2c_address"] == "0x19"
+    assert "`i2c.address` must be the new one" in address["configuration"]
+    assert "a host on the bus that was selected before loses the device" in bus["configuration"]
+    act(far, "save")
     far.restart()
     settings = far.module.settings
     assert (settings.rate_hz, settings.filter_control, settings.i2c_address) == (200, 0x35, 0x19)
 
 
+def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent() -> None:
+    far = imu61x_bench()
+    words = "rate_hz: expected at most 200 Hz at 115200 baud, got 400 Hz, .* 400 Hz need 230400 baud; set that first"
+    with pytest.raises(BadArgument, match=words):
+        act(far, "rate", rate_hz=400)
+    assert far.asked == []
+    act(far, "baud", baud=230400)
+    act(far, "rate", rate_hz=400)
+    assert len(far.samples(100)) >= 39
+    with pytest.raises(BadArgument, match="lower the output rate first"):
+        act(far, "baud", baud=115200)
+    assert len(far.samples(100)) >= 35
+
+
 def test_baud_is_followed() -> None:
     far = imu61x_bench()
-    assert act(far, "baud", baud=460800) == BaudChange(460800, saved=True)
+    change = act(far, "baud", baud=460800)
+    assert change == BaudChange(460800, True, "where `uart.baud` is a number, make it 460800; `auto` needs no change")
     assert far.line_baud == far.module.baud == 460800
+
+
+def test_questions_have_names_and_units() -> None:
+    far = imu61x_bench()
+    assert act(far, "status")["model_number"] == 614
+    assert act(far, "settings")["output_rate_hz"] == "100"
+    assert set(act(far, "sample_once")) > {"accel_m_s2", "gyro_rad_s"}
 
 
 def test_calibrations_answer_three_numbers() -> None:
     far = imu61x_bench()
     for name in ("calibrate_gyro", "calibrate_installation"):
-        answer = act(far, name)
-        assert isinstance(answer, tuple)
-        assert len(answer) == 3
-    act(far, "installation_status")
-    act(far, "heading", heading_deg=90)
+        assert len(act(far, name)) == 3
+
+
+def test_options_give_the_codes() -> None:
+    far = imu61x_bench(result_done=4)
+    act(far, "save", Imu61xUartSettings(result_done=4))
+    with pytest.raises(CommandError, match=r"options\.result_done"):
+        act(far, "save")
+
+
+def test_what_may_be_cut_off_is_said_in_the_help() -> None:
+    for name, words in (
+        ("stop_streaming", "cuts off"),
+        ("baud", "`uart.baud`"),
+        ("factory_reset", "`uart.baud`"),
+        ("i2c_address", "`i2c.address`"),
+        ("bus", "loses the device"),
+    ):
+        assert words in ACTIONS[name].help
 
 
 def test_restart_and_factory_reset_keep_contact() -> None:
-    far = imu61x_bench()
+    far = imu61x_bench(uptime_us=20_000_000)
     act(far, "baud", baud=921600)
     assert getattr(act(far, "restart"), "product", "") == "IMU61x"
     act(far, "factory_reset")
@@ -76,8 +164,10 @@ def test_restart_and_factory_reset_keep_contact() -> None:
         ("i2c_address", {"address": 0x1C}, "address"),
         ("i2c_address", {"address": 0x20}, "one of 24, 25, 26, 27"),
         ("i2c_address", {"address": 0x50}, "address"),
-        ("i2c_address", {"address": "0x18"}, "address"),
+        ("i2c_address", {"address": "0x1c"}, "address"),
+        ("i2c_address", {"address": "18"}, "address"),
         ("filter", {"accel_filter": 16, "gyro_filter": 0}, "accel_filter"),
+        ("filter", {"accel_filter": "9 Hz", "gyro_filter": 0}, '"0.2 Hz", "1 Hz", "2 Hz", "5 Hz", "10 Hz", "15 Hz"'),
         ("filter", {"accel_filter": 0, "gyro_filter": 16}, "gyro_filter"),
         ("filter", {"accel_filter": -1, "gyro_filter": 0}, "accel_filter"),
         ("filter", {"accel_filter": 0, "gyro_filter": True}, "gyro_filter"),

@@ -11,6 +11,7 @@ from imud.devices.imu61x.common.family import crc32
 from imud.devices.imu61x.uart import commands as c
 from imud.devices.imu61x.uart.replies import Parameter, pack_acknowledgement, pack_parameters
 from imud.errors import BadArgument
+from imud.sample import Measurement
 
 STREAM_HEX = "55AA 0300 1800 0000803F" + 20 * "00" + "52D88EE8"
 """A command frame that a device obeyed."""
@@ -88,7 +89,11 @@ def test_status_and_installation_status_replies() -> None:
 
 
 def test_one_ahrs_frame_comes_as_a_sample() -> None:
-    assert c.ask_ahrs().silent
+    request = c.ask_ahrs()
+    assert request.is_sample is not None
+    assert request.is_sample(Measurement(54, 0, 0))
+    assert not request.is_end(ReplyFrame(5, pack_acknowledgement(2, 0)))
+    assert request.is_part(ReplyFrame(5, pack_acknowledgement(2, 0)))
 
 
 @pytest.mark.parametrize(("make", "value"), [(c.set_bus_mode, 1), (c.output_mode, 1), (c.read_parameter, 21)])

@@ -1,4 +1,4 @@
-"""Request scripts against simulated devices: one answers while it streams, one in command mode only."""
+"""Request scripts against simulated devices in all variants: identity, status, settings, modes, saving, heading."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,37 +8,33 @@ import pytest
 
 from imud.contracts.session import RequestScript, Silence
 from imud.devices.imu61x.uart import commands, session
-from imud.devices.imu61x.uart.commands import BusMode, OutputMode
-from imud.devices.imu61x.uart.replies import Parameter
+from imud.devices.imu61x.uart.commands import BusMode, Command, OutputMode
+from imud.devices.imu61x.uart.replies import Parameter, Status
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import STATUS
-from imud.sim.physics.motion import Still, swing
-from imud.sim.physics.noise import Noise
-from tests.support.simulated_modules import Imu61xBench, imu61x_bench
+from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, variant_bench
 
-either_way = pytest.mark.parametrize("answers", [True, False])
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
 
 
 def streams(far: Imu61xBench) -> bool:
-    """Whether samples come at the rate of the line."""
+    """Whether samples come at the rate of the line, at the latest when the device has been quiet after its answer."""
+    far.samples(800)
     return len(far.samples(100)) >= 5
 
 
-# --- who it is --------------------------------------------------------------------------------------------------------
+# --- identity and status ----------------------------------------------------------------------------------------------
 
 
-@either_way
-def test_identity_and_the_stream_goes_on(answers: bool) -> None:
-    far = imu61x_bench(answers_while_streaming=answers)
+@every_variant
+def test_identity_and_the_stream_goes_on(variant: str) -> None:
+    far = variant_bench(variant)
     identity = far.run(session.identify())
     assert identity.product == "IMU61x"
     assert identity.serial_number == "003200473133510D33383736"
     assert identity.firmware == "10203"
-    assert identity.details is not None
-    assert identity.details["model"] == "614"
-    assert "imu_health" not in identity.details
+    assert identity.details == {"hardware_version": "2", "model_number": "614"}
     assert streams(far)
     assert far.module.flash == Imu61xSettings()
 
@@ -50,23 +46,60 @@ def test_a_device_that_answers_as_it_is_is_sent_questions_only() -> None:
     assert all(name == "status" or name.startswith("read parameter") for name in far.asked)
 
 
-def test_a_device_in_command_mode_stays_there() -> None:
-    far = imu61x_bench(QUIET)
+@every_variant
+def test_a_device_in_command_mode_stays_there(variant: str) -> None:
+    far = variant_bench(variant, QUIET)
     assert far.run(session.identify()).serial_number
     assert far.module.settings.mode is OutputMode.COMMAND
     assert far.samples(1000) == []
 
 
-def test_identity_from_the_shortest_status() -> None:
-    short = replace(STATUS, system_status=None)
-    identity = imu61x_bench(status=short).run(session.identify())
-    assert identity.details == {"hardware_version": "2", "model": "614"}
+@every_variant
+def test_status_has_names(variant: str) -> None:
+    words = variant_bench(variant).run(session.device_status())
+    head = {
+        "serial_number": "003200473133510D33383736",
+        "software_version": 10203,
+        "hardware_version": 2,
+        "model_number": 614,
+    }
+    rest = {
+        "system_status_bits": "0x00000000",
+        "cpu_load_raw": 120,
+        "drop_rate_raw": 0,
+        "i2c_master_raw": 0,
+        "voltage_raw": 50,
+        "user_config_status_raw": 0,
+        "calibration_status_raw": 0,
+        "imu_health_bits": "00" * 32,
+    }
+    assert words == (head if variant == "short status" else head | rest)
 
 
-def test_health_is_told_where_there_is_something_to_tell() -> None:
-    details = session.identity_of(replace(STATUS, imu_health=bytes([1]) + bytes(31))).details
-    assert details is not None
-    assert details["imu_health"] == "01" + "00" * 31
+def test_status_bits_are_hexadecimal() -> None:
+    words = session.status_words(replace(STATUS, system_status=0x8000_0001, imu_health=bytes([1]) + bytes(31)))
+    assert words["system_status_bits"] == "0x80000001"
+    assert words["imu_health_bits"] == "01" + "00" * 31
+    assert session.status_words(Status(1, 2, 3, (4, 5, 6)))["serial_number"] == "000000040000000500000006"
+
+
+@every_variant
+@pytest.mark.parametrize("settings", [Imu61xSettings(), QUIET])
+def test_one_sample_with_names_and_units(variant: str, settings: Imu61xSettings) -> None:
+    far = variant_bench(variant, settings)
+    words = far.run(session.sample_once())
+    assert set(words) == {"timer_us", "accel_m_s2", "gyro_rad_s", "euler_rad", "temperature_c"}
+    assert words["accel_m_s2"][2] == pytest.approx(9.8, abs=0.1)
+    assert words["euler_rad"] == pytest.approx([radians(-3), radians(2), words["euler_rad"][2]], abs=0.01)
+    assert bool(far.samples(2000)) is (settings is not QUIET)
+
+
+def test_a_refused_sample_is_said() -> None:
+    far = imu61x_bench(QUIET, refuses=frozenset({Command.AHRS}))
+    with pytest.raises(Rejected, match="AHRS once: expected a sample, got an acknowledgement with result 2"):
+        far.run(session.sample_once())
+    with pytest.raises(NoReply, match="AHRS once: expected a sample, got nothing"):
+        imu61x_bench(QUIET, ignores=frozenset({Command.AHRS})).run(session.sample_once())
 
 
 def test_without_a_transmit_line_nothing_changes() -> None:
@@ -90,68 +123,98 @@ def test_streaming_is_started_again_when_the_answer_fails() -> None:
     assert streams(far)
 
 
-@either_way
-def test_settings(answers: bool) -> None:
-    far = imu61x_bench(
-        Imu61xSettings(rate_hz=50, filter_control=0x4B, i2c_address=0x1A, gyro_off_deg_s=(0.5, -0.25, 0.0)),
-        answers_while_streaming=answers,
+@every_variant
+def test_settings_have_names_and_units(variant: str) -> None:
+    far = variant_bench(
+        variant, Imu61xSettings(rate_hz=50, filter_control=0x4B, i2c_address=0x1A, gyro_off_deg_s=(0.5, -0.25, 0.0))
     )
     assert far.run(session.read_settings()) == {
-        "BAUD": "115200",
-        "GYRO_X_OFF": "0.5",
-        "GYRO_Y_OFF": "-0.25",
-        "GYRO_Z_OFF": "0",
-        "INSTALL_X_OFF": "0",
-        "INSTALL_Y_OFF": "0",
-        "INSTALL_Z_OFF": "0",
-        "AHRS_RATE": "50",
-        "BUS_MODE": "1",
-        "I2C_ADDRESS": "0x1A",
-        "FILTER": "0x4B",
+        "baud": "115200",
+        "output_rate_hz": "50",
+        "accel_filter": "10 Hz",
+        "gyro_filter": "47 Hz",
+        "second_bus": "spi",
+        "i2c_address": "0x1a",
+        "gyro_offset_deg_s": "0.5, -0.25, 0",
+        "installation_angles_deg": "0, 0, 0",
     }
     assert streams(far)
 
 
-# --- modes and restart ------------------------------------------------------------------------------------------------
+def test_values_that_are_none_of_the_manuals_are_shown_as_they_are() -> None:
+    values = {Parameter.BAUD: 9600.0, Parameter.FILTER: 300.0, Parameter.BUS_MODE: 7.0, Parameter.I2C_ADDRESS: -1.0}
+    assert session.parameter_words(values) == {"baud": "9600", "filter": "300", "second_bus": "7", "i2c_address": "-1"}
+    assert session.parameter_words({Parameter.FILTER: float("nan")}) == {"filter": "nan"}
 
 
-@pytest.mark.parametrize("acknowledges", [True, False])
-def test_stream_and_command_mode(acknowledges: bool) -> None:
-    far = imu61x_bench(acknowledges=acknowledges)
+# --- modes and saving -------------------------------------------------------------------------------------------------
+
+
+@every_variant
+def test_command_mode_and_stream(variant: str) -> None:
+    far = variant_bench(variant)
+    far.run(session.stop_streaming(done=done(variant)))
+    assert far.samples(1500) == []
+    far.run(session.start_streaming(done=done(variant)))
+    assert streams(far)
+
+
+@pytest.mark.parametrize("rate_hz", [1, 400])
+def test_modes_are_seen_at_any_rate(rate_hz: int) -> None:
+    far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=rate_hz))
     far.run(session.stop_streaming())
-    assert far.samples(500) == []
-    assert far.run(session.start_streaming()) is acknowledges
+    far.run(session.start_streaming())
+
+
+def test_a_mode_that_is_acknowledged_and_not_changed_is_an_error() -> None:
+    far = imu61x_bench(changes_mode=False)
+    with pytest.raises(Rejected, match="output mode COMMAND: expected no more samples, got one"):
+        far.run(session.stop_streaming())
+    silent = imu61x_bench(QUIET, changes_mode=False)
+    with pytest.raises(NoReply, match="output mode STREAM: expected a sample within 3 s, got none"):
+        silent.run(session.start_streaming())
+
+
+ORDERS: dict[Command, Callable[[], RequestScript[object]]] = {
+    Command.OUTPUT_MODE: session.stop_streaming,
+    Command.SAVE: session.save,
+    Command.HEADING: lambda: session.reset_heading(10),
+}
+
+
+@pytest.mark.parametrize("command", ORDERS)
+def test_a_refusal_is_an_error_that_names_the_option(command: Command) -> None:
+    far = imu61x_bench(refuses=frozenset({command}))
+    with pytest.raises(Rejected, match=r"expected result 0 \(done\), got 2: it refused, or `options.result_done`"):
+        far.run(ORDERS[command]())
     assert streams(far)
 
 
-@either_way
-def test_restart_loses_what_was_not_saved(answers: bool) -> None:
-    far = imu61x_bench(answers_while_streaming=answers)
-    far.run(session.write_parameter(Parameter.AHRS_RATE, 10))
-    assert far.module.settings.rate_hz == 10
-    assert far.run(session.restart()).product == "IMU61x"
-    assert far.module.settings == far.module.flash == Imu61xSettings()
-    assert streams(far)
+@pytest.mark.parametrize("command", [Command.SAVE, Command.HEADING])
+def test_an_order_without_an_acknowledgement_is_not_known_to_be_done(command: Command) -> None:
+    far = imu61x_bench(acknowledges=False)
+    with pytest.raises(NoReply, match="though the device answers: whether it is done is not known"):
+        far.run(ORDERS[command]())
 
 
-def test_a_device_that_does_not_come_back_is_no_reply() -> None:
-    far = imu61x_bench(boot_ms=60_000)
-    with pytest.raises(NoReply, match="status"):
-        far.run(session.restart())
-
-
-def test_saved_parameters_stay() -> None:
-    far = imu61x_bench()
+@every_variant
+def test_saved_parameters_stay(variant: str) -> None:
+    far = variant_bench(variant)
     far.run(session.write_parameter(Parameter.FILTER, 0x44))
-    assert far.run(session.save()) is True
+    if variant == "no K1":
+        with pytest.raises(NoReply):
+            far.run(session.save())
+    else:
+        far.run(session.save(done=done(variant)))
+    assert streams(far)
     far.restart()
     assert far.module.settings.filter_control == 0x44
 
 
-# --- parameters -------------------------------------------------------------------------------------------------------
+# --- parameters and heading -------------------------------------------------------------------------------------------
 
 
-@either_way
+@every_variant
 @pytest.mark.parametrize(
     ("parameter", "value", "read"),
     [
@@ -161,18 +224,27 @@ def test_saved_parameters_stay() -> None:
         (Parameter.FILTER, 0xF0, 0xF0),
     ],
 )
-def test_a_parameter_is_set_and_read_back(answers: bool, parameter: Parameter, value: int, read: int) -> None:
-    far = imu61x_bench(answers_while_streaming=answers)
+def test_a_parameter_is_set_and_read_back(variant: str, parameter: Parameter, value: int, read: int) -> None:
+    far = variant_bench(variant)
     far.run(session.write_parameter(parameter, value))
     assert far.module.settings.value(parameter) == read
     assert far.module.flash == Imu61xSettings()
     assert streams(far)
 
 
-def test_a_parameter_that_does_not_stick_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    far = imu61x_bench()
-    monkeypatch.setattr("imud.sim.imu61x.uart.changed", lambda settings, index, value: settings)
-    with pytest.raises(Rejected, match="set parameter AHRS_RATE to 200: reads back as 100"):
+@every_variant
+def test_one_filter_leaves_the_other(variant: str) -> None:
+    far = variant_bench(variant)
+    far.run(session.write_filters(4, None))
+    assert far.module.settings.filter_control == 0x4B
+    far.run(session.write_filters(None, 0))
+    assert far.module.settings.filter_control == 0x40
+
+
+def test_a_parameter_that_does_not_stick_is_refused() -> None:
+    far = imu61x_bench(refuses=frozenset({Command.SET_PARAMETER}))
+    words = "set parameter AHRS_RATE to 200: reads back as 100, acknowledged with result 2"
+    with pytest.raises(Rejected, match=words):
         far.run(session.write_parameter(Parameter.AHRS_RATE, 200))
 
 
@@ -192,132 +264,20 @@ def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parame
     assert far.asked == []
 
 
-# --- calibrations -----------------------------------------------------------------------------------------------------
-
-
-@either_way
-def test_gyro_calibration_takes_the_bias_off(answers: bool) -> None:
-    far = imu61x_bench(answers_while_streaming=answers, noise=Noise(3))
-    before = far.samples(2000)
-    offsets_deg_s = far.run(session.calibrate_gyro())
-    after = far.samples(2000)
-    assert any(abs(offset) > 1e-3 for offset in offsets_deg_s)
-    for axis in range(3):
-        means = [sum(m.gyro_rad_s[axis] for m in part if m.gyro_rad_s) / len(part) for part in (before, after)]
-        assert means[0] - means[1] == pytest.approx(radians(offsets_deg_s[axis]), abs=1.5e-4)
-        assert abs(means[1]) < 1.5e-4
-
-
-def test_gyro_calibration_of_a_moving_device_is_refused() -> None:
-    far = imu61x_bench(motion=swing())
-    with pytest.raises(Rejected, match=r"gyro calibration: expected result 0 \(done\), got 1"):
-        far.run(session.calibrate_gyro())
-
-
-def test_what_counts_as_done_can_be_told() -> None:
-    far = imu61x_bench(motion=swing())
-    assert far.run(session.calibrate_gyro(done=1)) == (0, 0, 0)
-    with pytest.raises(Rejected):
-        far.run(session.reset_heading(10, done=1))
-
-
-@either_way
-def test_installation_calibration_ends_with_the_angles(answers: bool) -> None:
-    tilted = Still(radians(4), radians(0), radians(0))  # 312: roll about Y, which is pitch in ZYX
-    far = imu61x_bench(answers_while_streaming=answers, motion=tilted)
-    assert far.run(session.installation_status()) == 0
-    begun_ns = far.now_ns
-    assert far.run(session.calibrate_installation()) == pytest.approx((0, 4, 0), abs=1e-5)
-    assert 3e9 <= far.now_ns - begun_ns < 6e9
+@every_variant
+@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 359.0])
+def test_heading_reset(variant: str, heading_deg: float) -> None:
+    if variant == "no K1":
+        return  # see above: not known to be done
+    far = variant_bench(variant)
+    far.run(session.reset_heading(heading_deg, done=done(variant)))
     assert streams(far)
-
-
-def test_installation_calibration_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.sim.imu61x.uart.CALIBRATION_NS", 10**15)
-    far = imu61x_bench(QUIET)
-    with pytest.raises(NoReply, match="expected status 0 within 60 s, got 1"):
-        far.run(session.calibrate_installation())
-
-
-@either_way
-@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 180.0, 359.0])
-def test_heading_reset(answers: bool, heading_deg: float) -> None:
-    far = imu61x_bench(answers_while_streaming=answers)
-    far.run(session.reset_heading(heading_deg))
     euler = far.samples(100)[-1].euler_rad
     assert euler is not None
     assert (euler[2] - radians(heading_deg) + 3) % radians(360) == pytest.approx(3, abs=1e-5)
 
 
-# --- baud rate and factory reset --------------------------------------------------------------------------------------
-
-
-@either_way
-@pytest.mark.parametrize("at_start", [False, True])
-@pytest.mark.parametrize("acknowledges", [True, False])
-@pytest.mark.parametrize(("baud", "present"), [(921600, 115200), (115200, 1500000), (460800, 460800)])
-def test_the_baud_rate_changes_and_the_device_is_kept(
-    answers: bool, at_start: bool, acknowledges: bool, baud: int, present: int
-) -> None:
-    settings = Imu61xSettings(baud=present)
-    far = imu61x_bench(
-        settings, answers_while_streaming=answers, baud_acts_at_start=at_start, acknowledges=acknowledges
-    )
-    change = far.run(session.change_baud(baud, present))
-    assert change.baud == baud == far.line_baud == far.module.baud
-    assert far.module.flash.baud == baud
-    assert far.module.flash.mode is OutputMode.STREAM
-    assert streams(far)
-    far.restart()
-    assert streams(far)
-
-
-def test_the_line_comes_back_when_the_device_keeps_its_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    far = imu61x_bench()
-    monkeypatch.setattr("imud.sim.imu61x.uart.changed", lambda settings, index, value: settings)
-    with pytest.raises(Rejected, match="stays at 115200 baud"):
-        far.run(session.change_baud(921600, 115200))
-    assert far.line_baud == 115200
-    assert streams(far)
-
-
-def test_a_device_that_is_lost_was_not_saved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes a third rate, by some fault of its own: power off and on brings it back."""
-    far = imu61x_bench()
-    wrong = lambda settings, index, value: replace(settings, baud=1500000)  # noqa: E731
-    monkeypatch.setattr("imud.sim.imu61x.uart.changed", wrong)
-    with pytest.raises(NoReply, match="switch its power off and on: nothing was saved"):
-        far.run(session.change_baud(460800, 115200))
-    assert far.line_baud == 115200
-    far.restart()
-    assert streams(far)
-
-
-@pytest.mark.parametrize("change", [lambda: session.change_baud(921600, 115200), lambda: session.factory_reset(115200)])
-def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[object]]) -> None:
-    far = imu61x_bench()
-    far.connected = False
-    with pytest.raises(NoReply, match="nothing was changed"):
-        far.run(change())
-    assert far.line_baud == 115200
-    assert "factory reset" not in far.asked
-    assert not any(name.startswith("set parameter") for name in far.asked)
-    assert streams(far)
-
-
-@either_way
-@pytest.mark.parametrize("at_start", [False, True])
-@pytest.mark.parametrize("present", [115200, 921600])
-def test_factory_reset_and_the_line_follows(answers: bool, at_start: bool, present: int) -> None:
-    settings = Imu61xSettings(baud=present, rate_hz=400, filter_control=0)
-    far = imu61x_bench(settings, answers_while_streaming=answers, baud_acts_at_start=at_start)
-    change = far.run(session.factory_reset(present))
-    assert change.baud == far.line_baud == far.module.baud == 115200
-    assert far.module.flash == Imu61xSettings()
-    assert streams(far)
-
-
 def test_orders_outside_scripts_are_obeyed_too() -> None:
     far = imu61x_bench(QUIET)
-    assert far.ask(commands.ask_ahrs())
-    assert len(far.samples(50)) == 1
+    outcome = far.ask(commands.ask_ahrs())
+    assert getattr(outcome, "sample", None) is not None

@@ -1,0 +1,204 @@
+"""Restart, baud rate and factory reset of simulated devices in all variants: what they show decides."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from imud.contracts.session import RequestScript
+from imud.devices.imu61x.uart import following, session
+from imud.devices.imu61x.uart.commands import Command, OutputMode
+from imud.devices.imu61x.uart.replies import Parameter
+from imud.errors import BadArgument, NoReply, Rejected
+from imud.sim.imu61x.behaviour import REFUSING
+from imud.sim.imu61x.settings import Imu61xSettings
+from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, variant_bench
+
+
+def streams(far: Imu61xBench) -> bool:
+    """Whether samples come at the rate of the line, at the latest when the device has been quiet after its answer."""
+    far.samples(800)
+    return len(far.samples(100)) >= 5
+
+
+# --- restart ----------------------------------------------------------------------------------------------------------
+
+
+@every_variant
+def test_restart_loses_what_was_not_saved_and_begins_the_timer_again(variant: str) -> None:
+    far = variant_bench(variant, uptime_us=20_000_000)
+    far.run(session.write_parameter(Parameter.AHRS_RATE, 10))
+    assert far.module.settings.rate_hz == 10
+    assert far.run(following.restart(done=done(variant))).product == "IMU61x"
+    assert far.module.settings == far.module.flash == Imu61xSettings()
+    assert streams(far)
+
+
+@every_variant
+def test_a_restart_that_did_not_happen_is_an_error(variant: str) -> None:
+    """It acknowledges or not, and its timer goes on."""
+    far = variant_bench(variant, uptime_us=20_000_000)
+    behaviour = replace(far.module.hardware.behaviour, ignores=frozenset({Command.RESTART}))
+    far = imu61x_bench(behaviour=behaviour, uptime_us=20_000_000)
+    with pytest.raises(Rejected, match=r"expected a timer that begins again, got 2\d\.\d s before and 2\d\.\d s after"):
+        far.run(following.restart(done=done(variant)))
+
+
+def test_a_refused_restart_names_the_result() -> None:
+    far = imu61x_bench(behaviour=REFUSING, uptime_us=20_000_000)
+    with pytest.raises(Rejected, match=r"and acknowledgement 2 \(0 is done\)"):
+        far.run(following.restart())
+
+
+def test_a_restart_is_seen_whatever_code_means_done() -> None:
+    """With `result_done` left as it is: what the device shows counts more than what it acknowledges."""
+    far = imu61x_bench(result_done=1, uptime_us=20_000_000)
+    assert far.run(following.restart()).product == "IMU61x"
+
+
+@pytest.mark.parametrize("uptime_us", [0, 2**32 - 5_000_000, 2**32 - 25_000_000])
+def test_a_young_timer_and_one_that_turns_over_soon_are_waited_for(uptime_us: int) -> None:
+    """0.5 s after power-on, after a restart it shows more; close to its end it turns over by itself."""
+    far = imu61x_bench(uptime_us=uptime_us)
+    begun_ns = far.now_ns
+    assert far.run(following.restart()).product == "IMU61x"
+    assert far.now_ns - begun_ns < 60e9
+    still = imu61x_bench(uptime_us=uptime_us, ignores=frozenset({Command.RESTART}))
+    with pytest.raises(Rejected, match="timer that begins again"):
+        still.run(following.restart())
+
+
+def test_a_device_that_does_not_come_back_is_no_reply() -> None:
+    far = imu61x_bench(uptime_us=20_000_000)
+    far.module.hardware = replace(far.module.hardware, boot_ms=60_000)
+    with pytest.raises(NoReply, match="status"):
+        far.run(following.restart())
+
+
+# --- baud rate --------------------------------------------------------------------------------------------------------
+
+
+@every_variant
+@pytest.mark.parametrize(("baud", "present"), [(921600, 115200), (115200, 1500000), (460800, 460800)])
+def test_the_baud_rate_changes_and_the_device_is_kept(variant: str, baud: int, present: int) -> None:
+    far = variant_bench(variant, Imu61xSettings(baud=present))
+    change = far.run(following.change_baud(baud, present, done=done(variant)))
+    assert change.baud == baud == far.line_baud == far.module.baud
+    assert change.saved is (variant != "no K1")
+    assert change.configuration == f"where `uart.baud` is a number, make it {baud}; `auto` needs no change"
+    assert far.module.flash.baud == baud
+    assert far.module.flash.mode is OutputMode.STREAM
+    assert streams(far)
+    far.restart()
+    assert streams(far)
+
+
+@every_variant
+def test_without_save_flash_is_written_only_where_the_rate_comes_into_force_in_no_other_way(variant: str) -> None:
+    far = variant_bench(variant)
+    far.run(following.change_baud(460800, 115200, done=done(variant), save=False))
+    assert far.line_baud == far.module.baud == 460800
+    at_start = far.module.hardware.behaviour.baud_acts_at_start
+    assert far.module.flash.baud == (460800 if at_start else 115200)
+
+
+@pytest.mark.parametrize("baud", [115200, 230400])
+def test_a_baud_rate_that_does_not_carry_the_output_rate_is_refused(baud: int) -> None:
+    """400 Hz of 54 bytes of 10 bits are 216000 bit/s: 230400 carries them, 115200 does not."""
+    far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=400))
+    if baud == 115200:
+        words = (
+            "baud: expected at most 200 Hz at 115200 baud, got 400 Hz, .* 216000 bit/s .*; lower the output rate first"
+        )
+        with pytest.raises(BadArgument, match=words):
+            far.run(following.change_baud(baud, 921600))
+        assert (far.line_baud, far.module.baud, far.module.flash.baud) == (921600, 921600, 921600)
+    else:
+        far.run(following.change_baud(baud, 921600))
+    assert len(far.samples(100)) >= 35
+
+
+def test_the_line_comes_back_when_the_device_keeps_its_rate() -> None:
+    far = imu61x_bench(refuses=frozenset({Command.SET_PARAMETER}))
+    with pytest.raises(Rejected, match="stays at 115200 baud"):
+        far.run(following.change_baud(921600, 115200))
+    assert far.line_baud == 115200
+    assert streams(far)
+
+
+def test_a_rate_that_is_not_saved_because_the_device_refuses_is_an_error() -> None:
+    far = imu61x_bench(refuses=frozenset({Command.SAVE}))
+    with pytest.raises(Rejected, match="save: expected result 0"):
+        far.run(following.change_baud(921600, 115200))
+    assert far.line_baud == far.module.baud == 921600
+    assert streams(far)
+
+
+def test_a_device_that_is_lost_was_not_saved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes a third rate, by some fault of its own: power off and on brings it back."""
+    far = imu61x_bench()
+    wrong = lambda settings, index, value: replace(settings, baud=1500000)  # noqa: E731
+    monkeypatch.setattr("imud.sim.imu61x.uart.changed", wrong)
+    with pytest.raises(NoReply, match="switch its power off and on: nothing was saved"):
+        far.run(following.change_baud(460800, 115200))
+    assert far.line_baud == 115200
+    far.restart()
+    assert streams(far)
+
+
+CHANGES: list[Callable[[], RequestScript[object]]] = [
+    lambda: following.change_baud(921600, 115200),
+    lambda: following.factory_reset(115200),
+]
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[object]]) -> None:
+    far = imu61x_bench()
+    far.connected = False
+    with pytest.raises(NoReply, match="nothing was changed"):
+        far.run(change())
+    assert far.line_baud == 115200
+    assert "factory reset" not in far.asked
+    assert not any(name.startswith("set parameter") for name in far.asked)
+    assert streams(far)
+
+
+# --- factory reset ----------------------------------------------------------------------------------------------------
+
+
+@every_variant
+@pytest.mark.parametrize("present", [115200, 921600])
+def test_factory_reset_is_read_back_and_the_line_follows(variant: str, present: int) -> None:
+    settings = Imu61xSettings(baud=present, rate_hz=200, filter_control=0, i2c_address=0x1B)
+    far = variant_bench(variant, settings)
+    change = far.run(following.factory_reset(present, done=done(variant)))
+    assert change.baud == far.line_baud == far.module.baud == 115200
+    assert far.module.flash == far.module.settings == Imu61xSettings()
+    assert streams(far)
+
+
+def test_settings_that_were_not_saved_are_not_saved_by_a_reset_at_the_next_start() -> None:
+    """Flash has the factory settings already; to save what is in use would bring the old ones back."""
+    far = imu61x_bench(Imu61xSettings(rate_hz=50), reset_acts_at_start=True)
+    far.run(session.write_parameter(Parameter.AHRS_RATE, 10))
+    far.run(following.factory_reset(115200))
+    assert far.asked.index("restart") < far.asked.index("save")
+    assert far.module.flash == Imu61xSettings()
+
+
+def test_a_refused_factory_reset_names_what_is_not_as_delivered_and_restarts_nothing() -> None:
+    far = imu61x_bench(Imu61xSettings(rate_hz=50), refuses=frozenset({Command.FACTORY_RESET}))
+    words = r"expected AHRS_RATE 100, read back AHRS_RATE 50; acknowledgement 2 \(0 is done\)"
+    with pytest.raises(Rejected, match=words):
+        far.run(following.factory_reset(115200))
+    assert "restart" not in far.asked
+    assert streams(far)
+
+
+def test_a_factory_reset_that_does_nothing_is_an_error_though_it_is_acknowledged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    far = imu61x_bench(Imu61xSettings(filter_control=0x44), ignores=frozenset({Command.FACTORY_RESET}))
+    with pytest.raises(Rejected, match="expected FILTER 187, read back FILTER 68; acknowledgement none"):
+        far.run(following.factory_reset(115200))
