@@ -179,15 +179,16 @@ class DeviceTime:
     """
 
     __slots__ = (
-        "_even_for", "_gap", "_modulus", "_phase_ns", "_shift_ns", "_step_ns", "_ticks", "doubt_ns", "even_ns",
-        "missed", "period", "raw_ns", "tick_ns", "uneven", "watched",
+        "_even_for", "_gap", "_modulus", "_phase_ns", "_shift_ns", "_step_ns", "doubt_ns", "even_ns", "missed",
+        "period", "raw_ns", "tick_ns", "ticks", "uneven", "watched",
     )  # fmt: skip
 
     def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
         """`on_unknown_gap` is called for a gap in which the number of missing samples is not known."""
         self.tick_ns = tick_ns
         self._modulus = tick_modulus
-        self._ticks = 0
+        self.ticks = 0
+        """The newest stamp."""
         self._phase_ns = 0.0
         self._shift_ns = 0.0
         """Part of the corrections of the counter that is still in `even_ns`."""
@@ -212,7 +213,7 @@ class DeviceTime:
 
     def begin(self, ticks: int) -> None:
         """Set the first stamp of a device, or the first after its clock started anew."""
-        self._ticks = ticks
+        self.ticks = ticks
         self._phase_ns = self._shift_ns = self.doubt_ns = 0.0
         self.missed = self._gap = self.watched = self._even_for = 0
         self.uneven = False
@@ -220,7 +221,7 @@ class DeviceTime:
 
     def elapsed_ns(self, ticks: int) -> int:
         """Device time from the newest stamp to `ticks`, if the counter only went forward and wrapped once at most."""
-        return (ticks - self._ticks) % self._modulus * self.tick_ns
+        return (ticks - self.ticks) % self._modulus * self.tick_ns
 
     def missed_since(self, line: CounterLine, ticks: int, arrival_ns: int) -> int | None:
         """Return how many samples are missing since the newest one; None where the counter did not run on to `ticks`.
@@ -235,8 +236,8 @@ class DeviceTime:
 
     def advance(self, ticks: int) -> None:
         """Set the next stamp."""
-        step = (ticks - self._ticks) % self._modulus
-        self._ticks = ticks
+        step = (ticks - self.ticks) % self._modulus
+        self.ticks = ticks
         tick_ns = self.tick_ns
         self.raw_ns += step * tick_ns
         period = self.period

@@ -34,18 +34,11 @@ from imud.clock.device_time import (
 from imud.clock.gaps import ArrivalLosses, CounterLine
 from imud.clock.intervals import SIGMA_OF_RANGE
 from imud.clock.link_delay import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
+from imud.clock.stamp_time import StampTime
 from imud.clock.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
 from imud.contracts.lines import Edge
 from imud.contracts.status import ClockStatus
-from imud.contracts.timing import (
-    NO_TIME_BITS,
-    Mark,
-    SoutTiming,
-    TimeBits,
-    TriggerStamp,
-    TriggerTiming,
-    UtcReference,
-)
+from imud.contracts.timing import NO_TIME_BITS, Mark, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
 from imud.sample import Measurement, Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -70,14 +63,12 @@ class SampleClock:
 
     `tick_ns` and `tick_modulus` describe the device's counter, `byte_ns` is the time of a byte on the wire (0: none
     known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
-    the samples: it shows how many are missing, and the arrivals show when they were. `bits` are the status bits of the
-    device that concern time, `sout` and `sin` where on their edges the measurement is.
+    the samples: it shows how many are missing, and the arrivals show when they were. Messages without that counter are
+    dated by `pps_age_ms`, in ms modulo `stamp_modulus` (0: by arrival). `bits` are the status bits of the device that
+    concern time, `sout` and `sin` where on their edges the measurement is.
 
-    `missed` counts within one sample. For a gap where that cannot be known, `on_unknown_gap` is called: its samples are
-    not in `missed`, or by an estimate.
-
-    Edges, triggers and UTC (`on_…`, `set_utc_reference`) are given before the messages that follow them, in the order
-    of time. Only a device that sends time can make use of them; for others they are ignored.
+    `missed` counts within one sample; for a gap where that cannot be known `on_unknown_gap` is called.
+    Edges, triggers and UTC are given before the messages that follow them; without device time they are ignored.
     """
 
     def __init__(
@@ -88,6 +79,7 @@ class SampleClock:
         tick_modulus: int,
         byte_ns: int,
         hold_ns: int,
+        stamp_modulus: int = 0,
         bits: TimeBits = NO_TIME_BITS,
         sout: SoutTiming | None = None,
         sin: TriggerTiming | None = None,
@@ -102,6 +94,7 @@ class SampleClock:
         self._time = DeviceTime(tick_ns, tick_modulus, on_unknown_gap)
         self._losses = ArrivalLosses(0 if tick_ns else tick_modulus, on_unknown_gap)
         self._by_number = tick_ns == 0
+        self._stamps = StampTime(stamp_modulus) if stamp_modulus else None
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._spread = ArrivalSpread()
         self._line: CounterLine | None = None
@@ -110,23 +103,15 @@ class SampleClock:
         self._slew = Slew()
         self._holdover: Holdover | None = None
         self._fit: ArrivalFit | None = None
-        self._fit_begin_ns = 0
-        """Device time at which the fit began."""
+        self._fit_begin_ns = 0  # device time
         self._fit_bias_ns = 0.0
         """Distance from the fit down to the time of measurement, ns."""
         self._fit_error_ns = 0.0
-        self._fit_sync = Sync.ARRIVAL
-        """REGRESSION once the fit is used."""
-        self._sync = Sync.ARRIVAL
-        """Origin of the newest time stamp, where there are aiding sources."""
-        self._known = False
-        """Whether device time has begun."""
-        self._seq = 0
-        self._t_ns = 0
-        self._t_rx_ns = 0
-        self._t_err_ns = 0
-        self._error_ns = 0.0
-        """One-sigma error of the newest time, before it is lifted or held back."""
+        self._fit_sync = Sync.ARRIVAL  # REGRESSION once the fit is used
+        self._sync = Sync.ARRIVAL  # origin of the newest time stamp, where there are aiding sources
+        self._known = False  # whether device time has begun
+        self._seq = self._t_ns = self._t_rx_ns = self._t_err_ns = 0
+        self._error_ns = 0.0  # one-sigma error of the newest time, before it is lifted or held back
         self._resets = 0
         self._own_status: int | None = None
         self.missed = 0
@@ -145,6 +130,8 @@ class SampleClock:
         size_bytes, ticks, byte_ns = m.size_bytes, m.dev_ticks, self._delay.byte_ns or 1
         trailing_ns = m.trailing_bytes * byte_ns
         arrival_ns = t_rx_ns - size_bytes * byte_ns - trailing_ns if t_begin_ns is None else t_begin_ns
+        if ticks is None and self._stamps is not None and m.pps_age_ms is not None:
+            ticks = self._stamped(self._stamps, m.pps_age_ms, arrival_ns)
         if ticks is None or self._by_number:
             wanted_ns, t_dev_ns, sync = self._by_arrival(ticks, arrival_ns, size_bytes), None, _ARRIVAL
         else:
@@ -230,9 +217,8 @@ class SampleClock:
 
     def take_marks(self) -> list[Mark]:
         """Return the pulses on SOUT_DIV whose samples are known by now, in order, each once."""
-        if self._aiding is None or self._aiding.marks is None:
-            return []
-        return self._aiding.marks.take_marks()
+        marks = self._aiding.marks if self._aiding is not None else None
+        return marks.take_marks() if marks is not None else []
 
     def _aided(self) -> AidingSources:
         if self._aiding is None:
@@ -284,6 +270,8 @@ class SampleClock:
         self._known = False
         self._spread = ArrivalSpread()
         self._losses.restart()
+        if self._stamps is not None:
+            self._stamps.restart()
         self.missed = 0
         self._drop_fit()
 
@@ -293,6 +281,16 @@ class SampleClock:
         self.set_utc_reference(other.utc_reference)
 
     # --- by arrival ----------------------------------------------------------------------------------------------
+
+    def _stamped(self, stamps: StampTime, stamp: int, arrival_ns: int) -> int | None:
+        """Return the ticks of a message that has a short stamp only; None where those do not date it."""
+        was_in_use = stamps.in_use
+        ticks = stamps.ticks(stamp, arrival_ns, self._time.ticks if self._known else None)
+        if was_in_use is not stamps.in_use:
+            self._known, self._line = stamps.in_use, None
+            self._drop_fit()
+            self._time.begin(stamps.before)
+        return ticks
 
     def _by_arrival(self, ticks: int | None, arrival_ns: int, size_bytes: int) -> int:
         """Return the time of a message without device time; it may have a number."""
@@ -340,7 +338,9 @@ class SampleClock:
             fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
             above_ns = arrival_ns - fit_ns
         odd = above_ns < -JUMP_EARLY_NS or above_ns > JUMP_LATE_NS or self._jump.late_reads
-        if odd and self._jumped(fit, above_ns, device_ns - before_ns, t_rx_ns):
+        if odd and self._jump.is_jump(
+            fit, above_ns, device_ns - before_ns, self._known_error_ns, t_rx_ns, self._t_rx_ns
+        ):
             return self._after_jump(above_ns, ticks, arrival_ns, size_bytes)
         self.missed = time.missed
         if fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
@@ -389,10 +389,6 @@ class SampleClock:
         self.missed = missed or 0
         self._line = None
         self._time.begin(ticks)
-
-    def _jumped(self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, t_rx_ns: int) -> bool:
-        error_ns = None if self._fit_sync is _ARRIVAL else self._fit_error_ns
-        return self._jump.is_jump(fit, above_ns, elapsed_ns, error_ns, t_rx_ns, self._t_rx_ns)
 
     def _after_jump(self, above_ns: float, ticks: int, arrival_ns: int, size_bytes: int) -> int:
         """Return the time of the first message after a jump: by UTC if the counter jumped to it, else by arrival.
@@ -491,6 +487,10 @@ class SampleClock:
         )  # fmt: skip
         self._error_ns = aiding.error_ns
         return t_ns
+
+    @property
+    def _known_error_ns(self) -> float | None:
+        return None if self._fit_sync is _ARRIVAL else self._fit_error_ns
 
     def _period_ns(self) -> float:
         """Host time between samples; 0 while unknown."""

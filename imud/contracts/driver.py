@@ -65,6 +65,9 @@ class Driver:
     """Length of one device tick in ns, or SAMPLE_COUNTER."""
     tick_modulus: int
     """Device time counts 0 … tick_modulus - 1."""
+    stamp_modulus: int = 0
+    """After how many ms `Measurement.pps_age_ms` begins anew without a pulse, where it dates messages without device
+    time; 0 where there are no such messages."""
     euler_convention: str
     """Order, axes and signs of `euler_rad`, in words."""
     navigation_frame: str

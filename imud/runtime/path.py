@@ -261,6 +261,7 @@ def make_clock(
         tick_modulus=driver.tick_modulus,
         byte_ns=byte_ns,
         hold_ns=hold_ns,
+        stamp_modulus=driver.stamp_modulus,
         bits=driver.time_bits,
         sout=lines.sout.timing if lines is not None and lines.sout is not None else None,
         sin=lines.sin.timing if lines is not None and lines.sin is not None else None,

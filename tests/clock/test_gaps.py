@@ -32,6 +32,18 @@ class Device:
     modulus: int
     ppm: float = 30.0
     first: int = 12345
+    stamp_modulus: int = 0
+    """Of a stamp in ms in messages without a counter; 0 where there is none."""
+    pulses: bool = False
+    """Whether a pulse per second sets the stamp to zero."""
+
+    def stamp_ms(self, index: int) -> int | None:
+        """The stamp of a sample."""
+        if not self.stamp_modulus:
+            return None
+        if self.pulses:
+            return self.time_ns(index) % NS_PER_S // NS_PER_MS
+        return (self.first + index * 1000 // self.rate_hz) % self.stamp_modulus
 
     def ticks(self, index: int) -> int | None:
         """The counter of a sample."""
@@ -53,6 +65,7 @@ def make_clock(device: Device, unknown: list[int]) -> SampleClock:
         tick_modulus=device.modulus,
         byte_ns=0,
         hold_ns=0,
+        stamp_modulus=device.stamp_modulus,
         on_unknown_gap=lambda: unknown.append(1),
     )
 
@@ -113,7 +126,8 @@ class Reader:
         t_rx_ns = self.now_ns + int(self.random.expovariate(1 / (30 * NS_PER_US)))
         for place, index in enumerate(indices):
             trailing = (len(indices) - 1 - place) * FRAME_BYTES
-            m = Measurement(FRAME_BYTES, trailing, self.device.ticks(index), (0.0, 0.0, 9.8))
+            ticks, stamp_ms = self.device.ticks(index), self.device.stamp_ms(index)
+            m = Measurement(FRAME_BYTES, trailing, ticks, (0.0, 0.0, 9.8), pps_age_ms=stamp_ms)
             sample = self.clock.sample(m, t_rx_ns, 0)
             assert sample.t_ns <= sample.t_rx_ns
             self.delivered += 1
@@ -134,8 +148,9 @@ IMU61X = Device(1000, NS_PER_US, 1 << 32)
 IMU61X_WRAPS = Device(1000, NS_PER_US, 1 << 24)
 NUMBERED = Device(200, 0, 1 << 16)
 NUMBERED_SHORT = Device(200, 0, 256)
-HI92 = Device(100, -1, 1 << 32)
-HI92_FAST = Device(1000, -1, 1 << 32)
+UNCOUNTED = Device(100, -1, 1 << 32)
+UNCOUNTED_FAST = Device(1000, -1, 1 << 32)
+HI92, HI92_400, HI92_FAST = (Device(rate_hz, -1, 1 << 32, stamp_modulus=8192) for rate_hz in (100, 400, 1000))
 COUNTED = [HI91, HI91_400, IMU61X, IMU61X_WRAPS, NUMBERED, NUMBERED_SHORT]
 
 
@@ -148,6 +163,27 @@ def test_losses_over_stalls_are_those_of_the_device(device: Device, kept_bytes: 
         one.run(int(one.random.choice([0.01, 0.1, 0.3, 1.5]) * NS_PER_S))
     assert one.finish() == one.missed
     assert not unknown
+
+
+@pytest.mark.parametrize("kept_bytes", [N_TTY, FLIP_BUFFER])
+@pytest.mark.parametrize("device", [HI92, HI92_400, HI92_FAST])
+def test_losses_over_stalls_shorter_than_a_turn_are_those_of_the_stamps(device: Device, kept_bytes: int) -> None:
+    one, unknown = reader(device, kept_bytes, 1)
+    for _ in range(STALLS):
+        one.stall(int(one.random.choice([0.05, 0.2, 0.7, 1, 2, 5, 7]) * NS_PER_S))
+        one.run(int(one.random.choice([0.01, 0.1, 0.3, 1.5]) * NS_PER_S))
+    assert one.finish() == one.missed
+    assert not unknown
+    assert one.clock.status().resets == 0
+
+
+@pytest.mark.parametrize("device", [HI92, HI92_400, HI92_FAST, replace(HI92_FAST, pulses=True)])
+def test_losses_over_longer_stalls_are_right_within_one_where_messages_are_on_time_again(device: Device) -> None:
+    one, _ = reader(device, N_TTY, 1)
+    for _ in range(10):
+        one.stall(int(one.random.choice([1, 5, 10, 20]) * NS_PER_S))
+        one.run(3 * NS_PER_S)
+    assert abs(one.finish() - one.missed) <= 10
 
 
 @pytest.mark.parametrize("kept_bytes", [N_TTY, FLIP_BUFFER])
@@ -167,7 +203,7 @@ def test_losses_under_starvation_are_those_of_the_device(device: Device, kept_by
 
 
 @pytest.mark.parametrize("stall_s", [0.2, 2.0, 10.0])
-@pytest.mark.parametrize("device", [HI92, HI92_FAST])
+@pytest.mark.parametrize("device", [UNCOUNTED, UNCOUNTED_FAST])
 def test_losses_of_a_device_without_counter_are_seen_by_its_pace(device: Device, stall_s: float) -> None:
     one, unknown = reader(device, N_TTY, 2)
     one.run(20 * NS_PER_S)
@@ -178,7 +214,7 @@ def test_losses_of_a_device_without_counter_are_seen_by_its_pace(device: Device,
     assert not unknown
 
 
-@pytest.mark.parametrize("device", [HI92, HI92_FAST])
+@pytest.mark.parametrize("device", [UNCOUNTED, UNCOUNTED_FAST])
 def test_what_the_pace_cannot_show_is_unknown(device: Device) -> None:
     one, unknown = reader(device, N_TTY, 1)
     for _ in range(STALLS):
@@ -200,7 +236,7 @@ def test_a_counter_that_ran_on_while_the_link_was_away_counts(device: Device) ->
     assert not unknown
 
 
-@pytest.mark.parametrize("device", [*COUNTED[:-1], HI92])
+@pytest.mark.parametrize("device", [*COUNTED[:-1], UNCOUNTED])
 def test_a_device_that_began_anew_leaves_a_gap_of_unknown_size(device: Device) -> None:
     one, unknown = reader(device, N_TTY, 3)
     one.device = replace(device, first=device.first + 777_777_777)

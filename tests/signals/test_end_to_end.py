@@ -17,6 +17,8 @@ from imud.utc.source import RmcSettings
 from tests.support.wired_device import BEGIN_NS, EDGE_LATE_NS, WiredDevice
 
 SOUT = DeviceLines(sout=SoutSettings(line="A"))
+HI92 = ModuleSettings(hi91=Output(), hi92=Output(10))
+"""Messages without device time, dated by their stamp of 13 bits."""
 FEW_US = 4_000
 STEP_NS = 20_000
 """By how much the error of time may change from one sample to the next: 500 ppm of slewing in 10 ms, and noise."""
@@ -40,8 +42,9 @@ def rises(samples: list[Sample]) -> bool:
     return all(a.t_ns < b.t_ns <= b.t_rx_ns for a, b in pairwise(samples))
 
 
-def test_every_sample_has_its_edge(monkeypatch: pytest.MonkeyPatch) -> None:
-    wired = WiredDevice(SOUT)
+@pytest.mark.parametrize("settings", [None, HI92])
+def test_every_sample_has_its_edge(monkeypatch: pytest.MonkeyPatch, settings: ModuleSettings | None) -> None:
+    wired = WiredDevice(SOUT, settings)
 
     async def story() -> None:
         await wired.wait(3)

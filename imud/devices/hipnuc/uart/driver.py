@@ -60,6 +60,7 @@ DRIVER: Final = StreamDriver(
     make_codec=HipnucCodec,
     tick_ns=NS_PER_MS,
     tick_modulus=2**32,
+    stamp_modulus=PPS_STAMP_MODULUS_MS,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
     navigation_frame="ENU",
     heading=heading_by_mode,
