@@ -6,6 +6,7 @@ type is looked at before opening, and again afterwards, because the file may hav
 
 import errno
 import os
+import select
 import stat
 from contextlib import suppress
 from pathlib import Path
@@ -38,6 +39,23 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     except OSError:
         os.close(descriptor)
         raise
+    return open(descriptor, "rb")
+
+
+def open_stream(path: str | os.PathLike[str], wait_ms: int) -> BinaryIO:
+    """Open a regular file, or a FIFO that a program writes to, which is waited for. Raises OSError, NotRegularFile.
+
+    A FIFO without data and without a writer for `wait_ms` is refused: opening it otherwise would wait without end.
+    """
+    if not stat.S_ISFIFO(os.stat(path).st_mode):
+        return open_regular(path)
+    descriptor = os.open(path, READ_FLAGS)
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    if not poll.poll(wait_ms):
+        os.close(descriptor)
+        raise NotRegularFile(errno.EAGAIN, "is a FIFO that no program writes to", os.fspath(path))
+    os.set_blocking(descriptor, True)
     return open(descriptor, "rb")
 
 

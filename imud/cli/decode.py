@@ -20,11 +20,14 @@ from imud.contracts.driver import SAMPLE_COUNTER, Driver, StreamDriver
 from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
 from imud.errors import ImudError
+from imud.files import NotRegularFile, open_stream
 from imud.formats.candump import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.ledger import Ledger
 from imud.sample import Measurement
 
+FIFO_WAIT_MS = 5000
+"""Time for the first bytes of a FIFO."""
 NOT_SHOWN = {"trailing_bytes", "dev_ticks"}
 
 
@@ -51,9 +54,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def open_capture(name: str) -> BinaryIO:
-    """Open the file, or standard input for `-`. Raises ImudError."""
+    """Open the file or FIFO, or standard input for `-`. Raises ImudError."""
     try:
-        return sys.stdin.buffer if name == "-" else open(name, "rb")
+        return sys.stdin.buffer if name == "-" else open_stream(name, FIFO_WAIT_MS)
+    except NotRegularFile as error:
+        raise ImudError(f"{name} {error.strerror}; `-` reads standard input") from error
     except OSError as error:
         raise ImudError(f"{name}: {error.strerror}") from error
 

@@ -4,6 +4,8 @@ from collections.abc import Iterable, Sequence
 from math import floor, log10
 from typing import Final
 
+from imud.log import MESSAGE_CHARACTERS_MAX, printable
+
 WIDTH: Final = 40
 """Characters of the longest bar."""
 BARS: Final = 12
@@ -49,7 +51,8 @@ def bar_width(span: float) -> float:
 
 
 def _word(cell: object) -> str:
-    return f"{cell:.1f}" if isinstance(cell, float) else str(cell)
+    """Format a cell; texts may come from devices and adapters, and are made printable."""
+    return f"{cell:.1f}" if isinstance(cell, float) else printable(str(cell), MESSAGE_CHARACTERS_MAX)
 
 
 def _line(cells: Sequence[str], widths: Sequence[int]) -> str:

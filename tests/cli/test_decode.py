@@ -2,12 +2,15 @@
 
 import io
 import json
+import os
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
 from imud.cli import main
+from tests.support.files import hi91
 
 MANUAL_FRAME = bytes.fromhex(
     "5AA54C0014BB910815 2309A2C447 08151C00 CCE861BE9A35563E65EA723F 31D07CBD75DDC5BB6BD724BC"
@@ -76,3 +79,29 @@ def test_log_of_a_can_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     ledger = json.loads(counted)
     assert (ledger["bytes_in"], ledger["bytes_skipped"]) == (81, 1)
     assert ledger["frames_in_samples"] == 10
+
+
+@pytest.mark.timeout(20)
+def test_a_fifo_is_read_as_it_comes_and_not_waited_for_without_a_writer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "fifo"
+    os.mkfifo(path)
+    monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 1)
+    assert main(["decode", "--driver", "hipnuc-uart", str(path)]) == 2
+    assert capsys.readouterr().err == (
+        f"imud decode: {path} is a FIFO that no program writes to; `-` reads standard input\n"
+    )
+    monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 10_000)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    writer = os.open(path, os.O_WRONLY)
+    os.write(writer, hi91(1000) + hi91(1010))
+    threading.Timer(0.0, os.close, (writer,)).start()
+    assert main(["decode", "--driver", "hipnuc-uart", str(path)]) == 0
+    os.close(reader)
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_a_device_is_no_capture(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["decode", "--driver", "hipnuc-uart", "/dev/zero"]) == 2
+    assert "/dev/zero is a character device, expected a regular file" in capsys.readouterr().err

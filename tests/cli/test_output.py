@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.cli.output import BARS, WIDTH, bar_width, histogram
+from imud.cli.output import BARS, WIDTH, bar_width, histogram, table
 
 
 def test_nothing_for_no_values() -> None:
@@ -39,3 +39,7 @@ def test_a_stray_value_hides_nothing() -> None:
 @pytest.mark.parametrize(("span", "width"), [(0, 1), (11, 1), (11.1, 2), (22, 2), (50, 5), (100, 10), (0.011, 0.001)])
 def test_widths_are_round(span: float, width: float) -> None:
     assert bar_width(span) == pytest.approx(width)
+
+
+def test_a_cell_cannot_write_to_the_terminal() -> None:
+    assert table(("A",), [("x\x1b[2J\ny",)]) == "A\nx\\x1b[2J\\ny"

@@ -15,6 +15,7 @@ from imud.devices.hipnuc.modbus.session import probe, save, set_id
 from imud.errors import CommandError, DeviceRefused, TransferError
 from imud.formats.modbus import BROADCAST
 from imud.links.rs485.link import Rs485Link, Rs485Settings
+from imud.runtime.identity import printable_identity
 
 T = TypeVar("T")
 
@@ -104,7 +105,7 @@ def keep(link: Rs485Link, found: FoundModule) -> None:
 def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
     strange = link.heard.strange
     try:
-        who = _run(link, address, probe(HipnucModbusSettings()))
+        who = printable_identity(_run(link, address, probe(HipnucModbusSettings())))
     except DeviceRefused as error:
         return FoundModule(baud, address, problem=f"{error}; are there two modules with this address?")
     except TransferError as error:
@@ -117,7 +118,7 @@ def _identity(link: Rs485Link, address: int) -> Identity | None:
     problem: Exception | None = None
     for _ in range(TRIES):
         try:
-            return _run(link, address, probe(HipnucModbusSettings()))
+            return printable_identity(_run(link, address, probe(HipnucModbusSettings())))
         except TransferError:
             continue
         except DeviceRefused as error:

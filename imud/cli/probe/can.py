@@ -22,7 +22,7 @@ from imud.links.can.netlink import can_details
 from imud.runtime.detection import CanDevice, CanSearch
 from imud.runtime.detection.rounds import EVERYTHING, CanRound
 from imud.runtime.exchange import Exchange
-from imud.runtime.identity import identity_words
+from imud.runtime.identity import identity_words, printable_identity
 
 
 async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
@@ -74,7 +74,7 @@ def state_of(interface: str) -> str:
 async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -> ProbeReport:
     driver, node = device
     identity = await ask(device, link) if may_ask else Identity()
-    words = identity_words(identity)
+    words = identity_words(printable_identity(identity))
     return ProbeReport(link.title, title, driver.name, driver.node_title(node), link.bitrate, words)
 
 

@@ -26,7 +26,7 @@ from imud.links.uart.port_list import list_ports
 from imud.runtime.detection import StreamFound
 from imud.runtime.detection.rounds import StreamRound
 from imud.runtime.exchange import Exchange
-from imud.runtime.identity import identity_words
+from imud.runtime.identity import identity_words, printable_identity
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +71,8 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
         link.open()
         found = await find(config, link)
         identity = await ask(found, link) if may_ask else Identity()
-        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=identity_words(identity))]
+        words = identity_words(printable_identity(identity))
+        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words)]
     except ImudError as error:
         return [ProbeReport(port, title, problem=str(error))]
     finally:

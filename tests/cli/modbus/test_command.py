@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
+from imud.contracts.driver import Identity
+from imud.contracts.session import says_nothing
 from imud.sim.hipnuc.modbus import SlaveSettings
 from tests.support.pty_port import BAUD, serial_of, slave, wired
 
@@ -146,3 +148,13 @@ def test_addresses_that_are_none(text: str, capsys: pytest.CaptureFixture[str]) 
 def test_port_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["modbus", "scan", str(tmp_path / "none")]) == 2
     assert "is not there" in capsys.readouterr().err
+
+
+def test_what_a_module_says_of_itself_cannot_write_to_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = Identity("HI\x1b[2J14\n", "\x9b1A", "1.6.9")
+    monkeypatch.setattr("imud.cli.modbus.line.probe", lambda _settings: says_nothing(said))
+    with wired(tmp_path, slave(2)) as (path, _):
+        status, (found,) = scanned(path, capsys, *ON, "--addresses", "2")
+        assert (status, found["product"], found["serial_number"]) == (0, "HI\\x1b[2J14\\n", "\\x9b1A")
