@@ -5,6 +5,7 @@
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make pictures   the pictures of README.md and docs/frames.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
+# make audit  items of both manuals: code and tests of each
 # make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
 SHELL := /bin/sh
 PYTHON ?= python3
@@ -14,7 +15,7 @@ ARGS ?=
 LAB_OPTIONS ?= --steady
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench bench-instructions bench-deps attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos
+.PHONY: all demo test lint check bench bench-instructions bench-deps attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit
 
 all: check
 
@@ -46,6 +47,9 @@ bench-instructions: $(VENV)/made
 # valgrind, which counts instructions
 bench-deps:
 	apt-get install --yes --no-install-recommends valgrind
+
+audit: $(VENV)/made
+	$(BIN)/python -m tests.audit
 
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)

@@ -271,7 +271,7 @@ def test_tests_write_no_private_members(file: Path) -> None:
 
 # --- a test by the path of its module ---------------------------------------------------------------------------------
 
-ELSEWHERE = ("bench", "lab", "lab_host", "include", "fuzz", "attack", "support")
+ELSEWHERE = ("audit", "bench", "lab", "lab_host", "include", "fuzz", "attack", "support")
 """Folders of tests that mirror no package: measurements, kernels, the C header, foreign bytes, helpers."""
 
 CROSS_CUTTING = {

@@ -53,6 +53,7 @@ def turned(matrix: Matrix3, v: Vector3) -> Vector3:
     return (x, y, z)
 
 
+@pytest.mark.manual("B 9.1 angles of a quaternion")
 def test_manual_example() -> None:
     """Section 3.5: the quaternion gives 13.0519° / 12.1885° / -122.477°."""
     euler = degrees(euler312_from_quat((-0.485922, -0.14982, 0.0380868, 0.860223)))
@@ -74,6 +75,7 @@ def test_turns_about_one_axis(quat: Quaternion, euler_deg: Vector3) -> None:
     assert degrees(euler312_from_quat(quat)) == pytest.approx(euler_deg, abs=1e-6)
 
 
+@pytest.mark.manual("B 9.2 matrix of a quaternion")
 def test_the_matrix_turns_body_to_navigation() -> None:
     """A body turned left by 90° has its x axis (east before) pointing north."""
     assert turned(matrix_from_quat((HALF, 0.0, 0.0, HALF)), (1, 0, 0)) == pytest.approx((0, 1, 0), abs=1e-15)
@@ -112,6 +114,7 @@ def test_euler_to_quaternion_and_back_is_the_same_rotation(roll: float, pitch: f
 
 @quick
 @given(st.floats(-3, 3), st.floats(-0.5, 0.5), st.floats(-3, 3))
+@pytest.mark.manual("B 9.1 angles of a quaternion")
 def test_the_manual_formula_gives_the_same(roll: float, pitch: float, yaw: float) -> None:
     """Section 9.1 as printed, away from its weak spots."""
     q0, q1, q2, q3 = quat_from_euler312((roll, pitch, yaw))

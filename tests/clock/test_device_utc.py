@@ -37,6 +37,7 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 0.0, seed: i
     [(BARE_UART, UNIX, 1), (USB_16MS, UNIX, 1), (USB_16MS_PACKET, DAY, 3)],
     ids=lambda v: getattr(v, "name", v),
 )
+@pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
 def test_a_device_that_turns_to_utc_is_recognised(profile: ArrivalProfile, turn_ms: int, seed: int) -> None:
     dated, clock = run_utc(model(profile, seed=seed), 60, turn_ms=turn_ms)
     assert clock.status().resets == 0
@@ -136,6 +137,7 @@ def test_a_reference_that_goes_away_is_no_step() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "ppm", "seconds"), [(1, 0.0, 100), (1, 50.0, 100), (100, 50_000.0, 40)])
+@pytest.mark.manual("B 1.2.1 pulse per second")
 def test_a_pulse_per_second_is_better_than_a_slow_adapter(rate_hz: int, ppm: float, seconds: int) -> None:
     dated = run_pps(model(USB_16MS_PACKET, rate_hz, ppm), seconds)
     assert share_honest(dated) >= 0.95
@@ -161,6 +163,7 @@ def test_losing_and_regaining_the_pulse_makes_no_step() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "ppm"), [(100, 0.0), (200, 50_000.0), (1000, -50.0)])
+@pytest.mark.manual("B 1.2.1 delay of the answer")
 def test_triggers_find_their_answers(rate_hz: int, ppm: float) -> None:
     dated, clock, missed = run_triggers(model(BARE_UART, rate_hz, ppm), 5, 0.95)
     paired = [t for t in dated if t.sample.edge_seq is not None]

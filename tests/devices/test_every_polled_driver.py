@@ -134,6 +134,7 @@ def test_scripts_end_whatever_is_answered(name: str, seed: int) -> None:
 
 
 @every_driver
+@pytest.mark.manual("A 3.1 address")
 def test_targets_and_link_of_the_row(name: str) -> None:
     driver = row(name)
     assert len(set(driver.targets)) == len(driver.targets) > 0

@@ -185,6 +185,7 @@ def test_text_interrupted_by_frames_is_one_line(name: str) -> None:
 
 
 @every_driver
+@pytest.mark.manual("A 1.1 rates")
 def test_rates_of_the_row(name: str) -> None:
     driver = DRIVERS[name]
     assert all(baud > 0 for baud in driver.baud_rates)

@@ -26,6 +26,7 @@ def finder(echoes: bool | None = False, request: bytes = REQUEST, size: int = le
     return ReplyFinder(request, size, echoes=echoes)
 
 
+@pytest.mark.manual("B 4.1.3 CRC")
 def test_check_value_and_frames() -> None:
     assert crc16_modbus(b"123456789") == 0x4B37
     assert crc16_modbus(b"123456789\x37\x4b") == 0

@@ -261,6 +261,7 @@ def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
     assert (kernel.error_passive, kernel.bus_off) == (1, 1)
 
 
+@pytest.mark.manual("A 4.1 rate")
 def test_real_controllers_carry_the_stream(can_pair: tuple[CanInterface, CanInterface]) -> None:
     near, far = can_pair
     rig = Rig(near.name, far.name)

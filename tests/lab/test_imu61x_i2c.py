@@ -20,6 +20,7 @@ RESOLUTION_M_S2 = 0.02
 ADDRESS = 0x1A
 
 
+@pytest.mark.manual("A 3.1 rate")
 def test_found_by_its_id_and_streams_the_truth(i2c: Bus[I2cTransfer]) -> None:
     """Another sensor answers at the first address; the device is at the third."""
     other = RegisterDevice({0x6A: 0x12})

@@ -27,6 +27,7 @@ def opened(bus: InProcessI2c, address: int = 0x19) -> I2cLink:
 
 
 @pytest.mark.parametrize("funcs", [I2cFunc.I2C, I2cFunc.SMBUS_READ_I2C_BLOCK])
+@pytest.mark.manual("A 3.3.1 reading")
 def test_register_is_written_and_read_in_one_transaction(funcs: int) -> None:
     bus = InProcessI2c({0x19: device()}, funcs)
     link = opened(bus)

@@ -25,6 +25,7 @@ def link_to(bus: InProcessSpi, **settings: object) -> SpiLink:
 
 
 @pytest.mark.parametrize("word_bits", [8, 16])
+@pytest.mark.manual("A 2.1 role", "A 2.1 words")
 def test_same_bits_on_the_wires_whatever_the_words(word_bits: int) -> None:
     bus = InProcessSpi(echo, word_bits=word_bits)
     link = link_to(bus, speed_hz=2_000_000)
@@ -61,6 +62,7 @@ def test_controller_that_refuses_16_bits_in_a_message_only() -> None:
     assert bus.messages[-1][1] == 8
 
 
+@pytest.mark.manual("A 2.1 clock")
 def test_speed_is_set_at_open() -> None:
     calls: list[tuple[int, bytes]] = []
     bus = InProcessSpi(echo)

@@ -44,6 +44,7 @@ def angles(x_deg: float, y_deg: float) -> Vector3:
         ({}, angles(0, 0), True, AlarmVerdict.UNKNOWN),
     ],
 )
+@pytest.mark.manual("B 2.2.4 alarm level")
 def test_verdicts(ranges: dict[str, AlarmRange], euler_rad: Vector3 | None, level: bool, verdict: AlarmVerdict) -> None:
     assert judge(ranges, euler_rad, level) is verdict
 

@@ -43,6 +43,7 @@ def rises(samples: list[Sample]) -> bool:
 
 
 @pytest.mark.parametrize("settings", [None, HI92])
+@pytest.mark.manual("B 1.2.2 SOUT")
 def test_every_sample_has_its_edge(monkeypatch: pytest.MonkeyPatch, settings: ModuleSettings | None) -> None:
     wired = WiredDevice(SOUT, settings)
 
@@ -120,6 +121,7 @@ def test_pairing_is_right_under_loss(
     wired.play(monkeypatch, story)
 
 
+@pytest.mark.manual("B 2.2.4 PMUX4 SOUT_DIV")
 def test_marks_name_the_samples_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = replace_line(SOUT, sout_div=DividedSettings(line="B", divisor=8))
     wired = WiredDevice(lines, frame_faults=Faults(5, FaultRates(lose=0.05)))
@@ -156,6 +158,7 @@ ALARM = DeviceLines(alarm=InputSettings(line="C"))
 RANGE = ModuleSettings(alarm_y=AlarmSetting(-5, 5, True))
 
 
+@pytest.mark.manual("B 2.2.4 PMUX5 ALARM")
 def test_an_alarm_is_an_event_and_shown_in_the_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """The motion swings by 25°."""
     wired = WiredDevice(ALARM, RANGE, identify=True)
@@ -201,6 +204,7 @@ def test_an_alarm_wire_that_is_cut_is_reported(monkeypatch: pytest.MonkeyPatch) 
     wired.play(monkeypatch, story)
 
 
+@pytest.mark.manual("B 1.2.1 trigger")
 def test_frames_answer_the_triggers_on_sin(monkeypatch: pytest.MonkeyPatch) -> None:
     wired = WiredDevice(
         DeviceLines(sin=TriggerSettings(line="D", rate_hz=50)),
@@ -236,6 +240,7 @@ WITHOUT_S = 30
 
 @pytest.mark.parametrize("skew_ppm", [30.0, -30.0])
 @pytest.mark.parametrize("lines", [PPS, DeviceLines(pps=PPS.pps, sout=SOUT.sout)], ids=["pps", "pps and sout"])
+@pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
 def test_a_module_that_is_fed_utc_is_on_utc_and_stays_in_time(
     monkeypatch: pytest.MonkeyPatch, lines: DeviceLines, skew_ppm: float
 ) -> None:

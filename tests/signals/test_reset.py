@@ -18,6 +18,7 @@ SETTINGS = ResetSettings(line="RESET", hold_ms=20)
 
 
 @in_loop
+@pytest.mark.manual("A 2.2 reset")
 async def test_the_line_is_held_and_then_the_device_has_its_time() -> None:
     story: list[object] = []
     line = MemoryOutput(on_change=lambda _t_ns, active: story.append(active))

@@ -67,6 +67,7 @@ def test_scan_at_every_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         assert [(one["baud"], one["address"]) for one in found if "problem" not in one] == [(19200, 3)]
 
 
+@pytest.mark.manual("B 4.6 address by serial number")
 def test_two_modules_of_one_address_are_told_and_parted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     twins = slave(80, serial=0x0F), slave(80, serial=0xF0)
     with wired(tmp_path, *twins) as (path, line):
@@ -82,6 +83,7 @@ def test_two_modules_of_one_address_are_told_and_parted(tmp_path: Path, capsys: 
         assert status == 0
 
 
+@pytest.mark.manual("B 4.6 random addresses")
 def test_random_addresses_part_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     twins = [slave(80, serial=number) for number in (1, 2, 3)]
     with wired(tmp_path, *twins) as (path, line):

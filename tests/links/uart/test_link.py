@@ -221,6 +221,7 @@ def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
     assert play(link, scene).ends == []
 
 
+@pytest.mark.manual("A 1.1 characters", "B 3 characters")
 def test_the_port_is_raw_8n1_at_the_rate(pty: PtyPort) -> None:
     tty_settings = termios.tcgetattr(pty.slave)
     tty_settings[0] |= termios.BRKINT | termios.IXON | termios.ICRNL | termios.ISTRIP
@@ -240,6 +241,7 @@ def test_the_port_is_raw_8n1_at_the_rate(pty: PtyPort) -> None:
 
 
 @pytest.mark.parametrize("baud", [9600, 115200, 256000, 460800, 921600, 250_001])
+@pytest.mark.manual("A 1.1 rates")
 def test_every_rate_is_set_when_opening_and_later(pty: PtyPort, baud: int) -> None:
     link = UartLink(UartSettings(port=pty.path, baud=baud))
     link.open()
@@ -278,6 +280,7 @@ def test_a_rate_that_the_driver_changes_is_refused(pty: PtyPort, monkeypatch: py
     assert caught.value.__cause__ is None
 
 
+@pytest.mark.manual("A 1.8 one program")
 def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort) -> None:
     first, second = (UartLink(UartSettings(port=pty.path)) for _ in range(2))
     first.open()

@@ -269,6 +269,7 @@ def turned_where_it_is_disturbed(rig: GuideRig) -> None:
     rig.mag_t = mag_t
 
 
+@pytest.mark.manual("B 8.1.1 procedure")
 def test_turning_ends_when_the_device_says_so(rig: GuideRig) -> None:
     turned_by_hand(rig, HARD_IRON_T)
 
@@ -315,6 +316,7 @@ def test_a_device_that_was_calibrated_before_needs_the_turning_only(rig: GuideRi
     ],
     ids=["no field", "at rest", "gyroscope at rest", "not accepted", "disturbed"],
 )
+@pytest.mark.manual("B 8.1.1 procedure", "B 8.1.2 disturbance")
 def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], words: str) -> None:
     prepare(rig)
 
@@ -350,6 +352,7 @@ def module(monkeypatch: pytest.MonkeyPatch, motion: Motion, att_mode: int, story
     it.play(monkeypatch, lambda: story(it))
 
 
+@pytest.mark.manual("B 1.1 9-axis mode")
 def test_magnetometer_of_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(it: WiredDevice) -> None:
         await it.wait(2)
@@ -372,6 +375,7 @@ def test_six_axes_have_no_use_for_the_magnetometer(monkeypatch: pytest.MonkeyPat
     module(monkeypatch, tumble(), 0, story)
 
 
+@pytest.mark.manual("B 2.2.4 YAW range")
 def test_level_and_heading_of_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(it: WiredDevice) -> None:
         await it.wait(2)
@@ -391,6 +395,7 @@ def test_level_and_heading_of_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
     module(monkeypatch, Still(0.05, -0.03, 0.4), 0, story)
 
 
+@pytest.mark.manual("B 2.2.4 rest")
 def test_a_module_that_moves_is_not_levelled(monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(it: WiredDevice) -> None:
         await it.wait(2)

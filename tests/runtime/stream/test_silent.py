@@ -32,6 +32,7 @@ def turns(device: LinkedDevice) -> list[EventKind]:
 @pytest.mark.parametrize(
     ("settings", "why"), [(NO_RATE, "no message has a rate"), (ON_MARK, "HI91 on mark, one for each pulse on SIN")]
 )
+@pytest.mark.manual("B 2.2.5 LOG DISABLE")
 def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
     settings: ModuleSettings, why: str, link: dict[str, Any]
 ) -> None:
@@ -146,6 +147,7 @@ def test_a_script_under_way_ends_when_a_search_begins_under_it(monkeypatch: pyte
 
 @every_link
 @pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
+@pytest.mark.manual("B 2.2.3 a wrong rate")
 def test_every_variant_is_followed_to_another_rate_and_back(behaviour: Behaviour, link: dict[str, Any]) -> None:
     async def story(device: LinkedDevice) -> None:
         await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)

@@ -101,6 +101,7 @@ def play() -> Play:
 
 
 @pytest.mark.parametrize("link", [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}], ids=str)
+@pytest.mark.manual("A 1 mode at power-on")
 def test_device_saved_in_command_mode_is_made_to_stream(play: Play, link: dict[str, Any]) -> None:
     async def story(bench: WakeBench) -> None:
         await bench.until(lambda: bench.woken and len(bench.samples) > 20)

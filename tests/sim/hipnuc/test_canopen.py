@@ -77,12 +77,14 @@ def test_next_ns_is_when_something_is_sent() -> None:
     assert silent.next_ns() is None
 
 
+@pytest.mark.manual("B 5.1 defaults")
 def test_boot_up_and_heartbeat() -> None:
     bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=100), boot_ms=50)
     bench.run(400 * MS)
     assert bench.heard == [(0x708, b"\0"), *[(0x708, b"\5")] * 3]
 
 
+@pytest.mark.manual("B 5.4.2 transmission type")
 def test_sync_sends_what_is_of_type_1() -> None:
     bench = CanopenBench(NodeSettings(periods_ms={1: 10, 2: 10, 3: 0, 4: 0, 6: 0, 7: 0}))
     bench.run_script(session.set_tpdo_type(8, 1, Transmission.SYNC))
@@ -147,6 +149,7 @@ def test_saved_settings_survive_and_a_factory_reset_clears_them_at_power_on() ->
     assert bench.module.objects.settings == QUIET
 
 
+@pytest.mark.manual("B 5.4.1 zero of the inclinometer")
 def test_inclinometer_signs_and_zero() -> None:
     def incli() -> tuple[float, float]:
         bench.run(20 * MS)

@@ -131,6 +131,7 @@ def test_next_ns_is_when_something_is_sent() -> None:
     assert seen >= 60
 
 
+@pytest.mark.manual("B 6.2.2 intervals")
 def test_an_interval_is_set_and_read_back() -> None:
     bench = J1939Bench(made())
     bench.talk(lambda peer: session.set_interval(peer, 0xFF37, 20))
@@ -191,6 +192,7 @@ def test_what_is_not_saved_is_lost_at_a_restart() -> None:
     assert bench.module.settings == J1939Settings()
 
 
+@pytest.mark.manual("B 6.2.2 bit rate", "B 6.2.2 address")
 def test_address_and_bit_rate_change_at_the_restart() -> None:
     bench = J1939Bench(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
     bench.talk(lambda peer: session.set_address(peer, 20))
@@ -205,6 +207,7 @@ def test_address_and_bit_rate_change_at_the_restart() -> None:
     assert bench.talk(session.identify, address=20) is not None
 
 
+@pytest.mark.manual("B 6.2.2 restart")
 def test_a_restart_is_answered_before_it_happens() -> None:
     module = made(boot_ms=0)
     module.receive(0x0CEF0855, True, bytes.fromhex("00000600FF000000"), BEGIN_NS)
@@ -229,6 +232,7 @@ def test_a_message_is_sent_once() -> None:
     assert pgns(bench.wait(SECOND_NS))[0xFF46] == 0
 
 
+@pytest.mark.manual("B 6.2.2 zero", "B 6.2.2 directions")
 def test_zero_and_directions_of_the_inclinometer() -> None:
     still = Still(roll_rad=math.radians(10), pitch_rad=math.radians(20))
     settings = J1939Settings(intervals_ms={messages.INCLINOMETER: 10})

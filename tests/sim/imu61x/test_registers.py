@@ -33,6 +33,7 @@ def spoken(one: Imu61xRegisters, *words: int) -> list[int]:
     return [int.from_bytes(miso, "big") for miso in one.spi([word.to_bytes(2, "big") for word in words])]
 
 
+@pytest.mark.manual("A 2.3 answers")
 def test_answer_comes_with_the_second_word_after_it_even_in_another_transaction() -> None:
     one, _ = device(product="IMU618")
     assert spoken(one, 0xFE01, 0x6A00, 0x6C00, 0x6E00, 0x7000)[3:] == [0x0000, 0x494D]
@@ -40,6 +41,7 @@ def test_answer_comes_with_the_second_word_after_it_even_in_another_transaction(
     assert spoken(one, 0x7E00) == [1]
 
 
+@pytest.mark.manual("A 2.4 WIN_CTRL")
 def test_windows_hide_each_other() -> None:
     one, _ = device()
     assert spoken(one, 0x0600, 0x6C00, 0, 0)[2:] == [0, 0]  # configuration is not in window 0
@@ -49,6 +51,7 @@ def test_windows_hide_each_other() -> None:
     assert (one.filter, one.extended) == (0xBB, 0)  # writes to window 1 need it open
 
 
+@pytest.mark.manual("A 2.4.1 reading")
 def test_burst_ends_with_its_selection() -> None:
     one, _ = device()
     whole = one.spi(spi.READ_STANDARD.sends)[0]
@@ -73,6 +76,7 @@ def test_registers_are_latched_and_renewed_in_steps() -> None:
     assert one.latched_ns == 20 * MS
 
 
+@pytest.mark.manual("A 2.1 mode")
 def test_wrong_mode_shifts_the_bits() -> None:
     one, _ = device(modes=frozenset({3}))
     right = b"".join(one.spi(READ_STATE.sends, 3))

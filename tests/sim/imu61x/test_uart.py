@@ -63,6 +63,7 @@ def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", c.RATES_HZ)
+@pytest.mark.manual("A 1 stream mode", "A 1.6 CMD 14, 21")
 def test_it_streams_at_every_rate_of_the_manual(rate_hz: int) -> None:
     far = imu61x_bench(Imu61xSettings(baud=230400, rate_hz=rate_hz))
     far.wait(1000 - far.module.hardware.boot_ms)
@@ -97,6 +98,7 @@ def test_the_physics_of_the_truth_come_out() -> None:
             assert row == pytest.approx(wanted, abs=1e-6)
 
 
+@pytest.mark.manual("A 1.3 timer")
 def test_the_timer_runs_fast_and_wraps() -> None:
     far = imu61x_bench(skew_ppm=1000.0, uptime_us=2**32 - 600_000)
     samples = far.samples(400)
@@ -107,6 +109,7 @@ def test_the_timer_runs_fast_and_wraps() -> None:
     assert far.now_ns - begin_ns == 10 * NS_PER_S
 
 
+@pytest.mark.manual("A 1 command mode")
 def test_command_mode_is_silent_but_for_replies() -> None:
     far = imu61x_bench()
     assert acknowledged(far, c.output_mode(c.OutputMode.COMMAND)) == 0

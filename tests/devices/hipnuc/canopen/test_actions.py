@@ -105,6 +105,7 @@ def test_the_module_obeys() -> None:
     assert not bench.module.objects.settings.invert_y  # nothing was saved
 
 
+@pytest.mark.manual("B 5.4.1 node number")
 def test_a_new_node_number_is_in_force_after_saving_and_restarting() -> None:
     bench = CanopenBench()
     bench.run_script(begun("node", node=9))

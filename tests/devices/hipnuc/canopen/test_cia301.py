@@ -22,6 +22,7 @@ def frame(text: str, can_id: int = 0x588) -> ReplyFrame:
     return ReplyFrame(can_id, bytes.fromhex(text))
 
 
+@pytest.mark.manual("B 5.4.1 SDO")
 def test_write_and_its_confirmation() -> None:
     conversation = write_object(8, 0x20A0, 0, 9, 4)
     request = next(conversation)

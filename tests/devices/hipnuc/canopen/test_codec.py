@@ -48,6 +48,7 @@ def measured(numbers: list[int]) -> Measurement:
     return event
 
 
+@pytest.mark.manual("B 5.2 TPDO1", "B 5.2 TPDO2", "B 5.2 TPDO3", "B 5.2 TPDO4", "B 5.2 TPDO6", "B 5.2 TPDO7")
 def test_all_tpdos_in_si_units() -> None:
     event = measured([1, 2, 3, 4, 6, 7])
     # 74 · 0.0098, 31 · 0.0098, 968 · 0.0098 m/s²
@@ -66,6 +67,7 @@ def test_all_tpdos_in_si_units() -> None:
 @pytest.mark.parametrize(
     ("sent", "pressure_pa"), [(0, None), (999, None), (1000, 1000), (120_000, 120_000), (-5, None)]
 )
+@pytest.mark.manual("B 5.2 TPDO6")
 def test_a_node_without_barometer_has_no_pressure(sent: int, pressure_pa: float | None) -> None:
     codec = make()
     for burst in range(6):
@@ -123,6 +125,7 @@ def test_wrong_length_is_a_bad_frame(number: int) -> None:
     assert codec.ledger.closes()
 
 
+@pytest.mark.manual("B 5 frames")
 def test_extended_identifiers_are_not_ours() -> None:
     codec = make()
     assert not codec.feed_frame(0x188, True, bytes(6), 0)
@@ -190,6 +193,7 @@ def test_the_node_is_told_by_identifier_and_length(can_id: int, size: int, node:
     assert DRIVER.node_of(can_id, True, bytes(size)) is None
 
 
+@pytest.mark.manual("B 5.4.2 SYNC")
 def test_sync_is_sent_at_its_rate() -> None:
     assert DRIVER.cyclic(HipnucCanopenSettings()) == []
     assert DRIVER.cyclic(HipnucCanopenSettings(sync_hz=150)) == [CyclicFrame(0x80, False, b"", 6_667_000)]
@@ -204,6 +208,7 @@ def test_settings_that_it_cannot_have(bad: dict[str, object]) -> None:
         make(**bad)
 
 
+@pytest.mark.manual("B 5.1 defaults")
 def test_the_row_names_its_nodes() -> None:
     assert DRIVER.node_settings(12) == HipnucCanopenSettings(node=12)
     assert DRIVER.node_title(12) == "node 12"

@@ -35,6 +35,15 @@ PERIODS = {0: "00", 5: "05", 10: "0A", 20: "14", 50: "32", 100: "64"}
 
 
 @pytest.mark.parametrize(("text", "make"), MANUAL)
+@pytest.mark.manual(
+    "B 5.4.1 node number",
+    "B 5.4.1 save",
+    "B 5.4.1 restart",
+    "B 5.4.1 factory settings",
+    "B 5.4.1 bit rate",
+    "B 5.4.1 zero of the inclinometer",
+    "B 5.4.2 transmission type",
+)
 def test_commands_of_the_manual(text: str, make: Callable[[], RequestScript[object]]) -> None:
     assert unpack(next(make()).payload) == (0x608, bytes.fromhex(text))
 
@@ -45,12 +54,14 @@ def test_the_restart_of_the_manual() -> None:
 
 @pytest.mark.parametrize("tpdo", TPDO_OBJECTS)
 @pytest.mark.parametrize("period_ms", PERIODS)
+@pytest.mark.manual("B 5.4.1 output rates")
 def test_rate_commands_of_the_manual(tpdo: TpdoNumber, period_ms: int) -> None:
     text = f"2B {TPDO_OBJECTS[tpdo]} 18 05 {PERIODS[period_ms]} 00 00 00"
     assert unpack(next(session.set_tpdo_period(8, tpdo, period_ms)).payload) == (0x608, bytes.fromhex(text))
 
 
 @pytest.mark.parametrize("invert", [False, True])
+@pytest.mark.manual("B 5.4.1 signs of the inclinometer")
 def test_the_sign_of_y_has_its_own_object(invert: bool) -> None:
     bench = CanopenBench()
     bench.run_script(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))

@@ -66,18 +66,21 @@ def learned(**options: object) -> HipnucJ1939Codec:
 # --- values ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.manual("B 6.1.1 FF34")
 def test_acceleration() -> None:
     # 2048 · 0.00048828 = 0.99999744 G · 9.8; -2048; 1 count = 0.0047851 m/s²
     found = measured(0xFF34, "0008 00f8 0100 ffff".replace(" ", "")).accel_m_s2
     assert found == pytest.approx((9.799974912, -9.799974912, 0.004785144), abs=1e-12)
 
 
+@pytest.mark.manual("B 6.1.2 FF37")
 def test_angular_rate() -> None:
     # 1000 · 0.061035 = 61.035 °/s = 1.06526171… rad/s; -16384 → -999.99744 °/s
     found = measured(0xFF37, "e803 00c0 ffff 0000".replace(" ", "")).gyro_rad_s
     assert found == pytest.approx((1.0652617, -17.4532478, -0.00106526171), abs=1e-7)
 
 
+@pytest.mark.manual("B 6.1.3 FF3D")
 def test_roll_pitch_and_heading_make_the_attitude() -> None:
     # roll 10.5°, pitch -20.25°; heading 90° clockwise is yaw -90°
     both = [
@@ -97,6 +100,7 @@ def test_roll_pitch_and_heading_make_the_attitude() -> None:
     [(0, 0.0), (1, -0.001), (90_000, -90.0), (180_000, -180.0), (180_001, 179.999), (270_000, 90.0), (359_999, 0.001),
      (360_000, 0.0)],
 )  # fmt: skip
+@pytest.mark.manual("B 6.1.4 FF41")
 def test_heading_is_clockwise_and_yaw_is_not(clockwise: int, yaw_deg: float) -> None:
     for second in (0, -1, 12345):  # what the other bytes say does not count
         data = clockwise.to_bytes(4, "little") + second.to_bytes(4, "little", signed=True)
@@ -115,6 +119,7 @@ def test_both_headings_of_newer_firmware_are_the_same_angle() -> None:
         assert messages.pack_heading(math.radians(yaw_deg), twice=False) == data[:4] + bytes(4)
 
 
+@pytest.mark.manual("B 6.1.5 FF4A")
 def test_inclinometer() -> None:
     # 8.701° and -33.058°
     found = measured(0xFF4A, "fd210000de7effff").incli_rad
@@ -258,6 +263,7 @@ def test_utc_agrees_with_the_vendors_definition() -> None:
 # --- frames ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.manual("B 6 identifiers")
 def test_identifiers_of_the_manual() -> None:
     pgns = (0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A)
     assert [encode(pgn, b"")[0] for pgn in pgns] == [0x0CFF3408, 0x0CFF3708, 0x0CFF3D08, 0x0CFF4108, 0x0CFF4A08]

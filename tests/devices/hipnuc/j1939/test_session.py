@@ -82,6 +82,17 @@ READABLE = ("interval", "bitrate", "address", "direction")
 
 
 @pytest.mark.parametrize(("name", "arguments", "data"), ROWS, ids=[f"{name} {data}" for name, _, data in ROWS])
+@pytest.mark.manual(
+    "B 6.2.2 intervals",
+    "B 6.2.2 save",
+    "B 6.2.2 factory settings",
+    "B 6.2.2 restart",
+    "B 6.2.2 bit rate",
+    "B 6.2.2 address",
+    "B 6.2.2 zero",
+    "B 6.2.2 directions",
+    "B 6.2.2 source address",
+)
 def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: str) -> None:
     written = bytes.fromhex(data)
     read = written[:2] + b"\3\0" + bytes(4)
@@ -156,6 +167,7 @@ def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dic
         (0x0CEF5508, "37010300640000", False),
     ],
 )
+@pytest.mark.manual("B 6.2.1 request and reply")
 def test_a_reply_is_matched_by_sender_register_and_command(can_id: int, data: str, is_reply: bool) -> None:
     request = next(session.read(J1939Node(8, 0x20), 0x0137))
     assert sent(request) == (0x0CEF0820, bytes.fromhex("3701030000000000"))

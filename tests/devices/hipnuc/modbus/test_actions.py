@@ -39,6 +39,7 @@ def act(bench: ModbusBench, name: str, **given: object) -> object:
         ("mounting", {"mounting": "x_down"}, "0600a60004"),
     ],
 )
+@pytest.mark.manual("B 4.3.1 save", "B 4.3.4 mounting", "B 4.3.5 level", "B 4.3.6 axes")
 def test_what_is_sent(name: str, given: dict[str, object], sent: str) -> None:
     bench = ModbusBench()
     act(bench, name, **given)

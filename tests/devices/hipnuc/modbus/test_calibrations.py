@@ -30,6 +30,7 @@ def value_of(script: Any, registers: dict[int, int]) -> tuple[list[Transfer], ob
 
 
 @pytest.mark.parametrize(("kind", "value"), [("level", 2), ("accelerometer_level", 3)])
+@pytest.mark.manual("B 4.3.5 level")
 def test_levels(kind: str, value: int) -> None:
     calibration = CALIBRATIONS[kind]
     assert value_of(calibration.begin(TARGET), {})[0] == [write_register(0xA5, value)]

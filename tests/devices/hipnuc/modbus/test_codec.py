@@ -71,6 +71,7 @@ def measured(made: HipnucModbusCodec, data: bytes) -> Measurement:
     return event
 
 
+@pytest.mark.manual("B 4.2 identity", "B 4.4 example")
 def test_identity_of_the_manual() -> None:
     identity = run_transfer_script(probe(HipnucModbusSettings()), lambda _: IDENTITY)
     assert identity.product == "HI14R2N-485-000"
@@ -79,6 +80,7 @@ def test_identity_of_the_manual() -> None:
     assert identity.details == {"BL_VERSION": "107"}
 
 
+@pytest.mark.manual("B 4.2 acceleration", "B 4.2 angular rate", "B 4.2 magnetic field", "B 4.2 angles", "B 4.5 example")
 def test_sensors_of_the_manual() -> None:
     """Values computed from its integers: -255, 944, 1616 times 0.00048828 G of 9.8 m/s², and so on."""
     m = measured(short(), SENSORS)
@@ -105,6 +107,7 @@ def test_a_module_without_barometer_has_no_pressure(counts: int, pressure_pa: fl
     assert m.pressure_pa == pressure_pa
 
 
+@pytest.mark.manual("B 4.2 temperature and pressure")
 def test_block_of_newer_firmware() -> None:
     """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
     words = "0000 0000 0800 0000 0000 0000 0000 0000 0000" + "0000 0000" * 3 + "09D0 009A9C14" + "2710 0000 0000 0000"
@@ -193,6 +196,7 @@ def test_reply_of_another_function_or_count_is_no_block() -> None:
 
 
 @pytest.mark.parametrize("per_lsb", [QUAT_OLD_PER_LSB, QUAT_PER_LSB])
+@pytest.mark.manual("B 4.2 quaternion")
 def test_scale_of_the_quaternion_is_decided_once(per_lsb: float) -> None:
     made = codec()
     assert measured(made, block(quat=(0, 0, 0, 0), per_lsb=per_lsb)).quat_wxyz is None
@@ -214,6 +218,7 @@ def test_scale_of_the_quaternion_is_decided_once(per_lsb: float) -> None:
         ((16384, 0), 0.2, None),  # cannot be told while level
     ],
 )
+@pytest.mark.manual("B 4.2 inclinometer")
 def test_axes_of_the_inclinometer(
     incli: tuple[int, int], pitch_deg: float, degrees_read: tuple[float, float] | None
 ) -> None:
@@ -261,6 +266,7 @@ def test_settings_are_read_and_nothing_is_written() -> None:
     assert [transfer.sends[0][0] for transfer in asked] == [3]
 
 
+@pytest.mark.manual("B 4 defaults")
 def test_targets_begin_with_the_factory_address() -> None:
     assert DRIVER.targets[0] == 0x50
     assert sorted(DRIVER.targets) == list(range(1, 248))

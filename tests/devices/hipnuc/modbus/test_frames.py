@@ -62,6 +62,7 @@ PRINTED = [  # sections 4.3.1 to 4.5, in their order
 
 
 @pytest.mark.parametrize(("printed", "asked"), PRINTED, ids=[row[0] for row in PRINTED])
+@pytest.mark.manual("B 4 byte order", "B 4.1.1 read", "B 4.1.2 write", "B 4.3.2 baud rate")
 def test_printed_requests(printed: str, asked: object) -> None:
     transfer = asked if isinstance(asked, Transfer) else next(asked)  # type: ignore[call-overload]  # a generator
     assert framed(0x50, transfer.sends[0]) == bytes.fromhex(printed)
@@ -72,6 +73,7 @@ def test_there_are_as_many_as_the_manual_has() -> None:
     assert len({row[0] for row in PRINTED}) == 27
 
 
+@pytest.mark.manual("B 4.6 address by serial number", "B 4.6 random addresses")
 def test_requests_to_all() -> None:
     """Section 4.6: sub-command, length of what follows, then the data. No reply is expected."""
     by_serial = set_id_by_serial("047D955F8D2A1708", 0x22)
@@ -103,6 +105,7 @@ def test_what_cannot_be_asked(begin: object, names: str) -> None:
     assert names in str(refused.value)
 
 
+@pytest.mark.manual("B 4.1.1 read")
 def test_replies_are_read_or_refused_with_the_reason() -> None:
     good = framed(7, registers_reply(b"\x00\x01\xff\xfe"))
     assert registers_of(good, 2) == (1, 0xFFFE)
@@ -122,6 +125,7 @@ def test_replies_are_read_or_refused_with_the_reason() -> None:
         check_written(framed(7, write_register(6, 0).sends[0]), write)
 
 
+@pytest.mark.manual("B 4.2 registers")
 def test_table_of_registers() -> None:
     """Section 4.2 and what newer firmware has: no gap in the block, nothing twice, what is written is bounded."""
     taken = [

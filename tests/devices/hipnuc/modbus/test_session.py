@@ -56,6 +56,7 @@ def test_what_is_written_is_read_back_and_saved_only_when_told(bench: ModbusBenc
     assert bench.slave.writes_to_flash == 1
 
 
+@pytest.mark.manual("B 4.3.1 save")
 def test_a_save_may_take_two_seconds(bench: ModbusBench) -> None:
     before_ns = bench.now_ns
     bench.run(save())
@@ -64,6 +65,7 @@ def test_a_save_may_take_two_seconds(bench: ModbusBench) -> None:
         ModbusBench(module(7, variant=SlaveVariant(flash_ms=2600))).run(save())
 
 
+@pytest.mark.manual("B 4.3.3 address")
 def test_a_module_is_followed_to_another_address(bench: ModbusBench) -> None:
     written = bench.run(change_address(7, 9))
     if bench.slave.variant.address_at_once:
@@ -136,6 +138,7 @@ def test_addresses_beyond_the_register_go_by_serial_number_only() -> None:
         ModbusBench().run(change_address(7, 129))
 
 
+@pytest.mark.manual("B 4.3.1 restart")
 def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> None:
     if bench.slave.variant.rate_at_once:
         with pytest.raises(NoReply, match="it has 9600 baud at once"):
@@ -148,6 +151,7 @@ def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> N
     assert bench.slave.baud == 9600
 
 
+@pytest.mark.manual("B 4.3.2 baud rate")
 def test_code_nine_is_256000(bench: ModbusBench) -> None:
     if not bench.slave.variant.rate_at_once:
         bench.run(set_baud(256000))
@@ -155,6 +159,7 @@ def test_code_nine_is_256000(bench: ModbusBench) -> None:
         assert bench.slave.settings.baud == 256000
 
 
+@pytest.mark.manual("B 4.3.1 factory settings")
 def test_factory_settings_and_where_the_module_is_then(bench: ModbusBench) -> None:
     bench.run(set_heading_mode(NINE))
     assert bench.run(factory_reset((7,), BAUD)) == "restarted, at address 80"

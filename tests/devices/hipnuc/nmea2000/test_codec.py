@@ -135,6 +135,7 @@ def test_a_heading_in_error_is_absent() -> None:
 # --- the independent library ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.manual("B 7 NMEA 2000")
 def test_the_library_reads_what_we_encode() -> None:
     pgns = pytest.importorskip("nmea2000.pgns")
     random = Random(1)
@@ -159,6 +160,7 @@ def test_the_library_reads_what_we_encode() -> None:
         assert fields["roll"] == pytest.approx(roll, abs=5.1e-5)
 
 
+@pytest.mark.manual("B 7 NMEA 2000")
 def test_we_read_what_the_library_encodes() -> None:
     pgns = pytest.importorskip("nmea2000.pgns")
     random = Random(2)

@@ -54,6 +54,21 @@ def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> t
         ("sout_divider", {"divisor": 4}, "CONFIG PMUX4 DIV4"),
     ],
 )
+@pytest.mark.manual(
+    "B 2.2.4 ATT MODE 0",
+    "B 2.2.4 ATT MODE 1",
+    "B 2.2.4 YAW 1",
+    "B 2.2.4 YAW 0",
+    "B 2.2.4 PMUX",
+    "B 2.2.4 alarm range",
+    "B 2.2.5 LOG ENABLE",
+    "B 2.2.5 LOG DISABLE",
+    "B 2.2.5 output off",
+    "B 2.2.5 ONMARK 1",
+    "B 2.2.5 ONMARK ONCE",
+    "B 2.2.6 UNLOGALL",
+    "B 8.2 EN_MCAL",
+)
 def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None:
     (request,), value = sent(name, **arguments)
     assert request.payload == f"{command}\r\n".encode()
@@ -100,6 +115,7 @@ HALF_TURN = "a number from -180 to 180"
         ("baud", {"baud": 57600}, "one of 9600, 115200, 230400, 256000, 460800, 921600"),
     ],
 )
+@pytest.mark.manual("B 2.2.4 YAW range", "B 2.2.4 divider")
 def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(BadArgument, match=message):
         sent(name, [], **arguments)
@@ -128,6 +144,7 @@ def test_output_is_set_where_the_module_does_not_tell_what_it_sends() -> None:
     assert requests[-1].name == "LOG HI91 ONTIME 0.02"
 
 
+@pytest.mark.manual("B 2.2.1 REBOOT")
 def test_restart_waits_until_it_answers() -> None:
     requests, value = sent("restart", [Reply(()), Silence(()), Silence(()), Silence(()), VERSION])
     assert requests[0].silent

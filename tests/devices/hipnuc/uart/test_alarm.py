@@ -19,6 +19,7 @@ def y(low_deg: float, high_deg: float, enabled: bool = True) -> dict[str, AlarmR
     return {"Y": AlarmRange(0, low_deg, high_deg, enabled)}
 
 
+@pytest.mark.manual("B 2.2.4 alarm range")
 def test_the_modules_own_lines_are_read() -> None:
     settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
     report = parse_report([*settings.user_lines(), "OK"]).values

@@ -37,6 +37,7 @@ def sent(script: RequestScript[object], *answers: Outcome) -> tuple[list[str], o
         ("heading", ["CONFIG YAW 1 0"], []),
     ],
 )
+@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 3", "B 8.2 once")
 def test_commands(kind: str, begun: list[str], saved: list[str]) -> None:
     calibration = CALIBRATIONS[kind]
     assert sent(calibration.begin(TARGET), *[OK] * len(begun))[0] == begun
@@ -53,6 +54,7 @@ def test_commands(kind: str, begun: list[str], saved: list[str]) -> None:
         (("MC=1", "OK"), Verdict(False, "it does not tell its bias")),
     ],
 )
+@pytest.mark.manual("B 8.1.1 result")
 def test_verdict_of_the_magnetometer(lines: tuple[str, ...], verdict: Verdict) -> None:
     ask = CALIBRATIONS["magnetometer"].verdict
     assert ask is not None
@@ -70,6 +72,7 @@ def test_no_magnetometer() -> None:
 
 @pytest.mark.parametrize(("mode", "ready"), [("0", False), ("1", True)])
 @pytest.mark.parametrize("kind", ["magnetometer", "magnetometer_once"])
+@pytest.mark.manual("B 1.1 9-axis mode")
 def test_nine_axes_are_needed(kind: str, mode: str, ready: bool) -> None:
     calibration: Calibration = CALIBRATIONS[kind]
     assert calibration.unready is not None

@@ -97,6 +97,19 @@ def check_manual_values(m: Measurement) -> None:
     assert (m.size_bytes, m.trailing_bytes) == (82, 0)
 
 
+@pytest.mark.manual(
+    "B 3.1 header",
+    "B 3.3.1 pps_sync_stamp",
+    "B 3.3.1 temperature",
+    "B 3.3.1 air_pressure",
+    "B 3.3.1 system_time",
+    "B 3.3.1 acceleration",
+    "B 3.3.1 angular rate",
+    "B 3.3.1 magnetic field",
+    "B 3.3.1 angles",
+    "B 3.3.1 quaternion",
+    "B 3.5 example",
+)
 def test_manual_hi91_in_one_read() -> None:
     m = one(make().feed(MANUAL_HI91))
     check_manual_values(m)
@@ -122,17 +135,30 @@ def test_frames_back_to_back_are_decoded_like_one(word: str) -> None:
     assert general == [msgspec.structs.replace(alone, size_bytes=len(MANUAL_HI91) + 1)]
 
 
+@pytest.mark.manual("B 3.6 check of an example")
 def test_manual_crc_is_that_of_the_table() -> None:
     assert crc_bit_by_bit(MANUAL_HI91[:4] + MANUAL_HI91[6:]) == 0xBB14
     assert encode_frame(MANUAL_HI91[6:]) == MANUAL_HI91
 
 
+@pytest.mark.manual("B 3.3.1 angles")
 def test_manual_quaternion_and_euler_angles_agree() -> None:
     m = one(make().feed(MANUAL_HI91))
     assert m.quat_wxyz is not None
     assert euler312_from_quat(m.quat_wxyz) == pytest.approx(m.euler_rad, abs=2e-6)
 
 
+@pytest.mark.manual(
+    "B 3.3.2 status",
+    "B 3.3.2 temperature",
+    "B 3.3.2 pps_sync_stamp",
+    "B 3.3.2 air_pressure",
+    "B 3.3.2 angular rate",
+    "B 3.3.2 acceleration",
+    "B 3.3.2 magnetic field",
+    "B 3.3.2 angles",
+    "B 3.3.2 quaternion",
+)
 def test_hand_made_hi92() -> None:
     m = one(make().feed(framed(HI92_PAYLOAD)))
     assert m.dev_ticks is None
@@ -174,6 +200,7 @@ def test_a_configured_word_stays(word: str, version: str) -> None:
         assert (m.status, m.pps_age_ms) == ((None, 7) if word == "pps" else (7, None))
 
 
+@pytest.mark.manual("B 3.1 sub-packets")
 def test_two_sub_packets_are_two_measurements_of_one_frame() -> None:
     codec = make()
     frame = framed(MANUAL_HI91[6:] + HI92_PAYLOAD)
@@ -185,6 +212,7 @@ def test_two_sub_packets_are_two_measurements_of_one_frame() -> None:
     assert codec.ledger.frames_good == codec.ledger.frames_in_samples == 1
 
 
+@pytest.mark.manual("B 3.1 sub-packets")
 def test_an_unknown_tag_ends_the_payload_and_is_no_error() -> None:
     codec = make()
     assert codec.feed(framed(b"\x77" + MANUAL_HI91[6:])) == []
@@ -205,6 +233,7 @@ def test_a_sub_packet_cut_off_makes_the_frame_bad(payload: bytes) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 513, 0xFFFF])
+@pytest.mark.manual("B 3.1 length")
 def test_an_impossible_length_costs_the_sync_word_only(length: int) -> None:
     codec = make()
     header = HEADER.pack(b"\x5a\xa5", length, 0)
@@ -215,12 +244,14 @@ def test_an_impossible_length_costs_the_sync_word_only(length: int) -> None:
 
 
 @pytest.mark.parametrize("length", [1, 512])
+@pytest.mark.manual("B 3.1 length")
 def test_the_shortest_and_the_longest_payload_are_taken(length: int) -> None:
     codec = make()
     assert codec.feed(framed(b"\x77" * length)) == []
     assert codec.ledger.frames_ignored == 1
 
 
+@pytest.mark.manual("B 3.4 CRC")
 def test_every_single_bit_error_is_found_and_costs_one_frame() -> None:
     for bit in range(8 * len(MANUAL_HI91)):
         damaged = bytearray(MANUAL_HI91)
@@ -298,6 +329,7 @@ OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453F
         (120_001.0, 59, (None, None)),
     ],
 )
+@pytest.mark.manual("B 3.3.1 air_pressure")
 def test_no_barometer_no_pressure(
     pressure_pa: float, temperature_c: int, expected: tuple[float | None, float | None], frames: int
 ) -> None:
@@ -451,6 +483,7 @@ def test_half_a_frame_that_looks_like_the_end_of_a_line_survives_an_idle_line() 
     assert codec.ledger.bytes_in_good_frames == len(frame)
 
 
+@pytest.mark.manual("B 3.4 CRC")
 def test_the_check_value_of_crc16_xmodem() -> None:
     assert crc_hqx(b"123456789", 0) == 0x31C3
     assert crc_hqx(b"6789", crc_hqx(b"12345", 0)) == 0x31C3

@@ -65,6 +65,9 @@ PRINTED = [
 
 
 @pytest.mark.parametrize(("request_", "text"), PRINTED, ids=[text for _, text in PRINTED])
+@pytest.mark.manual(
+    "B 2 line end", "B 2.2.3 SERIALCONFIG", "B 2.2.4 URFR presets", "B 2.2.4 PMUX3 LED", "B 2.2.5 ONTIME"
+)
 def test_commands_are_as_printed(request_: Request, text: str) -> None:
     assert request_.payload == text.encode() + b"\r\n"
     assert request_.name == text
@@ -93,11 +96,13 @@ def test_bad_arguments_are_refused_with_what_was_expected(make: Callable[[], obj
     assert "expected" in str(caught.value)
 
 
+@pytest.mark.manual("B 2.2.1 REBOOT")
 def test_reboot_is_silent_and_only_that() -> None:
     assert [text for request, text in PRINTED if request.silent] == ["REBOOT"]
 
 
 @pytest.mark.parametrize("baud", c.BAUD_RATES)
+@pytest.mark.manual("B 3.7 rates by baud rate")
 def test_every_rate_of_table_3_7_is_a_rate_and_fits_through_the_line(baud: int) -> None:
     for message, frame_bytes in ((H91, 82), (H92, 54)):
         rate = c.max_rate_hz(message, baud)
@@ -105,5 +110,6 @@ def test_every_rate_of_table_3_7_is_a_rate_and_fits_through_the_line(baud: int) 
         assert rate * frame_bytes * 10 <= baud
 
 
+@pytest.mark.manual("B 3.7 rates by baud rate")
 def test_table_3_7_distinguishes_the_messages() -> None:
     assert (c.max_rate_hz(H91, 115200), c.max_rate_hz(H92, 115200)) == (100, 200)

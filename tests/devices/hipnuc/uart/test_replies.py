@@ -7,6 +7,7 @@ from imud.devices.hipnuc.uart import replies as r
 VERSION = ("PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK")
 
 
+@pytest.mark.manual("B 2.2.5 VERSION")
 def test_version() -> None:
     version = r.parse_version(VERSION)
     assert (version.product, version.build, version.uuid) == ("HI14R3", "Oct 15 2024", "043995698D6E1708")
@@ -21,6 +22,7 @@ def test_version_of_another_firmware_is_read_as_far_as_it_goes() -> None:
     assert version.report.other == ("* boot ok *", "PNAME=again")
 
 
+@pytest.mark.manual("B 2.2.5 USRCONFIG")
 def test_usrconfig_with_the_comment_of_the_manual() -> None:
     config = r.parse_usrconfig(("ATT_MODE: 1 /* 0:6, 1:9 */", "URFR=1,0,0", "OK"))
     assert config.att_mode == 1
@@ -28,6 +30,7 @@ def test_usrconfig_with_the_comment_of_the_manual() -> None:
     assert r.parse_usrconfig(("OK",)).att_mode is None
 
 
+@pytest.mark.manual("B 2.2.5 COMCONFIG")
 def test_comconfig_finds_periods_however_they_are_written() -> None:
     config = r.parse_comconfig(("BAUD=115200", "LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0", "OK"))
     assert config.periods_s == {"HI91": 0.01, "HI92": 0.0}
@@ -39,6 +42,7 @@ def test_comconfig_finds_periods_however_they_are_written() -> None:
     ("line", "bias_ut"),
     [("MB=14.14, -2.08, -8.75", (14.14, -2.08, -8.75)), ("MB=1,2", None), ("MB=1,nan,2", None), ("X=1", None)],
 )
+@pytest.mark.manual("B 8.1.1 result")
 def test_magconfig(line: str, bias_ut: tuple[float, float, float] | None) -> None:
     assert r.parse_magconfig((line, "OK")).bias_ut == bias_ut
 

@@ -27,6 +27,7 @@ def hold(script: RequestScript[T], answer: Callable[[str], Outcome]) -> T:
     return run_script(script, lambda request: answer(request.name))
 
 
+@pytest.mark.manual("B 2.2.5 VERSION")
 def test_identity() -> None:
     asked: list[str] = []
 
@@ -108,6 +109,7 @@ every_variant = pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARI
 
 @every_variant
 @pytest.mark.parametrize("baud", [9600, 230400, 921600])
+@pytest.mark.manual("B 2.2.3 SERIALCONFIG")
 def test_another_baud_rate_is_followed_and_saved(behaviour: Behaviour, baud: int) -> None:
     line = HipnucLine(ModuleSettings(hi91=Output(200)), hardware_of(behaviour))
     assert line.act("baud", baud=baud) == {"baud": baud}
@@ -118,6 +120,7 @@ def test_another_baud_rate_is_followed_and_saved(behaviour: Behaviour, baud: int
 
 
 @every_variant
+@pytest.mark.manual("B 2.2.3 a wrong rate")
 def test_a_module_that_refuses_another_rate_stays_reachable(behaviour: Behaviour) -> None:
     refusing = Behaviour(flash_ms=behaviour.flash_ms, quiet_ms=behaviour.quiet_ms, refuses=("SERIALCONFIG",))
     line = HipnucLine(hardware=hardware_of(refusing))
@@ -169,6 +172,7 @@ def test_a_baud_rate_that_does_not_carry_the_present_output_is_refused(
     assert line.asked == ["LOG COMCONFIG"]
 
 
+@pytest.mark.manual("B 2.2.5 output and line")
 def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None:
     """100 Hz of HI91 take 82000 bit/s of 115200; HI92 takes 540 bit per frame: 95 % leave 50 Hz and not 100."""
     line = HipnucLine()
@@ -179,6 +183,7 @@ def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None
     assert line.module.settings.hi92 == Output(20)
 
 
+@pytest.mark.manual("B 2.2.5 ONTIME")
 def test_a_period_of_the_rule_and_so_on_is_accepted() -> None:
     line = HipnucLine()
     line.act("output", message="HI91", rate_hz=25)
@@ -187,6 +192,7 @@ def test_a_period_of_the_rule_and_so_on_is_accepted() -> None:
 
 @every_variant
 @pytest.mark.parametrize("baud", BAUD_RATES)
+@pytest.mark.manual("B 2.2.7 FRESET")
 def test_a_factory_reset_is_in_force_and_followed(behaviour: Behaviour, baud: int) -> None:
     line = HipnucLine(ModuleSettings(baud=baud, att_mode=1, hi91=Output(200)), hardware_of(behaviour))
     answer = line.act("factory_reset", fixed_baud=baud)
@@ -249,6 +255,7 @@ def test_a_silent_module_is_woken_by_an_action(settings: ModuleSettings, done: s
         (ModuleSettings(hi91=Output(on_mark=True), hi92=Output(100)), None),
     ],
 )
+@pytest.mark.manual("B 2.2.5 LOG ENABLE")
 def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSettings, woken: bool | None) -> None:
     line = HipnucLine(settings)
     line.module.receive(b"LOG DISABLE\r\n", line.now_ns)

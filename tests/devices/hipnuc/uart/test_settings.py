@@ -34,6 +34,7 @@ def read(line: HipnucLine) -> dict[str, Any]:
     return values
 
 
+@pytest.mark.manual("B 3.2 factory output")
 def test_a_module_as_delivered() -> None:
     line = HipnucLine()
     assert read(line) == DELIVERED
@@ -100,6 +101,7 @@ CHANGES: list[tuple[str, Any, dict[str, Any]]] = [
 
 @pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
 @pytest.mark.parametrize(("name", "given", "changed"), CHANGES)
+@pytest.mark.manual("B 2.2.2 SAVECONFIG")
 def test_written_read_back_saved_and_kept_over_a_restart(
     behaviour: Behaviour, name: str, given: Any, changed: dict[str, Any]
 ) -> None:
@@ -140,6 +142,7 @@ def test_output_enabled_is_written_and_not_told() -> None:
         ({"alarm": {"x": {"min_deg": 5, "max_deg": 5}}}, "alarm.x: expected the minimum below the maximum"),
     ],
 )
+@pytest.mark.manual("B 2.2.4 PMUX")
 def test_what_does_not_go_together_is_refused(values: dict[str, Any], words: str) -> None:
     with pytest.raises(BadArgument, match=words):
         SETTINGS.check(Target(None, 115200), values)
@@ -179,6 +182,7 @@ def test_a_declaration_is_checked_by_its_types(given: dict[str, Any]) -> None:
         msgspec.convert(given, SETTINGS.declarable)
 
 
+@pytest.mark.manual("B 2.2.4 when CONFIG acts")
 def test_the_table_names_section_and_moment_of_each_setting() -> None:
     for name, setting in TABLE.items():
         info = msgspec.inspect.type_info(setting.type)

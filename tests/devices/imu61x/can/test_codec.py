@@ -51,6 +51,7 @@ def indices(events: list[CodecEvent]) -> list[int | None]:
     return [event.dev_ticks for event in events if isinstance(event, Measurement)]
 
 
+@pytest.mark.manual("A 4.2 frame 101", "A 4.2 frame 102", "A 4.2 frame 103", "A 4.2 frame 104", "A 4.2 frame 105")
 def test_golden_set_in_si_units() -> None:
     (measured,) = feed(make(), GOLDEN)
     assert isinstance(measured, Measurement)
@@ -64,6 +65,7 @@ def test_golden_set_in_si_units() -> None:
     assert measured.quat_wxyz == pytest.approx((0.7067770, 0.0215940, -0.0030853, 0.7071000), abs=1e-7)
 
 
+@pytest.mark.manual("A 4.2 frame 105")
 def test_index_wraps() -> None:
     codec = make()
     found = [indices(feed(codec, sample(index))) for index in (65534, 65535, 65536, 65537)]
@@ -71,6 +73,7 @@ def test_index_wraps() -> None:
 
 
 @pytest.mark.parametrize(("raw", "expected"), [("0000", 0.0), ("9cff", -1.0), ("ff7f", 327.67), ("0080", -327.68)])
+@pytest.mark.manual("A 4.2 temperature")
 def test_temperature_is_in_hundredths(raw: str, expected: float) -> None:
     frames = [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")]
     (measured,) = feed(make(), frames)
@@ -229,6 +232,7 @@ def test_values_that_are_not_finite_are_left_out_and_told() -> None:
     assert codec.ledger.frames_in_samples == 5
 
 
+@pytest.mark.manual("A 4.1 frames")
 def test_extended_identifiers_are_not_ours() -> None:
     codec = make()
     for can_id, data in GOLDEN:

@@ -24,10 +24,12 @@ def crc32_bit_by_bit(data: bytes) -> int:
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00", b"123456789", bytes(range(256)), b"\xff" * 44])
+@pytest.mark.manual("A 5 CRC-32")
 def test_crc_is_the_reflected_polynomial_from_one_without_inversion(data: bytes) -> None:
     assert crc32(data) == crc32_bit_by_bit(data)
 
 
+@pytest.mark.manual("A 1.2 CRC")
 def test_crc_of_a_command_that_a_device_obeyed() -> None:
     assert crc32(bytes.fromhex("55AA 0300 1800 0000803F") + bytes(20)) == 0xE88ED852
 
@@ -47,6 +49,7 @@ def test_crc_check_value() -> None:
         ("0000494D55363142", "IMU6132B"),
     ],
 )
+@pytest.mark.manual("A 2.4.3 products")
 def test_product_ids_of_tables_22_and_28(product_id: str, product: str) -> None:
     assert product_of(bytes.fromhex(product_id)) == product
     assert product_id_of(product) == bytes.fromhex(product_id)
@@ -63,6 +66,7 @@ def test_an_unknown_product_has_no_id() -> None:
     assert len(PRODUCTS) == 5
 
 
+@pytest.mark.manual("A 2.4.2 codes", "A 2.4.2 default")
 def test_filters() -> None:
     """The manual writes 0x44 for 10 Hz and 0xBB for 47 Hz, accelerometer in the high half."""
     assert FILTERS[4] == "10 Hz"
@@ -75,10 +79,12 @@ def test_filters() -> None:
 
 
 @pytest.mark.parametrize("codes", [(-1, 0), (16, 0), (0, 16), (0, -1)])
+@pytest.mark.manual("A 2.4.2 layout")
 def test_filter_codes_have_four_bits(codes: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="0 … 15"):
         filter_control(*codes)
 
 
+@pytest.mark.manual("A 1.3 acceleration")
 def test_g_is_standard_gravity() -> None:
     assert M_S2_PER_G == 9.80665

@@ -21,6 +21,7 @@ def codec(**settings: int) -> Imu61xI2cCodec:
     return Imu61xI2cCodec(Ledger(), RegisterSettings(**settings))
 
 
+@pytest.mark.manual("A 3.3.1 reading", "A 3.3.1 order")
 def test_burst_in_si() -> None:
     made = codec()
     (m,) = made.decode(0, GOLDEN)
@@ -31,6 +32,7 @@ def test_burst_in_si() -> None:
     assert m.size_bytes == made.ledger.bytes_in_good_frames == 32
 
 
+@pytest.mark.manual("A 3.3.1 CRC")
 def test_crc_covers_all_28_bytes() -> None:
     for at in range(32):
         damaged = GOLDEN[:at] + bytes([GOLDEN[at] ^ 0x80]) + GOLDEN[at + 1 :]

@@ -13,6 +13,7 @@ from tests.support.simulated_modules import over_i2c
 @pytest.mark.parametrize(
     ("last", "product"), [("2", "IMU612"), ("4", "IMU614"), ("8", "IMU618"), ("A", "IMU6132A"), ("B", "IMU6132B")]
 )
+@pytest.mark.manual("A 3.3.3 ID")
 def test_probe_names_every_product(last: str, product: str) -> None:
     script = probe(RegisterSettings())
     assert next(script) == Transfer((b"\x6a",), 8)
@@ -21,6 +22,7 @@ def test_probe_names_every_product(last: str, product: str) -> None:
     assert end.value.value.product == product
 
 
+@pytest.mark.manual("A 3.3.2 filters")
 def test_set_up_writes_reads_back_and_leaves_alone() -> None:
     device, log = Imu61xRegisters(lambda: 0), list[Transfer]()
 

@@ -8,6 +8,7 @@ from imud.devices.imu61x.spi.bursts import BurstKind, burst_problem
 PIPELINE = b"\xde\xad\xbe\xef"
 
 
+@pytest.mark.manual("A 2.3 read and write", "A 2.4.1 reading", "A 2.4.2 write and read")
 def test_transfers_on_the_wire() -> None:
     assert bursts.READ_STANDARD.sends == (b"\x80\x00" + bytes(30),)
     assert bursts.READ_EXTENDED.sends == (b"\x80\x00" + bytes(50),)

@@ -47,6 +47,9 @@ def one(events: Sequence[PolledEvent]) -> Measurement:
     return event
 
 
+@pytest.mark.manual(
+    "A 2.4 BURST", "A 2.4.1 order", "A 2.4.1 scale of the gyroscope", "A 2.4.1 scale of the accelerometer"
+)
 def test_standard_burst_in_si() -> None:
     made = codec()
     m = one(made.decode(0, PIPELINE + GOLDEN))
@@ -58,6 +61,7 @@ def test_standard_burst_in_si() -> None:
     }  # fmt: skip
 
 
+@pytest.mark.manual("A 2.4.1 checksum")
 def test_both_halves_of_the_checksum_count_unless_told_otherwise() -> None:
     wrong_high, wrong_low = with_sum(GOLDEN[:24], 0x1FFFF), with_sum(GOLDEN[:24], 0x2FFFE)
     assert codec().decode(0, PIPELINE + wrong_high) == (BadFrame(BadReason.CRC, wrong_high),)
@@ -84,6 +88,7 @@ def extended(*values: float, status: int = 0x01020304) -> bytes:
     return b"".join(memory[at : at + 2][::-1] for at in range(0, 48, 2))
 
 
+@pytest.mark.manual("A 2.4.1 extended burst")
 def test_extended_burst_in_si() -> None:
     data = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
     assert words(data)[:6] == (0x0000, 0x3F80, 0, 0, 0x0000, 0xBF80)  # 1.0 = 0x3F800000, low word first
@@ -111,6 +116,7 @@ def test_extended_burst_with_nan_comes_without_the_values_concerned() -> None:
     assert m.accel_m_s2 == pytest.approx((0, 0, G))
 
 
+@pytest.mark.manual("A 2.4.1 extended burst")
 def test_extended_crc_covers_44_bytes() -> None:
     good = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
     for at in range(48):
@@ -118,6 +124,7 @@ def test_extended_crc_covers_44_bytes() -> None:
         assert codec("extended").decode(0, PIPELINE + damaged) == (BadFrame(BadReason.CRC, damaged),)
 
 
+@pytest.mark.manual("A 2.4 single registers", "A 2.4.1 scale of the accelerometer")
 def test_single_registers_in_si() -> None:
     """TEMP 2634 · 65536 is 25 °C; gyro high word 1 is 0.016 °/s; accel 327680000 = 0x13880000 is 1 g."""
     data = bytes.fromhex("0a4a0000 00010000 00000000 ffff0000 00000000 ec780000 13880000".replace(" ", ""))
@@ -128,6 +135,7 @@ def test_single_registers_in_si() -> None:
 
 
 @pytest.mark.parametrize(("counts", "celsius"), [(172621824, 25.0), (0, 35.0), (172621824 - 17262182, 26.0)])
+@pytest.mark.manual("A 2.4.1 scale of the temperature")
 def test_temperature_of_counts(counts: int, celsius: float) -> None:
     assert temperature_c(counts) == pytest.approx(celsius, abs=1e-6)
 

@@ -33,6 +33,7 @@ class Wire:
         return data
 
 
+@pytest.mark.manual("A 2.4 PROD_ID", "A 2.4.3 reading")
 def test_probe_names_the_product_and_closes_the_window() -> None:
     wire = Wire()
     assert run_transfer_script(probe(SpiDeviceSettings()), wire.transfer).product == "IMU614"
@@ -40,6 +41,7 @@ def test_probe_names_the_product_and_closes_the_window() -> None:
     assert len(wire.sent) == 1
 
 
+@pytest.mark.manual("A 2.4 BURST_CTRL", "A 2.4 FILTER_CTRL", "A 2.4.2 write and read")
 def test_set_up_writes_what_differs_only() -> None:
     wire = Wire()
     words = run_transfer_script(set_up(SpiDeviceSettings()), wire.transfer)
@@ -55,6 +57,7 @@ def test_set_up_writes_what_differs_only() -> None:
 
 
 @pytest.mark.parametrize("fail_at", [0, 1, 2])
+@pytest.mark.manual("A 2.4.4 windows")
 def test_window_is_closed_after_a_failure(fail_at: int) -> None:
     wire = Wire(fail_at=fail_at)
     with pytest.raises(TransferError):

@@ -66,6 +66,7 @@ def test_every_order_to_a_device_that_refuses_is_an_error(name: str) -> None:
     assert len(far.samples(100)) >= 15
 
 
+@pytest.mark.manual("A 1.6 CMD 3 stream", "A 1.6 CMD 3 command")
 def test_stop_and_start() -> None:
     far = imu61x_bench()
     answer = act(far, "stop_streaming")
@@ -76,6 +77,7 @@ def test_stop_and_start() -> None:
     assert far.samples(50)
 
 
+@pytest.mark.manual("A 1.6 CMD 14, 21", "A 1.6 CMD 14, 27", "A 1.6 CMD 14, 30", "A 1.6 CMD 14, 31")
 def test_parameters_are_set_and_stay() -> None:
     far = imu61x_bench()
     act(far, "rate", rate_hz=200)
@@ -104,6 +106,7 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
     assert len(far.samples(100)) >= 35
 
 
+@pytest.mark.manual("A 1.6 CMD 14, 3")
 def test_baud_is_followed() -> None:
     far = imu61x_bench()
     change = act(far, "baud", baud=460800)
@@ -180,6 +183,7 @@ def test_restart_and_factory_reset_keep_contact() -> None:
         ("heading", {"heading_deg": "90"}, "from 0 to 360"),
     ],
 )
+@pytest.mark.manual("A 1.6 other values")
 def test_what_the_device_would_not_take_is_refused(name: str, arguments: dict[str, Any], named: str) -> None:
     far = imu61x_bench()
     with pytest.raises(BadArgument, match=named):

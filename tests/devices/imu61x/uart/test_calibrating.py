@@ -18,6 +18,7 @@ ACKNOWLEDGING = [calibrating.calibrate_gyro, calibrating.calibrate_installation]
 
 
 @every_variant
+@pytest.mark.manual("A 1.5 parameters 8 to 10", "A 1.6 CMD 10")
 def test_gyro_calibration_takes_the_bias_off(variant: str) -> None:
     if variant == "no K1":
         return  # below
@@ -36,6 +37,7 @@ def test_gyro_calibration_takes_the_bias_off(variant: str) -> None:
 
 
 @every_variant
+@pytest.mark.manual("A 1.5 parameters 16 to 18", "A 1.6 CMD 7")
 def test_installation_calibration_ends_with_the_angles(variant: str) -> None:
     if variant == "no K1":
         return  # below
@@ -91,6 +93,7 @@ def test_offsets_that_are_found_again_end_by_time_where_the_device_does_not_tell
 
 
 @pytest.mark.parametrize("reports", [True, False])
+@pytest.mark.manual("A 1.6 CMD 8")
 def test_installation_calibration_without_end(reports: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.sim.imu61x.uart.CALIBRATION_NS", 10**15)
     far = imu61x_bench(reports_calibration=reports)

@@ -51,6 +51,16 @@ def only(events: object) -> Measurement:
     return event
 
 
+@pytest.mark.manual(
+    "A 1.2 headers",
+    "A 1.3 frame",
+    "A 1.3 pitch",
+    "A 1.3 roll",
+    "A 1.3 yaw",
+    "A 1.3 acceleration",
+    "A 1.3 angular rate",
+    "A 1.3 temperature",
+)
 def test_golden_ahrs_frame() -> None:
     measurement = only(codec().feed(GOLDEN))
     assert measurement.size_bytes == len(GOLDEN) == 54
@@ -64,6 +74,7 @@ def test_golden_ahrs_frame() -> None:
     assert absent == (None, None, None, None)
 
 
+@pytest.mark.manual("A 1.3 yaw")
 def test_the_quaternion_turns_in_the_order_zyx() -> None:
     """Where the axes of the body point at roll -45°, pitch 30°, yaw 90°, by hand: Rz(90°) Ry(30°) Rx(-45°)."""
     quat = only(codec().feed(GOLDEN)).quat_wxyz
@@ -101,6 +112,7 @@ def test_encode_is_the_golden_frame() -> None:
     )
 
 
+@pytest.mark.manual("A 1.3 timer")
 def test_the_driver_counts_microseconds() -> None:
     assert (DRIVER.tick_ns, DRIVER.tick_modulus) == (1000, 2**32)
     assert "assumed" in DRIVER.euler_convention
@@ -143,6 +155,7 @@ def test_what_is_finite_is_the_same_beside_what_is_not() -> None:
     assert measurement.quat_wxyz == pytest.approx(whole.quat_wxyz, abs=1e-15)
 
 
+@pytest.mark.manual("A 1.2 ID and length")
 def test_replies_are_told_from_samples() -> None:
     tested = codec()
     status = encode_status(Status(1, 2, 3, (4, 5, 6)))
@@ -184,6 +197,7 @@ def test_a_frame_too_short_for_its_kind_is_bad(frame_id: int, size: int) -> None
 
 
 @pytest.mark.parametrize("length", [0, PAYLOAD_BYTES_MAX + 1, 0xFFFF])
+@pytest.mark.manual("A 1.2 ID and length")
 def test_a_length_beyond_the_maximum_is_refused_at_once(length: int) -> None:
     lie = b"\xaa\x55\x02\x00" + length.to_bytes(2, "little")
     tested = codec()
@@ -247,6 +261,7 @@ def test_bytes_where_a_damaged_frame_claimed_to_be_are_its_in_any_split(end: byt
     assert whole.ledger.closes()
 
 
+@pytest.mark.manual("A 1.2 CRC")
 def test_every_single_bit_matters() -> None:
     for place in range(len(GOLDEN)):
         for bit in range(8):
@@ -258,6 +273,7 @@ def test_every_single_bit_matters() -> None:
             assert tested.ledger.closes()
 
 
+@pytest.mark.manual("A 1.2 headers")
 def test_what_the_host_sends_is_no_frame() -> None:
     tested = codec()
     command = bytes.fromhex("55AA 0300 1800 0000803F") + bytes(20) + bytes.fromhex("52D88EE8")

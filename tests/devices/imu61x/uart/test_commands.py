@@ -17,6 +17,7 @@ STREAM_HEX = "55AA 0300 1800 0000803F" + 20 * "00" + "52D88EE8"
 """A command frame that a device obeyed."""
 
 
+@pytest.mark.manual("A 1.6 request")
 def test_golden_frame() -> None:
     assert c.output_mode(c.OutputMode.STREAM).payload == bytes.fromhex(STREAM_HEX)
 
@@ -49,6 +50,7 @@ def test_golden_frame() -> None:
         (c.factory_reset(), 15, "00000000", 0),
     ],
 )
+@pytest.mark.manual("A 1.6 request")
 def test_bytes(request_: Request, command: int, param1: str, param3: int) -> None:
     body = (
         b"\x55\xaa" + command.to_bytes(2, "little") + b"\x18\x00"
@@ -63,6 +65,7 @@ def test_every_command_of_the_manual_is_there() -> None:
 
 
 @pytest.mark.parametrize("index", [3, 8, 9, 10, 16, 17, 18, 21, 27, 30, 31])
+@pytest.mark.manual("A 1.6 CMD 6")
 def test_every_parameter_can_be_read(index: int) -> None:
     request = c.read_parameter(Parameter(index))
     assert request.is_end(ReplyFrame(6, pack_parameters(1.5, index)))
@@ -80,6 +83,7 @@ def test_any_acknowledgement_of_the_command_ends_an_order() -> None:
     assert not request.is_end("OK")
 
 
+@pytest.mark.manual("A 1.6 CMD 1")
 def test_status_and_installation_status_replies() -> None:
     s1 = ReplyFrame(0xFF, bytes(22))
     assert c.ask_status().is_end(s1)
@@ -88,6 +92,7 @@ def test_status_and_installation_status_replies() -> None:
     assert c.ask_installation_status().is_end(ReplyFrame(5, pack_acknowledgement(8, 0)))
 
 
+@pytest.mark.manual("A 1.6 CMD 2")
 def test_one_ahrs_frame_comes_as_a_sample() -> None:
     request = c.ask_ahrs()
     assert request.is_sample is not None
@@ -104,11 +109,13 @@ def test_a_bare_number_is_no_member_of_an_enum(make: Callable[[Any], Request], v
 
 
 @pytest.mark.parametrize(("baud", "most_hz"), [(115200, 200), (230400, 400), (460800, 400), (1500000, 400)])
+@pytest.mark.manual("A 1.3 rate and line")
 def test_rates_that_fit_the_line(baud: int, most_hz: int) -> None:
     assert c.max_rate_hz(baud) == most_hz
     c.set_rate(most_hz, baud=baud)
 
 
+@pytest.mark.manual("A 1.3 rate and line")
 def test_a_rate_that_does_not_fit_the_line_is_refused() -> None:
     with pytest.raises(BadArgument, match="at most 200 Hz at 115200 baud, got 400 Hz"):
         c.set_rate(400, baud=115200)

@@ -25,6 +25,7 @@ def streams(far: Imu61xBench) -> bool:
 
 
 @every_variant
+@pytest.mark.manual("A 1.6 CMD 9")
 def test_restart_loses_what_was_not_saved_and_begins_the_timer_again(variant: str) -> None:
     far = variant_bench(variant, uptime_us=20_000_000)
     far.run(session.write_parameter(Parameter.AHRS_RATE, 10))
@@ -80,6 +81,7 @@ def test_a_device_that_does_not_come_back_is_no_reply() -> None:
 
 @every_variant
 @pytest.mark.parametrize(("baud", "present"), [(921600, 115200), (115200, 1500000), (460800, 460800)])
+@pytest.mark.manual("A 1.6 CMD 14, 3")
 def test_the_baud_rate_changes_and_the_device_is_kept(variant: str, baud: int, present: int) -> None:
     far = variant_bench(variant, Imu61xSettings(baud=present))
     change = far.run(following.change_baud(baud, present, done=done(variant)))
@@ -169,6 +171,7 @@ def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[o
 
 @every_variant
 @pytest.mark.parametrize("present", [115200, 921600])
+@pytest.mark.manual("A 1.1 default rate", "A 1.6 CMD 15")
 def test_factory_reset_is_read_back_and_the_line_follows(variant: str, present: int) -> None:
     settings = Imu61xSettings(baud=present, rate_hz=200, filter_control=0, i2c_address=0x1B)
     far = variant_bench(variant, settings)

@@ -34,12 +34,14 @@ FULL = Status(
 )  # fmt: skip
 
 
+@pytest.mark.manual("A 1.4 software version", "A 1.4 hardware version", "A 1.4 status members")
 def test_s1_of_66_bytes() -> None:
     assert len(S1) == 0x42
     assert parse_status(ReplyFrame(0xFF, S1)) == FULL
     assert pack_status(FULL) == S1
 
 
+@pytest.mark.manual("A 1.4 frame")
 def test_s1_as_a_whole_frame() -> None:
     """Its length field reads 0x0042, as table 5 has it."""
     frame = encode_status(FULL)
@@ -51,6 +53,7 @@ def test_s1_as_a_whole_frame() -> None:
 
 
 @pytest.mark.parametrize("size", range(STATUS_BYTES_MIN, 90))
+@pytest.mark.manual("A 1.4 frame")
 def test_s1_of_any_length_says_what_is_there_whole(size: int) -> None:
     ends = {
         "system_status": 26, "cpu_load": 28, "drop_rate": 30, "i2c_master": 31, "voltage": 32,
@@ -70,6 +73,7 @@ def test_what_is_no_s1(message: ReplyFrame | str) -> None:
     assert parse_status(message) is None
 
 
+@pytest.mark.manual("A 1.5 frame")
 def test_p1() -> None:
     """Parameter 3 = 921600 bit/s: 0x49610000 as a float."""
     payload = bytes.fromhex("00006149 00000000 03000000 00000000 00000000 00000000")
@@ -80,10 +84,12 @@ def test_p1() -> None:
     assert parse_parameter("P1") is None
 
 
+@pytest.mark.manual("A 1.5 parameter 3")
 def test_parameters_of_table_9() -> None:
     assert [parameter.value for parameter in Parameter] == [3, 8, 9, 10, 16, 17, 18, 21, 27, 30, 31]
 
 
+@pytest.mark.manual("A 1.7 K1")
 def test_k1() -> None:
     payload = bytes.fromhex("0E00 0500")
     assert parse_acknowledgement(ReplyFrame(0x1234, payload)) == Acknowledgement(14, 5)

@@ -28,6 +28,7 @@ def streams(far: Imu61xBench) -> bool:
 
 
 @every_variant
+@pytest.mark.manual("A 1.4 serial number")
 def test_identity_and_the_stream_goes_on(variant: str) -> None:
     far = variant_bench(variant)
     identity = far.run(session.identify())
@@ -55,6 +56,7 @@ def test_a_device_in_command_mode_stays_there(variant: str) -> None:
 
 
 @every_variant
+@pytest.mark.manual("A 1.4 status members")
 def test_status_has_names(variant: str) -> None:
     words = variant_bench(variant).run(session.device_status())
     head = {
@@ -102,6 +104,7 @@ def test_a_refused_sample_is_said() -> None:
         imu61x_bench(QUIET, ignores=frozenset({Command.AHRS})).run(session.sample_once())
 
 
+@pytest.mark.manual("A 1.8 two hosts")
 def test_without_a_transmit_line_nothing_changes() -> None:
     far = imu61x_bench()
     far.connected = False
@@ -124,6 +127,7 @@ def test_streaming_is_started_again_when_the_answer_fails() -> None:
 
 
 @every_variant
+@pytest.mark.manual("A 1.5 parameter 21", "A 1.5 parameter 27", "A 1.5 parameter 30", "A 1.5 parameter 31")
 def test_settings_have_names_and_units(variant: str) -> None:
     far = variant_bench(
         variant, Imu61xSettings(rate_hz=50, filter_control=0x4B, i2c_address=0x1A, gyro_off_deg_s=(0.5, -0.25, 0.0))
@@ -151,6 +155,7 @@ def test_values_that_are_none_of_the_manuals_are_shown_as_they_are() -> None:
 
 
 @every_variant
+@pytest.mark.manual("A 1 stream mode", "A 1 command mode")
 def test_command_mode_and_stream(variant: str) -> None:
     far = variant_bench(variant)
     far.run(session.stop_streaming(done=done(variant)))
@@ -183,6 +188,7 @@ ORDERS: dict[Command, Callable[[], RequestScript[object]]] = {
 
 
 @pytest.mark.parametrize("command", ORDERS)
+@pytest.mark.manual("A 1.7 K1")
 def test_a_refusal_is_an_error_that_names_the_option(command: Command) -> None:
     far = imu61x_bench(refuses=frozenset({command}))
     with pytest.raises(Rejected, match=r"expected result 0 \(done\), got 2: it refused, or `options.result_done`"):
@@ -198,6 +204,7 @@ def test_an_order_without_an_acknowledgement_is_not_known_to_be_done(command: Co
 
 
 @every_variant
+@pytest.mark.manual("A 1.6 CMD 5")
 def test_saved_parameters_stay(variant: str) -> None:
     far = variant_bench(variant)
     far.run(session.write_parameter(Parameter.FILTER, 0x44))
@@ -266,6 +273,7 @@ def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parame
 
 @every_variant
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 359.0])
+@pytest.mark.manual("A 1.6 CMD 4")
 def test_heading_reset(variant: str, heading_deg: float) -> None:
     if variant == "no K1":
         return  # see above: not known to be done

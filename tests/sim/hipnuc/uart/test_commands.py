@@ -46,6 +46,7 @@ def test_replies_stand_between_whole_frames() -> None:
         "LOG D\xffLOG VERSION\n",
     ],
 )
+@pytest.mark.manual("B 2 line end")
 def test_line_ends_and_garbage_before_a_command(line: str) -> None:
     bench = HipnucUartBench()
     bench.module.receive(line.encode("latin-1"), bench.now_ns)
@@ -143,6 +144,7 @@ def test_magconfig_and_usrconfig_have_the_manuals_form() -> None:
 
 
 @pytest.mark.parametrize("mounting", commands.Mounting)
+@pytest.mark.manual("B 2.2.4 URFR")
 def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: commands.Mounting) -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     before = bench.frames(20.0)[-1]
@@ -158,6 +160,7 @@ def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: command
     assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude turned with the axes: force still points up
 
 
+@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5")
 def test_relative_level_zeroes_roll_and_pitch_and_can_be_cancelled() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
@@ -169,6 +172,7 @@ def test_relative_level_zeroes_roll_and_pitch_and_can_be_cancelled() -> None:
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
 
 
+@pytest.mark.manual("B 2.2.4 ATT RST 3")
 def test_automatic_level_turns_the_accelerometer_too() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.ask("CONFIG ATT RST 3") == ["OK"]
@@ -196,6 +200,7 @@ def test_level_survives_a_reboot_if_saved() -> None:
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
 
 
+@pytest.mark.manual("B 2.2.4 YAW 1", "B 2.2.4 YAW 0")
 def test_yaw_absolute_and_relative_is_lost_at_reboot() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     for command, yaw_deg in (("CONFIG YAW 1 16", 16.0), ("CONFIG YAW 0 1.5", 17.5), ("CONFIG YAW 1 -170", -170.0)):

@@ -29,6 +29,7 @@ def run(bench: HipnucUartBench, duration_ms: float) -> tuple[list[Burst], list[P
 
 
 @pytest.mark.parametrize("settings", [ModuleSettings(), FAST, ModuleSettings(baud=115_200, hi91=Output(1))])
+@pytest.mark.manual("B 1.2.2 SOUT", "B 2.2.4 PMUX2 SOUT")
 def test_each_frame_has_its_pulse_right_before_it(settings: ModuleSettings) -> None:
     bench = HipnucUartBench(settings)
     bursts, edges = run(bench, 1000.0)
@@ -106,6 +107,7 @@ def test_pins_that_nobody_watches_cost_no_memory() -> None:
 
 
 @pytest.mark.parametrize("divider", [1, 4, 8, 64])
+@pytest.mark.manual("B 2.2.4 divider")
 def test_every_nth_pulse_is_repeated(divider: int) -> None:
     bench = HipnucUartBench()
     assert bench.ask(sout_divider(divider).payload.decode().strip()) == ["OK"]
@@ -127,6 +129,7 @@ def test_a_new_divider_counts_anew() -> None:
     assert rises[0] - bench.now_ns + 1000 * NS_PER_MS == pytest.approx(20 * 10 * NS_PER_MS, abs=10 * NS_PER_MS)
 
 
+@pytest.mark.manual("B 2.2.4 PMUX4 SOUT_DIV")
 def test_the_factory_divides_by_eight() -> None:
     _, edges = run(HipnucUartBench(), 1000.0)
     periods = [(b.due_ns - a.due_ns) / NS_PER_MS for (a, _), (b, _) in pairwise(pulses(edges, Pin.SOUT_DIV))]
@@ -137,6 +140,7 @@ def test_the_factory_divides_by_eight() -> None:
 # --- ALARM ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.manual("B 2.2.4 alarm level")
 def test_alarm_follows_the_angles() -> None:
     motion = swing()
     bench = HipnucUartBench(hardware=HipnucHardware(motion=motion, skew_ppm=0))
@@ -198,6 +202,7 @@ def test_without_power_all_pins_are_low_and_nothing_comes() -> None:
 # --- SIN --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.manual("B 1.2.1 delay of the answer", "B 2.2.4 PMUX1 SIN")
 def test_a_trigger_is_answered_125_us_later_on_average() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(on_mark=True)))
     delays, wire_ns = [], 82 * 10 * NS_PER_S // 921_600

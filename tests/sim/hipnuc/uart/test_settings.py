@@ -32,11 +32,13 @@ FACTORY = ModuleSettings()
         ("UNLOGALL", replace(FACTORY, hi91=Output())),
     ],
 )
+@pytest.mark.manual("B 2.2.5 names")
 def test_examples_of_the_manual(line: str, expected: ModuleSettings) -> None:
     assert changed(FACTORY, line, 156) == expected
 
 
 @pytest.mark.parametrize("mounting", Mounting)
+@pytest.mark.manual("B 2.2.4 URFR presets")
 def test_every_mounting_of_the_host_is_understood(mounting: Mounting) -> None:
     settings = changed(FACTORY, commands.mounting(mounting).name, 156)
     assert settings
@@ -95,11 +97,13 @@ def test_other_commands_are_not_for_it(line: str) -> None:
     assert changed(FACTORY, line, 156) is None
 
 
+@pytest.mark.manual("B 2.2.4 pins by firmware")
 def test_pins_need_newer_firmware() -> None:
     assert changed(FACTORY, "CONFIG PMUX3 IO2", 154) is None
     assert changed(FACTORY, "CONFIG PMUX3 IO2", 155) is not None
 
 
+@pytest.mark.manual("B 1.2.2 timed output off")
 def test_unlogall_keeps_triggered_messages() -> None:
     settings = replace(FACTORY, hi92=Output(on_mark=True))
     assert changed(settings, "UNLOGALL", 156) == replace(settings, hi91=Output())

@@ -25,6 +25,7 @@ T = TypeVar("T")
 # --- frames and time --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.manual("B 3.2 factory output")
 def test_factory_output_is_hi91_at_100_hz() -> None:
     frames = HipnucUartBench().frames(1000.0)
     assert len(frames) == pytest.approx(100, abs=1)
@@ -117,6 +118,7 @@ def test_both_messages_share_the_wire() -> None:
     assert (sizes.count(82), sizes.count(54)) == pytest.approx((50, 20), abs=1)
 
 
+@pytest.mark.manual("B 3.3.1 system_time")
 def test_system_time_wraps_at_32_bits() -> None:
     frames = HipnucUartBench(hardware=HipnucHardware(uptime_ms=2**32 - 700)).frames(1000.0)
     times = [frame.system_time_ms for frame in frames]
@@ -161,6 +163,7 @@ def test_a_pulse_restarts_the_pps_stamp() -> None:
     assert frame.word_1_2 == frame.system_time_ms - 625
 
 
+@pytest.mark.manual("B 2.2.5 ONMARK 1")
 def test_marked_messages_come_with_the_pulse_and_once() -> None:
     bench = HipnucUartBench()
     assert bench.ask("UNLOGALL") == ["OK"]

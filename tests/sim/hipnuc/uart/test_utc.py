@@ -120,6 +120,7 @@ def test_bad_sentences_say_nothing(spoil: Callable[[int], bytes]) -> None:
     assert receiver.frames[-1][1].system_time_ms < 10_000
 
 
+@pytest.mark.manual("B 1.2.1 RMC sentences")
 def test_ten_sentences_a_second_name_the_same_pulse() -> None:
     receiver = Receiver(still())
     for _ in range(6):

@@ -1,0 +1,86 @@
+"""Items of the vendors' manuals: what imud does with each, where, and which tests show it.
+
+A test says which items it shows with a mark, `@pytest.mark.manual("B 2.2.3 SERIALCONFIG", …)`. The marks are read from
+the source of the tests; nothing is imported or run for it.
+"""
+
+import ast
+import importlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+TESTS: Final = Path(__file__).parents[1]
+MARK: Final = "manual"
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One thing that a manual says."""
+
+    key: str
+    """Letter of the manual, section, and a short name; as in the marks."""
+    words: str
+    """What is to work, for people."""
+    code: str = ""
+    """`module:name` below `imud`, where the work is done; empty for what is left."""
+    left: str = ""
+    """Why nothing is done about it; empty for what works."""
+
+    @property
+    def section(self) -> str:
+        """Letter and number, for example `B 2.2.3`."""
+        return " ".join(self.key.split(" ")[:2])
+
+    @property
+    def code_exists(self) -> bool:
+        """Whether `code` names something that is there."""
+        module, _, name = self.code.partition(":")
+        try:
+            return hasattr(importlib.import_module(f"imud.{module}"), name)
+        except ImportError:
+            return False
+
+
+@cache
+def marks() -> dict[str, list[str]]:
+    """Return the tests, as `path::name`, by the key of each item that they have a mark for."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(TESTS.rglob("test_*.py")):
+        for key, name in _marks_of(ast.parse(path.read_text())):
+            found.setdefault(key, []).append(f"{path.relative_to(TESTS)}::{name}")
+    return found
+
+
+def _marks_of(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            for decorator in node.decorator_list:
+                for key in _keys(decorator):
+                    yield key, node.name
+
+
+def _keys(decorator: ast.expr) -> Iterator[str]:
+    """The arguments of `pytest.mark.manual(…)`; none for any other decorator."""
+    if isinstance(decorator, ast.Call) and isinstance(decorator.func, ast.Attribute) and decorator.func.attr == MARK:
+        for argument in decorator.args:
+            assert isinstance(argument, ast.Constant), "a mark has its keys as they are, so that they can be read"
+            yield str(argument.value)
+
+
+def faults(items: Mapping[str, Item], marked: Mapping[str, list[str]]) -> Iterator[str]:
+    """What is wrong with the account, a line each: items without code or tests, marks without an item."""
+    for key, item in items.items():
+        if item.left and (item.code or key in marked):
+            yield f"{key}: left, although it has code or a test"
+        if item.left:
+            continue
+        if not item.code_exists:
+            yield f"{key}: no {item.code} in imud"
+        if key not in marked:
+            yield f"{key}: no test has a mark for it"
+    for key, tests in marked.items():
+        if key not in items:
+            yield f"{key}: no such item, although {tests[0]} has a mark for it"
