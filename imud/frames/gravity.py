@@ -13,7 +13,7 @@ All directions are in the sensor's own axes, as the device sends them.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from math import acos, asin, atan2, cos, degrees, hypot, isfinite
+from math import acos, asin, atan2, cos, degrees, hypot, inf, isfinite
 from typing import Final
 
 from imud.attitude import Matrix3, matrix_from_quat, matrix_times
@@ -126,9 +126,9 @@ def cos_deg(angle_deg: float) -> float:
 
 def _directions(device: DeviceAxes, sample: Sample) -> Iterator[tuple[str, Vector3]]:
     """List where up is in the sensor's axes, by each member that says so."""
-    euler = sample.euler_rad
-    if sample.quat_wxyz is not None and any(sample.quat_wxyz):
-        yield "quat_wxyz", _up_of(device, sample.quat_wxyz)
+    quat, euler = sample.quat_wxyz, sample.euler_rad
+    if quat is not None and 0.0 < hypot(*quat) < inf:
+        yield "quat_wxyz", _up_of(device, quat)
     if euler is not None and isfinite(euler[0] + euler[1]):
         yield "euler_rad", _up_of(device, TO_QUAT[device.order]((euler[0], euler[1], 0.0)))
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from math import cos, radians, sin
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -24,6 +24,7 @@ from imud.units import NS_PER_S
 
 G = 9.80665
 TICK_NS = NS_PER_S // 10
+quick = settings(max_examples=100, derandomize=True, deadline=None, database=None)
 FRD = DeviceAxes(order=EulerOrder.ZYX, has_north=False, z_down=True)
 
 
@@ -58,6 +59,7 @@ def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -
     return check.finding
 
 
+@quick
 @given(st.floats(-179, 179), st.floats(-89, 89), st.floats(-180, 180))
 def test_nothing_is_found_in_any_attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> None:
     assert found(FLU_LEVEL, zyx(roll_deg, pitch_deg, yaw_deg)) is None
@@ -241,8 +243,11 @@ def test_what_has_no_vectors_is_left_out() -> None:
     assert judged(replace(one, gyro_rad_s=None) for one in ticks(WRONG, 20)) == 0
     assert judged(replace(one, accel_m_s2=None) for one in ticks(WRONG, 20)) == 0
     assert found(FLU_LEVEL, replace(WRONG, quat_wxyz=None, euler_rad=None)) is None
-    unknown = replace(WRONG, quat_wxyz=(0, 0, 0, 0), euler_rad=(float("nan"), 0.0, 0.0))
-    assert found(FLU_LEVEL, unknown) is None
+    nan, inf = float("nan"), float("inf")
+    for quat in ((0.0, 0.0, 0.0, 0.0), (nan, 0.0, 0.0, 0.0), (inf, 0.0, 0.0, 0.0), (1e308, 1e308, 1e308, 1e308)):
+        assert found(FLU_LEVEL, replace(WRONG, quat_wxyz=quat, euler_rad=(nan, 0.0, 0.0))) is None
+    for accel in ((nan, 0.0, G), (inf, 0.0, G)):
+        assert judged(replace(one, accel_m_s2=accel) for one in ticks(WRONG, 20)) == 0
 
 
 def test_the_finding_ends_when_rest_shows_no_contradiction() -> None:

@@ -3,7 +3,7 @@
 from math import cos, hypot, isnan, nan, pi, radians, sin, sqrt
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -26,6 +26,7 @@ from imud.sample import Quaternion, Sample, Sync, Vector3
 
 G = 9.8
 HALF = sqrt(0.5)
+quick = settings(max_examples=100, derandomize=True, deadline=None, database=None)
 ENU, NED = Convention.ENU_FLU, Convention.NED_FRD
 
 
@@ -200,12 +201,12 @@ def test_a_module_in_any_mounting_shows_the_same_as_one_that_is_mounted_straight
     matrix = matrix_from_quat(attitude)
     up = matrix[2]
     body_accel = (up[0] * G, up[1] * G, up[2] * G)
-    for settings in (FrameSettings(euler=MountingAngles(roll_deg=33, pitch_deg=-50, yaw_deg=170)), FrameSettings()):
+    for given_frame in (FrameSettings(euler=MountingAngles(roll_deg=33, pitch_deg=-50, yaw_deg=170)), FrameSettings()):
         for device in (RFU_ENU, FLU_LEVEL):
-            mounting = frame(settings, ENU, device=device).mounting
+            mounting = frame(given_frame, ENU, device=device).mounting
             quat = quat_from_matrix(matrix_product(matrix, mounting))
             one = replace(sample(matrix_times(transposed(mounting), body_accel)), quat_wxyz=quat)
-            made = turned(one, frame(settings, ENU, device=device))
+            made = turned(one, frame(given_frame, ENU, device=device))
             assert made.accel_m_s2 == pytest.approx(body_accel)
             assert same_rotation(made.quat_wxyz, attitude)
 
@@ -346,6 +347,7 @@ FRAMES = st.builds(
 )
 
 
+@quick
 @given(FRAMES, VECTORS, VECTORS, VECTORS, QUATS)
 def test_lengths_and_the_direction_of_gravity_are_kept(
     published: PublishedFrame, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
@@ -371,6 +373,7 @@ def _triple(a: Vector3, b: Vector3, c: Vector3) -> float:
     return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 
 
+@quick
 @given(st.none() | MOUNTINGS, DEVICES, VECTORS, QUATS)
 def test_what_a_client_asks_for_is_what_the_device_would_be_configured_to(
     settings: FrameSettings | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
@@ -396,6 +399,7 @@ def test_what_a_client_asks_for_is_what_the_device_would_be_configured_to(
         assert same_rotation(again.quat_wxyz, direct[configured].quat_wxyz or (0, 0, 0, 0))
 
 
+@quick
 @given(st.sampled_from([ENU, NED]), st.none() | st.floats(-30, 30), DEVICES, VECTORS, QUATS)
 def test_a_client_of_a_device_without_convention(
     asked: Convention, declination_deg: float | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
@@ -408,6 +412,23 @@ def test_a_client_of_a_device_without_convention(
     made, wanted = rotation.sample(published), turned(one, frame(None, asked, declination_deg, device))
     assert made.accel_m_s2 == pytest.approx(wanted.accel_m_s2, abs=1e-9)
     assert same_rotation(made.quat_wxyz, wanted.quat_wxyz or (0, 0, 0, 0))
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+ANY3 = st.none() | st.tuples(ANY, ANY, ANY)
+
+
+@quick
+@given(FRAMES, ANY3, ANY3, st.none() | st.tuples(ANY, ANY, ANY, ANY))
+def test_no_value_of_a_device_raises(
+    published: PublishedFrame, vector: Vector3 | None, euler: Vector3 | None, quat: Quaternion | None
+) -> None:
+    one = Sample(
+        "bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=vector, gyro_rad_s=vector, quat_wxyz=quat, euler_rad=euler
+    )
+    made = turned(one, published)
+    assert (made.accel_m_s2 is None) == (vector is None)
+    assert made.quat_wxyz is None or made.euler_rad is not None, "a quaternion never without its angles"
 
 
 # --- words ------------------------------------------------------------------------------------------------------------

@@ -59,7 +59,8 @@ EULER_CONVENTION: Final = (
 
 The vendor contradicts itself about the axes: its driver for ROS 1 turns Y and Z, pitch and yaw about, as for a device
 whose Z points down; its driver for ROS 2 and its serial library do not. Values are passed on as sent. A device that
-lies level and shows -9.8 m/s² in Z has its Z down."""
+lies level and shows -9.8 m/s² in Z has its Z down: then `frame: {z_down: true}` in the configuration makes them right,
+and imud says so when it sees that device at rest (`imud.frames.gravity`)."""
 NAVIGATION_FRAME: Final = (
     "level, Z up (assumed, the manual states none; with the device's Z down it is Z down); "
     "heading from power-on or the last heading reset"
