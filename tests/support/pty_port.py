@@ -1,4 +1,7 @@
-"""Pseudo-terminals as serial ports: with the far end in the test's hand, or a simulated RS-485 line behind it."""
+"""Pseudo-terminals as serial ports: with the far end in the test's hand, or a simulated RS-485 line behind it.
+
+`ModbusBench` is such a line without a port, in virtual time: transfer scripts run on it.
+"""
 
 import array
 import fcntl
@@ -8,15 +11,22 @@ import termios
 import threading
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, TypeVar
 
-from imud.formats.modbus import SLAVES
-from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings
+from imud.contracts.action import Target
+from imud.contracts.polling import Transfer, TransferScript
+from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings
+from imud.errors import TransferError, Trouble
+from imud.formats.modbus import BROADCAST, SLAVES, ReplyFinder, frame_gap_ns, framed
+from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings, SlaveVariant
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort
-from imud.units import NS_PER_S
+from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+
+T = TypeVar("T")
 
 NOBODY_UID = 65534
 SETTLED_S = 0.05
@@ -132,3 +142,87 @@ def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0
         thread.join(LIMIT_S)
         port.close()
         assert not failed, failed
+
+
+# --- without a port, in virtual time ----------------------------------------------------------------------------------
+
+REPLY_MS = 20
+LINE_BAUD = 115200
+BEGIN_NS = 5 * NS_PER_S
+
+
+class ModbusBench:
+    """A line whose port has a rate of its own, and the address at which the script's device is."""
+
+    def __init__(self, *slaves: Slave, at: int = 7, baud: int = LINE_BAUD) -> None:
+        self.line = ModbusLine(BEGIN_NS, slaves or [modbus_slave(7)])
+        self.now_ns = BEGIN_NS
+        self.at = at
+        self.baud = baud
+        self.sent: list[tuple[int, bytes]] = []
+        """Address and request of each transfer."""
+
+    @property
+    def slave(self) -> Slave:
+        """The first module."""
+        return self.line.slaves[0]
+
+    @property
+    def target(self) -> Target:
+        """What actions and settings get."""
+        return Target(HipnucModbusSettings(), self.baud, places=tuple(dict.fromkeys((self.at, 7))))
+
+    def run(self, script: TransferScript[T]) -> T:
+        """Run a transfer script to its end; return its value, raise what it raises."""
+        return _run_transfers(script, self)
+
+    def transfer(self, transfer: Transfer) -> bytes:
+        """One transfer, with the time it takes. Raises TransferError where no reply comes in time."""
+        address = self.at if transfer.at is None else transfer.at
+        try:
+            return self._ask(address, transfer)
+        finally:
+            if transfer.then_at is not None:
+                self.at = transfer.then_at
+
+    def _ask(self, address: int, transfer: Transfer) -> bytes:
+        (request,) = transfer.sends
+        self.sent.append((address, request))
+        frame = framed(address, request)
+        self.now_ns += frame_gap_ns(self.baud)
+        self.line.receive(frame, self.now_ns)
+        finder = ReplyFinder(frame, transfer.read_bytes, echoes=False)
+        wire_ns = (len(frame) + transfer.read_bytes) * uart_byte_ns(self.baud) + 2 * frame_gap_ns(self.baud)
+        end_ns = self.now_ns + wire_ns + max(REPLY_MS, transfer.reply_ms) * NS_PER_MS
+        while (next_ns := self.line.next_ns()) is not None and next_ns <= end_ns:
+            self.now_ns = max(next_ns, self.now_ns)
+            for burst in self.line.advance(self.now_ns):
+                reply = finder.feed(burst.data if self.line.baud == self.baud else b"")
+                if reply is not None:
+                    return reply
+        self.now_ns = end_ns
+        self.line.advance(end_ns)
+        if address == BROADCAST:
+            return b""
+        raise TransferError(Trouble.DISTURBED, f"no reply from address {address}")
+
+
+def modbus_slave(address: int = 7, serial: int = 0, variant: SlaveVariant | None = None, **more: Any) -> Slave:
+    """A module; its serial number ends with its first address."""
+    number = (0xA000_0000_0000_0000 + (serial or address)).to_bytes(8, "big")
+    return Slave(number, SlaveSettings(address, LINE_BAUD), variant=variant or SlaveVariant(), **more)
+
+
+def _run_transfers(script: Generator[Transfer, bytes, T], bench: ModbusBench) -> T:
+    try:
+        wanted = next(script)
+        while True:
+            try:
+                data = bench.transfer(wanted)
+            except TransferError as error:
+                wanted = script.throw(error)
+            else:
+                wanted = script.send(data)
+    except StopIteration as end:
+        value: T = end.value
+        return value

@@ -5,7 +5,7 @@ registers behind I2C and SPI are read by single transfers.
 """
 
 import struct
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from math import radians
 from typing import Any, NamedTuple, TypeVar
@@ -13,22 +13,23 @@ from typing import Any, NamedTuple, TypeVar
 import pytest
 
 from imud.contracts.action import Target
+from imud.contracts.can import CanCodec, CanDriver
 from imud.contracts.codec import CodecEvent, ReplyFrame, message_of
-from imud.contracts.polling import Transfer, TransferScript
+from imud.contracts.polling import Transfer
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
-from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings
-from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.devices.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.devices.hipnuc.j1939.driver import DRIVER as J1939_DRIVER
 from imud.devices.hipnuc.uart.actions import ACTIONS
 from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings
 from imud.devices.imu61x.uart.codec import Imu61xCodec
-from imud.errors import TransferError, Trouble
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter
-from imud.formats.modbus import BROADCAST, ReplyFinder, frame_gap_ns, framed
 from imud.ledger import Ledger
 from imud.sample import Measurement
-from imud.sim.can_module import SentFrame
+from imud.sim.can_module import CanModule, SentFrame
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings, NodeVariant
-from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings, SlaveVariant
+from imud.sim.hipnuc.j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
 from imud.sim.hipnuc.uart.behaviour import Behaviour
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule
@@ -39,7 +40,7 @@ from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule
 from imud.sim.physics.motion import Still
 from imud.sim.ports.uart_wire import heard
 from imud.sim.simulator import Burst
-from imud.units import NS_PER_MS, NS_PER_US, uart_byte_ns
+from imud.units import NS_PER_MS, NS_PER_US
 
 T = TypeVar("T")
 
@@ -195,28 +196,16 @@ def unpack(payload: bytes) -> tuple[int, bytes]:
     return can_id, data[:size]
 
 
-class CanopenBench:
-    """A module, others on its bus, a codec that hears it, and a session."""
+class CanBench:
+    """A module on a CAN bus, others beside it, a codec that hears it, and a session."""
 
-    def __init__(
-        self,
-        factory: NodeSettings | None = None,
-        boot_ms: int = 0,
-        variant: NodeVariant | None = None,
-        others: tuple[int, ...] = (),
-    ) -> None:
-        """`others`: numbers of other nodes, which send."""
+    def __init__(self, driver: CanDriver, module: CanModule, settings: Any, others: Sequence[CanModule] = ()) -> None:
         self.now_ns = BEGIN_NS
-        made = NodeVariant() if variant is None else variant
-        hardware = HipnucCanopenHardware(factory=factory or QUIET, boot_ms=boot_ms, skew_ppm=0, variant=made)
-        self.module = HipnucCanopenModule(BEGIN_NS, hardware)
-        self.others = [
-            HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=NodeSettings(node=node), boot_ms=0))
-            for node in others
-        ]
-        self.settings = HipnucCanopenSettings(node=self.module.node)
+        self.driver = driver
+        self.bus: tuple[CanModule, ...] = (module, *others)
+        self.settings = settings
         """Settings of the driver, which scripts change when they follow the module."""
-        self.codec = HipnucCanopenCodec(Ledger(), self.settings)
+        self.codec: CanCodec = driver.make_codec(Ledger(), settings)
         self.session = Session(self.codec.ledger)
         self.sent: list[tuple[int, bytes]] = []
         """What the host sent."""
@@ -234,9 +223,9 @@ class CanopenBench:
         end_ns = self.now_ns + duration_ns
         while self.now_ns < end_ns:
             self.now_ns += CAN_STEP_NS
-            frames = self.module.advance(self.now_ns)
+            frames, *beside = [module.advance(self.now_ns) for module in self.bus]
             self.heard += [(frame.can_id, frame.data) for frame in frames]
-            for frame in [*frames, *(frame for other in self.others for frame in other.advance(self.now_ns))]:
+            for frame in [*frames, *(frame for sent in beside for frame in sent)]:
                 if (outcome := self._hear(frame)) is not None:
                     return outcome
             silence = self.session.on_time(self.now_ns)
@@ -256,24 +245,31 @@ class CanopenBench:
             return self.session.on_message(ReplyFrame(frame.can_id, frame.data), self.now_ns)
         return None
 
-    def send(self, can_id: int, data: bytes) -> None:
+    def send(self, can_id: int, data: bytes, *, extended: bool = False) -> None:
         """A frame of the host."""
         self.sent.append((can_id, data))
-        for module in (self.module, *self.others):
-            module.receive(can_id, False, data, self.now_ns)
+        for module in self.bus:
+            module.receive(can_id, extended, data, self.now_ns)
 
     def run_script(self, script: RequestScript[T]) -> T:
         """Run a request script to its end."""
         return run_script(script, self._ask)
 
+    def act(self, name: str, **given: object) -> object:
+        """Run an action of the driver."""
+        action = self.driver.actions[name]
+        result: object = self.run_script(action.script(self.target(), action.arguments(given)))
+        return result
+
     def _ask(self, request: Request) -> Outcome:
         if request.settings is not None:
             self.settings = request.settings
-            self.codec = HipnucCanopenCodec(self.codec.ledger, self.settings)
+            self.codec = self.driver.make_codec(self.codec.ledger, self.settings)
         self._also = request.also
         payload = self.session.start(request, self.now_ns)
         if payload:
-            self.send(*unpack(payload))
+            can_id, size, data = RAW_FRAME.unpack(payload)
+            self.send(can_id & ~EXTENDED_FLAG, data[:size], extended=bool(can_id & EXTENDED_FLAG))
         if request.silent:
             return Reply(())
         outcome = self.run(request.timeout_ns + 2 * CAN_STEP_NS)
@@ -281,87 +277,44 @@ class CanopenBench:
         return outcome
 
 
-# --- HiPNUC on RS-485 ------------------------------------------------------------------------------------------------
+class CanopenBench(CanBench):
+    """A CANopen node."""
 
-REPLY_MS = 20
-LINE_BAUD = 115200
-
-
-class ModbusBench:
-    """A line whose port has a rate of its own, and the address at which the script's device is."""
-
-    def __init__(self, *slaves: Slave, at: int = 7, baud: int = LINE_BAUD) -> None:
-        self.line = ModbusLine(BEGIN_NS, slaves or [modbus_slave(7)])
-        self.now_ns = BEGIN_NS
-        self.at = at
-        self.baud = baud
-        self.sent: list[tuple[int, bytes]] = []
-        """Address and request of each transfer."""
-
-    @property
-    def slave(self) -> Slave:
-        """The first module."""
-        return self.line.slaves[0]
-
-    @property
-    def target(self) -> Target:
-        """What actions and settings get."""
-        return Target(HipnucModbusSettings(), self.baud, places=tuple(dict.fromkeys((self.at, 7))))
-
-    def run(self, script: TransferScript[T]) -> T:
-        """Run a transfer script to its end; return its value, raise what it raises."""
-        return _run_transfers(script, self)
-
-    def transfer(self, transfer: Transfer) -> bytes:
-        """One transfer, with the time it takes. Raises TransferError where no reply comes in time."""
-        address = self.at if transfer.at is None else transfer.at
-        try:
-            return self._ask(address, transfer)
-        finally:
-            if transfer.then_at is not None:
-                self.at = transfer.then_at
-
-    def _ask(self, address: int, transfer: Transfer) -> bytes:
-        (request,) = transfer.sends
-        self.sent.append((address, request))
-        frame = framed(address, request)
-        self.now_ns += frame_gap_ns(self.baud)
-        self.line.receive(frame, self.now_ns)
-        finder = ReplyFinder(frame, transfer.read_bytes, echoes=False)
-        wire_ns = (len(frame) + transfer.read_bytes) * uart_byte_ns(self.baud) + 2 * frame_gap_ns(self.baud)
-        end_ns = self.now_ns + wire_ns + max(REPLY_MS, transfer.reply_ms) * NS_PER_MS
-        while (next_ns := self.line.next_ns()) is not None and next_ns <= end_ns:
-            self.now_ns = max(next_ns, self.now_ns)
-            for burst in self.line.advance(self.now_ns):
-                reply = finder.feed(burst.data if self.line.baud == self.baud else b"")
-                if reply is not None:
-                    return reply
-        self.now_ns = end_ns
-        self.line.advance(end_ns)
-        if address == BROADCAST:
-            return b""
-        raise TransferError(Trouble.DISTURBED, f"no reply from address {address}")
+    def __init__(
+        self,
+        factory: NodeSettings | None = None,
+        boot_ms: int = 0,
+        variant: NodeVariant | None = None,
+        others: tuple[int, ...] = (),
+    ) -> None:
+        """`others`: numbers of other nodes, which send."""
+        made = NodeVariant() if variant is None else variant
+        hardware = HipnucCanopenHardware(factory=factory or QUIET, boot_ms=boot_ms, skew_ppm=0, variant=made)
+        self.module = HipnucCanopenModule(BEGIN_NS, hardware)
+        self.others = [
+            HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=NodeSettings(node=node), boot_ms=0))
+            for node in others
+        ]
+        settings = HipnucCanopenSettings(node=self.module.node)
+        super().__init__(CANOPEN_DRIVER, self.module, settings, self.others)
 
 
-def modbus_slave(address: int = 7, serial: int = 0, variant: SlaveVariant | None = None, **more: Any) -> Slave:
-    """A module; its serial number ends with its first address."""
-    number = (0xA000_0000_0000_0000 + (serial or address)).to_bytes(8, "big")
-    return Slave(number, SlaveSettings(address, LINE_BAUD), variant=variant or SlaveVariant(), **more)
+class J1939Bench(CanBench):
+    """A module on J1939."""
 
-
-def _run_transfers(script: Generator[Transfer, bytes, T], bench: ModbusBench) -> T:
-    try:
-        wanted = next(script)
-        while True:
-            try:
-                data = bench.transfer(wanted)
-            except TransferError as error:
-                wanted = script.throw(error)
-            else:
-                wanted = script.send(data)
-    except StopIteration as end:
-        value: T = end.value
-        return value
+    def __init__(
+        self,
+        settings: J1939Settings | None = None,
+        boot_ms: int = 0,
+        variant: J1939Variant | None = None,
+        others: tuple[int, ...] = (),
+    ) -> None:
+        """`others`: addresses of other modules, which send."""
+        hardware = J1939Hardware(boot_ms=boot_ms, skew_ppm=0, variant=variant or J1939Variant())
+        flash = settings or J1939Settings()
+        self.module = HipnucJ1939Module(BEGIN_NS, flash, hardware)
+        beside = [HipnucJ1939Module(BEGIN_NS, J1939Settings(address=one), J1939Hardware(boot_ms=0)) for one in others]
+        super().__init__(J1939_DRIVER, self.module, HipnucJ1939Settings(address=flash.address), beside)
 
 
 # --- IMU61x -----------------------------------------------------------------------------------------------------------

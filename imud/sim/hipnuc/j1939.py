@@ -2,21 +2,23 @@
 
 Without I/O and without a clock of its own. It samples at whole milliseconds of its own crystal, which runs `skew_ppm`
 fast; messages due in the same millisecond are of one instant and leave back to back, lowest PGN first, `processing_ns`
-later. Requests on PGN EF00 are obeyed at once and answered to 0x55, whatever the sender. Assumed, where the manual is
-silent: an unknown register is not answered, a value out of range is answered with the value that stays, an interval
-applies from the next whole multiple of it, the zero concerns the inclinometer only, and the direction is turned after
-it.
+later. Requests on PGN EF00 are obeyed at once and answered to 0x55, whatever the sender; a restart is not answered, nor
+is a message that is sent once, which answers by itself. After power-on, and when asked (PGN EA00), it claims its
+address (J1939-81). Registers 0x70 to 0x78 are those of Modbus. What else no manual settles is in `J1939Variant`.
+Assumed, where the manual is silent: an unknown register is not answered, a value out of range is answered with the
+value that stays, an interval applies from the next whole multiple of it, the zero concerns the inclinometer only, and
+the direction is turned after it.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import atan2, cos, pi, sin
-from typing import Final
+from typing import Final, Literal
 
 from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
 from imud.devices.hipnuc.j1939.session import LAYOUT, READ, WRITE
-from imud.formats.j1939 import J1939Id, join, split
+from imud.formats.j1939 import GLOBAL, J1939Id, join, split
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
 from imud.sim.physics.motion import Truth
 from imud.sim.sensor import SensorHardware, sensor_of
@@ -37,6 +39,48 @@ SLOW: Final = (messages.TEMPERATURE, messages.UTC)
 SLOW_MS: Final = 1000
 """Interval of those in `all`."""
 YEAR: Final = 2025
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class J1939Variant:
+    """Behaviour that differs between modules, or that no manual settles."""
+
+    reads: Literal["answered", "value_one", "ignored"] = "answered"
+    """Reads that are answered: all, those with the value 1, or none."""
+    address_at_once: bool = False
+    """Whether a new address is in force at once; else after saving and restarting."""
+    confirms_from: Literal["old", "new"] = "old"
+    """Address from which a new address is confirmed that is in force at once."""
+    claims_address: bool = True
+    confirms_restart: bool = False
+    confirms_once: bool = False
+    flash_ms: int = 0
+    """Time that saving takes before it is confirmed."""
+    refuses: frozenset[int] = frozenset()
+    """Registers of which a write is answered with a status."""
+    ignores: frozenset[int] = frozenset()
+    """Registers of which a write is confirmed and changes nothing."""
+
+
+J1939_VARIANTS: Final[Mapping[str, J1939Variant]] = {
+    "real": J1939Variant(),
+    "confirms everything": J1939Variant(confirms_restart=True, confirms_once=True),
+    "reads need the value 1": J1939Variant(reads="value_one"),
+    "ignores reads": J1939Variant(reads="ignored"),
+    "address at once": J1939Variant(address_at_once=True),
+    "address at once, confirmed from there": J1939Variant(address_at_once=True, confirms_from="new"),
+    "address at once, ignores reads": J1939Variant(address_at_once=True, confirms_from="new", reads="ignored"),
+    "claims no address": J1939Variant(claims_address=False),
+    "slow flash": J1939Variant(flash_ms=1900),
+}
+"""One for each behaviour that is not settled: drivers work with all of them."""
+
+REFUSED: Final = 1
+"""Status of a refusal (assumed: the vendor's programs say other than 0)."""
+PRODUCT: Final = "HI14R2N-CAN-000"
+FIRMWARE: Final = 169
+NAME: Final = (1 << 63 | 0x2A_1708).to_bytes(8, "little")
+"""Made up: arbitrary address capable, an identity number, nothing else."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +105,7 @@ class J1939Hardware(SensorHardware):
     """Of the bus in bit/s, 0 for frames that take no time; None for what it is set to."""
     sends_heading_twice: bool = True
     """As newer firmware does."""
+    variant: J1939Variant = field(default_factory=J1939Variant)
 
 
 class HipnucJ1939Module:
@@ -75,7 +120,7 @@ class HipnucJ1939Module:
         self.epoch_ns = now_ns
         self.instants_sent = 0
         self.frames_sent = 0
-        self.requests = 0
+        self.requests = self.writes_to_flash = 0
         self._leaving: list[SentFrame] = []
         """Frames that were on their way when the restart was requested, the reply to that too."""
         self._ns_per_ms = NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6)
@@ -84,6 +129,9 @@ class HipnucJ1939Module:
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
         """Receive a frame of another node."""
         parts = split(can_id)
+        asks_claim = extended and parts.pgn == session.REQUEST and data[:3] == session.CLAIMED.to_bytes(3, "little")
+        if asks_claim and parts.destination in (self._address, GLOBAL) and now_ns >= self._begin_ns:
+            self._claim(now_ns)
         is_request = extended and parts.pgn == session.CONFIGURE and parts.destination == self._address
         if is_request and len(data) == LAYOUT.size and now_ns >= self._begin_ns:
             self._sample(now_ns)
@@ -126,6 +174,13 @@ class HipnucJ1939Module:
         self._wire = FrameWire(bitrate, self._begin_ns)
         self._next_ms = dict.fromkeys(settings.intervals_ms, 0)
         self._leaving = []
+        self._claim(self._begin_ns)
+
+    def _claim(self, now_ns: int) -> None:
+        if self.hardware.variant.claims_address:
+            can_id = join(J1939Id(session.REQUEST_PRIORITY, session.CLAIMED, self._address))
+            self._wire.send(now_ns + REPLY_NS, can_id, True, NAME)
+            self.frames_sent += 1
 
     def _instant_ns(self, device_ms: int) -> int:
         return self._begin_ns + round(device_ms * self._ns_per_ms)
@@ -180,17 +235,32 @@ class HipnucJ1939Module:
 
     def _obey(self, register: int, command: int, value: int, now_ns: int) -> None:
         self.requests += 1
-        if command == READ and (present := self._present(register)) is not None:
+        variant = self.hardware.variant
+        is_heard = variant.reads == "answered" or (variant.reads == "value_one" and value == 1)
+        if command == READ and is_heard and (present := self._present(register)) is not None:
             self._reply(register, command, present, now_ns)
+        elif command == WRITE and register in variant.refuses:
+            self._reply(register, command, value, now_ns, status=REFUSED)
         elif command == WRITE and register == session.CONTROL:
             self._control(value, now_ns)
         elif command == WRITE and register == session.ONCE and value in session.INTERVALS:
-            self._reply(register, command, value, now_ns)
+            if variant.confirms_once:
+                self._reply(register, command, value, now_ns)
             self._send(value, self._reading(now_ns), now_ns)
         elif command == WRITE and (register == session.ZERO or self._present(register) is not None):
+            self._write(register, value, now_ns)
+
+    def _write(self, register: int, value: int, now_ns: int) -> None:
+        """Write a register, confirm it, and move to another address where that is in force at once."""
+        variant, before = self.hardware.variant, self._address
+        if register not in variant.ignores:
             self._set(register, value, now_ns)
-            present = self._present(register)
-            self._reply(register, command, value if present is None else present, now_ns)
+        present = self._present(register)
+        confirmed = value if present is None or register in variant.ignores else present
+        if variant.address_at_once:
+            self._address = self.settings.address
+        source = before if variant.confirms_from == "old" else self._address
+        self._reply(register, WRITE, confirmed, now_ns, source=source)
 
     def _present(self, register: int) -> int | None:
         """The value of a register that can be read."""
@@ -198,7 +268,12 @@ class HipnucJ1939Module:
         for pgn, interval_register in session.INTERVALS.items():
             if register == interval_register:
                 return settings.intervals_ms.get(pgn, 0)
+        name = PRODUCT.encode().ljust(2 * len(session.PRODUCT_NAME), b"\0")
+        words = {register: 2 * place for place, register in enumerate(session.PRODUCT_NAME)}
+        if register in words:
+            return int.from_bytes(name[words[register] :][:2], "big")
         return {
+            session.VERSION: FIRMWARE,
             session.BITRATE: settings.bitrate_code,
             session.ADDRESS: settings.address,
             session.X_SIGN: settings.x_reversed,
@@ -227,11 +302,15 @@ class HipnucJ1939Module:
             self.settings = replace(settings, zero_rad=(0.0, 0.0))
 
     def _control(self, value: int, now_ns: int) -> None:
+        variant = self.hardware.variant
         if value not in (session.SAVE, session.FACTORY, session.RESTART):
             return
-        self._reply(session.CONTROL, WRITE, value, now_ns)
+        if value != session.RESTART or variant.confirms_restart:
+            wait_ns = variant.flash_ms * NS_PER_MS if value == session.SAVE else 0
+            self._reply(session.CONTROL, WRITE, value, now_ns + wait_ns)
         if value == session.SAVE:
             self.flash = self.settings
+            self.writes_to_flash += 1
         elif value == session.FACTORY:
             self.flash = J1939Settings()
         else:
@@ -239,9 +318,12 @@ class HipnucJ1939Module:
             self.reboot(now_ns)
             self._leaving = leaving
 
-    def _reply(self, register: int, command: int, value: int, now_ns: int) -> None:
-        can_id = join(J1939Id(messages.PRIORITY, session.CONFIGURE, self._address, session.HOST_ADDRESS))
-        self._wire.send(now_ns + REPLY_NS, can_id, True, LAYOUT.pack(register, command, 0, value))
+    def _reply(
+        self, register: int, command: int, value: int, now_ns: int, *, status: int = 0, source: int | None = None
+    ) -> None:
+        sender = self._address if source is None else source
+        can_id = join(J1939Id(messages.PRIORITY, session.CONFIGURE, sender, session.HOST_ADDRESS))
+        self._wire.send(now_ns + REPLY_NS, can_id, True, LAYOUT.pack(register, command, status, value))
         self.frames_sent += 1
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 
 from imud.contracts.codec import ReplyFrame
-from imud.contracts.session import Outcome, Reply, Request, RequestScript, Silence
+from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript, Silence
 from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings
 from imud.devices.hipnuc.j1939.session import J1939Node
@@ -19,7 +19,7 @@ from imud.formats.j1939 import split
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.can_module import CanModules, SentFrame
-from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings
+from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
 from imud.sim.physics.motion import Still
 from imud.sim.simulator import SimulatorOptions
 from tests.support.simulated_modules import run_script
@@ -53,7 +53,7 @@ def pgns(frames: Sequence[SentFrame]) -> Counter[int]:
     return Counter(split(frame.can_id).pgn for frame in frames)
 
 
-class J1939Bench:
+class J1939Host:
     """A module and a host that talks to it."""
 
     def __init__(self, module: HipnucJ1939Module, host: int = 0x55) -> None:
@@ -78,10 +78,20 @@ class J1939Bench:
             self.module.receive(can_id & EXTENDED_ID_MAX, True, data[:size], self.now_ns)
             frames = self.wait(5 * MS)
             events = [e for f in frames for e in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
-            ends = [e for e in events if isinstance(e, ReplyFrame) and request.is_end(e)]
-            return Reply((ends[0],)) if ends else Silence(())
+            also = [f for f in frames if any(wanted.matches(f.can_id, f.extended) for wanted in request.also)]
+            messages = [e for e in events if isinstance(e, ReplyFrame)] + [ReplyFrame(f.can_id, f.data) for f in also]
+            for message in messages:
+                if request.is_rejection(message):
+                    return Rejection((message,))
+                if request.is_end(message):
+                    return Reply((message,))
+            return Silence(())
 
         return run_script(begin(J1939Node(address, self.host)), ask)
+
+
+def restarted(peer: J1939Node) -> RequestScript[None]:
+    yield session.restart_request(peer)
 
 
 def test_values_are_the_truth_of_the_sample_instant() -> None:
@@ -113,10 +123,10 @@ def test_four_modules_on_a_bus() -> None:
 
 def test_crystal_and_wire() -> None:
     module = made(baud=250_000, skew_ppm=1000.0)
-    frames = module.advance(BEGIN_NS + SECOND_NS)
+    frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != session.CLAIMED]
     assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(frames[:4])] == [560_000] * 3  # 140 bits
     assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
-    assert module.counters() == {"samples_sent": 101, "frames_sent": 404, "requests": 0}
+    assert module.counters() == {"samples_sent": 101, "frames_sent": 405, "requests": 0}
 
 
 def test_next_ns_is_when_something_is_sent() -> None:
@@ -133,7 +143,7 @@ def test_next_ns_is_when_something_is_sent() -> None:
 
 @pytest.mark.manual("B 6.2.2 intervals")
 def test_an_interval_is_set_and_read_back() -> None:
-    bench = J1939Bench(made())
+    bench = J1939Host(made())
     bench.talk(lambda peer: session.set_interval(peer, 0xFF37, 20))
     bench.talk(lambda peer: session.set_interval(peer, 0xFF4A, 500))  # switched on by it
     counts = pgns(bench.wait(SECOND_NS))
@@ -155,7 +165,7 @@ def written_and_read(peer: J1939Node, register: int, value: int) -> RequestScrip
 
 
 def test_values_out_of_range_do_not_take() -> None:
-    bench = J1939Bench(made())
+    bench = J1939Host(made())
     for register, value in ((0x0134, 4), (0x009A, 5), (0x009C, 129), (0x009E, 2)):
         assert bench.talk(partial(written_and_read, register=register, value=value)) != value
     with pytest.raises(Rejected):
@@ -175,31 +185,31 @@ def test_values_out_of_range_do_not_take() -> None:
 
 
 def test_what_is_not_saved_is_lost_at_a_restart() -> None:
-    bench = J1939Bench(made(boot_ms=200))
+    bench = J1939Host(made(boot_ms=200))
     bench.wait(300 * MS)
     bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
-    bench.talk(session.restart)
+    bench.talk(restarted)
     assert bench.module.settings.intervals_ms[0xFF34] == 10
     assert pgns(bench.wait(190 * MS)) == {}
     bench.wait(100 * MS)
     bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
     bench.talk(session.save)
-    bench.talk(session.restart)
+    bench.talk(restarted)
     assert bench.module.settings.intervals_ms[0xFF34] == 50
     bench.wait(300 * MS)
     bench.talk(session.factory_reset)
-    bench.talk(session.restart)
+    bench.talk(restarted)
     assert bench.module.settings == J1939Settings()
 
 
 @pytest.mark.manual("B 6.2.2 bit rate", "B 6.2.2 address")
 def test_address_and_bit_rate_change_at_the_restart() -> None:
-    bench = J1939Bench(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
+    bench = J1939Host(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
     bench.talk(lambda peer: session.set_address(peer, 20))
     bench.talk(lambda peer: session.set_bitrate(peer, 125_000))
     assert {split(f.can_id).source for f in bench.wait(SECOND_NS)} == {8}
     bench.talk(session.save)
-    bench.talk(session.restart)
+    bench.talk(restarted)
     bench.wait(100 * MS)
     frames = bench.wait(SECOND_NS)
     assert {split(f.can_id).source for f in frames} == {20}
@@ -208,25 +218,47 @@ def test_address_and_bit_rate_change_at_the_restart() -> None:
 
 
 @pytest.mark.manual("B 6.2.2 restart")
-def test_a_restart_is_answered_before_it_happens() -> None:
-    module = made(boot_ms=0)
-    module.receive(0x0CEF0855, True, bytes.fromhex("00000600FF000000"), BEGIN_NS)
-    due_ns = module.next_ns()
-    assert due_ns is not None
-    (reply, *_) = [f for f in module.advance(due_ns + 2 * MS) if split(f.can_id).pgn == 0xEF00]
-    assert reply.data == bytes.fromhex("00000600FF000000")
-    assert reply.can_id == 0x0CEF5508
+@pytest.mark.parametrize("confirms", [False, True])
+def test_a_restart_is_answered_before_it_happens_or_not_at_all(confirms: bool) -> None:
+    hardware = J1939Hardware(boot_ms=0, variant=J1939Variant(confirms_restart=confirms))
+    module = HipnucJ1939Module(BEGIN_NS, hardware=hardware)
+    module.advance(BEGIN_NS + 50 * MS)
+    module.receive(0x0CEF0855, True, bytes.fromhex("00000600FF000000"), BEGIN_NS + 50 * MS)
+    replies = [f for f in module.advance(BEGIN_NS + 60 * MS) if split(f.can_id).pgn == 0xEF00]
+    expected = [(0x0CEF5508, bytes.fromhex("00000600FF000000"))] if confirms else []
+    assert [(f.can_id, f.data) for f in replies] == expected
+
+
+def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:
+    """Request for PGN 0xEE00 as J1939-21 has it, low byte first, to the module and to all."""
+    module = HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0))
+    claims = [f for f in module.advance(BEGIN_NS + 10 * MS) if f.can_id == 0x18EEFF08]
+    assert len(claims) == 1
+    for number, can_id in enumerate((0x18EA0855, 0x18EAFF55), 1):
+        now_ns = BEGIN_NS + number * 20 * MS
+        module.advance(now_ns)
+        module.receive(can_id, True, bytes.fromhex("00EE000000000000"), now_ns)
+        (claim,) = [f for f in module.advance(now_ns + 10 * MS) if f.can_id == 0x18EEFF08]
+        assert claim.data == claims[0].data
+    module.receive(0x18EA0955, True, bytes.fromhex("00EE000000000000"), BEGIN_NS + 70 * MS)
+    assert not [f for f in module.advance(BEGIN_NS + 80 * MS) if f.can_id == 0x18EEFF08]
+
+
+def test_name_and_firmware_are_in_registers() -> None:
+    bench = J1939Host(made())
+    assert bench.talk(lambda peer: session.read(peer, 0x78)) == 169
+    assert bench.talk(lambda peer: session.read(peer, 0x70)) == 0x4849  # "HI"
 
 
 def test_replies_go_to_the_one_address() -> None:
-    bench = J1939Bench(made(), host=0x20)
+    bench = J1939Host(made(), host=0x20)
     assert bench.talk(lambda peer: session.read(peer, session.ADDRESS)) == 8
     replies = [f for f in bench.heard if split(f.can_id).pgn == session.CONFIGURE]
     assert {split(f.can_id).destination for f in replies} == {0x55}
 
 
 def test_a_message_is_sent_once() -> None:
-    bench = J1939Bench(made())
+    bench = J1939Host(made())
     bench.talk(lambda peer: session.send_once(peer, 0xFF46))
     assert pgns(bench.heard)[0xFF46] == 1
     assert pgns(bench.wait(SECOND_NS))[0xFF46] == 0
@@ -236,7 +268,7 @@ def test_a_message_is_sent_once() -> None:
 def test_zero_and_directions_of_the_inclinometer() -> None:
     still = Still(roll_rad=math.radians(10), pitch_rad=math.radians(20))
     settings = J1939Settings(intervals_ms={messages.INCLINOMETER: 10})
-    bench = J1939Bench(HipnucJ1939Module(BEGIN_NS, settings, J1939Hardware(boot_ms=0, motion=still)))
+    bench = J1939Host(HipnucJ1939Module(BEGIN_NS, settings, J1939Hardware(boot_ms=0, motion=still)))
 
     def shown() -> tuple[float, float]:
         last = messages.measurement_of([(0xFF4A, bench.wait(50 * MS)[-1].data)]).incli_rad

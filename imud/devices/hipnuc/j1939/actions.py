@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.session import RequestScript
-from imud.devices.hipnuc.j1939 import session
+from imud.devices.hipnuc.j1939 import moves, session
 from imud.devices.hipnuc.j1939.messages import PgnName
 from imud.devices.hipnuc.j1939.session import (
     ADDRESS_MAX,
@@ -21,6 +21,7 @@ from imud.devices.hipnuc.j1939.session import (
     J1939Node,
     Zero,
 )
+from imud.devices.hipnuc.j1939.settings import set_interval
 
 Pgn = Annotated[PgnName, Meta(description="the last four digits of its number", extra={"section": "6.1"})]
 
@@ -35,8 +36,8 @@ def _interval(
     *,
     pgn: Pgn,
     interval_ms: Annotated[int, Meta(ge=INTERVAL_MIN_MS, le=INTERVAL_MAX_MS, extra={"unit": "ms", "section": "6.2.2"})],
-) -> RequestScript[None]:
-    return session.set_interval(target.settings.peer, int(pgn, 16), interval_ms)
+) -> RequestScript[str]:
+    return set_interval(target, int(pgn, 16), interval_ms)
 
 
 def _send_once(target: Target, *, pgn: Pgn) -> RequestScript[None]:
@@ -47,7 +48,7 @@ def _bitrate(
     target: Target,
     *,
     bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "6.2.2"})],
-) -> RequestScript[None]:
+) -> RequestScript[str]:
     return session.set_bitrate(target.settings.peer, bitrate)
 
 
@@ -63,8 +64,8 @@ def _address(
             extra={"section": "6.2.2"},
         ),
     ],
-) -> RequestScript[None]:
-    return session.set_address(target.settings.peer, address)
+) -> RequestScript[str]:
+    return moves.change_address(target.settings, address)
 
 
 def _zero(
@@ -75,21 +76,24 @@ def _zero(
 
 def _direction(
     target: Target, *, axis: Annotated[Literal["X", "Y"], Meta(extra={"section": "6.2.2"})], reversed: bool
-) -> RequestScript[None]:
+) -> RequestScript[str]:
     return session.set_direction(target.settings.peer, axis, reversed)
 
 
 ACTIONS: Final[Actions] = {
     "save": _simple("write all settings to flash", session.save),
-    "restart": _simple("restart it; what was not saved is lost", session.restart),
-    "factory_reset": _simple(
-        "factory settings, address 8 and its bit rate included: imud then hears it only where bus and "
-        "`options.address` are set to that",
-        session.factory_reset,
+    "restart": Action(
+        "restart it and wait until it is heard, also at another address; what was not saved is lost",
+        lambda target: moves.restart(target.settings, target.baud),
+    ),
+    "factory_reset": Action(
+        "factory settings, address 8 and its bit rate included, in force after a restart at the latest; refused if "
+        "another node of the bus has address 8",
+        lambda target: moves.factory_reset(target.settings),
         Risk.RESET,
     ),
-    "interval": Action("how often a message is sent", _interval),
-    "send_once": Action("send a message once, now", _send_once),
+    "interval": Action("how often a message is sent; refused if the bus cannot carry it", _interval),
+    "send_once": Action("send a message once, now, and wait for it", _send_once),
     "bitrate": Action(
         "set the bit rate, in force after `save` and `restart`: the module is off the bus then, and disturbs it, until "
         "interface and all others have the same",
@@ -97,8 +101,8 @@ ACTIONS: Final[Actions] = {
         Risk.CONNECTION,
     ),
     "address": Action(
-        "set its address, in force after `save` and `restart`: imud then hears nothing of it until `options.address` "
-        "says the new one; with `driver: auto` it looks again after 15 s",
+        "set its address, in force after `save` and `restart`, in some modules at once: imud follows. Refused if "
+        "something on the bus has it already",
         _address,
         Risk.CONNECTION,
     ),

@@ -11,6 +11,7 @@ from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.actions import ACTIONS
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, encode
 from imud.devices.hipnuc.j1939.session import CONFIGURE, HOST_ADDRESS
+from imud.devices.hipnuc.j1939.settings import SETTINGS
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import filter_of, sender_of
 from imud.sample import Vector3
@@ -57,6 +58,7 @@ DRIVER: Final = CanDriver(
     "NaN for an angle that the module does not send",
     navigation_frame="ENU",
     actions=ACTIONS,
+    device_settings=SETTINGS,
     calibrations=inclinometer_zero("6.2.2", ACTIONS),
     node_of=_node_of,
     node_settings=lambda address: HipnucJ1939Settings(address=address),

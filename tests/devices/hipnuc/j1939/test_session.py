@@ -6,8 +6,8 @@ import pytest
 
 from imud.contracts.action import Target
 from imud.contracts.codec import ReplyFrame
-from imud.contracts.driver import Identity
-from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session, Silence
+from imud.contracts.device_settings import Written
+from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript, Session, Silence
 from imud.devices.hipnuc.j1939 import session
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.devices.hipnuc.j1939.driver import DRIVER
@@ -15,7 +15,8 @@ from imud.devices.hipnuc.j1939.session import HOST_ADDRESS, X_SIGN, Y_SIGN, J193
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
 from imud.ledger import Ledger
-from tests.support.simulated_modules import run_script
+from imud.sim.hipnuc.j1939 import J1939_VARIANTS, J1939Settings, J1939Variant
+from tests.support.simulated_modules import J1939Bench, run_script
 
 PEER = J1939Node(8)
 SET = Target(HipnucJ1939Settings(), 0)
@@ -94,12 +95,11 @@ READABLE = ("interval", "bitrate", "address", "direction")
     "B 6.2.2 source address",
 )
 def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: str) -> None:
-    written = bytes.fromhex(data)
-    read = written[:2] + b"\3\0" + bytes(4)
-    frames, value = played(of_action(name, **arguments), written, read[:4] + written[4:])
-    expected = [(0x0CEF0855, written)]
-    assert frames == ([*expected, (0x0CEF0855, read)] if name in READABLE else expected)
-    assert value is None
+    bench = J1939Bench()
+    result = bench.act(name, **arguments)
+    writes = [frame for frame in bench.sent if frame[0] == 0x0CEF0855 and frame[1][2] == 6]
+    assert writes[0] == (0x0CEF0855, bytes.fromhex(data))
+    assert (result in (Written.VERIFIED, Written.PENDING)) == (name in READABLE)
 
 
 def test_every_action_has_a_row() -> None:
@@ -112,8 +112,8 @@ def test_a_value_that_did_not_take_is_told() -> None:
         played(session.set_interval(PEER, 0xFF37, 50), reply, bytes.fromhex("3701030064000000"))
 
 
-def test_silence_is_told_but_where_it_is_no_failure() -> None:
-    begins: list[Callable[[], RequestScript[None]]] = [
+def test_silence_is_told() -> None:
+    begins: list[Callable[[], RequestScript[object]]] = [
         lambda: session.save(PEER),
         lambda: session.zero(PEER, Zero.HERE),
         lambda: session.send_once(PEER, 0xFF34),
@@ -123,12 +123,51 @@ def test_silence_is_told_but_where_it_is_no_failure() -> None:
     for begin in begins:
         with pytest.raises(NoReply, match="address 8"):
             played(begin(), None)
-    assert played(session.restart(PEER), None)[1] is None
     assert played(session.factory_reset(PEER), None)[1] is None
     with pytest.raises(NoReply, match="register 0x009c"):
         played(session.identify(PEER), None)
-    with pytest.raises(NoReply, match="register 0x0134"):
-        played(session.set_interval(PEER, 0xFF34, 10), bytes.fromhex("340106000A000000"), None)
+
+
+def test_what_cannot_be_read_back_is_written_and_not_verified() -> None:
+    assert played(session.set_interval(PEER, 0xFF34, 10), bytes.fromhex("340106000A000000"), None)[1] is (
+        Written.UNVERIFIED
+    )
+    assert played(session.set_bitrate(PEER, 500_000), bytes.fromhex("9A00060002000000"), None)[1] is (
+        Written.UNVERIFIED_PENDING
+    )
+
+
+@pytest.mark.parametrize("status", [1, 0x5A, 0xFF])
+def test_an_answer_with_a_status_is_no_success(status: int) -> None:
+    """Byte 3 of the answer, in writes and in reads."""
+    for begin, head in (
+        (session.save(PEER), "000006"),
+        (session.zero(PEER, Zero.HERE), "A50006"),
+        (session.set_interval(PEER, 0xFF34, 10), "340106"),
+        (session.send_once(PEER, 0xFF34), "960006"),
+        (session.factory_reset(PEER), "000006"),
+        (session.read(PEER, 0x009C), "9C0003"),
+    ):
+        request = next(begin)
+        reply = ReplyFrame(0x0CEF5508, bytes.fromhex(head) + bytes([status]) + bytes(4))
+        assert request.is_rejection(reply)
+        assert not request.is_end(reply)
+        with pytest.raises(Rejected, match=f"status {status}"):
+            begin.send(Rejection((reply,)))
+
+
+def test_a_message_sent_once_is_its_own_answer() -> None:
+    """No acknowledgement: the message comes, from the module and of that kind."""
+    request = next(session.send_once(PEER, 0xFF43))
+    assert request.is_end(ReplyFrame(0x0CFF4308, bytes(8)))
+    assert not request.is_end(ReplyFrame(0x0CFF4309, bytes(8)))
+    assert not request.is_end(ReplyFrame(0x0CFF3408, bytes(8)))
+    assert not request.is_end(ReplyFrame(0x0CEF5508, bytes.fromhex("9600060043FF0000")))
+    for variant in (J1939Variant(), J1939Variant(confirms_once=True)):
+        bench = J1939Bench(J1939Settings(intervals_ms={0xFF34: 1000}), variant=variant)
+        bench.run(10_000_000)
+        assert bench.act("send_once", pgn="FF43") is None
+        assert [can_id for can_id, _ in bench.heard].count(0x0CFF4308) == 1
 
 
 @pytest.mark.parametrize(
@@ -159,7 +198,6 @@ def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dic
         (0x0CEF5508, "3701030064000000", True),
         (0x18EF5508, "3701030064000000", True),  # another priority
         (0x0CEF2008, "3701030064000000", True),  # to the asking address
-        (0x0CEF5508, "3701035A64000000", True),  # status is reserved
         (0x0CEF5509, "3701030064000000", False),  # another module
         (0x0CEF2108, "3701030064000000", False),  # to somebody else
         (0x0CEF5508, "3401030064000000", False),  # another register
@@ -170,7 +208,7 @@ def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dic
 @pytest.mark.manual("B 6.2.1 request and reply")
 def test_a_reply_is_matched_by_sender_register_and_command(can_id: int, data: str, is_reply: bool) -> None:
     request = next(session.read(J1939Node(8, 0x20), 0x0137))
-    assert sent(request) == (0x0CEF0820, bytes.fromhex("3701030000000000"))
+    assert sent(request) == (0x0CEF0820, bytes.fromhex("3701030001000000"))
     reply = ReplyFrame(can_id, bytes.fromhex(data))
     assert request.is_end(reply) is request.is_part(reply) is is_reply
     assert not request.is_rejection(reply)
@@ -202,10 +240,31 @@ def test_all_that_can_be_read() -> None:
         "interval_ms_FF37": "10", "interval_ms_FF3D": "100", "interval_ms_FF41": "100",
     }  # fmt: skip
     assert len(frames) == 13
-    assert all(data[2:] == b"\3\0\0\0\0\0" for _, data in frames)
+    assert all(data[2:] == b"\3\0\1\0\0\0" for _, data in frames)
 
 
-def test_identity_is_the_address() -> None:
-    _, identity = played(DRIVER.identify(HipnucJ1939Settings()), bytes.fromhex("9C00030008000000"))
-    assert identity == Identity(details={"address": "8"})
+@pytest.mark.parametrize("variant", J1939_VARIANTS)
+def test_identity(variant: str) -> None:
+    bench = J1939Bench(variant=J1939_VARIANTS[variant])
+    bench.run(10_000_000)
+    if J1939_VARIANTS[variant].reads == "ignored":
+        with pytest.raises(NoReply):
+            bench.run_script(DRIVER.identify(bench.settings))
+        return
+    identity = bench.run_script(DRIVER.identify(bench.settings))
+    assert (identity.product, identity.firmware) == ("HI14R2N-CAN-000", "1.6.9")
+    claims = {"J1939 NAME": "80000000002A1708"} if J1939_VARIANTS[variant].claims_address else {}
+    assert identity.details == {"address": "8", **claims}
     assert HOST_ADDRESS == 0x55
+
+
+def test_a_name_that_is_no_text_is_left_out() -> None:
+    def answer(request: Request) -> Outcome:
+        data = sent(request)[1]
+        if sent(request)[0] != 0x0CEF0855:
+            return Silence(())
+        value = 8 if data[0] == 0x9C else 0x0102
+        return Reply((ReplyFrame(0x0CEF5508, data[:4] + value.to_bytes(4, "little")),))
+
+    identity = run_script(session.identify(PEER), answer)
+    assert (identity.product, identity.firmware) == ("", "2.5.8")

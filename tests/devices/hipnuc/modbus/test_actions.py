@@ -6,8 +6,8 @@ from imud.contracts.action import Target, parameters_of
 from imud.devices.hipnuc.modbus.codec import HipnucModbusSettings
 from imud.devices.hipnuc.modbus.driver import DRIVER
 from imud.errors import BadArgument
-from tests.support.simulated_modules import ModbusBench
-from tests.support.simulated_modules import modbus_slave as module
+from tests.support.pty_port import ModbusBench
+from tests.support.pty_port import modbus_slave as module
 
 
 def act(bench: ModbusBench, name: str, **given: object) -> object:

@@ -26,9 +26,9 @@ from imud.devices.hipnuc.uart.commands import AttitudeMode, LevelReset
 from imud.errors import BadArgument, DeviceRefused, NoReply, TransferError
 from imud.formats.modbus import framed
 from imud.sim.hipnuc.modbus import SLAVE_VARIANTS, SlaveSettings, SlaveVariant
-from tests.support.simulated_modules import LINE_BAUD as BAUD
-from tests.support.simulated_modules import ModbusBench
-from tests.support.simulated_modules import modbus_slave as module
+from tests.support.pty_port import LINE_BAUD as BAUD
+from tests.support.pty_port import ModbusBench
+from tests.support.pty_port import modbus_slave as module
 
 NINE = AttitudeMode.NINE_AXIS
 

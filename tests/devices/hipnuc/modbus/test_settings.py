@@ -10,8 +10,8 @@ from imud.devices.hipnuc.modbus.driver import DRIVER
 from imud.devices.hipnuc.modbus.settings import SETTINGS
 from imud.errors import BadArgument
 from imud.sim.hipnuc.modbus import SLAVE_VARIANTS, SlaveVariant
-from tests.support.simulated_modules import ModbusBench
-from tests.support.simulated_modules import modbus_slave as module
+from tests.support.pty_port import ModbusBench
+from tests.support.pty_port import modbus_slave as module
 
 VALUES: dict[str, tuple[object, ...]] = {
     "mode": ("9-axis", "6-axis"),
