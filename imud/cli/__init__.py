@@ -45,6 +45,7 @@ COMMANDS = {
         "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"
     ),
     "command": Subcommand("imud.cli.devices:COMMAND", "list the actions of a device, or carry one out"),
+    "settings": Subcommand("imud.cli.settings:SETTINGS", "show, set, save or restore a device's own settings"),
     "calibrate": Subcommand("imud.cli.calibrate:CALIBRATE", "calibrate a device, guided step by step"),
     "schema": Subcommand("imud.cli.samples:SCHEMA", "list the fields of a sample with units and frames"),
 }

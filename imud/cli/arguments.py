@@ -1,6 +1,7 @@
 """Parts that several commands share: the type of a command, the daemon's socket, and arguments `NAME=VALUE`."""
 
 import argparse
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -44,6 +45,24 @@ def connect(args: argparse.Namespace) -> Client:
 def statuses(client: Client) -> list[DeviceStatus]:
     """Ask for the status of every device."""
     return msgspec.convert(client.status()["devices"], list[DeviceStatus])
+
+
+# --- questions ------------------------------------------------------------------------------------------------------
+
+
+def confirmed(what: str, risk: str, *, yes: bool) -> bool:
+    """Ask on the terminal whether to do something; True at once with `yes`. Say so where it is not done.
+
+    Raises BadArgument where there is no terminal to ask on.
+    """
+    if yes:
+        return True
+    if not sys.stdin.isatty():
+        raise BadArgument(f"{risk}: expected a terminal to ask on, or --yes")
+    if input(f"{risk}; {what}? [y/N] ").strip().lower() in ("y", "yes"):
+        return True
+    print("nothing was done")
+    return False
 
 
 # --- NAME=VALUE -----------------------------------------------------------------------------------------------------

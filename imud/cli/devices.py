@@ -5,7 +5,7 @@ from typing import Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket, argument, connect, statuses
+from imud.cli.arguments import CliCommand, add_socket, argument, confirmed, connect, statuses
 from imud.cli.output import table
 from imud.client import Client
 from imud.contracts.action import ActionInfo
@@ -46,16 +46,21 @@ def command_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("device", metavar="DEVICE")
     parser.add_argument("name", nargs="?", metavar="ACTION", help="without it: list the actions of the device")
     parser.add_argument("arguments", nargs="*", metavar="NAME=VALUE", help="as the list says")
+    parser.add_argument("--yes", action="store_true", help="do not ask before an action that cannot be taken back")
 
 
 def command(args: argparse.Namespace) -> int:
     """Print the list or the answer. All but the list needs permission to control."""
     with Client(args.socket, timeout_s=LIMIT_S) as client:
+        known = msgspec.convert(client.call("actions", device=args.device), list[ActionInfo])
         if args.name is None:
-            for action in msgspec.convert(client.call("actions", device=args.device), list[ActionInfo]):
+            for action in known:
                 print("\n".join([f"{action.name:24} {action.help}", *(f"{'':24}   {p}" for p in action.parameters)]))
             return 0
         arguments = dict(map(argument, args.arguments))
+        risk = next((action.risk for action in known if action.name == args.name), "")
+        if risk and not confirmed(f"{args.name} on {args.device}", risk, yes=args.yes):
+            return 1
         answer = client.call("command", device=args.device, name=args.name, arguments=arguments)
     print(msgspec.json.encode(answer).decode() if answer is not None else "done")
     return 0

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect, statuses
+from imud.contracts.device_settings import SettingsState, SettingsStatus
+from imud.contracts.settings import shown
 from imud.contracts.status import DeviceStatus, FrameStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.ledger import bytes_open, frames_open, lost
 from imud.units import NS_PER_MS, NS_PER_US
@@ -64,6 +66,8 @@ def axes(frame: FrameStatus) -> str:
 
 def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
     """List name and text of each row that only some devices have."""
+    if status.declared is not None and status.declared.state is not SettingsState.UNDECLARED:
+        yield "settings", declared(status.declared)
     if status.polling is not None:
         yield "polling", polling(status.polling)
     if status.serial_line is not None:
@@ -77,6 +81,19 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
         yield from ((name, status.lines.problems[name]) for name in sorted(others))
     if status.utc is not None:
         yield "utc", utc(status.utc)
+
+
+def declared(settings: SettingsStatus) -> str:
+    """Format how declared and actual settings compare."""
+    words = str(settings.state)
+    if settings.differences:
+        words += ": " + ", ".join(
+            f"{name} is {'not told' if one.actual is None else shown(one.actual)}, declared {shown(one.declared)}"
+            for name, one in settings.differences.items()
+        )
+    if settings.unverified:
+        words += f"; not told by the device: {', '.join(settings.unverified)}"
+    return words + (f" ({settings.problem})" if settings.problem else "")
 
 
 def polling(polls: PollingStatus) -> str:

@@ -6,6 +6,7 @@ from typing import Any, Final, Protocol
 
 from imud.contracts.action import Actions
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
+from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.errors import CommandError
@@ -112,6 +113,18 @@ class DeviceControl(Protocol):
 
     def stop_calibration(self) -> bool:
         """End the calibration that runs; return whether there was one."""
+        ...
+
+    async def settings_report(self, *, fresh: bool) -> SettingsReport:
+        """Return its own settings: asked for now if `fresh`, otherwise as told last. Raises ImudError."""
+        ...
+
+    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
+        """Return what would make it as `given` (None: as declared). Raises ImudError."""
+        ...
+
+    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+        """Make it as `given` (None: as declared). Raises ImudError, with nothing written."""
         ...
 
 

@@ -1,7 +1,8 @@
 """Makes the generated parts of the documents from the code: `python -m tests.support.references`.
 
-The tables of docs/configuration.md come from the settings classes, those of docs/commands.md and docs/calibration.md
-from the drivers' actions and calibrations, and those of docs/shm.md from the layout of shared memory.
+The tables of docs/configuration.md come from the settings classes, those of docs/commands.md, docs/calibration.md
+and docs/settings.md from the drivers' actions, calibrations and device settings, and those of
+docs/shm.md from the layout of shared memory.
 """
 
 import ast
@@ -23,6 +24,7 @@ from imud.formats.ring import HEADER_FIELDS
 from imud.formats.slot import PRESENT_BITS, SLOT_FIELDS, SYNC_CODES, SlotField
 from imud.frames.settings import FrameSettings, MountingAngles, MountingAxes
 from imud.ledger import LEDGER_FIELDS
+from imud.runtime.settings.difference import described_settings
 from imud.signals.line_actions import RESET, TRIGGER
 from imud.utc.source import RmcSettings
 from tests.support.files import ROOT
@@ -93,6 +95,8 @@ def settings_tables() -> str:
         if not msgspec.structs.fields(schema):
             text.append("| (none) | | | |")
         text.append("")
+    declared = "[the driver's settings](settings.md#the-settings-of-each-driver)"
+    text += [f"### `devices.NAME.settings.…`: {declared} that the device should have", ""]
     return "\n".join(text)
 
 
@@ -161,6 +165,28 @@ def calibrations_table() -> str:
     return "\n".join(rows)
 
 
+# --- docs/settings.md -------------------------------------------------------------------------------------------------
+
+
+def device_settings_part(driver: Driver) -> list[str]:
+    """Title and table of the settings that the devices of a driver keep."""
+    title = [f"### `{driver.name}`: {driver.title}", ""]
+    if driver.device_settings is None:
+        return [*title, "None: this driver does not know them.", ""]
+    rows = ["| setting | values | unit | manual | in force | told | meaning |", "|---|---|---|---|---|---|---|"]
+    for one in described_settings(driver.device_settings, {}, None):
+        force = str(one.effect) + (", last" if one.connection else "") if one.declarable else "only read"
+        told = "yes" if one.readable else "no"
+        cells = (cell(one.values), one.unit, one.section, force, told, cell(one.description))
+        rows.append(f"| `{one.name}` | {' | '.join(cells)} |")
+    return [*title, *rows, ""]
+
+
+def device_settings_tables() -> str:
+    """The whole generated part."""
+    return "\n".join(line for driver in DRIVERS.values() for line in device_settings_part(driver))
+
+
 # --- docs/shm.md ------------------------------------------------------------------------------------------------------
 
 C_TYPES = {
@@ -195,6 +221,7 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/configuration.md": lambda: {"keys": "\n" + settings_tables()},
     "docs/commands.md": lambda: {"actions": "\n" + actions_tables()},
     "docs/calibration.md": lambda: {"calibrations": calibrations_table()},
+    "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
 }
 """The generated parts of each page by the name that their marks have."""

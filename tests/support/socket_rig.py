@@ -15,6 +15,20 @@ from typing import Any, Self, TypeVar
 
 from imud.contracts.action import Action, Actions, Target
 from imud.contracts.control.calibration import Calibration, CalibrationResult, Calibrations, Check, Handling, Kept
+from imud.contracts.device_settings import (
+    AppliedSettings,
+    AppliedStep,
+    Effect,
+    OnDifference,
+    PlannedStep,
+    SettingDifference,
+    SettingInfo,
+    SettingsPlan,
+    SettingsReport,
+    SettingsState,
+    SettingsStatus,
+    StepOutcome,
+)
 from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, FrameStatus, KernelCounters
 from imud.errors import Rejected
@@ -148,6 +162,30 @@ class FakeControl:
     def stop_calibration(self) -> bool:
         """Nothing runs."""
         return False
+
+    async def settings_report(self, *, fresh: bool) -> SettingsReport:
+        """One setting, which differs."""
+        differences = {"mode": SettingDifference("9-axis", "6-axis")}
+        status = SettingsStatus(
+            SettingsState.DIFFER, OnDifference.REPORT, differences=differences, flash_writes=3,
+            read_ns=NOW_NS if fresh else 80_000_000_000_000,
+        )  # fmt: skip
+        texts = 'one of "6-axis", "9-axis"', "axes that make the attitude", "", "2.2.4"
+        mode = SettingInfo("mode", *texts, Effect.AT_ONCE, False, True, True, "9-axis", "6-axis", differs=True)
+        return SettingsReport(self._device, "hipnuc-uart", {"product": "HI13"}, status, (mode,))
+
+    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
+        """One step, of what is given or of what is declared."""
+        mode = {"mode": "9-axis"} if given is None else given
+        return SettingsPlan(tuple(PlannedStep(name, value, "6-axis") for name, value in mode.items()), save=save)
+
+    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+        """The same, done; `wait` waits."""
+        if given and "wait" in given:
+            await done_late.wait()
+        plan = await self.settings_plan(given, save=save)
+        steps = [AppliedStep(one.name, one.value, one.before, StepOutcome.DONE) for one in plan.steps]
+        return AppliedSettings(tuple(steps), saved=save)
 
 
 def run(body: Callable[[], Awaitable[T]]) -> T:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Final
 
 import imud
+from imud.contracts.device_settings import SettingsState, SettingsStatus
 from imud.contracts.status import LATENCY_BOUNDS_NS, ClockStatus, DeviceState, DeviceStatus, LinesStatus, UtcStatus
 from imud.ledger import bytes_open, frames_open
 from imud.publishers.metrics.family import (
@@ -75,6 +76,18 @@ def _fed(device: DeviceStatus) -> UtcStatus | None:
     return device.utc if device.utc is not None and device.utc.source else None
 
 
+def _declared(device: DeviceStatus) -> SettingsStatus | None:
+    """Settings of a device for which some are declared."""
+    found = device.declared
+    return found if found is not None and found.state is not SettingsState.UNDECLARED else None
+
+
+def _compared(device: DeviceStatus) -> SettingsStatus | None:
+    """The same once the device has told them."""
+    found = _declared(device)
+    return found if found is not None and found.state is not SettingsState.UNKNOWN else None
+
+
 DEVICE: Final = DevicePart(lambda device: device)
 CLOCK: Final = DevicePart(lambda device: device.clock)
 LEDGER: Final = DevicePart(lambda device: device.ledger)
@@ -88,6 +101,9 @@ ALARM: Final = DevicePart(_with_alarm)
 SIN: Final = DevicePart(_with_sin)
 UTC: Final = DevicePart(lambda device: device.utc)
 SENTENCES: Final = DevicePart(_fed)
+SETTINGS: Final = DevicePart(lambda device: device.declared)
+DECLARED: Final = DevicePart(_declared)
+COMPARED: Final = DevicePart(_compared)
 
 
 def _ledger(field: str) -> Reader:
@@ -346,6 +362,29 @@ LINE_FAMILIES: Final = (
     ),
 )  # fmt: skip
 
+SETTINGS_FAMILIES: Final = (
+    _gauge(
+        "imud_settings_differ", "Settings of the device that are not as declared; absent while that is not known.",
+        COMPARED.one(lambda settings: len(settings.differences)),
+    ),
+    _gauge(
+        "imud_settings_problem", "1 while declared settings cannot be read, set or saved.",
+        DECLARED.one(lambda settings: bool(settings.problem)),
+    ),
+    _counter(
+        "imud_settings_repairs_total", "Times that imud has set the device by itself.",
+        DECLARED.one(lambda settings: settings.repairs),
+    ),
+    _counter(
+        "imud_settings_flash_writes_total", "Writes to the flash of this module by imud, earlier runs included.",
+        SETTINGS.one(lambda settings: settings.flash_writes),
+    ),
+    _gauge(
+        "imud_settings_flash_writes_day", "Of these, those of the last 24 hours, which are limited.",
+        SETTINGS.one(lambda settings: settings.flash_writes_day),
+    ),
+)  # fmt: skip
+
 LATENCY: Final = Histogram(
     "imud_sample_latency_seconds",
     "Time from the measurement to its publication.",
@@ -393,6 +432,7 @@ FAMILIES: Final[tuple[Family | Histogram, ...]] = (
     *POLLING_FAMILIES,
     *TIME_FAMILIES,
     *LINE_FAMILIES,
+    *SETTINGS_FAMILIES,
     LATENCY,
     *CLIENT_FAMILIES,
 )

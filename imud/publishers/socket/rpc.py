@@ -95,6 +95,21 @@ class CalibrateParams(msgspec.Struct):
     save: bool = False
 
 
+class SettingsParams(msgspec.Struct):
+    """Parameters of `settings.get`."""
+
+    device: str
+    fresh: bool = False
+
+
+class SettingsChangeParams(msgspec.Struct):
+    """Parameters of `settings.plan` and `settings.apply`; settings that are left out or null are the declared ones."""
+
+    device: str
+    settings: dict[str, Any] | None = None
+    save: bool = False
+
+
 @dataclass(frozen=True, slots=True)
 class Answer:
     """What a method answers."""
@@ -353,6 +368,31 @@ def _stop_calibration(hub: Hub, _connection: Connection, params: DeviceParams) -
     return Answer({"stopped": hub.context.control(params.device).stop_calibration()})
 
 
+def _settings(hub: Hub, connection: Connection, params: SettingsParams) -> Later:
+    """The device's own settings, as told last or asked for now."""
+    _known_devices(hub, [params.device])
+    if params.fresh:
+        if Rights.CONTROL not in connection.rights:
+            message = f"settings.get: for fresh, expected root or a member of {hub.control_group}"
+            raise RpcError(Code.DENIED, message)
+        _refuse_second(hub, connection, "settings.get")
+    return hub.context.control(params.device).settings_report(fresh=params.fresh)
+
+
+def _settings_plan(hub: Hub, connection: Connection, params: SettingsChangeParams) -> Later:
+    """What would make the device as wanted; nothing is written."""
+    _known_devices(hub, [params.device])
+    _refuse_second(hub, connection, "settings.plan")
+    return hub.context.control(params.device).settings_plan(params.settings, save=params.save)
+
+
+def _settings_apply(hub: Hub, connection: Connection, params: SettingsChangeParams) -> Later:
+    """Make the device as wanted; the reply comes when it is done or has failed, with how the device is then."""
+    _known_devices(hub, [params.device])
+    _refuse_second(hub, connection, "settings.apply")
+    return hub.context.control(params.device).settings_apply(params.settings, save=params.save)
+
+
 def _refuse_second(hub: Hub, connection: Connection, method: str) -> None:
     if hub.busy(connection):
         raise RpcError(Code.UNAVAILABLE, f"{method}: the one before is not done yet; wait for its reply")
@@ -376,6 +416,9 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
     "calibrations": Method(DeviceParams, _calibrations),
     "calibrate": Method(CalibrateParams, _calibrate, Rights.CONTROL, acts=True),
+    "settings.get": Method(SettingsParams, _settings),
+    "settings.plan": Method(SettingsChangeParams, _settings_plan, Rights.CONTROL),
+    "settings.apply": Method(SettingsChangeParams, _settings_apply, Rights.CONTROL, acts=True),
     "stop_calibration": Method(DeviceParams, _stop_calibration, Rights.CONTROL, acts=True),
 }
 

@@ -105,3 +105,64 @@ def test_it_goes_on_when_the_client_leaves_and_ends_with_the_server(tmp_path: Pa
         await until(lambda: not server.hub.busy(connection))
 
     run(body)
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def test_settings_as_told_last_are_for_readers_and_all_else_needs_control(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
+
+    async def body() -> None:
+        async with serving(tmp_path, control_group="imud-test-control") as server:
+            peer = await Peer.greeted(server)
+            found = await peer.result("settings.get", device="imu0")
+            assert found["settings"][0]["actual"] == "6-axis"
+            for method, more in (("settings.get", {"fresh": True}), ("settings.plan", {}), ("settings.apply", {})):
+                code, message = await peer.error(method, device="imu0", **more)
+                assert code == -32001
+                assert message.startswith("settings.")
+                assert "expected root or a member of group 'imud-test-control'" in message
+            peer.close()
+
+    run(body)
+
+
+def test_settings_are_planned_and_applied_as_asked_for(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            assert (await peer.result("settings.get", device="imu0", fresh=True))["status"]["read_ns"] > 80 * 10**12
+            plan = await peer.result("settings.plan", device="imu0", settings={"output": {"hi91": 5}}, save=True)
+            assert plan["steps"][0]["value"] == {"hi91": 5}
+            assert plan["save"] is True
+            done = await peer.result("settings.apply", device="imu0", settings=None)
+            assert (done["steps"][0]["name"], done["saved"]) == ("mode", False)
+            code, message = await peer.error("settings.apply", device="imu0", settings=[1])
+            assert code == -32602
+            assert "settings: expected keys" in message
+            code, _message = await peer.error("settings.apply", device="imu7")
+            assert code == -32602
+            peer.close()
+
+    run(body)
+
+
+def test_one_change_at_a_time(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            peer = await Peer.greeted(server)
+            params = {"device": "imu0", "settings": {"wait": 1}}
+            line = {"jsonrpc": "2.0", "id": 90, "method": "settings.apply", "params": params}
+            await peer.send(json.dumps(line).encode() + b"\n")
+            for method in ("settings.plan", "settings.apply", "command"):
+                more = {"name": "output"} if method == "command" else {}
+                code, message = await peer.error(method, device="imu0", **more)
+                assert (code, "the one before is not done yet" in message) == (-32004, True)
+            socket_rig.done_late.set()
+            assert (await peer.message())["id"] == 90
+            peer.close()
+
+    run(body)

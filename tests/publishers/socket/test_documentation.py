@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from imud.contracts.device_settings import SettingsState, SettingsStatus, StepOutcome
 from imud.contracts.status import (
     ClockStatus,
     DeviceStatus,
@@ -125,8 +126,20 @@ def test_every_member_of_status_is_explained() -> None:
     in_devices = {"name", "device_id", "driver", "link", "state", "problem", "identity", "rate_hz"}
     assert first | in_devices == set(DeviceStatus.__struct_encode_fields__)
     named = set(re.findall(r"`(\w+)`", section))
-    for part in (ClockStatus, KernelCounters, PollingStatus, SerialLineCounters, LinesStatus, UtcStatus):
+    for part in (
+        ClockStatus,
+        KernelCounters,
+        PollingStatus,
+        SerialLineCounters,
+        LinesStatus,
+        UtcStatus,
+        SettingsStatus,
+    ):
         assert set(part.__struct_encode_fields__) <= named, part.__name__
+
+
+def test_every_state_of_settings_and_outcome_of_a_step_is_named() -> None:
+    assert all(f"`{word}`" in DOCUMENT for word in (*SettingsState, *StepOutcome))
 
 
 def test_every_kind_of_event_is_named() -> None:

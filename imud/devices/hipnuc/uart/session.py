@@ -221,7 +221,7 @@ def _found_after_boot(bauds: Sequence[int]) -> RequestScript[tuple[Identity, int
 
     A rate that was in force without being saved is lost by a restart, and which was saved is not known.
     """
-    yield pause(BOOT_NS, baud=bauds[0])
+    yield pause(BOOT_NS)  # at the present rate: REBOOT may still be on its way out of the port
     likely = dict.fromkeys(bauds)
     others = [baud for baud in BAUD_RATES if baud not in likely] if bauds[0] else []
     for baud in (*likely, *others):

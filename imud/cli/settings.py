@@ -1,0 +1,233 @@
+"""`imud settings`: a device's own settings beside the declared ones; apply, save, back up and restore them."""
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from imud.cli.arguments import CliCommand, add_socket, argument, confirmed
+from imud.cli.output import table
+from imud.client import Client
+from imud.config.yaml_tree import FILE_BYTES_MAX, no_pause, read_yaml
+from imud.contracts.device_settings import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState
+from imud.contracts.settings import shown
+from imud.errors import BadArgument
+from imud.files import read_regular, replace_file
+from imud.formats.jsonrpc import Code, RpcError
+from imud.formats.yaml_text import yaml_block, yaml_comment
+from imud.runtime.settings.backup import backup_text
+
+HEAD: Final = ("SETTING", "DECLARED", "ACTUAL", "")
+MORE: Final = ("UNIT", "MANUAL", "IN FORCE", "VALUES")
+LIMIT_S: Final = 180.0
+"""A plan of many steps with a restart and another baud rate at its end takes some ten seconds."""
+
+
+def settings_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud settings`."""
+    add_socket(parser)
+    parser.add_argument("device", metavar="DEVICE")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--apply", action="store_true", help="set what is not as declared")
+    what.add_argument("--set", nargs="+", metavar="NAME=VALUE", help="set these, whatever is declared")
+    what.add_argument("--yaml", action="store_true", help="print what the device has, to paste into the configuration")
+    what.add_argument("--backup", metavar="FILE", type=Path, help="write what the device has, with its identity")
+    what.add_argument("--restore", metavar="FILE", type=Path, help="set what a backup has")
+    parser.add_argument(
+        "--save", action="store_true", help="save to the device's flash, and restart it where that is needed"
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask, for scripts")
+    parser.add_argument("--verbose", action="store_true", help="units, sections of the manual, accepted values as well")
+    parser.add_argument("--json", action="store_true", help="what the socket answers, for programs")
+
+
+def settings(args: argparse.Namespace) -> int:
+    """Show, set, save, back up or restore; 0 when all is as it should be, 1 when it is not."""
+    with Client(args.socket, timeout_s=LIMIT_S) as client:
+        if args.restore is not None:
+            return _restore(client, args)
+        if args.apply or args.set or (args.save and not args.yaml and args.backup is None):
+            return _change(client, args, None if args.apply else dict(map(argument, args.set or ())))
+        report = _report(client, args.device, needed=args.yaml or args.backup is not None)
+    if args.yaml:
+        print(_yaml(report))
+        return 0
+    if args.backup is not None:
+        return _back_up(report, args)
+    print(msgspec.json.encode(report).decode() if args.json else _shown(report, verbose=args.verbose))
+    return 1 if report.status.state in (SettingsState.DIFFER, SettingsState.UNKNOWN) else 0
+
+
+# --- what there is ----------------------------------------------------------------------------------------------------
+
+
+def _report(client: Client, device: str, *, needed: bool) -> SettingsReport:
+    """Ask for the settings: of the device itself where this user may, else what it told last.
+
+    Raises ImudError where they are `needed` and the device does not tell them now.
+    """
+    fresh = "control" in client.hello.rights
+    try:
+        found = client.call("settings.get", device=device, fresh=fresh)
+    except RpcError as error:
+        if needed or not fresh or error.code is not Code.FAILED:
+            raise
+        print(f"{error}; what it told last:", file=sys.stderr)
+        found = client.call("settings.get", device=device)
+    report = msgspec.convert(found, SettingsReport)
+    if needed and report.status.read_ns is None:
+        raise BadArgument(f"{device} has not told its settings yet, and only members of the control group may ask it")
+    return report
+
+
+def _shown(report: SettingsReport, *, verbose: bool) -> str:
+    """Format the table and what follows from it."""
+    rows = [_row(one, verbose=verbose) for one in report.settings]
+    status, count = report.status, len(report.status.differences)
+    words = {
+        SettingsState.UNDECLARED: "nothing is declared; `--yaml` prints what to paste into the configuration",
+        SettingsState.UNKNOWN: "the device has not told its settings",
+        SettingsState.AGREE: "all that can be read is as declared",
+        SettingsState.DIFFER: f"{count} of {len(report.settings)} differ; `--apply` sets them, with `--save` for good",
+    }[status.state]
+    lines = [table((*HEAD, *MORE) if verbose else HEAD, rows), "", words]
+    if status.problem:
+        lines.append(f"problem: {status.problem}")
+    lines.append(f"flash written by imud: {status.flash_writes} times, {status.flash_writes_day} within 24 hours")
+    return "\n".join(lines)
+
+
+def _row(one: SettingInfo, *, verbose: bool) -> Sequence[str]:
+    """Format one setting."""
+    actual = _value(one.actual) if one.readable or one.actual is not None else "(not told)"
+    mark = "differs" if one.differs else "" if one.declarable else "only read"
+    row = (one.name, _value(one.declared), actual, mark)
+    return (*row, one.unit, one.section, str(one.effect), one.values) if verbose else row
+
+
+def _value(value: Any) -> str:
+    """Format a value in one short text: plain words without quotes."""
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else shown(value)
+
+
+def _settable(report: SettingsReport) -> dict[str, Any]:
+    return {one.name: one.actual for one in report.settings if one.declarable and one.actual is not None}
+
+
+def _yaml(report: SettingsReport) -> str:
+    """Format the present settings as they are declared in the configuration."""
+    who = " ".join(dict.fromkeys(report.identity.get(key, "") for key in ("product", "serial_number", "firmware")))
+    comment = f"Settings of {report.device} ({report.driver} {who.strip()}); paste below `{report.device}:`"
+    lines = [yaml_comment(comment)]
+    notes = {one.name: _note(one) for one in report.settings}
+    for line in yaml_block({"settings": _settable(report)}).splitlines():
+        note = notes.get(line.strip().partition(":")[0], "")
+        lines.append(f"{line}   # {note}" if note else line)
+    return "\n".join(lines)
+
+
+def _note(one: SettingInfo) -> str:
+    """Describe a setting in a comment: meaning, unit, section of the manual."""
+    texts = (one.description, one.unit, f"manual {one.section}" if one.section else "")
+    return "; ".join("".join(c if c.isprintable() else " " for c in text) for text in texts if text)
+
+
+# --- backup and restore -----------------------------------------------------------------------------------------------
+
+
+def _back_up(report: SettingsReport, args: argparse.Namespace) -> int:
+    text = backup_text(report.device, report.driver, report.identity, _settable(report), time.time_ns())
+    if str(args.backup) == "-":
+        print(text, end="")
+        return 0
+    if args.backup.exists() and not confirmed(f"write over {args.backup}", "it is there already", yes=args.yes):
+        return 1
+    replace_file(args.backup, text.encode())
+    print(f"{len(_settable(report))} settings of {report.device} are in {args.backup}")
+    return 0
+
+
+def _restore(client: Client, args: argparse.Namespace) -> int:
+    """Set what a backup has, after saying whether it is of this module."""
+    backup = _read_backup(args.restore)
+    report = _report(client, args.device, needed=True)
+    others = _other_module(backup, report)
+    if backup.get("driver", report.driver) != report.driver:
+        raise BadArgument(f"{args.restore} is of {backup['driver']}, {args.device} has driver {report.driver}")
+    given, known = backup["settings"], {one.name for one in report.settings if one.declarable}
+    unknown = [name for name in given if name not in known]
+    for words in (*others, *(f"left out: {name}, which {report.driver} cannot set" for name in unknown)):
+        print(words, file=sys.stderr)
+    if others and not confirmed(f"set {args.device} by it", "the backup is of another module", yes=args.yes):
+        return 1
+    return _change(client, args, {name: value for name, value in given.items() if name in known})
+
+
+def _read_backup(file: Path) -> dict[str, Any]:
+    """Read a backup, or what `--yaml` printed. Raises BadArgument with what is wrong with it."""
+    tree = read_yaml(read_regular(file, FILE_BYTES_MAX + 1), no_pause)
+    if tree.problems:
+        problem = tree.problems[0]
+        raise BadArgument(f"{file}:{problem.mark.line}:{problem.mark.column}: {problem.message}")
+    if not isinstance(tree.data, dict) or not isinstance(tree.data.get("settings"), dict):
+        raise BadArgument(f"{file}: expected the key settings with values, as `imud settings --backup` writes it")
+    return tree.data
+
+
+def _other_module(backup: Mapping[str, Any], report: SettingsReport) -> list[str]:
+    """List in which way a backup is of another module."""
+    identity = backup.get("identity")
+    if not isinstance(identity, dict):
+        return []
+    return [
+        f"the backup is of {name.replace('_', ' ')} {identity[name]}, {report.device} has {report.identity[name]}"
+        for name in ("product", "serial_number", "firmware")
+        if name in identity and name in report.identity and identity[name] != report.identity[name]
+    ]
+
+
+# --- change -----------------------------------------------------------------------------------------------------------
+
+
+def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] | None) -> int:
+    """Plan, show the plan, ask where that is needed, and apply."""
+    params = {"device": args.device, "settings": given, "save": args.save}
+    plan = msgspec.convert(client.call("settings.plan", **params), SettingsPlan)
+    if not args.json:
+        print(_planned(plan))
+    if plan.empty:
+        if args.json:
+            print(msgspec.json.encode(AppliedSettings(left_out=plan.left_out)).decode())
+        return 1 if plan.left_out else 0
+    if plan.risk and not confirmed(f"change {args.device}", plan.risk, yes=args.yes):
+        return 1
+    done = msgspec.convert(client.call("settings.apply", **params), AppliedSettings)
+    print(msgspec.json.encode(done).decode() if args.json else _account(done))
+    return 1 if done.problem or done.left_out or done.differences else 0
+
+
+def _planned(plan: SettingsPlan) -> str:
+    """Format a plan for people."""
+    lines = [f"  {one.name}: {_value(one.before)} → {_value(one.value)}" for one in plan.steps]
+    lines += ["  save to flash"] * plan.save + ["  restart"] * plan.restart
+    lines = ["to do:", *lines] if lines else ["nothing to do"]
+    return "\n".join([*lines, *(f"left out: {name} {why} (--save)" for name, why in plan.left_out.items())])
+
+
+def _account(done: AppliedSettings) -> str:
+    """Format what was done for people."""
+    lines = [f"  {one.name}: {one.outcome}" + (f": {one.message}" if one.message else "") for one in done.steps]
+    lines += ["  saved to flash"] * done.saved + ["  restarted"] * done.restarted
+    if done.problem:
+        lines.append(f"NOT done: {done.problem}")
+    now = (f"{name} is {_value(one.actual)}, wanted {_value(one.declared)}" for name, one in done.differences.items())
+    return "\n".join(["done:" if not done.problem else "tried:", *lines, *now])
+
+
+SETTINGS = CliCommand(settings_arguments, settings)
