@@ -287,6 +287,7 @@ CROSS_CUTTING = {
     "devices/test_every_stream_driver.py": "every driver of byte streams",
     "devices/test_every_can_driver.py": "every driver on CAN",
     "devices/test_every_polled_driver.py": "every driver that is polled",
+    "devices/test_every_device_settings.py": "the settings of every driver",
     "devices/hipnuc/canopen/test_peers.py": "the canopen library as a peer of codec and simulator",
     "devices/imu61x/test_one_truth.py": "one motion through every protocol of the family",
     "links/rs485/test_modbus_peers.py": "pymodbus as a peer of link and simulator",

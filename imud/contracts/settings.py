@@ -144,7 +144,7 @@ def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
 
 
 def _words(info: inspect.Type) -> str:
-    words = "keys and values"
+    words = _words_of_several(info)
     match info:
         case inspect.Metadata(type=inner, extra=extra):
             words = (extra or {}).get("words") or _words(inner)
@@ -160,10 +160,6 @@ def _words(info: inspect.Type) -> str:
             words = "a number" + _range(info)
         case inspect.StrType():
             words = "text" + _text_rules(info)
-        case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item) | inspect.SetType(item_type=item):
-            words = f"a list{_length(info)}, each of it {_words(item)}"
-        case inspect.DictType(value_type=item):
-            words = f"keys, each with {_words(item)}"
         case inspect.BoolType():
             words = "true or false"
         case inspect.NoneType():
@@ -171,6 +167,20 @@ def _words(info: inspect.Type) -> str:
         case inspect.AnyType():
             words = "any value"
     return words
+
+
+def _words_of_several(info: inspect.Type) -> str:
+    """Describe lists, and mappings with their keys where these are known."""
+    match info:
+        case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item) | inspect.SetType(item_type=item):
+            return f"a list{_length(info)}, each of it {_words(item)}"
+        case inspect.DictType(key_type=inspect.LiteralType(values=keys), value_type=item):
+            return f"keys {', '.join(map(str, sorted(keys, key=_natural)))}, each with {_words(item)}"
+        case inspect.DictType(value_type=item):
+            return f"keys, each with {_words(item)}"
+        case inspect.StructType(fields=fields):
+            return f"the keys {', '.join(f'{one.encode_name} ({_words(one.type)})' for one in fields)}"
+    return "keys and values"
 
 
 def _natural(value: object) -> list[tuple[str, float]]:

@@ -308,6 +308,8 @@ class FakeModule(MemoryLink):
         """Commands that it does not answer."""
         self.commands: list[str] = []
         self.saves = 0
+        self.pauses_clock = False
+        """Whether its clock begins anew with every answer to GET."""
         self._now_ns = now_ns
         self._boot_ns = now_ns()
 
@@ -344,6 +346,8 @@ class FakeModule(MemoryLink):
         return ["NAME=FAKE", f"SN={self.serial}", "OK"]
 
     def _get(self) -> list[str]:
+        if self.pauses_clock:
+            self._boot_ns = self._now_ns()
         values = {**self.set, "mounting": self.mounting}
         return [*(f"{name}={msgspec.json.encode(values[name]).decode()}" for name in TOLD), "OK"]
 

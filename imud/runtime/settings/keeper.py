@@ -58,6 +58,9 @@ BEGIN_NS: Final = NS_PER_S
 """From finding a device to the question: imud asks for its identity meanwhile, on which counting writes depends."""
 SETTLE_NS: Final = NS_PER_S // 2
 """From the first sample after a restart to the question: a module that has just started need not answer at once."""
+OWN_NS: Final = 2 * NS_PER_S
+"""After a script a device that paused its samples for it, or that it restarted, may begin its clock anew so late: what
+it has then is compared at the end of the script, and not once more, which would pause its samples again."""
 BACKUP_LIMIT_S: Final = 5.0
 """How long a command waits for a disk that does not answer."""
 READ_AGAIN_NS: Final = 5 * NS_PER_S
@@ -96,6 +99,8 @@ class SettingsKeeper:
         self._hears = hears
         self._read_back = read_back
         self._clock: SampleClock | None = None
+        self._own_until_ns = 0
+        """Until when a new beginning of the device's clock is counted as caused by imud's own scripts."""
         self._resets = 0
         self._lock = asyncio.Lock()
         self._wanted = asyncio.Event()
@@ -129,8 +134,11 @@ class SettingsKeeper:
             return
         if self._clock is not None and (resets := self._clock.status().resets) != self._resets:
             self._resets = resets
-            self._begin_anew(SETTLE_NS)
-        if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._hears():
+            if not self.busy and now_ns >= self._own_until_ns:
+                self._begin_anew(SETTLE_NS)
+        if self.busy:
+            self._own_until_ns = now_ns + OWN_NS
+        elif self._due_ns is not None and now_ns >= self._due_ns and self._hears():
             self._wanted.set()
 
     def commanded(self) -> None:

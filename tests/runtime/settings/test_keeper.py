@@ -192,6 +192,22 @@ def test_compared_again_after_a_replug_a_restart_and_a_command() -> None:
     bench.play(story)
 
 
+def test_a_device_whose_clock_begins_anew_by_the_question_is_asked_once() -> None:
+    bench = ModuleBench(declared={"mode": "6-axis"})
+    bench.module.pauses_clock = True
+
+    async def story() -> None:
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+        asked = bench.module.commands.count("GET")
+        await bench.pass_s(50)
+        assert bench.module.commands.count("GET") == asked
+        bench.module.set["mode"] = "9-axis"
+        bench.module.restart()  # and by itself it is noticed
+        await bench.until(lambda: bench.module.commands.count("GET") == asked + 1)
+
+    bench.play(story)
+
+
 def test_a_device_that_does_not_tell_its_settings_is_asked_a_few_times() -> None:
     bench = ModuleBench(declared={"mode": "6-axis"})
     bench.module.silent = {"GET"}
