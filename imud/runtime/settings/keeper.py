@@ -136,9 +136,7 @@ class SettingsKeeper:
             self._resets = resets
             if not self.busy and now_ns >= self._own_until_ns:
                 self._begin_anew(SETTLE_NS)
-        if self.busy:
-            self._own_until_ns = now_ns + OWN_NS
-        elif self._due_ns is not None and now_ns >= self._due_ns and self._hears():
+        if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._hears():
             self._wanted.set()
 
     def commanded(self) -> None:
@@ -167,16 +165,19 @@ class SettingsKeeper:
 
     @asynccontextmanager
     async def exclusive(self) -> AsyncIterator[None]:
-        """Keep settings alone while a command is carried out."""
+        """Keep settings alone while a command is carried out, or they are read or written."""
         async with self._lock:
-            yield
+            try:
+                yield
+            finally:
+                self._own_until_ns = self._host.now_ns() + OWN_NS
 
     async def run(self) -> None:
         """Compare whenever it is time. Ends only by an error of imud."""
         while True:
             await self._wanted.wait()
             self._wanted.clear()
-            async with self._lock:
+            async with self.exclusive():
                 self._due_ns = None
                 await self._keep()
 
@@ -209,7 +210,7 @@ class SettingsKeeper:
         """
         table = self._table()
         if fresh:
-            async with self._lock:
+            async with self.exclusive():
                 await self._read(table)
         status = self.status()
         assert status is not None
@@ -225,14 +226,14 @@ class SettingsKeeper:
         """Plan to make the device as `given` (None: as declared), without changing it. Raises what `report` does."""
         table = self._table()
         wanted = self._wanted_values(table, given)
-        async with self._lock:
+        async with self.exclusive():
             return self._make_plan(table, wanted, await self._read(table), save=save)
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
         """Make the device as `given` (None: as declared). Raises what `report` does, before anything is written."""
         table = self._table()
         wanted = self._wanted_values(table, given)
-        async with self._lock:
+        async with self.exclusive():
             return await self._apply(table, wanted, await self._read(table), save=save, asked=True)
 
     async def back_up(self, action: str) -> None:

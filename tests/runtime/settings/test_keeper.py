@@ -323,6 +323,7 @@ def test_a_device_that_forgets_is_set_again_after_growing_pauses() -> None:
             times_s.append((bench.clock.now_ns() - before_ns) / 1e9)
         assert [round(time_s, -1) for time_s in times_s] == [10, 60, 600]
         bench.module.forgets = set()
+        await bench.pass_s(3)
         bench.module.restart()
         await bench.pass_s(20)
         assert "does not keep its settings" in bench.status.problem
