@@ -8,6 +8,7 @@ Readings are decoded only between an identification and the first sign that the 
 """
 
 import asyncio
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,7 +23,7 @@ from imud.contracts.polling import PolledDriver, Reading
 from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
 from imud.devices import DRIVERS
-from imud.errors import CommandError, DeviceRefused, LinkError, TransferError, Trouble
+from imud.errors import CommandError, DeviceRefused, ImudError, LinkError, TransferError, Trouble
 from imud.event import EventKind
 from imud.links import LINKS
 from imud.runtime.path import SamplePath
@@ -32,6 +33,8 @@ from imud.runtime.polled.path import PolledPath, PollTiming
 from imud.runtime.polled.schedule import Deadlines
 from imud.runtime.transport import UNHEARD_NS, DeviceContext
 from imud.units import NS_PER_MS, NS_PER_S
+
+log = logging.getLogger(__name__)
 
 RETRY_S = 0.5
 """Pause between two rounds of search."""
@@ -215,7 +218,18 @@ class PolledTransport:
         return tuple(dict.fromkeys((device.target, *self._former, *given)))
 
     async def read_back(self) -> None:
-        """No-op: such a device is set up again, and asked, whenever it returns."""
+        """Set the device up again as configured, and keep the settings that it reads back.
+
+        One that does not answer is left as it is: it is set up when it returns."""
+        member, device = self._member, self._device
+        if member is None or device is None or not self._identified:
+            return
+        try:
+            settings = await member.run(device.driver.set_up(device.options), device.target)
+        except ImudError as error:
+            log.info("%s: settings not read back: %s", self._config.name, error)
+            return
+        self._context.identity.update(device.identity, settings)
 
     def _follow(self, target: int) -> None:
         """Follow a script that has given the device another address."""

@@ -9,8 +9,13 @@ from typing import Any
 
 import pytest
 
+from imud.contracts.polling import Poll
 from imud.contracts.status import DeviceState
+from imud.devices.imu61x.spi import codec
+from imud.devices.imu61x.spi.words import READ_STATE
+from imud.errors import DeviceRefused
 from imud.event import EventKind
+from imud.sim.imu61x.behaviour import REGISTER_VARIANTS
 from tests.support.device_rig import device_config
 from tests.support.event_loops import VirtualClock
 from tests.support.polled_bus_bench import RATE_HZ, PolledBusBench, on_i2c
@@ -408,5 +413,68 @@ def test_slow_transfers_miss_deadlines_which_are_lost_samples(
             assert polling.late_sum_ns // polling.polls == polling.late_mean_ns > 0
             assert "no value of it is new" not in caplog.text  # it was not asked for long enough to say so
             assert rig.device.ledger.lost_queue == polling.missed >= 30
+
+    bench.run(body())
+
+
+def test_settings_are_read_again_after_an_action(bench: PolledBusBench) -> None:
+    device = bench.registers()
+    bench.spi.device = device.spi
+
+    async def body() -> None:
+        async with bench.running(bench.on_spi()) as (rig,):
+            await rig.until_samples(5)
+            assert rig.device.status().settings["gyro_filter"] == "47 Hz"
+            answer = await rig.device.act("filter", {"gyro_filter": "10 Hz"})
+            assert isinstance(answer, dict)
+            assert answer["gyro_filter"] == rig.device.status().settings["gyro_filter"] == "10 Hz"
+            device.faults.ignores_writes = True
+            with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xb0, read back 0xb4"):
+                await rig.device.act("filter", {"gyro_filter": 0})
+            assert rig.device.status().settings["gyro_filter"] == "10 Hz"
+            await rig.until_samples(5)
+
+    bench.run(body())
+
+
+@pytest.mark.parametrize("variant", REGISTER_VARIANTS)
+@pytest.mark.parametrize("burst", ["standard", "extended"])
+def test_a_kind_of_burst_is_found_and_kept_in_every_variant(
+    bench: PolledBusBench, variant: str, burst: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over readings of identity and settings, ten per second here, and after a restart that loses them."""
+    polls = {kind: (first, Poll(READ_STATE, 10**8)) for kind, (first, *_) in codec.POLLS.items()}
+    monkeypatch.setattr(codec, "POLLS", polls)
+    device = bench.registers(behaviour=REGISTER_VARIANTS[variant])
+    device.extended = 1
+    bench.spi.device = device.spi
+
+    async def body() -> None:
+        async with bench.running(bench.on_spi(burst=burst)) as (rig,):
+            await rig.until_samples(int(RATE_HZ))
+            polling = rig.device.status().polling
+            assert polling is not None
+            assert (polling.vanished, rig.device.ledger.frames_bad_crc) == (0, 0)
+            device.restart()
+            await rig.until_samples(5)
+            assert rig.device.status().polling.vanished == (burst == "extended")  # type: ignore[union-attr]  # it has it
+            assert device.extended == (burst == "extended")
+
+    bench.run(body())
+
+
+def test_settings_are_declared_and_applied_on_a_bus(bench: PolledBusBench) -> None:
+    device = bench.registers()
+    bench.spi.device = device.spi
+
+    async def body() -> None:
+        async with bench.running(bench.on_spi(burst="extended")) as (rig,):
+            await rig.until_samples(5)
+            report = await rig.device.settings_report(fresh=True)
+            actual = {one.name: one.actual for one in report.settings}
+            assert actual == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "extended"}
+            applied = await rig.device.settings_apply({"accel_filter": "average 16"}, save=False)
+            assert [(step.name, str(step.outcome)) for step in applied.steps] == [("accel_filter", "done")]
+            assert device.filter == 0xDB
 
     bench.run(body())
