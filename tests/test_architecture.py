@@ -296,6 +296,7 @@ CROSS_CUTTING = {
     "runtime/detection/test_stream_families.py": "every driver in one search",
     "runtime/polled/test_in_daemon.py": "a bus thread in the daemon",
     "runtime/polled/test_shared_line.py": "modules on one RS-485 line, from the port to samples",
+    "runtime/stream/test_imu61x_variants.py": "every variant of an IMU61x, from the line to actions and settings",
     "runtime/stream/test_wake.py": "a device that is silent, from the line to its state",
     "runtime/stream/test_silent.py": "every simulated variant of a module, from the line to its state",
     "signals/test_end_to_end.py": "pins of a simulated module through the whole device",

@@ -24,6 +24,7 @@ from imud.formats.modbus import BROADCAST, SLAVES, ReplyFinder, frame_gap_ns, fr
 from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveSettings, SlaveVariant
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort
+from imud.sim.simulator import StreamModule
 from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 T = TypeVar("T")
@@ -113,10 +114,17 @@ def slave(address: int, *, baud: int = BAUD, serial: int = 0, **more: object) ->
 @contextmanager
 def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0) -> Iterator[tuple[Path, ModbusLine]]:
     """The path of a port with these modules on its line."""
+    line = ModbusLine(time.monotonic_ns(), slaves, echo=echo, chunk_bytes=chunk_bytes)
+    with plugged(folder / "line", line) as path:
+        yield path, line
+
+
+@contextmanager
+def plugged(path: Path, module: StreamModule) -> Iterator[Path]:
+    """The path of a port with this module behind it, in real time."""
     now_ns = time.monotonic_ns()
-    line = ModbusLine(now_ns, slaves, echo=echo, chunk_bytes=chunk_bytes)
-    node = PtyNode(folder / "line")
-    port = SimulatedPort(line, node, Adapter(BARE_UART, now_ns))
+    node = PtyNode(path)
+    port = SimulatedPort(module, node, Adapter(BARE_UART, now_ns))
     ended = threading.Event()
     failed: list[BaseException] = []
 
@@ -136,7 +144,7 @@ def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0
     thread = threading.Thread(target=run, name="line", daemon=True)
     thread.start()
     try:
-        yield node.path, line
+        yield node.path
     finally:
         ended.set()
         thread.join(LIMIT_S)

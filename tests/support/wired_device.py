@@ -1,4 +1,5 @@
-"""A simulated HiPNUC module with pins, wired to a device, in virtual time: bytes and edges come in step."""
+"""Simulated modules wired to a device in virtual time: a HiPNUC module with pins, whose bytes and edges come in step, and
+the line of an IMU61x."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
@@ -16,6 +17,7 @@ from imud.runtime import utc_keeper
 from imud.sample import Sample
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings
 from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.imu61x.uart import Imu61xModule
 from imud.sim.ports.faults import Faults
 from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
 from imud.sim.ports.pins import OnEdge, Pin, PinFaults, Pins
@@ -300,3 +302,29 @@ def play_linked(
 
     run_virtually(clock, both())
     return made[0]
+
+
+# --- IMU61x ----------------------------------------------------------------------------------------------------------
+
+LINE_STEP_S = 0.001
+
+
+class Imu61xLine(MemoryLink):
+    """A line in virtual time with a device at its far end; `carry` must run."""
+
+    def __init__(self, settings: MemorySettings, module: Imu61xModule, clock: VirtualClock) -> None:
+        super().__init__(settings)
+        self.module = module
+        self.clock = clock
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
+
+    async def carry(self) -> None:
+        """What the device sends, as it leaves the wire."""
+        while True:
+            baud = self.module.baud
+            for burst in self.module.advance(self.clock.now_ns()):
+                self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
+            await asyncio.sleep(LINE_STEP_S)

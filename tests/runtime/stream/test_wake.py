@@ -10,37 +10,15 @@ from imud.config import DeviceConfig
 from imud.contracts.status import DeviceState
 from imud.devices.imu61x.uart.commands import OutputMode
 from imud.event import EventKind
-from imud.links.memory import MemoryLink, MemorySettings
+from imud.links.memory import MemorySettings
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xModule
-from imud.sim.ports.uart_wire import heard
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.simulated_modules import imu61x_hardware
+from tests.support.wired_device import Imu61xLine
 
-STEP_S = 0.001
 QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
-
-
-class Line(MemoryLink):
-    """A line with a device at its far end."""
-
-    def __init__(self, settings: MemorySettings, module: Imu61xModule, clock: VirtualClock) -> None:
-        super().__init__(settings)
-        self.module = module
-        self.clock = clock
-
-    def write(self, data: bytes) -> None:
-        super().write(data)
-        self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
-
-    async def carry(self) -> None:
-        """What the device sends, as it leaves the wire."""
-        while True:
-            baud = self.module.baud
-            for burst in self.module.advance(self.clock.now_ns()):
-                self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
-            await asyncio.sleep(STEP_S)
 
 
 class WakeBench:
@@ -51,7 +29,7 @@ class WakeBench:
         driver, identify = link.pop("driver", "imu61x-uart"), link.pop("identify", True)
         memory = MemorySettings(**{"baud": 115200, **link})
         self.module = Imu61xModule(clock.now_ns(), settings, imu61x_hardware(**hardware))
-        self.line = Line(memory, self.module, clock)
+        self.line = Imu61xLine(memory, self.module, clock)
         self.rigs = DeviceRigs(clock.host)
         self.rig = self.rigs.add(DeviceConfig("bow", driver, None, identify, "memory", memory), self.line)
         self.device = self.rig.device
