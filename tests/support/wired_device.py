@@ -1,5 +1,5 @@
-"""Simulated modules wired to a device in virtual time: a HiPNUC module with pins, whose bytes and edges come in step, and
-the line of an IMU61x."""
+"""Simulated modules wired to a device in virtual time: a HiPNUC module with pins, whose bytes and edges come in step,
+and the line of an IMU61x."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
