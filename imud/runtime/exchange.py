@@ -41,6 +41,8 @@ class Exchange:
         self._listen = listen
         self._lock = asyncio.Lock()
         self._outcome: asyncio.Future[Outcome] | None = None
+        self.wants_samples = False
+        """Whether a request waits for a measurement; read once per batch, so an attribute."""
 
     async def run(self, script: RequestScript[T]) -> T:
         """Run `script` to its end and return its value. Raises what it raises, and LinkError when unplugged.
@@ -74,11 +76,6 @@ class Exchange:
         """Pass on one line of text or one reply frame from the codec."""
         self._settle(self._session.on_message(message, t_rx_ns))
 
-    @property
-    def wants_samples(self) -> bool:
-        """Whether a request waits for a measurement."""
-        return self._session.wants_samples
-
     def on_sample(self, sample: Measurement) -> None:
         """Pass on one measurement from the codec."""
         self._settle(self._session.on_sample(sample))
@@ -94,6 +91,7 @@ class Exchange:
         timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
         try:
             payload = self._session.start(request, self._now_ns())
+            self.wants_samples = self._session.wants_samples
             if payload:
                 self._write(payload)
             if request.silent:
@@ -103,6 +101,7 @@ class Exchange:
         finally:
             timer.cancel()
             self._outcome = None
+            self.wants_samples = False
             self._session.cancel()
             if request.also:
                 self._hear(request, ())

@@ -141,10 +141,8 @@ class SamplePath(ABC):
 class SampleListener(Protocol):
     """Listener to measurements as a codec makes them, before they are samples: a command waits for one."""
 
-    @property
-    def wants_samples(self) -> bool:
-        """Whether it listens now."""
-        ...
+    wants_samples: bool
+    """Whether it listens now."""
 
     def on_sample(self, sample: Measurement) -> None:
         """Process one measurement."""
