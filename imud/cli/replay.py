@@ -1,7 +1,6 @@
 """`imud replay`: run a capture through the daemon's whole path, for clients to read, or printed."""
 
 import argparse
-import asyncio
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +19,7 @@ from imud.errors import ImudError
 from imud.event import Event
 from imud.links import LINKS
 from imud.log import STDERR, log_to
+from imud.runtime import event_loop
 
 SPEEDS = ("recorded", "real", "maximum")
 
@@ -55,7 +55,7 @@ def play(args: argparse.Namespace) -> DeviceStatus:
     check(settings.devices[0])
     printer = Printer(lambda: daemon.stop())  # noqa: PLW0108 - the daemon is made with the printer
     daemon = Daemon(settings, extra={"print": printer} if args.json else {}, until_finished=True)
-    asyncio.run(serve(daemon))
+    event_loop.run(serve(daemon))
     if printer.problem is not None:
         raise printer.problem
     return daemon.status()[0]

@@ -1,7 +1,6 @@
 """`imud run`: the daemon in the foreground, as the service manager starts it; `imud check`: its configuration alone."""
 
 import argparse
-import asyncio
 import logging
 import os
 import sys
@@ -14,6 +13,7 @@ from imud.config.yaml_tree import FILE_BYTES_MAX
 from imud.daemon import Daemon
 from imud.errors import ImudError
 from imud.log import STDERR, log_to
+from imud.runtime import event_loop
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     settings = config.load(args.config, missing="give the file with --config")
     with log_to(STDERR, settings.log_level):
         try:
-            asyncio.run(serve(settings, args.config))
+            event_loop.run(serve(settings, args.config))
         except ImudError:
             raise
         except Exception:

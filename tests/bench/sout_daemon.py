@@ -3,7 +3,6 @@
 What a GPIO chip gives by its descriptor a FIFO gives here: the same bytes for the same system calls.
 """
 
-import asyncio
 import os
 import sys
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from imud import config
 from imud.contracts.lines import InputSettings, LineFactory
 from imud.daemon import Daemon
 from imud.log import STDERR, log_to
+from imud.runtime import event_loop
 from imud.signals.gpio import GpioInput, GpioOutput
 
 
@@ -49,7 +49,7 @@ def main() -> None:
         await daemon.run()
 
     with log_to(STDERR, settings.log_level):
-        asyncio.run(serve())
+        event_loop.run(serve())
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.links import LINKS
 from imud.links.memory import MemoryCanLink, MemoryLink
+from imud.runtime import event_loop
 from imud.runtime.device import Device
 from imud.runtime.device_factory import DeviceFactory
 from imud.sample import Sample
@@ -214,7 +215,7 @@ def play(
         assert not any(link.is_open for link in _memory_links(made))
 
     if clock is None:
-        asyncio.run(whole())
+        event_loop.run(whole())
     else:
         run_virtually(clock, whole())
 

@@ -13,6 +13,7 @@ from functools import wraps
 from typing import Any, ParamSpec
 
 from imud.host_clock import HostClock
+from imud.runtime import event_loop
 from imud.runtime.polled.bus import PolledBuses
 from imud.units import NS_PER_S
 from imud.worker import Round
@@ -25,7 +26,7 @@ def in_loop(test: Callable[P, Coroutine[None, None, None]]) -> Callable[P, None]
 
     @wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        asyncio.run(test(*args, **kwargs))
+        event_loop.run(test(*args, **kwargs))
 
     return run
 

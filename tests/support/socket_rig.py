@@ -34,6 +34,7 @@ from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, FrameS
 from imud.errors import Rejected
 from imud.frames.conventions import Convention, Heading
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
+from imud.runtime import event_loop
 from imud.sample import Sample, Sync
 
 T = TypeVar("T")
@@ -198,7 +199,7 @@ def run(body: Callable[[], Awaitable[T]]) -> T:
         async with asyncio.timeout(LIMIT_S):
             return await body()
 
-    result = asyncio.run(limited())
+    result = event_loop.run(limited())
     assert not strays
     return result
 
@@ -270,7 +271,7 @@ def daemon(directory: Path) -> Iterator[Daemon]:
             ready.set()
             await found[0].stopped()
 
-    thread = threading.Thread(target=asyncio.run, args=(main(),))
+    thread = threading.Thread(target=event_loop.run, args=(main(),))
     thread.start()
     try:
         assert ready.wait(LIMIT_S)

@@ -204,8 +204,10 @@ class Scheduler:
         self._served_all_ns = 0
         self._loop = asyncio.get_running_loop()
         self._epoll = select.epoll()
-        self._loop.add_reader(self._epoll.fileno(), self._turn)
+        self._loop.add_reader(self._epoll.fileno(), self._on_events)
         self._next_turn: asyncio.Handle | None = None
+        self._pausing = False
+        """Whether the next turn comes after a pause."""
         self._places: dict[int, Place] = {}
         self._users: dict[int, _User] = {}
         self._in_line: dict[_User, None] = {}
@@ -246,7 +248,7 @@ class Scheduler:
             self._in_line[user] = None
         heappush(user.line, (not place.is_light, place.run_ns, place.number, place))
         if self._next_turn is None:
-            self._next_turn = self._loop.call_soon(self._turn)
+            self._schedule(True)
 
     def arm(self, place: Place) -> None:
         """Wait for the events that a client wants."""
@@ -278,6 +280,11 @@ class Scheduler:
         self._epoll.close()
 
     # --- a turn -----------------------------------------------------------------------------------------------------
+
+    def _on_events(self) -> None:
+        """Sockets have events: serve once in this turn of the event loop, so that samples are read before and after."""
+        if self._next_turn is None or self._pausing:
+            self._schedule(True)
 
     def _turn(self) -> None:
         """Serve pieces until the time is used up or nobody is in line."""
@@ -311,6 +318,7 @@ class Scheduler:
         if self._next_turn is not None:
             self._next_turn.cancel()
         self._next_turn = self._loop.call_soon(self._turn) if at_once else self._loop.call_later(PAUSE_S, self._turn)
+        self._pausing = not at_once
 
     def _collect(self) -> None:
         """Put those in line whose sockets have events."""
