@@ -15,11 +15,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
 from tests.bench.instructions import figures
-from tests.bench.instructions.measured import MARK, MARKS_PER_STAGE
+from tests.bench.instructions.measured import MARK, MARKS
 
 LIMIT_S: Final = 900.0
 ROOT: Final = Path(__file__).parents[3]
@@ -39,36 +40,38 @@ def total(dump: str) -> int:
     return int(found[1])
 
 
-def per_operation(names: Sequence[str], totals: Sequence[int]) -> dict[str, int]:
-    """Instructions by stage. `names` are the lines that the program printed, `totals` those of the dumps, in order."""
-    if len(totals) != MARKS_PER_STAGE * len(names):
-        raise MeasurementError(f"{len(totals)} dumps for {len(names)} stages, expected {MARKS_PER_STAGE} each")
-    found = {}
-    for number, line in enumerate(names):
-        count, _, name = line.partition(" ")
-        once, twice = totals[MARKS_PER_STAGE * number + 1 : MARKS_PER_STAGE * (number + 1)]
-        found[name] = round((twice - once) / int(count))
-    return found
+def per_operation(count: int, totals: Sequence[int]) -> int:
+    """Instructions of an operation. `totals` are those of the dumps: before n, n and 2 n operations."""
+    if len(totals) != MARKS:
+        raise MeasurementError(f"{len(totals)} dumps of a stage, expected {MARKS}")
+    _, once, twice = totals
+    return round((twice - once) / count)
 
 
 def measure(words: Sequence[str]) -> dict[str, int]:
     """Count the stages whose names have one of `words`; all without any. Raises MeasurementError."""
     environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
     environment |= {"PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
-    with tempfile.TemporaryDirectory(prefix="imud-instructions-") as name:
-        dumps = Path(name) / "dump"
-        valgrind = ["valgrind", "--quiet", "--tool=callgrind", f"--dump-before={MARK}", f"--callgrind-out-file={dumps}"]
-        python = [sys.executable, "-m", "tests.bench.instructions.measured", *words]
+    with ExitStack() as stack:
+        dumps, files = (
+            Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-", dir=place)))
+            for place in (None, "/dev/shm")
+        )
+        valgrind = ["valgrind", "--quiet", "--tool=callgrind", f"--dump-before={MARK}"]
+        valgrind += [f"--callgrind-out-file={dumps}/%p"]
+        python = [sys.executable, "-m", "tests.bench.instructions.measured", str(files), *words]
         done = subprocess.run(
             [*valgrind, *python], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT_S,
             check=False,
         )  # fmt: skip
         if done.returncode:
             raise MeasurementError(done.stderr)
-        names = done.stdout.splitlines()
-        count = len(list(dumps.parent.glob("dump.*")))
-        totals = [total(Path(f"{dumps}.{number}").read_text()) for number in range(1, count + 1)]
-    return per_operation(names, totals)
+        found = {}
+        for line in done.stdout.splitlines():
+            pid, count, name = line.split(" ", 2)
+            parts = sorted(dumps.glob(f"{pid}.*"), key=lambda path: int(path.suffix[1:]))
+            found[name] = per_operation(int(count), [total(part.read_text()) for part in parts])
+    return found
 
 
 def main() -> int:

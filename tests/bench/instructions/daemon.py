@@ -11,7 +11,6 @@ import select
 import selectors
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -19,6 +18,7 @@ import msgspec
 from imud import config
 from imud.daemon import Daemon
 from imud.formats.jsonrpc import encode_request, line_of
+from imud.runtime.event_loop import ReaderSelector, SampleLoop
 from imud.units import NS_PER_MS
 from tests.bench.instructions import virtual_time
 from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
@@ -30,7 +30,7 @@ CONNECT_MS: Final = 10
 BUFFER: Final = bytearray(1 << 20)
 
 
-class _Feeder(selectors.EpollSelector):
+class _Feeder(ReaderSelector):
     """Gives the loop its next read when it would sleep; where none is left, the loop stops."""
 
     def __init__(self, master: int, slave: int) -> None:
@@ -70,23 +70,19 @@ class _Feeder(selectors.EpollSelector):
 class VirtualDaemon:
     """A daemon with one device and its clients, in the caller's thread."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: str) -> None:
         self._master, slave = os.openpty()
-        self._socket_path = str(directory / "s")
+        self._socket_path = f"{directory}/s"
         self._module = Module()
         self._feeder = _Feeder(self._master, slave)
-        self._loop = asyncio.SelectorEventLoop(self._feeder)
+        self._loop = SampleLoop(self._feeder)
         self._feeder.loop = self._loop
         self._running = self._loop.create_task(Daemon(_settings(directory, os.ttyname(slave))).run())
         self._pass_time(START_MS)
         self.process(self._module.first_minute())
 
     def connect(self, clients: int, encoding: str) -> None:
-        """Have so many clients that get every sample, in place of those before."""
-        for client in self._feeder.clients:
-            client.close()
-        self._feeder.clients = []
-        self._pass_time(CONNECT_MS)
+        """Have so many clients that get every sample."""
         watch = line_of(encode_request("watch", {"encoding": encoding}, 1))
         for _ in range(clients):
             client = socket.socket(socket.AF_UNIX)
@@ -107,14 +103,6 @@ class VirtualDaemon:
         """Have the daemon read, process and publish; a wake-up each."""
         self._run(iter(reads))
 
-    def close(self) -> None:
-        """End the daemon."""
-        self._running.cancel()
-        self._loop.run_until_complete(asyncio.gather(self._running, return_exceptions=True))
-        self._loop.close()
-        for client in self._feeder.clients:
-            client.close()
-
     def _run(self, reads: Iterator[Read]) -> None:
         self._feeder.reads = reads
         self._loop.run_forever()
@@ -129,12 +117,12 @@ class VirtualDaemon:
         self._module.skip(duration_ms)
 
 
-def _settings(directory: Path, port: str) -> config.Config:
+def _settings(directory: str, port: str) -> config.Config:
     tree = {
         "log_level": "error",
-        "state_dir": str(directory),
-        "socket": {"path": str(directory / "s"), "group": own_group()},
-        "shm": {"directory": str(directory), "group": own_group()},
+        "state_dir": directory,
+        "socket": {"path": f"{directory}/s", "group": own_group()},
+        "shm": {"directory": directory, "group": own_group()},
         "metrics": {"port": 0},
         "devices": {"d0": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": BAUD}}},
     }

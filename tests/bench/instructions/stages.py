@@ -5,15 +5,11 @@ less those of n are n operations without all that surrounds them.
 """
 
 import asyncio
-import atexit
-import shutil
 import socket
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from itertools import islice
-from pathlib import Path
 from random import Random
 from typing import Final
 
@@ -41,8 +37,9 @@ from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
 Run = Callable[[int], None]
 
 READ_BYTES: Final = 4096
-WARM: Final = 64
-"""Operations before the first that is counted: the interpreter specialises its instructions."""
+WARM: Final = 200
+"""Samples or frames before the first that is counted."""
+WARM_LEAST: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +47,8 @@ class CountedStage:
     """A part of the way of a sample."""
 
     name: str
-    make: Callable[[int], Run]
-    """Makes `run` for so many operations in all."""
+    make: Callable[[int, str], Run]
+    """Makes `run` for so many operations in all; its files go into the directory."""
     count: int
     """Operations that are counted; twice as many the second time."""
     per: int = 1
@@ -60,7 +57,12 @@ class CountedStage:
     @property
     def total(self) -> int:
         """Operations in all."""
-        return WARM + 3 * self.count
+        return self.warm + 3 * self.count
+
+    @property
+    def warm(self) -> int:
+        """Operations before the first that is counted: the interpreter specialises its instructions."""
+        return max(WARM // self.per, WARM_LEAST)
 
 
 def _taking(operations: Sequence[Callable[[], object]]) -> Run:
@@ -74,7 +76,7 @@ def _taking(operations: Sequence[Callable[[], object]]) -> Run:
     return run
 
 
-def _interpreter(total: int) -> Run:
+def _interpreter(total: int, _directory: str) -> Run:
     """What depends on how Python was built, and on nothing else: calls, a dictionary, integers and floats."""
 
     def loop(count: int) -> float:
@@ -97,7 +99,7 @@ def _hi91_frames(count: int) -> list[bytes]:
     return [read.data for read in Module().reads(count)]
 
 
-def _hi91_single(total: int) -> Run:
+def _hi91_single(total: int, _directory: str) -> Run:
     return _feeding(HipnucCodec(Ledger(), HipnucSettings()), _hi91_frames(total))
 
 
@@ -105,7 +107,7 @@ HI91_BLOCK: Final = 50
 """Frames in 4100 bytes: reads of that size have a cut frame at each end, as those of 4096 have."""
 
 
-def _hi91_bulk(total: int) -> Run:
+def _hi91_bulk(total: int, _directory: str) -> Run:
     stream = b"".join(_hi91_frames(total * HI91_BLOCK + 1))
     size = len(stream) // (total * HI91_BLOCK + 1) * HI91_BLOCK
     return _feeding(HipnucCodec(Ledger(), HipnucSettings()), _cut(stream, size))
@@ -129,14 +131,14 @@ def _ahrs_frames(count: int) -> list[bytes]:
     ]  # fmt: skip
 
 
-def _ahrs_single(total: int) -> Run:
+def _ahrs_single(total: int, _directory: str) -> Run:
     return _feeding(Imu61xCodec(Ledger()), _ahrs_frames(total))
 
 
 AHRS_BLOCK: Final = 75
 
 
-def _ahrs_bulk(total: int) -> Run:
+def _ahrs_bulk(total: int, _directory: str) -> Run:
     stream = b"".join(_ahrs_frames(total * AHRS_BLOCK + 1))
     size = len(stream) // (total * AHRS_BLOCK + 1) * AHRS_BLOCK
     return _feeding(Imu61xCodec(Ledger()), _cut(stream, size))
@@ -146,7 +148,7 @@ VECTOR: Final = (0.125, -0.25, 0.5)
 TPDO_IDS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
 
 
-def _imu61x_can(total: int) -> Run:
+def _imu61x_can(total: int, _directory: str) -> Run:
     codec = Imu61xCanCodec(Ledger(), Imu61xCanSettings())
     frames = [
         (can_id, data, number * 5 * NS_PER_MS + place * 200_000)
@@ -158,7 +160,7 @@ def _imu61x_can(total: int) -> Run:
     return _taking([partial(codec.feed_frame, can_id, False, data, t_ns) for can_id, data, t_ns in frames])
 
 
-def _canopen(total: int) -> Run:
+def _canopen(total: int, _directory: str) -> Run:
     codec = HipnucCanopenCodec(Ledger(), HipnucCanopenSettings())
     tpdos = encode_tpdos(
         accel_m_s2=VECTOR, gyro_rad_s=VECTOR, euler_rad=VECTOR, quat_wxyz=(1.0, 0.0, 0.0, 0.0), pressure_pa=101_325.0,
@@ -184,7 +186,7 @@ def _clock_of_module() -> SampleClock:
     return SampleClock("d0", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=uart_byte_ns(BAUD), hold_ns=0)
 
 
-def _clock(total: int) -> Run:
+def _clock(total: int, _directory: str) -> Run:
     module, clock = Module(), _clock_of_module()
     for m, t_rx_ns in _measured(module.first_minute()):
         clock.sample(m, t_rx_ns, 0)
@@ -199,29 +201,22 @@ def _samples(count: int) -> list[Sample]:
     return [clock.sample(m, t_rx_ns, virtual_time.UTC_AHEAD_NS) for m, t_rx_ns in _measured(reads)][-count:]
 
 
-def _slot(total: int) -> Run:
+def _slot(total: int, _directory: str) -> Run:
     return _taking([partial(encode_slot, sample, 1) for sample in _samples(total)])
-
-
-def _directory() -> Path:
-    """A new directory, for files of one stage."""
-    path = tempfile.mkdtemp(dir="/dev/shm", prefix="imud-bench-")
-    atexit.register(shutil.rmtree, path)
-    return Path(path)
 
 
 def _context() -> PublisherContext:
     return PublisherContext(list, 1, virtual_time.now_ns, cpu_ns=virtual_time.now_ns)
 
 
-def _ring_publisher() -> ShmPublisher:
-    publisher = ShmPublisher(ShmSettings(directory=str(_directory()), group=own_group()), _context())
+def _ring_publisher(directory: str) -> ShmPublisher:
+    publisher = ShmPublisher(ShmSettings(directory=directory, group=own_group()), _context())
     publisher.add_device("d0", 0)
     return publisher
 
 
-def _ring(frames: int, total: int) -> Run:
-    publisher = _ring_publisher()
+def _ring(frames: int, total: int, directory: str) -> Run:
+    publisher = _ring_publisher(directory)
     samples = _samples(total * frames)
     batches = [Batch("d0", 0, samples[at : at + frames]) for at in range(0, len(samples), frames)]
     for batch in batches:
@@ -232,16 +227,9 @@ def _ring(frames: int, total: int) -> Run:
 # --- socket ---------------------------------------------------------------------------------------------------------
 
 
-@cache
-def _loop() -> asyncio.AbstractEventLoop:
-    loop = asyncio.new_event_loop()
-    atexit.register(loop.close)
-    return loop
-
-
-async def _serve(clients: int, encoding: str) -> tuple[SocketServer, list[socket.socket]]:
+async def _serve(directory: str, clients: int, encoding: str) -> tuple[SocketServer, list[socket.socket]]:
     """A server whose clients watch `d0`, over real sockets."""
-    path = str(_directory() / f"{clients}-{encoding}")
+    path = f"{directory}/s"
     server = SocketServer(SocketSettings(path=path, group=own_group()), _context())
     server.start()
     server.add_device("d0", 0)
@@ -259,8 +247,9 @@ async def _serve(clients: int, encoding: str) -> tuple[SocketServer, list[socket
     return server, socks
 
 
-def _socket(clients: int, encoding: str, frames: int, total: int) -> Run:
-    server, socks = _loop().run_until_complete(_serve(clients, encoding))
+def _socket(clients: int, encoding: str, frames: int, total: int, directory: str) -> Run:
+    loop = asyncio.new_event_loop()
+    server, socks = loop.run_until_complete(_serve(directory, clients, encoding))
     samples = _samples(total * frames)
     made = [Batch("d0", 0, samples[at : at + frames]) for at in range(0, len(samples), frames)]
     if encoding == "binary":
@@ -276,7 +265,7 @@ def _socket(clients: int, encoding: str, frames: int, total: int) -> Run:
                     sock.recv_into(BUFFER)
 
     def run(count: int) -> None:
-        _loop().run_until_complete(publish(count))
+        loop.run_until_complete(publish(count))
         assert not any(status.dropped or status.queue_samples for status in server.hub.clients())
 
     return run
@@ -285,10 +274,10 @@ def _socket(clients: int, encoding: str, frames: int, total: int) -> Run:
 # --- all of it ------------------------------------------------------------------------------------------------------
 
 
-def _path(frames: int, total: int) -> Run:
+def _path(frames: int, total: int, directory: str) -> Run:
     """From the bytes of a read to shared memory and one binary client, without the event loop."""
-    server, (sock,) = _loop().run_until_complete(_serve(1, "binary"))
-    publishers = (_ring_publisher(), server)
+    server, (sock,) = asyncio.new_event_loop().run_until_complete(_serve(directory, 1, "binary"))
+    publishers = (_ring_publisher(directory), server)
 
     def publish(batch: Batch) -> None:
         for publisher in publishers:
@@ -315,15 +304,8 @@ def _ignore(*_arguments: object) -> None:
     """Of what the stream has beside samples: nothing."""
 
 
-@cache
-def _daemon_process() -> VirtualDaemon:
-    daemon = VirtualDaemon(_directory())
-    atexit.register(daemon.close)
-    return daemon
-
-
-def _daemon(clients: int, encoding: str, frames: int, total: int) -> Run:
-    daemon = _daemon_process()
+def _daemon(clients: int, encoding: str, frames: int, total: int, directory: str) -> Run:
+    daemon = VirtualDaemon(directory)
     daemon.connect(clients, encoding)
     reads = iter(daemon.prepare(total, frames))
     return lambda count: daemon.process(list(islice(reads, count)))
