@@ -13,6 +13,7 @@ CRC-32 (IEEE 802.3, as zlib.crc32) is over bytes 0…251, the sequence number in
 """
 
 import struct
+import sys
 import zlib
 from dataclasses import dataclass
 from typing import Final
@@ -97,13 +98,20 @@ SYNC_CODES: Final = {sync: code for code, sync in enumerate(Sync)}
 """`sync` in the slot: 0 arrival, 1 regression, 2 edge, 3 utc."""
 SYNC_BY_CODE: Final = tuple(Sync)
 
-_BODY = struct.Struct("<" + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:-2]) + "24x")
+_NATIVE: Final = "@" if sys.byteorder == "little" else "<"
+"""All fields are aligned, so this machine's own layout is the same, and `struct` is twice as fast with it."""
+_HEAD_FIELDS: Final = 12
+"""Those before the first vector. A slot is packed in two parts: a call of more than 30 arguments makes a list."""
+_HEAD = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:_HEAD_FIELDS]))
+_VALUES = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[_HEAD_FIELDS:-2]) + "24x")
+_BODY = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:-2]) + "24x")
 _CRC = struct.Struct("<I")
 _U16_MAX: Final = 0xFFFF
 _U32_MAX: Final = 0xFFFF_FFFF
 _U64_MAX: Final = 0xFFFF_FFFF_FFFF_FFFF
 _I64_MIN: Final = -(1 << 63)
 _I64_MAX: Final = (1 << 63) - 1
+_ALL_PRESENT: Final = sum(PRESENT_BITS.values())
 _ZERO3: Vector3 = (0.0, 0.0, 0.0)
 _ZERO4: Quaternion = (0.0, 0.0, 0.0, 0.0)
 _ZERO2: Pair = (0.0, 0.0)
@@ -122,39 +130,43 @@ def encode_slot(sample: Sample, device_id: int) -> bytes:
 
 def _encode(sample: Sample, device_id: int) -> bytes:
     """`encode_slot` for values that fit. Raises struct.error for others."""
-    t_dev, accel, gyro, mag = sample.t_dev_ns, sample.accel_m_s2, sample.gyro_rad_s, sample.mag_t
-    quat, euler, temperature, pressure = sample.quat_wxyz, sample.euler_rad, sample.temperature_c, sample.pressure_pa
-    incli, status, pps, edge = sample.incli_rad, sample.status, sample.pps_age_ms, sample.edge_seq
-    present = 0
-    if t_dev is not None:
-        present |= HAS_T_DEV
-    if accel is not None:
-        present |= HAS_ACCEL
-    if gyro is not None:
-        present |= HAS_GYRO
-    if mag is not None:
-        present |= HAS_MAG
-    if quat is not None:
-        present |= HAS_QUAT
-    if euler is not None:
-        present |= HAS_EULER
-    if temperature is not None:
-        present |= HAS_TEMPERATURE
-    if pressure is not None:
-        present |= HAS_PRESSURE
-    if incli is not None:
-        present |= HAS_INCLI
-    if status is not None:
-        present |= HAS_STATUS
-    if pps is not None:
-        present |= HAS_PPS_AGE
-    if edge is not None:
-        present |= HAS_EDGE
-    body = _BODY.pack(
-        sample.seq, sample.t_ns, sample.t_rx_ns, sample.utc_ns, t_dev or 0, edge or 0,
-        sample.t_err_ns, present, status or 0, device_id, SYNC_CODES[sample.sync], 0,
-        *(accel or _ZERO3), *(gyro or _ZERO3), *(mag or _ZERO3), *(quat or _ZERO4), *(euler or _ZERO3),
-        temperature or 0.0, pressure or 0.0, *(incli or _ZERO2), pps or 0,
+    present = _ALL_PRESENT
+    if (t_dev := sample.t_dev_ns) is None:
+        present, t_dev = present - HAS_T_DEV, 0
+    if (accel := sample.accel_m_s2) is None:
+        present, accel = present - HAS_ACCEL, _ZERO3
+    if (gyro := sample.gyro_rad_s) is None:
+        present, gyro = present - HAS_GYRO, _ZERO3
+    if (mag := sample.mag_t) is None:
+        present, mag = present - HAS_MAG, _ZERO3
+    if (quat := sample.quat_wxyz) is None:
+        present, quat = present - HAS_QUAT, _ZERO4
+    if (euler := sample.euler_rad) is None:
+        present, euler = present - HAS_EULER, _ZERO3
+    if (temperature := sample.temperature_c) is None:
+        present, temperature = present - HAS_TEMPERATURE, 0.0
+    if (pressure := sample.pressure_pa) is None:
+        present, pressure = present - HAS_PRESSURE, 0.0
+    if (incli := sample.incli_rad) is None:
+        present, incli = present - HAS_INCLI, _ZERO2
+    if (status := sample.status) is None:
+        present, status = present - HAS_STATUS, 0
+    if (pps := sample.pps_age_ms) is None:
+        present, pps = present - HAS_PPS_AGE, 0
+    if (edge := sample.edge_seq) is None:
+        present, edge = present - HAS_EDGE, 0
+    ax, ay, az = accel
+    gx, gy, gz = gyro
+    mx, my, mz = mag
+    qw, qx, qy, qz = quat
+    roll, pitch, yaw = euler
+    incli_x, incli_y = incli
+    body = _HEAD.pack(
+        sample.seq, sample.t_ns, sample.t_rx_ns, sample.utc_ns, t_dev, edge, sample.t_err_ns, present, status,
+        device_id, SYNC_CODES[sample.sync], 0,
+    ) + _VALUES.pack(
+        ax, ay, az, gx, gy, gz, mx, my, mz, qw, qx, qy, qz, roll, pitch, yaw, temperature, pressure, incli_x, incli_y,
+        pps,
     )  # fmt: skip
     return body + _CRC.pack(zlib.crc32(body))
 
