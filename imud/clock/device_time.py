@@ -58,12 +58,12 @@ CORRECTION_TICKS: Final = 0.5
 """Distance below the fit at which a message came before its sample, if that was taken at its stamp."""
 
 # --- jumps ----------------------------------------------------------------------------------------------------------
-JUMP_EARLY_NS: Final = 5 * NS_PER_MS
+JUMP_EARLY_NS: Final = 5.0 * NS_PER_MS
 JUMP_EARLY_SIGMAS: Final = 10
 """A message so far below the fit shows that the device's clock jumped ahead."""
 FIRST_EARLY_NS: Final = NS_PER_S
 """The same before the fit is used: the first message may have waited that long in a buffer."""
-JUMP_LATE_NS: Final = NS_PER_S // 2
+JUMP_LATE_NS: Final = NS_PER_S / 2
 JUMP_LATE_READS: Final = 3
 """Number of late reads over a second that show a jump of the device's clock: fewer may be a busy host's queue."""
 
@@ -102,8 +102,7 @@ class PeriodLearner:
                 self._refine(0)
             return 0
         if ticks == period:
-            self._run = 0
-            self._even += 1
+            self.add_even_step()
             return 0
         if period and abs(ticks - period) <= 1 and int(ticks / period + 0.5) == 1:
             self._refine(ticks)
@@ -113,6 +112,11 @@ class PeriodLearner:
         if not period:
             return 0
         return self.steps_in(ticks) - 1
+
+    def add_even_step(self) -> None:
+        """Add a step that is exactly the period."""
+        self._run = 0
+        self._even += 1
 
     def steps_in(self, ticks: int) -> int:
         """Return how many periods are in a longer step; the period must be known."""
@@ -238,9 +242,14 @@ class DeviceTime:
         """Set the next stamp."""
         step = (ticks - self.ticks) % self._modulus
         self.ticks = ticks
-        tick_ns = self.tick_ns
+        tick_ns, period = self.tick_ns, self.period
         self.raw_ns += step * tick_ns
-        period = self.period
+        if step == period.period_ticks and step and not self.watched:  # the usual case, in a third of the time
+            period.add_even_step()
+            self.missed = 0
+            self._even_for += 1
+            self.even_ns += step * tick_ns
+            return
         self.missed = missed = period.add_step(step)
         self._even_for += 1
         if self.watched:
