@@ -58,7 +58,8 @@ def block(status: DeviceStatus) -> str:
 
 def axes(frame: FrameStatus) -> str:
     """Format axes, heading, and what contradicts them."""
-    words = f"{frame.convention}: {frame.frame}; heading {frame.heading}"
+    own = frame.convention == "device"
+    words = f"{frame.frame if own else f'{frame.convention}, {frame.frame}'}; heading {frame.heading}"
     if frame.declination_deg is not None:
         words += f" by a declination of {frame.declination_deg:g}°"
     return words + (f" ({frame.problem})" if frame.problem else "")

@@ -19,9 +19,10 @@ def test_axes_heading_and_what_contradicts_them() -> None:
     frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
     lines = block(replace(device("bow"), frame=frame)).splitlines()
     assert lines[3] == (
-        "  axes      ned-frd: body: x forward; heading true by a declination of -3.5° (its z axis points down)"
+        "  axes      ned-frd, body: x forward; heading true by a declination of -3.5° (its z axis points down)"
     )
-    assert axes(replace(frame, declination_deg=None, problem="")) == "ned-frd: body: x forward; heading true"
+    own = replace(frame, frame="sensor: x right", convention="device", declination_deg=None, problem="")
+    assert axes(own) == "sensor: x right; heading true"
 
 
 def test_polling_is_shown_for_a_device_that_is_polled() -> None:
