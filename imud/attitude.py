@@ -126,8 +126,22 @@ def euler_zyx_from_matrix(matrix: Matrix3) -> Vector3:
 
 
 def euler_zyx_from_quat(quat_wxyz: Quaternion) -> Vector3:
-    """(roll, pitch, yaw) in rad in the order ZYX. Raises ValueError for a quaternion without direction."""
-    return euler_zyx_from_matrix(matrix_from_quat(quat_wxyz))
+    """(roll, pitch, yaw) in rad in the order ZYX. Raises ValueError for a quaternion without direction.
+
+    `euler_zyx_from_matrix` of the elements that it needs, not divided by the square of the length: it is computed for
+    each sample of a device in a frame.
+    """
+    w, x, y, z = quat_wxyz
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    square = ww + xx + yy + zz
+    if not 0.0 < square < math.inf:
+        return euler_zyx_from_matrix(matrix_from_quat(quat_wxyz))  # too short or long to be squared, or no direction
+    c21, c22 = 2 * (y * z + w * x), ww - xx - yy + zz
+    cos_pitch = math.hypot(c21, c22)
+    pitch = math.atan2(2 * (w * y - x * z), cos_pitch)
+    if cos_pitch < GIMBAL_COS_PITCH * square:
+        return (0.0, pitch, math.atan2(2 * (w * z - x * y), ww - xx + yy - zz))
+    return (math.atan2(c21, c22), pitch, math.atan2(2 * (x * y + w * z), ww + xx - yy - zz))
 
 
 def is_rotation(matrix: Matrix3, tolerance: float = 1e-6) -> bool:

@@ -236,3 +236,23 @@ def test_zyx_straight_up_and_down_all_of_the_turn_is_yaw(sign: int) -> None:
     assert roll == 0
     assert pitch == pytest.approx(sign * math.pi / 2, abs=1e-7)
     assert yaw == pytest.approx(1.0 - sign * 0.3, abs=1e-7)
+
+
+@quick
+@given(angles, steep, angles, st.sampled_from([1e-170, 1e-3, 1.0, -2.0, 1e170]))
+def test_zyx_angles_of_a_quaternion_of_any_length_are_those_of_its_matrix(
+    roll: float, pitch: float, yaw: float, length: float
+) -> None:
+    """Its square may leave the range of a float at both ends."""
+    w, x, y, z = quat_from_euler_zyx((roll, pitch, yaw))
+    quat = (w * length, x * length, y * length, z * length)
+    found, wanted = euler_zyx_from_quat(quat), euler_zyx_from_matrix(matrix_from_quat(quat))
+    assert found[1] == pytest.approx(wanted[1], abs=1e-12)
+    pairs = zip(quat_from_euler_zyx(found), quat_from_euler_zyx(wanted), strict=True)
+    assert abs(sum(a * b for a, b in pairs)) == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("quat", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 1.0)])
+def test_zyx_angles_of_no_direction_are_refused(quat: Quaternion) -> None:
+    with pytest.raises(ValueError, match="length above zero"):
+        euler_zyx_from_quat(quat)
