@@ -227,6 +227,7 @@ def _account(done: AppliedSettings) -> str:
     if done.problem:
         lines.append(f"NOT done: {done.problem}")
     now = (f"{name} is {_value(one.actual)}, wanted {_value(one.declared)}" for name, one in done.differences.items())
+    lines += [done.advice] if done.advice else []
     return "\n".join(["done:" if not done.problem else "tried:", *lines, *now])
 
 

@@ -55,6 +55,8 @@ class Action:
     The script returns the result of the action, a value that JSON can carry. Both raise BadArgument.
     """
     risk: Risk = Risk.NONE
+    saves: bool = False
+    """Whether it writes the device's flash, which is counted, and limited per day."""
 
     @property
     def parameters(self) -> type[Settings]:

@@ -260,3 +260,5 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
     """What is not as wanted now."""
+    advice: str = ""
+    """What to change in the configuration, so that imud finds the device at its next start; empty for nothing."""

@@ -253,6 +253,8 @@ class Device:
         log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
         self._require_replies()
         async with self._settings.exclusive():
+            if save:
+                self._settings.spend_flash()
             try:
                 return await self._guide.run(kind, calibration, save=save)
             finally:
@@ -265,6 +267,8 @@ class Device:
     async def _run_action(self, name: str, action: Action, arguments: Mapping[str, Any]) -> object:
         params = action.arguments(arguments)
         async with self._settings.exclusive():
+            if action.saves:
+                self._settings.spend_flash()
             if action.risk is Risk.RESET:
                 await self._settings.back_up(name)
             self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more

@@ -57,6 +57,13 @@ def test_every_action_has_help_and_arguments_that_can_be_described(driver: str, 
         action.arguments({"no_such_argument": 1})
 
 
+@pytest.mark.parametrize(("driver", "name"), ACTIONS)
+def test_actions_that_save_say_so(driver: str, name: str) -> None:
+    action = DRIVERS[driver].actions[name]
+    assert action.saves == (name == "save" or (driver, name) in SAVING)
+
+
+SAVING = {("hipnuc-uart", "baud"), ("imu61x-uart", "baud"), ("imu61x-uart", "factory_reset")}
 RISKS = {
     "factory_reset": Risk.RESET,
     "address": Risk.CONNECTION,

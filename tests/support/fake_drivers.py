@@ -477,10 +477,6 @@ FAKE_SETTINGS: Final = DeviceSettings(
 """Settings of every kind."""
 
 
-def _factory_reset(_target: Target) -> RequestScript[None]:
-    yield Request(b"RESTART\r\n", "RESTART", never, never, never, silent=True)
-
-
 def _set_mode(target: Target, *, mode: str) -> RequestScript[None]:
     return _setter("mode")(target, mode)
 
@@ -494,6 +490,8 @@ FAKE_MODULE_DRIVER: Final = replace(
     device_settings=FAKE_SETTINGS,
     actions={
         "set_mode": Action("set it", _set_mode),
-        "factory_reset": Action("forget all", _factory_reset, Risk.RESET),
+        "wait": Action("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
+        "save": Action("save all", _save_all, saves=True),
+        "factory_reset": Action("forget all", _restart, Risk.RESET),
     },
 )

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
+from imud.config import DeviceConfig
 from imud.contracts.action import Target
 from imud.contracts.device_settings import (
     AppliedSettings,
@@ -26,6 +27,8 @@ from imud.runtime.settings.difference import Values, as_json, differences
 DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
 """Raised where a device does not answer, does not take a value, or is gone."""
 
+PLACES: Final = ("baud", "address", "node")
+"""Settings by whose names link or options say where the device is found."""
 UNVERIFIED: Final = (Written.UNVERIFIED, Written.UNVERIFIED_PENDING)
 PENDING: Final = (Written.PENDING, Written.UNVERIFIED_PENDING)
 
@@ -175,6 +178,19 @@ class Applying:
         if not self.changed:
             return "; nothing else was written"
         return "" if self.saved else "; what was written before holds until the device restarts"
+
+
+def advice(config: DeviceConfig, done: AppliedSettings) -> str:
+    """Say what to change in a configuration that looks for the device where it was; empty for nothing."""
+    found = []
+    for step in done.steps:
+        if step.outcome not in (StepOutcome.DONE, StepOutcome.WRITTEN):
+            continue
+        for key, part in ((config.link, config.link_settings), ("options", config.options)):
+            place = getattr(part, step.name, None)
+            if place not in (None, "auto", step.value) and type(place) is type(step.value) and step.name in PLACES:
+                found.append(f"change `{key}.{step.name}: {place}` in the configuration to {step.value}")
+    return "; ".join(found) + (": imud looks for the device there at its next start" if found else "")
 
 
 def _applied(step: PlannedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:

@@ -11,8 +11,10 @@ limited number of times per day (`flash.py`).
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any, Final
+
+import msgspec
 
 from imud.clock import SampleClock
 from imud.config import DeviceConfig
@@ -36,7 +38,7 @@ from imud.event import EventKind
 from imud.host_clock import HostClock
 from imud.runtime.identity import KnownIdentity, identity_words
 from imud.runtime.notices import Notices
-from imud.runtime.settings.apply import DEVICE_ERRORS, Applying, RunScript
+from imud.runtime.settings.apply import DEVICE_ERRORS, Applying, RunScript, advice
 from imud.runtime.settings.backup import SettingsFiles, backup_text
 from imud.runtime.settings.difference import (
     Values,
@@ -61,6 +63,8 @@ SETTLE_NS: Final = NS_PER_S // 2
 OWN_NS: Final = 2 * NS_PER_S
 """After a script a device that paused its samples for it, or that it restarted, may begin its clock anew so late: what
 it has then is compared at the end of the script, and not once more, which would pause its samples again."""
+WAIT_S: Final = 10.0
+"""How long a command waits for another one."""
 BACKUP_LIMIT_S: Final = 5.0
 """How long a command waits for a disk that does not answer."""
 READ_AGAIN_NS: Final = 5 * NS_PER_S
@@ -165,21 +169,41 @@ class SettingsKeeper:
 
     @asynccontextmanager
     async def exclusive(self) -> AsyncIterator[None]:
-        """Keep settings alone while a command is carried out, or they are read or written."""
-        async with self._lock:
-            try:
-                yield
-            finally:
-                self._own_until_ns = self._host.now_ns() + OWN_NS
+        """Keep settings alone while a command is carried out, or they are read or written.
+
+        Raises CommandError where another one does not end in time, for example a calibration.
+        """
+        try:
+            async with asyncio.timeout(WAIT_S):
+                await self._lock.acquire()
+        except TimeoutError:
+            raise CommandError(f"{self._config.name}: another command or a calibration is still under way") from None
+        try:
+            yield
+        finally:
+            self._own_until_ns = self._host.now_ns() + OWN_NS
+            self._lock.release()
+
+    @property
+    def flash(self) -> ModuleFlash:
+        """The flash of the present module, as written for people and programs."""
+        return ModuleFlash(self._writes, self._module, asked=True)
+
+    def spend_flash(self) -> None:
+        """Count a write to flash that a command is about to make. Raises CommandError where it may not be made."""
+        if refusal := self.flash.refusal():
+            raise CommandError(f"{self._config.name}: {refusal}")
+        self.flash.count()
 
     async def run(self) -> None:
         """Compare whenever it is time. Ends only by an error of imud."""
         while True:
             await self._wanted.wait()
             self._wanted.clear()
-            async with self.exclusive():
-                self._due_ns = None
-                await self._keep()
+            with suppress(CommandError):  # a command is under way, after which it is compared anyway
+                async with self.exclusive():
+                    self._due_ns = None
+                    await self._keep()
 
     # --- questions ----------------------------------------------------------------------------------------------------
 
@@ -338,7 +362,7 @@ class SettingsKeeper:
         self._tell(self._differences(table), quiet=True)
         if applying.changed:
             await self._read_back()
-        return done
+        return msgspec.structs.replace(done, advice=advice(self._config, done))
 
     def _make_plan(self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool) -> SettingsPlan:
         assert self._target is not None

@@ -17,7 +17,7 @@ from imud.devices import DRIVERS
 from imud.errors import BadArgument, CommandError
 from imud.event import Event, EventKind
 from imud.links.memory import MemorySettings
-from imud.runtime.settings.flash import LIMIT_ITSELF
+from imud.runtime.settings.flash import LIMIT_ASKED, LIMIT_ITSELF
 from imud.runtime.settings.keeper import READ_TRIES
 from imud.runtime.stream import transport as stream_transport
 from tests.support.device_rig import DeviceRig, DeviceRigs
@@ -57,7 +57,7 @@ class ModuleBench:
         self.module = FakeModule(self.clock.now_ns)
         self.rigs = DeviceRigs(self.clock.host, state_dir=state_dir)
         config = DeviceConfig(
-            "bow", "fake-module", None, True, "memory", MemorySettings(name="/dev/fake"),
+            "bow", "fake-module", None, True, "memory", MemorySettings(name="/dev/fake", baud=115200),
             declared=msgspec.convert(declared, FAKE_SETTINGS.declarable) if declared else None,
             on_difference=OnDifference(on_difference),
         )  # fmt: skip
@@ -525,6 +525,9 @@ def test_another_rate_is_followed() -> None:
     assert outcomes(applied) == {"mode": StepOutcome.DONE, "baud": StepOutcome.DONE}
     assert (bench.module.baud, bench.module.set["baud"], bench.module.saves) == (921600, 921600, 1)
     assert (applied.problem, applied.saved) == ("", True)
+    assert applied.advice == (
+        "change `memory.baud: 115200` in the configuration to 921600: imud looks for the device there at its next start"
+    )
     assert bench.status.flash_writes == 1
     assert bench.rig.kinds.count(EventKind.UP) == 1
 
@@ -543,6 +546,39 @@ def test_without_saving_nothing_is_written_that_saves() -> None:
     assert list(applied.left_out) == ["baud", "mounting"]
     assert outcomes(applied) == {"mode": StepOutcome.DONE}
     assert bench.module.flash == FACTORY
+
+
+def test_commands_that_save_count_and_are_limited() -> None:
+    bench = ModuleBench()
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        await bench.pass_s(2)
+        for _ in range(LIMIT_ASKED):
+            await bench.doing(bench.device.act("save", {}))
+        assert bench.status.flash_writes_day == bench.module.saves == LIMIT_ASKED
+        with pytest.raises(CommandError, match="bow: its flash was written 40 times within 24 hours"):
+            await bench.doing(bench.device.act("save", {}))
+        assert bench.module.saves == LIMIT_ASKED
+
+    bench.play(story)
+
+
+def test_a_command_does_not_wait_for_another_one_for_ever() -> None:
+    bench = ModuleBench()
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        await bench.pass_s(2)
+        waiting = asyncio.ensure_future(bench.device.act("wait", {}))
+        await bench.pass_s(1)
+        with pytest.raises(CommandError, match="another command or a calibration is still under way"):
+            await bench.doing(bench.device.settings_report(fresh=True))
+        waiting.cancel()
+        await bench.pass_s(1)
+        await bench.doing(bench.device.settings_report(fresh=True))
+
+    bench.play(story)
 
 
 # --- a backup before all is lost --------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ The parameters of each function describe the arguments of its action: type, rang
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -104,7 +105,7 @@ def _nmt(
 
 
 ACTIONS: Final[Actions] = {
-    "save": _simple("write all settings to flash", session.save),
+    "save": replace(_simple("write all settings to flash", session.save), saves=True),
     "restart": Action(
         "restart it and wait until it is heard, also under another number; what was not saved is lost",
         lambda target: moves.restart(target.settings, target.baud),

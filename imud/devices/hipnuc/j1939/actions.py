@@ -4,6 +4,7 @@ The parameters of each function describe the arguments of its action: type, rang
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -81,7 +82,7 @@ def _direction(
 
 
 ACTIONS: Final[Actions] = {
-    "save": _simple("write all settings to flash", session.save),
+    "save": replace(_simple("write all settings to flash", session.save), saves=True),
     "restart": Action(
         "restart it and wait until it is heard, also at another address; what was not saved is lost",
         lambda target: moves.restart(target.settings, target.baud),

@@ -5,6 +5,7 @@ follows the module to another address. A baud rate is the whole line's, so imud 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -81,7 +82,7 @@ def _read(
 
 
 ACTIONS: Final[Actions] = {
-    "save": _simple("write all settings to flash", session.save),
+    "save": replace(_simple("write all settings to flash", session.save), saves=True),
     "restart": Action("restart, as by power-on, and wait until it answers; what is not saved is lost", _restart),
     "factory_reset": Action(
         "factory settings, and restart: imud follows it to address 80 if no other module has that and the line has the "

@@ -4,6 +4,7 @@ The parameters of each function describe the arguments of its action: type, rang
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -157,7 +158,7 @@ def _sout_divider(
 
 
 ACTIONS: Final[Actions] = {
-    "save": _simple("write all settings to flash", commands.save_config),
+    "save": replace(_simple("write all settings to flash", commands.save_config), saves=True),
     "restart": Action("restart it and wait until it answers; what was not saved is lost", _restart),
     "factory_reset": Action(
         "factory settings, the baud rate (115200) included: restart it, so that they are in force, and follow",
@@ -167,7 +168,7 @@ ACTIONS: Final[Actions] = {
     "wake": Action(
         "let frames out, and send HI91 where no message has a rate, also in place of output on mark; not saved", _wake
     ),
-    "baud": Action("set the baud rate, save, restart if it takes that, and follow", _baud, Risk.CONNECTION),
+    "baud": Action("set the baud rate, save, restart if it takes that, and follow", _baud, Risk.CONNECTION, saves=True),
     "output": Action("send a message by itself at a rate, or not at all (0)", _output),
     "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
     "output_once": Action("send a message once, as a pulse on SIN would", _output_once),

@@ -109,7 +109,7 @@ ACTIONS: Final[Actions] = {
         "command mode: send nothing but replies, until `start_streaming`; cuts off all programs that read samples",
         _stop,
     ),
-    "save": Action("write all parameters to flash", lambda target: session.save(done=_done(target))),
+    "save": Action("write all parameters to flash", lambda target: session.save(done=_done(target)), saves=True),
     "restart": Action(
         "restart it, wait until it answers, and see that its timer began again; what was not saved is lost",
         lambda target: following.restart(done=_done(target)),
@@ -118,11 +118,13 @@ ACTIONS: Final[Actions] = {
         "factory settings, read back, saved, and followed to their 115200 baud, which a fixed `uart.baud` must then be",
         _factory_reset,
         Risk.RESET,
+        saves=True,
     ),
     "baud": Action(
         "set and save the baud rate and follow; a fixed `uart.baud` in the configuration must then be the new one",
         _baud,
         Risk.CONNECTION,
+        saves=True,
     ),
     "rate": Action("set the output rate, as far as the baud rate carries it", _rate),
     "filter": Action("set the low-pass filters", _filter),
