@@ -10,10 +10,11 @@ from imud.contracts.can import CanCodec, CanDriver
 from imud.contracts.codec import ReplyFrame
 from imud.contracts.driver import Identity, of_kind
 from imud.contracts.link import CanLink, OnEnd
-from imud.contracts.settings import Settings
+from imud.contracts.settings import Settings, shown
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.devices import DRIVERS
 from imud.errors import LinkError
+from imud.event import EventKind
 from imud.formats.can import CanFilter, CanFrame, frame_bits
 from imud.runtime.can.buses import CanBuses
 from imud.runtime.detection import CanFound, CanSearch
@@ -219,6 +220,9 @@ class CanTransport:
         self._join()
         self._node = None  # the next search tells it
         self._begin()
+        if not self._searchable and options != (self._config.options or driver.settings()):
+            message = f"the device is heard by other options now: change {_changed(self._config.options, options)}"
+            self._context.notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message)
 
     def _listen(self, filters: Sequence[CanFilter]) -> None:
         """Receive further frames, as long as a request can be answered by them."""
@@ -304,3 +308,10 @@ class CanTransport:
     @property
     def _searchable(self) -> bool:
         return self._config.driver == "auto"
+
+
+def _changed(before: Settings | None, after: Settings) -> str:
+    """Options that differ, for people, for example `options.node to 9`."""
+    given = before if before is not None else type(after)()
+    names = [name for name in type(after).__struct_fields__ if getattr(given, name) != getattr(after, name)]
+    return ", ".join(f"options.{name} to {shown(getattr(after, name))}" for name in names) + " in the configuration"

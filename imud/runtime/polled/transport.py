@@ -238,6 +238,11 @@ class PolledTransport:
             return
         self._device, self._former = replace(device, target=target), (device.target,)
         member.release()
+        fixed = self.link.target
+        if fixed is not None and target != fixed:
+            place = self.link.place(target)
+            message = f"the device has {place} now: change {self.link.place(fixed)} in the configuration"
+            self._context.notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message)
         if not member.claim(target):
             place = self.link.place(target)
             message = f"the device has {place} now, which another device of this configuration has"

@@ -122,6 +122,8 @@ def test_a_device_that_is_given_another_number_is_followed(driver: str) -> None:
         await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
         await bench.device.act("renumber", {"node": 9})
         assert [wanted.can_id for wanted in bench.link.filters] == [BASE + 9]
+        words = "change options.node to 9 in the configuration"
+        assert any(words in one.message for one in bench.rig.events) == (driver != "auto")
         heard = len(bench.samples)
         await bench.until(lambda: len(bench.samples) > heard, 9)
         assert await bench.device.act("node", {}) == 9

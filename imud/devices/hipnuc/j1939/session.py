@@ -72,6 +72,8 @@ ADDRESS_MIN, ADDRESS_MAX = 1, 128
 INTERVAL_MIN_MS, INTERVAL_MAX_MS = 5, 1000
 
 REPLY_TIMEOUT_NS: Final = 500 * NS_PER_MS  # the manual gives none; J1939-21 gives a node 200 ms
+PRESENT_TIMEOUT_NS: Final = 250 * NS_PER_MS
+"""The same where a register may not exist, which is not answered, and many are read."""
 FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S // 2
 CLAIM_NS: Final = 250 * NS_PER_MS
 """J1939-81: a node claims its address within 250 ms."""
@@ -177,7 +179,8 @@ def read_values(peer: J1939Node, registers: Sequence[int]) -> RequestScript[dict
     for register in registers:
         if silent == SILENT_MAX and not values:
             break
-        outcome = yield exchange(peer, register, READ, READ_VALUE, f"read register {register:#06x}")
+        name = f"read register {register:#06x}"
+        outcome = yield exchange(peer, register, READ, READ_VALUE, name, PRESENT_TIMEOUT_NS)
         if isinstance(outcome, Reply):
             values[register] = _value(outcome)
         silent += isinstance(outcome, Silence)

@@ -80,7 +80,10 @@ PITCHED_RAD: Final = radians(1.0)
 READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
 READ_SHORT_BLOCK: Final = read_registers(BLOCK_FIRST, SHORT_BLOCK_REGISTERS)
 READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
-_SAMPLE: Final = 0
+READ_STATUS: Final = read_registers(BY_NAME["MAIN_STATUS"].address, BY_NAME["MAIN_STATUS"].count)
+STATUS_NS: Final = NS_PER_S
+"""Interval of reading MAIN_STATUS, which the block does not have: `status` of a sample is at most so much older."""
+_SAMPLE, _SERIAL, _STATUS = 0, 1, 2
 
 
 class HipnucModbusSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -120,8 +123,10 @@ class HipnucModbusCodec:
 
     def decode(self, poll: int, data: bytes) -> Sequence[PolledEvent]:
         """Decode one reply. Never raises."""
-        if poll != _SAMPLE:
+        if poll == _SERIAL:
             return self._decode_serial(data)
+        if poll == _STATUS:
+            return self._decode_status(data)
         self._silent = 0
         if is_exception(data):
             return self._decode_exception(data)
@@ -146,6 +151,7 @@ class HipnucModbusCodec:
         self._quat_scale = 0.0
         self._incli_scale = self._fixed_incli
         self._serial = b""
+        self._status: int | None = None
 
     def _decode_exception(self, data: bytes) -> Sequence[PolledEvent]:
         missing = data[2] == ILLEGAL_ADDRESS
@@ -183,6 +189,13 @@ class HipnucModbusCodec:
         self._read_block(short=False)
         return (Vanished(f"serial number {serial.hex().upper()}, was {before.hex().upper()}: another module"),)
 
+    def _decode_status(self, data: bytes) -> Sequence[PolledEvent]:
+        whole = len(data) == READ_STATUS.read_bytes and is_whole(data) and data[1] == READ_HOLDING
+        self._book.add_reply(data, good=whole or is_exception(data))
+        if whole:
+            self._status = int.from_bytes(data[DATA_AT:-CRC_BYTES], "big")
+        return ()
+
     def _bad(self, data: bytes) -> BadReason | None:
         if not is_whole(data):
             return BadReason.CRC
@@ -202,7 +215,7 @@ class HipnucModbusCodec:
             self._quaternion(qw, qx, qy, qz), (roll * angle, pitch * angle, yaw * angle),
             celsius * TEMPERATURE_C_PER_LSB if celsius or pressure else None,
             pressure_of(pressure * PRESSURE_PA_PER_LSB),
-            self._inclination(ix, iy, roll * angle, pitch * angle),
+            self._inclination(ix, iy, roll * angle, pitch * angle), self._status,
         ), True  # fmt: skip
 
     def _quaternion(self, w: int, x: int, y: int, z: int) -> Quaternion | None:
@@ -238,7 +251,9 @@ def _dual_y_rad(roll_rad: float, pitch_rad: float) -> float:
 
 
 def _polls(*, short: bool) -> Sequence[Poll]:
-    return Poll(READ_SHORT_BLOCK if short else READ_BLOCK), Poll(READ_SERIAL, CHECK_NS)
+    """Cyclic reads; firmware without UPTIME has no MAIN_STATUS either."""
+    serial = Poll(READ_SERIAL, CHECK_NS)
+    return (Poll(READ_SHORT_BLOCK), serial) if short else (Poll(READ_BLOCK), serial, Poll(READ_STATUS, STATUS_NS))
 
 
 # --- the device's side ------------------------------------------------------------------------------------------------

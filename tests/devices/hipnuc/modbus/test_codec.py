@@ -234,6 +234,23 @@ def test_axes_of_the_inclinometer_are_kept_or_configured() -> None:
     assert measured(codec(inclinometer="dual"), block(incli=(0, 0))).incli_rad == (0, 0)
 
 
+def test_status_is_read_beside_the_block() -> None:
+    """MAIN_STATUS, register 0x09: bits 3 and 9 are 0x0208."""
+    made = codec()
+    assert [poll.transfer.sends[0].hex() for poll in made.polls] == ["030034001a", "03007f0004", "0300090001"]
+    assert made.polls[2].every_ns == 1_000_000_000
+    assert measured(made, block()).status is None
+    assert made.decode(2, framed(9, registers_reply(b"\x02\x08"))) == ()
+    assert measured(made, block(uptime_ms=6)).status == 0x0208
+    assert made.decode(2, EXCEPTION) == made.decode(2, b"") == ()
+    assert measured(made, block(uptime_ms=7)).status == 0x0208
+    made.reset()
+    assert measured(made, block(uptime_ms=8)).status is None
+    made.decode(0, EXCEPTION)
+    assert len(made.polls) == 2  # firmware without UPTIME has none
+    assert made.ledger.closes()
+
+
 def test_another_module_in_its_place_is_noticed() -> None:
     made = codec()
     first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
