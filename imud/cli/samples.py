@@ -21,6 +21,7 @@ LOOK_S: Final = 2.0
 """Time between two looks at the states of the watched devices."""
 FIELD_HEAD: Final = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
 DRIVER_HEAD: Final = ("DRIVER", "NAVIGATION FRAME", "EULER ANGLES")
+STATUS_HEAD: Final = ("DRIVER", "STATUS BIT", "MEANING WHILE IT IS SET")
 
 
 def watch_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,8 +117,13 @@ def schema_arguments(parser: argparse.ArgumentParser) -> None:
 
 def schema(args: argparse.Namespace) -> int:
     """Print the fields and each driver's conventions. Needs no daemon."""
+    bits = {name: {str(n): bit.name for n, bit in driver.status_bits.items()} for name, driver in DRIVERS.items()}
     conventions = {
-        name: {"navigation_frame": driver.navigation_frame, "euler_convention": driver.euler_convention}
+        name: {
+            "navigation_frame": driver.navigation_frame,
+            "euler_convention": driver.euler_convention,
+            "status_bits": bits[name],
+        }
         for name, driver in DRIVERS.items()
     }
     if args.json:
@@ -126,6 +132,8 @@ def schema(args: argparse.Namespace) -> int:
     print(table(FIELD_HEAD, [(f.name, f.type, f.unit, f.frame, f.meaning) for f in SAMPLE_SCHEMA]))
     print()
     print(table(DRIVER_HEAD, [(name, c["navigation_frame"], c["euler_convention"]) for name, c in conventions.items()]))
+    print()
+    print(table(STATUS_HEAD, [(name, n, words) for name, named in bits.items() for n, words in named.items()]))
     return 0
 
 

@@ -69,6 +69,10 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
     """List name and text of each row that only some devices have."""
     if status.declared is not None and status.declared.state is not SettingsState.UNDECLARED:
         yield "settings", declared(status.declared)
+    if status.status_bit_names and status.status_bits is not None:
+        yield "status", ", ".join(status.status_words) or "no bit that is known is set"
+    if status.settings:
+        yield "present", ", ".join(f"{name} {value}" for name, value in status.settings.items())
     if status.polling is not None:
         yield "polling", polling(status.polling)
     if status.serial_line is not None:

@@ -9,7 +9,7 @@ from imud.contracts.action import Actions
 from imud.contracts.codec import StreamCodec
 from imud.contracts.control.calibration import Calibrations
 from imud.contracts.device_settings import DeviceSettings
-from imud.contracts.lines import AlarmRanges
+from imud.contracts.lines import AlarmRanges, DeviceLines
 from imud.contracts.session import RequestScript
 from imud.contracts.settings import Settings
 from imud.contracts.timing import NO_TIME_BITS, TimeBits
@@ -40,6 +40,20 @@ class KeyProblem(NamedTuple):
     """The key in that part."""
     message: str
     """What is expected, what came, and figures where they decide."""
+
+
+class StatusBit(NamedTuple):
+    """Meaning of one bit of `Measurement.status`."""
+
+    name: str
+    """What the device says while it is set, for people."""
+    notable: bool = False
+    """Whether its change is an event: values are wrong, or not yet right, while it is set."""
+
+
+def status_words(bits: Mapping[int, StatusBit], status: int | None) -> tuple[str, ...]:
+    """Return the names of the bits that are set, as far as they are known."""
+    return tuple(bit.name for number, bit in bits.items() if status is not None and status >> number & 1)
 
 
 def no_problems(_options: Any, _link: Any) -> Sequence[KeyProblem]:
@@ -88,6 +102,12 @@ class Driver:
     """Reads the meaning of the ALARM line from the device's settings; None if they have none."""
     time_bits: TimeBits = NO_TIME_BITS
     """Bits of `Measurement.status` about time."""
+    status_bits: Mapping[int, StatusBit] = field(default_factory=dict)
+    """Meaning of the bits of `Measurement.status`, by number; those that are not known are left out."""
+    shown_settings: Callable[[Mapping[str, str]], Mapping[str, str]] = lambda settings: settings
+    """Returns settings as they were read back by name and with units, for people."""
+    line_differences: Callable[[Mapping[str, str], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}
+    """Finds lines of the configuration that the device's settings contradict: why, one sentence, by the line's key."""
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
     """Finds what does not work in an instance of `settings` and in the settings of a link, each good by itself."""
 

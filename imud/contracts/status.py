@@ -204,7 +204,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     identity: dict[str, str]
     """`product`, `serial_number`, `firmware` and what else the device sent."""
     settings: dict[str, str]
-    """The device's own settings as read back."""
+    """The device's own settings as read back, by name and with units as far as they are known."""
     rate_hz: float
     """Samples per second over the last seconds."""
     expected_rate_hz: float
@@ -220,6 +220,10 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     status_bits: int | None
     connects: int
     """Times the link was opened since start."""
+    status_words: tuple[str, ...] = ()
+    """Names of the bits in `status_bits` that are set, as far as they are known."""
+    status_bit_names: dict[str, str] = {}  # msgspec copies a mutable default
+    """Names of the bits of `status` by number, from the driver; empty while it is not known or has none."""
     euler_convention: str = ""
     """Order, axes and signs of `euler_rad` as published; empty while the driver is not known."""
     navigation_frame: str = ""

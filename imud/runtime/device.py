@@ -13,16 +13,19 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import msgspec
+
 from imud.config import DeviceConfig
 from imud.contracts.action import Action, Actions, Risk
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
+from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
 from imud.contracts.publisher import Batch
-from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, LinesStatus
 from imud.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
-from imud.event import Event
+from imud.event import Event, EventKind
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.log import printable, shown
@@ -36,6 +39,7 @@ from imud.runtime.notices import Notices
 from imud.runtime.path import SamplePath
 from imud.runtime.settings.backup import SettingsFiles
 from imud.runtime.settings.keeper import SettingsKeeper
+from imud.runtime.status_watch import StatusWatch
 from imud.runtime.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.runtime.utc_keeper import DevicePort
 from imud.units import NS_PER_MS, NS_PER_S
@@ -82,7 +86,7 @@ class Device:
         port = DevicePort(self._write, lambda: self._transport.bit_rate, self._is_busy)
         hooks = AttachmentHooks(port, self._on_reset)
         self._attachments = Attachments(config, lines, hooks, self._notices, host)
-        self._identity = KnownIdentity(self._notices, host.now_ns, self._on_settings)
+        self._identity = KnownIdentity(self._notices, host.now_ns, self._on_settings, self._described)
         self._transport = make_transport(
             DeviceContext(
                 config, device_id, host, self.ledger, self._notices, self._health, self._identity, self._attachments,
@@ -98,6 +102,8 @@ class Device:
         )  # fmt: skip
         self._attachments.add(self._settings)
         self._frame = FrameWatch(config, self._notices)
+        self._status = StatusWatch(self._notices)
+        self._line_differences: Mapping[str, str] = {}
         self._rate = RateMeter()
         self._connects = 0
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -136,6 +142,7 @@ class Device:
         if transport.receiving:
             self._watch_flow(path, now_ns)
         self._frame.tick(now_ns, path)
+        self._status.tick(now_ns, transport.driver, path)
         self._notices.tick(now_ns, path.newest.sync if path.newest else None)
 
     def close(self) -> None:
@@ -218,6 +225,25 @@ class Device:
         driver = self._transport.driver
         read = driver.alarm_ranges if driver is not None else None
         self._attachments.set_alarm_ranges(read(settings) if read is not None else None)
+        lines = self.config.lines
+        found = driver.line_differences(settings, lines) if driver is not None and lines is not None else {}
+        for key, words in found.items():
+            if self._line_differences.get(key) != words:
+                self._notices.raise_event(
+                    self._host.now_ns(), EventKind.CONFIGURATION, f"line {key}: {words}", line=key
+                )
+        self._line_differences = found
+
+    def _described(self, settings: Mapping[str, str]) -> Mapping[str, str]:
+        driver = self._transport.driver
+        return driver.shown_settings(settings) if driver is not None else settings
+
+    def _lines_status(self) -> LinesStatus | None:
+        """Status of the lines, with what the device's settings contradict."""
+        lines = self._attachments.lines_status()
+        if lines is None or not self._line_differences:
+            return lines
+        return msgspec.structs.replace(lines, problems={**self._line_differences, **lines.problems})
 
     # --- actions -----------------------------------------------------------------------------------------------------
 
@@ -362,7 +388,7 @@ class Device:
             state=health.state,
             problem=health.problem,
             identity=identity_words(self._identity.identity),
-            settings=dict(self._identity.settings),
+            settings=dict(self._identity.shown_settings),
             rate_hz=self._rate.rate_hz(),
             expected_rate_hz=path.clock.expected_rate_hz if path else 0.0,
             newest_seq=newest.seq if newest else 0,
@@ -373,8 +399,10 @@ class Device:
             latency_sum_ns=latency.sum_ns,
             temperature_c=newest.temperature_c if newest else None,
             status_bits=newest.status if newest else None,
+            status_words=status_words(driver.status_bits, newest.status) if driver and newest else (),
+            status_bit_names={str(number): bit.name for number, bit in driver.status_bits.items()} if driver else {},
             connects=self._connects,
-            lines=self._attachments.lines_status(),
+            lines=self._lines_status(),
             utc=self._attachments.utc_status(),
             declared=self._settings.status(),
         )

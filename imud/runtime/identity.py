@@ -34,13 +34,18 @@ class KnownIdentity:
         notices: Notices,
         now_ns: Callable[[], int],
         on_settings: Callable[[Mapping[str, str]], None] = ignore_settings,
+        describe: Callable[[Mapping[str, str]], Mapping[str, str]] = dict,
     ) -> None:
-        """`on_settings` is called with settings as they are read back."""
+        """`on_settings` is called with settings as they are read back, `describe` makes them readable for people."""
         self.identity = Identity()
         self.settings: Mapping[str, str] = {}
+        """By the device's own names."""
+        self.shown_settings: Mapping[str, str] = {}
+        """The same for people."""
         self._notices = notices
         self._now_ns = now_ns
         self._on_settings = on_settings
+        self._describe = describe
 
     async def ask(
         self,
@@ -67,17 +72,18 @@ class KnownIdentity:
     def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
         """Keep what the device said; raise an event for what differs from before."""
         identity, settings = printable_identity(identity), printable_words(settings)
-        now_ns, before, known = self._now_ns(), self.identity, self.settings
+        shown = printable_words(self._describe(settings))
+        now_ns, before, known = self._now_ns(), self.identity, self.shown_settings
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
             serial_number = identity.serial_number
             self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, serial_number=serial_number)
-        changed = {name: value for name, value in settings.items() if known.get(name, value) != value}
+        changed = {name: value for name, value in shown.items() if known.get(name, value) != value}
         if changed:
             words = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
             message = f"settings of the device changed: {words}"
             self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, **changed)
-        self.identity, self.settings = identity, settings
+        self.identity, self.settings, self.shown_settings = identity, settings, shown
         self._on_settings(settings)
 
 

@@ -58,6 +58,7 @@ class SamplePath(ABC):
         self.last_data_ns = 0
         self.last_sample_ns = 0
         self._begun_samples = context.ledger.samples
+        self._status_mask = self._status_seen = 0
         self._device = context.device
         self._device_id = context.device_id
         self._ledger = context.ledger
@@ -68,6 +69,15 @@ class SamplePath(ABC):
         self._overruns = context.overruns
         self._now_ns = context.host.now_ns
         self._utc_offset_ns = context.host.utc_offset_ns
+
+    def watch_status(self, mask: int) -> None:
+        """Gather these bits of the status of all samples from now on."""
+        self._status_mask, self._status_seen = mask, 0
+
+    def take_status(self) -> int:
+        """Return the gathered bits that any sample had since the last call."""
+        seen, self._status_seen = self._status_seen, 0
+        return seen
 
     @property
     def fresh(self) -> bool:
@@ -132,6 +142,10 @@ class SamplePath(ABC):
         if self._rotation is not None:
             samples = self._rotation.samples(samples)
         self._publish(Batch(self._device, self._device_id, samples, self.frame))
+        if mask := self._status_mask:
+            for sample in samples:
+                if sample.status is not None:
+                    self._status_seen |= sample.status & mask
         now_ns = self._now_ns()
         add = self.latency.add
         for sample in samples:

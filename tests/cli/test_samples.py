@@ -66,6 +66,14 @@ def test_watch_ends_after_count_samples(tmp_path: Path, capsys: pytest.CaptureFi
         assert seqs == [seqs[0], seqs[0] + 1, seqs[0] + 2]
 
 
+def test_schema_names_the_status_bits_of_each_driver(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["schema"]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "magnetic disturbance" in line)
+    assert row.split()[:2] == ["hipnuc-uart", "4"]
+    assert main(["schema", "--json"]) == 0
+    assert '"status_bits":{"3":"gyroscope bias not converged",' in capsys.readouterr().out
+
+
 def test_schema_names_every_field_with_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
     text = capsys.readouterr().out

@@ -68,3 +68,18 @@ def test_utc_says_only_what_there_is() -> None:
     assert utc(UtcStatus("", "", pulses=3)) == "3 pulses, 0 ignored"
     assert utc(msgspec.structs.replace(UTC, refused={}, pulses=0, pulses_ignored=0, chrony_refused=0, chrony_sent=0,
                                        problem="")) == "gpsd at 127.0.0.1:2947: 100 sentences, 90 sent"  # fmt: skip
+
+
+def test_settings_and_status_bits_have_names() -> None:
+    shown = replace(
+        device("bow"),
+        settings={"mode": "6-axis", "output.hi91": "100 Hz"},
+        status_bits=1 << 5,
+        status_words=("accelerometer over range",),
+        status_bit_names={"5": "accelerometer over range"},
+    )
+    assert dict(parts(shown)) == {
+        "status": "accelerometer over range",
+        "present": "mode 6-axis, output.hi91 100 Hz",
+    }
+    assert dict(parts(replace(shown, status_bits=0, status_words=())))["status"] == "no bit that is known is set"

@@ -239,6 +239,7 @@ def _frame_of(device: DeviceStatus) -> dict[str, object]:
         "driver": device.driver,
         "euler_convention": device.euler_convention,
         "navigation_frame": device.navigation_frame,
+        "status_bits": device.status_bit_names,
     }
     frame = device.frame
     if frame is not None:

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from imud.contracts.lines import DeviceLines, DividedSettings
 from imud.contracts.status import DeviceState
 from imud.errors import CommandError
 from imud.event import EventKind
@@ -47,7 +48,7 @@ def test_a_module_that_is_silent_by_its_settings_is_known_and_left_so(
         assert turns(device) == []
         await device.act("mode", axes=9)
         assert device.module.settings.att_mode == 1
-        assert device.device.status().settings["ATT_MODE"] == "1"
+        assert device.device.status().settings["mode"] == "9-axis"
         await device.act("wake")
         await device.until(lambda: len(device.samples) > 20)
         assert device.rig.is_in(DeviceState.RUNNING)
@@ -157,12 +158,12 @@ def test_every_variant_is_followed_to_another_rate_and_back(behaviour: Behaviour
         assert ("configuration" in answer) is (not link)
         count = len(device.samples)
         await device.until(lambda: len(device.samples) > count + 20)
-        assert device.device.status().settings["BAUD"] == "921600"
+        assert device.device.status().settings["baud"] == "921600 bit/s"
         answer = await device.act("factory_reset")
         assert answer == {"baud": 115200}
         count = len(device.samples)
         await device.until(lambda: len(device.samples) > count + 20)
-        assert device.device.status().settings["BAUD"] == "115200"
+        assert device.device.status().settings["baud"] == "115200 bit/s"
         assert device.module.settings == ModuleSettings()
         assert device.device.ledger.frames_bad() < 10
 
@@ -176,9 +177,9 @@ def test_settings_are_read_again_after_each_action() -> None:
         await device.act("mounting", turned="y_up")
         await device.act("output", message="HI91", rate_hz=25)
         settings = device.device.status().settings
-        assert (settings["PMUX3"], settings["URFR"]) == ("IO7", "1,0,0,0,0,-1,0,1,0")
-        assert settings["COMCONFIG 1"] == "LOG HI91 ONTIME 0.04"
-        assert "settings of the device changed: PMUX3 is IO7, was IO5" in device.messages
+        assert (settings["pins.led"], settings["mounting"]) == ("IO7", "y_up")
+        assert settings["output.hi91"] == "25 Hz"
+        assert "settings of the device changed: pins.led is IO7, was IO5" in device.messages
 
     play_linked(story)
 
@@ -190,6 +191,43 @@ def test_after_an_action_that_fails_the_settings_are_what_the_module_has() -> No
         await device.wait(0.1)
         with pytest.raises(CommandError, match="the module refused"):
             await device.act("level", level="automatic")
-        assert device.device.status().settings["ATT_MODE"] == "1"
+        assert device.device.status().settings["mode"] == "9-axis"
 
     play_linked(story, hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",))))
+
+
+def test_status_bits_and_settings_are_shown_by_name() -> None:
+    """Firmware 1.6.9 and newer sends MAIN_STATUS; the simulated module converges within 5 s."""
+
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        status = device.device.status()
+        assert status.status_words == (
+            "gyroscope bias not converged", "attitude not converged", "at rest", "time not UTC", "frame with SOUT pulse"
+        )  # fmt: skip
+        assert status.status_bit_names["4"] == "magnetic disturbance"
+        assert status.settings["output.hi91"] == "100 Hz"
+        assert status.settings["magnetometer_bias"] == "0, 0, 0 µT: not calibrated"
+        await device.wait(10)
+        assert device.device.status().status_words == ("at rest", "time not UTC", "frame with SOUT pulse")
+        alarms = [event.message for event in device.events if event.kind is EventKind.ALARM]
+        assert alarms[0] == "status: gyroscope bias not converged, attitude not converged"
+        assert alarms[-1] == "status: no longer gyroscope bias not converged"
+
+    play_linked(story, hardware=hardware_of(Behaviour(), firmware=169))
+
+
+def test_lines_that_the_module_contradicts_are_events_and_shown() -> None:
+    lines = DeviceLines(sout_div=DividedSettings(line="A", divisor=4))
+    words = "divisor is 4 in the configuration, and the module divides SOUT by 8"
+
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        assert device.messages.count(f"line sout_div: {words}") == 1
+        await device.act("mode", axes=9)
+        assert device.messages.count(f"line sout_div: {words}") == 1
+        await device.act("sout_divider", divisor=4)
+        await device.act("sout_divider", divisor=8)
+        assert device.messages.count(f"line sout_div: {words}") == 2
+
+    play_linked(story, lines=lines)

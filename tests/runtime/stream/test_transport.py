@@ -136,7 +136,7 @@ def test_identity_is_asked_and_a_changed_setting_is_told_after_a_replug() -> Non
         await rig.turn(lambda: len(rig.events) >= 2)
         messages = [event.message for event in rig.events]
         assert any("another device: serial number 0000000000000001" in message for message in messages)
-        assert any("is 1, was 0" in message for message in messages)
+        assert any("mode is 9-axis, was 6-axis" in message for message in messages)
 
     play(story, configured(identify=True))
 

@@ -8,6 +8,7 @@ from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.codec import StreamCodec
 from imud.contracts.driver import Identity, StreamDriver
 from imud.devices.hipnuc.common.heading import heading_by_mode
+from imud.devices.hipnuc.common.main_status import MAIN_STATUS
 from imud.devices.hipnuc.uart.actions import ACTIONS
 from imud.devices.hipnuc.uart.alarm import alarm_ranges
 from imud.devices.hipnuc.uart.calibrations import CALIBRATIONS
@@ -21,9 +22,10 @@ from imud.devices.hipnuc.uart.codec import (
     encode_hi92,
 )
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
+from imud.devices.hipnuc.uart.line_check import line_differences
 from imud.devices.hipnuc.uart.packets import PPS_STAMP_MODULUS_MS
 from imud.devices.hipnuc.uart.session import identify, read_settings, wake, why_silent
-from imud.devices.hipnuc.uart.settings import SETTINGS
+from imud.devices.hipnuc.uart.settings import SETTINGS, shown
 from imud.units import NS_PER_MS
 
 
@@ -67,6 +69,9 @@ DRIVER: Final = StreamDriver(
     lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
     alarm_ranges=alarm_ranges,
     time_bits=TIME_BITS,
+    status_bits=MAIN_STATUS,
+    shown_settings=shown,
+    line_differences=line_differences,
     actions=ACTIONS,
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,

@@ -1,0 +1,58 @@
+"""Lines of the configuration against the module's settings, as the simulated module reports them."""
+
+import pytest
+
+from imud.contracts.lines import (
+    DeviceLines,
+    DividedSettings,
+    InputSettings,
+    PpsSettings,
+    SoutSettings,
+    TriggerSettings,
+)
+from imud.devices.hipnuc.uart.line_check import line_differences
+from imud.devices.hipnuc.uart.session import read_settings
+from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings, Output
+from tests.support.simulated_modules import HipnucLine
+
+SOUT = DeviceLines(sout=SoutSettings(line="A"))
+DIVIDED = DeviceLines(sout_div=DividedSettings(line="B", divisor=4))
+SIN = DeviceLines(sin=TriggerSettings(line="C", rate_hz=200))
+PPS = DeviceLines(pps=PpsSettings(line="D"))
+ALARM = DeviceLines(alarm=InputSettings(line="E"))
+MARKED = Output(on_mark=True)
+
+
+@pytest.mark.parametrize(
+    ("lines", "settings", "found"),
+    [
+        (SOUT, ModuleSettings(), {}),
+        (SOUT, ModuleSettings(pins=(1, 2, 2, 6, 9)), {"sout": "the module has sout and led on IO2: set one with pin"}),
+        (DIVIDED, ModuleSettings(sout_div=4), {}),
+        (
+            DIVIDED,
+            ModuleSettings(),
+            {"sout_div": "divisor is 4 in the configuration, and the module divides SOUT by 8"},
+        ),
+        (SIN, ModuleSettings(baud=921600, hi91=MARKED), {}),
+        (SIN, ModuleSettings(), {"sin": "no message of the module is on mark"}),
+        (SIN, ModuleSettings(hi91=MARKED), {"sin": "200 triggers a second, and 115200 baud carry 100 Hz of HI91"}),
+        (SIN, ModuleSettings(hi91=Output(), hi92=MARKED), {"sin": "HI92 on mark has no time of its own"}),
+        (PPS, ModuleSettings(), {}),
+        (PPS, ModuleSettings(hi91=MARKED), {"pps": "HI91 on mark: each pulse per second makes a sample"}),
+        (ALARM, ModuleSettings(alarm_y=AlarmSetting(-5, 5, True)), {}),
+        (ALARM, ModuleSettings(), {"alarm": "the module watches no angle"}),
+    ],
+)
+def test_what_the_module_contradicts_is_found(
+    lines: DeviceLines, settings: ModuleSettings, found: dict[str, str]
+) -> None:
+    differences = line_differences(HipnucLine(settings).run(read_settings()), lines)
+    assert differences.keys() == found.keys()
+    for key, words in found.items():
+        assert words in differences[key]
+
+
+@pytest.mark.parametrize("lines", [SOUT, DIVIDED, SIN, PPS, ALARM])
+def test_what_the_module_does_not_tell_is_not_compared(lines: DeviceLines) -> None:
+    assert line_differences({"ATT_MODE": "0"}, lines) == {}
