@@ -327,7 +327,7 @@ TESTED_IN = {
     "imud.devices.hipnuc.modbus.registers": "devices/hipnuc/modbus/test_codec.py",
     "imud.devices.hipnuc.nmea2000.driver": "devices/test_every_can_driver.py",
     "imud.devices.hipnuc.nmea2000.messages": "devices/hipnuc/nmea2000/test_codec.py",
-    "imud.devices.hipnuc.common.main_status": "runtime/test_status_watch.py",
+    "imud.devices.hipnuc.common.main_status": "runtime/watch/test_status_watch.py",
     "imud.devices.hipnuc.uart.driver": "devices/test_every_stream_driver.py",
     "imud.devices.imu61x.can.driver": "devices/test_every_can_driver.py",
     "imud.devices.imu61x.common.registers": "devices/imu61x/spi/test_codec.py",

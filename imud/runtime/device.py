@@ -31,7 +31,6 @@ from imud.ledger import Ledger
 from imud.log import printable, shown
 from imud.runtime.attachments import AttachmentHooks, Attachments
 from imud.runtime.calibration.guide import Guide
-from imud.runtime.frame_watch import FrameWatch
 from imud.runtime.health import Health
 from imud.runtime.identity import KnownIdentity, identity_words
 from imud.runtime.meters import LatencyMeter, RateMeter
@@ -39,9 +38,10 @@ from imud.runtime.notices import Notices
 from imud.runtime.path import SamplePath
 from imud.runtime.settings.backup import SettingsFiles
 from imud.runtime.settings.keeper import SettingsKeeper
-from imud.runtime.status_watch import StatusWatch
 from imud.runtime.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.runtime.utc_keeper import DevicePort
+from imud.runtime.watch.frame_watch import FrameWatch
+from imud.runtime.watch.status_watch import StatusWatch
 from imud.units import NS_PER_MS, NS_PER_S
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from imud.devices import DRIVERS
 from imud.event import Event, EventKind
 from imud.ledger import Ledger
 from imud.runtime.notices import Notices
-from imud.runtime.status_watch import CLEAR_NS, INTERVAL_NS, StatusWatch
+from imud.runtime.watch.status_watch import CLEAR_NS, INTERVAL_NS, StatusWatch
 from imud.units import NS_PER_MS, NS_PER_S
 
 TICK_NS = 100 * NS_PER_MS
