@@ -32,6 +32,7 @@ from imud.contracts.device_settings import (
     declared_values,
 )
 from imud.contracts.driver import Driver
+from imud.contracts.polling import PolledDriver
 from imud.contracts.settings import shown
 from imud.errors import BadArgument, CommandError
 from imud.event import EventKind
@@ -60,6 +61,8 @@ BEGIN_NS: Final = NS_PER_S
 """From finding a device to the question: imud asks for its identity meanwhile, on which counting writes depends."""
 SETTLE_NS: Final = NS_PER_S // 2
 """From the first sample after a restart to the question: a module that has just started need not answer at once."""
+AGAIN_NS: Final = 60 * NS_PER_S
+"""From one comparison to the next of a device that is polled: it has no clock by which its restart shows."""
 OWN_NS: Final = 2 * NS_PER_S
 """After a script a device that paused its samples for it, or that it restarted, may begin its clock anew so late: what
 it has then is compared at the end of the script, and not once more, which would pause its samples again."""
@@ -300,6 +303,8 @@ class SettingsKeeper:
         self._tries, self._problem = 0, ""
         found = self._differences(table)
         self._tell(found)
+        if isinstance(self._driver(), PolledDriver):
+            self._due_ns = self._host.now_ns() + AGAIN_NS
         if self._config.on_difference is not OnDifference.REPORT:
             await self._repair(table, actual)
 
