@@ -13,18 +13,20 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, monotonic_ns, sleep
 from typing import Final
 
+from imud.ledger import lost
 from imud.sample import Sample
 from tests.lab.chaos import account as accounts
-from tests.lab.chaos.account import Account, Interval
+from tests.lab.chaos.account import Account, Hole, Interval
 from tests.lab.chaos.daemon import Life, Snapshot, memory_control
 from tests.lab.chaos.far_side import FarSide
 from tests.lab.chaos.faults import Fault, Planned, all_faults, plan
+from tests.lab.chaos.polls import Answer
 from tests.lab.tool import tool
 from tests.lab.waiting import wait_until
 from tests.support.daemon_process import write_config
@@ -48,7 +50,6 @@ class Chaos:
         self.lives = 0
         self._folder = folder
         self._outages: dict[str, list[Interval]] = {name: [] for name in far.devices()}
-        self._polled_before: dict[str, tuple[int, int]] = {}
         self.write_config(0)
         self.life = self._born()
 
@@ -71,13 +72,13 @@ class Chaos:
     def outage_begins(self, fault: Fault) -> None:
         """Note it for the devices that it concerns."""
         for name in fault.outage:
-            self._outages[name].append(Interval(monotonic_ns(), NEVER_NS))
+            self._outages[name].append(Interval(monotonic_ns(), NEVER_NS, fault.restarts))
 
     def outage_ends(self, fault: Fault) -> None:
         """The same."""
         for name in fault.outage:
             begin = self._outages[name].pop()
-            self._outages[name].append(Interval(begin.begin_ns, monotonic_ns()))
+            self._outages[name].append(begin._replace(end_ns=monotonic_ns()))
 
     # --- audits ------------------------------------------------------------------------------------------------------
 
@@ -96,74 +97,100 @@ class Chaos:
 
     def audit(self, what: str) -> None:
         """Add up the present life; it must be followed by another, or by the end."""
-        before, now = self.life.recorder.begin, self.life.snapshot()
-        samples = self._received(before, now, what)
-        for name in self.accounts:
+        before, now = self.life.recorder.begin, self._counted_snapshot(what)
+        received = self._received(before, now, what)
+        for name, samples in received.items():
+            first = before.devices[name].newest_seq
             if problem := accounts.open_ledger(now.devices[name]):
                 self._violated(what, f"{name}: {problem}")
-            for fault in accounts.sequence_faults(samples[name], before.devices[name].newest_seq + 1):
+            for fault in accounts.sequence_faults(samples, first + (not samples or samples[0].seq > first)):
                 self._violated(what, f"{name}: {fault}")
             if name in self.far.truth:
-                self._audit_sender(name, samples[name], before, now, what)
-            elif name in self.far.polled:
-                self._audit_polled(name, before, now, what)
+                self._audit_sender(name, samples, before, now, what)
             else:
-                self.accounts[name] += Account(len(samples[name]), outages=len(self._outages[name]))
+                self._audit_polled(name, samples, before, now, what)
         if self.life.recorder.dropped:
             self._violated(what, f"the recorder was too slow: {self.life.recorder.dropped}")
         self._outages = {name: [i for i in times if i.end_ns == NEVER_NS] for name, times in self._outages.items()}
 
     def _audit_sender(self, name: str, samples: list[Sample], before: Snapshot, now: Snapshot, what: str) -> None:
         found = self.far.truth[name].numbers_of(samples)
-        strange = [sample.seq for sample, number in zip(samples, found, strict=True) if number is None]
-        if strange:
-            self._violated(what, f"{name}: {len(strange)} samples that the device never took, first {strange[0]}")
         true = [(sample, number) for sample, number in zip(samples, found, strict=True) if number is not None]
-        lost = accounts.losses(now.devices[name].ledger) - accounts.losses(before.devices[name].ledger)
+        self._refuse_strange(name, [s.seq for s, number in zip(samples, found, strict=True) if number is None], what)
+        outages = self._outages[name]
         numbers = [number for _, number in true]
-        learns = name in self.far.noise
-        result = accounts.account([s for s, _ in true], numbers, lost, self._outages[name], learns=learns)
-        self._book(name, result, what)
+        holes = accounts.find_holes([s for s, _ in true], numbers, outages, learns=name in self.far.noise)
+        self._book(name, holes, before, now, what)
 
-    def _audit_polled(self, name: str, before: Snapshot, now: Snapshot, what: str) -> None:
-        """Every burst that was answered is a sample, or one that was the same as before, or a damaged frame."""
-        bus = self.far.polled[name]
-        good, damaged = self._polled_before[name]
+    def _audit_polled(self, name: str, samples: list[Sample], before: Snapshot, now: Snapshot, what: str) -> None:
+        """Hold the deadlines of a device that is polled against its samples, and its answers against the causes."""
+        log, was, is_now = self.far.polls[name], before.devices[name], now.devices[name]
+        self._refuse_strange(name, log.strange(samples), what)
+        troubles = [*self._outages[name], *log.troubles(before.at_ns, now.at_ns)]
+        holes = accounts.find_holes(samples, log.numbers_of(samples, troubles), troubles)
+        if samples and any(trouble.end_ns > samples[-1].t_rx_ns for trouble in troubles):
+            missing = round((now.at_ns - samples[-1].t_ns) / log.period_ns)
+            holes.append(accounts.Hole(missing, is_certain=False, is_open=True))
+        self._book(name, holes, before, now, what)
+        assert was.polling is not None
+        assert is_now.polling is not None
+        gone = is_now.polling.vanished - was.polling.vanished + 1
+        asked = [a for a in log.between(before.at_ns, now.at_ns) if a.is_sample]
+        for answer, cause in ((Answer.DAMAGED, "lost_crc"), (Answer.REFUSED, "lost_gap_device")):
+            true, counted = sum(a.answer is answer for a in asked), is_now.ledger[cause] - was.ledger[cause]
+            if not 0 <= true - counted <= gone and name in self.far.registers:
+                self._violated(what, f"{name}: {true} reads {answer.value}, {cause} {counted}, {gone - 1} times gone")
+
+    def _refuse_strange(self, name: str, seqs: Sequence[int], what: str) -> None:
+        if seqs:
+            self._violated(what, f"{name}: {len(seqs)} samples that the device never took, the first is {seqs[0]}")
+
+    def _book(self, name: str, holes: list[Hole], before: Snapshot, now: Snapshot, what: str) -> None:
         was, is_now = before.devices[name].ledger, now.devices[name].ledger
-        polling, earlier = now.devices[name].polling, before.devices[name].polling
-        assert polling is not None
-        assert earlier is not None
-        bad = sum(is_now[key] - was[key] for key in is_now if key.startswith("frames_bad"))
-        taken = is_now["samples"] - was["samples"] + polling.stale - earlier.stale
-        answered, hit = bus.good - good, bus.damaged - damaged
-        count = len(self._outages[name]) + 1
-        if not 0 <= answered - taken <= count or not hit - count <= bad <= hit + count:
-            self._violated(
-                what, f"{name}: {answered} bursts answered, {hit} answers damaged, the ledger has {taken} and {bad}, "
-                f"outages {count - 1}",
-            )  # fmt: skip
-        queue = is_now["lost_queue"] - was["lost_queue"]
-        missed = polling.missed - earlier.missed
-        self._book(name, Account(is_now["samples"] - was["samples"], missed, queue, count - 1), what)
-
-    def _book(self, name: str, result: Account, what: str) -> None:
+        count, outages = is_now["samples"] - was["samples"], len(self._outages[name])
+        unknown = is_now["lost_unknown"] - was["lost_unknown"]
+        result = accounts.account(count, holes, lost(is_now) - lost(was), unknown, outages)
         self.accounts[name] += result
         if not result.balanced:
-            self._violated(
-                what, f"{name}: the ledger says {result.lost} lost, the truth {result.holes}, outages {result.outages}"
-            )
+            self._show_holes(name, holes)
+            uncertain = [hole.missing for hole in holes if not hole.is_certain]
+            self._violated(what, f"{name}: {result}, uncertain holes {uncertain}")
+
+    def _show_holes(self, name: str, holes: list[Hole]) -> None:
+        """Print what is between samples, by the time since the first of them."""
+        samples = self.life.recorder.samples()[name]
+        for sample, hole in zip(samples, holes, strict=False):
+            if hole.missing or not hole.is_certain:
+                print(f"  {name}: {(sample.t_ns - samples[0].t_ns) / 1e9:.3f} s, after sample {sample.seq}: {hole}")
+
+    def _counted_snapshot(self, what: str) -> Snapshot:
+        """The state at a moment at which missed deadlines are in the ledger: it counts them ten times a second."""
+        found: list[Snapshot] = []
+
+        def counted() -> bool:
+            found[:] = [self.life.snapshot()]
+            devices = found[0].devices.values()
+            return all(d.polling is None or d.polling.missed == d.ledger["lost_queue"] for d in devices)
+
+        try:
+            wait_until(counted, "missed deadlines in the ledger", CATCH_UP_S)
+        except AssertionError as error:
+            self._violated(what, str(error))
+        return found[0]
 
     def _received(self, before: Snapshot, now: Snapshot, what: str) -> dict[str, list[Sample]]:
-        """The samples between two states, once the recorder has them."""
+        """The samples between two states, once the recorder has them; with the one before, if it has that too."""
         newest = {name: now.devices[name].newest_seq for name in self.accounts}
         first = {name: before.devices[name].newest_seq for name in self.accounts}
 
         def chosen() -> dict[str, list[Sample]]:
             found = self.life.recorder.samples()
-            return {name: [s for s in found[name] if first[name] < s.seq <= newest[name]] for name in newest}
+            return {name: [s for s in found[name] if first[name] <= s.seq <= newest[name]] for name in newest}
 
         def complete() -> bool:
-            return all(len(samples) >= newest[name] - first[name] for name, samples in chosen().items())
+            return all(
+                sum(s.seq > first[n] for s in samples) == newest[n] - first[n] for n, samples in chosen().items()
+            )
 
         try:
             wait_until(complete, "the samples that the ledger has", CATCH_UP_S)
@@ -184,7 +211,6 @@ class Chaos:
 
     def _born(self) -> Life:
         self.lives += 1
-        self._polled_before = {name: (bus.good, bus.damaged) for name, bus in self.far.polled.items()}
         return Life(self._folder, self._folder / "imud.yaml")
 
 
@@ -226,11 +252,12 @@ def show(chaos: Chaos, made: Counter[str], faults: list[Fault]) -> None:
     for fault in faults:
         print(f"  {fault.name:32}{made[fault.name]:5}")
     print(f"  {'in all':32}{made.total():5}, lives of the daemon {chaos.lives}")
-    print("\ndevice    samples   lost by ledger   true holes   difference   outages (allowed)   unheard in outages")
+    print("\ndevice    samples   true holes   lost by ledger   by the rule   gaps unknown   by the rule   outages")
     for name, sum_ in chaos.accounts.items():
+        bounds = f"{sum_.least}" if sum_.least == sum_.most else f"{sum_.least} to {sum_.most}"
         print(
-            f"  {name:8}{sum_.samples:7}{sum_.lost:17}{sum_.holes:13}{sum_.lost - sum_.holes:+13}"
-            f"{sum_.outages:20}{sum_.unheard:21}"
+            f"  {name:8}{sum_.samples:7}{sum_.holes:13}{sum_.lost:17}{bounds:>14}"
+            f"{sum_.unknown:15}{f'0 to {sum_.unknown_most}':>14}{sum_.outages:10}"
         )
 
 
@@ -269,7 +296,7 @@ def main(arguments: list[str] | None = None) -> int:
                 chaos.life.destroy()
         log = (folder / "log").read_text()
     if "Traceback" in log or chaos.violations:
-        print("\n".join(["", "the daemon's log:", *log.splitlines()[-60:]]))
+        print("\n".join(["", "the daemon's log:", *log.splitlines()]))
     if "Traceback" in log:
         chaos.violations.append("a traceback in the daemon's log")
     show(chaos, made, faults)

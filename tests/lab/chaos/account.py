@@ -1,12 +1,23 @@
 """The account of one device over one life of the daemon: samples and losses against the truth.
 
-Rule. A hole is the number of true samples between two received ones. The ledger's losses must equal the sum of all
-holes that no outage touches. An outage is a time in which the link was away or the device began anew: the daemon
-cannot know what was sent then and does not count it. Where an outage begins or ends in the middle of a sample, or in
-the kernel's buffer, one sample per outage may be counted or not, hence |lost - holes| <= outages.
+Rule. A hole is the number of true samples between two received ones. The ledger counts each hole, exactly, where the
+daemon can know its size: by the counter of a device that ran on, also while the link was away, and by the deadlines at
+which a polled device was read. Its size cannot be known
+
+- where the device began anew: its counter says nothing about the time before;
+- before the daemon knows the rate of a device that gives time and no numbers, or what it needs to recognise a counter
+  over a link that was away (`KNOWN`);
+- where a polled device was away: it is not read then, and has no counter.
+
+Such a hole is uncertain. It counts as one of the ledger's gaps of unknown size, and what `lost` has of it is anything
+from nothing to all, or it is counted within one sample. Hence, with the ledger's number of unknown gaps U,
+
+    holes - (the U largest uncertain ones) - (one for each of the rest) <= lost <= holes + (one for each uncertain one)
+
+and U is at most what there are uncertain ones. Without an uncertain hole `lost` is exactly the truth.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -16,41 +27,65 @@ from imud.sample import Sample
 
 LEARNED: Final = 4
 """So many equal steps in a row are a rate (imud.clock.device_time.CONSISTENT); before that no loss can be known."""
-LOSSES: Final = ("lost_gap_device", "lost_crc", "lost_overrun", "lost_queue")
+KNOWN: Final = 80
+"""After so many samples since the device began, its counter is known over a link that was away. A fit needs 8
+(imud.clock.sampler.ENOUGH_POINTS), the pace of numbered samples four windows of 16 where one is disturbed
+(imud.clock.gaps.WINDOW_MESSAGES); one more window for SIGSTOP."""
+UNKNOWN_MOST: Final = 2
+"""A hole before the rate is known is seen twice: as a step longer than the one before, and than the one after."""
 
 
 class Interval(NamedTuple):
-    """A time, CLOCK_MONOTONIC in ns."""
+    """A time in which a link was away, CLOCK_MONOTONIC in ns."""
 
     begin_ns: int
     end_ns: int
+    restarts: bool = False
+    """Whether the device began anew in it, or is one that is polled."""
+
+    def touches(self, before: Sample, after: Sample) -> bool:
+        """Whether it has a part between two samples."""
+        return self.begin_ns <= after.t_rx_ns and self.end_ns >= before.t_ns
+
+
+class Hole(NamedTuple):
+    """What is between two samples that the daemon received one after the other."""
+
+    missing: int
+    """True samples."""
+    is_certain: bool
+    """Whether the daemon can know how many."""
+    unknown_most: int = 1
+    """So many unknown gaps it may count for."""
+    is_open: bool = False
+    """Whether no sample ended it so far."""
 
 
 class Account(NamedTuple):
     """What one device did in one life, or in several together."""
 
     samples: int = 0
-    holes: int = 0
-    """True samples between received ones, outages apart."""
     lost: int = 0
-    """Losses of the ledger in the same time."""
+    """Losses of the ledger."""
+    holes: int = 0
+    """True samples between received ones."""
+    least: int = 0
+    most: int = 0
+    """Bounds of `lost` by the rule."""
+    unknown: int = 0
+    """Unknown gaps of the ledger."""
+    unknown_most: int = 0
+    """Their number by the rule."""
     outages: int = 0
-    unheard: int = 0
-    """True samples in holes that an outage touches."""
 
     @property
     def balanced(self) -> bool:
-        """Whether the ledger's losses are the true ones."""
-        return abs(self.lost - self.holes) <= self.outages
+        """Whether the ledger says the truth."""
+        return self.least <= self.lost <= self.most and self.unknown <= self.unknown_most
 
     def __add__(self, other: tuple[object, ...]) -> "Account":
         assert isinstance(other, Account)
         return Account(*(a + b for a, b in zip(tuple(self), tuple(other), strict=True)))
-
-
-def losses(ledger: Mapping[str, int]) -> int:
-    """Samples lost by every cause."""
-    return sum(ledger[name] for name in LOSSES)
 
 
 def sequence_faults(samples: Sequence[Sample], first_seq: int) -> list[str]:
@@ -73,25 +108,32 @@ def open_ledger(status: DeviceStatus) -> str:
     return f"{byte} bytes and {frame} frames unaccounted for" if byte or frame else ""
 
 
-def account(
-    samples: Sequence[Sample],
-    numbers: Sequence[int],
-    lost: int,
-    outages: Sequence[Interval],
-    *,
-    learns: bool = False,
-) -> Account:
-    """Compare losses with the holes between samples whose true numbers are given.
+def find_holes(
+    samples: Sequence[Sample], numbers: Sequence[int], outages: Sequence[Interval], *, learns: bool = False
+) -> list[Hole]:
+    """Return what is between samples whose true numbers are given.
 
-    `learns`: the device gives time and no numbers, so holes before LEARNED equal steps in a row are not countable.
+    `learns`: the device gives time and no numbers.
     """
-    holes = unheard = even = 0
+    found: list[Hole] = []
+    heard, even = 1, 0
     for (before, a), (after, b) in pairwise(zip(samples, numbers, strict=True)):
         missing = b - a - 1
-        away = any(outage.begin_ns <= after.t_rx_ns and outage.end_ns >= before.t_rx_ns for outage in outages)
-        if away or (learns and even < LEARNED):
-            unheard += missing
-            even = even if even >= LEARNED else (even + 1) * (not missing)
-        else:
-            holes += missing
-    return Account(len(samples), holes, lost, len(outages) + (learns and even < LEARNED), unheard)
+        touching = [outage for outage in outages if outage.touches(before, after)]
+        restarts = any(outage.restarts for outage in touching)
+        unlearned = learns and even < LEARNED
+        is_uncertain = restarts or (missing > 0 and (unlearned or (bool(touching) and heard < KNOWN)))
+        found.append(Hole(missing, not is_uncertain, UNKNOWN_MOST if unlearned else 1))
+        heard = 1 if restarts else heard + 1
+        if unlearned:
+            even = (even + 1) * (not missing)
+    return found
+
+
+def account(samples: int, holes: Sequence[Hole], lost: int, unknown: int, outages: int) -> Account:
+    """Hold losses and unknown gaps of a ledger against the true holes."""
+    true = sum(hole.missing for hole in holes if not hole.is_open)
+    uncertain = sorted((hole for hole in holes if not hole.is_certain and not hole.is_open), reverse=True)
+    least = true - sum(hole.missing for hole in uncertain[:unknown]) - sum(h.missing > 0 for h in uncertain[unknown:])
+    most = true + len(uncertain) + sum(hole.missing + 1 for hole in holes if hole.is_open)
+    return Account(samples, lost, true, least, most, unknown, sum(h.unknown_most for h in uncertain), outages)

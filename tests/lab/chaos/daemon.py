@@ -8,7 +8,7 @@ import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic, monotonic_ns, sleep
 from typing import Final, NamedTuple
 
 import msgspec
@@ -35,6 +35,8 @@ class Snapshot(NamedTuple):
     """Every device at one moment."""
 
     devices: Mapping[str, DeviceStatus]
+    at_ns: int
+    """CLOCK_MONOTONIC, right before it was asked for."""
 
 
 class Recorder:
@@ -46,7 +48,9 @@ class Recorder:
     def __init__(self, path: Path) -> None:
         self._client = Client(path, timeout_s=ANSWER_LIMIT_S)
         self._watch = self._client.watch(encoding="binary")
-        self.begin = Snapshot(_statuses(self._client))
+        self._newest = self._client.poll()
+        """The sample before the first that is received, of each device that had one."""
+        self.begin = _snapshot(self._client)
         """The state at a moment from which on every sample is received."""
         self._slots: list[bytes] = []
         self._others: list[object] = []
@@ -54,7 +58,7 @@ class Recorder:
         self._thread.start()
 
     def samples(self) -> dict[str, list[Sample]]:
-        """All samples so far, by device."""
+        """All samples so far, by device, and the newest of the time before."""
         names = {status.device_id: name for name, status in self.begin.devices.items()}
         found: dict[str, list[Sample]] = {name: [] for name in names.values()}
         for slots in list(self._slots):
@@ -63,6 +67,10 @@ class Recorder:
                 number = int.from_bytes(slot[ID_AT : ID_AT + 2], "little")
                 if number in names:
                     found[names[number]].append(decode_slot(slot, names[number]))
+        for sample in self._newest:
+            received = found[sample.device]
+            if not received or received[0].seq > sample.seq:
+                received.insert(0, sample)
         return found
 
     @property
@@ -107,7 +115,7 @@ class Life:
     def snapshot(self) -> Snapshot:
         """The state of every device now. Raises ImudError, TimeoutError."""
         with Client(self.socket, timeout_s=ANSWER_LIMIT_S) as client:
-            return Snapshot(_statuses(client))
+            return _snapshot(client)
 
     def wait_running(self) -> Snapshot:
         """Wait until every device runs. Raises AssertionError with those that do not."""
@@ -178,6 +186,7 @@ def memory_control() -> bool:
     return True
 
 
-def _statuses(client: Client) -> dict[str, DeviceStatus]:
+def _snapshot(client: Client) -> Snapshot:
+    at_ns = monotonic_ns()
     devices = msgspec.convert(client.status()["devices"], list[DeviceStatus])
-    return {device.name: device for device in devices}
+    return Snapshot({device.name: device for device in devices}, at_ns)

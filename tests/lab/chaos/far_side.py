@@ -5,9 +5,9 @@ serial   pseudo-terminal, SOUT on gpio-sim           hipnuc-uart      every samp
 uart     16550A pair                                 imu61x-uart      every sample by device time
 vcan     virtual CAN                                 imu61x-can       every sample by a number in its values
 can      SJA1000 pair                                imu61x-can       every sample by a number in its values
-modbus   pseudo-terminal                             hipnuc-modbus    bytes of its ledger
-i2c      i2c-dev                                     imu61x-i2c       bursts that were answered, and damaged ones
-spi      spidev, 8-bit words                         imu61x-spi       bursts that were answered, and damaged ones
+modbus   pseudo-terminal                             hipnuc-modbus    its deadlines, and what it answered
+i2c      i2c-dev                                     imu61x-i2c       the same, and what was damaged or refused
+spi      spidev, 8-bit words                         imu61x-spi       the same
 """
 
 import errno
@@ -16,15 +16,14 @@ import select
 import termios
 import threading
 import tty
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from time import monotonic_ns
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 from imud.sim import SIMULATORS
-from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.can_port import CanPort
 from imud.sim.ports.faults import FaultRates, Faults
@@ -34,7 +33,8 @@ from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, set_baud
 from imud.sim.simulator import SimulatorOptions, StreamModule
 from tests.lab.bus import Bus, i2c_bus, spi_bus
 from tests.lab.can_interface import CanInterface, controller_pair, virtual_can
-from tests.lab.chaos.truth import LoggedModule, TruthLog, decoded, numbered_can, time_key
+from tests.lab.chaos.polls import LoggedRegisters, PollLog, block_replies
+from tests.lab.chaos.truth import LoggedModule, TruthLog, by_device_time, decoded, numbered_can, time_key
 from tests.lab.gpio_chip import GpioChip, simulated_chip
 from tests.lab.imu61x_bus import on_i2c, on_spi
 from tests.lab.serial_port import uart_pair
@@ -43,6 +43,7 @@ from tests.lab.wire import I2cTransfer, SpiTransfer
 RATE_HZ: Final = 10.0
 BAUD: Final = 115200
 PERIOD_NS: Final = round(1e9 / RATE_HZ)
+MODBUS_HZ: Final = 5.0
 SETTLE_S: Final = 0.012
 """After a rising edge, as in tests/lab/imu_process.py."""
 LOOK_S: Final = 0.02
@@ -100,27 +101,6 @@ class UartNode(PtyNode):
             return os.write(self._fd, data)
         except BlockingIOError:
             return 0
-
-
-class CountedRegisters:
-    """A device on a polled bus, how many of its bursts were answered, and how many answers damaged."""
-
-    def __init__(self) -> None:
-        self.device = Imu61xRegisters(monotonic_ns)
-        self.good = self.damaged = 0
-
-    def counted(self, answer: Callable[[Any], bytes], is_burst: Callable[[Any], bool]) -> Callable[[Any], bytes]:
-        """The device as a bus has it."""
-
-        def counting(transfer: Any) -> bytes:
-            flips, line = self.device.faults.flips, self.device.faults.line
-            data = answer(transfer)
-            if line is None:
-                self.damaged += flips > 0
-                self.good += flips == 0 and is_burst(transfer)
-            return data
-
-        return counting
 
 
 class PortThread:
@@ -191,7 +171,10 @@ class FarSide:
         self.pin_noise = PinFaults(seed, PinFaultRates())
         self.thread = PortThread()
         self.streams: dict[str, SimulatedPort] = {}
-        self.polled = {name: CountedRegisters() for name in ("i2c", "spi")}
+        self.modules: dict[str, LoggedModule] = {}
+        self.cans: dict[str, CanPort] = {}
+        self.registers = {name: LoggedRegisters(PERIOD_NS) for name in ("i2c", "spi")}
+        self.polls = {name: registers.log for name, registers in self.registers.items()}
 
     def __enter__(self) -> Self:
         enter = self._stack.enter_context
@@ -230,7 +213,7 @@ class FarSide:
             "can": {"driver": "imu61x-can", "socketcan": {"interface": "can0"}, "options": {"base_id": 201}},
             "modbus": {
                 "driver": "hipnuc-modbus",
-                "rs485": {"line": str(self.folder / "modbus"), "rate_hz": 5, "reply_ms": 200},
+                "rs485": {"line": str(self.folder / "modbus"), "rate_hz": MODBUS_HZ, "reply_ms": 200},
             },
             "i2c": {"driver": "imu61x-i2c", "i2c": {"bus": 0, "address": 0x18, "rate_hz": RATE_HZ}},
             "spi": {"driver": "imu61x-spi", "spi": {"port": "/dev/spidev0.0", "rate_hz": RATE_HZ}},
@@ -247,7 +230,10 @@ class FarSide:
             self._stack.callback(lines.close)
         if name in self.noise:
             self.truth[name] = TruthLog(time_key, PERIOD_NS // 3)
-            module = LoggedModule(module, self.truth[name], now_ns)
+            module = self.modules[name] = LoggedModule(module, by_device_time(self.truth[name]), now_ns)
+        else:
+            self.polls[name] = PollLog(round(1e9 / MODBUS_HZ))
+            module = self.modules[name] = LoggedModule(module, block_replies(self.polls[name]), now_ns)
         port = SimulatedPort(module, node, Adapter(BARE_UART, now_ns), self.noise.get(name))
         self.streams[name] = port
         self.thread.add(port, lines)
@@ -255,24 +241,37 @@ class FarSide:
     def _add_can(self, name: str, interface: CanInterface, base_id: int) -> None:
         log = self.truth[name] = TruthLog(decoded, 0)
         module = numbered_can(monotonic_ns, RATE_HZ, base_id, log)
-        self.thread.add(CanPort(module, interface.name))
+        self.cans[name] = CanPort(module, interface.name)
+        self.thread.add(self.cans[name])
 
     def _add_polled(self, i2c: Bus[I2cTransfer], spi: Bus[SpiTransfer]) -> None:
-        at_i2c, at_spi = self.polled["i2c"], self.polled["spi"]
-        i2c.attach(0x18, at_i2c.counted(on_i2c(at_i2c.device), _is_i2c_burst))
-        spi.attach(0, at_spi.counted(on_spi(at_spi.device), _is_spi_burst))
+        at_i2c, at_spi = self.registers["i2c"], self.registers["spi"]
+        i2c.attach(0x18, at_i2c.logged(on_i2c(at_i2c.device), _is_i2c_burst))
+        spi.attach(0, at_spi.logged(on_spi(at_spi.device), _is_spi_burst))
 
     # --- what can be done to them ------------------------------------------------------------------------------------
 
     def unplug(self, name: str, seconds: float) -> None:
-        """Pull the plug of a pseudo-terminal for so long."""
+        """Pull the plug of a pseudo-terminal for so long; the module loses its power."""
         with self.thread.changing:
+            self.modules[name].power_off(monotonic_ns())
             self.streams[name].unplug(monotonic_ns(), round(seconds * 1e9))
+
+    def pull_data(self, name: str) -> None:
+        """Pull the plug of a pseudo-terminal whose module has power of its own."""
+        with self.thread.changing:
+            self.streams[name].node.unplug()
+
+    def plug_data(self, name: str) -> None:
+        """Put that plug in again."""
+        with self.thread.changing:
+            self.streams[name].node.plug(self.modules[name].baud)
 
     def reboot(self, name: str) -> None:
         """Restart a module while its port stays."""
+        module = self.modules.get(name) or self.cans[name].module
         with self.thread.changing:
-            self.streams[name].module.reboot(monotonic_ns())
+            module.reboot(monotonic_ns())
 
     def set_noise(self, name: str, rates: FaultRates) -> None:
         """Set what happens to the bytes of a stream."""
@@ -287,7 +286,7 @@ class FarSide:
     def set_registers(self, name: str, **values: object) -> None:
         """Set what is wrong with a polled device."""
         for key, value in values.items():
-            setattr(self.polled[name].device.faults, key, value)
+            setattr(self.registers[name].device.faults, key, value)
 
 
 STUCK: Final = {"error": errno.ETIMEDOUT}

@@ -66,7 +66,9 @@ class Fault:
     shortest_s: float = 0.2
     longest_s: float = 2.5
     outage: tuple[str, ...] = ()
-    """Devices whose link is away meanwhile, or that begin anew."""
+    """Devices whose link is away meanwhile, or that begin anew. Those on I2C and SPI say by themselves when."""
+    restarts: bool = False
+    """Whether these devices begin anew, or lose their power; else they run on."""
     weight: float = 1.0
 
 
@@ -154,6 +156,14 @@ def _registers(name: str, **values: object) -> dict[str, Any]:
     }
 
 
+def _restart(name: str) -> dict[str, Any]:
+    return {"outage": (name,), "restarts": True}
+
+
+def _reboot(name: str) -> dict[str, Any]:
+    return {**_restart(name), "shortest_s": 0.0, "longest_s": 0.0}
+
+
 def _bus_off(scene: Scene, lasts_s: float) -> None:
     scene.far.can.enter("bus-off")
 
@@ -183,10 +193,13 @@ def all_faults(*, with_memory: bool) -> list[Fault]:
     one = frozenset
     bad_wire = FaultRates(flip=0.15, drop=0.1, insert=0.1, cut=0.1)
     faults = [
-        Fault("pty unplugged", one({"serial"}), lambda s, t: s.far.unplug("serial", t), outage=("serial",)),
-        Fault("RS-485 pty unplugged", one({"modbus"}), lambda s, t: s.far.unplug("modbus", t), outage=("modbus",)),
-        Fault("module restarts (pty)", one({"serial"}), lambda s, t: s.far.reboot("serial"), outage=("serial",)),
-        Fault("module restarts (UART)", one({"uart"}), lambda s, t: s.far.reboot("uart"), outage=("uart",)),
+        Fault("pty unplugged", one({"serial"}), lambda s, t: s.far.unplug("serial", t), **_restart("serial")),
+        Fault("pty unplugged, module has power", one({"serial"}), lambda s, t: s.far.pull_data("serial"),
+              lambda s: s.far.plug_data("serial"), outage=("serial",)),
+        Fault("RS-485 pty unplugged", one({"modbus"}), lambda s, t: s.far.unplug("modbus", t), **_restart("modbus")),
+        Fault("module restarts (pty)", one({"serial"}), lambda s, t: s.far.reboot("serial"), **_reboot("serial")),
+        Fault("module restarts (UART)", one({"uart"}), lambda s, t: s.far.reboot("uart"), **_reboot("uart")),
+        Fault("module restarts (vcan)", one({"vcan"}), lambda s, t: s.far.reboot("vcan"), **_reboot("vcan")),
         Fault("noise on the pty", one({"serial"}), **_noise("serial", bad_wire)),
         Fault("noise on the UART", one({"uart"}), **_noise("uart", bad_wire)),
         Fault("pty silent", one({"serial"}), **_noise("serial", FaultRates(lose=1.0))),
@@ -199,13 +212,13 @@ def all_faults(*, with_memory: bool) -> list[Fault]:
         Fault("can0 bus-off", one({"can"}), _bus_off, lambda s: s.far.can.restart()),
         Fault("can0 error-passive", one({"can"}), lambda s, t: s.far.can.enter("error-passive"),
               lambda s: s.far.can.enter("error-active")),
-        Fault("I2C: SDA stuck", one({"i2c"}), **_registers("i2c", **STUCK), outage=("i2c",)),
-        Fault("I2C: not acknowledged", one({"i2c"}), **_registers("i2c", error=6), outage=("i2c",)),
-        Fault("I2C: noise", one({"i2c"}), **_registers("i2c", flips=3), outage=("i2c",)),
-        Fault("I2C: registers frozen", one({"i2c"}), **_registers("i2c", frozen=True), outage=("i2c",)),
-        Fault("SPI: noise", one({"spi"}), **_registers("spi", flips=3), outage=("spi",)),
-        Fault("SPI: line high", one({"spi"}), **_registers("spi", line=0xFF), outage=("spi",)),
-        Fault("SPI: transfer fails", one({"spi"}), **_registers("spi", error=5), outage=("spi",)),
+        Fault("I2C: SDA stuck", one({"i2c"}), **_registers("i2c", **STUCK)),
+        Fault("I2C: not acknowledged", one({"i2c"}), **_registers("i2c", error=6)),
+        Fault("I2C: noise", one({"i2c"}), **_registers("i2c", flips=3)),
+        Fault("I2C: registers frozen", one({"i2c"}), **_registers("i2c", frozen=True)),
+        Fault("SPI: noise", one({"spi"}), **_registers("spi", flips=3)),
+        Fault("SPI: line high", one({"spi"}), **_registers("spi", line=0xFF)),
+        Fault("SPI: transfer fails", one({"spi"}), **_registers("spi", error=5)),
         Fault("clock steps", one({"clock"}), clock.step, clock.back),
         Fault("clock slews", one({"clock"}), lambda s, t: slew(SLEW_PPM), lambda s: slew(0.0)),
         Fault("SIGHUP, another configuration", one({DAEMON}), _reload(1), _good_again),

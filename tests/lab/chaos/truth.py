@@ -15,6 +15,7 @@ from imud.sim.can_module import BITRATE, PeriodicCanModule
 from imud.sim.physics.motion import Truth
 from imud.sim.sensor import SensorHardware
 from imud.sim.simulator import Burst, StreamModule
+from imud.units import NS_PER_MS
 
 BASE: Final = 512
 """Of the number that an acceleration carries: x has the lower part, y the upper one."""
@@ -93,11 +94,11 @@ def decoded(sample: Sample) -> int:
 
 
 class LoggedModule:
-    """A device on a byte stream (`StreamModule`) whose samples are logged as they are taken."""
+    """A device on a byte stream (`StreamModule`) whose bursts are logged as they leave it."""
 
-    def __init__(self, module: StreamModule, log: TruthLog, now_ns: int) -> None:
-        """`now_ns` is when it was powered on."""
-        self._module, self._log, self._power_ns = module, log, now_ns
+    def __init__(self, module: StreamModule, log: Callable[[Burst, int], None], now_ns: int) -> None:
+        """`log` gets each burst and when the device was powered on; `now_ns` is when it was for the first time."""
+        self._module, self._log, self._power_ns, self._is_on = module, log, now_ns, True
         self.epoch_ns = module.epoch_ns
 
     @property
@@ -110,12 +111,12 @@ class LoggedModule:
         self._module.receive(data, now_ns)
 
     def advance(self, now_ns: int) -> list[Burst]:
-        """Return what left the wire; its samples are in the log."""
+        """Return what left the wire, which is in the log then."""
         bursts = self._module.advance(now_ns)
+        if not self._is_on:
+            return []
         for burst in bursts:
-            if burst.sample_ns is not None:
-                key = burst.sample_ns - self._power_ns if burst.device_ms is None else burst.device_ms * 1_000_000
-                self._log.add(burst.sample_ns, key)
+            self._log(burst, self._power_ns)
         return bursts
 
     def next_ns(self) -> int | None:
@@ -130,11 +131,27 @@ class LoggedModule:
         """Pass the edge on."""
         self._module.mark(now_ns)
 
+    def power_off(self, now_ns: int) -> None:
+        """Take the power away until `reboot`: no sample is taken."""
+        self.advance(now_ns)
+        self._is_on = False
+
     def reboot(self, now_ns: int) -> None:
         """Restart the module: its time begins at 0 again."""
         self.advance(now_ns)
         self._module.reboot(now_ns)
-        self._power_ns = now_ns
+        self._power_ns, self._is_on = now_ns, True
+
+
+def by_device_time(log: TruthLog) -> Callable[[Burst, int], None]:
+    """Return what logs the samples in bursts by their device time."""
+
+    def add(burst: Burst, power_ns: int) -> None:
+        if burst.sample_ns is not None:
+            key = burst.sample_ns - power_ns if burst.device_ms is None else burst.device_ms * NS_PER_MS
+            log.add(burst.sample_ns, key)
+
+    return add
 
 
 def numbered_can(clock_ns: Callable[[], int], rate_hz: float, base_id: int, log: TruthLog) -> PeriodicCanModule:

@@ -1,0 +1,145 @@
+"""What the far ends of polled links were asked and answered, and how received samples are found in it.
+
+A polled device makes a sample when it is read, so the truth has two sides: the deadlines, which follow each other at
+the period of the configuration from the first read on, and the answers. What the device renewed meanwhile and nobody
+read is no sample, and values that are read twice before they are renewed are one.
+"""
+
+import threading
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Sequence
+from enum import Enum
+from itertools import pairwise
+from time import monotonic_ns
+from typing import Any, Final, NamedTuple
+
+from imud.devices.hipnuc.modbus.registers import BLOCK_REGISTERS
+from imud.formats.modbus import READ_OVERHEAD_BYTES
+from imud.sample import Sample
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.simulator import Burst
+from tests.lab.chaos.account import Interval
+from tests.lab.wire import Refuse
+
+BLOCK_REPLY_BYTES: Final = READ_OVERHEAD_BYTES + 2 * BLOCK_REGISTERS
+
+
+class Answer(Enum):
+    """What the host got."""
+
+    GOOD = "good"
+    DAMAGED = "damaged"
+    """With a wrong bit."""
+    REFUSED = "refused"
+    """The transfer failed."""
+    ABSENT = "absent"
+    """The level of a line that no device drives."""
+
+
+class Asked(NamedTuple):
+    """One transfer."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC, between its begin and its end."""
+    answer: Answer
+    is_sample: bool
+    """Whether a sample was asked for, and not identity or settings."""
+    measured_ns: int
+    """When the device renewed the values that it answered."""
+
+
+class PollLog:
+    """All transfers, in order. Synchronization: one thread adds, another one reads."""
+
+    def __init__(self, period_ns: int) -> None:
+        """`period_ns` is the time between two deadlines."""
+        self.period_ns = period_ns
+        self._asked: list[Asked] = []
+        self._lock = threading.Lock()
+
+    def add(self, asked: Asked) -> None:
+        """Add the next transfer."""
+        with self._lock:
+            self._asked.append(asked)
+
+    def between(self, begin_ns: int, end_ns: int) -> list[Asked]:
+        """Transfers after `begin_ns`, `end_ns` included."""
+        with self._lock:
+            first = bisect_right(self._asked, begin_ns, key=_time)
+            return self._asked[first : bisect_right(self._asked, end_ns, key=_time)]
+
+    def strange(self, samples: Sequence[Sample]) -> list[int]:
+        """`seq` of samples in whose read the device gave no good answer."""
+        with self._lock:
+            times = [asked.t_ns for asked in self._asked if asked.is_sample and asked.answer is Answer.GOOD]
+        return [s.seq for s in samples if bisect_left(times, s.t_ns) == bisect_right(times, s.t_rx_ns)]
+
+    def troubles(self, begin_ns: int, end_ns: int) -> list[Interval]:
+        """Moments at which the device was not there, or seemed not to be: it may have been looked for."""
+        asked = self.between(begin_ns, end_ns)
+        return [Interval(a.t_ns, a.t_ns, restarts=True) for a in asked if a.answer is not Answer.GOOD]
+
+    def numbers_of(self, samples: Sequence[Sample], troubles: Sequence[Interval]) -> list[int]:
+        """Return the number of each sample by deadlines, those left out at which a value was read once more.
+
+        From one trouble to the next the deadlines are one series, in which reads are hardly late; after a trouble
+        another series begins.
+        """
+        numbers, begin = [0], 0
+        for n, (before, after) in enumerate(pairwise(samples), 1):
+            if any(trouble.touches(before, after) for trouble in troubles):
+                numbers.append(numbers[-1] + self._steps(before, after))
+                begin = n
+            else:
+                numbers.append(numbers[begin] + self._steps(samples[begin], after))
+        return numbers[: len(samples)]
+
+    def _steps(self, before: Sample, after: Sample) -> int:
+        asked = self.between(before.t_ns - 1, after.t_rx_ns)
+        good = [a for a in asked if a.is_sample and a.answer is Answer.GOOD]
+        stale = sum(a.measured_ns == b.measured_ns for a, b in pairwise(good))
+        return round((after.t_ns - before.t_ns) / self.period_ns) - stale
+
+
+class LoggedRegisters:
+    """A device on a polled bus, whose transfers are logged."""
+
+    def __init__(self, period_ns: int) -> None:
+        self.device = Imu61xRegisters(monotonic_ns)
+        self.log = PollLog(period_ns)
+
+    def logged(self, answer: Callable[[Any], bytes], is_sample: Callable[[Any], bool]) -> Callable[[Any], bytes]:
+        """Return the device as the bus has it; `is_sample` says whether a transfer asks for a sample."""
+
+        def logging(transfer: Any) -> bytes:
+            device, got, t_ns = self.device, Answer.GOOD, monotonic_ns()
+            flips = device.faults.flips
+            try:
+                data = answer(transfer)
+            except Refuse:
+                got = Answer.REFUSED
+                raise
+            else:
+                if device.faults.line is not None:
+                    got = Answer.ABSENT
+                elif device.faults.flips < flips:
+                    got = Answer.DAMAGED
+                return data
+            finally:
+                self.log.add(Asked(t_ns, got, is_sample(transfer), device.latched_ns))
+
+        return logging
+
+
+def block_replies(log: PollLog) -> Callable[[Burst, int], None]:
+    """Return what logs the replies of a module on RS-485 that have a sample."""
+
+    def add(reply: Burst, _power_ns: int) -> None:
+        if reply.sample_ns is not None and len(reply.data) == BLOCK_REPLY_BYTES:
+            log.add(Asked(monotonic_ns(), Answer.GOOD, True, reply.sample_ns))  # the module's time may be a step old
+
+    return add
+
+
+def _time(asked: Asked) -> int:
+    return asked.t_ns
