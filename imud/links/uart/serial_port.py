@@ -43,11 +43,36 @@ ICOUNTER_INTS: Final = 20
 FRAME, OVERRUN, PARITY, BREAK, BUFFER_OVERRUN = 6, 7, 8, 9, 10
 
 
+PIPE_ENDS: Final = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_r", "pipe_abort_write_w")
+"""Of pyserial's two pipes, by which another thread can end a wait in its `read` and `write`."""
+
+
+class DescriptorPort(serial.Serial):
+    """A port that is read and written by its descriptor, not by pyserial: without its pipes, one descriptor instead of
+    five."""
+
+    def open(self) -> None:
+        """Open the port. Raises OSError, ValueError, termios.error."""
+        super().open()
+        for name in PIPE_ENDS:
+            descriptor = getattr(self, name, None)
+            if descriptor is not None:
+                os.close(descriptor)
+                setattr(self, name, None)
+
+    def close(self) -> None:
+        """Close the port; may be called twice."""
+        if self.is_open:
+            descriptor = self.fileno()
+            self.fd, self.is_open = None, False
+            os.close(descriptor)
+
+
 def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
     """Open `path` exclusively as raw 8N1 without flow control. Raises LinkMissing, LinkDenied, LinkBusy, LinkError."""
     try:
         # inter_byte_timeout=0 gives VMIN=1: then a read without data is EAGAIN, and 0 bytes always means hung up.
-        port = serial.Serial(path, baud, exclusive=True, timeout=0, write_timeout=0, inter_byte_timeout=0)
+        port = DescriptorPort(path, baud, exclusive=True, timeout=0, write_timeout=0, inter_byte_timeout=0)
     except (OSError, ValueError, termios.error) as error:
         raise port_problem(error, path, proc) from error
     try:

@@ -1,6 +1,7 @@
 """A serial port's errors in words, how long adapters hold bytes back by a made-up /sys, the kernel's error counters."""
 
 import errno
+import os
 import termios
 from pathlib import Path
 
@@ -8,7 +9,15 @@ import pytest
 
 from imud.contracts.status import KernelCounters
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
-from imud.links.uart.serial_port import TtyCounters, hold_ns, port_problem, read_latency_timer_ms, relative
+from imud.links.device_node import PROC
+from imud.links.uart.serial_port import (
+    TtyCounters,
+    hold_ns,
+    open_port,
+    port_problem,
+    read_latency_timer_ms,
+    relative,
+)
 from imud.units import NS_PER_MS
 from tests.support.pty_port import PtyPort
 
@@ -36,6 +45,24 @@ def test_each_number_has_its_error_which_names_the_port(number: int, kind: type[
         explained = port_problem(error, "/dev/ttyS9", tmp_path)
         assert type(explained) is kind
         assert str(explained).startswith("/dev/ttyS9")
+
+
+def descriptors() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
+    pty = PtyPort()
+    before = descriptors()
+    port = open_port(str(pty.path), 115200, PROC)
+    assert descriptors() == before + 1
+    port.close()
+    port.close()
+    assert descriptors() == before
+    again = open_port(str(pty.path), 115200, PROC)  # it is neither locked nor exclusive any more
+    again.baudrate = 9600
+    again.close()
+    pty.unplug()
 
 
 def test_an_unseen_holder_is_another_program(tmp_path: Path) -> None:
