@@ -2,8 +2,10 @@
 
 import logging
 import os
+import select
 import sys
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from time import monotonic
@@ -89,6 +91,10 @@ def test_shown_is_a_literal_where_it_fits() -> None:
     assert shown(b"\x01") == r"b'\x01'"
 
 
+def test_shown_has_the_outer_levels_of_a_deep_value() -> None:
+    assert shown(nested(100_001)) == "{'a': [{'a': [{...}]}]}"
+
+
 # --- messages ---------------------------------------------------------------------------------------------------------
 
 
@@ -125,11 +131,22 @@ def test_lines_of_a_traceback_cannot_be_taken_for_messages() -> None:
     assert len(lines) <= TRACEBACK_LINES_MAX + 1
 
 
-def test_a_long_traceback_is_cut() -> None:
+def test_a_long_traceback_is_cut_and_its_end_is_kept() -> None:
     try:
-        raise ValueError("\n".join("line" for _ in range(10_000)))
+        raise ValueError("\n".join(f"line {number}" for number in range(10_000)))
     except ValueError:
-        assert len(formatted("it failed", exc_info=sys.exc_info()).split("\n")) == TRACEBACK_LINES_MAX + 1
+        lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
+    assert len(lines) == TRACEBACK_LINES_MAX + 1
+    assert lines[-1] == "    line 9999"
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_lines_of_a_traceback_are_escaped_and_bounded(text: str) -> None:
+    try:
+        raise ValueError(text)
+    except ValueError:
+        lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
+    assert all(line.isprintable() and len(line) <= MESSAGE_CHARACTERS_MAX + 4 for line in lines)
 
 
 # --- the writer -------------------------------------------------------------------------------------------------------
@@ -163,13 +180,54 @@ def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing() -> Non
         assert "dropped" not in read_until(reader, b"it flows\n").decode()
 
 
+def no_thread_is_left() -> None:
+    wait_until(lambda: all(thread.name != "log" for thread in threading.enumerate()), "the thread has ended")
+
+
 def test_the_end_waits_for_the_reader_only_so_long() -> None:
     with pipe(full=True) as (_, descriptor):
         begin = monotonic()
         with log_to(descriptor, "info"):
             log.warning("lost")
         assert monotonic() - begin < FLUSH_S + 1.0
-    wait_until(lambda: all(thread.name != "log" for thread in threading.enumerate()), "the thread has ended")
+        no_thread_is_left()
+
+
+def test_a_line_longer_than_the_room_in_a_pipe_does_not_keep_the_thread() -> None:
+    """A pipe with room for a page says that it can be written; a longer write would wait in it."""
+    with pipe(full=True) as (reader, descriptor):
+        assert len(os.read(reader, select.PIPE_BUF)) == select.PIPE_BUF
+        with log_to(descriptor, "info"):
+            try:
+                raise ValueError("\n".join("x" * 200 for _ in range(50)))
+            except ValueError:
+                log.exception("long")
+        no_thread_is_left()
+
+
+def test_a_message_that_cannot_be_formatted_is_counted_and_nothing_else(capfd: pytest.CaptureFixture[str]) -> None:
+    class Broken(logging.Formatter):
+        def format(self, record: logging.LogRecord) -> str:
+            raise ValueError(record.msg)
+
+    with pipe() as (_, descriptor), log_to(descriptor, "info") as writer:
+        writer.setFormatter(Broken())
+        log.warning("one")
+        assert writer.dropped == 1
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("journal", [False, True])
+def test_the_journal_adds_the_time_itself(journal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    if journal:
+        monkeypatch.setenv("JOURNAL_STREAM", "8:1")
+    with pipe() as (reader, descriptor):
+        with log_to(descriptor, "info"):
+            log.info("begun")
+        line = os.read(reader, 1 << 16).decode()
+    assert line.startswith("INFO begun") == journal
+    assert line.endswith("INFO begun\n")
 
 
 def no_reader() -> int:
@@ -199,14 +257,28 @@ def test_messages_that_cannot_be_written_are_counted(make: Callable[[], int]) ->
         os.close(descriptor)
 
 
+class Unclosable:
+    def __del__(self) -> None:
+        raise KeyError("not closed")
+
+
 def test_a_file_is_written_and_what_python_reports_too(tmp_path: Path) -> None:
+    hooks = sys.unraisablehook, threading.excepthook
     with (tmp_path / "log").open("wb") as file, log_to(file.fileno(), "info"):
         thread = threading.Thread(target=lambda: {}["missing"], name="worker")  # type: ignore[index]
         thread.start()
         thread.join()
+        Unclosable()
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            warnings.warn("out of date", DeprecationWarning, stacklevel=1)
+    assert (sys.unraisablehook, threading.excepthook) == hooks
     text = (tmp_path / "log").read_text()
     assert "ERROR thread worker ended by an exception" in text
     assert "KeyError: 'missing'" in text
+    assert "ERROR exception ignored in <function Unclosable.__del__" in text
+    assert "KeyError: 'not closed'" in text
+    assert "DeprecationWarning: out of date" in text
 
 
 def test_a_writer_closed_twice_returns_at_once() -> None:
