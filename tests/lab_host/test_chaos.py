@@ -196,7 +196,7 @@ def test_replies_with_a_sample_are_logged() -> None:
 def test_a_module_without_power_takes_no_sample() -> None:
     options = SimulatorOptions(rate_hz=10.0, baud=115200, boot_ms=0, noise="none", skew_ppm=0.0)
     log = TruthLog(time_key, 1)
-    module = LoggedModule(SIMULATORS["hipnuc-uart"].make(options, 0), by_device_time(log), 0)
+    module = LoggedModule(SIMULATORS["hipnuc-uart"].make(options, 0), by_device_time(log, PERIOD_NS), 0)
     assert module.advance(PERIOD_NS * 21 // 2)
     taken = len(log)
     module.power_off(PERIOD_NS * 21 // 2)
@@ -205,6 +205,17 @@ def test_a_module_without_power_takes_no_sample() -> None:
     assert len(log) == taken
     module.advance(PERIOD_NS * 81 // 2)
     assert len(log) == 2 * taken
+
+
+def test_samples_that_a_module_had_no_room_for_are_taken_too() -> None:
+    log = TruthLog(time_key, 1)
+    add = by_device_time(log, PERIOD_NS)
+    for number, power_ns in ((1, 0), (2, 0), (5, 0), (9, 7 * PERIOD_NS)):  # restarted at 7
+        add(Burst(0, b"", number * PERIOD_NS, (number * PERIOD_NS - power_ns) // 1_000_000), power_ns)
+    add(Burst(0, b"text"), 0)
+    taken = [(1, 1), (5, 5), (9, 2)]
+    received = [sample(seq, at, t_dev_ns=key * PERIOD_NS) for seq, (at, key) in enumerate(taken, 1)]
+    assert log.numbers_of(received) == [0, 4, 5]
 
 
 def test_faults_of_the_sequence() -> None:

@@ -128,6 +128,10 @@ class Chaos:
         self._refuse_strange(name, log.strange(samples), what)
         troubles = [*self._outages[name], *log.troubles(before.at_ns, now.at_ns)]
         holes = accounts.find_holes(samples, log.numbers_of(samples, troubles), troubles)
+        begin_ns = samples[0].t_ns if samples else now.at_ns
+        if not was.newest_seq and any(trouble.begin_ns < begin_ns for trouble in troubles):
+            missing = round((begin_ns - before.at_ns) / log.period_ns)
+            holes.append(accounts.Hole(missing, is_certain=False, is_open=True))
         if samples and any(trouble.end_ns > samples[-1].t_rx_ns for trouble in troubles):
             missing = round((now.at_ns - samples[-1].t_ns) / log.period_ns)
             holes.append(accounts.Hole(missing, is_certain=False, is_open=True))
@@ -159,9 +163,10 @@ class Chaos:
     def _show_holes(self, name: str, holes: list[Hole]) -> None:
         """Print what is between samples, by the time since the first of them."""
         samples = self.life.recorder.samples()[name]
-        for sample, hole in zip(samples, holes, strict=False):
+        for sample, after, hole in zip(samples, [*samples[1:], None], holes, strict=False):
             if hole.missing or not hole.is_certain:
-                print(f"  {name}: {(sample.t_ns - samples[0].t_ns) / 1e9:.3f} s, after sample {sample.seq}: {hole}")
+                t_ns, t_dev = sample.t_ns - samples[0].t_ns, (sample.t_dev_ns, after and after.t_dev_ns)
+                print(f"  {name}: {t_ns / 1e9:.3f} s, after sample {sample.seq}: {hole}, device time {t_dev}")
 
     def _counted_snapshot(self, what: str) -> Snapshot:
         """The state at a moment at which missed deadlines are in the ledger: it counts them ten times a second."""

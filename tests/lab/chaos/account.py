@@ -58,7 +58,7 @@ class Hole(NamedTuple):
     unknown_most: int = 1
     """So many unknown gaps it may count for."""
     is_open: bool = False
-    """Whether no sample ended it so far."""
+    """Whether there is a sample on one side of it only: no other one came yet, or none before."""
 
 
 class Account(NamedTuple):

@@ -230,7 +230,7 @@ class FarSide:
             self._stack.callback(lines.close)
         if name in self.noise:
             self.truth[name] = TruthLog(time_key, PERIOD_NS // 3)
-            module = self.modules[name] = LoggedModule(module, by_device_time(self.truth[name]), now_ns)
+            module = self.modules[name] = LoggedModule(module, by_device_time(self.truth[name], PERIOD_NS), now_ns)
         else:
             self.polls[name] = PollLog(round(1e9 / MODBUS_HZ))
             module = self.modules[name] = LoggedModule(module, block_replies(self.polls[name]), now_ns)

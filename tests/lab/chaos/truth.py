@@ -143,13 +143,23 @@ class LoggedModule:
         self._power_ns, self._is_on = now_ns, True
 
 
-def by_device_time(log: TruthLog) -> Callable[[Burst, int], None]:
-    """Return what logs the samples in bursts by their device time."""
+def by_device_time(log: TruthLog, period_ns: int) -> Callable[[Burst, int], None]:
+    """Return what logs the samples in bursts by their device time.
+
+    A module drops what its transmitter has no room for while this process stands still. It took these samples too: they
+    are logged with the next one.
+    """
+    newest_key, newest_power_ns = 0, -1
 
     def add(burst: Burst, power_ns: int) -> None:
-        if burst.sample_ns is not None:
-            key = burst.sample_ns - power_ns if burst.device_ms is None else burst.device_ms * NS_PER_MS
-            log.add(burst.sample_ns, key)
+        nonlocal newest_key, newest_power_ns
+        if burst.sample_ns is None:
+            return
+        key = burst.sample_ns - power_ns if burst.device_ms is None else burst.device_ms * NS_PER_MS
+        dropped = round((key - newest_key) / period_ns) - 1 if power_ns == newest_power_ns else 0
+        for back in range(dropped, -1, -1):
+            log.add(burst.sample_ns - back * period_ns, key - back * period_ns)
+        newest_key, newest_power_ns = key, power_ns
 
     return add
 
