@@ -93,6 +93,8 @@ class HipnucCodec:
         """Incomplete rest of the bytes: begins with a sync word, or is the first half of one."""
         self._bad_ahead = 0
         """Claimed rest of a damaged frame, in bytes from the begin of the tail."""
+        self._barred_ahead = 0
+        """The same of one that came whole: no line is found in it."""
 
     def learn_app_ver(self, app_ver: int) -> None:
         """Set the firmware's version number, 169 for 1.6.9. A configured meaning of HI91 bytes 1-2 stays."""
@@ -134,7 +136,7 @@ class HipnucCodec:
         self._lines.clear()
         self.ledger.bytes_skipped += len(self._tail)
         self._tail = b""
-        self._bad_ahead = 0
+        self._bad_ahead = self._barred_ahead = 0
         self.ledger.bytes_pending = 0
 
     def _scan(self, data: bytes, give_up: int) -> list[CodecEvent]:
@@ -145,7 +147,8 @@ class HipnucCodec:
             sync = data.find(SYNC, at)
             if sync != at:
                 end = sync if sync >= 0 else total - data.endswith(SYNC[:1], at)
-                events += self._lines.add(data[at:end], max(min(self._bad_ahead, end) - at, 0))
+                bad, barred = (max(min(ahead, end) - at, 0) for ahead in (self._bad_ahead, self._barred_ahead))
+                events += self._lines.add(data[at:end], bad, barred)
                 at = end
                 if sync < 0:
                     break
@@ -154,7 +157,7 @@ class HipnucCodec:
                 break
             at = after
         self._tail = data[at:]
-        self._bad_ahead = max(self._bad_ahead - at, 0)
+        self._bad_ahead, self._barred_ahead = max(self._bad_ahead - at, 0), max(self._barred_ahead - at, 0)
         self.ledger.bytes_pending = total - at + self._lines.pending_bytes
         return events
 
@@ -242,6 +245,8 @@ class HipnucCodec:
         ledger.bytes_in_bad_frames += len(SYNC)
         self._lines.break_off()
         self._bad_ahead = max(self._bad_ahead, end)
+        if end <= len(data):
+            self._barred_ahead = max(self._barred_ahead, end)
         events.append(BadFrame(reason, data[at:end]))
         return at + len(SYNC)
 

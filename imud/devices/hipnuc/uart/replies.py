@@ -206,6 +206,7 @@ _PRINTABLE: Final = bytes([0x09, *range(0x20, 0x7F)])
 class LineFinder:
     """Finder of text lines across reads and frames; counts every byte in the ledger: good, bad, skipped, or pending.
 
+    What looks like a line inside a damaged frame is none: its first characters may be the frame's last bytes.
     Synchronization: one thread. Holds at most LINE_CHARACTERS_MAX + 1 bytes.
     """
 
@@ -215,6 +216,8 @@ class LineFinder:
         """Printable characters without a line end yet, with the CR that may belong to it."""
         self._held_bad = 0
         """Number of the held bytes, from the first on, that lie inside a damaged frame's claimed length."""
+        self._held_barred = 0
+        """Number of these that lie inside a damaged frame that came whole."""
         self._overlong = False
         """The line is longer than allowed: it is dropped up to its end."""
 
@@ -223,16 +226,19 @@ class LineFinder:
         """Bytes held for a line that has not ended."""
         return len(self._held)
 
-    def add(self, data: bytes, bad: int) -> list[TextLine]:
-        """Add bytes that belong to no frame, the first `bad` of them inside a damaged one; return whole lines."""
+    def add(self, data: bytes, bad: int, barred: int) -> list[TextLine]:
+        """Add bytes that belong to no frame; return whole lines.
+
+        The first `bad` of them are inside a damaged frame, the first `barred` inside one that came whole.
+        """
         lines: list[TextLine] = []
         start = 0
         while (feed := data.find(b"\n", start)) >= 0:
-            self._extend(data[start:feed], max(bad - start, 0))
-            self._end(bad > feed, lines)
+            self._extend(data[start:feed], max(bad - start, 0), max(barred - start, 0))
+            self._end(bad > feed, barred > feed, lines)
             start = feed + 1
         if start < len(data):
-            self._extend(data[start:], max(bad - start, 0))
+            self._extend(data[start:], max(bad - start, 0), max(barred - start, 0))
         return lines
 
     def break_off(self) -> None:
@@ -242,12 +248,13 @@ class LineFinder:
 
     def clear(self) -> None:
         """Skip the held bytes: the stream broke."""
-        self._held_bad = 0
+        self._held_bad = self._held_barred = 0
         self.break_off()
 
-    def _extend(self, part: bytes, bad: int) -> None:
+    def _extend(self, part: bytes, bad: int, barred: int) -> None:
         """Append `part`, which has no LF, and keep the printable characters after the last other byte."""
         self._held_bad += min(bad, len(part))
+        self._held_barred += min(barred, len(part))
         held = self._held = self._held + part
         returned = held.endswith(b"\r")
         body = held[:-1] if returned else held
@@ -260,11 +267,11 @@ class LineFinder:
         if self._overlong:
             self._drop(characters)
 
-    def _end(self, bad: bool, lines: list[TextLine]) -> None:
-        """Finish a line at its LF; `bad`: it lies inside a damaged frame."""
+    def _end(self, bad: bool, barred: bool, lines: list[TextLine]) -> None:
+        """Finish a line at its LF; `bad`: that lies inside a damaged frame, `barred`: inside one that came whole."""
         ledger = self._ledger
         text = self._held.removesuffix(b"\r")
-        if text and not self._overlong:
+        if text and not (self._overlong or barred or self._held_barred):
             lines.append(TextLine(text.decode("ascii")))
             ledger.bytes_in_good_frames += len(self._held) + 1
             ledger.frames_good += 1
@@ -283,4 +290,5 @@ class LineFinder:
         self._ledger.bytes_in_bad_frames += bad
         self._ledger.bytes_skipped += count - bad
         self._held_bad -= bad
+        self._held_barred -= min(count, self._held_barred)
         self._held = self._held[count:]

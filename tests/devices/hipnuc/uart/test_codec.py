@@ -436,7 +436,41 @@ def test_a_damaged_frame_breaks_a_line() -> None:
     events = codec.feed(b"APP_" + damaged + b"\n\x00VER\n")
     assert [event.text for event in events if isinstance(event, TextLine)] == ["VER"]
     codec = make()
-    assert codec.feed(b"ab\x5a\xa5\x20\x20cd\n")[1:] == [TextLine("  cd")]
+    assert codec.feed(b"ab\x5a\xa5\x20\x20cd\nef\n")[1:] == [TextLine("ef")]
+    assert codec.ledger.closes()
+
+
+@pytest.mark.parametrize("text", [b"AOK\r\n", b"KERR\r\n", b"OK\r\nOK\r\n", b"\nOK\r\n"])
+@pytest.mark.parametrize("step", [1, 7, 1000])
+def test_what_looks_like_a_line_inside_a_damaged_frame_is_none(text: bytes, step: int) -> None:
+    """Its first characters may be bytes of the frame: `AOK` is a byte of a sample and a reply, or four bytes of one."""
+    damaged = HEADER.pack(b"\x5a\xa5", 76, 0x1234) + b"\x91" + bytes(20) + text + bytes(55 - len(text))
+    data = damaged + b"OK\r\n" + MANUAL_HI91
+    codec = make()
+    events = [event for at in range(0, len(data), step) for event in codec.feed(data[at : at + step])]
+    assert reasons(events) == [BadReason.CRC]
+    assert [event for event in events if isinstance(event, TextLine)] == [TextLine("OK")]
+    ledger = codec.ledger
+    assert (ledger.frames_in_replies, ledger.frames_in_samples) == (1, 1)
+    assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames) == (82, 4 + 82)
+    assert ledger.closes()
+
+
+def test_a_line_that_begins_inside_a_damaged_frame_is_none() -> None:
+    damaged = HEADER.pack(b"\x5a\xa5", 10, 0x1234) + bytes(6) + b"KERR"
+    codec = make()
+    events = codec.feed(damaged + b"OR\r\nOK\r\n")
+    assert events[1:] == [TextLine("OK")]
+    assert codec.ledger.closes()
+
+
+def test_replies_after_an_idle_line_are_lines_though_the_claim_lasts() -> None:
+    """A false frame claims 200 bytes that never come: replies to come are not its bytes."""
+    codec = make()
+    codec.feed(HEADER.pack(b"\x5a\xa5", 200, 0x1234) + b"\x00APP_VER=156\r\nOK\r\n")
+    codec.flush()
+    assert codec.feed(b"ATT_MODE: 0\r\nOK\r\n") == [TextLine("ATT_MODE: 0"), TextLine("OK")]
+    assert codec.ledger.closes()
 
 
 def test_an_overlong_line_ends_at_other_bytes_in_any_split() -> None:
