@@ -97,6 +97,8 @@ class ActionParameter(msgspec.Struct, frozen=True):
     """The accepted values, for example `a whole number from 1 to 127`."""
     default: str | None
     """The default as JSON; None for a required argument."""
+    required: bool = False
+    """Whether a call without it is refused."""
 
     def __str__(self) -> str:
         """Format the description, for example `rate_hz (a number; default 100)`."""
@@ -116,8 +118,8 @@ class ActionInfo(msgspec.Struct, frozen=True):
 def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
     """Describe the arguments of an action."""
     return tuple(
-        ActionParameter(field.name, expected(field.type), None if field.required else shown(field.default))
-        for field in msgspec.structs.fields(action.parameters)
+        ActionParameter(one.name, expected(one.type), None if one.required else shown(one.default), one.required)
+        for one in msgspec.structs.fields(action.parameters)
     )
 
 

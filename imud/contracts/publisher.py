@@ -148,6 +148,9 @@ class PublisherContext:
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
 
+    rings: dict[str, str] = field(default_factory=dict)
+    """Path of the shared memory of each device that has some; kept by the publisher that makes it."""
+
     def clients(self) -> list[ClientStatus]:
         """The clients of all publishers now. To be called in the event loop's thread only."""
         return [client for source in self.client_sources for client in source()]

@@ -128,14 +128,32 @@ def encode_request(method: str, params: Mapping[str, Any], request_id: int) -> b
     return encode({"jsonrpc": "2.0", "id": request_id, "method": method, "params": params})
 
 
-def encode_notification(method: str, params: object) -> bytes:
-    """A notification, newline left out."""
-    return encode({"jsonrpc": "2.0", "method": method, "params": params})
+def encode_notification(method: str, params: object, *, texts: bool = False) -> bytes:
+    """A notification, newline left out; `texts`: with big numbers as text."""
+    return encode({"jsonrpc": "2.0", "method": method, "params": with_texts(params) if texts else params})
 
 
-def encode_result(request_id: RequestId, result: object) -> bytes:
-    """The reply to a request that went well, newline left out."""
-    return encode({"jsonrpc": "2.0", "id": request_id, "result": result})
+def encode_result(request_id: RequestId, result: object, *, texts: bool = False) -> bytes:
+    """The reply to a request that went well, newline left out; `texts`: with big numbers as text."""
+    return encode({"jsonrpc": "2.0", "id": request_id, "result": with_texts(result) if texts else result})
+
+
+def with_texts(value: object) -> object:
+    """Convert to what JSON has, with integers as text whose members may exceed 2⁵³ (`is_big`)."""
+    return _texts(msgspec.to_builtins(value))
+
+
+def is_big(member: str) -> bool:
+    """Whether a member of this name may have integers of more than 53 bits: `epoch`, and times in ns."""
+    return member == "epoch" or member.endswith("_ns")
+
+
+def _texts(value: object) -> object:
+    if isinstance(value, dict):
+        return {
+            name: str(one) if type(one) is int and is_big(str(name)) else _texts(one) for name, one in value.items()
+        }
+    return [_texts(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def encode_error(error: RpcError) -> bytes:

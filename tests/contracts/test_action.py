@@ -38,8 +38,8 @@ def test_description_for_people() -> None:
         "name": "yaw",
         "help": "turn",
         "parameters": [
-            {"name": "angle_deg", "values": "a number", "default": None},
-            {"name": "relative", "values": "true or false", "default": "false"},
+            {"name": "angle_deg", "values": "a number", "default": None, "required": True},
+            {"name": "relative", "values": "true or false", "default": "false", "required": False},
         ],
         "risk": "",
     }

@@ -9,9 +9,9 @@ import struct
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 from imud.contracts.action import Action, Actions, Target
 from imud.contracts.control.calibration import Calibration, CalibrationResult, Calibrations, Check, Handling, Kept
@@ -34,10 +34,14 @@ from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, FrameS
 from imud.errors import Rejected
 from imud.frames.conventions import Convention, Heading
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
+from imud.publishers.socket.rpc import METHODS
 from imud.runtime import event_loop
 from imud.sample import Sample, Sync
+from tests.support.references import MessageChecker
 
 T = TypeVar("T")
+CHECKER = MessageChecker()
+"""Every message that a `Peer` receives is what docs/socket.schema.json has."""
 
 EPOCH = 4886718345
 NOW_NS = 80_000_123_456_789
@@ -111,7 +115,7 @@ def context(now_ns: Callable[[], int] = lambda: NOW_NS) -> PublisherContext:
     return PublisherContext(lambda: statuses, EPOCH, now_ns, FakeControl)
 
 
-def set_rate(_target: Target, *, rate_hz: int) -> None:
+def set_rate(_target: Target, *, message: Literal["HI91", "HI92"], rate_hz: int) -> None:
     """The action `output`."""
 
 
@@ -290,6 +294,8 @@ class Peer:
         self.framed = False
         self.buffer = b""
         self.ids = 0
+        self._methods: dict[str, str] = {}
+        """Method of each request by its id, as JSON."""
 
     @classmethod
     async def connect(cls, server: SocketServer) -> Self:
@@ -308,6 +314,11 @@ class Peer:
 
     async def send(self, data: bytes) -> None:
         """Send bytes as they are."""
+        for line in data.splitlines():
+            with suppress(ValueError, TypeError, KeyError, RecursionError):
+                request = json.loads(line)
+                if request["method"] in METHODS:
+                    self._methods[json.dumps(request["id"])] = request["method"]
         await asyncio.get_running_loop().sock_sendall(self.sock, data)
 
     async def ask(self, method: str, **params: object) -> dict[str, Any]:
@@ -336,6 +347,7 @@ class Peer:
         body = await self.body()
         value = json.loads(body, parse_constant=_refuse)
         assert isinstance(value, dict)
+        CHECKER.check_sent(value, self._methods.get(json.dumps(value.get("id"))))
         return value
 
     async def messages(self, count: int) -> Sequence[dict[str, Any]]:

@@ -109,6 +109,7 @@ class ShmPublisher:
         """Close the device's ring and remove its file; no-op if absent."""
         self._places.pop(name, None)
         ring = self._rings.pop(name, None)
+        self._context.rings.pop(name, None)
         if ring is not None:
             ring.close()
 
@@ -198,6 +199,7 @@ class ShmPublisher:
             self._put_off(name, error, now_ns)
             return False
         place.problem = ""
+        context.rings[name] = str(ring_path(directory.path, name))
         if self._group_id is not None and not ring.group_given:
             self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
         return True

@@ -46,6 +46,8 @@ class Connection:
         self.outbox = Outbox(sock, server.limits, server.pool, self)
         self.wakers = ClientWakers()
         self.closed = False
+        self.text_numbers = False
+        """Whether integers that may exceed 2⁵³ go out as text."""
         self._framed = False
         self._sock = sock
         self._server = server

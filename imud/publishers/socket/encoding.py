@@ -5,7 +5,7 @@ from operator import attrgetter
 from typing import Final, Protocol
 
 from imud.contracts.publisher import Batch
-from imud.formats.jsonrpc import FRAME_HEADER, encode, encode_notification, frame_of, line_of
+from imud.formats.jsonrpc import FRAME_HEADER, encode, encode_notification, frame_of, line_of, with_texts
 from imud.formats.slot import SLOT_BYTES
 from imud.frames.conventions import Convention
 from imud.sample import Sample
@@ -43,7 +43,9 @@ class Encoding(Protocol):
 class JsonEncoding:
     """`sample` notifications, all members or the selected ones, as lines or as frames."""
 
-    def __init__(self, fields: tuple[str, ...] | None, framed: bool) -> None:
+    def __init__(self, fields: tuple[str, ...] | None, framed: bool, texts: bool = False) -> None:
+        """`texts`: integers that may exceed 2⁵³ are text."""
+        self._texts = texts
         self._wrap = frame_of if framed else line_of
         self._select = None if fields is None else selector(fields)
         self._last: bytes = bytes(MESSAGE_GUESS_BYTES)
@@ -74,7 +76,8 @@ class JsonEncoding:
         return b"".join((*notices, message))
 
     def _message(self, sample: Sample) -> bytes:
-        return self._wrap(_HEAD + encode(self._select(sample) if self._select else sample) + _TAIL)
+        shown: object = self._select(sample) if self._select else sample
+        return self._wrap(_HEAD + encode(with_texts(shown) if self._texts else shown) + _TAIL)
 
 
 class BinaryEncoding:

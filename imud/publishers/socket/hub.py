@@ -10,6 +10,7 @@ from imud.contracts.status import ClientStatus, SocketStatus
 from imud.event import Event
 from imud.formats.jsonrpc import encode_notification
 from imud.publishers.socket.connection import Connection
+from imud.publishers.socket.messages import DeviceNotice
 from imud.publishers.socket.outbox import Pool
 from imud.publishers.socket.quota import Quota, Seldom
 from imud.publishers.socket.serving import TokenBucket
@@ -74,11 +75,15 @@ class Hub:
         self._devices[name] = device_id
         watching = self._subscriptions.items()
         everything = [self._connections[number] for number, wanted in watching if wanted.devices is None]
-        post_all(everything, encode_notification("device", {"device": name, "device_id": device_id}))
+        post_all(everything, encode_notification("device", DeviceNotice(name, device_id)))
 
     def remove_device(self, name: str) -> None:
         """Remove a device; subscriptions that name it stay, for it may be added again."""
-        self._devices.pop(name, None)
+        device_id = self._devices.pop(name, None)
+        if device_id is not None:
+            matching = [number for number, wanted in self._subscriptions.items() if wanted.matches(name)]
+            notice = encode_notification("device_removed", DeviceNotice(name, device_id))
+            post_all([self._connections[number] for number in matching], notice)
         self._newest.pop(name, None)
         self._plans.pop(name, None)
 
@@ -102,8 +107,10 @@ class Hub:
             for number, devices in self._events.items()
             if devices is None or not device or device in devices
         ]
-        if wanting:
-            post_all(wanting, encode_notification("event", event))
+        for texts in (False, True):
+            some = [connection for connection in wanting if connection.text_numbers is texts]
+            if some:
+                post_all(some, encode_notification("event", event, texts=texts))
 
     def _new_plan(self, device: str) -> DeliveryPlan:
         """The plan for a device, with the clients that watch it."""

@@ -7,11 +7,12 @@ from typing import Any, Final, Generic, TypeVar
 import msgspec
 
 from imud import __version__
-from imud.contracts.action import described
-from imud.contracts.control.calibration import infos
+from imud.contracts.action import ActionInfo, described
+from imud.contracts.control.calibration import CalibrationInfo, CalibrationResult, infos
+from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.publisher import Batch
 from imud.contracts.settings import wrong_values
-from imud.contracts.status import DeviceStatus
+from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
 from imud.errors import ImudError
 from imud.formats.jsonrpc import (
     PROTOCOL,
@@ -28,6 +29,33 @@ from imud.frames.conventions import Convention
 from imud.publishers.socket.connection import Connection
 from imud.publishers.socket.encoding import selector
 from imud.publishers.socket.hub import Hub
+from imud.publishers.socket.messages import (
+    BigNumbers,
+    CalibrateParams,
+    CommandParams,
+    DeviceFrame,
+    DeviceParams,
+    DeviceSummary,
+    EventsParams,
+    EventsResult,
+    Greeting,
+    NoParams,
+    NothingMore,
+    NotifyResult,
+    OptionsParams,
+    OptionsResult,
+    PollParams,
+    PollResult,
+    SchemaResult,
+    SettingsChangeParams,
+    SettingsParams,
+    SlotMember,
+    SlotSchema,
+    StatusResult,
+    StopResult,
+    WatchParams,
+    WatchResult,
+)
 from imud.publishers.socket.outbox import NO_FD
 from imud.publishers.socket.rights import Rights
 from imud.publishers.socket.subscription import Form, Subscription
@@ -44,72 +72,6 @@ NAME_MAX: Final = 64
 P = TypeVar("P", bound=msgspec.Struct)
 
 
-class NoParams(msgspec.Struct):
-    """For methods without parameters."""
-
-
-class WatchParams(msgspec.Struct):
-    """Parameters of `watch`; what is left out or null means all, all, every sample, JSON, as the device is set."""
-
-    devices: list[str] | None = None
-    fields: list[str] | None = None
-    rate_hz: float | None = None
-    encoding: Form = Form.JSON
-    convention: Convention | None = None
-
-
-class PollParams(msgspec.Struct):
-    """Parameters of `poll`."""
-
-    devices: list[str] | None = None
-    fields: list[str] | None = None
-    convention: Convention | None = None
-
-
-class EventsParams(msgspec.Struct):
-    """Parameters of `events`."""
-
-    devices: list[str] | None = None
-    enable: bool = True
-
-
-class DeviceParams(msgspec.Struct):
-    """Parameters of methods about one device."""
-
-    device: str
-
-
-class CommandParams(msgspec.Struct):
-    """Parameters of `command`."""
-
-    device: str
-    name: str
-    arguments: dict[str, Any] = {}  # msgspec copies a mutable default
-
-
-class CalibrateParams(msgspec.Struct):
-    """Parameters of `calibrate`."""
-
-    device: str
-    kind: str
-    save: bool = False
-
-
-class SettingsParams(msgspec.Struct):
-    """Parameters of `settings.get`."""
-
-    device: str
-    fresh: bool = False
-
-
-class SettingsChangeParams(msgspec.Struct):
-    """Parameters of `settings.plan` and `settings.apply`; settings that are left out or null are the declared ones."""
-
-    device: str
-    settings: dict[str, Any] | None = None
-    save: bool = False
-
-
 @dataclass(frozen=True, slots=True)
 class Answer:
     """What a method answers."""
@@ -119,6 +81,8 @@ class Answer:
     """A descriptor whose copy goes with the reply."""
     framed_from_here: bool = False
     """Whether everything after this reply goes out as frames."""
+    big_numbers: bool = True
+    """Whether integers in it may exceed 2⁵³; names of members are no data then."""
 
 
 Later = Coroutine[Any, Any, object]
@@ -135,13 +99,14 @@ class Method(Generic[P]):
     """The permission that the client needs."""
     acts: bool = False
     """Whether it does more than answer: only then is a request without a reply carried out."""
+    result: Any = Any
+    """Type of the result."""
 
 
 def hello(hub: Hub, connection: Connection) -> bytes:
     """The notification that greets a client."""
     rights = [right.name.lower() for right in Rights if right in connection.rights and right.name]
-    params = {"protocol": PROTOCOL, "version": __version__, "epoch": hub.context.epoch, "rights": rights}
-    return encode_notification("hello", params)
+    return encode_notification("hello", Greeting(PROTOCOL, __version__, hub.context.epoch, rights))
 
 
 def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
@@ -163,7 +128,8 @@ def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
         hub.do_later(connection, _answer_later(connection, request, answer))
         return
     if request.wants_reply:
-        connection.post(encode_result(request.request_id, answer.result), answer.fd)
+        texts = connection.text_numbers and answer.big_numbers
+        connection.post(encode_result(request.request_id, answer.result, texts=texts), answer.fd)
     if answer.framed_from_here:
         connection.use_frames()
 
@@ -172,7 +138,7 @@ async def _answer_later(connection: Connection, request: RpcRequest, later: Late
     """Wait for the result and send it."""
     try:
         result = await later
-        body = encode_result(request.request_id, result)
+        body = encode_result(request.request_id, result, texts=connection.text_numbers)
     except ImudError as error:
         body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
     except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
@@ -204,63 +170,57 @@ def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Lat
 
 def _devices(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
     """The devices, each in one line."""
+    rings = hub.context.rings
     return Answer(
         [
-            {
-                "name": device.name,
-                "device_id": device.device_id,
-                "driver": device.driver,
-                "link": device.link,
-                "state": device.state,
-                "problem": device.problem,
-                "identity": device.identity,
-                "rate_hz": device.rate_hz,
-                "sync": device.clock.sync,
-            }
-            for device in hub.context.status()
+            DeviceSummary(
+                one.name, one.device_id, one.driver, one.link, one.state, one.problem, one.identity, one.rate_hz,
+                one.clock.sync, rings.get(one.name),
+            )
+            for one in hub.context.status()
         ]
-    )
+    )  # fmt: skip
+
+
+def _options(hub: Hub, connection: Connection, params: OptionsParams) -> Answer:
+    """Set how messages are written on this connection; a `watch` that runs goes on as it is."""
+    if params.big_numbers is not None:
+        connection.text_numbers = params.big_numbers is BigNumbers.STRING
+    form = BigNumbers.STRING if connection.text_numbers else BigNumbers.NUMBER
+    return Answer(OptionsResult(form, hub.context.epoch))
 
 
 def _status(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
     """The full state: each device with its clock and ledger, the socket with its clients."""
-    return Answer({"now_ns": hub.context.now_ns(), "devices": hub.context.status(), "socket": hub.status()})
+    return Answer(StatusResult(hub.context.now_ns(), list(hub.context.status()), hub.status()))
 
 
 def _schema(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
     """What the members of samples mean, per device where that differs, and how a slot is laid out."""
     devices = {device.name: _frame_of(device) for device in hub.context.status()}
-    return Answer({"protocol": PROTOCOL, "fields": SAMPLE_SCHEMA, "devices": devices, "slot": SLOT_SCHEMA})
+    bounds, states = list(LATENCY_BOUNDS_NS), list(DeviceState)
+    result = SchemaResult(PROTOCOL, list(SAMPLE_SCHEMA), devices, SLOT_SCHEMA, bounds, states)
+    return Answer(result, big_numbers=False)
 
 
-def _frame_of(device: DeviceStatus) -> dict[str, object]:
+def _frame_of(device: DeviceStatus) -> DeviceFrame:
     """Axes and angles of a device's samples; without a known driver only that."""
-    known: dict[str, object] = {
-        "driver": device.driver,
-        "euler_convention": device.euler_convention,
-        "navigation_frame": device.navigation_frame,
-        "status_bits": device.status_bit_names,
-    }
+    known = DeviceFrame(device.driver, device.euler_convention, device.navigation_frame, device.status_bit_names)
     frame = device.frame
     if frame is not None:
-        known |= {
-            "frame": frame.frame,
-            "convention": frame.convention,
-            "heading": frame.heading,
-            "declination_deg": frame.declination_deg,
-            "conventions": frame.conventions,
-        }
+        known.frame, known.convention, known.heading = frame.frame, frame.convention, frame.heading
+        known.declination_deg, known.conventions = frame.declination_deg, frame.conventions
     return known
 
 
-SLOT_SCHEMA: Final = {
-    "bytes": SLOT_BYTES,
-    "layout_version": SLOT_LAYOUT_VERSION,
-    "byte_order": "little",
-    "fields": [{"name": f.name, "struct": f.code, "count": f.count, "offset": f.offset} for f in SLOT_FIELDS],
-    "present_bits": PRESENT_BITS,
-    "sync_codes": SYNC_CODES,
-}
+SLOT_SCHEMA: Final = SlotSchema(
+    bytes=SLOT_BYTES,
+    layout_version=SLOT_LAYOUT_VERSION,
+    byte_order="little",
+    fields=[SlotMember(f.name, f.code, f.count, f.offset) for f in SLOT_FIELDS],
+    present_bits=dict(PRESENT_BITS),
+    sync_codes={str(name): code for name, code in SYNC_CODES.items()},
+)
 
 
 # --- samples --------------------------------------------------------------------------------------------------------
@@ -271,20 +231,19 @@ def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
     devices = _known_devices(hub, params.devices)
     fields = _known_fields(params.fields)
     rate_hz = _rate(params.rate_hz)
-    framed = connection.framed or params.encoding is Form.BINARY
-    wanted = Subscription(devices, fields, rate_hz, params.encoding, framed, params.convention)
+    form = params.encoding or Form.JSON
+    framed = connection.framed or form is Form.BINARY
+    wanted = Subscription(devices, fields, rate_hz, form, framed, params.convention, connection.text_numbers)
     hub.subscribe(connection, wanted)
     numbers = hub.devices if devices is None else {name: hub.devices[name] for name in devices}
-    result = {
-        "encoding": params.encoding, "devices": numbers, "rate_hz": rate_hz, **_convention_of(params.convention)
-    }  # fmt: skip
-    return Answer(result, framed_from_here=params.encoding is Form.BINARY)
+    result = WatchResult(form, dict(numbers), rate_hz, params.convention)
+    return Answer(result, framed_from_here=form is Form.BINARY)
 
 
 def _unwatch(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
     """Send no more samples; what already waits for the client is still sent."""
     hub.unsubscribe(connection)
-    return Answer({})
+    return Answer(NothingMore())
 
 
 def _poll(hub: Hub, _connection: Connection, params: PollParams) -> Answer:
@@ -293,12 +252,7 @@ def _poll(hub: Hub, _connection: Connection, params: PollParams) -> Answer:
     fields = _known_fields(params.fields)
     newest = [_newest_of(hub.newest[name], params.convention) for name in names if name in hub.newest]
     samples = newest if fields is None else list(map(selector(fields), newest))
-    return Answer({"now_ns": hub.context.now_ns(), "samples": samples, **_convention_of(params.convention)})
-
-
-def _convention_of(convention: Convention | None) -> dict[str, object]:
-    """The convention that the client asked for, as a member of the reply."""
-    return {} if convention is None else {"convention": convention}
+    return Answer(PollResult(hub.context.now_ns(), samples, params.convention))
 
 
 def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
@@ -311,17 +265,18 @@ def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
 def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
     """Send events from now on, or no more; replaces what was asked before."""
     devices = _known_devices(hub, params.devices)
-    if params.enable:
+    enable = params.enable is not False
+    if enable:
         hub.subscribe_events(connection, devices)
     else:
         hub.unsubscribe_events(connection)
-    return Answer({"enable": params.enable})
+    return Answer(EventsResult(enable))
 
 
 def _notify(hub: Hub, connection: Connection, params: DeviceParams) -> Answer:
     """Send a descriptor that becomes readable with each batch of one device; it replaces an earlier one."""
     _known_devices(hub, [params.device])
-    return Answer({"device": params.device}, hub.make_waker(connection, params.device))
+    return Answer(NotifyResult(params.device), hub.make_waker(connection, params.device))
 
 
 # --- commands -------------------------------------------------------------------------------------------------------
@@ -342,7 +297,7 @@ def _command(hub: Hub, connection: Connection, params: CommandParams) -> Later:
 
 
 async def _done(hub: Hub, params: CommandParams) -> object:
-    return await hub.context.control(params.device).act(params.name, params.arguments)
+    return await hub.context.control(params.device).act(params.name, params.arguments or {})
 
 
 def _calibrations(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
@@ -366,7 +321,7 @@ async def _calibrated(hub: Hub, params: CalibrateParams) -> object:
 def _stop_calibration(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
     """End the calibration that runs, whoever began it."""
     _known_devices(hub, [params.device])
-    return Answer({"stopped": hub.context.control(params.device).stop_calibration()})
+    return Answer(StopResult(hub.context.control(params.device).stop_calibration()))
 
 
 def _settings(hub: Hub, connection: Connection, params: SettingsParams) -> Later:
@@ -405,22 +360,23 @@ def _check_name(method: str, name: str) -> None:
 
 
 METHODS: Final[Mapping[str, Method[Any]]] = {
-    "devices": Method(NoParams, _devices),
-    "status": Method(NoParams, _status),
-    "schema": Method(NoParams, _schema),
-    "watch": Method(WatchParams, _watch, acts=True),
-    "unwatch": Method(NoParams, _unwatch, acts=True),
-    "poll": Method(PollParams, _poll),
-    "events": Method(EventsParams, _events, acts=True),
-    "notify": Method(DeviceParams, _notify),
-    "actions": Method(DeviceParams, _actions),
+    "devices": Method(NoParams, _devices, result=list[DeviceSummary]),
+    "status": Method(NoParams, _status, result=StatusResult),
+    "schema": Method(NoParams, _schema, result=SchemaResult),
+    "options": Method(OptionsParams, _options, acts=True, result=OptionsResult),
+    "watch": Method(WatchParams, _watch, acts=True, result=WatchResult),
+    "unwatch": Method(NoParams, _unwatch, acts=True, result=NothingMore),
+    "poll": Method(PollParams, _poll, result=PollResult),
+    "events": Method(EventsParams, _events, acts=True, result=EventsResult),
+    "notify": Method(DeviceParams, _notify, result=NotifyResult),
+    "actions": Method(DeviceParams, _actions, result=list[ActionInfo]),
     "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
-    "calibrations": Method(DeviceParams, _calibrations),
-    "calibrate": Method(CalibrateParams, _calibrate, Rights.CONTROL, acts=True),
-    "settings.get": Method(SettingsParams, _settings),
-    "settings.plan": Method(SettingsChangeParams, _settings_plan, Rights.CONTROL),
-    "settings.apply": Method(SettingsChangeParams, _settings_apply, Rights.CONTROL, acts=True),
-    "stop_calibration": Method(DeviceParams, _stop_calibration, Rights.CONTROL, acts=True),
+    "calibrations": Method(DeviceParams, _calibrations, result=list[CalibrationInfo]),
+    "calibrate": Method(CalibrateParams, _calibrate, Rights.CONTROL, acts=True, result=CalibrationResult),
+    "settings.get": Method(SettingsParams, _settings, result=SettingsReport),
+    "settings.plan": Method(SettingsChangeParams, _settings_plan, Rights.CONTROL, result=SettingsPlan),
+    "settings.apply": Method(SettingsChangeParams, _settings_apply, Rights.CONTROL, acts=True, result=AppliedSettings),
+    "stop_calibration": Method(DeviceParams, _stop_calibration, Rights.CONTROL, acts=True, result=StopResult),
 }
 
 

@@ -60,8 +60,9 @@ class Pace:
         return True
 
 
-FormKey = tuple[Form, tuple[str, ...] | None, bool, Convention | None]
-"""What clients that get the same messages have in common: encoding, fields, frames or lines, axes and angles."""
+FormKey = tuple[Form, tuple[str, ...] | None, bool, Convention | None, bool]
+"""What clients that get the same messages have in common: encoding, fields, frames or lines, axes and angles, big
+numbers as text."""
 
 
 @dataclass(slots=True)
@@ -79,16 +80,20 @@ class Subscription:
     """Whether messages go out as frames."""
     convention: Convention | None = None
     """Axes and angles of samples; None for those of the device's configuration."""
+    text_numbers: bool = False
+    """Whether integers of JSON samples that may exceed 2⁵³ are text."""
     _paces: dict[str, Pace] = field(default_factory=dict)
 
     @property
     def key(self) -> FormKey:
         """What clients have in common that get the same messages."""
-        return self.form, self.fields if self.form is Form.JSON else None, self.framed, self.convention
+        json = self.form is Form.JSON
+        return self.form, self.fields if json else None, self.framed, self.convention, json and self.text_numbers
 
     def encoding(self) -> Encoding:
         """Make the encoding of these messages."""
-        encoding: Encoding = _BINARY if self.form is Form.BINARY else JsonEncoding(self.fields, self.framed)
+        binary = self.form is Form.BINARY
+        encoding: Encoding = _BINARY if binary else JsonEncoding(self.fields, self.framed, self.text_numbers)
         return encoding if self.convention is None else ConvertedEncoding(encoding, self.convention)
 
     def matches(self, device: str) -> bool:

@@ -33,7 +33,7 @@ def test_other_requests_are_answered_before_a_late_reply(tmp_path: Path) -> None
             assert (refused["id"], refused["error"]["code"]) == (71, -32004)
             socket_rig.done_late.set()
             assert await peer.message() == {"jsonrpc": "2.0", "id": 70, "result": {"waited": "imu0"}}
-            await peer.send(request(72, "output", rate_hz=5))
+            await peer.send(request(72, "output", message="HI91", rate_hz=5))
             assert (await peer.message())["result"] is None
             peer.close()
 
@@ -44,9 +44,9 @@ def test_other_requests_are_answered_before_a_late_reply(tmp_path: Path) -> None
     ("name", "arguments", "words"),
     [
         ("explode", {}, "imu0 refuses explode"),
-        ("output", {}, "expected the argument rate_hz (a whole number), got none; arguments: rate_hz (a whole number)"),
-        ("output", {"rate_hz": "x"}, 'rate_hz: expected a whole number, got "x"'),
-        ("output", {"rate_hz": 1, "speed": 2}, 'expected an argument that imud knows, got "speed"'),
+        ("output", {"message": "HI91"}, "expected the argument rate_hz (a whole number), got none; arguments: message"),
+        ("output", {"message": "HI91", "rate_hz": "x"}, 'rate_hz: expected a whole number, got "x"'),
+        ("output", {"message": "HI91", "rate_hz": 1, "speed": 2}, 'expected an argument that imud knows, got "speed"'),
     ],
 )
 def test_what_fails_says_why(tmp_path: Path, name: str, arguments: dict[str, Any], words: str) -> None:

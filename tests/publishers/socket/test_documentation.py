@@ -9,6 +9,7 @@ from typing import Any
 from imud.contracts.device_settings import SettingsState, SettingsStatus, StepOutcome
 from imud.contracts.status import (
     ClockStatus,
+    DeviceState,
     DeviceStatus,
     KernelCounters,
     LinesStatus,
@@ -122,7 +123,10 @@ def test_every_member_of_status_is_explained() -> None:
     """Members of a device, and of its parts."""
     section = DOCUMENT.partition("\n## Status\n")[2].partition("\n## ")[0]
     rows = [row.split(" | ")[0] for row in section.splitlines() if row.startswith("| `")]
+    states = {str(state) for state in DeviceState}
     first = {name for cell in rows for name in re.findall(r"`(\w+)`", cell)}
+    assert states <= first
+    first -= states
     in_devices = {"name", "device_id", "driver", "link", "state", "problem", "identity", "rate_hz"}
     assert first | in_devices == set(DeviceStatus.__struct_encode_fields__)
     named = set(re.findall(r"`(\w+)`", section))

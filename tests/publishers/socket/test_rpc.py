@@ -77,7 +77,7 @@ def test_bad_lines(tmp_path: Path, line: bytes, code: int, request_id: object, w
         ("watch", {"fields": ["accel"]}, "no field named 'accel'; there are: device, seq, t_ns"),
         ("watch", {"encoding": "xml"}, "xml"),
         ("poll", {"devices": ["imu7"]}, "there are: imu0, imu1"),
-        ("events", {"enable": "yes"}, 'enable: expected true or false, got "yes"'),
+        ("events", {"enable": "yes"}, 'enable: expected true or false, or null, got "yes"'),
         ("notify", {}, "notify: expected the parameter device (text), got none"),
         ("notify", {"device": "imu7"}, "there are: imu0, imu1"),
     ],
