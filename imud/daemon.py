@@ -14,8 +14,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from time import thread_time_ns
-from typing import cast
+from typing import NamedTuple, cast
 
+from imud import __version__
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.contracts.lines import LineFactory
@@ -24,7 +25,7 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
 from imud.host_clock import HostClock
-from imud.notify import notify, watchdog_interval_s
+from imud.notify import ServiceManager
 from imud.publishers import PUBLISHERS
 from imud.reload import Reloader
 from imud.runtime.device import Device
@@ -35,6 +36,17 @@ from imud.units import NS_PER_S
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
+RETRY_FIRST_NS = NS_PER_S
+"""Pause before an output that could not start is tried again; it doubles up to RETRY_MOST_NS."""
+RETRY_MOST_NS = 60 * NS_PER_S
+
+
+class _PutOff(NamedTuple):
+    """An output that is to be tried again."""
+
+    due_ns: int
+    """CLOCK_MONOTONIC."""
+    pause_ns: int
 
 
 class Daemon:
@@ -75,13 +87,17 @@ class Daemon:
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
         self._failure: BaseException | None = None
-        self._watchdog_s = watchdog_interval_s()
-        self._watchdog_due_ns = 0
+        self._manager = ServiceManager()
+        self._put_off: dict[str, _PutOff] = {}
+        """Outputs that could not start at the beginning, to be tried again."""
 
     # --- life ------------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run until stopped. Raises ServerError when an output cannot start, and the error of a device's task."""
+        """Run until stopped.
+
+        Raises ServerError when an output that is required cannot start, and the error that ended a device's task.
+        """
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._on_loop_error)
         loop.set_default_executor(_one_thread())
@@ -89,18 +105,20 @@ class Daemon:
             self._reloader = Reloader(self._file, self, self._now_ns)
         try:
             for name in self.config.publishers:
-                self._start_configured(name)
+                self._start_or_put_off(name)
             for name, publisher in self._extra.items():
                 self._start_publisher(name, publisher)
             for device in self.config.devices:
                 self._start_device(device)
             gc.collect()
             gc.freeze()  # what is there now stays: collections in service need not look at it
-            notify("READY=1")
+            self._manager.ready()
+            log.info("imud %s has started: %s", __version__, self._summary())
             await self._tick_until_stopped()
         finally:
-            notify("STOPPING=1")
+            self._manager.stopping()
             await self._close()
+            log.info("imud has stopped")
         if self._failure is not None:
             raise self._failure
 
@@ -160,6 +178,7 @@ class Daemon:
 
     def _restart_publisher(self, name: str, old: Config) -> str:
         """With its new settings, or with the old ones if those cannot be used; returns what is wrong, if anything."""
+        self._put_off.pop(name, None)
         if name in self._publishers:
             self._publishers.pop(name).close()
         try:
@@ -189,6 +208,29 @@ class Daemon:
         settings = self.config.publishers[name]
         if cast(PublisherSettings, settings).enabled:
             self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
+
+    def _start_or_put_off(self, name: str) -> None:
+        """Start an output; one that is not required is tried again later where that fails. Raises ServerError."""
+        before = self._put_off.pop(name, None)
+        try:
+            self._start_configured(name)
+        except ServerError as error:
+            if PUBLISHERS[name].required:
+                raise
+            pause_ns = RETRY_FIRST_NS if before is None else min(2 * before.pause_ns, RETRY_MOST_NS)
+            self._put_off[name] = _PutOff(self._now_ns() + pause_ns, pause_ns)
+            if before is None:
+                log.error("%s: %s; imud goes on without it and tries again", name, error)
+        else:
+            if before is not None:
+                log.info("%s: started after all", name)
+
+    def _summary(self) -> str:
+        """Configuration, devices and outputs, for the log."""
+        outputs = ", ".join(self._publishers) or "none"
+        missing = f" (not yet: {', '.join(self._put_off)})" if self._put_off else ""
+        file = f"configuration {self._file}; " if self._file is not None else ""
+        return f"{file}{len(self._devices)} devices; outputs: {outputs}{missing}"
 
     def _start_publisher(self, name: str, publisher: Publisher) -> None:
         for device_name, device in self._devices.items():
@@ -250,16 +292,13 @@ class Daemon:
                 device.tick(now_ns)
             for publisher in self._publishers.values():
                 publisher.tick(now_ns)
-            self._feed_watchdog(now_ns)
+            self._manager.tick(now_ns, {name: device.state for name, device in self._devices.items()})
+            for name in [name for name, one in self._put_off.items() if now_ns >= one.due_ns]:
+                self._start_or_put_off(name)
             try:
                 await asyncio.wait_for(self._stop.wait(), TICK_S)
             except TimeoutError:
                 continue
-
-    def _feed_watchdog(self, now_ns: int) -> None:
-        if self._watchdog_s is not None and now_ns >= self._watchdog_due_ns:
-            notify("WATCHDOG=1")
-            self._watchdog_due_ns = now_ns + int(self._watchdog_s * NS_PER_S)
 
     async def _close(self) -> None:
         if self._reloader is not None:

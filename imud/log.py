@@ -17,6 +17,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any, Final
 
 log = logging.getLogger(__name__)
@@ -34,6 +35,12 @@ FLUSH_S: Final = 1.0
 """How long the end of the process waits for the log's reader."""
 POLL_MS: Final = 100
 """How soon the thread notices that its handler was closed while nobody reads."""
+PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+"""Priorities of syslog(3) by the least level that has them; all below is 7, debug."""
+PAUSE_FIRST_S: Final = 1.0
+PAUSE_MOST_S: Final = 60.0
+KNOWN_MOST: Final = 512
+"""Different messages that are remembered: some for each of 256 devices."""
 LEVELS_SHOWN: Final = 4
 ITEMS_SHOWN: Final = 10
 
@@ -83,19 +90,77 @@ _SHORT: Final = _ShortRepr()
 class LineFormatter(logging.Formatter):
     """Makes one line of each message; only a traceback has more, each indented, so that none looks like a message."""
 
-    def __init__(self, *, stamped: bool) -> None:
-        """`stamped` lines begin with the time."""
+    def __init__(self, *, journal: bool) -> None:
+        """For the journal each line begins with its priority (sd-daemon(3)), else with the time and the level."""
         super().__init__()
-        self._stamped = stamped
+        self._journal = journal
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line of `record`, without its end; never raises."""
-        stamp = self.formatTime(record) + " " if self._stamped else ""
-        line = f"{stamp}{record.levelname} {printable(_message(record), MESSAGE_CHARACTERS_MAX)}"
+        head = f"<{_priority(record.levelno)}>" if self._journal else ""
+        level = "" if self._journal else f"{self.formatTime(record)} {record.levelname} "
+        line = f"{head}{level}{printable(_message(record), MESSAGE_CHARACTERS_MAX)}"
         if not record.exc_info:
             return line
         traceback = self.formatException(record.exc_info).splitlines()[-TRACEBACK_LINES_MAX:]
-        return "\n    ".join([line, *(printable(one, MESSAGE_CHARACTERS_MAX) for one in traceback)])
+        return f"\n{head}    ".join([line, *(printable(one, MESSAGE_CHARACTERS_MAX) for one in traceback)])
+
+
+def _priority(level: int) -> int:
+    """The priority of syslog(3) for a level of `logging`."""
+    return next((priority for least, priority in PRIORITIES if level >= least), 7)
+
+
+class RepeatFilter(logging.Filter):
+    """Lets trouble that repeats itself through less and less often, with the number of messages left out.
+
+    Messages are the same when their text before its values, and the first value (the device), are. After the first one
+    there is a pause of PAUSE_FIRST_S, which doubles with every message up to PAUSE_MOST_S; when there was none for that
+    long, it begins anew. Messages below WARNING all pass.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._known: dict[tuple[object, ...], _Repeated] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Decide whether `record` is logged; add to it how many were not."""
+        if record.levelno < logging.WARNING:
+            return True
+        now_s, key = record.created, _key_of(record)
+        known = self._known.pop(key, None)
+        if known is None or not 0 <= now_s - known.seen_s <= PAUSE_MOST_S:  # new, over, or the clock was set back
+            self._known[key] = _Repeated(now_s, now_s + PAUSE_FIRST_S, PAUSE_FIRST_S, 0, now_s)
+            if len(self._known) > KNOWN_MOST:
+                del self._known[next(iter(self._known))]
+            return True
+        self._known[key] = known  # the one that was seen last is the last that is forgotten
+        known.seen_s = now_s
+        if now_s < known.due_s:
+            known.left_out += 1
+            return False
+        if known.left_out:
+            since_s = now_s - known.told_s
+            record.msg, record.args = f"{_message(record)}, {known.left_out} more like it in {since_s:.0f} s", None
+        known.pause_s = min(2 * known.pause_s, PAUSE_MOST_S)
+        known.due_s, known.told_s, known.left_out = now_s + known.pause_s, now_s, 0
+        return True
+
+
+@dataclass(slots=True)
+class _Repeated:
+    """A message that may come again; times in s."""
+
+    seen_s: float
+    due_s: float
+    pause_s: float
+    left_out: int
+    told_s: float
+
+
+def _key_of(record: logging.LogRecord) -> tuple[object, ...]:
+    first = record.args[0] if isinstance(record.args, tuple) and record.args else None
+    return record.name, record.levelno, record.msg, first if isinstance(first, str) else None
 
 
 def _message(record: logging.LogRecord) -> str:
@@ -111,9 +176,10 @@ def _message(record: logging.LogRecord) -> str:
 class LogWriter(logging.Handler):
     """Writes messages to a descriptor from a thread of its own. Synchronization: any thread may log."""
 
-    def __init__(self, descriptor: int, *, stamped: bool = False, messages_max: int = LOG_QUEUE_MESSAGES) -> None:
+    def __init__(self, descriptor: int, *, journal: bool = False, messages_max: int = LOG_QUEUE_MESSAGES) -> None:
         super().__init__()
-        self.setFormatter(LineFormatter(stamped=stamped))
+        self.setFormatter(LineFormatter(journal=journal))
+        self._journal = journal
         self._descriptor = descriptor
         self._queue: queue.Queue[bytes | None] = queue.Queue(messages_max)
         self._refused = 0
@@ -168,7 +234,8 @@ class LogWriter(logging.Handler):
         """Write how many messages are missing, if any; the number is kept until that can be written."""
         dropped = self.dropped
         missing = dropped - self._reported
-        if missing and self._write(encoded(f"WARNING {missing} messages dropped: the log was not read in time")):
+        head = "<4>" if self._journal else "WARNING "
+        if missing and self._write(encoded(f"{head}{missing} messages dropped: the log was not read in time")):
             self._reported = dropped
 
     def _write(self, line: bytes) -> bool:
@@ -193,10 +260,11 @@ def encoded(line: str) -> bytes:
 def log_to(descriptor: int, level: str) -> Iterator[LogWriter]:
     """Log messages of `level` and above to `descriptor`, and what Python itself reports, until the context ends.
 
-    Under a service manager the journal adds the time, else we do.
+    The journal adds the time, elsewhere the lines have it.
     """
     root = logging.getLogger()
-    writer, level_before = LogWriter(descriptor, stamped="JOURNAL_STREAM" not in os.environ), root.level
+    writer, level_before = LogWriter(descriptor, journal=is_journal(descriptor)), root.level
+    writer.addFilter(RepeatFilter())
     hooks_before = sys.unraisablehook, threading.excepthook
     root.addHandler(writer)
     root.setLevel(level.upper())
@@ -210,6 +278,16 @@ def log_to(descriptor: int, level: str) -> Iterator[LogWriter]:
         root.setLevel(level_before)
         writer.close()
         root.removeHandler(writer)
+
+
+def is_journal(descriptor: int) -> bool:
+    """Whether a descriptor is the stream to the journal that the service manager made (systemd.exec(5))."""
+    device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
+    try:
+        status = os.fstat(descriptor)
+    except OSError:
+        return False
+    return (device, inode) == (str(status.st_dev), str(status.st_ino))
 
 
 def messages_dropped() -> int:

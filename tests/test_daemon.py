@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -166,8 +167,8 @@ def test_second_daemon_is_refused_with_the_reason(tmp_path: Path) -> None:
             [sys.executable, "-m", "imud", "run", "--config", str(tmp_path / "imud.yaml")],
             capture_output=True, text=True, timeout=20, check=False,
         )  # fmt: skip
-        assert again.returncode == 2
-        assert re.search(r"imud run: .*imud\.sock", again.stderr)
+        assert again.returncode == 75
+        assert re.search(r"CRITICAL .*imud\.sock", again.stderr)
         assert "Traceback" not in again.stderr
         assert daemon.statuses() == {}
 
@@ -226,7 +227,7 @@ def test_missing_configuration_is_one_line(tmp_path: Path) -> None:
         [sys.executable, "-m", "imud", "run", "-c", str(tmp_path / "none.yaml")],
         capture_output=True, text=True, timeout=20, check=False,
     )  # fmt: skip
-    assert done.returncode == 2
+    assert done.returncode == 78
     assert done.stderr.count("\n") == 1
     assert "none.yaml" in done.stderr
 
@@ -238,3 +239,22 @@ def test_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
         assert daemon.process.wait(10) == 0
         daemon.socket.touch()
         daemon.socket.unlink()
+
+
+def test_a_metrics_port_that_is_taken_is_tried_again(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = holder.getsockname()[1]
+        with running_daemon(tmp_path, {}, metrics={"port": port}) as daemon:
+            log = tmp_path / "log"
+            wait_until(lambda: "has started" in log.read_text(), "the devices are searched for")
+            assert f"port {port}: Address already in use" in log.read_text()
+            assert "imud goes on without it and tries again" in log.read_text()
+            assert "outputs: socket, shm (not yet: metrics)" in log.read_text()
+            assert daemon.statuses() == {}
+            holder.close()
+            wait_until(lambda: "metrics: started after all" in log.read_text(), "the port is taken")
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
+                assert b"imud_build_info" in page.read()
+    assert "imud has stopped" in (tmp_path / "log").read_text()

@@ -73,12 +73,17 @@ class Manager:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         self.states: list[str] = []
+        self.status = ""
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
         while (data := self._socket.recv(4096)) != b"end":
-            self.states.append(data.decode().partition("=")[0])
+            state, _, value = data.decode().partition("=")
+            if state == "STATUS":
+                self.status = value
+            else:
+                self.states.append(state)
 
     def close(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
@@ -101,6 +106,7 @@ def test_reloads_that_come_together_are_one_and_the_manager_knows(
                 daemon.signal(signal.SIGHUP)
                 time.sleep(0.001)
             wait_until(lambda: len(daemon.statuses()) == MISSING, "all devices are there")
+            wait_until(lambda: manager.status.startswith(f"0 of {MISSING} devices running; not: "), "it is told")
             write_config(tmp_path, {}, **quiet)
             daemon.signal(signal.SIGHUP)
             wait_until(lambda: not daemon.statuses(), "the newest file counts")

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import select
 import sys
 import threading
@@ -14,11 +15,14 @@ import pytest
 
 from imud.log import (
     FLUSH_S,
+    KNOWN_MOST,
     MESSAGE_CHARACTERS_MAX,
     TRACEBACK_LINES_MAX,
     VALUE_CHARACTERS_MAX,
     LineFormatter,
     LogWriter,
+    RepeatFilter,
+    is_journal,
     log_to,
     messages_dropped,
     printable,
@@ -48,7 +52,74 @@ def formatted(message: str, *values: object, **more: object) -> str:
     """The line of one message."""
     record = logging.LogRecord("imud", logging.WARNING, __file__, 1, message, values, None)
     record.__dict__.update(more)
-    return LineFormatter(stamped=False).format(record)
+    return LineFormatter(journal=True).format(record)
+
+
+# --- the journal, and repeated trouble --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("level", "priority"),
+    [(logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.DEBUG, 7), (1, 7)],
+)
+def test_lines_for_the_journal_begin_with_their_priority(level: int, priority: int) -> None:
+    record = logging.LogRecord("imud", level, __file__, 1, "bow is %s", ("up",), None)
+    assert LineFormatter(journal=True).format(record) == f"<{priority}>bow is up"
+
+
+def test_other_lines_begin_with_time_and_level() -> None:
+    record = logging.LogRecord("imud", logging.INFO, __file__, 1, "up", (), None)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} INFO up", LineFormatter(journal=False).format(record))
+
+
+def test_the_journal_is_known_by_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pipe() as (_, descriptor):
+        monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+        assert not is_journal(descriptor)
+        status = os.fstat(descriptor)
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
+        assert is_journal(descriptor)
+        monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino + 1}")  # standard error was redirected
+        assert not is_journal(descriptor)
+    assert not is_journal(-1)
+
+
+def passed(repeats: RepeatFilter, t_s: float, message: str, *values: object, level: int = logging.WARNING) -> str:
+    """The line that passes the filter at a time; empty for none."""
+    record = logging.LogRecord("imud", level, __file__, 1, message, values, None)
+    record.created = t_s
+    return LineFormatter(journal=True).format(record) if repeats.filter(record) else ""
+
+
+def test_repeated_trouble_is_told_less_and_less_often() -> None:
+    repeats = RepeatFilter()
+    told = {t: line for t in range(200) if (line := passed(repeats, 1000 + t, "%s: %d lost", "bow", t))}
+    assert list(told) == [0, 1, 3, 7, 15, 31, 63, 123, 183]
+    assert told[1] == "<4>bow: 1 lost"
+    assert told[7] == "<4>bow: 7 lost, 3 more like it in 4 s"
+    assert told[183] == "<4>bow: 183 lost, 59 more like it in 60 s"
+    assert passed(repeats, 1300, "%s: %d lost", "bow", 1) == "<4>bow: 1 lost"  # after a minute of quiet it is new
+
+
+def test_other_trouble_is_told_at_once() -> None:
+    repeats = RepeatFilter()
+    assert passed(repeats, 0, "%s: %d lost", "bow", 1)
+    assert not passed(repeats, 0, "%s: %d lost", "bow", 2)
+    assert passed(repeats, 0, "%s: %d lost", "stern", 2)
+    assert passed(repeats, 0, "%s: gone", "bow")
+    assert passed(repeats, 0, "%s: %d lost", "bow", 3, level=logging.ERROR)
+    for _ in range(10):
+        assert passed(repeats, 0, "%s: up", "bow", level=logging.INFO)
+    assert passed(repeats, -100, "%s: %d lost", "bow", 1)  # the clock was set back
+    assert passed(repeats, 0, "nothing %s", 5)
+
+
+def test_what_is_remembered_is_bounded() -> None:
+    repeats = RepeatFilter()
+    for number in range(KNOWN_MOST + 1):
+        assert passed(repeats, 0, f"message {number}")
+    assert passed(repeats, 0, "message 0")  # forgotten
+    assert not passed(repeats, 0, f"message {KNOWN_MOST}")
 
 
 # --- texts and values -------------------------------------------------------------------------------------------------
@@ -102,8 +173,8 @@ def test_shown_has_the_outer_levels_of_a_deep_value() -> None:
 def test_a_message_is_one_line(text: str) -> None:
     for line in (formatted("%s: gone", text), formatted(text)):
         assert line.isprintable()
-        assert line.startswith("WARNING ")
-        assert len(line) <= MESSAGE_CHARACTERS_MAX + len("WARNING ")
+        assert line.startswith("<4>")
+        assert len(line) <= MESSAGE_CHARACTERS_MAX + len("<4>")
 
 
 @pytest.mark.parametrize(
@@ -112,7 +183,7 @@ def test_a_message_is_one_line(text: str) -> None:
 def test_a_message_that_cannot_be_made_is_still_one(message: str, values: tuple[object, ...]) -> None:
     line = formatted(message, *values)
     assert line.isprintable()
-    assert line.startswith("WARNING ")
+    assert line.startswith("<4>")
 
 
 def test_lines_of_a_traceback_cannot_be_taken_for_messages() -> None:
@@ -125,8 +196,8 @@ def test_lines_of_a_traceback_cannot_be_taken_for_messages() -> None:
         deep(200)
     except ValueError:
         lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
-    assert lines[0] == "WARNING it failed"
-    assert all(line.startswith("    ") for line in lines[1:])
+    assert lines[0] == "<4>it failed"
+    assert all(line.startswith("<4>    ") for line in lines[1:])
     assert any("root logged in" in line for line in lines)
     assert len(lines) <= TRACEBACK_LINES_MAX + 1
 
@@ -167,7 +238,7 @@ def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing() -> Non
     with pipe(full=True) as (reader, descriptor), log_to(descriptor, "info") as writer:
         begin = monotonic()
         for number in range(5000):
-            log.warning("message %d", number)
+            log.info("message %d", number)
         assert monotonic() - begin < 2.0
         dropped = writer.dropped
         assert 3900 < dropped <= 4000  # all but what the queue holds, and what the thread has in its hand
@@ -175,7 +246,7 @@ def test_a_log_that_nobody_reads_stops_nothing_and_says_what_is_missing() -> Non
         text = read_until(reader, b"messages dropped").decode()
         lines = text.splitlines()
         assert f"WARNING {dropped} messages dropped: the log was not read in time" in lines
-        assert sum("WARNING message " in line for line in lines) == 5000 - dropped
+        assert sum("INFO message " in line for line in lines) == 5000 - dropped
         log.warning("it flows")
         assert "dropped" not in read_until(reader, b"it flows\n").decode()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.notify import notify, watchdog_interval_s
+from imud.notify import STATUS_NS, ServiceManager, notify, status_line, watchdog_interval_s
 
 
 def test_state_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -47,3 +47,46 @@ def test_watchdog_interval(usec: str, pid: str, expected: float | None, monkeypa
     if pid:
         monkeypatch.setenv("WATCHDOG_PID", pid)
     assert watchdog_interval_s() == expected
+
+
+@pytest.mark.parametrize(
+    ("states", "line"),
+    [
+        ({}, "No devices are configured."),
+        ({"bow": "running"}, "1 of 1 device running."),
+        ({"bow": "missing"}, "0 of 1 device running; not: bow (missing)."),
+        ({"a": "running", "b": "silent", "c": "finished"}, "2 of 3 devices running; not: b (silent)."),
+        (
+            {f"d{n}": "missing" for n in range(8)},
+            "0 of 8 devices running; not: "
+            "d0 (missing), d1 (missing), d2 (missing), d3 (missing), d4 (missing) and 3 more.",
+        ),
+    ],
+)
+def test_status_line(states: dict[str, str], line: str) -> None:
+    assert status_line(states) == line
+
+
+def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(tmp_path / "notify"))
+        receiver.settimeout(5)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "4000000")
+        monkeypatch.delenv("WATCHDOG_PID", raising=False)
+        manager = ServiceManager()
+        manager.ready()
+        for tenth in range(31):
+            manager.tick(tenth * STATUS_NS // 10, {"bow": "running" if tenth > 12 else "searching"})
+        manager.stopping()
+        states = [receiver.recv(100).decode() for _ in range(6)]
+    assert states == [
+        "READY=1",
+        "WATCHDOG=1",
+        "STATUS=0 of 1 device running; not: bow (searching).",
+        "WATCHDOG=1",
+        "STATUS=1 of 1 device running.",
+        "STOPPING=1",
+    ]

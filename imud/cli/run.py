@@ -5,18 +5,26 @@ import logging
 import os
 import sys
 from pathlib import Path
+from typing import Final
 
 from imud import config
 from imud.cli.arguments import CliCommand
+from imud.cli.streams import complain
 from imud.config import Config
 from imud.config.yaml_tree import FILE_BYTES_MAX
 from imud.daemon import Daemon
-from imud.errors import ImudError
+from imud.errors import ConfigError, ImudError, ServerError
 from imud.log import STDERR, log_to
 from imud.runtime import event_loop
 
 log = logging.getLogger(__name__)
 
+EXIT_MISTAKE: Final = 1
+"""A mistake of imud's own, which is in the log."""
+EXIT_OUTPUT: Final = 75
+"""An output that is required cannot start, for example the socket that another imud has (EX_TEMPFAIL, sysexits.h)."""
+EXIT_CONFIGURATION: Final = 78
+"""The configuration cannot be used; starting again changes nothing (EX_CONFIG)."""
 DEFAULT_FILE = Path("/etc/imud.yaml")
 
 
@@ -28,16 +36,23 @@ def run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGTERM or SIGINT; 1 after a mistake of imud's own, which is in the log."""
-    settings = config.load(args.config, missing="give the file with --config")
+    """Run until SIGTERM or SIGINT. The exit statuses are those of docs/operate.md."""
+    try:
+        settings = config.load(args.config, missing="give the file with --config")
+    except ConfigError as error:
+        complain(str(error))
+        return EXIT_CONFIGURATION
     with log_to(STDERR, settings.log_level):
         try:
             event_loop.run(serve(settings, args.config))
+        except ServerError as error:
+            log.critical("%s", error)
+            return EXIT_OUTPUT
         except ImudError:
             raise
         except Exception:
             log.critical("imud ends because of a mistake of its own", exc_info=True)
-            return 1
+            return EXIT_MISTAKE
     return 0
 
 

@@ -173,3 +173,5 @@ class PublisherType:
     """The top-level key in the configuration."""
     settings: type[Settings]
     make: Callable[[Any, PublisherContext], Publisher]
+    required: bool = True
+    """Whether the daemon ends when it cannot start at the beginning; otherwise it is tried again and again."""

@@ -56,12 +56,15 @@ class Notices:
         troubled = ledger.frames_bad() + ledger.frames_not_finite
         lost, bad = ledger.lost() - self._lost, troubled - self._bad
         if lost:
-            self.raise_event(now_ns, EventKind.LOSS, f"{lost} samples lost", **self._causes())
+            self.raise_event(now_ns, EventKind.LOSS, _counted(lost, "sample") + " lost", **self._causes())
         if bad and self._last_bad is not None:
             frame = self._last_bad
             shown = frame.raw[:RAW_SHOWN_BYTES].hex(" ")
             self.raise_event(
-                now_ns, EventKind.BAD_FRAME, f"{bad} bad frames, the last by {frame.reason}: {shown}", count=bad
+                now_ns,
+                EventKind.BAD_FRAME,
+                f"{_counted(bad, 'bad frame')}, the last by {frame.reason}: {shown}",
+                count=bad,
             )
         self._lost, self._bad = ledger.lost(), troubled
         if lost or bad:
@@ -81,3 +84,7 @@ class Notices:
         if before is not None:
             self._send(Event(now_ns, self.device, EventKind.SYNC, f"time stamps by {sync}, were by {before}",
                              {"sync": str(sync), "before": str(before)}))  # fmt: skip
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"

@@ -20,12 +20,14 @@ def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, caps
     assert "did you mean baud?" in error
 
 
-@pytest.mark.parametrize(("words", "hint"), [(["check"], "is the path right?"), (["run", "--config"], "--config")])
+@pytest.mark.parametrize(
+    ("words", "hint", "status"), [(["check"], "is the path right?", 2), (["run", "--config"], "--config", 78)]
+)
 def test_a_file_that_is_not_there(
-    words: list[str], hint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], hint: str, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The hint names an argument that the command has."""
-    assert main([*words, str(tmp_path / "none")]) == 2
+    assert main([*words, str(tmp_path / "none")]) == status
     error = capsys.readouterr().err
     assert error.startswith(f"{tmp_path}/none: cannot be read: No such file or directory; ")
     assert hint in error

@@ -236,4 +236,4 @@ class MetricsPublisher:
             )
 
 
-PUBLISHER = PublisherType("metrics", MetricsSettings, MetricsPublisher)
+PUBLISHER = PublisherType("metrics", MetricsSettings, MetricsPublisher, required=False)
