@@ -9,6 +9,7 @@ from imud.contracts.polling import Poll
 from imud.contracts.status import DeviceState
 from imud.devices.imu61x.spi import codec as spi
 from imud.devices.imu61x.spi.words import READ_STATE
+from imud.sim.imu61x.behaviour import REGISTER_VARIANTS
 from tests.lab.bus import Bus
 from tests.lab.demo import demo
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_spi, physics_holds, registers, vanishes
@@ -57,6 +58,30 @@ def test_streams_the_truth(bus: tuple[Bus[SpiTransfer], str], burst: str) -> Non
     if burst != "registers":  # one ioctl, one selection
         assert {len(t.segments) for t in bursts} == {1}
         assert not any(t.stays_selected for t in bursts)
+
+
+@pytest.mark.parametrize("variant", REGISTER_VARIANTS)
+@pytest.mark.parametrize("burst", ["standard", "extended"])
+def test_kind_of_burst_in_every_variant(spi8: Bus[SpiTransfer], variant: str, burst: str) -> None:
+    """Wherever BURST_CTRL reads back, and whatever the undefined bits of WIN_CTRL are, the burst decides."""
+    device = registers(behaviour=REGISTER_VARIANTS[variant])
+    device.extended = 1 if burst == "standard" else 0
+    spi8.attach(0, on_spi(device))
+    config = device_config("imu", "imu61x-spi", "spi", {"port": PORTS["spi8"], "rate_hz": 20}, burst=burst)
+
+    async def body() -> None:
+        async with running(config) as (rig,):
+            await rig.until_samples(10, LIMIT_S)
+            assert rig.device.status().settings["burst"] == burst
+            assert device.extended == (burst == "extended")
+            answer = await rig.device.act("filter", {"gyro_filter": "10 Hz"})
+            assert device.filter == 0xB4
+            assert rig.device.status().settings["gyro_filter"] == "10 Hz", answer
+            await rig.until_samples(5, LIMIT_S)
+            assert rig.device.ledger.frames_bad_crc == 0
+            assert device.window == 0
+
+    asyncio.run(body())
 
 
 FAULTS: dict[str, tuple[dict[str, object], str]] = {

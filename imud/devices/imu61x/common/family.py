@@ -109,18 +109,18 @@ FILTERS: Final[tuple[FilterName, ...]] = get_args(FilterName)
 """Low-pass filters by code 0 … 15."""
 FILTER_DEFAULT: Final = 0xBB
 """47 Hz for both, as delivered."""
-FILTER_CODES: Final = ", ".join(f"{code} {name}" for code, name in enumerate(FILTERS))
+FILTER_CODES: Final = ", ".join(f"{code} = {name}" for code, name in enumerate(FILTERS))
 """Table 21 in a line, for help and documents."""
 FilterCode = Annotated[int, Meta(ge=0, le=len(FILTERS) - 1)]
 """An index of FILTERS."""
 FilterChoice = FilterName | FilterCode
 """A filter by name, or by its code of table 21."""
 ACCEL_FILTER: Final = Meta(
-    description=f"low-pass filter of the accelerometer, by name or by code: {FILTER_CODES}",
+    description="low-pass filter of the accelerometer, by name, or by its code in the order of the names",
     extra={"section": "2.4.2, table 21"},
 )
 GYRO_FILTER: Final = Meta(
-    description="low-pass filter of the gyroscope, by name or by code as that of the accelerometer",
+    description="low-pass filter of the gyroscope, by name or code as that of the accelerometer",
     extra={"section": "2.4.2, table 21"},
 )
 

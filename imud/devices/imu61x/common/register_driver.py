@@ -18,6 +18,7 @@ from imud.contracts.settings import Settings
 from imud.devices.imu61x.common.family import (
     ACCEL_FILTER,
     EULER_CONVENTION,
+    FILTER_CODES,
     FILTERS,
     GYRO_FILTER,
     NAVIGATION_FRAME,
@@ -155,7 +156,7 @@ def _filter_action(set_up: SetUp[S]) -> Action:
 
     return Action(
         "set the low-pass filters until the device restarts, null leaves one as it is; answers what they are; "
-        "`options` set them at every start",
+        f"`options` set them at every start; by name or code: {FILTER_CODES}",
         set_filter,
     )
 

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from imud.contracts.action import Action, Actions, Risk, Target
 from imud.contracts.session import RequestScript
-from imud.devices.imu61x.common.family import FILTERS, filter_code, i2c_address
+from imud.devices.imu61x.common.family import FILTER_CODES, FILTERS, filter_code, i2c_address
 from imud.devices.imu61x.uart import calibrating, following, session
 from imud.devices.imu61x.uart.commands import BusMode, require_fit
 from imud.devices.imu61x.uart.replies import Parameter
@@ -41,11 +41,12 @@ def _done(target: Target) -> int:
 
 
 def _factory_reset(target: Target) -> RequestScript[following.BaudChange]:
-    return following.factory_reset(target.baud, done=_done(target))
+    return following.with_advice(following.factory_reset(target.baud, done=_done(target)), target.fixed_baud)
 
 
 def _baud(target: Target, *, baud: Baud) -> RequestScript[following.BaudChange]:
-    return following.change_baud(baud, target.baud, done=_done(target))
+    script = following.change_baud(baud, target.baud, done=_done(target))
+    return following.with_advice(script, target.fixed_baud)
 
 
 def _rate(target: Target, *, rate_hz: OutputRate) -> RequestScript[None]:
@@ -127,7 +128,7 @@ ACTIONS: Final[Actions] = {
         saves=True,
     ),
     "rate": Action("set the output rate, as far as the baud rate carries it", _rate),
-    "filter": Action("set the low-pass filters", _filter),
+    "filter": Action(f"set the low-pass filters, by name or code: {FILTER_CODES}", _filter),
     "i2c_address": Action(
         "set the I2C address; a host that reads the device at the old one loses it until `i2c.address` there is the "
         "new one",

@@ -6,7 +6,7 @@ it; a factory reset by the parameters that it reads back.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from imud.contracts.driver import Identity
@@ -60,12 +60,17 @@ class BaudChange:
     """The rate at which the device answered last; the line has it as well."""
     saved: bool
     """Whether the device acknowledged that it saved its parameters."""
-    configuration: str
-    """What to change in the configuration."""
+    configuration: str = ""
+    """What to change in the configuration; empty for nothing."""
 
 
-def _changed(baud: int, saved: bool) -> BaudChange:
-    return BaudChange(baud, saved, f"where `uart.baud` is a number, make it {baud}; `auto` needs no change")
+def with_advice(script: RequestScript[BaudChange], fixed_baud: int) -> RequestScript[BaudChange]:
+    """Make the same script; its answer says what to change where the configuration fixes the rate (0: it does not)."""
+    change = yield from script
+    if fixed_baud in (0, change.baud):
+        return change
+    words = f"change `uart.baud` from {fixed_baud} to {change.baud} or auto: imud uses it at its next start"
+    return replace(change, configuration=words)
 
 
 # --- restart ----------------------------------------------------------------------------------------------------------
@@ -168,7 +173,7 @@ def _change_baud(baud: int, present_baud: int, done: int, save: bool) -> Request
         raise Rejected(f"{request.name}: the device stays at {present_baud} baud")
     if save:
         saved = (yield from _save(done)) or saved
-    return _changed(baud, saved)
+    return BaudChange(baud, saved)
 
 
 # --- factory reset ----------------------------------------------------------------------------------------------------
@@ -211,7 +216,7 @@ def _factory_reset(present_baud: int, done: int) -> RequestScript[BaudChange]:
         raise Rejected(
             f"factory reset: expected {expected}, read back {words}; acknowledgement {word} ({done} is done)"
         )
-    return _changed(found[0], (yield from _save(done)))
+    return BaudChange(found[0], (yield from _save(done)))
 
 
 def _not_factory() -> RequestScript[Mapping[Parameter, float]]:

@@ -109,9 +109,19 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
 @pytest.mark.manual("A 1.6 CMD 14, 3")
 def test_baud_is_followed() -> None:
     far = imu61x_bench()
-    change = act(far, "baud", baud=460800)
-    assert change == BaudChange(460800, True, "where `uart.baud` is a number, make it 460800; `auto` needs no change")
+    assert act(far, "baud", baud=460800) == BaudChange(460800, saved=True)
     assert far.line_baud == far.module.baud == 460800
+
+
+@pytest.mark.parametrize("name", ["baud", "factory_reset"])
+def test_a_fixed_rate_in_the_configuration_is_to_be_changed(name: str) -> None:
+    far = imu61x_bench(Imu61xSettings(baud=921600))
+    action = ACTIONS[name]
+    arguments = action.arguments({"baud": 115200} if name == "baud" else {})
+    answer = far.run(action.script(Target(None, 921600, fixed_baud=921600), arguments))
+    assert answer.configuration == "change `uart.baud` from 921600 to 115200 or auto: imud uses it at its next start"
+    back = ACTIONS["baud"]
+    assert far.run(back.script(Target(None, 115200, 921600), back.arguments({"baud": 921600}))).configuration == ""
 
 
 def test_questions_have_names_and_units() -> None:
@@ -135,6 +145,7 @@ def test_options_give_the_codes() -> None:
 
 
 def test_what_may_be_cut_off_is_said_in_the_help() -> None:
+    assert "10 = 40 Hz, 11 = 47 Hz, 12 = average 4" in ACTIONS["filter"].help
     for name, words in (
         ("stop_streaming", "cuts off"),
         ("baud", "`uart.baud`"),
