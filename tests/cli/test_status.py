@@ -15,6 +15,13 @@ def test_a_device_without_parts_has_no_rows_of_them() -> None:
     assert block(device("bow")).splitlines()[-1].startswith("  kernel ")
 
 
+def test_parts_of_the_identity_have_names() -> None:
+    identity = {"product": "IMU61x", "serial_number": "0032", "firmware": "10203", "hardware_version": "2"}
+    lines = block(replace(device("bow"), identity=identity)).splitlines()
+    assert "  identity  product IMU61x, serial_number 0032, firmware 10203, hardware_version 2" in lines
+    assert "  identity  not known" in block(replace(device("bow"), identity={})).splitlines()
+
+
 def test_axes_heading_and_what_contradicts_them() -> None:
     frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
     lines = block(replace(device("bow"), frame=frame)).splitlines()

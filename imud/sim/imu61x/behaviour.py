@@ -65,7 +65,7 @@ VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
     "K1 at the end of a calibration": Imu61xBehaviour(acknowledges_at_end=True),
     "short status": Imu61xBehaviour(reports_calibration=False),
     "all at once": Imu61xBehaviour(
-        answers_while_streaming=False, result_done=1, result_refused=0, flash_ms=2000, quiet_ms=300,
+        answers_while_streaming=False, result_done=1, result_refused=0, flash_ms=2000, quiet_ms=700,
         baud_acts_at_start=True, reset_acts_at_start=True,
     ),
 }  # fmt: skip

@@ -13,7 +13,6 @@ it writes to flash: `settled` waits until it answers again.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Annotated, Final, TypeVar
 
 from msgspec import Meta
@@ -42,6 +41,8 @@ SETTLE_TRIES: Final = 10
 """Questions after an order that may take long, until one is answered: 3 s."""
 CONTACT_TRIES: Final = 5
 """The same after any other: 1.5 s."""
+ENTER_TRIES: Final = 2
+"""Orders to enter command mode; a device that acknowledges none and answers no question is not there."""
 STREAM: Final = commands.output_mode(OutputMode.STREAM).payload
 """The bytes that make it stream: the undo of every script that may leave it in command mode."""
 
@@ -58,28 +59,50 @@ class Imu61xUartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fie
 # --- contact ----------------------------------------------------------------------------------------------------------
 
 
-def in_contact(ask: Callable[[], RequestScript[T]]) -> RequestScript[T]:
-    """Run `ask` once, in command mode if the device answers only there, and leave it as it was. Raises NoReply."""
-    if isinstance((yield commands.ask_status()), Reply):
-        return (yield from ask())
+def in_contact(ask: Callable[[], RequestScript[T]], patience: int = 1) -> RequestScript[T]:
+    """Run `ask` once, in command mode if the device answers only there, and leave it as it was. Raises NoReply.
+
+    `patience` is the number of questions without an answer that show that it does not answer as it is: more than one
+    where it must not be taken into command mode only because it is quiet for a while.
+    """
+    for _ in range(patience):
+        if isinstance((yield commands.ask_status()), Reply):
+            return (yield from ask())
+
+    entered = False
 
     def in_command_mode() -> RequestScript[T]:
-        yield from settled(CONTACT_TRIES)
+        nonlocal entered
+        yield from _enter_command_mode()
+        entered = True
         return (yield from ask())
 
-    yield replace(commands.output_mode(OutputMode.COMMAND), undo=STREAM)
     try:
         value = yield from with_undo(in_command_mode(), STREAM)
     except CommandError:
-        yield from resume_streaming()
+        yield from resume_streaming(STREAM_TRIES if entered else ENTER_TRIES)
         raise
     yield from resume_streaming()
     return value
 
 
-def resume_streaming() -> RequestScript[bool]:
+def _enter_command_mode() -> RequestScript[None]:
+    """Enter command mode (CMD 3, mode 100) and wait until the device answers there. Raises NoReply.
+
+    One that is quiet after the script before may miss the first order.
+    """
+    for left in reversed(range(ENTER_TRIES)):
+        heard = isinstance((yield commands.output_mode(OutputMode.COMMAND)), Reply)
+        if heard or not left:
+            yield from settled(CONTACT_TRIES if heard else 1)
+            return
+        if isinstance((yield commands.ask_status()), Reply):
+            return
+
+
+def resume_streaming(tries: int = STREAM_TRIES) -> RequestScript[bool]:
     """Have AHRS frames streamed again (CMD 3, mode 1); return whether the device acknowledged, with any result."""
-    for _ in range(STREAM_TRIES):
+    for _ in range(tries):
         if isinstance((yield commands.output_mode(OutputMode.STREAM)), Reply):
             return True
     return False

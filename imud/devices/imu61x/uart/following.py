@@ -30,8 +30,8 @@ from imud.devices.imu61x.uart.session import identity_of
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.units import NS_PER_S, NS_PER_US
 
-LOOK_TRIES: Final = 2
-"""A device in the middle of a false frame, made of bytes at another rate, may miss one request."""
+LOOK_TRIES: Final = 3
+"""A device in the middle of a false frame, made of bytes at another rate, or quiet after an answer, may miss two."""
 BOOT_NS: Final = NS_PER_S
 BOOT_TRIES: Final = 5
 """Number of searches after a restart; with their time-outs longer than the 3 s that section 2.2 names."""
@@ -237,7 +237,7 @@ def _not_factory() -> RequestScript[Mapping[Parameter, float]]:
 
 def _save(done: int) -> RequestScript[bool]:
     """Save; return whether the device acknowledged. Raises Rejected."""
-    return (yield from in_contact(lambda: ordered(commands.save(), done)))
+    return (yield from in_contact(lambda: ordered(commands.save(), done), CONTACT_TRIES))
 
 
 def _look(bauds: Sequence[int], tries: int = LOOK_TRIES) -> RequestScript[tuple[int, float] | None]:

@@ -230,7 +230,7 @@ def save(*, done: int = RESULT_DONE) -> RequestScript[None]:
         yield from acknowledged(commands.save(), done)
         yield from settled()
 
-    return in_contact(ask)
+    return in_contact(ask, CONTACT_TRIES)
 
 
 # --- parameters and heading -------------------------------------------------------------------------------------------

@@ -69,6 +69,8 @@ def test_each_setting_is_written_and_reads_back(variant: str, name: str, value: 
     write(far, name, value, variant)
     found = read(far, variant)
     assert found == FACTORY | {name: shown}
+    acts_at_start = name == "baud" and far.module.hardware.behaviour.baud_acts_at_start
+    assert (far.module.flash == Imu61xSettings()) is not acts_at_start
     assert SETTINGS.table[name].agrees(value, found[name])
     assert not SETTINGS.table[name].agrees(value, FACTORY[name])
 
