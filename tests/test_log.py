@@ -208,7 +208,7 @@ def test_a_long_traceback_is_cut_and_its_end_is_kept() -> None:
     except ValueError:
         lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
     assert len(lines) == TRACEBACK_LINES_MAX + 1
-    assert lines[-1] == "    line 9999"
+    assert lines[-1] == "<4>    line 9999"
 
 
 @pytest.mark.parametrize("text", HOSTILE)
@@ -217,7 +217,7 @@ def test_lines_of_a_traceback_are_escaped_and_bounded(text: str) -> None:
         raise ValueError(text)
     except ValueError:
         lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
-    assert all(line.isprintable() and len(line) <= MESSAGE_CHARACTERS_MAX + 4 for line in lines)
+    assert all(line.isprintable() and len(line) <= MESSAGE_CHARACTERS_MAX + len("<4>    ") for line in lines)
 
 
 # --- the writer -------------------------------------------------------------------------------------------------------
@@ -291,14 +291,14 @@ def test_a_message_that_cannot_be_formatted_is_counted_and_nothing_else(capfd: p
 @pytest.mark.parametrize("journal", [False, True])
 def test_the_journal_adds_the_time_itself(journal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("JOURNAL_STREAM", raising=False)
-    if journal:
-        monkeypatch.setenv("JOURNAL_STREAM", "8:1")
     with pipe() as (reader, descriptor):
+        if journal:
+            status = os.fstat(descriptor)
+            monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
         with log_to(descriptor, "info"):
             log.info("begun")
         line = os.read(reader, 1 << 16).decode()
-    assert line.startswith("INFO begun") == journal
-    assert line.endswith("INFO begun\n")
+    assert line == "<6>begun\n" if journal else line.endswith(" INFO begun\n")
 
 
 def no_reader() -> int:
