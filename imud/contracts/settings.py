@@ -34,14 +34,20 @@ class NoSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Settings of parts that have none."""
 
 
-def is_host(text: str) -> bool:
-    """Whether a text is an IP address or a host name (RFC 1123, section 2.1), which has a letter in its last label."""
+def is_ip_address(text: str) -> bool:
+    """Whether a text is an IPv4 or IPv6 address."""
     try:
         ip_address(text)
     except ValueError:
-        labels = text.rstrip(".").split(".")
-        return len(text) <= HOST_CHARACTERS and all(map(_LABEL.fullmatch, labels)) and not labels[-1].isdecimal()
+        return False
     return True
+
+
+def is_host(text: str) -> bool:
+    """Whether a text is an IP address or a host name (RFC 1123, section 2.1), which has a letter in its last label."""
+    labels = text.rstrip(".").split(".")
+    is_name = len(text) <= HOST_CHARACTERS and all(map(_LABEL.fullmatch, labels)) and not labels[-1].isdecimal()
+    return is_name or is_ip_address(text)
 
 
 def expected(field_type: Any) -> str:

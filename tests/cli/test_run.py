@@ -43,6 +43,9 @@ def test_a_file_that_is_not_there(
         ("metrics: {address: not an address}", "1:20: metrics.address: expected an IP address"),
         ("metrics: {address: '::1'}", ""),
         ("metrics: {address: localhost}", ""),
+        ("metrics: {address: gateway}", "1:20: metrics.address: expected an IP address"),
+        ("socket: {path: /%s}" % ("x" * 99), "1:16: socket.path: expected at most 99 bytes, got 100"),
+        ("socket: {path: /%s}" % ("x" * 98), ""),
         ("socket: {path: imud.sock}", '1:16: socket.path: expected an absolute path, got "imud.sock"'),
     ],
 )

@@ -3,11 +3,14 @@
 import asyncio
 import errno
 import os
+import re
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from imud.errors import LinkBusy, LinkDenied, LinkMissing
+from imud.links import LINKS
 from imud.links.device_node import SERIAL_GROUP, DeviceNode, holders_of, open_problem
 from imud.permissions import user_name
 
@@ -69,6 +72,21 @@ def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.Monkey
         await asyncio.wait_for(waiting, 5)
 
     asyncio.run(appear())
+
+
+@pytest.mark.parametrize(
+    ("link", "settings"),
+    [
+        ("uart", {"port": "/dev/none"}), ("rs485", {"line": "/dev/none"}), ("i2c", {"bus": 255}),
+        ("spi", {"port": "/dev/spidev99.0"}), ("replay", {"path": "/none/drive.cap"}),
+        ("replay of frames", {"path": "/none/drive.log"}),
+    ],
+)  # fmt: skip
+def test_every_link_says_that_its_port_is_not_there_and_what_to_look_at(link: str, settings: dict[str, object]) -> None:
+    row = LINKS[link.partition(" ")[0]]
+    make = row.make_can if "frames" in link else row.make_polled if row.polled else row.make
+    absence = make(msgspec.convert(settings, row.settings)).absence()
+    assert re.fullmatch(r"/\S+ is not there: (is .*\?|expected a capture file)", absence)
 
 
 def test_access_that_is_not_granted_is_waited_for_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,7 @@ from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample as Line
 
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
-from imud.contracts.settings import Settings, is_host, shown
+from imud.contracts.settings import Settings, is_ip_address, shown
 from imud.contracts.status import ClientStatus
 from imud.event import Event
 from imud.log import messages_dropped
@@ -57,7 +57,7 @@ class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields
 
     def __post_init__(self) -> None:
         """Raise ValueError for what is no address to listen on."""
-        if not is_host(self.address):
+        if not is_ip_address(self.address) and self.address != "localhost":
             raise ValueError(f"address: expected an IP address such as 127.0.0.1 or ::1, got {shown(self.address)}")
 
 

@@ -18,13 +18,13 @@ from typing import Annotated, Final
 import msgspec
 
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
-from imud.contracts.settings import Settings
+from imud.contracts.settings import Settings, shown
 from imud.errors import reason_of
 from imud.event import Event
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
 from imud.publishers.socket.connection import Connection, ServerSide
 from imud.publishers.socket.hub import Hub
-from imud.publishers.socket.listener import Listener
+from imud.publishers.socket.listener import PATH_MAX_BYTES, Listener
 from imud.publishers.socket.outbox import Limits, Pool
 from imud.publishers.socket.quota import Quota, Seldom, Shares, raise_fd_limit
 from imud.publishers.socket.rights import Guard, Peer, Rights, gid_of, peer_of
@@ -60,6 +60,12 @@ class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """At most so many samples wait for a client that does not read; 4096 are 4 s at 1 kHz. The oldest are dropped."""
     queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
     """At most so many bytes of samples wait for a client that does not read."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a path that no socket can have."""
+        if len(os.fsencode(self.path)) > PATH_MAX_BYTES:
+            size = len(os.fsencode(self.path))
+            raise ValueError(f"path: expected at most {PATH_MAX_BYTES} bytes, got {size}: {shown(self.path)}")
 
 
 class SocketServer:
