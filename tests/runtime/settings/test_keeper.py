@@ -170,6 +170,11 @@ def test_a_difference_is_told_once_and_nothing_is_written() -> None:
         assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
         assert bench.status.differences["mode"].declared == "9-axis"
         assert bench.written() == []
+        asked = bench.module.commands.count("GET")
+        await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+        await bench.until(lambda: bench.module.commands.count("GET") >= asked + 2)  # as text, and to compare
+        await bench.pass_s(2)
+        assert bench.messages == [message]  # it is as before
 
     bench.play(story)
 

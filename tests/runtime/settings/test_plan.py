@@ -41,6 +41,14 @@ def test_the_order_is_that_of_the_table_and_what_changes_the_connection_comes_la
     assert planned({"mode": "9-axis"}).risk is Risk.NONE
 
 
+def test_what_changes_the_connection_comes_last_wherever_it_stands_in_the_table() -> None:
+    baud = replace(FAKE_SETTINGS.table["baud"], saves=False)
+    table = replace(FAKE_SETTINGS, table={**FAKE_SETTINGS.table, "baud": baud})
+    assert next(iter(table.table)) == "baud"
+    plan = make_plan(table, TARGET, {"baud": 921600, "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False)
+    assert (names(plan), plan.save) == (["mode", "baud"], True)
+
+
 def test_what_needs_a_restart_is_left_out_where_nothing_is_saved() -> None:
     wanted = {"mounting": "x_up", "mode": "9-axis", "baud": 921600}
     plan = planned(wanted, save=False)
