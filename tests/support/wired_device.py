@@ -245,11 +245,14 @@ class LinkedDevice:
         self.clock = clock
         driver, identify = config.pop("driver", "hipnuc-uart"), config.pop("identify", True)
         lines: DeviceLines | None = config.pop("lines", None)
+        declared = config.pop("declared", None)
         memory = MemorySettings(**{"baud": 115200, **config})
         self.module = HipnucModule(clock.now_ns(), settings, hardware)
         self.link = LinkedModule(memory, self.module, clock)
         self.rigs = DeviceRigs(clock.host)
-        self.rig = self.rigs.add(DeviceConfig("bow", driver, None, identify, "memory", memory, lines=lines), self.link)
+        self.rig = self.rigs.add(
+            DeviceConfig("bow", driver, None, identify, "memory", memory, lines=lines, declared=declared), self.link
+        )
         self.device = self.rig.device
         self.samples, self.events = self.rig.samples, self.rig.events
 

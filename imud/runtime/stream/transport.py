@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 from imud.contracts.action import Target
+from imud.contracts.device_settings import declared_values
 from imud.contracts.driver import Identity, StreamDriver
 from imud.contracts.link import OnEnd, StreamLink
 from imud.contracts.status import DeviceState, DeviceStatus
@@ -177,10 +178,11 @@ class StreamTransport:
         """Until its first sample since the link was opened: make a device stream that answers and sends none.
 
         One that has streamed is left alone when it falls silent: that may have been commanded. So is one that is meant
-        to be silent by its own settings, as its driver finds.
+        to be silent by its own settings, as its driver finds, or by the declared ones.
         """
         reported = False
-        while driver.wake is not None:
+        meant = declared_values(self._config.declared).get("output_enabled") is False
+        while driver.wake is not None and not meant:
             await asyncio.sleep(UNHEARD_NS / NS_PER_S)
             if self._ledger.samples != self._samples_before or self._search.requested:
                 return

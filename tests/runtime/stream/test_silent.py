@@ -1,17 +1,25 @@
 """A simulated HiPNUC module on a line in virtual time: silent and told things, changed, read back, never lost."""
 
 import asyncio
+import time
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
+from imud.contracts.device_settings import StepOutcome
 from imud.contracts.lines import DeviceLines, DividedSettings
 from imud.contracts.status import DeviceState
+from imud.devices.hipnuc.uart.settings import SETTINGS
 from imud.errors import CommandError
 from imud.event import EventKind
 from imud.runtime.stream.transport import StreamTransport
 from imud.sim.hipnuc.uart.behaviour import VARIANTS, Behaviour
 from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from tests.support.device_rig import device_config, running
+from tests.support.pty_port import plugged
 from tests.support.simulated_modules import hardware_of
 from tests.support.wired_device import LinkedDevice, play_linked
 
@@ -19,6 +27,7 @@ NO_RATE = ModuleSettings(hi91=Output())
 ON_MARK = ModuleSettings(hi91=Output(on_mark=True))
 FAST = ModuleSettings(baud=921600, hi91=Output())
 LINKS: list[dict[str, Any]] = [{}, {"baud": "auto"}, {"baud": "auto", "driver": "auto"}]
+LIMIT_S = 30.0
 UP_AND_DOWN = (EventKind.UP, EventKind.DOWN)
 
 every_link = pytest.mark.parametrize("link", LINKS, ids=str)
@@ -231,3 +240,69 @@ def test_lines_that_the_module_contradicts_are_events_and_shown() -> None:
         assert device.messages.count(f"line sout_div: {words}") == 2
 
     play_linked(story, lines=lines)
+
+
+def test_output_that_is_declared_to_be_off_is_not_switched_on() -> None:
+    async def story(device: LinkedDevice) -> None:
+        device.module.receive(b"LOG DISABLE\r\n", device.clock.now_ns())
+        await device.wait(20)
+        assert device.samples == []
+        assert "its output is off (LOG DISABLE), though HI91 has 100 Hz" in device.problem
+
+    declared = msgspec.convert({"output_enabled": False}, SETTINGS.declarable)
+    play_linked(story, hardware=hardware_of(Behaviour(), boot_ms=0), declared=declared)
+
+
+@pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
+def test_declared_settings_reach_every_variant(behaviour: Behaviour) -> None:
+    """More output than the old rate carries, with the rate that carries it."""
+    wanted = {"mode": "9-axis", "mounting": "y_up", "sout_divisor": 3, "output": {"hi91": 500}, "baud": 921600}
+
+    async def story(device: LinkedDevice) -> None:
+        await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
+        applying = asyncio.ensure_future(device.device.settings_apply(wanted, save=True))
+        await device.until(applying.done, "the end of the plan", 90)
+        applied = applying.result()
+        assert applied.problem == ""
+        outcomes = {step.name: step.outcome for step in applied.steps}
+        assert outcomes.pop("mounting") in (StepOutcome.DONE, StepOutcome.WRITTEN)  # in force by the restart for baud
+        assert set(outcomes.values()) == {StepOutcome.DONE}
+        assert applied.steps[-1].name == "baud"
+        flash = ModuleSettings(
+            baud=921600, att_mode=1, urfr=(1, 0, 0, 0, 0, -1, 0, 1, 0), sout_div=3, hi91=Output(2)
+        )  # fmt: skip
+        assert device.module.flash == device.module.settings == flash
+        assert device.link.baud == device.module.baud == 921600
+        count = len(device.samples)
+        await device.until(lambda: len(device.samples) > count + 100)
+
+    play_linked(story, hardware=hardware_of(behaviour), baud="auto")
+
+
+@pytest.mark.parametrize(
+    "variant", ["as in the manual", "rate changes before the answer", "rate changes after the answer"]
+)
+def test_on_a_real_port(tmp_path: Path, variant: str) -> None:
+    """The line's rate follows the terminal's: what is sent at another one is garbage at the far end."""
+    hardware = hardware_of(VARIANTS[variant], boot_ms=200)
+    module = HipnucModule(time.monotonic_ns(), NO_RATE, hardware)
+
+    async def story(path: Path) -> None:
+        config = device_config("bow", "hipnuc-uart", "uart", {"port": str(path), "baud": 115200})
+        async with running(config) as (rig,):
+            await rig.until(lambda: rig.is_in(DeviceState.SILENT), "silence", LIMIT_S)
+            assert "no message has a rate" in rig.problem
+            await rig.device.act("wake", {})
+            await rig.until_samples(20, LIMIT_S)
+            answer = await rig.device.act("baud", {"baud": 460800})
+            assert isinstance(answer, dict)
+            assert (answer["baud"], module.baud, module.flash.baud) == (460800, 460800, 460800)
+            await rig.until_samples(20, LIMIT_S)
+            assert await rig.device.act("factory_reset", {}) == {"baud": 115200}
+            assert (module.baud, module.settings) == (115200, ModuleSettings())
+            await rig.until_samples(20, LIMIT_S)
+            assert rig.device.status().settings["baud"] == "115200 bit/s"
+            assert rig.device.ledger.closes()
+
+    with plugged(tmp_path / "port", module) as path:
+        asyncio.run(story(path))

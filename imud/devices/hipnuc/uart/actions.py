@@ -168,7 +168,7 @@ ACTIONS: Final[Actions] = {
     "wake": Action(
         "let frames out, and send HI91 where no message has a rate, also in place of output on mark; not saved", _wake
     ),
-    "baud": Action("set the baud rate, save, restart if it takes that, and follow", _baud, Risk.CONNECTION, saves=True),
+    "baud": Action("set the baud rate, save, restart and follow", _baud, Risk.CONNECTION, saves=True),
     "output": Action("send a message by itself at a rate, or not at all (0)", _output),
     "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
     "output_once": Action("send a message once, as a pulse on SIN would", _output_once),

@@ -154,7 +154,9 @@ def restart(present_baud: int = 0) -> RequestScript[Identity]:
 
 
 def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
-    """Set the baud rate, save, restart if it takes that, and follow; return the rate. Saves all other settings too.
+    """Set the baud rate, save, restart, and follow; return the rate. Saves all other settings too.
+
+    The restart shows that the rate was saved, and puts in force what needs one.
 
     Raises BadArgument where the line would not carry the present output, NoReply, and Rejected where the module answers
     at the old rate only; the line is then left there.
@@ -163,16 +165,13 @@ def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
     outcome = yield commands.serial_config(baud)
     answered = _is_answer(outcome, f"SERIALCONFIG {baud}")
     heard = yield from _find((present_baud, baud) if answered else (baud, present_baud))
-    if heard == present_baud != baud:
-        if not answered:
-            raise NoReply(f"SERIALCONFIG {baud}: expected OK, got nothing; the module stays at {present_baud} baud")
-        yield from send(commands.save_config())
-        yield commands.reboot()
-        _, heard = yield from _found_after_boot((baud, present_baud))
-        if heard != baud:
-            raise Rejected(f"SERIALCONFIG {baud}: the module stays at {heard} baud")
-        return heard
+    if heard == present_baud != baud and not answered:
+        raise NoReply(f"SERIALCONFIG {baud}: expected OK, got nothing; the module stays at {present_baud} baud")
     yield from send(commands.save_config())
+    yield commands.reboot()
+    _, heard = yield from _found_after_boot((baud, present_baud))
+    if heard != baud:
+        raise Rejected(f"SERIALCONFIG {baud}: the module stays at {heard} baud")
     return heard
 
 
