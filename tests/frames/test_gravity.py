@@ -1,5 +1,6 @@
 """The check of gravity at rest: silent for right conventions and in motion, a cause for each mistake."""
 
+import csv
 from collections.abc import Iterator
 from math import cos, radians, sin
 
@@ -21,6 +22,7 @@ from imud.frames.gravity import SAMPLES_MIN, WINDOW_NS, Contradiction, Finding, 
 from imud.frames.mounting import matrix_from_axes
 from imud.sample import Sample, Sync, Vector3
 from imud.units import NS_PER_S
+from tests.support.files import SHARED
 
 G = 9.80665
 TICK_NS = NS_PER_S // 10
@@ -265,3 +267,37 @@ def test_an_error_of_a_sensor_is_no_contradiction() -> None:
         tilt = radians(angle_deg)
         one = replace(zyx(0, 0), accel_m_s2=(G * sin(tilt), 0, G * cos(tilt)))
         assert (found(FLU_LEVEL, one) is not None) == is_found
+
+
+# --- a real module ----------------------------------------------------------------------------------------------------
+
+RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
+
+
+def recorded() -> Iterator[Sample]:
+    """Ten samples a second of a recording of a HiPNUC module."""
+    with RECORDING.open() as file:
+        rows = list(csv.DictReader(file))
+    for number, row in enumerate(rows[::10]):
+        accel, gyro = ([float(row[f"{name}_{axis}"]) for axis in "xyz"] for name in ("acc", "gyr"))
+        yield replace(
+            zyx(0, 0),
+            seq=number + 1,
+            t_ns=number * TICK_NS,
+            accel_m_s2=(accel[0] * 9.8, accel[1] * 9.8, accel[2] * 9.8),
+            gyro_rad_s=(radians(gyro[0]), radians(gyro[1]), radians(gyro[2])),
+            euler_rad=(radians(float(row["roll"])), radians(float(row["pitch"])), radians(float(row["yaw"]))),
+            quat_wxyz=(float(row["quat_w"]), float(row["quat_x"]), float(row["quat_y"]), float(row["quat_z"])),
+        )
+
+
+@pytest.mark.skipif(not RECORDING.exists(), reason=f"the recording {RECORDING} is not on this machine")
+def test_a_real_module_agrees_with_its_driver() -> None:
+    """It lies still, is moved by hand, and lies still again, each time for less than a window."""
+    samples = list(recorded())
+    assert judged(iter(samples)) == 0
+    for one in (samples[0], samples[-1]):
+        assert found(RFU_ENU, one) is None
+        finding = found(DeviceAxes(z_down=True), one)
+        assert finding is not None
+        assert finding.kind is Contradiction.Z_AXIS
