@@ -303,3 +303,35 @@ def test_where_the_measurement_is_reaches_the_clock() -> None:
     assert (sample.sync, sample.t_ns - at_ns) == (Sync.EDGE, -7_000)
     assert sample.t_err_ns < 10_000  # 26 µs and more with the default of bias_us
     assert (answer.sync, answer.t_ns - at_ns) == (Sync.EDGE, 9_000)
+
+
+def test_at_the_start_a_device_on_a_bus_is_reset_before_it_is_asked(bench: PolledBusBench) -> None:
+    async def body() -> None:
+        async with polled(bench, at_start=True) as it:
+            await it.rig.until(lambda: it.pulses == 1, "the pulse")
+            assert it.device.transactions == 0
+            pulsed_ns = bench.clock.now_ns()
+            await it.rig.until(lambda: it.device.transactions, "the first question", 10)
+            assert 3e9 <= bench.clock.now_ns() - pulsed_ns < 3.2e9
+            await it.rig.until_samples(5)
+            it.hang()
+            await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
+            it.boot()
+            await it.rig.until_samples(5)
+            assert it.pulses == 1
+            assert it.told == ["reset by its line at the start"]
+
+    bench.run(body())
+
+
+def test_at_the_start_a_device_on_a_uart_is_reset() -> None:
+    clock = VirtualClock()
+    uart = Uart(clock, DeviceLines(reset=ResetSettings(line="R", at_start=True)), baud=115200)
+
+    async def story(it: Uart) -> None:
+        begin_ns = clock.now_ns()
+        await it.until(lambda: len(it.rig.samples) > 10)
+        assert clock.now_ns() - begin_ns < 5e9  # without it: after a search of more than 4 s
+        assert [e.message for e in it.events if e.detail.get("line") == "reset"] == ["reset by its line at the start"]
+
+    run_virtually(clock, uart.play(story))

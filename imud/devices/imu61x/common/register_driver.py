@@ -128,6 +128,13 @@ def filter_settings(control: FilterControl) -> Mapping[str, Setting]:
     }
 
 
+def check_settings(target: Target, values: Mapping[str, Any]) -> None:
+    """Raise BadArgument for a filter that `options` fix otherwise."""
+    if isinstance(target.settings, RegisterSettings):
+        filters = {name: values.get(name) for name in ("accel_filter", "gyro_filter")}
+        _require_as_configured(target.settings, **filters)
+
+
 def _require_as_configured(settings: RegisterSettings, **wanted: FilterChoice | None) -> None:
     """Raise BadArgument for a filter that `options` fix otherwise: they would soon be written again."""
     for name, choice in wanted.items():

@@ -8,7 +8,7 @@ from msgspec import Meta
 from imud.contracts.action import Target
 from imud.contracts.device_settings import DeviceSettings, Setting
 from imud.contracts.polling import TransferScript
-from imud.devices.imu61x.common.register_driver import FilterControl, filter_settings, filter_words
+from imud.devices.imu61x.common.register_driver import FilterControl, check_settings, filter_settings, filter_words
 from imud.devices.imu61x.spi.bursts import BurstKind
 from imud.devices.imu61x.spi.session import read_control, read_state, write_control
 
@@ -24,6 +24,8 @@ def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
 
 
 SETTINGS: Final = DeviceSettings(
-    table={**filter_settings(FilterControl(read_control, write_control)), "burst": Setting(type=Burst)}, read=_read
+    table={**filter_settings(FilterControl(read_control, write_control)), "burst": Setting(type=Burst)},
+    read=_read,
+    check=check_settings,
 )
 """Lost when the device restarts; the filters that it starts with are parameter 31 of its UART."""

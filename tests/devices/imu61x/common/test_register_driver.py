@@ -133,6 +133,10 @@ def test_a_setting_that_options_fix_otherwise_is_refused_and_one_that_is_not_tak
     fixed = Target(msgspec.convert({"gyro_filter": "5 Hz"}, driver.settings), 0)
     with pytest.raises(BadArgument, match=r"options\.gyro_filter"):
         run_transfer_script(write(fixed, "10 Hz"), wires.over(driver))
+    with pytest.raises(BadArgument, match=r"gyro_filter: expected 5 Hz .*`options\.gyro_filter`.* got 10 Hz"):
+        table.check(fixed, {"gyro_filter": "10 Hz"})
+    table.check(fixed, {"gyro_filter": 3, "accel_filter": "10 Hz"})
+    table.check(Target(driver.settings(), 0), {"gyro_filter": "10 Hz"})
     wires.device.faults.ignores_writes = True
     with pytest.raises(DeviceRefused, match="FILTER_CTRL: wrote 0xb4, read back 0xbb"):
         run_transfer_script(write(Target(driver.settings(), 0), "10 Hz"), wires.over(driver))
