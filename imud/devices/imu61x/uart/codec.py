@@ -8,6 +8,7 @@ comes before roll. The quaternion is computed from the angles, whose convention 
 The timer counts µs and wraps after 71.6 minutes.
 """
 
+import re
 import struct
 from collections.abc import Sequence
 from math import cos, isfinite, sin
@@ -40,6 +41,9 @@ TIMER_MODULUS: Final = 2**32
 
 _HEAD: Final = HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS.size)
 _ONLY: Final = struct.Struct(f"<{HEADER.size}xI10fI")  # a whole frame: values and CRC
+_RUN: Final = re.compile(rb"(?s:%b.{%d})+" % (re.escape(_HEAD), AHRS_FRAME_BYTES - HEADER.size))
+"""AHRS frames back to back by their headers."""
+_RUN_PARTS: Final = struct.Struct(f"<{AHRS_FRAME_BYTES - CRC_BYTES}sI")  # what the CRC is over, and the CRC
 
 
 class Imu61xCodec:
@@ -60,11 +64,15 @@ class Imu61xCodec:
             only = self._decode_only(data)
             if only is not None:
                 return (only,)
-        return self._events(self._finder.feed(data))
+        events: list[CodecEvent] = []
+        self._add_found(self._finder.feed_rest(data, lambda data: self._decode_run(data, events)), events)
+        return events
 
     def flush(self) -> Sequence[CodecEvent]:
         """Return whole frames that wait inside a longer frame that never came. Called when the line is idle."""
-        return self._events(self._finder.flush())
+        events: list[CodecEvent] = []
+        self._add_found(self._finder.flush(), events)
+        return events
 
     def reset(self) -> None:
         """Skip what is pending: the stream broke."""
@@ -82,14 +90,31 @@ class Imu61xCodec:
         ledger.frames_in_samples += 1
         return _finite_measurement(values, AHRS_FRAME_BYTES, 0)
 
-    def _events(self, found: Sequence[Frame | BadFrame]) -> list[CodecEvent]:
-        events: list[CodecEvent] = []
+    def _decode_run(self, data: bytes, events: list[CodecEvent]) -> int:
+        """Decode AHRS frames back to back at the begin, up to one that is damaged or not finite; return their size."""
+        run = _RUN.match(data)
+        if run is None:
+            return 0
+        size, left, check, unpack = AHRS_FRAME_BYTES, len(data), crc32, AHRS.unpack_from
+        for body, crc in _RUN_PARTS.iter_unpack(run[0]):
+            values = unpack(body, HEADER.size)
+            if check(body) != crc or not isfinite(sum(values)):
+                break
+            left -= size
+            events.append(_finite_measurement(values, size, left))
+        count = len(events)
+        ledger = self.ledger
+        ledger.bytes_in_good_frames += count * size
+        ledger.frames_good += count
+        ledger.frames_in_samples += count
+        return count * size
+
+    def _add_found(self, found: Sequence[Frame | BadFrame], events: list[CodecEvent]) -> None:
         for frame in found:
             if isinstance(frame, BadFrame):
                 events.append(frame)
             else:
                 self._add_frame(frame, events)
-        return events
 
     def _add_frame(self, frame: Frame, events: list[CodecEvent]) -> None:
         """Count a frame whose CRC matches, and add the event that it is."""

@@ -14,7 +14,7 @@ everything waits, at most FRAME_BYTES_MAX; `flush` ends the wait when the line w
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import msgspec
@@ -79,6 +79,16 @@ class FrameFinder:
         self._ledger.bytes_in += len(data)
         return self._scan(self._tail + data if self._tail else data, 0)
 
+    def feed_rest(self, data: bytes, take_run: Callable[[bytes], int]) -> Sequence[Frame | BadFrame]:
+        """Add bytes as `feed`, of which `take_run` takes whole frames first; it returns how many bytes those have.
+
+        It is given what waited together with `data`, unless that may belong to a damaged frame.
+        """
+        self._ledger.bytes_in += len(data)
+        if self._tail:
+            data = self._tail + data
+        return self._scan(data, 0, 0 if self._bad_ahead else take_run(data))
+
     def flush(self) -> Sequence[Frame | BadFrame]:
         """Drop an incomplete frame if a whole one waits inside it; no-op otherwise. Called when the line is idle."""
         found: list[Frame | BadFrame] = []
@@ -93,10 +103,10 @@ class FrameFinder:
         self._bad_ahead = 0
         self._ledger.bytes_pending = 0
 
-    def _scan(self, data: bytes, drop_before: int) -> list[Frame | BadFrame]:
-        """Find all that is complete in `data`; incomplete frames that begin before `drop_before` are bad."""
+    def _scan(self, data: bytes, drop_before: int, at: int = 0) -> list[Frame | BadFrame]:
+        """Find all that is complete in `data` from `at`; incomplete frames that begin before `drop_before` are bad."""
         found: list[Frame | BadFrame] = []
-        sync, at, total = self._sync, 0, len(data)
+        sync, total = self._sync, len(data)
         while at < total:
             begin = data.find(sync, at)
             if begin < 0:

@@ -87,9 +87,11 @@ def test_the_quaternion_turns_in_the_order_zyx() -> None:
     assert sum(q * q for q in quat) == pytest.approx(1)
 
 
-def test_the_general_way_gives_the_same_as_the_fast_one() -> None:
+@pytest.mark.parametrize("before", [b"", b"?"])
+def test_a_run_and_the_general_way_give_the_same_as_a_frame_in_a_read(before: bytes) -> None:
+    """A run is at the begin of a read; behind another byte each frame goes the general way."""
     slow = codec()
-    first, second = slow.feed(GOLDEN + GOLDEN)
+    first, second = slow.feed(before + GOLDEN + GOLDEN)
     fast = only(codec().feed(GOLDEN))
     assert second == fast
     assert isinstance(first, Measurement)
@@ -97,6 +99,36 @@ def test_the_general_way_gives_the_same_as_the_fast_one() -> None:
     ledger = slow.ledger
     assert (ledger.frames_good, ledger.frames_in_samples, ledger.bytes_in_good_frames) == (2, 2, 108)
     assert ledger.closes()
+
+
+def test_a_run_ends_before_a_frame_that_is_damaged_or_not_finite() -> None:
+    damaged = bytearray(GOLDEN)
+    damaged[20] ^= 1
+    hot = with_crc(AHRS_HEX.replace("00001242", "0000C07F"))  # NaN °C
+    for bad in (bytes(damaged), hot):
+        stream = GOLDEN * 3 + bad + GOLDEN * 2
+        run, one_by_one = codec(), codec()
+        events = list(run.feed(stream))
+        apart = [event for part in (GOLDEN, GOLDEN, GOLDEN, bad, GOLDEN, GOLDEN) for event in one_by_one.feed(part)]
+        trailing = [event.trailing_bytes for event in events if isinstance(event, Measurement)]
+        assert trailing == [left for left in range(270, -1, -54) if bad is hot or left != 108]
+        for event, same in zip(events, apart, strict=True):
+            if isinstance(event, Measurement):
+                assert isinstance(same, Measurement)
+                assert event.dev_ticks == same.dev_ticks
+                assert event.accel_m_s2 == same.accel_m_s2
+            else:
+                assert event == same
+        assert run.ledger.snapshot() == one_by_one.ledger.snapshot()
+        assert run.ledger.closes()
+
+
+def test_a_run_begins_with_what_waited_of_the_read_before() -> None:
+    split = codec()
+    events = [*split.feed(GOLDEN[:20]), *split.feed(GOLDEN[20:] + GOLDEN + GOLDEN[:9]), *split.feed(GOLDEN[9:])]
+    assert [event.trailing_bytes for event in events if isinstance(event, Measurement)] == [63, 9, 0]
+    assert len(events) == 3
+    assert split.ledger.closes()
 
 
 def test_encode_is_the_golden_frame() -> None:
