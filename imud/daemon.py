@@ -20,7 +20,7 @@ from imud import __version__
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.contracts.lines import LineFactory
-from imud.contracts.publisher import Batch, Publisher, PublisherContext, PublisherSettings
+from imud.contracts.publisher import Batch, DeviceLedger, Publisher, PublisherContext, PublisherSettings
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
@@ -78,7 +78,7 @@ class Daemon:
         )  # fmt: skip
         self._devices: dict[str, Device] = {}
         self._context = PublisherContext(
-            self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns
+            self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns, self.ledgers
         )
         self._extra = dict(extra or {})
         self._until_finished = until_finished
@@ -86,6 +86,7 @@ class Daemon:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
+        self._timer: asyncio.TimerHandle | None = None
         self._failure: BaseException | None = None
         self._manager = ServiceManager()
         self._put_off: dict[str, _PutOff] = {}
@@ -204,6 +205,10 @@ class Daemon:
         """Return the state of every device."""
         return [device.status() for device in self._devices.values()]
 
+    def ledgers(self) -> list[DeviceLedger]:
+        """Return the ledger of every device."""
+        return [(name, device.driver_name, device.ledger.snapshot()) for name, device in self._devices.items()]
+
     def _start_configured(self, name: str) -> None:
         settings = self.config.publishers[name]
         if cast(PublisherSettings, settings).enabled:
@@ -286,19 +291,25 @@ class Daemon:
     # --- time -------------------------------------------------------------------------------------------------------
 
     async def _tick_until_stopped(self) -> None:
-        while not self._stop.is_set():
-            now_ns = self._now_ns()
-            for device in self._devices.values():
-                device.tick(now_ns)
-            for publisher in self._publishers.values():
-                publisher.tick(now_ns)
-            self._manager.tick(now_ns, {name: device.state for name, device in self._devices.items()})
-            for name in [name for name, one in self._put_off.items() if now_ns >= one.due_ns]:
-                self._start_or_put_off(name)
-            try:
-                await asyncio.wait_for(self._stop.wait(), TICK_S)
-            except TimeoutError:
-                continue
+        """Tick at once, and by a timer from then on: a wait with a time limit turns the loop four more times."""
+        self._tick()
+        try:
+            await self._stop.wait()
+        finally:
+            if self._timer is not None:
+                self._timer.cancel()
+
+    def _tick(self) -> None:
+        """Call the ticks of all parts. An error here ends the process (`_on_loop_error`)."""
+        now_ns = self._now_ns()
+        for device in self._devices.values():
+            device.tick(now_ns)
+        for publisher in self._publishers.values():
+            publisher.tick(now_ns)
+        self._manager.tick(now_ns, {name: device.state for name, device in self._devices.items()})
+        for name in [name for name, one in self._put_off.items() if now_ns >= one.due_ns]:
+            self._start_or_put_off(name)
+        self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
     async def _close(self) -> None:
         if self._reloader is not None:

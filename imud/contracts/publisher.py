@@ -22,6 +22,10 @@ StatusSource = Callable[[], Sequence[DeviceStatus]]
 """The state of every device now. To be called in the event loop's thread only."""
 
 
+DeviceLedger = tuple[str, str, Mapping[str, int]]
+"""Name of a device, its driver as in `DeviceStatus.driver`, its ledger now."""
+
+
 class Batch:
     """Samples completed by one read of one device, oldest first, at least one; shared by all publishers, immutable."""
 
@@ -145,11 +149,19 @@ class PublisherContext:
     """A device by its name, to command it."""
     cpu_ns: Callable[[], int] = lambda: 0
     """CPU time of the event loop's thread."""
+    ledger_source: Callable[[], Sequence[DeviceLedger]] | None = None
+    """`ledgers` without the rest of the state, which costs five times as much; None: from `status`."""
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
 
     rings: dict[str, str] = field(default_factory=dict)
     """Path of the shared memory of each device that has some; kept by the publisher that makes it."""
+
+    def ledgers(self) -> Sequence[DeviceLedger]:
+        """The ledger of every device now. To be called in the event loop's thread only."""
+        if self.ledger_source is not None:
+            return self.ledger_source()
+        return [(status.name, status.driver, status.ledger) for status in self.status()]
 
     def clients(self) -> list[ClientStatus]:
         """The clients of all publishers now. To be called in the event loop's thread only."""

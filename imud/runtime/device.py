@@ -114,6 +114,12 @@ class Device:
         return self._health.state
 
     @property
+    def driver_name(self) -> str:
+        """Name of the driver in use; while none is known, what the configuration has."""
+        driver = self._transport.driver
+        return driver.name if driver else self.config.driver
+
+    @property
     def link(self) -> Link:
         """Link of the device."""
         return self._transport.link
@@ -380,7 +386,7 @@ class Device:
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,
-            driver=driver.name if driver else self.config.driver,
+            driver=self.driver_name,
             euler_convention=frame.euler_convention if frame else "",
             navigation_frame=frame.navigation_frame if frame else "",
             frame=frame,

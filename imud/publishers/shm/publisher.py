@@ -144,10 +144,10 @@ class ShmPublisher:
             self._directory = None
 
     def _show(self, now_ns: int) -> None:
-        for status in self._context.status():
-            ring = self._rings.get(status.name)
+        for name, driver, ledger in self._context.ledgers():
+            ring = self._rings.get(name)
             if ring is not None:
-                ring.set_ledger(status.driver, status.ledger)
+                ring.set_ledger(driver, ledger)
         for ring in self._rings.values():
             ring.beat(now_ns)
 

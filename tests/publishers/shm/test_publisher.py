@@ -18,6 +18,7 @@ import pytest
 
 from imud.client.ring import Ring
 from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.status import DeviceStatus
 from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.formats.ring import (
@@ -220,6 +221,24 @@ def test_ledger_is_written_only_when_it_changed(board: Board) -> None:
         board.tick()
         updates.append(board.word("ledger_update"))
     assert updates == [1, 1, 2, 2, 3]
+
+
+def test_a_tick_asks_for_ledgers_and_not_for_the_state_where_they_have_a_source(tmp_path: Path) -> None:
+    def whole_state() -> list[DeviceStatus]:
+        raise AssertionError("the state of every device was made for its ledger")
+
+    counts = dict.fromkeys(LEDGER_FIELDS, 7)
+    context = PublisherContext(
+        whole_state, 1, lambda: START_NS, ledger_source=lambda: [(DEVICE, "imu61x-uart", counts)]
+    )
+    publisher = ShmPublisher(ShmSettings(directory=str(tmp_path), slots=SLOTS), context)
+    publisher.add_device(DEVICE, 3)
+    publisher.tick(START_NS)
+    raw = (tmp_path / f"imud.{DEVICE}").read_bytes()[LEDGER_BLOCK_OFFSET:][:LEDGER_BLOCK_BYTES]
+    block = decode_ledger_block(raw, len(LEDGER_FIELDS))
+    assert block is not None
+    assert (block.driver, block.ledger) == ("imu61x-uart", counts)
+    publisher.close()
 
 
 def test_close_tells_readers_and_removes_the_file(board: Board) -> None:
