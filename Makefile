@@ -15,7 +15,7 @@ ARGS ?=
 LAB_OPTIONS ?= --steady
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench bench-instructions bench-deps attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit
+.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit
 
 all: check
 
@@ -43,6 +43,10 @@ bench: $(VENV)/made
 
 bench-instructions: $(VENV)/made
 	$(BIN)/python -m tests.bench.instructions $(ARGS)
+
+# BASE=COMMIT ARGS="clock socket": both checkouts in turns
+bench-compare: $(VENV)/made
+	$(BIN)/python -m tests.bench.compare --base $(BASE) $(ARGS)
 
 # valgrind, which counts instructions
 bench-deps:
