@@ -333,8 +333,10 @@ class Unclosable:
         raise KeyError("not closed")
 
 
-def test_a_file_is_written_and_what_python_reports_too(tmp_path: Path) -> None:
-    hooks = sys.unraisablehook, threading.excepthook
+def test_a_file_is_written_and_what_python_reports_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hooks = print, repr
+    monkeypatch.setattr(sys, "unraisablehook", hooks[0])
+    monkeypatch.setattr(threading, "excepthook", hooks[1])
     with (tmp_path / "log").open("wb") as file, log_to(file.fileno(), "info"):
         thread = threading.Thread(target=lambda: {}["missing"], name="worker")  # type: ignore[index]
         thread.start()
