@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.lab.host import __main__ as program
-from tests.lab.host import environment, kernel, packages
+from tests.lab.host import environment, guest, kernel, packages
+from tests.lab.host.errors import HungGuest
 from tests.lab.host.qemu import QEMU
 from tests.lab_host.conftest import FakeProgram
 
@@ -98,6 +99,30 @@ def test_panic_keeps_the_console(
         "lab: kernel panic in the guest: Kernel panic - not syncing: oh",
     ]
     assert os.listdir(tmp_path / "out") == ["console.log"]
+
+
+@pytest.mark.parametrize(("hangs", "status"), [(1, 5), (2, None)])
+def test_a_guest_that_hangs_is_booted_once_more(
+    fake_program: FakeProgram,
+    fake_lab: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    hangs: int,
+    status: int | None,
+) -> None:
+    monkeypatch.setattr(guest.Limits, "silence_s", 0.2)
+    boots = tmp_path / "boots"
+    hang = f"if [ $(wc -l <{boots}) -le {hangs} ]; then : >$share/alive; exec sleep 60; fi"
+    fake_program(QEMU, f"{FIND_SHARE}\necho >>{boots}\n{hang}\necho 5 >$share/status")
+    if status is None:
+        with pytest.raises(HungGuest, match="no sign of life"):
+            program.lab(fake_lab)
+    else:
+        assert program.lab(fake_lab) == status
+    assert boots.read_text() == "\n\n"
+    said = capsys.readouterr().err.splitlines()
+    assert sum(line.startswith("lab: hung guest") and line.endswith("; booting once more") for line in said) == 1
 
 
 def test_lab_is_not_collected_outside_the_guest() -> None:

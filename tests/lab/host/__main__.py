@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from tests.lab.host import environment, guest, kernel, packages, results
-from tests.lab.host.errors import LabError
+from tests.lab.host.errors import HungGuest, LabError
 from tests.lab.host.qemu import QEMU, Machine
 
 LAB_FAILED = 10
@@ -117,7 +117,11 @@ def lab(arguments: list[str]) -> int:
     if options.build_only:
         return 0
     environment.precompile(python)
-    return boot(options, python, built)
+    try:
+        return boot(options, python, built)
+    except HungGuest as error:
+        say(f"{error}; booting once more")
+        return boot(options, python, built)
 
 
 def terminate(number: int, _frame: object) -> NoReturn:

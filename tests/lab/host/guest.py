@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.lab.host.diagnosis import cause, last_line, out_of_memory
-from tests.lab.host.errors import LabError
+from tests.lab.host.errors import HungGuest, LabError
 
 TICK_S = 0.5
 GOODBYE_S = 5.0  # from the status to the end of QEMU; it is about 0.1 s
@@ -119,7 +119,7 @@ def _check_limits(folder: Folder, limits: Limits, elapsed_s: float) -> None:
     if silence_s is None and elapsed_s > limits.boot_s:
         raise LabError(f"hung guest: not booted after {limits.boot_s:.0f} s{_hint(folder)}")
     if silence_s is not None and silence_s > limits.silence_s:
-        raise LabError(f"hung guest: no sign of life for {silence_s:.0f} s{_hint(folder)}")
+        raise HungGuest(f"hung guest: no sign of life for {silence_s:.0f} s{_hint(folder)}")
 
 
 def _hint(folder: Folder) -> str:
