@@ -170,7 +170,7 @@ def test_an_alarm_is_an_event_and_shown_in_the_samples(monkeypatch: pytest.Monke
         assert any(message.startswith("no alarm any more") for message in messages)
         assert not any("line alarm" in message for message in messages)
         status = wired.device.status()
-        assert status.settings["ALARM_Y"] == "-5,5,0,1"
+        assert status.settings["alarm.y"] == "-5° … 5°, on"
         assert status.lines is not None
         assert status.lines.alarms > 2
         assert status.lines.problems == {}
