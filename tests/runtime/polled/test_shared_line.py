@@ -237,3 +237,26 @@ def test_a_module_is_followed_to_another_address_and_back(tmp_path: Path, varian
                 assert beside.kinds.count(EventKind.DOWN) == 0
 
     run(body())
+
+
+@pytest.mark.parametrize("variant", SLAVE_VARIANTS)
+def test_modules_of_every_kind_are_made_as_declared(tmp_path: Path, variant: str) -> None:
+    async def body() -> None:
+        module, other = slave(1, variant=SLAVE_VARIANTS[variant]), slave(2)
+        with wired(tmp_path, module, other) as (path, _):
+            async with running(on(path, 1), on(path, 2)) as (rig, beside):
+                await rig.until_samples(5)
+                taken = await rig.device.settings_apply({"address": 2}, save=True)
+                assert "address 2 is taken" in taken.problem
+                applied = await rig.device.settings_apply(
+                    {"mode": "9-axis", "mounting": "x_up", "address": 9}, save=True
+                )
+                assert applied.problem == "", applied
+                assert {step.name: str(step.outcome) for step in applied.steps}["mounting"] == "written, not verified"
+                await rig.until_samples(5)
+                assert rig.device.status().link == f"{path}, address 9"
+                assert (module.flash.heading_mode, module.flash.slave, module.address) == (1, 9, 9)
+                assert (module.writes_to_flash, other.writes_to_flash) == (1, 0)
+                assert beside.kinds.count(EventKind.DOWN) == 0
+
+    run(body())
