@@ -165,8 +165,9 @@ def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface)
             hear(end)
 
     with closing(port), node(vcan.name, 0x55) as end:
-        run_until(end, lambda: len(heard) >= 12)
-        assert [pgn for pgn, _, _ in heard[:8]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41] * 2
+        run_until(end, lambda: len(heard) >= 13)
+        assert heard[0][0] == session.CLAIMED  # the kernel passes it on, and knows the address by it
+        assert [pgn for pgn, _, _ in heard[1:9]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41] * 2
         assert {source for _, source, _ in heard} == {8}
         say(end, vcan.name, session.CONFIGURE, bytes.fromhex("3701060032000000"), 8)
         run_until(end, lambda: heard[-1][0] == session.CONFIGURE)
@@ -189,10 +190,12 @@ def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterf
     def step() -> None:
         port.step(monotonic_ns(), True)
 
+    results: dict[str, object] = {}
+
     async def told(name: str, **arguments: object) -> None:
         task = asyncio.create_task(rig.runner.act(name, arguments))
         await rig.until(task.done, name, step)
-        assert task.result() is None
+        results[name] = task.result()
 
     async def story() -> None:
         await rig.until(lambda: len(rig.samples) >= 20, "twenty samples", step)
@@ -206,6 +209,14 @@ def test_driver_and_simulator_with_every_message_and_all_actions(vcan: CanInterf
             await told("interval", pgn=pgn, interval_ms=50)
         await told("save")
         await told("restart")
+        assert results == {
+            "direction": "written and read back",
+            "zero": None,
+            "bitrate": "written and read back, in force after save and restart",
+            "interval": "written and read back",
+            "save": None,
+            "restart": "restarted, at address 8",
+        }
         assert module.flash.x_reversed == 1
         assert module.settings == module.flash
         count = len(rig.samples)

@@ -1,0 +1,136 @@
+"""Settings of modules on CAN made as they are declared, by a device of the daemon on the kernel's virtual bus.
+
+Over every kind of module that the simulators have: each setting is written, read back, saved, the module restarted and
+followed to its new number.
+"""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Mapping
+from contextlib import closing
+from time import monotonic, monotonic_ns
+from typing import Any
+
+import pytest
+
+from imud.config import DeviceConfig
+from imud.contracts.settings import Settings
+from imud.contracts.status import DeviceState
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.event import Event
+from imud.host_clock import HostClock
+from imud.links.can.link import SocketCanSettings
+from imud.runtime.device import Device
+from imud.runtime.device_factory import DeviceFactory
+from imud.sample import Sample
+from imud.sim.can_module import CanModule, CanModules
+from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
+from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
+from imud.sim.ports.can_port import CanPort
+from tests.lab.can_interface import CanInterface
+
+LIMIT_S = 60.0
+
+
+class BusRig:
+    """Modules on an interface, and a device of the daemon that is the first of them."""
+
+    def __init__(self, interface: str, driver: str, options: Settings, *modules: CanModule) -> None:
+        self.port = CanPort(CanModules(modules), interface)
+        self.samples: list[Sample] = []
+        self.events: list[Event] = []
+        config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanSettings(interface=interface))
+        self.factory = DeviceFactory(lambda batch: self.samples.extend(batch.samples), self.events.append, HostClock())
+        self.device: Device = self.factory.make(config, 1)
+
+    async def until(self, condition: Callable[[], object], what: str) -> None:
+        end = monotonic() + LIMIT_S
+        while not condition():
+            assert monotonic() < end, f"not within {LIMIT_S} s: {what}; {self.device.status()}"
+            self.device.tick(monotonic_ns())
+            self.port.step(monotonic_ns(), True)
+            await asyncio.sleep(0.002)
+
+    async def done(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """What comes of something that the device does, while the modules go on."""
+        task = asyncio.create_task(work)
+        await self.until(task.done, "its end")
+        return task.result()
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the device while the story is told."""
+
+        async def both() -> None:
+            task = asyncio.create_task(self.device.run())
+            try:
+                await self.until(lambda: self.device.state is DeviceState.RUNNING, "samples")
+                await story()
+            finally:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+                self.device.close()
+                self.factory.close()
+
+        with closing(self.port):
+            asyncio.run(both())
+        assert self.device.ledger.closes(), self.device.ledger.snapshot()
+
+
+async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) -> None:
+    """Apply settings with saving, and judge what is said of each."""
+    applied = await rig.done(rig.device.settings_apply(wanted, save=True))
+    assert applied.problem == "", applied
+    assert {step.name for step in applied.steps} == set(wanted)
+    outcomes = {str(step.outcome) for step in applied.steps}
+    assert ("not verified" in " ".join(outcomes)) is not verified, applied
+    assert applied.saved
+    count = len(rig.samples)
+    await rig.until(lambda: len(rig.samples) > count + 5, "samples afterwards")
+    messages = " ".join(event.message for event in rig.events)
+    assert "in the configuration" in messages  # which number to change there
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("variant", NODE_VARIANTS)
+def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
+    now_ns, kind = monotonic_ns(), NODE_VARIANTS[variant]
+    slow = NodeSettings(bit_rate=0, periods_ms={1: 100, 2: 100, 3: 100, 4: 100, 6: 0, 7: 0})
+    rare = NodeSettings(node=12, bit_rate=0, periods_ms={1: 500, 2: 0, 3: 0, 4: 0, 6: 0, 7: 0})
+    module = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=slow, boot_ms=200, variant=kind))
+    beside = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=rare, boot_ms=0))
+    rig = BusRig(vcan.name, "hipnuc-canopen", HipnucCanopenSettings(), module, beside)
+
+    async def story() -> None:
+        taken = await rig.done(rig.device.settings_apply({"node": 12}, save=True))
+        assert "node 12 is taken" in taken.problem
+        assert module.objects.writes_to_flash == 0
+        wanted = {"tpdo2_interval_ms": 200, "incli_x_reversed": True, "node": 9}
+        await made_so(rig, wanted, verified=kind.reads == "answered")
+
+    rig.play(story)
+    saved = module.objects.saved
+    assert (saved.periods_ms[2], saved.invert_x, saved.node, module.node) == (200, 1, 9, 9)
+    assert module.objects.writes_to_flash == 1
+    assert beside.objects.settings == rare
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("variant", J1939_VARIANTS)
+def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
+    now_ns, kind = monotonic_ns(), J1939_VARIANTS[variant]
+    module = HipnucJ1939Module(now_ns, J1939Settings(), J1939Hardware(bitrate=0, boot_ms=200, variant=kind))
+    beside = HipnucJ1939Module(now_ns, J1939Settings(address=12), J1939Hardware(bitrate=0, boot_ms=0))
+    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Settings(), module, beside)
+
+    async def story() -> None:
+        taken = await rig.done(rig.device.settings_apply({"address": 12}, save=True))
+        assert "address 12 is taken" in taken.problem
+        assert module.writes_to_flash == 0
+        wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
+        await made_so(rig, wanted, verified=kind.reads != "ignored")
+
+    rig.play(story)
+    saved = module.flash
+    assert (saved.intervals_ms[0xFF37], saved.y_reversed, saved.address) == (50, 1, 9)
+    assert module.writes_to_flash == 1
+    assert beside.settings == J1939Settings(address=12)
