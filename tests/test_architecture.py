@@ -295,6 +295,7 @@ CROSS_CUTTING = {
     "publishers/socket/test_documentation.py": "docs/protocol.md",
     "runtime/detection/test_stream_families.py": "every driver in one search",
     "runtime/polled/test_in_daemon.py": "a bus thread in the daemon",
+    "runtime/can/test_moving.py": "modules on a CAN bus made as declared, followed to other numbers",
     "runtime/polled/test_shared_line.py": "modules on one RS-485 line, from the port to samples",
     "runtime/stream/test_imu61x_variants.py": "every variant of an IMU61x, from the line to actions and settings",
     "runtime/stream/test_wake.py": "a device that is silent, from the line to its state",
