@@ -134,7 +134,7 @@ def test_check_of_what_is_no_file(special: str, tmp_path: Path) -> None:
 def test_an_error_that_nobody_reads_does_not_keep_the_command(tmp_path: Path) -> None:
     with pipe(full=True) as (_, writer):
         begin = monotonic()
-        assert imud("run", "--config", tmp_path / "none", stderr=writer).returncode == 2
+        assert imud("run", "--config", tmp_path / "none", stderr=writer).returncode == 78
         assert monotonic() - begin < 10
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from imud.config import DeviceConfig
+from imud.contracts.device_settings import Written
 from imud.contracts.settings import Settings
 from imud.contracts.status import DeviceState
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
@@ -77,9 +78,9 @@ def test_the_command_reaches_the_node(driver: str, options: Settings | None, mon
     bench = CanopenDeviceBench(driver, options)
 
     async def story() -> None:
-        assert await bench.act("interval", tpdo=1, interval_ms=20) is None
+        assert await bench.act("interval", tpdo=1, interval_ms=20) is Written.VERIFIED
         assert bench.module.objects.settings.periods_ms[1] == 20
-        assert await bench.act("direction", x_reversed=True, y_reversed=False) is None
+        assert await bench.act("direction", x_reversed=True, y_reversed=False) is Written.VERIFIED
         assert bench.module.objects.settings.invert_x == 1
 
     play(bench, story())

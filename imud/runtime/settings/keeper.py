@@ -34,7 +34,7 @@ from imud.contracts.device_settings import (
 from imud.contracts.driver import Driver
 from imud.contracts.polling import PolledDriver
 from imud.contracts.settings import shown
-from imud.errors import BadArgument, CommandError
+from imud.errors import BadArgument, CommandError, reason_of
 from imud.event import EventKind
 from imud.host_clock import HostClock
 from imud.runtime.identity import KnownIdentity, identity_words
@@ -280,8 +280,11 @@ class SettingsKeeper:
             text = backup_text(device, self._driver_name, words, values, utc_ns)
             writing = asyncio.to_thread(self._files.backups.write, device, text, utc_ns)
             file = await asyncio.wait_for(writing, BACKUP_LIMIT_S)
-        except (*DEVICE_ERRORS, OSError, TimeoutError) as error:
-            self._raise(f"no backup of the settings before {action}: {str(error) or 'the disk does not answer'}")
+        except TimeoutError:
+            self._raise(f"no backup of the settings before {action}: the disk does not answer")
+            return
+        except (*DEVICE_ERRORS, OSError) as error:
+            self._raise(f"no backup of the settings before {action}: {reason_of(error)}")
             return
         if file is not None:
             self._raise(f"settings before {action} are in {file}", file=str(file))
