@@ -121,6 +121,7 @@ def test_module_is_told_something_while_it_is_read(tmp_path: Path) -> None:
             async with running(on(path, 1), on(path, 2)) as rigs:
                 for rig in rigs:
                     await rig.until_samples(5)
+                assert rigs[0].device.status().status_words == ("time not UTC",)  # 0x0800 of the simulated module
                 await rigs[0].device.act("attitude_mode", {"axes": 9})
                 assert rigs[0].device.status().settings["heading_mode"] == "nine axes"  # read again by itself
                 assert await rigs[0].device.act("read", {"register": "HEADING_MODE"}) == (1,)

@@ -6,6 +6,7 @@ from typing import Final
 from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.polling import PolledDriver
 from imud.devices.hipnuc.common.heading import heading_by_mode
+from imud.devices.hipnuc.common.main_status import MAIN_STATUS
 from imud.devices.hipnuc.modbus.actions import ACTIONS
 from imud.devices.hipnuc.modbus.calibrations import CALIBRATIONS
 from imud.devices.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusSettings, pack_block, update_ns
@@ -48,6 +49,7 @@ DRIVER: Final = PolledDriver(
     make_codec=HipnucModbusCodec,
     update_ns=update_ns,
     example_reading=_example_reading,
+    status_bits=MAIN_STATUS,
     actions=ACTIONS,
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,
