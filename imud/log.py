@@ -11,6 +11,7 @@ them; the log says how many as soon as it flows again.
 import logging
 import os
 import queue
+import re
 import reprlib
 import select
 import sys
@@ -41,6 +42,9 @@ PAUSE_FIRST_S: Final = 1.0
 PAUSE_MOST_S: Final = 60.0
 KNOWN_MOST: Final = 512
 """Different messages that are remembered: some for each of 256 devices."""
+SAME_AS: Final = "same_as"
+"""Attribute of a record, by `extra`."""
+NUMBERS: Final = re.compile(r"\d+")
 LEVELS_SHOWN: Final = 4
 ITEMS_SHOWN: Final = 10
 
@@ -114,9 +118,9 @@ def _priority(level: int) -> int:
 class RepeatFilter(logging.Filter):
     """Lets trouble that repeats itself through less and less often, with the number of messages left out.
 
-    Messages are the same when their text before its values, and the first value (the device), are. After the first one
-    there is a pause of PAUSE_FIRST_S, which doubles with every message up to PAUSE_MOST_S; when there was none for that
-    long, it begins anew. Messages below WARNING all pass.
+    Messages are the same when their text before its values, the first value (the device), and what `same_as` gave them
+    are. After the first one there is a pause of PAUSE_FIRST_S, which doubles with every message up to PAUSE_MOST_S;
+    when there was none for that long, it begins anew. Messages below WARNING all pass.
     """
 
     def __init__(self) -> None:
@@ -147,6 +151,14 @@ class RepeatFilter(logging.Filter):
         return True
 
 
+def same_as(text: str) -> dict[str, str]:
+    """Return the `extra` of a message whose text is itself a value: it is the same as those of this text.
+
+    Numbers do not count: "3 samples lost" is the same as "5 samples lost", and not the same as "the adapter is gone".
+    """
+    return {SAME_AS: NUMBERS.sub("", text)}
+
+
 @dataclass(slots=True)
 class _Repeated:
     """A message that may come again; times in s."""
@@ -160,7 +172,7 @@ class _Repeated:
 
 def _key_of(record: logging.LogRecord) -> tuple[object, ...]:
     first = record.args[0] if isinstance(record.args, tuple) and record.args else None
-    return record.name, record.levelno, record.msg, first if isinstance(first, str) else None
+    return record.name, record.levelno, record.msg, first if isinstance(first, str) else None, vars(record).get(SAME_AS)
 
 
 def _message(record: logging.LogRecord) -> str:

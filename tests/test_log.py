@@ -26,6 +26,7 @@ from imud.log import (
     log_to,
     messages_dropped,
     printable,
+    same_as,
     shown,
 )
 from tests.support.daemon_process import wait_until
@@ -112,6 +113,21 @@ def test_other_trouble_is_told_at_once() -> None:
         assert passed(repeats, 0, "%s: up", "bow", level=logging.INFO)
     assert passed(repeats, -100, "%s: %d lost", "bow", 1)  # the clock was set back
     assert passed(repeats, 0, "nothing %s", 5)
+
+
+def test_texts_that_are_values_are_told_apart_and_numbers_in_them_are_not() -> None:
+    repeats = RepeatFilter()
+
+    def told(text: str) -> bool:
+        record = logging.makeLogRecord(
+            {"msg": "%s: %s", "args": ("bow", text), "levelno": logging.WARNING, "created": 0.0}
+        )
+        vars(record).update(same_as(text))
+        return repeats.filter(record)
+
+    assert told("3 samples lost")
+    assert not told("5 samples lost")
+    assert told("the adapter is gone")
 
 
 def test_what_is_remembered_is_bounded() -> None:

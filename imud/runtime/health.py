@@ -8,7 +8,7 @@ import logging
 
 from imud.contracts.status import DeviceState
 from imud.event import EventKind
-from imud.log import MESSAGE_CHARACTERS_MAX, printable
+from imud.log import MESSAGE_CHARACTERS_MAX, printable, same_as
 from imud.runtime.notices import Notices
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class Health:
         if was_up:
             self._notices.raise_event(now_ns, EventKind.DOWN, problem, state=str(state))
         elif changed:
-            log.warning("%s: %s", self._notices.device, problem)
+            log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
 
     def missing(self, now_ns: int, reason: str) -> None:
         """Enter MISSING for `reason`, empty for a link that is there; how a link went stays shown until it is back."""
@@ -76,7 +76,7 @@ class Health:
         """Show what is wrong while the state stays; trouble of the link takes precedence."""
         problem = self.link_problem or printable(problem, MESSAGE_CHARACTERS_MAX)
         if problem != self.problem:
-            log.warning("%s: %s", self._notices.device, problem)
+            log.warning("%s: %s", self._notices.device, problem, extra=same_as(problem))
         self.problem = problem
 
     def on_link_news(self, now_ns: int, news: str, problem: str) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from imud.contracts.codec import BadFrame
 from imud.event import Event, EventKind
 from imud.ledger import Ledger
-from imud.log import MESSAGE_CHARACTERS_MAX, printable
+from imud.log import MESSAGE_CHARACTERS_MAX, printable, same_as
 from imud.sample import Sync
 from imud.units import NS_PER_S
 
@@ -39,7 +39,8 @@ class Notices:
         """Send one event, and log it; texts that came from the device may hold anything, and are made printable."""
         message = printable(message, MESSAGE_CHARACTERS_MAX)
         detail = {name: printable(one) if isinstance(one, str) else one for name, one in detail.items()}
-        log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self.device, message)
+        alike = same_as(kind if kind is EventKind.BAD_FRAME else message)  # the bytes of a damaged frame always differ
+        log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self.device, message, extra=alike)
         self._send(Event(now_ns, self.device, kind, message, detail))
 
     def bad_frame(self, frame: BadFrame) -> None:

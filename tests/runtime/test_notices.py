@@ -1,10 +1,12 @@
 """Events come at a bounded rate and say what is behind them."""
 
 import msgspec
+import pytest
 
 from imud.contracts.codec import BadFrame, BadReason
 from imud.event import Event, EventKind
 from imud.ledger import Ledger
+from imud.log import RepeatFilter
 from imud.runtime.notices import Notices
 from imud.sample import Sync
 
@@ -65,3 +67,22 @@ def test_texts_of_an_event_are_printable_and_bounded() -> None:
     assert events[0].detail["kind"].isprintable()
     assert events[0].detail["number"] == 1
     msgspec.json.encode(events[0])
+
+
+def test_an_event_is_logged_at_once_after_another_kind_of_trouble(caplog: pytest.LogCaptureFixture) -> None:
+    notices, ledger, _ = make()
+    repeats = RepeatFilter()
+    for t, lost in enumerate((2, 3)):
+        ledger.lost_crc += lost
+        ledger.frames_bad_crc += 1
+        notices.bad_frame(BadFrame(BadReason.CRC, bytes((0x5A, 0xA5, t))))
+        notices.tick(t * S, None)
+    notices.raise_event(2 * S, EventKind.CONFIGURATION, "settings are not as declared")
+    for record in caplog.records:
+        record.created = 1000.0
+    told = [record.getMessage() for record in caplog.records if repeats.filter(record)]
+    assert told == [
+        "bow: 2 samples lost",
+        "bow: 1 bad frame, the last by crc: 5a a5 00",
+        "bow: settings are not as declared",
+    ]
