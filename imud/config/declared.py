@@ -12,6 +12,7 @@ from imud.config.schema import DriverRow
 from imud.config.yaml_tree import Path as KeyPath
 from imud.contracts.action import Target
 from imud.contracts.device_settings import DeviceSettings, declared_values
+from imud.contracts.lines import DeviceLines
 from imud.contracts.settings import Settings, shown
 from imud.errors import BadArgument
 
@@ -63,6 +64,13 @@ class DeclaredReader:
             table.check(Target(options, baud if isinstance(baud, int) else 0), values)
         except BadArgument as error:
             self._keys.problem(key, str(error))
+
+    def check_lines(self, path: KeyPath, driver: str, declared: Settings, lines: DeviceLines) -> None:
+        """Refuse lines that do nothing with the settings that are declared."""
+        if self._table(driver) is not None:
+            found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
+            for key, words in found.items():
+                self._keys.problem((*path, "lines", key), f"with the settings declared here {words}", at_key=True)
 
     def _table(self, driver: str) -> DeviceSettings | None:
         try:

@@ -83,6 +83,8 @@ class DeviceReader:
         self._usable(path, general.driver, link_name, link_settings)
         if declared is not None:
             self._declared.check(path, general.driver, declared, options, link_settings)
+            if lines is not None:
+                self._declared.check_lines(path, general.driver, declared, lines)
         check_declination(self._keys, path, general, options, self._tables.drivers)
         line = self._keys.tree.key_mark(path).line
         own_keys = general.driver, options, general.identify, link_name, link_settings

@@ -12,6 +12,7 @@ import msgspec
 from imud.contracts.claims import Claim
 from imud.contracts.device_settings import DeviceSettings, OnDifference
 from imud.contracts.driver import KeyProblem
+from imud.contracts.lines import DeviceLines
 from imud.contracts.settings import Settings
 from imud.devices import DRIVERS
 from imud.frames.conventions import Convention, Heading
@@ -25,7 +26,8 @@ class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Lowest level of messages in the log."""
     state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
-    """Folder where imud remembers at which rate each device was found. systemd's STATE_DIRECTORY wins over it."""
+    """Folder of what imud remembers: at which rate each device was found, writes to flash, backups of settings.
+    imud makes it where it is missing. systemd's STATE_DIRECTORY wins over it."""
 
 
 class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -66,6 +68,11 @@ class DriverRow(Row, Protocol):
     @property
     def device_settings(self) -> DeviceSettings | None:
         """Settings that the device keeps itself; None for a driver that does not know them."""
+        ...
+
+    @property
+    def declared_line_differences(self) -> Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]]:
+        """Finds lines that declared settings contradict: why, by the line's key."""
         ...
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:

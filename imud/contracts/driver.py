@@ -108,6 +108,8 @@ class Driver:
     """Returns settings as they were read back by name and with units, for people."""
     line_differences: Callable[[Mapping[str, str], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}
     """Finds lines of the configuration that the device's settings contradict: why, one sentence, by the line's key."""
+    declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
+    """The same for settings that are declared, by their values, before the device is asked."""
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
     """Finds what does not work in an instance of `settings` and in the settings of a link, each good by itself."""
 

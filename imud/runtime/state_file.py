@@ -67,6 +67,7 @@ class StateFile:
                 newer = self._contents.get()
                 ended, content = newer is None, newer or content
             try:
+                file.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
                 replace_file(file, content)
             except OSError as error:
                 log.warning(

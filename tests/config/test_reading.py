@@ -21,6 +21,7 @@ from imud.config.yaml_tree import EVENTS_PER_TURN
 from imud.contracts.claims import Claim
 from imud.contracts.device_settings import DeviceSettings
 from imud.contracts.driver import KeyProblem
+from imud.contracts.lines import DeviceLines
 from imud.contracts.settings import NoSettings, Settings, expected, got
 from imud.devices import DRIVERS
 from imud.errors import ConfigError
@@ -71,6 +72,7 @@ class FakeRow:
     faults: tuple[KeyProblem, ...] = ()
     """Problems that a driver has with everything."""
     device_settings: DeviceSettings | None = None
+    declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
 
     def bus_of(self, settings: Settings) -> str:
         return ""

@@ -38,7 +38,7 @@ class BackupFolder:
         """Write a backup and remove old ones of the device; return its path, None without a folder. Raises OSError."""
         if self._folder is None:
             return None
-        self._folder.mkdir(mode=0o750, exist_ok=True)
+        self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
         file = self._folder / f"{device}.{_time(utc_ns):%Y%m%dT%H%M%S.%fZ}.yaml"
         replace_file(file, text.encode())
         self._remove_old(self._folder, device)

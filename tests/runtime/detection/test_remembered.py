@@ -93,6 +93,11 @@ def test_what_is_no_file_is_reported_and_replaced(
     assert recalled(tmp_path, "bow") == FOUND
 
 
+def test_a_state_directory_that_is_missing_is_made(tmp_path: Path) -> None:
+    remember(tmp_path / "var" / "imud", bow=FOUND)
+    assert recalled(tmp_path / "var" / "imud", "bow") == FOUND
+
+
 def test_directory_of_its_name_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / FILE_NAME).mkdir()
     remember(tmp_path, bow=FOUND)
@@ -125,7 +130,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_unwritable_folder_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with closing(Remembered(tmp_path / "missing")) as memory:
+    (tmp_path / "taken").touch()
+    with closing(Remembered(tmp_path / "taken" / "imud")) as memory:
         memory.put("bow", FOUND)
         assert memory.get("bow") == FOUND
     assert "cannot be written" in caplog.text

@@ -5,11 +5,11 @@ A line that is wired and configured does nothing where the module has its functi
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 from imud.contracts.lines import DeviceLines
 from imud.devices.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMessage
-from imud.devices.hipnuc.uart.settings import ON_MARK, values_of
+from imud.devices.hipnuc.uart.settings import ON_MARK, MessageName, values_of
 
 FUNCTIONS: Final = {"sin": "sin", "pps": "sin", "sout": "sout", "sout_div": "sout_div", "alarm": "alarm"}
 """Function of the module's pin by the key of the line."""
@@ -17,7 +17,19 @@ FUNCTIONS: Final = {"sin": "sin", "pps": "sin", "sout": "sout", "sout_div": "sou
 
 def line_differences(settings: Mapping[str, str], lines: DeviceLines) -> dict[str, str]:
     """Return what the module's settings contradict, one sentence by the line's key, from `session.read_settings`."""
-    values = values_of(settings)
+    return _differences(values_of(settings), lines)
+
+
+def declared_line_differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
+    """Return what declared settings contradict. What is declared in part is not compared: the module has the rest."""
+    known = dict(values)
+    if set(known.get("output") or ()) != set(get_args(MessageName)):
+        known.pop("output", None)
+    known.pop("alarm", None)
+    return _differences(known, lines)
+
+
+def _differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
     found: dict[str, list[str]] = {}
     for key, words in (
         *_shared_pins(values.get("pins", {}), lines),

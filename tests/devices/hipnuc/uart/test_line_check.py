@@ -2,6 +2,8 @@
 
 import pytest
 
+from imud import config
+from imud.config.schema import TABLES
 from imud.contracts.lines import (
     DeviceLines,
     DividedSettings,
@@ -10,8 +12,9 @@ from imud.contracts.lines import (
     SoutSettings,
     TriggerSettings,
 )
-from imud.devices.hipnuc.uart.line_check import line_differences
+from imud.devices.hipnuc.uart.line_check import declared_line_differences, line_differences
 from imud.devices.hipnuc.uart.session import read_settings
+from imud.errors import ConfigError
 from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings, Output
 from tests.support.simulated_modules import HipnucLine
 
@@ -56,3 +59,33 @@ def test_what_the_module_contradicts_is_found(
 @pytest.mark.parametrize("lines", [SOUT, DIVIDED, SIN, PPS, ALARM])
 def test_what_the_module_does_not_tell_is_not_compared(lines: DeviceLines) -> None:
     assert line_differences({"ATT_MODE": "0"}, lines) == {}
+
+
+@pytest.mark.parametrize(
+    ("lines", "declared", "found"),
+    [
+        (SIN, {"output": {"hi91": 0, "hi92": "on_mark"}}, {"sin": "HI92 on mark has no time of its own"}),
+        (SIN, {"output": {"hi91": 100, "hi92": 0}}, {"sin": "no message of the module is on mark"}),
+        (SIN, {"output": {"hi91": "on_mark", "hi92": 0}}, {}),
+        (SIN, {"output": {"hi92": "on_mark"}}, {}),  # the module may have HI91 on mark
+        (DIVIDED, {"sout_divisor": 8}, {"sout_div": "divisor is 4 in the configuration"}),
+        (SOUT, {"pins": {"sout": 2, "led": 2}}, {"sout": "sout and led on IO2"}),
+        (ALARM, {"alarm": {"x": {"min_deg": -5, "max_deg": 5, "enabled": False}}}, {}),  # Y may be watched
+    ],
+)
+def test_what_declared_settings_contradict_is_found(
+    lines: DeviceLines, declared: dict[str, object], found: dict[str, str]
+) -> None:
+    differences = declared_line_differences(declared, lines)
+    assert differences.keys() == found.keys()
+    for key, words in found.items():
+        assert words in differences[key]
+
+
+def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
+    text = (
+        "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
+        "    lines: {sin: {line: GPIO1, rate_hz: 10}}\n    settings: {output: {hi91: 0, hi92: on_mark}}\n"
+    )
+    with pytest.raises(ConfigError, match=r"f:5:\d+: devices\.bow\.lines\.sin: .*HI92 on mark has no time of its own"):
+        config.parse(text, "f", TABLES)
