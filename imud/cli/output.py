@@ -10,16 +10,20 @@ WIDTH: Final = 40
 """Characters of the longest bar."""
 BARS: Final = 12
 """Most lines of a histogram."""
+NO_VALUE: Final = ("", "-")
+"""Cells of a column of numbers that are none."""
 STEPS: Final = (1, 2, 5, 10, 20)
 TAIL: Final = 0.005
 """Share of outliers on either side; they are counted in the outermost bars, so that one outlier hides nothing."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Format columns as wide as their widest cell, numbers right-aligned, two spaces between, no final line end."""
+    """Format columns as wide as their widest cell, two spaces between, no final line end; numbers stand to the right in
+    columns that have nothing else."""
     cells = [[str(cell) for cell in head], *([_word(cell) for cell in row] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
-    return "\n".join(_line(line, widths) for line in cells)
+    numbers = [all(_is_number(line[i]) for line in cells[1:] if line[i] not in NO_VALUE) for i in range(len(head))]
+    return "\n".join(_line(line, widths, numbers) for line in cells)
 
 
 def histogram(values: Sequence[float], unit: str) -> list[str]:
@@ -55,8 +59,8 @@ def _word(cell: object) -> str:
     return f"{cell:.1f}" if isinstance(cell, float) else printable(str(cell), MESSAGE_CHARACTERS_MAX)
 
 
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    padded = (c.rjust(w) if _is_number(c) else c.ljust(w) for c, w in zip(cells, widths, strict=True))
+def _line(cells: Sequence[str], widths: Sequence[int], numbers: Sequence[bool]) -> str:
+    padded = (c.rjust(w) if n and _is_number(c) else c.ljust(w) for c, w, n in zip(cells, widths, numbers, strict=True))
     return "  ".join(padded).rstrip()
 
 

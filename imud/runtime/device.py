@@ -261,7 +261,7 @@ class Device:
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
         """Run an action and return its answer. Raises CommandError, TransferError, DeviceRefused, LinkError."""
-        log.info("%s: run %s %s", self.config.name, printable(name), shown(arguments) if arguments else "")
+        log.info("%s: run %s%s", self.config.name, printable(name), f" {shown(arguments)}" if arguments else "")
         action = self.actions.get(name)
         if action is None:
             raise BadArgument(f"{self.config.name}: no action {name[:64]!r}; there are: {self._known_actions()}")

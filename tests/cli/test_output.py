@@ -43,3 +43,13 @@ def test_widths_are_round(span: float, width: float) -> None:
 
 def test_a_cell_cannot_write_to_the_terminal() -> None:
     assert table(("A",), [("x\x1b[2J\ny",)]) == "A\nx\\x1b[2J\\ny"
+
+
+def test_numbers_stand_to_the_right_in_columns_that_have_nothing_else() -> None:
+    rows = [("mode", "6-axis, slowly", 7), ("baud", 115200, 11), ("node", "-", "-")]
+    assert table(("SETTING", "ACTUAL", "N"), rows).splitlines() == [
+        "SETTING  ACTUAL          N",
+        "mode     6-axis, slowly   7",
+        "baud     115200          11",
+        "node     -               -",
+    ]

@@ -116,7 +116,7 @@ def _interval(tpdo: TpdoNumber) -> Setting:
             Meta(
                 ge=0,
                 le=PERIOD_MAX_MS,
-                description=f"time from one {CONTENT[tpdo]} to the next, {PERIOD_MIN_MS} or more; 0 for never",
+                description=f"interval of the message with the {CONTENT[tpdo]}, {PERIOD_MIN_MS} or more; 0 for never",
                 extra={"unit": "ms", "section": "5.4.1"},
             ),
         ],
@@ -125,7 +125,9 @@ def _interval(tpdo: TpdoNumber) -> Setting:
 
 
 def _transmission(tpdo: TpdoNumber) -> Setting:
-    words = f"when the {CONTENT[tpdo]} is sent: at its interval, or when SYNC comes (`options.sync_hz`)"
+    words = (
+        f"when the message with the {CONTENT[tpdo]} is sent: at its interval, or when SYNC comes (`options.sync_hz`)"
+    )
     return Setting(
         type=Annotated[By, Meta(description=words, extra={"section": "5.4.2"})],
         write=lambda target, by: session.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by]),
@@ -161,7 +163,8 @@ SETTINGS: Final = DeviceSettings(
             type=Annotated[
                 BitRate,
                 Meta(
-                    description="that of the bus: it can only be repaired", extra={"unit": "bit/s", "section": "5.4.1"}
+                    description="that of the bus: a module that would take another one at its restart is set back",
+                    extra={"unit": "bit/s", "section": "5.4.1"},
                 ),
             ],
             write=lambda target, rate: session.set_bit_rate(target.settings.node, rate),

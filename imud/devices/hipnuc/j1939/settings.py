@@ -98,7 +98,7 @@ def _interval(pgn: int) -> Setting:
             Meta(
                 ge=INTERVAL_MIN_MS,
                 le=INTERVAL_MAX_MS,
-                description=f"time from one {CONTENT[pgn]} (PGN {pgn:04X}) to the next",
+                description=f"interval of the message with the {CONTENT[pgn]} (PGN {pgn:04X})",
                 extra={"unit": "ms", "section": "6.2.2"},
             ),
         ],
@@ -123,7 +123,8 @@ SETTINGS: Final = DeviceSettings(
             type=Annotated[
                 BitRate,
                 Meta(
-                    description="that of the bus: it can only be repaired", extra={"unit": "bit/s", "section": "6.2.2"}
+                    description="that of the bus: a module that would take another one at its restart is set back",
+                    extra={"unit": "bit/s", "section": "6.2.2"},
                 ),
             ],
             write=lambda target, rate: session.set_bitrate(target.settings.peer, rate),

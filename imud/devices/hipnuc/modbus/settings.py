@@ -66,7 +66,8 @@ SETTINGS: Final = DeviceSettings(
             type=Annotated[
                 BaudRate,
                 Meta(
-                    description="that of the line: it can only be repaired", extra={"unit": "bit/s", "section": "4.3.2"}
+                    description="that of the line: a module that would take another one at its restart is set back",
+                    extra={"unit": "bit/s", "section": "4.3.2"},
                 ),
             ],
             write=lambda _target, baud: session.set_baud(baud),
