@@ -27,7 +27,7 @@ from imud.devices.hipnuc.canopen.session import (
     Place,
     Transmission,
 )
-from imud.devices.hipnuc.common.bus_load import MS_PER_S, CyclicMessage, refuse_overload
+from imud.devices.hipnuc.common.bus_load import MS_PER_S, CyclicMessage, refuse_other_rate, refuse_overload
 from imud.errors import BadArgument
 
 TPDOS: Final[tuple[TpdoNumber, ...]] = get_args(TpdoNumber)
@@ -91,13 +91,8 @@ def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
-    """A node of another rate than its bus is lost, and disturbs the others."""
-    rate = values.get("bit_rate")
-    if rate is not None and target.baud and rate != target.baud:
-        raise BadArgument(
-            f"bit_rate: expected {target.baud}, the rate of the bus, got {rate}; to change the rate of a bus give all "
-            "of its devices the new one with the actions `bitrate`, `save` and `restart`, and the interface"
-        )
+    """Refuse another bit rate than that of the bus, and more than it carries. Raises BadArgument."""
+    refuse_other_rate(target, values)
     for tpdo in TPDOS:
         if 0 < values.get(interval_name(tpdo), 0) < PERIOD_MIN_MS:
             got = values[interval_name(tpdo)]

@@ -1,4 +1,4 @@
-"""Load of a CAN bus by cyclic messages: what intervals cost, and refusal of more than the bus carries.
+"""What a CAN bus carries: the cost of intervals, refusal of more than fits, and of another bit rate.
 
     message   frame, in bits                                   per second       at 500 kbit/s
     TPDO1     47 + 8 · 6 = 95                                  100: 9,500       1.9 %
@@ -11,8 +11,9 @@ about does not.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
+from imud.contracts.action import Target
 from imud.errors import BadArgument
 from imud.formats.can import frame_bits
 from imud.units import NS_PER_MS, NS_PER_S
@@ -60,3 +61,13 @@ def refuse_overload(messages: Mapping[str, CyclicMessage], other_bits_per_s: flo
 
 def _percent(bits_per_s: float, bus_bits_per_s: int) -> str:
     return f"{100 * bits_per_s / bus_bits_per_s:.3g} %"
+
+
+def refuse_other_rate(target: Target, values: Mapping[str, Any]) -> None:
+    """Raise BadArgument for a `bit_rate` that the bus has not: such a device is lost, and disturbs the others."""
+    rate = values.get("bit_rate")
+    if rate is not None and target.baud and rate != target.baud:
+        raise BadArgument(
+            f"bit_rate: expected {target.baud}, the rate of the bus, got {rate}; to change the rate of a bus give all "
+            "of its devices the new one with the actions `bitrate`, `save` and `restart`, and the interface"
+        )

@@ -12,7 +12,7 @@ from msgspec import Meta
 from imud.contracts.action import Target
 from imud.contracts.device_settings import DeviceSettings, Effect, Setting, Written
 from imud.contracts.session import RequestScript
-from imud.devices.hipnuc.common.bus_load import CyclicMessage, refuse_overload
+from imud.devices.hipnuc.common.bus_load import CyclicMessage, refuse_other_rate, refuse_overload
 from imud.devices.hipnuc.j1939 import messages, moves, session
 from imud.devices.hipnuc.j1939.session import (
     ADDRESS_MAX,
@@ -23,7 +23,6 @@ from imud.devices.hipnuc.j1939.session import (
     INTERVALS,
     BitRate,
 )
-from imud.errors import BadArgument
 
 CONTENT: Final = {
     messages.UTC: "UTC", messages.ACCEL: "acceleration", messages.GYRO: "angular rate", messages.MAG: "magnetic field",
@@ -77,13 +76,8 @@ def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
-    """A module of another rate than its bus is lost, and disturbs the others."""
-    rate = values.get("bit_rate")
-    if rate is not None and target.baud and rate != target.baud:
-        raise BadArgument(
-            f"bit_rate: expected {target.baud}, the rate of the bus, got {rate}; to change the rate of a bus give all "
-            "of its devices the new one with the actions `bitrate`, `save` and `restart`, and the interface"
-        )
+    """Refuse another bit rate than that of the bus, and more than it carries. Raises BadArgument."""
+    refuse_other_rate(target, values)
     _refuse_overload(target, values)
 
 

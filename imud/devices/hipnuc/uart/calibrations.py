@@ -4,13 +4,11 @@ The magnetometer is calibrated by the module itself, in the background, while it
 result. That it is done shows in the bias of MAGCONFIG, which is zero before.
 """
 
+from dataclasses import replace
 from typing import Final
 
 from imud.contracts.action import Target
 from imud.contracts.control.calibration import (
-    ACCEL_LEVEL,
-    PITCH_ZERO,
-    ROLL_ZERO,
     YAW_ZERO,
     Calibration,
     Calibrations,
@@ -19,9 +17,9 @@ from imud.contracts.control.calibration import (
     Verdict,
 )
 from imud.contracts.session import Rejection, RequestScript, Silence
-from imud.devices.hipnuc.common.calibrations import LEVELLING, NINE_AXES_NEEDED, TURNING
+from imud.devices.hipnuc.common.calibrations import NINE_AXES_NEEDED, levels, magnetometer
 from imud.devices.hipnuc.uart import commands
-from imud.devices.hipnuc.uart.commands import LevelReset, Query, YawMode, ask
+from imud.devices.hipnuc.uart.commands import Query, YawMode, ask
 from imud.devices.hipnuc.uart.replies import parse_magconfig
 from imud.devices.hipnuc.uart.session import read_settings, send
 from imud.errors import NoReply, Rejected
@@ -61,48 +59,18 @@ def _save(_target: Target) -> RequestScript[None]:
     return send(commands.save_config())
 
 
+_MAGNETOMETER: Final = magnetometer(_start_magnetometer, _magnetometer_verdict, _nine_axes_needed)
+
 CALIBRATIONS: Final[Calibrations] = {
-    "magnetometer": Calibration(
-        help="measure the field of what the module is mounted on; goes on in the background afterwards",
-        section="8.1.1",
-        handling=Handling.TURN,
-        instructions=TURNING,
-        begin=_start_magnetometer,
-        verdict=_magnetometer_verdict,
-        unready=_nine_axes_needed,
-        kept=Kept.BY_DEVICE,
-    ),
-    "magnetometer_once": Calibration(
+    "magnetometer": _MAGNETOMETER,
+    "magnetometer_once": replace(
+        _MAGNETOMETER,
         help="the same, and with `save` no further calibration in the background",
         section="8.2",
-        handling=Handling.TURN,
-        instructions=TURNING,
-        begin=_start_magnetometer,
-        verdict=_magnetometer_verdict,
-        unready=_nine_axes_needed,
         kept=Kept.BY_SAVE,
         save=_keep_magnetometer,
     ),
-    "level": Calibration(
-        help="make the present pitch and roll zero, at any tilt",
-        section="2.2.4",
-        handling=Handling.REST,
-        instructions=LEVELLING,
-        begin=lambda _target: send(commands.level_reset(LevelReset.RELATIVE)),
-        expected=(ROLL_ZERO, PITCH_ZERO),
-        kept=Kept.BY_SAVE,
-        save=_save,
-    ),
-    "accelerometer_level": Calibration(
-        help="make pitch, roll and the horizontal acceleration zero, within 5° of level or of upside down",
-        section="2.2.4",
-        handling=Handling.REST,
-        instructions=("Put the module on a level surface, within 5° of level, and do not touch it.",),
-        begin=lambda _target: send(commands.level_reset(LevelReset.AUTOMATIC)),
-        expected=(PITCH_ZERO, ACCEL_LEVEL),
-        kept=Kept.BY_SAVE,
-        save=_save,
-    ),
+    **levels("2.2.4", 5, lambda kind: lambda _target: send(commands.level_reset(kind)), _save),
     "heading": Calibration(
         help="make the present heading zero",
         section="2.2.4",
@@ -113,4 +81,3 @@ CALIBRATIONS: Final[Calibrations] = {
         kept=Kept.NEVER,
     ),
 }
-"""Upside down, `accelerometer_level` makes roll 180°: only pitch and acceleration are expected to be zero."""
