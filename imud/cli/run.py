@@ -4,15 +4,19 @@ import argparse
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from imud import config
 from imud.cli.arguments import CliCommand
 from imud.cli.streams import complain
-from imud.config import Config
+from imud.config import Config, DeviceConfig
 from imud.config.yaml_tree import FILE_BYTES_MAX
+from imud.contracts.device_settings import declared_values
+from imud.contracts.lines import DeviceLines
 from imud.daemon import Daemon
+from imud.devices import DRIVERS
 from imud.errors import ConfigError, ImudError, ServerError
 from imud.log import STDERR, log_to
 from imud.runtime import event_loop
@@ -62,11 +66,23 @@ def check_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> int:
-    """Print one line when the file is good; the error with line and column goes to standard error."""
+    """Print one line when the file is good, and notes; the error with line and column goes to standard error."""
     settings = config.parse(standard_input(), "standard input") if args.file == "-" else config.load(args.file)
     names = ", ".join(device.name for device in settings.devices) or "none"
     print(f"{args.file}: good; devices: {names}")
+    for device in settings.devices:
+        for note in limits_of(device):
+            print(f"{args.file}:{device.line}: note: {device.name}: {note}")
     return 0
+
+
+def limits_of(device: DeviceConfig) -> Sequence[str]:
+    """What the device cannot do of all that its configuration has, a sentence each."""
+    if device.driver not in DRIVERS:
+        return ()
+    return DRIVERS[device.driver].limits(
+        declared_values(device.declared), device.lines or DeviceLines(), device.rmc is not None
+    )
 
 
 def standard_input() -> bytes:

@@ -110,6 +110,9 @@ class Driver:
     """Finds lines of the configuration that the device's settings contradict: why, one sentence, by the line's key."""
     declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
     """The same for settings that are declared, by their values, before the device is asked."""
+    limits: Callable[[Mapping[str, Any], DeviceLines, bool], Sequence[str]] = lambda _declared, _lines, _fed: ()
+    """What works, but not with all that the configuration has: from the declared settings by their values, the GPIO
+    lines, and whether sentences with UTC are sent. A sentence each, which `imud check` prints."""
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
     """Finds what does not work in an instance of `settings` and in the settings of a link, each good by itself."""
 

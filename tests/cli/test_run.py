@@ -65,3 +65,15 @@ def test_the_host_of_gpsd(host: str, good: bool, tmp_path: Path, capsys: pytest.
     file.write_text(f"devices:\n  a: {{driver: hipnuc-uart, uart: {{port: x}}, rmc: {rmc}}}\n")
     assert main(["check", str(file)]) == (0 if good else 2)
     assert ("devices.a.rmc.host: expected" in capsys.readouterr().err) is not good
+
+
+def test_check_says_what_a_device_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "imud.yaml"
+    file.write_text(
+        "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
+        "    settings: {output: {hi91: 50, hi92: 50}}\n  stern:\n    uart: {port: /dev/ttyUSB1}\n"
+    )
+    assert main(["check", str(file)]) == 0
+    good, note = capsys.readouterr().out.splitlines()
+    assert good == f"{file}: good; devices: bow, stern"
+    assert note.startswith(f"{file}:2: note: bow: HI92 beside HI91 is dated by its arrival")

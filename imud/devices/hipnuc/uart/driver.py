@@ -22,7 +22,7 @@ from imud.devices.hipnuc.uart.codec import (
     encode_hi92,
 )
 from imud.devices.hipnuc.uart.commands import BAUD_RATES
-from imud.devices.hipnuc.uart.line_check import declared_line_differences, line_differences
+from imud.devices.hipnuc.uart.line_check import declared_line_differences, line_differences, message_limits
 from imud.devices.hipnuc.uart.packets import PPS_STAMP_MODULUS_MS
 from imud.devices.hipnuc.uart.session import identify, read_settings, wake, why_silent
 from imud.devices.hipnuc.uart.settings import SETTINGS, shown
@@ -73,6 +73,7 @@ DRIVER: Final = StreamDriver(
     shown_settings=shown,
     line_differences=line_differences,
     declared_line_differences=declared_line_differences,
+    limits=message_limits,
     actions=ACTIONS,
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,

@@ -29,6 +29,22 @@ def declared_line_differences(values: Mapping[str, Any], lines: DeviceLines) -> 
     return _differences(known, lines)
 
 
+def message_limits(values: Mapping[str, Any], lines: DeviceLines, fed: bool) -> list[str]:
+    """Return what HI92 cannot do of all that the configuration has, if declared settings have the module send it.
+
+    `fed`: sentences with UTC are sent to the module.
+    """
+    output = values.get("output") or {}
+    if not output.get("hi92"):
+        return []
+    found = []
+    if fed or lines.pps is not None:
+        found.append("HI92 never shows UTC: its samples are dated by the host; those of HI91 can be on UTC")
+    if output.get("hi91"):
+        found.append("HI92 beside HI91 is dated by its arrival; alone it is dated by its stamp")
+    return found
+
+
 def _differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
     found: dict[str, list[str]] = {}
     for key, words in (

@@ -12,7 +12,7 @@ from imud.contracts.lines import (
     SoutSettings,
     TriggerSettings,
 )
-from imud.devices.hipnuc.uart.line_check import declared_line_differences, line_differences
+from imud.devices.hipnuc.uart.line_check import declared_line_differences, line_differences, message_limits
 from imud.devices.hipnuc.uart.session import read_settings
 from imud.errors import ConfigError
 from imud.sim.hipnuc.uart.settings import AlarmSetting, ModuleSettings, Output
@@ -89,3 +89,22 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
     )
     with pytest.raises(ConfigError, match=r"f:5:\d+: devices\.bow\.lines\.sin: .*HI92 on mark has no time of its own"):
         config.parse(text, "f", TABLES)
+
+
+@pytest.mark.parametrize(
+    ("declared", "lines", "fed", "found"),
+    [
+        ({}, DeviceLines(), True, []),
+        ({"output": {"hi91": 100, "hi92": 0}}, DeviceLines(), True, []),
+        ({"output": {"hi92": 100}}, DeviceLines(), False, []),
+        ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 never shows UTC"]),
+        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsSettings(line="GPIO1")), False, ["HI92 never shows UTC"]),
+        ({"output": {"hi91": 50, "hi92": 50}}, DeviceLines(), False, ["HI92 beside HI91 is dated by its arrival"]),
+    ],
+)
+def test_what_hi92_cannot_do_is_said(
+    declared: dict[str, object], lines: DeviceLines, fed: bool, found: list[str]
+) -> None:
+    limits = message_limits(declared, lines, fed)
+    assert len(limits) == len(found)
+    assert all(limit.startswith(words) for limit, words in zip(limits, found, strict=True))
