@@ -82,14 +82,14 @@ class CalibrateParams(msgspec.Struct):
 
     device: str
     kind: str
-    save: bool = False
+    save: bool | None = None
 
 
 class SettingsParams(msgspec.Struct):
     """Parameters of `settings.get`."""
 
     device: str
-    fresh: bool = False
+    fresh: bool | None = None
 
 
 class SettingsChangeParams(msgspec.Struct):
@@ -97,7 +97,7 @@ class SettingsChangeParams(msgspec.Struct):
 
     device: str
     settings: dict[str, Any] | None = None
-    save: bool = False
+    save: bool | None = None
 
 
 # --- results --------------------------------------------------------------------------------------------------------

@@ -315,7 +315,7 @@ def _calibrate(hub: Hub, connection: Connection, params: CalibrateParams) -> Lat
 
 
 async def _calibrated(hub: Hub, params: CalibrateParams) -> object:
-    return await hub.context.control(params.device).calibrate(params.kind, save=params.save)
+    return await hub.context.control(params.device).calibrate(params.kind, save=bool(params.save))
 
 
 def _stop_calibration(hub: Hub, _connection: Connection, params: DeviceParams) -> Answer:
@@ -332,21 +332,21 @@ def _settings(hub: Hub, connection: Connection, params: SettingsParams) -> Later
             message = f"settings.get: for fresh, expected root or a member of {hub.control_group}"
             raise RpcError(Code.DENIED, message)
         _refuse_second(hub, connection, "settings.get")
-    return hub.context.control(params.device).settings_report(fresh=params.fresh)
+    return hub.context.control(params.device).settings_report(fresh=bool(params.fresh))
 
 
 def _settings_plan(hub: Hub, connection: Connection, params: SettingsChangeParams) -> Later:
     """What would make the device as wanted; nothing is written."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "settings.plan")
-    return hub.context.control(params.device).settings_plan(params.settings, save=params.save)
+    return hub.context.control(params.device).settings_plan(params.settings, save=bool(params.save))
 
 
 def _settings_apply(hub: Hub, connection: Connection, params: SettingsChangeParams) -> Later:
     """Make the device as wanted; the reply comes when it is done or has failed, with how the device is then."""
     _known_devices(hub, [params.device])
     _refuse_second(hub, connection, "settings.apply")
-    return hub.context.control(params.device).settings_apply(params.settings, save=params.save)
+    return hub.context.control(params.device).settings_apply(params.settings, save=bool(params.save))
 
 
 def _refuse_second(hub: Hub, connection: Connection, method: str) -> None:

@@ -366,7 +366,8 @@ class SettingsKeeper:
                 self._unsaved = False
                 told = {name: as_json(value) for name, value in self._all_told(table).items()}
                 self._writes.keep_told(self._module, told)
-        log.info("%s: %s", self._config.name, _summary(done) or "settings are as wanted")
+        if asked:  # the rest is an event, which is in the log
+            log.info("%s: %s", self._config.name, _summary(done) or "settings are as wanted")
         self._tell(self._differences(table), quiet=True)
         if applying.changed:
             await self._read_back()

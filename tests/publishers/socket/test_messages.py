@@ -4,8 +4,10 @@ import ast
 import json
 import socket
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args
 
+import msgspec
 import pytest
 
 from imud.event import Event, EventKind
@@ -77,6 +79,12 @@ def test_parameters_that_may_be_left_out_may_be_null(tmp_path: Path) -> None:
             peer.close()
 
     run(body)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_parameter_that_has_a_default_may_be_null(name: str) -> None:
+    fields = msgspec.structs.fields(METHODS[name].params)
+    assert [one.name for one in fields if not one.required and NoneType not in get_args(one.type)] == []
 
 
 def test_big_numbers_are_text_where_that_is_asked_for(tmp_path: Path) -> None:
