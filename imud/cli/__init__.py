@@ -5,7 +5,7 @@ Exit status: 0 done, 1 it ran and the answer is no, 2 it could not run.
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -51,14 +51,14 @@ COMMANDS = {
 }
 
 
-def build_parser(only: str = "") -> argparse.ArgumentParser:
-    """Build the parser of the command line; with `only` for that command alone, which imports no other."""
+def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
+    """Build the parser of the command line, with the arguments of these commands; it imports no other."""
     parser = argparse.ArgumentParser(prog="imud", description="A daemon for inertial sensors.")
     parser.add_argument("--version", action="version", version=f"imud {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    parsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
-        sub = commands.add_parser(name, help=command.help, description=command.help.capitalize() + ".")
-        if only in ("", name):
+        sub = parsers.add_parser(name, help=command.help, description=command.help.capitalize() + ".")
+        if name in commands:
             command.load().add_arguments(sub)
     return parser
 
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         try:
-            args = build_parser(name).parse_args(words)
+            args = build_parser((name,)).parse_args(words)
             return COMMANDS[args.command].load().run(args)
         finally:
             sys.stdout.flush()

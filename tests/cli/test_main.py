@@ -62,3 +62,14 @@ def test_reader_of_the_output_that_goes_away_is_no_error(tmp_path: Path) -> None
     first, status = done.stdout.splitlines()
     assert first == '{"text":"A"}'
     assert status == "0"
+
+
+def test_help_of_all_imports_no_command() -> None:
+    """The list of commands is there at once, whatever the commands need."""
+    program = (
+        "import sys\nfrom imud.cli import main\ntry:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print([name for name in sys.modules if name.startswith(('imud.c', 'imud.d')) and 'imud.cli' not in name])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=20, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "calibrate" in done.stdout
