@@ -304,13 +304,15 @@ class Device:
             if action.risk is Risk.RESET:
                 await self._settings.back_up(name)
             self._attachments.set_alarm_ranges(None)  # what was read back need not hold any more
+            saved = False
             try:
                 answer = await self._transport.run_script(lambda target: action.script(target, params))
+                saved = action.saves
             except ImudError:
                 await self._transport.read_back()
                 raise
             finally:
-                self._settings.commanded()
+                self._settings.commanded(saved=saved)
             await self._transport.read_back()
             return answer
 

@@ -120,6 +120,8 @@ class SettingsKeeper:
         """Values written since the device's last restart, of settings that it does not tell."""
         self._unsaved = False
         """Whether something was written since then that flash does not have, as far as imud knows."""
+        self._saved: Values | None = None
+        """While `_unsaved`: what the device had before, None where that is not known."""
         self._reported: Mapping[str, SettingDifference] = {}
         self._problem = ""
         self._read_ns: int | None = None
@@ -146,9 +148,11 @@ class SettingsKeeper:
         if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._hears():
             self._wanted.set()
 
-    def commanded(self) -> None:
-        """Note that a command was carried out, which may have changed anything."""
-        self._unsaved, self._tries = True, 0
+    def commanded(self, *, saved: bool = False) -> None:
+        """Note that a command was carried out, which may have changed anything, or `saved` everything."""
+        if not self._unsaved:
+            self._saved = self._actual
+        self._unsaved, self._tries = not saved, 0
         self._due_ns = self._host.now_ns()
 
     def stop(self) -> None:
@@ -254,7 +258,7 @@ class SettingsKeeper:
         table = self._table()
         wanted = self._wanted_values(table, given)
         async with self.exclusive():
-            return self._make_plan(table, wanted, await self._read(table), save=save)
+            return self._make_plan(table, wanted, await self._read(table), save=save, unsaved=self._unsaved)
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
         """Make the device as `given` (None: as declared). Raises what `report` does, before anything is written."""
@@ -315,7 +319,8 @@ class SettingsKeeper:
         """Set what differs, or note when it may be set again."""
         save = self._config.on_difference is OnDifference.APPLY_AND_SAVE
         try:
-            plan = self._make_plan(table, self._declared, actual, save=save)
+            unsaved = self._unsaved and not self._is_saved(actual)
+            plan = self._make_plan(table, self._declared, actual, save=save, unsaved=unsaved)
         except BadArgument as error:
             self._complain(f"settings cannot be set: {error}")
             return
@@ -332,6 +337,10 @@ class SettingsKeeper:
         self._repairs += 1
         applied = await self._apply(table, self._declared, actual, save=save, asked=False)
         self._announce(applied)
+
+    def _is_saved(self, actual: Values) -> bool:
+        """Whether flash has what is declared, after commands that changed nothing."""
+        return actual == self._saved and all(name in actual for name in self._declared)
 
     def _pause_ns(self, now_ns: int) -> int:
         """Time to wait before the device may be set by imud itself again, by how often that was needed of late."""
@@ -352,7 +361,7 @@ class SettingsKeeper:
     async def _apply(
         self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool, asked: bool
     ) -> AppliedSettings:
-        plan = self._make_plan(table, wanted, actual, save=save)
+        plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved)
         flash = ModuleFlash(self._writes, self._module, asked=asked)
         applying = Applying(table, self._run, flash, wanted, actual)
         try:
@@ -373,9 +382,11 @@ class SettingsKeeper:
             await self._read_back()
         return msgspec.structs.replace(done, advice=advice(self._config, done))
 
-    def _make_plan(self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool) -> SettingsPlan:
+    def _make_plan(
+        self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool, unsaved: bool
+    ) -> SettingsPlan:
         assert self._target is not None
-        return make_plan(table, self._target, wanted, actual, self._all_told(table), save=save, unsaved=self._unsaved)
+        return make_plan(table, self._target, wanted, actual, self._all_told(table), save=save, unsaved=unsaved)
 
     def _all_told(self, table: DeviceSettings) -> dict[str, Any]:
         """Values of settings that the device does not tell, as it was told them since its restart or before a save."""

@@ -286,6 +286,41 @@ def test_apply_and_save_does_everything_once() -> None:
     bench.play(story)
 
 
+def test_flash_is_not_written_after_commands_that_change_nothing_or_save_themselves() -> None:
+    bench = ModuleBench("apply_and_save", {"mode": "9-axis"})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
+        await bench.doing(bench.device.act("save", {}))
+        await bench.pass_s(300)
+        assert bench.module.saves == 2
+        await bench.doing(bench.device.act("set_mode", {"mode": "9-axis"}))
+        await bench.pass_s(300)
+        assert bench.module.saves == 2
+        await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+        await bench.until(lambda: bench.status.repairs == 2)
+        await bench.pass_s(300)
+        assert bench.module.saves == 3
+
+    bench.play(story)
+
+
+def test_flash_is_not_written_again_after_a_change_that_a_command_has_saved() -> None:
+    bench = ModuleBench("apply_and_save", {"output": {"b": 50}})
+
+    async def change_and_save() -> None:
+        await asyncio.gather(bench.device.act("set_mode", {"mode": "9-axis"}), bench.device.act("save", {}))
+
+    async def story() -> None:
+        await bench.until(lambda: bench.status.repairs == 1 and bench.is_in(SettingsState.AGREE))
+        await bench.pass_s(300)
+        await bench.doing(change_and_save())
+        await bench.pass_s(300)
+        assert (bench.module.flash["mode"], bench.module.saves) == ("9-axis", 2)
+
+    bench.play(story)
+
+
 def test_what_is_saved_and_not_told_is_not_written_again_in_the_next_run(tmp_path: Path) -> None:
     modules = []
     for _run in range(2):
