@@ -63,6 +63,6 @@ class StatusWatch:
             del self._seen_ns[number]
         self._set ^= sum(1 << number for number in (*risen, *fallen))
         self._due_ns = now_ns + INTERVAL_NS
-        words = [self._bits[n].name for n in risen] + [f"no longer {self._bits[n].name}" for n in fallen]
+        words = [self._bits[n].name for n in risen] + [f"cleared: {self._bits[n].name}" for n in fallen]
         detail = {self._bits[n].name: n in risen for n in (*risen, *fallen)}
         self._notices.raise_event(now_ns, EventKind.ALARM, f"status: {', '.join(words)}", **detail)

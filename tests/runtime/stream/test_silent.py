@@ -221,7 +221,7 @@ def test_status_bits_and_settings_are_shown_by_name() -> None:
         assert device.device.status().status_words == ("at rest", "time not UTC", "frame with SOUT pulse")
         alarms = [event.message for event in device.events if event.kind is EventKind.ALARM]
         assert alarms[0] == "status: gyroscope bias not converged, attitude not converged"
-        assert alarms[-1] == "status: no longer gyroscope bias not converged"
+        assert alarms[-1] == "status: cleared: gyroscope bias not converged"
 
     play_linked(story, hardware=hardware_of(Behaviour(), firmware=169))
 

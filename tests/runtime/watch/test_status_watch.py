@@ -57,7 +57,7 @@ def test_a_bit_of_one_sample_is_an_event_and_so_is_its_end() -> None:
     assert bench.events[-1].kind is EventKind.ALARM
     assert bench.events[-1].detail == {"accelerometer over range": True}
     assert bench.step(0, CLEAR_NS // TICK_NS) == []
-    assert bench.step(0, 3) == ["status: no longer accelerometer over range"]
+    assert bench.step(0, 3) == ["status: cleared: accelerometer over range"]
     assert bench.step(0, 100) == []
 
 
@@ -70,9 +70,9 @@ def test_events_are_one_a_second_with_all_that_changed() -> None:
     other = WatchBench()
     other.step(DISTURBED | OVER_RANGE)
     other.step(DISTURBED, 10)
-    assert other.step(0) == ["status: no longer accelerometer over range"]
+    assert other.step(0) == ["status: cleared: accelerometer over range"]
     assert other.step(OVER_RANGE) == []
-    assert other.step(0, 9) == ["status: accelerometer over range, no longer magnetic disturbance"]
+    assert other.step(0, 9) == ["status: accelerometer over range, cleared: magnetic disturbance"]
 
 
 def test_silence_is_no_end() -> None:
@@ -80,7 +80,7 @@ def test_silence_is_no_end() -> None:
     bench.step(DISTURBED)
     assert bench.step(None, 50) == []
     assert bench.step(DISTURBED, 5) == []
-    assert bench.step(0, 12) == ["status: no longer magnetic disturbance"]
+    assert bench.step(0, 12) == ["status: cleared: magnetic disturbance"]
 
 
 def test_a_driver_without_bits_is_not_watched() -> None:
