@@ -66,3 +66,8 @@ def _line(cells: Sequence[str], widths: Sequence[int], numbers: Sequence[bool]) 
 
 def _is_number(cell: str) -> bool:
     return cell.replace(".", "", 1).replace("-", "", 1).isdecimal()
+
+
+def times(count: int) -> str:
+    """Format how often something happened, for example `1 time`."""
+    return f"{count} time{'' if count == 1 else 's'}"

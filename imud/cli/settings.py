@@ -10,7 +10,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, argument, confirmed
-from imud.cli.output import table
+from imud.cli.output import table, times
 from imud.client import Client
 from imud.config.yaml_tree import FILE_BYTES_MAX, no_pause, read_yaml
 from imud.contracts.device_settings import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState
@@ -97,7 +97,7 @@ def _shown(report: SettingsReport, *, verbose: bool) -> str:
     lines = [table((*HEAD, *MORE) if verbose else HEAD, rows), "", words]
     if status.problem:
         lines.append(f"problem: {status.problem}")
-    lines.append(f"flash written by imud: {status.flash_writes} times, {status.flash_writes_day} within 24 hours")
+    lines.append(f"flash written by imud: {times(status.flash_writes)}, {status.flash_writes_day} within 24 hours")
     return "\n".join(lines)
 
 

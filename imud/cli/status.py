@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect, statuses
+from imud.cli.output import times
 from imud.contracts.device_settings import SettingsState, SettingsStatus
 from imud.contracts.settings import shown
 from imud.contracts.status import DeviceStatus, FrameStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
@@ -36,7 +37,7 @@ def block(status: DeviceStatus) -> str:
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
     lines = [
         f"{status.name}: {status.state}" + (f" ({status.problem})" if status.problem else ""),
-        f"  link      {status.link}, driver {status.driver}, opened {status.connects} times",
+        f"  link      {status.link}, driver {status.driver}, opened {times(status.connects)}",
         f"  identity  {words}",
         f"  rate      {status.rate_hz:.1f} Hz seen, {status.expected_rate_hz:.1f} Hz by the device's clock",
         f"  clock     {clock.sync}, skew {clock.skew_ppm:+.2f} ppm, residual {clock.residual_ns / NS_PER_US:.1f} µs, "
@@ -106,7 +107,7 @@ def polling(polls: PollingStatus) -> str:
     return (
         f"{polls.polls} reads, {polls.late} late, {polls.missed} missed, {polls.stale} stale, {polls.failed} failed;"
         f" {polls.late_mean_ns / NS_PER_US:.1f} µs after the deadline, {polls.late_worst_ns / NS_PER_US:.1f} at worst;"
-        f" vanished {polls.vanished} times"
+        f" vanished {times(polls.vanished)}"
     )
 
 
@@ -123,7 +124,7 @@ def watched(lines: LinesStatus, name: str, edges: int) -> str:
     words = f"{edges} edges, {lines.edges_lost.get(name, 0)} lost"
     if name == "alarm":
         level = {True: "ACTIVE", False: "inactive", None: "level not known"}[lines.alarm]
-        words = f"{level}, raised {lines.alarms} times; {words}"
+        words = f"{level}, raised {times(lines.alarms)}; {words}"
     return words + problem_of(lines, name)
 
 

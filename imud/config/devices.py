@@ -159,7 +159,9 @@ class DeviceReader:
             driver = self._tables.drivers.get(device.driver)
             bus = self._tables.links[device.link].bus_of(device.link_settings)
             rate_hz = getattr(device.link_settings, "rate_hz", 0.0)
-            if not isinstance(driver, PolledDriver) or not bus or not rate_hz:
+            if not isinstance(driver, PolledDriver) or device.options is None or not bus or not rate_hz:
+                continue  # without options, these have a problem of their own
+            if not self._tables.links[device.link].fits(driver):
                 continue
             read_ns = driver.read_ns(device.options, device.link_settings)
             before = shares.get((device.link, bus), 0.0)

@@ -94,7 +94,7 @@ def test_from_difference_to_agreement_and_back(
     assert run(daemon, "--save") == 0
     assert "saved to flash" in capsys.readouterr().out
     assert run(daemon) == 0
-    assert "flash written by imud: 1 times, 1 within 24 hours" in capsys.readouterr().out
+    assert "flash written by imud: 1 time, 1 within 24 hours" in capsys.readouterr().out
     # and back
     assert run(daemon, "--restore", str(file), "--json") == 0
     assert json.loads(capsys.readouterr().out)["problem"] == ""

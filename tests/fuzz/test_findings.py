@@ -48,6 +48,19 @@ def test_text_with_control_characters_is_refused(text: str) -> None:
     assert str(refused.value).isprintable()
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "devices: {a: {driver: imu61x-spi, options: {gyro_filter: 22}, spi: {port: /dev/spidev0.0, rate_hz: 500}}}",
+        "devices: {a: {driver: imu61x-i2c, options: {nothing: 1}, i2c: {bus: 1, rate_hz: 500}}}",
+    ],
+)
+def test_bad_options_of_a_polled_driver_are_refused(text: str) -> None:
+    """config/yaml: the load of a bus was computed from options that could not be read, an AttributeError."""
+    with pytest.raises(ConfigError, match=r"imud\.yaml:1:.*options"):
+        config.parse(text, "imud.yaml")
+
+
 def test_heartbeat_at_the_end_of_its_range_is_no_undefined_behaviour(tmp_path: Path) -> None:
     """c-header: `now_ns - heartbeat_ns` overflowed in imud_health."""
     if problem := c_header.build(tmp_path):

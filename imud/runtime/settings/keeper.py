@@ -127,6 +127,7 @@ class SettingsKeeper:
         self._read_ns: int | None = None
         self._repairs = 0
         self._repaired_ns: list[int] = []
+        self._repaired_module = ""
         """When imud set the device by itself, of the last PAUSES_FORGOTTEN_S."""
 
     # --- when ---------------------------------------------------------------------------------------------------------
@@ -343,7 +344,13 @@ class SettingsKeeper:
         return actual == self._saved and all(name in actual for name in self._declared)
 
     def _pause_ns(self, now_ns: int) -> int:
-        """Time to wait before the device may be set by imud itself again, by how often that was needed of late."""
+        """Time to wait before the device may be set by imud itself again, by how often that was needed of late.
+
+        A module that takes the place of another one begins without pauses.
+        """
+        if self._module != self._repaired_module:
+            self._repaired_module = self._module
+            self._repaired_ns.clear()
         forgotten_ns = now_ns - PAUSES_FORGOTTEN_S * NS_PER_S
         self._repaired_ns = [time_ns for time_ns in self._repaired_ns if time_ns > forgotten_ns]
         pause_s = PAUSES_S[min(len(self._repaired_ns), len(PAUSES_S) - 1)]

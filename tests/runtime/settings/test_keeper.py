@@ -354,6 +354,22 @@ def test_another_module_is_brought_to_the_same_settings() -> None:
     bench.play(story)
 
 
+def test_each_module_that_takes_the_place_of_another_is_set_at_once() -> None:
+    bench = ModuleBench("apply", {"mode": "9-axis"})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.status.repairs == 1)
+        for number, serial in enumerate(("B2", "C3", "D4"), start=2):
+            bench.module.disappear()
+            await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+            bench.module.serial, bench.module.flash = serial, dict(FACTORY)
+            bench.module.restart()
+            bench.module.appear()
+            await bench.until(partial(bench.repaired, number), limit_s=10)
+
+    bench.play(story)
+
+
 def test_a_device_that_forgets_is_set_again_after_growing_pauses() -> None:
     bench = ModuleBench("apply", {"mode": "9-axis"})
     bench.module.forgets = {"mode"}
