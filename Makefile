@@ -6,6 +6,8 @@
 # make pictures   the pictures of README.md and docs/frames.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
 # make audit  items of both manuals: code and tests of each
+# make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
+# make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
 # make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
 SHELL := /bin/sh
 PYTHON ?= python3
@@ -15,7 +17,7 @@ ARGS ?=
 LAB_OPTIONS ?= --steady
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit
+.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try
 
 all: check
 
@@ -75,6 +77,15 @@ fuzz: $(VENV)/made-fuzz
 # the compiler for the fuzzer of imud.h
 fuzz-deps:
 	apt-get install --yes --no-install-recommends clang libclang-rt-14-dev
+
+deb: $(VENV)/made
+	PYTHON=$(BIN)/python packaging/debian/build $(RELEASE) $(ARCH)
+
+deb-try: deb
+	packaging/debian/try "$$(ls -t build/deb/*.deb | head -n 1)"
+
+deb-deps:
+	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap
 
 lab-deps:
 	tests/lab/deps

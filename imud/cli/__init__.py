@@ -57,7 +57,8 @@ def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParse
     parser.add_argument("--version", action="version", version=f"imud {__version__}")
     parsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
-        sub = parsers.add_parser(name, help=command.help, description=command.help.capitalize() + ".")
+        description = command.help[:1].upper() + command.help[1:] + "."
+        sub = parsers.add_parser(name, help=command.help, description=description)
         if name in commands:
             command.load().add_arguments(sub)
     return parser

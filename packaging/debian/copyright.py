@@ -1,0 +1,94 @@
+"""Prints debian/copyright for a folder of installed wheels: `copyright.py SITE-PACKAGES`.
+
+Each library gets a paragraph with the lines of its licence files. The long texts that Debian has in
+/usr/share/common-licenses are named instead. A library without any licence text is an error: it has to be looked at.
+"""
+
+import re
+import sys
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+
+COMMON = (
+    ("Apache License", "Apache-2.0", "Apache-2.0"),
+    ("GNU LESSER GENERAL PUBLIC LICENSE Version 2.1", "LGPL-2.1", "LGPL-2.1"),
+    ("GNU LESSER GENERAL PUBLIC LICENSE Version 3", "LGPL-3", "LGPL-3"),
+)
+"""How a text begins, its name, and its file in /usr/share/common-licenses."""
+BSD_3_CLAUSE = """
+Redistribution and use in source and binary forms, with or without modification, are permitted provided that the
+following conditions are met:
+
+1. Redistributions of source code must retain the above copyright notice, this list of conditions and the following
+   disclaimer.
+2. Redistributions in binary form must reproduce the above copyright notice, this list of conditions and the following
+   disclaimer in the documentation and/or other materials provided with the distribution.
+3. Neither the name of the copyright holder nor the names of its contributors may be used to endorse or promote products
+   derived from this software without specific prior written permission.
+
+THIS SOFTWARE IS PROVIDED BY THE COPYRIGHT HOLDERS AND CONTRIBUTORS "AS IS" AND ANY EXPRESS OR IMPLIED WARRANTIES,
+INCLUDING, BUT NOT LIMITED TO, THE IMPLIED WARRANTIES OF MERCHANTABILITY AND FITNESS FOR A PARTICULAR PURPOSE ARE
+DISCLAIMED. IN NO EVENT SHALL THE COPYRIGHT HOLDER OR CONTRIBUTORS BE LIABLE FOR ANY DIRECT, INDIRECT, INCIDENTAL,
+SPECIAL, EXEMPLARY, OR CONSEQUENTIAL DAMAGES (INCLUDING, BUT NOT LIMITED TO, PROCUREMENT OF SUBSTITUTE GOODS OR
+SERVICES; LOSS OF USE, DATA, OR PROFITS; OR BUSINESS INTERRUPTION) HOWEVER CAUSED AND ON ANY THEORY OF LIABILITY,
+WHETHER IN CONTRACT, STRICT LIABILITY, OR TORT (INCLUDING NEGLIGENCE OR OTHERWISE) ARISING IN ANY WAY OUT OF THE USE OF
+THIS SOFTWARE, EVEN IF ADVISED OF THE POSSIBILITY OF SUCH DAMAGE.
+"""
+KNOWN = {"pyserial": BSD_3_CLAUSE}
+"""Texts of libraries whose wheel has none: the files of pyserial say "SPDX-License-Identifier: BSD-3-Clause"."""
+
+
+def licence_texts(distribution: Distribution) -> list[str]:
+    """The licence texts of a library, from the folder of its metadata."""
+    return [
+        Path(str(file.locate())).read_text(errors="replace")
+        for file in distribution.files or []
+        if ".dist-info/" in str(file) and re.search(r"LICEN[CS]E|COPYING|NOTICE", file.name, re.IGNORECASE)
+    ]
+
+
+def indented(text: str) -> str:
+    """Text as the body of a field."""
+    return "\n".join(f" {line.rstrip()}" if line.strip() else " ." for line in text.strip().splitlines())
+
+
+def paragraph(distribution: Distribution) -> str:
+    """The paragraph of a library. Raises SystemExit where nothing says what its licence is."""
+    name = distribution.metadata["Name"]
+    holders, bodies = [], []
+    for text in licence_texts(distribution):
+        flat = " ".join(text.split())
+        common = next((one for one in COMMON if flat[:200].lower().startswith(one[0].lower())), None)
+        if common is None:
+            holders += [line.strip() for line in text.splitlines() if re.match(r"\s*Copyright\b.*\d{4}", line)]
+            bodies.append(text)
+        else:
+            bodies.append(f"The text of {common[1]} is in /usr/share/common-licenses/{common[2]}.")
+    if not bodies and name not in KNOWN:
+        raise SystemExit(f"copyright.py: expected a licence text in the wheel of {name}, found none; add it to KNOWN")
+    bodies = bodies or [KNOWN[name]]
+    author = distribution.metadata["Author"] or distribution.metadata["Author-email"] or f"the authors of {name}"
+    files = sorted({str(file).split("/")[0] for file in distribution.files or [] if not str(file).startswith("..")})
+    return "\n".join(
+        [
+            f"Files: {' '.join(f'*/site-packages/{one}*' for one in files if one != 'bin')}",
+            f"Copyright: {(chr(10) + ' ').join(holders) or author}",
+            f"License: {re.sub('[^a-z0-9]+', '-', name.lower())}",
+            indented("\n\n".join(bodies)),
+        ]
+    )
+
+
+def main(folder: str) -> None:
+    """Print the whole file."""
+    print("Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/")
+    print("Upstream-Name: imud")
+    print("\nFiles: *\nCopyright: the authors of imud\nLicense: Apache-2.0")
+    print(" The text of Apache-2.0 is in /usr/share/common-licenses/Apache-2.0.")
+    for distribution in sorted(distributions(path=[folder]), key=lambda one: one.metadata["Name"].lower()):
+        if distribution.metadata["Name"] != "imud":
+            print("\n" + paragraph(distribution))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

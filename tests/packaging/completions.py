@@ -1,0 +1,47 @@
+"""Makes shell completions from the parsers, by shtab: `python -m tests.packaging.completions FOLDER`.
+
+FOLDER gets a file per shell, named as the shell looks for it: `bash/imud`, `zsh/_imud`, `fish/imud.fish`.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from imud.cli import build_parser
+
+FILES: Final = {"bash": "bash/imud", "zsh": "zsh/_imud", "fish": "fish/imud.fish"}
+"""File of each shell."""
+PATHS: Final = ("FILE", "PATH", "PORT", "CAPTURE")
+"""Names of arguments in the help that are completed with names of files; a port is a node below /dev."""
+
+
+def every_parser(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """This parser and those of all commands below it."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for one in action.choices.values():
+                yield from every_parser(one)
+
+
+def completions() -> dict[str, str]:
+    """The text of each file by its name. Raises ImportError where shtab is missing."""
+    import shtab
+
+    parser = build_parser()
+    for one in every_parser(parser):
+        for action in one._actions:
+            if action.metavar in PATHS:
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+    return {file: shtab.complete(parser, shell=shell) for shell, file in FILES.items()}
+
+
+if __name__ == "__main__":
+    os.environ.pop("IMUD_SOCKET", None)
+    for file, text in completions().items():
+        path = Path(sys.argv[1]) / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)

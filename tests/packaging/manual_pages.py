@@ -1,0 +1,239 @@
+"""Makes manual pages in roff: `python -m tests.packaging.manual_pages FOLDER`.
+
+imud(1) and a page for each command, imud-COMMAND(1), come from the parsers that print `--help`; imud.yaml(5) comes from
+the settings classes, as docs/configuration.md does. The Debian package installs them.
+"""
+
+import argparse
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from imud import __version__
+from imud.cli import COMMANDS, build_parser
+from imud.contracts.settings import expected
+from imud.formats.jsonrpc import DEFAULT_PATH
+from tests.support import references
+
+EXIT_STATUS: Final = (
+    ("0", "Done."),
+    ("1", "The command ran, and the answer is no."),
+    ("2", "The command could not run; the reason is on standard error."),
+)
+RUN_STATUS: Final = (
+    ("0", "Stopped by SIGTERM or SIGINT."),
+    ("1", "A mistake of imud's own; the log has where."),
+    ("2", "Wrong command line."),
+    ("75", "An output that is required cannot start."),
+    ("78", "The configuration cannot be used; the log has file, line and column."),
+)
+ENVIRONMENT: Final = (
+    ("IMUD_SOCKET", f"The daemon's socket, instead of {DEFAULT_PATH}."),
+    ("IMUD_SHM", "The folder of the rings of shared memory."),
+)
+FILES: Final = (
+    ("/etc/imud.yaml", "The configuration, imud.yaml(5)."),
+    (DEFAULT_PATH, "The socket: questions, samples and events."),
+    ("/run/imud/shm", "The rings of shared memory."),
+    ("/var/lib/imud", "What the daemon remembers."),
+)
+
+# --- roff -------------------------------------------------------------------------------------------------------------
+
+
+def inside(text: str) -> str:
+    """Text within a line as roff prints it: hyphens stay hyphens, so that they can be copied."""
+    return text.replace("\\", "\\e").replace("-", "\\-").replace("^", "\\(ha").replace("~", "\\(ti")
+
+
+def escaped(text: str) -> str:
+    """Text as roff prints it, no line of which is taken for a request."""
+    return "\n".join("\\&" + line if line[:1] in (".", "'") else line for line in inside(text).splitlines())
+
+
+def bold(text: str) -> str:
+    """Text in bold."""
+    return f"\\fB{inside(text)}\\fR"
+
+
+def italic(text: str) -> str:
+    """Text in italics: what the user replaces."""
+    return f"\\fI{inside(text)}\\fR"
+
+
+def marked(text: str) -> str:
+    """Text of a document with its `code` in bold."""
+    parts = text.split("`")
+    return "".join(bold(part) if number % 2 else inside(part) for number, part in enumerate(parts))
+
+
+def header(name: str, section: int, summary: str) -> Iterator[str]:
+    """The first lines of a page."""
+    yield f'.TH "{escaped(name.upper())}" "{section}" "" "imud {escaped(__version__)}" "imud"'
+    yield from (".SH NAME", f"{escaped(name)} \\- {escaped(summary)}")
+
+
+def listed(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Paragraphs with a term, which is bold, and its meaning."""
+    for term, meaning in rows:
+        yield from (".TP", bold(term), escaped(meaning))
+
+
+def see_also(pages: Iterable[tuple[str, int]]) -> Iterator[str]:
+    """The last part of a page."""
+    yield ".SH SEE ALSO"
+    yield ",\n".join(f"{bold(name)}({section})" for name, section in pages)
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+def sentence(text: str) -> str:
+    """The text of a help with a capital letter and a full stop."""
+    return text[:1].upper() + text[1:] + ("." if text and not text.endswith((".", "?")) else "")
+
+
+def values_of(action: argparse.Action) -> str:
+    """What stands behind an option, or in the place of a positional argument."""
+    if action.nargs == 0:
+        return ""
+    word = action.metavar
+    if isinstance(word, tuple):
+        return " ".join(italic(one) for one in word)
+    if word is None and action.choices is not None:
+        word = "{" + ",".join(map(str, action.choices)) + "}"
+    one = italic(word or (action.dest.upper() if action.option_strings else action.dest))
+    return {"*": f"[{one} ...]", "+": f"{one} [{one} ...]", "?": f"[{one}]"}.get(str(action.nargs), one)
+
+
+def help_of(action: argparse.Action, parser: argparse.ArgumentParser) -> str:
+    """The help text with its %(…)s filled in, as `--help` prints it."""
+    words = {**vars(action), "prog": parser.prog}
+    if action.choices is not None:
+        words["choices"] = ", ".join(map(str, action.choices))
+    text = (action.help or "") % words
+    return sentence(text)
+
+
+def arguments_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """The arguments that `--help` shows, commands of a command not among them."""
+    return [
+        action
+        for action in parser._actions
+        if action.help != argparse.SUPPRESS and not isinstance(action, argparse._SubParsersAction)
+    ]
+
+
+def helps_of(parser: argparse.ArgumentParser) -> Mapping[str, str]:
+    """The help texts of the commands below this one."""
+    return {
+        one.dest: one.help or ""
+        for action in parser._actions
+        if isinstance(action, argparse._SubParsersAction)
+        for one in action._choices_actions
+    }
+
+
+def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
+    """The parsers of the commands below this one."""
+    found: dict[str, argparse.ArgumentParser] = {}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            found |= action.choices
+    return found
+
+
+def synopsis(parser: argparse.ArgumentParser) -> str:
+    """How a command is called, as `--help` has it: what excludes each other stands between bars."""
+    words = " ".join(parser.format_usage().split()).removeprefix("usage: ").removeprefix(parser.prog)
+    return bold(parser.prog) + inside(words)
+
+
+def options(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """A paragraph for each argument, the positional ones first."""
+    for action in sorted(arguments_of(parser), key=lambda one: bool(one.option_strings)):
+        values = values_of(action)
+        names = ", ".join(f"{bold(one)} {values}".rstrip() for one in action.option_strings)
+        yield from (".TP", names or values, escaped(help_of(action, parser)) or "\\&")
+
+
+def main_page(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """The lines of imud(1)."""
+    yield from header("imud", 1, "daemon that owns inertial sensors and gives programs their samples")
+    yield from (".SH SYNOPSIS", synopsis(parser), ".SH DESCRIPTION")
+    yield escaped(
+        "imud owns inertial sensors on serial ports, RS-485, CAN, I2C and SPI, gives each sample the time at which it "
+        "was measured, and hands it to any number of programs over a UNIX socket and shared memory. As a service it is "
+        "imud.service. Its commands find sensors, check a configuration, and ask the running daemon."
+    )
+    yield ".SH COMMANDS"
+    for name, command in COMMANDS.items():
+        yield from (".TP", f"{bold(f'imud-{name}')}(1)", escaped(sentence(command.help)))
+    yield from (".SH OPTIONS", *options(parser))
+    yield from (".SH EXIT STATUS", *listed(EXIT_STATUS), ".SH ENVIRONMENT", *listed(ENVIRONMENT))
+    yield from (".SH FILES", *listed(FILES))
+    yield from see_also([*((f"imud-{name}", 1) for name in COMMANDS), ("imud.yaml", 5)])
+
+
+def command_page(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
+    """The lines of imud-NAME(1)."""
+    yield from header(f"imud-{name}", 1, COMMANDS[name].help)
+    yield ".SH SYNOPSIS"
+    below = commands_of(parser)
+    for number, one in enumerate(below.values() if below else [parser]):
+        yield from (*([".br"] if number else []), synopsis(one))
+    yield from (".SH DESCRIPTION", escaped(parser.description or COMMANDS[name].help))
+    yield from (".SH OPTIONS", *options(parser))
+    for word, one in below.items():
+        yield from (f".SS {escaped(one.prog)}", escaped(sentence(helps_of(parser)[word])), *options(one))
+    yield from (".SH EXIT STATUS", *listed(RUN_STATUS if name == "run" else EXIT_STATUS))
+    yield from see_also([("imud", 1), ("imud.yaml", 5)])
+
+
+# --- the configuration ------------------------------------------------------------------------------------------------
+
+
+def configuration_page() -> Iterator[str]:
+    """The lines of imud.yaml(5)."""
+    yield from header("imud.yaml", 5, "configuration of imud")
+    yield from (".SH SYNOPSIS", escaped("/etc/imud.yaml"), ".SH DESCRIPTION")
+    yield marked(
+        "A YAML file. All keys have defaults but those marked as needed. `imud check` says whether a file can be used "
+        "and what is wrong with it; `systemctl reload imud` makes the daemon read it again. The smallest useful file:"
+    )
+    yield from (".PP", ".EX", "devices:", "  front:", "    uart: {port: /dev/ttyUSB0}", ".EE")
+    for title, path, schema in references.settings_parts():
+        fields = msgspec.structs.fields(schema)
+        if not fields:
+            continue
+        docs = references.docs_of(schema)
+        yield f".SH {escaped(re.sub('`', '', title).upper())}"
+        for field in fields:
+            default = references.default_of(field).strip("`")
+            value = "needed" if default == "needed" else f"default {default}"
+            yield from (".TP", bold(path + field.name), marked(f"{docs[field.name]} Expected: {expected(field.type)};"))
+            yield escaped(f"{value}.")
+    yield from see_also([("imud", 1), ("imud-check", 1), ("imud-run", 1)])
+
+
+def pages() -> dict[str, str]:
+    """Every page by the name of its file."""
+    parser = build_parser()
+    found = {"imud.1": main_page(parser)}
+    for name, command in commands_of(parser).items():
+        found[f"imud-{name}.1"] = command_page(name, command)
+    found["imud.yaml.5"] = configuration_page()
+    return {name: "\n".join(lines) + "\n" for name, lines in found.items()}
+
+
+if __name__ == "__main__":
+    os.environ.pop("IMUD_SOCKET", None)  # a default that is printed must not be that of who makes the pages
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, text in pages().items():
+        (folder / file).write_text(text)

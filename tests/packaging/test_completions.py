@@ -1,0 +1,55 @@
+"""The shell completions know all commands, and each shell can read its own."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from imud.cli import COMMANDS
+from tests.packaging.completions import FILES, completions
+
+pytest.importorskip("shtab", reason="shtab is not installed (extra dev)")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the three files."""
+    path = tmp_path_factory.mktemp("completions")
+    for file, text in completions().items():
+        (path / file).parent.mkdir()
+        (path / file).write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("shell", FILES)
+def test_every_command_and_its_options_are_known(folder: Path, shell: str) -> None:
+    text = (folder / FILES[shell]).read_text()
+    for command in (*COMMANDS, "scan", "assign"):
+        assert command in text
+    assert "convention" in text
+    assert "ned-frd" in text
+
+
+@pytest.mark.parametrize("shell", FILES)
+def test_the_shell_can_read_it(folder: Path, shell: str) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"no {shell} on this machine")
+    subprocess.run([shell, "-n", str(folder / FILES[shell])], check=True, timeout=30)
+
+
+def completed_by_bash(folder: Path, *words: str) -> list[str]:
+    """What bash offers for the last of these words."""
+    script = 'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _shtab_imud; echo "${COMPREPLY[@]}"'
+    argv = ["bash", "--norc", "-c", script, "bash", str(folder / FILES["bash"]), *words]
+    return subprocess.run(argv, capture_output=True, text=True, check=True, timeout=30).stdout.split()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash on this machine")
+def test_bash_completes_commands_options_values_and_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert completed_by_bash(folder, "imud", "wa") == ["watch"]
+    assert completed_by_bash(folder, "imud", "watch", "--conv") == ["--convention"]
+    assert completed_by_bash(folder, "imud", "watch", "--convention", "n") == ["ned-frd"]
+    (folder / "boat.yaml").touch()
+    monkeypatch.chdir(folder)
+    assert completed_by_bash(folder, "imud", "check", "boa") == ["boat.yaml"]

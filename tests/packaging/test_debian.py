@@ -1,0 +1,183 @@
+"""The files of the Debian package that can be judged without building it; `make deb` builds it."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from imud import __version__
+from tests.support.files import ROOT
+
+DEBIAN = ROOT / "packaging" / "debian"
+SCRIPTS = ("imud.postinst", "imud.prerm", "imud.postrm")
+
+
+def fields(text: str) -> dict[str, str]:
+    """Fields of a paragraph of a control file."""
+    found: dict[str, str] = {}
+    name = ""
+    for line in text.splitlines():
+        if line[:1] == " ":
+            found[name] += "\n" + line
+        else:
+            name, _, value = line.partition(":")
+            found[name] = value.strip()
+    return found
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_maintainer_scripts_are_shell_and_leave_a_place_for_debhelper(name: str) -> None:
+    text = (DEBIAN / name).read_text()
+    assert text.startswith("#!/bin/sh\nset -e\n")
+    assert text.count("\n#DEBHELPER#\n") == 1
+    subprocess.run(["sh", "-n", str(DEBIAN / name)], check=True, timeout=30)
+
+
+@pytest.mark.parametrize("name", ["build", "try"])
+def test_programs_of_the_package_are_shell(name: str) -> None:
+    assert os.access(DEBIAN / name, os.X_OK)
+    subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=30)
+
+
+def run_script(name: str, *arguments: str, root: Path) -> None:
+    """Run a maintainer script as dpkg does, with its paths below `root`."""
+    text = (DEBIAN / name).read_text()
+    moved = re.sub(r"(?<![\w/])/(usr/lib/imud|var/lib/imud|run/udev|run/systemd/system)", rf"{root}/\1", text)
+    assert moved != text
+    subprocess.run(["sh", "-c", moved, name, *arguments], check=True, timeout=30)
+
+
+def test_only_a_purge_removes_the_state(tmp_path: Path) -> None:
+    state = tmp_path / "var/lib/imud/state.json"
+    state.parent.mkdir(parents=True)
+    state.touch()
+    for action in ("remove", "upgrade", "disappear", "abort-install"):
+        run_script("imud.postrm", action, root=tmp_path)
+        assert state.exists(), action
+    run_script("imud.postrm", "purge", root=tmp_path)
+    assert not state.parent.exists()
+
+
+def test_what_was_compiled_at_the_installation_goes_before_the_package(tmp_path: Path) -> None:
+    (tmp_path / "usr/lib/imud/bin").mkdir(parents=True)
+    library = tmp_path / "usr/lib/imud/lib"
+    library.mkdir()
+    (library / "one.py").touch()
+    (tmp_path / "usr/lib/imud/bin/python3").symlink_to(sys.executable)
+    run_script("imud.postinst", "configure", "", root=tmp_path)
+    assert list(library.rglob("*.pyc"))
+    run_script("imud.prerm", "remove", root=tmp_path)
+    assert list(library.iterdir()) == [library / "one.py"]
+    run_script("imud.prerm", "remove", root=tmp_path / "nothing")
+
+
+def test_a_removal_stops_the_service_and_an_upgrade_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = tmp_path / "calls"
+    (tmp_path / "bin").mkdir()
+    stub = tmp_path / "bin/deb-systemd-invoke"
+    stub.write_text(f'#!/bin/sh\necho "$@" >>{calls}\nexit 1\n')
+    stub.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{stub.parent}:{os.environ['PATH']}")
+    run_script("imud.prerm", "remove", root=tmp_path)
+    assert not calls.exists(), "no systemd runs"
+    (tmp_path / "run/systemd/system").mkdir(parents=True)
+    run_script("imud.prerm", "upgrade", "0.2.0-1", root=tmp_path)
+    assert not calls.exists()
+    run_script("imud.prerm", "remove", root=tmp_path)
+    assert calls.read_text() == "stop imud.service\n"
+
+
+def test_control_has_what_debian_wants() -> None:
+    source, package = map(fields, (DEBIAN / "control").read_text().strip().split("\n\n"))
+    assert source["Source"] == package["Package"] == "imud"
+    assert {"Maintainer", "Section", "Priority", "Standards-Version"} <= source.keys()
+    assert package["Architecture"] == "any"
+    assert "@PYTHON@" in package["Depends"]
+    assert "${misc:Depends}" in package["Depends"]
+    summary, *rest = package["Description"].splitlines()
+    assert len(summary) < 80
+    assert rest
+    assert all(len(line) <= 80 for line in rest)
+
+
+def test_every_file_that_the_build_takes_is_there() -> None:
+    text = (DEBIAN / "build").read_text()
+    taken = re.findall(r" ((?:packaging/debian|etc|systemd|imud/include)/[\w./-]+\w)(?= |\n|$)", text)
+    assert len(taken) >= 8
+    assert all((ROOT / one).is_file() for one in taken), taken
+    (names,) = re.findall(r"for file in ([^;]*);", text)
+    assert {"control", "changelog", "rules", *SCRIPTS} <= set(names.replace("\\", "").split())
+    assert all((DEBIAN / one).is_file() for one in names.replace("\\", "").split())
+
+
+def test_overrides_have_reasons_and_the_launcher_its_own_python() -> None:
+    lines = (DEBIAN / "imud.lintian-overrides").read_text().splitlines()
+    assert lines[0].startswith("# ")
+    assert all(re.match(r"# |imud( \[arm64\])?: ", line) for line in lines)
+    assert (DEBIAN / "imud.py").read_text().startswith("#!/usr/lib/imud/bin/python3 -I\n")
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == __version__
+    assert re.match(r"imud \(@VERSION@-1~@RELEASE@\) @RELEASE@; ", (DEBIAN / "changelog").read_text())
+
+
+def test_sysusers_make_every_group_that_the_unit_names() -> None:
+    unit = (ROOT / "systemd/imud.service").read_text()
+    named = re.findall(r"^(?:Group|SupplementaryGroups)=(.*)$", unit, re.MULTILINE)
+    made = re.findall(r"^g (\S+)", (ROOT / "systemd/imud.sysusers.conf").read_text(), re.MULTILINE)
+    assert set(" ".join(named).split()) <= set(made)
+
+
+@pytest.mark.skipif(shutil.which("pkg-config") is None, reason="no pkg-config on this machine")
+def test_pkg_config_reads_its_file(tmp_path: Path) -> None:
+    (tmp_path / "imud.pc").write_text((DEBIAN / "imud.pc").read_text().replace("@VERSION@", __version__))
+    argv = ["pkg-config", "--modversion", "imud"]
+    environment = {**os.environ, "PKG_CONFIG_PATH": str(tmp_path)}
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=True, timeout=30)
+    assert done.stdout.strip() == __version__
+
+
+def library(folder: Path, name: str, **texts: str) -> None:
+    """A library as an installed wheel, with these files of licences."""
+    info = folder / f"{name}-1.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\nAuthor: A. Uthor\n")
+    (folder / f"{name}.py").touch()
+    for file, text in texts.items():
+        (info / file).write_text(text)
+    files = [f"{name}.py", *(f"{info.name}/{file}" for file in ("METADATA", "RECORD", *texts))]
+    (info / "RECORD").write_text("".join(f"{file},,\n" for file in files))
+
+
+def copyright_of(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run copyright.py on a folder of installed wheels."""
+    argv = [sys.executable, str(DEBIAN / "copyright.py"), str(folder)]
+    return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=30)
+
+
+def test_copyright_has_each_library_with_its_text(tmp_path: Path) -> None:
+    library(tmp_path, "one", LICENSE="Copyright (c) 2020 Someone\n\nDo what you like.\n")
+    library(tmp_path, "two", LICENSE="  Apache License\n  Version 2.0, January 2004\n")
+    library(tmp_path, "pyserial")
+    text = copyright_of(tmp_path).stdout
+    assert "Files: */site-packages/one-1.dist-info* */site-packages/one.py*\n" in text
+    assert "Copyright: Copyright (c) 2020 Someone\nLicense: one\n Copyright (c) 2020 Someone\n .\n Do what" in text
+    assert (
+        "Copyright: A. Uthor\nLicense: two\n The text of Apache-2.0 is in /usr/share/common-licenses/Apache-2.0."
+        in text
+    )
+    assert "License: pyserial\n Redistribution and use" in text
+
+
+def test_copyright_refuses_a_library_without_a_text(tmp_path: Path) -> None:
+    library(tmp_path, "bare")
+    done = copyright_of(tmp_path)
+    assert done.returncode == 1
+    assert "expected a licence text in the wheel of bare" in done.stderr

@@ -1,0 +1,107 @@
+"""The manual pages say what `--help` and the settings classes say, in roff that every reader prints."""
+
+import argparse
+import re
+import shutil
+import subprocess
+
+import msgspec
+import pytest
+
+from imud.cli import COMMANDS, build_parser
+from tests.packaging.completions import every_parser
+from tests.packaging.manual_pages import escaped, help_of, marked, pages, sentence
+from tests.support import references
+from tests.support.files import ROOT
+
+REQUESTS = ("TH", "SH", "SS", "TP", "PP", "EX", "EE")
+
+PAGES = pages()
+
+
+def plain(text: str) -> str:
+    """What a reader sees of a page, on one line."""
+    words = re.sub(r"\\f[BIR]|\\&", "", text).replace("\\-", "-").replace("\\(ha", "^").replace("\\(ti", "~")
+    return " ".join(words.replace("\\e", "\\").split())
+
+
+def test_there_is_a_page_for_each_command_and_for_the_configuration() -> None:
+    assert set(PAGES) == {"imud.1", "imud.yaml.5", *(f"imud-{name}.1" for name in COMMANDS)}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_page_has_every_argument_with_its_help(name: str) -> None:
+    text = plain(PAGES[f"imud-{name}.1"])
+    arguments = 0
+    for parser in every_parser(build_parser([name])):
+        if parser.prog.split()[1:2] != [name]:
+            continue
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                continue
+            arguments += 1
+            for word in action.option_strings:
+                assert word in text
+            assert plain(escaped(help_of(action, parser))) in text
+    assert arguments > 0
+
+
+def test_the_synopsis_says_what_excludes_each_other() -> None:
+    synopsis = plain(PAGES["imud-settings.1"].partition(".SH DESCRIPTION")[0])
+    assert "[--apply | --set NAME=VALUE" in synopsis
+
+
+def test_commands_of_a_command_are_on_its_page() -> None:
+    text = plain(PAGES["imud-modbus.1"])
+    assert ".SS imud modbus scan List the module at every address." in text
+    assert ".SS imud modbus assign" in text
+
+
+def test_a_page_names_command_section_and_summary() -> None:
+    assert PAGES["imud-watch.1"].startswith('.TH "IMUD\\-WATCH" "1" ')
+    assert ".SH NAME\nimud\\-watch \\- print samples as they come\n" in PAGES["imud-watch.1"]
+    assert "RS\\-485" in PAGES["imud-modbus.1"]
+
+
+def test_the_exit_statuses_of_the_daemon_are_those_of_its_document() -> None:
+    rows = re.findall(r"^\| (\d+) \|", (ROOT / "docs/operate.md").read_text(), re.MULTILINE)
+    part = PAGES["imud-run.1"].partition(".SH EXIT STATUS")[2]
+    assert re.findall(r"^\\fB(\d+)\\fR$", part, re.MULTILINE) == rows
+
+
+def test_the_configuration_page_has_every_key_with_what_is_expected() -> None:
+    text = PAGES["imud.yaml.5"]
+    keys = [path + field.name for _, path, one in references.settings_parts() for field in msgspec.structs.fields(one)]
+    assert len(keys) > 100
+    for key in keys:
+        assert f".TP\n\\fB{escaped(key)}\\fR\n" in text, key
+    assert "Expected: a whole number from 1 to 4096; default 256." in plain(text)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_line_is_an_unknown_request(name: str) -> None:
+    for line in PAGES[name].splitlines():
+        assert not line.startswith("'")
+        if line.startswith("."):
+            assert line[1:].split()[0] in (*REQUESTS, "br"), line
+
+
+@pytest.mark.parametrize(
+    ("text", "roff"),
+    [("--json", "\\-\\-json"), (".5", "\\&.5"), ("'a'", "\\&'a'"), ("a\\b", "a\\eb"), ("~^", "\\(ti\\(ha")],
+)
+def test_roff_is_escaped(text: str, roff: str) -> None:
+    assert escaped(text) == roff
+
+
+def test_helps_become_sentences_and_code_becomes_bold() -> None:
+    assert sentence("list what is attached") == "List what is attached."
+    assert marked("see `imud check`.") == "see \\fBimud check\\fR."
+
+
+@pytest.mark.skipif(shutil.which("mandoc") is None, reason="no mandoc on this machine")
+@pytest.mark.parametrize("name", PAGES)
+def test_mandoc_finds_nothing_wrong(name: str) -> None:
+    argv = ["mandoc", "-T", "lint", "-W", "warning"]
+    done = subprocess.run(argv, input=PAGES[name], capture_output=True, text=True, timeout=30, check=False)
+    assert not [line for line in done.stdout.splitlines() if "missing date" not in line]
