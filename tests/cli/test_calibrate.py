@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from subprocess import PIPE, Popen
 
 import pytest
@@ -82,3 +83,19 @@ def test_progress_as_a_bar() -> None:
     line = progress_line(Event(0, "bow", EventKind.CALIBRATION, "…", detail))
     assert line == "[###############...............]  50%  field 45.1 µT, residual 1.2%  bias 0, 0, 0 µT"
     assert progress_line(Event(0, "bow", EventKind.CALIBRATION, "verified", {"phase": "end"})) == "verified"
+
+
+def test_a_module_on_rs485_is_levelled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = [sys.executable, "-m", "imud.sim", "--device", "hipnuc-modbus", "--path", str(tmp_path / "port")]
+    with Popen([*argv, "--motion", "still"], stdin=PIPE, stdout=PIPE, text=True) as simulator:
+        assert simulator.stdout is not None
+        assert simulator.stdout.readline()
+        line = {"line": str(tmp_path / "port"), "baud": 115200, "address": 80}
+        with running_daemon(tmp_path, {"bow": {"driver": "hipnuc-modbus", "rs485": line}}) as daemon:
+            daemon.wait_for("bow", "running")
+            assert calibrate(daemon, "level", "--yes", "--save") == 0
+        simulator.terminate()
+        simulator.communicate()
+    out = capsys.readouterr().out
+    assert "\nverified\n  roll: " in out
+    assert out.endswith("  saved\n")

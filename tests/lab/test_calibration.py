@@ -1,0 +1,63 @@
+"""Guided calibrations of inclinometers on CAN, by a device of the daemon on the kernel's virtual bus."""
+
+from collections.abc import Callable
+from time import monotonic_ns
+
+import pytest
+
+from imud.contracts.control.calibration import CalibrationResult
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
+from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
+from imud.errors import CommandError
+from imud.event import EventKind
+from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
+from imud.sim.hipnuc.j1939 import HipnucJ1939Module, J1939Hardware, J1939Settings
+from imud.sim.physics.motion import Motion, Still, swing
+from tests.lab.can_device import BusRig
+from tests.lab.can_interface import CanInterface
+
+TILTED = Still(0.2, -0.1, 0.5)
+SLOW = NodeSettings(bit_rate=0, periods_ms={1: 50, 2: 50, 3: 50, 4: 0, 6: 0, 7: 50})
+
+
+def canopen(interface: str, motion: Motion) -> BusRig:
+    """A node with an inclinometer."""
+    hardware = HipnucCanopenHardware(factory=SLOW, boot_ms=0, motion=motion)
+    return BusRig(interface, "hipnuc-canopen", HipnucCanopenSettings(), HipnucCanopenModule(monotonic_ns(), hardware))
+
+
+def j1939(interface: str, motion: Motion) -> BusRig:
+    """A module with an inclinometer."""
+    hardware = J1939Hardware(bitrate=0, boot_ms=0, motion=motion)
+    return BusRig(
+        interface, "hipnuc-j1939", HipnucJ1939Settings(), HipnucJ1939Module(monotonic_ns(), J1939Settings(), hardware)
+    )
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("make", [canopen, j1939])
+def test_the_zero_of_an_inclinometer(vcan: CanInterface, make: Callable[[str, Motion], BusRig]) -> None:
+    rig = make(vcan.name, TILTED)
+
+    async def story() -> None:
+        await rig.until(lambda: any(sample.incli_rad is not None for sample in rig.samples), "inclinations")
+        before = next(sample.incli_rad for sample in reversed(rig.samples) if sample.incli_rad is not None)
+        assert max(map(abs, before)) > 0.05
+        result: CalibrationResult = await rig.done(rig.device.calibrate("zero", save=True))
+        assert result.verified, result
+        assert result.saved
+        assert [check.name for check in result.checks] == ["inclination"]
+
+    rig.play(story)
+    assert any(event.kind is EventKind.CALIBRATION for event in rig.events)
+
+
+@pytest.mark.timeout(300)
+def test_a_node_that_moves_gets_no_zero(vcan: CanInterface) -> None:
+    rig = canopen(vcan.name, swing())
+
+    async def story() -> None:
+        with pytest.raises(CommandError, match="expected the device at rest"):
+            await rig.done(rig.device.calibrate("zero", save=True))
+
+    rig.play(story)
