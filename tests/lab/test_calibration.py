@@ -29,9 +29,9 @@ def canopen(interface: str, motion: Motion) -> BusRig:
 def j1939(interface: str, motion: Motion) -> BusRig:
     """A module with an inclinometer."""
     hardware = J1939Hardware(bitrate=0, boot_ms=0, motion=motion)
-    return BusRig(
-        interface, "hipnuc-j1939", HipnucJ1939Settings(), HipnucJ1939Module(monotonic_ns(), J1939Settings(), hardware)
-    )
+    settings = J1939Settings(intervals_ms={**J1939Settings().intervals_ms, 0xFF4A: 100})
+    module = HipnucJ1939Module(monotonic_ns(), settings, hardware)
+    return BusRig(interface, "hipnuc-j1939", HipnucJ1939Settings(), module)
 
 
 @pytest.mark.timeout(300)

@@ -178,7 +178,7 @@ class Guide:
 
     async def _rest(self, kind: str) -> RestMeans:
         """Wait until the device rests and return the means of its samples. Raises CommandError."""
-        window, begun_ns, first = RestWindow(), self._now_ns, True
+        window, begun_ns, first, moved = RestWindow(), self._now_ns, True, ""
         while self._now_ns - begun_ns < REST_LIMIT_NS:
             now_ns, sample = await self._next()
             if first:
@@ -188,12 +188,13 @@ class Guide:
             window.add(sample)
             if not window.full:
                 continue
-            if not (motion := window.motion()):
+            moved = window.motion()
+            if not moved:
                 return window.means()
-            self._report(kind, "rest", f"waiting for rest: {motion}")
+            self._report(kind, "rest", f"waiting for rest: {moved}")
             window.clear()
-        if window.samples:
-            words = window.motion() or f"only {window.samples} samples came"
+        if moved or window.samples:
+            words = moved or window.motion() or f"only {window.samples} samples came"
             raise CommandError(f"{kind}: expected the device at rest, got: {words}; put it down, away from vibration")
         raise CommandError(f"{kind}: expected samples of the device, got none for {REST_LIMIT_NS // NS_PER_S} s")
 

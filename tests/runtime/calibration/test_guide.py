@@ -177,6 +177,20 @@ def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
     assert "rest" in rig.phases()
 
 
+@pytest.mark.parametrize("until_s", [19.7, 20.05])
+def test_motion_is_told_also_when_no_sample_came_since_it_was_seen(rig: GuideRig, until_s: float) -> None:
+    rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
+
+    async def story() -> None:
+        running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
+        await asyncio.sleep(until_s - 18)
+        rig.silent = True
+        with pytest.raises(CommandError, match="expected the device at rest"):
+            await running
+
+    rig.play(story)
+
+
 def test_rest_is_waited_for(rig: GuideRig) -> None:
     rig.motion = lambda t_s: (0.0, 0.0, 0.5 if t_s < 5 else 0.0)
 
