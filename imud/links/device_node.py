@@ -76,6 +76,11 @@ def open_problem(error: Exception, path: str, missing: str, proc: Path = PROC) -
     number = errno_of(error)
     if number in MISSING:
         return LinkMissing(f"{path} is not there: {missing}")
+    if number == errno.EPERM:  # of a group it would be EACCES
+        return LinkDenied(
+            f"{path} may not be opened: the control group of this process does not allow the device (EPERM, "
+            f"not its group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
+        )
     if number in REFUSED:
         group = group_of(path, SERIAL_GROUP)
         return LinkDenied(

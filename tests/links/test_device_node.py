@@ -47,6 +47,15 @@ def test_another_imud_is_named_by_what_it_does(tmp_path: Path, command: list[str
     assert sorted(named.split(", ")) == ["imud probe (pid 10)", f"this imud (pid {os.getpid()})"]
 
 
+def test_a_control_group_is_told_from_a_group() -> None:
+    by_group = str(open_problem(OSError(errno.EACCES, "x"), "/dev/ttyS9", "?"))
+    by_control_group = str(open_problem(OSError(errno.EPERM, "x"), "/dev/ttyS9", "?"))
+    assert "usermod" in by_group
+    assert "DeviceAllow" not in by_group
+    assert "`DeviceAllow=/dev/ttyS9 rw`" in by_control_group
+    assert "usermod" not in by_control_group
+
+
 def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """udev sets the group of a node after the kernel has made it; a refusal counts only when that time is over."""
     path, granted = tmp_path / "tty", False
