@@ -1,5 +1,7 @@
 """The Prometheus endpoint: `http://ADDRESS:PORT/metrics`. Names and meanings: docs/metrics.md.
 
+`/scrapes` says how often `/metrics` was asked and how long ago, which `imud doctor` asks without being counted.
+
     HTTP thread ──call_soon_threadsafe──▶ event loop: status, clients ──▶ HTTP thread: render, send
 
 The event loop gives a snapshot of plain records and goes on. Rendering holds Python's global lock, so the HTTP
@@ -31,6 +33,7 @@ from imud.log import messages_dropped
 from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
+from imud.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +45,7 @@ PAUSE_S: Final = 100e-6
 SAMPLES_PER_TURN: Final = 64
 """Lines rendered without a pause; one costs some 4 µs."""
 
+JSON: Final = "application/json"
 ABOUT: Final = b"imud: metrics for Prometheus are at /metrics\n"
 
 
@@ -59,6 +63,14 @@ class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields
         """Raise ValueError for what is no address to listen on."""
         if not is_ip_address(self.address) and self.address != "localhost":
             raise ValueError(f"address: expected an IP address such as 127.0.0.1 or ::1, got {shown(self.address)}")
+
+
+class Scrapes(msgspec.Struct, frozen=True):
+    """Requests of `/metrics` since the start."""
+
+    scrapes: int
+    age_s: float
+    """Time since the last one, s; without meaning before the first."""
 
 
 class ClientTotals:
@@ -158,6 +170,8 @@ class MetricsPublisher:
         self._renderer = Renderer()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server: ScrapeServer | None = None
+        self._scrapes = 0
+        self._scraped_ns = 0
 
     @property
     def port(self) -> int:
@@ -204,8 +218,13 @@ class MetricsPublisher:
             return HttpResponse("405 Method Not Allowed", b"expected GET or HEAD\n")
         if request.path == "/":
             return HttpResponse("200 OK", ABOUT)
+        if request.path == "/scrapes":
+            age_ns = self._context.now_ns() - self._scraped_ns
+            return HttpResponse("200 OK", msgspec.json.encode(Scrapes(self._scrapes, age_ns / NS_PER_S)), JSON)
         if request.path != "/metrics":
             return HttpResponse("404 Not Found", b"there is only /metrics\n")
+        self._scrapes += 1
+        self._scraped_ns = self._context.now_ns()
         try:
             snapshot = await self._ask_loop()
         except TimeoutError:

@@ -71,6 +71,21 @@ def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
     assert set(threads) == {threading.get_ident()}
 
 
+def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
+    async def run() -> None:
+        async with publisher(
+            PublisherContext(lambda: DEVICES, 1, iter(range(0, 10**12, 2 * 10**9)).__next__)
+        ) as served:
+            assert (await ask(served.port, "/scrapes"))[2].startswith('{"scrapes":0,')
+            await ask(served.port)
+            line, head, body = await ask(served.port, "/scrapes")
+            assert line == "HTTP/1.1 200 OK"
+            assert "Content-Type: application/json" in head
+            assert body == '{"scrapes":1,"age_s":4.0}'  # the clock of the test goes on 2 s a look: status, and here
+
+    asyncio.run(run())
+
+
 def test_paths_and_methods() -> None:
     async def run() -> None:
         async with publisher(context()) as served:
