@@ -311,6 +311,7 @@ CROSS_CUTTING = {
 TESTED_IN = {
     "imud.reload": "test_daemon_signals.py",
     "imud.publishers.shm.directory": "publishers/shm/test_hostile.py",
+    "imud.cli.doctor.finding": "cli/doctor/test_report.py",
     "imud.cli.modbus.line": "cli/modbus/test_command.py",
     "imud.cli.probe.command": "cli/probe/test_can.py",
     "imud.cli.probe.report": "cli/probe/test_can.py",

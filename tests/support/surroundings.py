@@ -1,19 +1,25 @@
-"""Surroundings that a daemon must withstand.
+"""Surroundings that a daemon must withstand, and made-up ones that `imud doctor` looks at.
 
-These are processes of other users, which only root can start, and pipes that nothing reads.
+The first are processes of other users, which only root can start, and pipes that nothing reads.
 """
 
 import os
 import select
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import takewhile
+from pathlib import Path
 from typing import Final
 
 import pytest
 
+from imud.cli.doctor.finding import DoctorCheck, DoctorFinding
+from imud.cli.doctor.surroundings import CommandOutput, Surroundings
+from imud.contracts.status import DeviceStatus
+from imud.errors import LinkMissing
+from imud.utc.system_clock import KernelClock
 from tests.support.files import ROOT
 
 DAEMON_UID: Final = 65534
@@ -74,3 +80,86 @@ def read_until(descriptor: int, end: bytes) -> bytes:
         assert select.select([descriptor], [], [], 10)[0], data[-200:]
         data += os.read(descriptor, 65536)
     return data
+
+
+class Machine:
+    """A made-up machine: a file tree, the output of commands, the state of a daemon."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.outputs: dict[str, CommandOutput | OSError] = {}
+        """By the first words of a command."""
+        self.status: list[DeviceStatus] | Exception = LinkMissing("no daemon at /run/imud/imud.sock")
+        self.pages: dict[tuple[str, int, str], str] = {}
+        self.clock = KernelClock(True, 50, 1000)
+        self.sync_s: list[float] = []
+        """Times of the next writes."""
+        self.uid = 1000
+        self.gids: frozenset[int] = frozenset({1000})
+        self.boot_utc_ns = 0
+
+    def write(self, path: str, text: str = "") -> Path:
+        """Make a file, and the folders that it is in."""
+        file = self.root / path.lstrip("/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+        return file
+
+    def configure(self, *devices: str, more: str = "") -> None:
+        """Write the configuration, of devices as YAML flow mappings: `bow: {driver: …}`."""
+        lines = ["devices:" if devices else "devices: {}", *(f"  {device}" for device in devices)]
+        self.write("/etc/imud.yaml", more + "\n".join(lines) + "\n")
+
+    def port(self, name: str, *, gid: int = 20, mode: int = 0o660) -> Path:
+        """A serial port with hardware. Its group is `gid` where the test may set it."""
+        self.write(f"/sys/class/tty/{name}/device/uevent")
+        node = self.write(f"/dev/{name}")
+        node.chmod(mode)
+        return node
+
+    def unit(self, *lines: str) -> None:
+        """What `systemctl show` prints of a unit that is there."""
+        self.outputs["systemctl show"] = CommandOutput(0, "\n".join(("LoadState=loaded", *lines)), "")
+
+    def prints(self, command: str, text: str, status: int = 0, complaint: str = "") -> None:
+        """What a command prints whose words begin so."""
+        self.outputs[command] = CommandOutput(status, text, complaint)
+
+    def run(self, words: Sequence[str]) -> CommandOutput:
+        """Give the output of a command; FileNotFoundError where none was given."""
+        line = " ".join(words)
+        for begin, output in self.outputs.items():
+            if line.startswith(begin):
+                if isinstance(output, OSError):
+                    raise output
+                return output
+        raise FileNotFoundError(2, "No such file or directory", words[0])
+
+    def fetch(self, address: str, port: int, path: str) -> str:
+        """Give a page; ConnectionRefusedError where none was given."""
+        if (address, port, path) not in self.pages:
+            raise ConnectionRefusedError(111, "Connection refused")
+        return self.pages[address, port, path]
+
+    def ask(self) -> list[DeviceStatus]:
+        """Give the status, or raise why there is none."""
+        if isinstance(self.status, Exception):
+            raise self.status
+        return self.status
+
+    def surroundings(self) -> Surroundings:
+        """The machine as the checks see it."""
+        times_s = iter(self.sync_s)
+        return Surroundings(
+            Path("/etc/imud.yaml"), self.ask, root=self.root, run=self.run, fetch=self.fetch,
+            clock=lambda: self.clock, sync_s=lambda _folder: next(times_s), uid=self.uid, gids=self.gids,
+            boot_utc_ns=lambda: self.boot_utc_ns,
+        )  # fmt: skip
+
+    def find(self, check: DoctorCheck) -> list[DoctorFinding]:
+        """Run one check."""
+        return list(check.run(self.surroundings()))
+
+    def told(self, check: DoctorCheck) -> list[tuple[str, str]]:
+        """Run one check; severity and text of each finding."""
+        return [(str(finding.severity), f"{finding.seen} → {finding.advice}") for finding in self.find(check)]

@@ -1,0 +1,85 @@
+"""I2C and SPI: nodes, transfers, and what is likely wrong."""
+
+import msgspec
+import pytest
+
+from imud.cli.doctor.buses import bus_nodes, i2c_transfers, spi_transfers
+from imud.cli.doctor.finding import DoctorCheck
+from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
+from tests.support.metrics import device
+from tests.support.surroundings import Machine
+
+NODES, I2C, SPI = DoctorCheck("n", bus_nodes), DoctorCheck("i", i2c_transfers), DoctorCheck("s", spi_transfers)
+KEEL = "keel: {driver: imu61x-i2c, i2c: {bus: 3, address: 0x18}}"
+MAST = "mast: {driver: imu61x-spi, spi: {port: /dev/spidev0.0, mode: 3}}"
+
+
+def polled(name: str, state: DeviceState = DeviceState.RUNNING, counts: dict[str, int] | None = None) -> DeviceStatus:
+    made = device(
+        name, state=state, polling=PollingStatus(**(counts or {})), problem="" if state == "running" else "no answer"
+    )
+    return msgspec.structs.replace(made, ledger=dict.fromkeys(made.ledger, 0))
+
+
+def test_nodes(machine: Machine) -> None:
+    machine.configure(KEEL, MAST)
+    machine.write("/dev/i2c-1")
+    found = machine.told(NODES)
+    assert [severity for severity, _ in found] == ["error", "error"]
+    assert "/dev/i2c-3 is not there; of its kind there are: /dev/i2c-1" in found[0][1]
+    assert "dtparam=spi=on" in found[1][1]
+    machine.write("/dev/i2c-3")
+    machine.write("/dev/spidev0.0")
+    assert [finding.severity for finding in machine.find(NODES)] == ["ok", "ok"]
+
+
+def test_transfers_need_the_daemon_and_the_device_in_it(machine: Machine) -> None:
+    machine.configure(KEEL, MAST)
+    assert [machine.find(check)[0].severity for check in (I2C, SPI)] == ["not checked", "not checked"]
+    machine.status = []
+    assert "does not have this device" in machine.told(I2C)[0][1]
+
+
+@pytest.mark.parametrize(
+    ("counts", "severity", "words"),
+    [
+        ({"polls": 10_000, "failed": 10}, "ok", "10 failed"),
+        ({"polls": 10_000, "failed": 11}, "warning", "11 of 10000 transfers failed"),
+        ({"polls": 10_000, "vanished": 1}, "warning", "vanished 1 times"),
+        ({"polls": 10_000, "stale": 5001}, "note", "nothing new"),
+        ({}, "not checked", "was not read yet"),
+    ],
+)
+def test_failed_transfers(machine: Machine, counts: dict[str, int], severity: str, words: str) -> None:
+    machine.configure(KEEL)
+    machine.status = [polled("keel", counts=counts)]
+    ((got, text),) = machine.told(I2C)
+    assert got == severity
+    assert words in text
+
+
+def test_damaged_answers(machine: Machine) -> None:
+    machine.configure(MAST)
+    one = polled("mast", counts={"polls": 1000})
+    machine.status = [msgspec.structs.replace(one, ledger=one.ledger | {"frames_bad_crc": 2})]
+    assert "2 of 1000 answers were damaged → shorter wires, a slower clock than 1000000 Hz" in machine.told(SPI)[0][1]
+
+
+def test_clock_stretching_is_named_where_the_controller_mishandles_it(machine: Machine) -> None:
+    machine.configure(KEEL)
+    machine.status = [polled("keel", counts={"polls": 100, "failed": 50})]
+    assert "stretching" not in machine.told(I2C)[0][1]
+    machine.write("/sys/class/i2c-adapter/i2c-3/name", "bcm2835 (i2c@7e804000)\n")
+    assert "mishandles clock stretching" in machine.told(I2C)[0][1]
+
+
+def test_a_device_that_does_not_answer(machine: Machine) -> None:
+    machine.configure(KEEL, MAST)
+    machine.status = [polled("keel", DeviceState.SEARCHING), polled("mast", DeviceState.FAILED)]
+    ((severity, text),) = machine.told(I2C)
+    assert severity == "error"
+    assert "`sudo i2cdetect -y 3` should show 18; no answer at address 0x18" in text
+    assert "words of 8 bits" in machine.told(SPI)[0][1]
+    assert "has mode 3" in machine.told(SPI)[0][1]
+    machine.configure("mast: {driver: imu61x-spi, spi: {port: /dev/spidev0.0}}")
+    assert "mode 0 or 3" in machine.told(SPI)[0][1]

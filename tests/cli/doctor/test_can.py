@@ -1,0 +1,128 @@
+"""CAN interfaces by a made-up /sys and the JSON of ip(8)."""
+
+import json
+from typing import Any
+
+import pytest
+
+from imud.cli.doctor.can import can_bitrate, can_state, can_up, interfaces
+from imud.cli.doctor.finding import DoctorCheck
+from imud.cli.doctor.report import examine
+from imud.contracts.status import DeviceState
+from tests.support.metrics import device
+from tests.support.surroundings import Machine
+
+UP, STATE, RATE = DoctorCheck("u", can_up), DoctorCheck("s", can_state), DoctorCheck("r", can_bitrate)
+
+
+@pytest.fixture
+def mast(machine: Machine) -> Machine:
+    machine.configure("mast: {driver: hipnuc-canopen, socketcan: {interface: can0}}")
+    return machine
+
+
+def interface(
+    machine: Machine, flags: str = "0x40081", *, packets: int = 0, data: dict[str, Any] | None = None
+) -> None:
+    """An interface, with the answer of `ip` as iproute2 6.1 gives it."""
+    machine.write("/sys/class/net/can0/type", "280\n")
+    machine.write("/sys/class/net/can0/flags", flags + "\n")
+    data = dict(data or {})
+    xstats = {"restarts": 0, "bus_error": 0, "error_passive": 1, "bus_off": data.pop("bus_off", 0)}
+    link = {"linkinfo": {"info_kind": "can", "info_data": data, "info_xstats": xstats}} if data else {}
+    answer = [{"ifname": "can0", "stats64": {"rx": {"packets": packets}}, **link}]
+    machine.prints("ip -json -details -statistics link show can0", json.dumps(answer))
+
+
+def controller(state: str = "ERROR-ACTIVE", tx: int = 0, rx: int = 0, **more: object) -> dict[str, object]:
+    counters = {"tx": tx, "rx": rx}
+    return {
+        "state": state, "berr_counter": counters, "restart_ms": 100, "bittiming": {"bitrate": 500_000}, **more
+    }  # fmt: skip
+
+
+def test_an_interface_that_is_not_there_down_or_up(mast: Machine) -> None:
+    assert mast.told(UP)[0][1].startswith("can0 is not there; CAN interfaces of this machine: none →")
+    interface(mast, "0x40080")
+    ((severity, text),) = mast.told(UP)
+    assert severity == "error"
+    assert "can0 is down" in text
+    assert "up type can bitrate" in text
+    assert mast.find(STATE) == []  # nothing is known of an interface that is down
+    interface(mast)
+    assert mast.find(UP)[0].severity == "ok"
+
+
+def test_a_virtual_interface_has_no_controller(mast: Machine) -> None:
+    interface(mast)
+    assert mast.told(STATE) == [("ok", "can0 is virtual: it has no controller → ")]
+    assert mast.find(RATE) == []
+
+
+@pytest.mark.parametrize(
+    ("data", "packets", "severity", "words"),
+    [
+        (controller(), 100, "ok", "100 frames received"),
+        (controller("BUS-OFF", 248, 0), 100, "error", "has left the bus"),
+        (controller("ERROR-PASSIVE", 128, 0), 0, "error", "no other node acknowledges"),
+        (controller("ERROR-WARNING", 0, 100), 0, "error", "a missing terminator or a wrong bit rate"),
+        (controller("ERROR-PASSIVE", 0, 130), 100, "warning", "60 Ω"),
+        (controller("ERROR-ACTIVE", 0, 96), 100, "warning", "60 Ω"),
+        (controller("ERROR-ACTIVE", 0, 3), 100, "ok", "rx 3"),
+    ],
+)
+def test_state_and_error_counters(
+    mast: Machine, data: dict[str, object], packets: int, severity: str, words: str
+) -> None:
+    interface(mast, packets=packets, data=data)
+    ((got, text),) = mast.told(STATE)
+    assert got == severity
+    assert words in text
+
+
+def test_bus_off_before_and_no_restart(mast: Machine) -> None:
+    interface(mast, packets=9, data=controller(bus_off=4, restart_ms=0))
+    found = mast.told(STATE)
+    assert [severity for severity, _ in found] == ["ok", "warning", "note"]
+    assert "bus-off 4 times" in found[1][1]
+    interface(mast, data=controller("BUS-OFF", restart_ms=0))
+    assert "restart-ms 100` lets it recover" in mast.told(STATE)[0][1]
+
+
+@pytest.mark.parametrize(
+    ("bitrate", "packets", "state", "severity"),
+    [
+        (500_000, 0, DeviceState.SEARCHING, "error"),
+        (500_000, 9, DeviceState.SEARCHING, "ok"),
+        (500_000, 0, DeviceState.RUNNING, "ok"),
+        (100_000, 9, DeviceState.RUNNING, "warning"),
+    ],
+)
+def test_bit_rates(mast: Machine, bitrate: int, packets: int, state: DeviceState, severity: str) -> None:
+    interface(mast, packets=packets, data=controller(bittiming={"bitrate": bitrate}))
+    mast.status = [device("mast", state=state)]
+    ((got, text),) = mast.told(RATE)
+    assert got == severity
+    if severity == "error":
+        assert "mast: no frame came at 500000 bit/s on can0 → try 125000, 250000, 1000000" in text
+
+
+@pytest.mark.parametrize("answer", ["", "{}", "[]", "[1]", '[{"linkinfo": 3}]'])
+def test_an_answer_of_another_form_is_not_checked(mast: Machine, answer: str) -> None:
+    interface(mast)
+    mast.prints("ip -json -details -statistics link show can0", answer)
+    (examined,) = examine([STATE], mast.surroundings())
+    assert [finding.severity for finding in examined.findings] == ["not checked"]
+
+
+def test_ip_that_fails_or_is_not_installed_is_not_checked(mast: Machine) -> None:
+    interface(mast)
+    mast.prints("ip", "", 1, "Device does not exist")
+    mast.outputs["ip -json -details -statistics link show can0"] = FileNotFoundError(2, "No such file", "ip")
+    (examined,) = examine([STATE], mast.surroundings())
+    assert examined.findings[0].seen == "s: ip is not there, or not installed"
+
+
+def test_interfaces_of_other_backends_are_not_the_kernels(machine: Machine) -> None:
+    machine.configure("a: {driver: hipnuc-canopen, socketcan: {interface: x, backend: virtual}}")
+    assert interfaces(machine.surroundings()) == []

@@ -1,0 +1,75 @@
+"""`imud doctor` as a whole, on a made-up machine and on this one."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from imud.cli import main
+from imud.cli.doctor.command import CHECKS
+from imud.cli.doctor.report import examine, exit_status, verdict
+from imud.contracts.status import KernelCounters
+from tests.support.files import ROOT
+from tests.support.metrics import device
+from tests.support.surroundings import Machine
+
+
+def healthy(machine: Machine) -> None:
+    """A machine on which everything is in order and everything can be seen."""
+    machine.configure("bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}")
+    machine.port("ttyUSB0")
+    machine.uid = 0
+    machine.write("/etc/passwd", "root:x:0:0::/root:/bin/sh\n")
+    machine.unit("ActiveState=active", "UnitFileState=enabled", "User=root")
+    machine.prints("systemctl is-active", "inactive", 3)
+    running = device("bow", kernel=KernelCounters())
+    machine.status = [
+        device("bow", kernel=KernelCounters(), ledger=running.ledger | {"lost_queue": 0, "frames_good": 10**8})
+    ]
+    machine.write("/proc/loadavg", "0.10 0.10 0.10 1/200 999\n")
+    machine.write("/var/lib/imud/x")
+    machine.sync_s = [0.01, 0.01, 0.01]
+    machine.prints("journalctl", "usb 1-1: new full-speed USB device\n")
+    machine.pages["127.0.0.1", 9321, "/scrapes"] = '{"scrapes":7,"age_s":9.0}'
+
+
+def test_nothing_wrong_is_said_only_where_all_was_seen(machine: Machine) -> None:
+    healthy(machine)
+    examined = examine(CHECKS, machine.surroundings())
+    assert (verdict(examined), exit_status(examined)) == ("nothing wrong found", 0)
+    del machine.outputs["journalctl"]
+    machine.sync_s = [0.01, 0.01, 0.01]
+    assert verdict(examine(CHECKS, machine.surroundings())).startswith(
+        "nothing wrong found in what could be checked; 1"
+    )
+
+
+def test_an_empty_machine_ends_no_check(machine: Machine) -> None:
+    examined = examine(CHECKS, machine.surroundings())
+    assert [one.name for one in examined] == [check.name for check in CHECKS]
+    assert exit_status(examined) == 2
+    assert "could not be checked" in verdict(examined)
+
+
+def test_on_this_machine_without_a_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "imud.yaml"
+    file.write_text(f"state_dir: {tmp_path}\ndevices:\n  bow: {{driver: auto, uart: {{port: {tmp_path}/none}}}}\n")
+    words = ["doctor", "--config", str(file), "--socket", str(tmp_path / "none")]
+    assert main(words) == 2
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 80
+    assert "is not there" in printed
+    assert main([*words, "--json"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert [check["name"] for check in told["checks"]] == [check.name for check in CHECKS]
+    (storage,) = [check for check in told["checks"] if check["name"] == "storage"]
+    assert "writing 4 KiB" in storage["findings"][0]["seen"]
+    assert sorted(tmp_path.iterdir()) == [file]
+
+
+def test_names_are_unique_and_in_the_document() -> None:
+    text = (ROOT / "docs/doctor.md").read_text()
+    names = [check.name for check in CHECKS]
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert f"| {name} |" in text, name

@@ -1,0 +1,67 @@
+"""Lines as kernels write them, by kind of trouble."""
+
+import pytest
+
+from imud.cli.doctor.finding import DoctorCheck
+from imud.cli.doctor.kernel_log import kernel_log
+from tests.support.surroundings import Machine
+
+LOG = DoctorCheck("k", kernel_log)
+QUIET = (
+    "usb 1-1: new full-speed USB device number 4 using xhci_hcd\nhub 1-0:1.0: USB hub found\n"
+    "ftdi_sio ttyUSB0: FTDI USB Serial Device converter now disconnected from ttyUSB0\n"
+    "mmc0: new high speed SDHC card at address aaaa\ni2c_dev: i2c /dev entries driver\n"
+    "can0: bitrate error 0.0%\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("usb 1-1.2: reset full-speed USB device number 4 using dwc_otg", "resets of USB devices"),
+        ("usb 1-1-port2: cannot reset port (err = -71)", "resets of USB devices"),
+        ("usb 1-1-port2: over-current change #3", "too much current on USB"),
+        ("usb 1-1: device descriptor read/64, error -71", "errors of USB transfers"),
+        ("usb usb1-port1: disabled by hub (EMI?), re-enabling...", "errors of USB transfers"),
+        ("hwmon hwmon1: Undervoltage detected!", "low voltage"),
+        ("Under-voltage detected! (0x00050005)", "low voltage"),
+        ("mmc0: Timeout waiting for hardware interrupt.", "trouble of the SD card"),
+        ("blk_update_request: I/O error, dev mmcblk0, sector 123", "trouble of the SD card"),
+        ("i2c-bcm2835 fe804000.i2c: i2c transfer timed out", "trouble of I2C"),
+        ("mcp251x spi0.0 can0: bus-off", "trouble of CAN controllers"),
+        ("ttyAMA0: 4 input overrun(s)", "overruns of serial ports"),
+        ("oom-kill:constraint=CONSTRAINT_NONE,task=python3", "lack of memory"),
+    ],
+)
+def test_each_kind_of_trouble(machine: Machine, line: str, words: str) -> None:
+    machine.prints("journalctl", QUIET + line + "\n")
+    ((severity, text),) = machine.told(LOG)
+    assert severity == "warning"
+    assert f"kernel log: 1 lines on {words}, the last: {line[:40]}" in text
+
+
+def test_a_quiet_log(machine: Machine) -> None:
+    machine.prints("journalctl", QUIET)
+    assert machine.told(LOG) == [
+        ("ok", "nothing on ports, buses, storage or voltage in 6 lines of the kernel's log → ")
+    ]
+
+
+def test_adapters_unplugged_again_and_again(machine: Machine) -> None:
+    machine.prints("journalctl", QUIET * 3)
+    ((_, text),) = machine.told(LOG)
+    assert "3 lines on unplugged serial adapters" in text
+
+
+def test_dmesg_where_there_is_no_journal(machine: Machine) -> None:
+    machine.prints("journalctl", "", 1, "No journal files were found.")
+    machine.prints("dmesg", QUIET)
+    assert machine.find(LOG)[0].severity == "ok"
+
+
+def test_a_log_that_may_not_be_read(machine: Machine) -> None:
+    machine.prints("journalctl", "")
+    machine.prints("dmesg", "", 1, "dmesg: read kernel buffer failed: Operation not permitted")
+    ((severity, text),) = machine.told(LOG)
+    assert severity == "not checked"
+    assert "Operation not permitted → run `sudo imud doctor`" in text

@@ -1,0 +1,83 @@
+"""Whether something scrapes the metrics, by what the endpoint says."""
+
+import asyncio
+
+import pytest
+
+from imud.cli.doctor.finding import DoctorCheck
+from imud.cli.doctor.outputs import prometheus
+from imud.cli.doctor.surroundings import fetch_over_http
+from imud.contracts.publisher import PublisherContext
+from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
+from tests.support.metrics import ask
+from tests.support.surroundings import Machine
+
+PROMETHEUS = DoctorCheck("p", prometheus)
+AT = ("127.0.0.1", 9321, "/scrapes")
+
+
+@pytest.fixture
+def running(machine: Machine) -> Machine:
+    machine.configure()
+    machine.status = []
+    return machine
+
+
+@pytest.mark.parametrize(
+    ("page", "severity", "words"),
+    [
+        ('{"scrapes":0,"age_s":9.0}', "note", "has not scraped 127.0.0.1 port 9321"),
+        ('{"scrapes":7,"age_s":9.0}', "ok", "scraped 7 times, last 9 s ago"),
+        ('{"scrapes":7,"age_s":301.0}', "warning", "for 5 minutes, 7 times before"),
+        ("<html>", "error", "another program than imud"),
+    ],
+)
+def test_scrapes(running: Machine, page: str, severity: str, words: str) -> None:
+    running.pages[AT] = page
+    ((got, text),) = running.told(PROMETHEUS)
+    assert got == severity
+    assert words in text
+
+
+def test_an_address_of_every_network_is_asked_at_home(running: Machine) -> None:
+    running.configure(more="metrics: {address: 0.0.0.0}\n")
+    running.pages[AT] = '{"scrapes":7,"age_s":9.0}'
+    assert running.find(PROMETHEUS)[0].severity == "ok"
+
+
+def test_no_answer_no_daemon_no_configuration_and_switched_off(running: Machine) -> None:
+    ((severity, text),) = running.told(PROMETHEUS)
+    assert severity == "error"
+    assert "do not answer at 127.0.0.1 port 9321: Connection refused" in text
+    running.configure(more="metrics: {enabled: false}\n")
+    assert running.find(PROMETHEUS)[0].severity == "note"
+    running.configure(more="metrics: {port: 0}\n")
+    assert running.find(PROMETHEUS)[0].severity == "not checked"
+
+
+def test_without_daemon_or_configuration(machine: Machine) -> None:
+    assert machine.find(PROMETHEUS)[0].severity == "not checked"
+    machine.configure()
+    assert "no daemon runs" in machine.told(PROMETHEUS)[0][1]
+
+
+def test_the_endpoint_itself_is_understood(running: Machine) -> None:
+    async def serve() -> list[str]:
+        made = MetricsPublisher(MetricsSettings(port=0), PublisherContext(lambda: (), 1, lambda: 5_000_000_000))
+        made.start()
+        pages = []
+        try:
+            pages.append(await asyncio.to_thread(fetch_over_http, "127.0.0.1", made.port, "/scrapes"))
+            await ask(made.port)
+            pages.append(await asyncio.to_thread(fetch_over_http, "127.0.0.1", made.port, "/scrapes"))
+            with pytest.raises(OSError, match="got 404"):
+                await asyncio.to_thread(fetch_over_http, "127.0.0.1", made.port, "/other")
+        finally:
+            made.close()
+        return pages
+
+    severities = []
+    for page in asyncio.run(serve()):
+        running.pages[AT] = page
+        severities.append(str(running.find(PROMETHEUS)[0].severity))
+    assert severities == ["note", "ok"]

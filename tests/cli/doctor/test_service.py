@@ -1,0 +1,134 @@
+"""Configuration, unit, socket and states as `imud doctor` sees them."""
+
+import os
+
+import msgspec
+import pytest
+
+from imud.cli.doctor.finding import DoctorCheck
+from imud.cli.doctor.service import configuration, device_states, service, socket, stale_configuration
+from imud.contracts.status import DeviceState
+from imud.errors import LinkDenied, LinkMissing, ServerError
+from tests.support.metrics import device
+from tests.support.surroundings import Machine
+
+CONFIGURATION, SERVICE, SOCKET = DoctorCheck("c", configuration), DoctorCheck("s", service), DoctorCheck("o", socket)
+STALE, STATES = DoctorCheck("t", stale_configuration), DoctorCheck("d", device_states)
+BOW = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
+ACTIVE = ("ActiveState=active", "UnitFileState=enabled", "Result=success", "NRestarts=0", "NeedDaemonReload=no")
+
+
+def test_a_good_configuration_and_its_disabled_device(machine: Machine) -> None:
+    machine.configure(BOW, "old: {enabled: false, driver: hipnuc-uart, uart: {port: /dev/ttyUSB1, baud: 115200}}")
+    assert machine.told(CONFIGURATION) == [
+        ("ok", "/etc/imud.yaml has no mistakes; devices: bow → "),
+        ("note", "device old is disabled in /etc/imud.yaml → "),
+    ]
+
+
+def test_a_configuration_without_devices_is_a_warning(machine: Machine) -> None:
+    machine.configure()
+    assert [finding.severity for finding in machine.find(CONFIGURATION)] == ["warning"]
+
+
+def test_each_mistake_is_an_error_with_its_place(machine: Machine) -> None:
+    machine.configure("bow: {driver: hipnuc-uart, uart: {prt: /dev/ttyUSB0}}")
+    found = machine.told(CONFIGURATION)
+    assert found
+    assert {severity for severity, _ in found} == {"error"}
+    assert any("imud.yaml:2:" in text and "prt" in text for _, text in found)
+
+
+def test_no_configuration_is_an_error(machine: Machine) -> None:
+    ((severity, text),) = machine.told(CONFIGURATION)
+    assert severity == "error"
+    assert "No such file" in text
+
+
+def test_a_service_that_runs(machine: Machine) -> None:
+    machine.unit(*ACTIVE)
+    assert [finding.severity for finding in machine.find(SERVICE)] == ["ok", "ok"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "severity", "words"),
+    [
+        ("UnitFileState=disabled", "warning", "sudo systemctl enable imud"),
+        ("UnitFileState=masked", "error", "sudo systemctl unmask imud"),
+        ("ActiveState=inactive", "error", "sudo systemctl start imud"),
+        ("ActiveState=activating", "warning", "look again"),
+        ("NRestarts=5", "warning", "restarted imud.service 5 times"),
+        ("NeedDaemonReload=yes", "warning", "daemon-reload"),
+    ],
+)
+def test_what_is_wrong_with_a_service(machine: Machine, changed: str, severity: str, words: str) -> None:
+    key = changed.partition("=")[0]
+    machine.unit(*(line for line in ACTIVE if not line.startswith(f"{key}=")), changed)
+    wrong = [found for found in machine.told(SERVICE) if found[0] != "ok"]
+    assert len(wrong) == 1
+    assert wrong[0][0] == severity
+    assert words in wrong[0][1]
+
+
+def test_an_exit_status_of_imud_has_its_own_advice(machine: Machine) -> None:
+    machine.unit("UnitFileState=enabled", "ActiveState=failed", "Result=exit-code", "ExecMainStatus=78")
+    assert "`imud check` says where" in machine.told(SERVICE)[-1][1]
+
+
+def test_no_systemd_and_no_unit(machine: Machine) -> None:
+    assert machine.find(SERVICE)[0].severity == "not checked"
+    machine.prints("systemctl show", "LoadState=not-found\n")
+    assert machine.find(SERVICE)[0].severity == "warning"
+
+
+@pytest.mark.parametrize(
+    ("answer", "severity"),
+    [
+        ([device("bow")], "ok"),
+        (LinkMissing("no daemon"), "error"),
+        (LinkDenied("group imud?"), "not checked"),
+        (ServerError("another protocol"), "error"),
+        (TimeoutError("waited in vain"), "error"),
+    ],
+)
+def test_answers_of_the_socket(machine: Machine, answer: Exception, severity: str) -> None:
+    machine.status = answer
+    assert [finding.severity for finding in machine.find(SOCKET)] == [severity]
+
+
+def test_a_file_newer_than_the_last_reload(machine: Machine) -> None:
+    machine.configure(BOW)
+    machine.unit(*ACTIVE, "StateChangeTimestampMonotonic=5000000")
+    machine.boot_utc_ns = 1_000 * 10**9  # so the reload was at 1005 s
+    file = machine.root / "etc/imud.yaml"
+    os.utime(file, (1004, 1004))
+    assert machine.find(STALE)[0].severity == "ok"
+    os.utime(file, (1007, 1007))
+    assert machine.told(STALE) == [
+        ("warning", "/etc/imud.yaml was written after the daemon read it last → `sudo systemctl reload imud`")
+    ]
+
+
+def test_a_daemon_with_other_devices(machine: Machine) -> None:
+    machine.configure(BOW)
+    machine.status = [device("stern")]
+    ((severity, text),) = machine.told(STALE)
+    assert severity == "warning"
+    assert "has the devices stern, /etc/imud.yaml has bow" in text
+    machine.status = [device("bow")]
+    assert machine.find(STALE)[0].severity == "ok"
+
+
+def test_nothing_to_compare_is_not_checked(machine: Machine) -> None:
+    assert machine.find(STALE)[0].severity == "not checked"
+    machine.configure(BOW)
+    assert machine.find(STALE)[0].severity == "not checked"
+
+
+def test_states_come_with_the_reason_of_the_daemon(machine: Machine) -> None:
+    assert machine.find(STATES)[0].severity == "not checked"
+    down = msgspec.structs.replace(device("b"), state=DeviceState.MISSING, problem="/dev/ttyUSB1 is not there")
+    machine.status = [device("a"), down, device("c", problem="can0 is error-passive")]
+    found = machine.told(STATES)
+    assert [severity for severity, _ in found] == ["ok", "error", "warning"]
+    assert "b is missing: /dev/ttyUSB1 is not there" in found[1][1]

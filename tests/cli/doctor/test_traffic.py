@@ -1,0 +1,128 @@
+"""What the daemon's counters say of wires, rates, supplies and lines."""
+
+import msgspec
+import pytest
+
+from imud.cli.doctor.finding import DoctorCheck
+from imud.cli.doctor.traffic import half_duplex, heard, lines, restarts
+from imud.contracts.status import (
+    ClockStatus,
+    DeviceState,
+    DeviceStatus,
+    KernelCounters,
+    LinesStatus,
+    SerialLineCounters,
+)
+from imud.sample import Sync
+from tests.support.metrics import POLLING, device
+from tests.support.surroundings import Machine
+
+HEARD, HALF, RESTARTS, LINES = (
+    DoctorCheck("h", heard),
+    DoctorCheck("d", half_duplex),
+    DoctorCheck("r", restarts),
+    DoctorCheck("l", lines),
+)
+UART = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
+WIRED = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}, lines: {sout: {line: GPIO17}}}"
+RS485 = "bow: {driver: hipnuc-modbus, rs485: {line: /dev/ttyUSB0, address: 80}}"
+
+
+def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> DeviceStatus:
+    """A device with these counts, the others 0, and no errors of the kernel."""
+    made = device("bow", state=state, kernel=KernelCounters())
+    return msgspec.structs.replace(made, ledger=dict.fromkeys(made.ledger, 0) | counts)
+
+
+def test_all_of_it_needs_the_daemon(machine: Machine) -> None:
+    machine.configure(WIRED)
+    for check in (HEARD, RESTARTS, LINES):
+        assert [finding.severity for finding in machine.find(check)] == ["not checked"]
+    assert machine.find(HALF) == []  # no such line is configured
+
+
+@pytest.mark.parametrize(
+    ("status", "severity", "words"),
+    [
+        (counted(), "error", "are TX and RX swapped"),
+        (counted(bytes_in=40), "error", "is it an echo of what imud sends"),
+        (counted(bytes_in=5000), "error", "wrong rate, driver or device"),
+        (
+            msgspec.structs.replace(counted(bytes_in=5000), kernel=KernelCounters(framing=9)),
+            "error",
+            "9 framing errors",
+        ),
+        (counted(DeviceState.RUNNING, frames_good=5000, frames_bad_crc=3), "ok", "3 damaged"),
+        (counted(DeviceState.RUNNING, frames_good=5000, frames_bad_crc=6), "warning", "6 damaged frames"),
+        (msgspec.structs.replace(counted(frames_good=5000), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
+    ],
+)
+def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, words: str) -> None:
+    machine.configure(UART)
+    machine.status = [status]
+    ((got, text),) = machine.told(HEARD)
+    assert got == severity
+    assert words.lower() in text.lower()
+
+
+def test_a_missing_port_is_not_judged_by_its_bytes(machine: Machine) -> None:
+    machine.configure(UART)
+    machine.status = [counted(DeviceState.MISSING)]
+    assert machine.find(HEARD) == []
+
+
+@pytest.mark.parametrize(
+    ("state", "line", "severity", "words"),
+    [
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=10, echoes=1000), "ok", "echoes are expected"),
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=11), "warning", "11 requests unanswered"),
+        (DeviceState.RUNNING, SerialLineCounters(strange_bytes=5), "warning", "5 strange bytes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9, echoes=9), "error", "only imud's own 9 echoes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9), "error", "nothing heard"),
+    ],
+)
+def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, severity: str, words: str) -> None:
+    machine.configure(RS485)
+    machine.status = [device("bow", state=state, serial_line=line, polling=POLLING)]  # 1000 reads
+    ((got, text),) = machine.told(HALF)
+    assert got == severity
+    assert words in text
+
+
+@pytest.mark.parametrize(
+    ("resets", "samples", "severity"),
+    [
+        (0, 1000, "ok"),
+        (2, 1000, "note"),
+        (3, 360_000, "warning"),
+        (3, 2 * 360_000, "warning"),
+        (3, 4 * 360_000, "note"),
+    ],
+)
+def test_restarts_count_by_the_hour(machine: Machine, resets: int, samples: int, severity: str) -> None:
+    clock = ClockStatus(Sync.REGRESSION, resets=resets)
+    running = counted(DeviceState.RUNNING, samples=samples)
+    machine.status = [msgspec.structs.replace(running, clock=clock, expected_rate_hz=100.0)]  # 360,000 samples an hour
+    assert [finding.severity for finding in machine.find(RESTARTS)] == [severity]
+
+
+@pytest.mark.parametrize(
+    ("samples", "found", "severity", "words"),
+    [
+        (5000, LinesStatus({}, {"sout": 4999}, {"sout": 0}), "ok", "4999 edges"),
+        (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "9 of 4999 edges were lost"),
+        (5000, LinesStatus({}, {"sout": 0}, {}), "warning", "no edge in 5000 samples"),
+        (50, LinesStatus({}, {"sout": 0}, {}), "not checked", "too few samples"),
+        (5000, LinesStatus({}, {"alarm": 0}, {}), "note", "no edge so far"),
+        (900, LinesStatus({}, {"pps": 0}, {}), "not checked", "too few samples"),
+        (1100, LinesStatus({}, {"pps": 0}, {}), "warning", "has the receiver a fix"),
+        (5000, LinesStatus({"sout": "GPIO17 is in use"}, {"sout": 0}, {}), "error", "GPIO17 is in use"),
+    ],
+)
+def test_edges_of_lines(machine: Machine, samples: int, found: LinesStatus, severity: str, words: str) -> None:
+    machine.configure(WIRED)
+    running = counted(DeviceState.RUNNING, samples=samples)
+    machine.status = [msgspec.structs.replace(running, lines=found, expected_rate_hz=100.0)]
+    ((got, text),) = machine.told(LINES)
+    assert got == severity
+    assert words.lower() in text.lower()
