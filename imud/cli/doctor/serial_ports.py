@@ -110,6 +110,8 @@ def modem_manager(at: Surroundings) -> Findings:
             'udev rule `SUBSYSTEM=="tty", ENV{ID_MM_DEVICE_IGNORE}="1"`, or '
             "`sudo systemctl disable --now ModemManager`",
         )
+    elif not state:
+        yield not_checked("systemctl does not say whether ModemManager runs")
     else:
         yield ok("ModemManager does not run")
 

@@ -110,6 +110,8 @@ def restarts(at: Surroundings) -> Findings:
         if isinstance(one, DoctorFinding):
             yield one
             return
+        if not one.ledger["samples"]:
+            continue
         resets = one.clock.resets
         rate_hz = one.expected_rate_hz or one.rate_hz
         hours = one.ledger["samples"] / rate_hz / S_PER_H if rate_hz else 0.0

@@ -88,6 +88,8 @@ def test_a_console_on_the_port(bow: Machine) -> None:
 def test_modem_manager_concerns_usb_ports_only(bow: Machine) -> None:
     bow.prints("systemctl is-active ModemManager", "active\n")
     assert bow.find(MODEM)[0].severity == "warning"
+    bow.prints("systemctl is-active ModemManager", "", 1, "System has not been booted with systemd")
+    assert bow.find(MODEM)[0].severity == "not checked"
     bow.prints("systemctl is-active ModemManager", "inactive\n", 3)
     assert bow.find(MODEM)[0].severity == "ok"
     bow.configure("bow: {driver: hipnuc-uart, uart: {port: /dev/ttyAMA0, baud: 115200}}")

@@ -106,6 +106,11 @@ def test_restarts_count_by_the_hour(machine: Machine, resets: int, samples: int,
     assert [finding.severity for finding in machine.find(RESTARTS)] == [severity]
 
 
+def test_a_device_without_samples_is_not_said_to_run(machine: Machine) -> None:
+    machine.status = [counted()]
+    assert machine.find(RESTARTS) == []
+
+
 @pytest.mark.parametrize(
     ("samples", "found", "severity", "words"),
     [
