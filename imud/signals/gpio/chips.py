@@ -73,7 +73,12 @@ def chip_error(error: OSError, path: str) -> LinkError:
     """Return the LinkError for a chip that cannot be used."""
     if error.errno in GONE:
         return LinkMissing(f"{path} is gone, or is no GPIO chip: {os.strerror(error.errno or 0)}")
-    if error.errno in (errno.EACCES, errno.EPERM):
+    if error.errno == errno.EPERM:  # of a group it would be EACCES
+        return LinkDenied(
+            f"{path} may not be opened: the control group of this process does not allow the device (EPERM, "
+            f"not its group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
+        )
+    if error.errno == errno.EACCES:
         group, user = group_of(path, GROUP), user_name()
         return LinkDenied(
             f"{path} may not be opened by user {user}: it must belong to group {group}, readable and writable, and "

@@ -97,7 +97,8 @@ def test_a_node_that_is_no_chip(gpiod: FakeGpiod, tmp_path: Path) -> None:
     ("number", "kind", "message"),
     [
         (errno.EBUSY, LinkBusy, "gpiochip0 line 0 (SOUT) is in use by gpiomon: stop that"),
-        (errno.EACCES, LinkDenied, "may not be opened"),
+        (errno.EACCES, LinkDenied, "may not be opened by user"),
+        (errno.EPERM, LinkDenied, "add a line `DeviceAllow="),
         (errno.ENODEV, LinkMissing, "is gone"),
         (errno.ENXIO, LinkError, "gpiochip0 line 0 (SOUT) cannot be requested: No such device or address; an input"),
     ],
