@@ -57,7 +57,7 @@ def _refused(at: Surroundings, path: str, person: Person, gid: int) -> DoctorFin
     seen = f"{path} may not be opened by user {person.name}: the node belongs to group {group or gid}, EACCES"
     if gid == 0:
         rule = f'SUBSYSTEM=="{SUBSYSTEMS[wanted]}", GROUP="{wanted}", MODE="0660"'
-        return error(seen, f"install etc/udev/60-imud.rules, or add the udev rule {rule}; then `sudo udevadm trigger`")
+        return error(seen, f"add the udev rule {rule} in /etc/udev/rules.d; then `sudo udevadm trigger`")
     if gid in person.listed_gids:
         return error(f"{seen} of a session that began before the user joined it", "log out and in again")
     again = "restart imud" if at.installed else "log in again"
