@@ -20,11 +20,8 @@ PRESSURE_PERCENT: Final = 20.0
 LOST_SHARE: Final = 1e-4
 LATE_SHARE: Final = 0.05
 
-THROTTLED: Final = (
-    "/sys/devices/platform/soc/soc:firmware/get_throttled",
-    "/sys/devices/platform/soc@107c000000/soc@107c000000:firmware/get_throttled",
-    "/sys/devices/platform/axi/axi:firmware/get_throttled",
-)
+THROTTLED: Final = "/sys/devices/platform/soc/soc:firmware/get_throttled"
+"""Raspberry Pi OS up to the Pi 4; elsewhere vcgencmd is asked."""
 UNDER_VOLTAGE, CAPPED, SLOWED, HOT = 0x1, 0x2, 0x4, 0x8
 SINCE_BOOT: Final = 16
 """Bits of the firmware's word: what is so now; the same shifted by SINCE_BOOT for what has been since boot."""
@@ -113,7 +110,7 @@ def power(at: Surroundings) -> Findings:
 
 def _throttled(at: Surroundings) -> int | None:
     """Return the firmware's word, from sysfs or from vcgencmd; None where neither has it."""
-    texts = [text for path in THROTTLED if (text := at.text(path))]
+    texts = [text] if (text := at.text(THROTTLED)) else []
     if not texts:
         try:
             output = at.run(["vcgencmd", "get_throttled"])

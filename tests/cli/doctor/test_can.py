@@ -24,7 +24,7 @@ def mast(machine: Machine) -> Machine:
 def interface(
     machine: Machine, flags: str = "0x40081", *, packets: int = 0, data: dict[str, Any] | None = None
 ) -> None:
-    """An interface, with the answer of `ip` as iproute2 6.1 gives it."""
+    """An interface, with the answer of `ip` written by hand: its members are not from a recording."""
     machine.write("/sys/class/net/can0/type", "280\n")
     machine.write("/sys/class/net/can0/flags", flags + "\n")
     data = dict(data or {})

@@ -1,4 +1,4 @@
-"""Lines as kernels write them, by kind of trouble."""
+"""Lines by kind of trouble, written by hand after the messages of the drivers: not from a recorded log."""
 
 import pytest
 
