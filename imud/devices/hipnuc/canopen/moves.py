@@ -26,6 +26,7 @@ from imud.devices.hipnuc.canopen.cia301 import (
     HEARTBEAT,
     NODE_DEFAULT,
     NODE_MASK,
+    NODE_MAX,
     SDO_REPLY,
     SDO_REQUEST,
     TPDO_FUNCTIONS,
@@ -102,6 +103,8 @@ def _reset(settings: HipnucCanopenSettings, bus_bit_s: int, request: Request) ->
     node = settings.node
     saved = yield from session.read_values(node, ((session.NODE_ID, 0), (session.BIT_RATE, 0)), silent_is_fine=True)
     number = saved.get((session.NODE_ID, 0), node)
+    if not 1 <= number <= NODE_MAX:  # no number of a node: it will stay where it is
+        number = node
     rate = session.BIT_RATE_OF.get(saved.get((session.BIT_RATE, 0), -1), bus_bit_s)
     places = tuple(dict.fromkeys((node, number)))
     booted = yield from _boot(request, (*places, NODE_DEFAULT) if saved else None)

@@ -20,7 +20,7 @@ from imud.devices.hipnuc.j1939.codec import FACTORY_ADDRESS, HipnucJ1939Settings
 from imud.devices.hipnuc.j1939.session import ADDRESS, CLAIMED, READ, READ_VALUE, WRITE, J1939Node, exchange
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.formats.can import CanFilter
-from imud.formats.j1939 import filter_of, split
+from imud.formats.j1939 import ADDRESS_MAX, filter_of, split
 from imud.units import NS_PER_MS, NS_PER_S
 
 LISTEN_NS: Final = 1100 * NS_PER_MS
@@ -66,7 +66,9 @@ def restart(settings: HipnucJ1939Settings, bus_bit_s: int) -> RequestScript[str]
     saved = yield from session.read_values(peer, (ADDRESS, session.BITRATE))
     code = saved.get(session.BITRATE, len(session.BITRATES))
     rate = session.BITRATES[code] if code < len(session.BITRATES) else bus_bit_s
-    places = tuple(dict.fromkeys((peer.address, saved.get(ADDRESS, peer.address))))
+    told = saved.get(ADDRESS, peer.address)
+    address = told if 0 <= told <= ADDRESS_MAX else peer.address  # no address of a node: it will stay where it is
+    places = tuple(dict.fromkeys((peer.address, address)))
     found = yield from _claim(session.restart_request(peer), (*places, FACTORY_ADDRESS) if saved else None)
     for place in places if found is None else ():
         if (yield from _heard(settings, place)):

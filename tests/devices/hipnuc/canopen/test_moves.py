@@ -3,7 +3,7 @@
 import pytest
 
 from imud.contracts.device_settings import Written
-from imud.contracts.session import Outcome, Reply, Request, Silence
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Silence
 from imud.devices.hipnuc.canopen import moves, session
 from imud.devices.hipnuc.canopen.cia301 import Aborted, NmtCommand
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
@@ -138,3 +138,16 @@ def test_factory_settings_are_in_force_after_a_restart() -> None:
     with pytest.raises(BadArgument, match="node 8 is taken"):
         bench.run_script(moves.factory_reset(bench.settings))
     assert all(data[0] == 0x40 for _, data in bench.sent)
+
+
+@pytest.mark.parametrize("told", [0, 128, 0xF006_0102])
+def test_a_number_that_is_none_is_not_looked_for(told: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Found by fuzzing: such a number made an identifier that no frame can have, a ValueError."""
+
+    def read_values(*_arguments: object, **_more: object) -> RequestScript[dict[tuple[int, int], int]]:
+        return {(session.NODE_ID, 0): told}
+        yield  # makes it a generator
+
+    monkeypatch.setattr(session, "read_values", read_values)
+    with pytest.raises(NoReply, match="nothing is heard of node 8 after the restart"):
+        run_script(moves.restart(HipnucCanopenSettings(node=8), BUS), lambda _request: Silence(()))

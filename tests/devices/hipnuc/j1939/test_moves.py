@@ -3,7 +3,7 @@
 import pytest
 
 from imud.contracts.device_settings import Written
-from imud.contracts.session import Outcome, Reply, Request, Silence
+from imud.contracts.session import Outcome, Reply, Request, RequestScript, Silence
 from imud.devices.hipnuc.j1939 import moves, session
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Settings
 from imud.errors import BadArgument, NoReply, Rejected
@@ -112,3 +112,14 @@ def test_factory_settings_are_in_force_after_a_restart() -> None:
     bench.run(100_000_000)
     with pytest.raises(BadArgument, match="address 8 is taken"):
         bench.run_script(moves.factory_reset(bench.settings))
+
+
+@pytest.mark.parametrize("told", [254, 0xF006_0102])
+def test_an_address_that_is_none_is_not_looked_for(told: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read_values(*_arguments: object, **_more: object) -> RequestScript[dict[int, int]]:
+        return {session.ADDRESS: told}
+        yield  # makes it a generator
+
+    monkeypatch.setattr(session, "read_values", read_values)
+    with pytest.raises(NoReply):
+        run_script(moves.restart(HipnucJ1939Settings(), 500_000), lambda _request: Silence(()))
