@@ -81,10 +81,9 @@ def _follow(args: argparse.Namespace, watching: Client) -> CalibrationResult:
             while not reply.done():
                 with suppress(TimeoutError):
                     _show(next(events), sys.stdout, as_json=args.json)
-        except BaseException:
-            watching.call("stop_calibration", device=args.device)
-            raise
         finally:
+            if not reply.done():  # interrupted, or nobody reads the progress
+                watching.call("stop_calibration", device=args.device)
             if not args.json and sys.stdout.isatty():
                 sys.stdout.write("\n")
         return msgspec.convert(reply.result(), CalibrationResult)
