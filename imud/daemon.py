@@ -306,10 +306,13 @@ class Daemon:
             device.tick(now_ns)
         for publisher in self._publishers.values():
             publisher.tick(now_ns)
-        self._manager.tick(now_ns, {name: device.state for name, device in self._devices.items()})
+        self._manager.tick(now_ns, self._states)
         for name in [name for name, one in self._put_off.items() if now_ns >= one.due_ns]:
             self._start_or_put_off(name)
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _states(self) -> dict[str, str]:
+        return {name: device.state for name, device in self._devices.items()}
 
     async def _close(self) -> None:
         if self._reloader is not None:

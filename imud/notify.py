@@ -3,7 +3,7 @@
 import logging
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from imud.units import NS_PER_S
@@ -49,15 +49,18 @@ class ServiceManager:
         """The daemon ends."""
         notify("STOPPING=1")
 
-    def tick(self, now_ns: int, states: Mapping[str, str]) -> None:
-        """Feed the watchdog, and tell how the devices are when that has changed. Call it ten times a second."""
+    def tick(self, now_ns: int, states: Callable[[], Mapping[str, str]]) -> None:
+        """Feed the watchdog, and tell how the devices are when that has changed. Call it ten times a second.
+
+        `states` returns the state of each device by its name; it is called at most once a second.
+        """
         if self._watchdog_s is not None and now_ns >= self._watchdog_due_ns:
             notify("WATCHDOG=1")
             self._watchdog_due_ns = now_ns + int(self._watchdog_s * NS_PER_S)
         if now_ns < self._status_due_ns:
             return
         self._status_due_ns = now_ns + STATUS_NS
-        status = status_line(states)
+        status = status_line(states())
         if status != self._status:
             self._status = status
             notify(f"STATUS={status}")

@@ -2,6 +2,7 @@
 
 import os
 import socket
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -79,10 +80,11 @@ def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
         manager = ServiceManager()
         manager.ready()
         for tenth in range(31):
-            manager.tick(tenth * STATUS_NS // 10, {"bow": "running" if tenth > 12 else "searching"})
+            states = {"bow": "running" if tenth > 12 else "searching"}
+            manager.tick(tenth * STATUS_NS // 10, partial(dict, states))
         manager.stopping()
-        states = [receiver.recv(100).decode() for _ in range(6)]
-    assert states == [
+        sent = [receiver.recv(100).decode() for _ in range(6)]
+    assert sent == [
         "READY=1",
         "WATCHDOG=1",
         "STATUS=0 of 1 device running; not: bow (searching).",
