@@ -156,6 +156,8 @@ class PublisherContext:
 
     rings: dict[str, str] = field(default_factory=dict)
     """Path of the shared memory of each device that has some; kept by the publisher that makes it."""
+    without_ring: set[str] = field(default_factory=set)
+    """Devices whose shared memory cannot be made now; kept by the same."""
 
     def ledgers(self) -> Sequence[DeviceLedger]:
         """The ledger of every device now. To be called in the event loop's thread only."""

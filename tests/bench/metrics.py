@@ -11,8 +11,12 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from threading import Event, Thread
 
+from imud.formats.slot import encode_slot
 from imud.publishers.metrics.family import Snapshot
-from imud.publishers.metrics.publisher import Renderer
+from imud.publishers.metrics.publisher import Renderer, pause
+from imud.publishers.metrics.rings import SAMPLES_MAX, motion_of
+from imud.sample import Sample, Sync
+from imud.units import NS_PER_MS
 from tests.bench.rows import Row, at_most
 from tests.support.metrics import client, equipped
 
@@ -62,6 +66,26 @@ def wall_ms(renderer: Renderer, shown: Snapshot) -> float:
     return (time.perf_counter_ns() - begin_ns) / 1e6
 
 
+def motion_slots() -> bytes:
+    """As many slots as are read of one device."""
+    return b"".join(
+        encode_slot(
+            Sample("bow", n, n * NS_PER_MS, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(0.1 * (n % 7), 0.2, 9.8)), 0
+        )
+        for n in range(1, SAMPLES_MAX + 1)
+    )  # fmt: skip
+
+
+def motion_ms(slots: bytes, repeats: int) -> float:
+    """CPU ms of the motion of one device, best of `repeats`."""
+    best_ns = 1 << 62
+    for _ in range(repeats):
+        begin_ns = time.thread_time_ns()
+        motion_of(slots, 0)
+        best_ns = min(best_ns, time.thread_time_ns() - begin_ns)
+    return best_ns / 1e6
+
+
 def stall_rows(name: str, stalls: list[float], limit_ms: float | None = None) -> Iterator[Row]:
     """The quietest run, which other programs disturbed least, and the median."""
     best, median = stalls[0], stalls[len(stalls) // 2]
@@ -85,6 +109,10 @@ def rows(quick: bool = False) -> Iterator[Row]:
         yield from stall_rows(f"metrics: loop stall, {devices} devices, no pauses", straight)
         paused = asyncio.run(stalls_ms(partial(Renderer().render, shown, ""), repeats))
         yield from stall_rows(f"metrics: loop stall, {devices} devices", paused, STALL_MS_MAX)
+    slots = motion_slots()
+    yield Row(f"metrics: motion of a device, {SAMPLES_MAX} samples, CPU", motion_ms(slots, repeats), "ms")
+    moving = asyncio.run(stalls_ms(partial(motion_of, slots, 0, pause), repeats))
+    yield from stall_rows("metrics: loop stall, motion of a device", moving, STALL_MS_MAX)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,16 @@ from imud.contracts.status import (
     ClockStatus,
     DeviceState,
     DeviceStatus,
+    FrameStatus,
     KernelCounters,
     LinesStatus,
     PollingStatus,
     SerialLineCounters,
     UtcStatus,
 )
+from imud.frames.conventions import Heading
 from imud.ledger import LEDGER_FIELDS
+from imud.publishers.metrics.rings import MotionValues, RingView
 from imud.sample import Sync
 
 
@@ -72,12 +75,19 @@ EDGED = ClockStatus(
     Sync.EDGE, 5_250_000_000, -40.0, 30_000, 4_500, 2, hold_ns=16_000_000, edges=4998, edges_unpaired=9,
     samples_unpaired=17, triggers_missed=21, reference_error_ns=250_000,
 )  # fmt: skip
+FRAME = FrameStatus("sensor", "device", "", "", Heading.UNKNOWN, None, {})
+MOTION = MotionValues(12_500_000_000, (0.1, -0.2, 3.0), 9.81, (0.01, 0.02, 0.03), (0.04, 0.05, 0.06))
 
 
 def equipped(name: str, number: int = 0, **changes: object) -> DeviceStatus:
     """A device that has every part that a device can have."""
-    parts = {"clock": EDGED, "polling": POLLING, "serial_line": SERIAL_LINE, "lines": LINES, "utc": UTC}
+    parts = {"frame": FRAME, "clock": EDGED, "polling": POLLING, "serial_line": SERIAL_LINE, "lines": LINES, "utc": UTC}
     return device(name, number, **(parts | changes))
+
+
+def views(*names: str) -> dict[str, RingView]:
+    """Rings with all that there can be in one."""
+    return {name: RingView(True, MOTION) for name in names}
 
 
 def client(number: int, encoding: str = "json", sent: int = 0, dropped: int = 0, queue: int = 0) -> ClientStatus:

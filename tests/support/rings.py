@@ -1,7 +1,7 @@
 """Shared memory in a folder of its own, written by a publisher whose clock and ledger the test moves."""
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from imud.contracts.publisher import Batch, PublisherContext
@@ -35,9 +35,8 @@ class Board:
         self.ledger = Ledger()
         self.driver = "hipnuc-uart"
         self.settings = ShmSettings(directory=str(folder), slots=slots, group="")
-        self.publisher = ShmPublisher(
-            self.settings, PublisherContext(lambda: [self.status()], epoch, lambda: self.now_ns)
-        )  # fmt: skip
+        self.context = PublisherContext(lambda: [self.status()], epoch, lambda: self.now_ns)
+        self.publisher = ShmPublisher(self.settings, self.context)
         self.publisher.start()
         self.publisher.add_device(DEVICE, 3)
 
@@ -50,7 +49,11 @@ class Board:
 
     def publish(self, numbers: Iterable[int]) -> None:
         """Publish the samples of these sequence numbers as one batch."""
-        self.publisher.publish(Batch(DEVICE, 3, [make_sample(seq) for seq in numbers]))
+        self.publish_samples([make_sample(seq) for seq in numbers])
+
+    def publish_samples(self, samples: Sequence[Sample]) -> None:
+        """Publish these samples as one batch."""
+        self.publisher.publish(Batch(DEVICE, 3, samples))
 
     def tick(self, later_ns: int = 100_000_000) -> None:
         """Let time pass, and tick."""

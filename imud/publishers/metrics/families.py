@@ -7,7 +7,7 @@ a label per client would make a new time series for every connection.
 
 import platform
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import imud
@@ -15,10 +15,12 @@ from imud.contracts.device_settings import SettingsState, SettingsStatus
 from imud.contracts.status import LATENCY_BOUNDS_NS, ClockStatus, DeviceState, DeviceStatus, LinesStatus, UtcStatus
 from imud.ledger import bytes_open, frames_open
 from imud.publishers.metrics.family import (
+    ACCELERATION,
     BYTES,
     CELSIUS,
     HERTZ,
     NO_UNIT,
+    RADIANS,
     RATIO,
     SECONDS,
     DevicePart,
@@ -30,8 +32,10 @@ from imud.publishers.metrics.family import (
     Snapshot,
     Unit,
     daemon,
+    status_part,
 )
-from imud.sample import Sync
+from imud.publishers.metrics.rings import MotionValues
+from imud.sample import Sync, Vector3
 
 DEVICE_INFO_LABELS: Final = ("device", "driver", "link", "product", "serial_number", "firmware")
 CLIENT_ENCODINGS: Final = ("json", "binary", "none")
@@ -88,22 +92,27 @@ def _compared(device: DeviceStatus) -> SettingsStatus | None:
     return found if found is not None and found.state is not SettingsState.UNKNOWN else None
 
 
-DEVICE: Final = DevicePart(lambda device: device)
-CLOCK: Final = DevicePart(lambda device: device.clock)
-LEDGER: Final = DevicePart(lambda device: device.ledger)
-KERNEL: Final = DevicePart(lambda device: device.kernel)
-POLLING: Final = DevicePart(lambda device: device.polling)
-SERIAL_LINE: Final = DevicePart(lambda device: device.serial_line)
-EDGES: Final = DevicePart(_edged)
-TRIGGERS: Final = DevicePart(_triggered)
-LINES: Final = DevicePart(lambda device: device.lines)
-ALARM: Final = DevicePart(_with_alarm)
-SIN: Final = DevicePart(_with_sin)
-UTC: Final = DevicePart(lambda device: device.utc)
-SENTENCES: Final = DevicePart(_fed)
-SETTINGS: Final = DevicePart(lambda device: device.declared)
-DECLARED: Final = DevicePart(_declared)
-COMPARED: Final = DevicePart(_compared)
+DEVICE: Final = status_part(lambda device: device)
+CLOCK: Final = status_part(lambda device: device.clock)
+FRAME: Final = status_part(lambda device: device.frame)
+LEDGER: Final = status_part(lambda device: device.ledger)
+KERNEL: Final = status_part(lambda device: device.kernel)
+POLLING: Final = status_part(lambda device: device.polling)
+SERIAL_LINE: Final = status_part(lambda device: device.serial_line)
+EDGES: Final = status_part(_edged)
+TRIGGERS: Final = status_part(_triggered)
+LINES: Final = status_part(lambda device: device.lines)
+ALARM: Final = status_part(_with_alarm)
+SIN: Final = status_part(_with_sin)
+UTC: Final = status_part(lambda device: device.utc)
+SENTENCES: Final = status_part(_fed)
+SETTINGS: Final = status_part(lambda device: device.declared)
+DECLARED: Final = status_part(_declared)
+COMPARED: Final = status_part(_compared)
+RING: Final = DevicePart(lambda snapshot: snapshot.views.items())
+MOTION: Final = DevicePart(lambda snapshot: ((name, view.motion) for name, view in snapshot.views.items()))
+ANGLES: Final = ("roll", "pitch", "yaw")
+AXES: Final = ("x", "y", "z")
 
 
 def _ledger(field: str) -> Reader:
@@ -113,6 +122,11 @@ def _ledger(field: str) -> Reader:
 def _ledger_by(label: str, **fields: str) -> Reader:
     """Fields of the ledger by the label's value: `crc="lost_crc"`."""
     return LEDGER.by(label, lambda ledger: {value: ledger[field] for value, field in fields.items()})
+
+
+def _vector(label: str, names: tuple[str, ...], read: Callable[[MotionValues], Vector3 | None]) -> Reader:
+    """Three values of the motion by the label's value; absent where there are none."""
+    return MOTION.by(label, lambda motion: dict(zip(names, read(motion) or (), strict=False)))
 
 
 def _line_problems(lines: LinesStatus) -> Mapping[str, float]:
@@ -229,6 +243,10 @@ DEVICE_FAMILIES: Final = (
     _counter("imud_clock_resets_total", "Times the device's clock started anew.", CLOCK.one(lambda c: c.resets)),
     _gauge(
         "imud_temperature_celsius", "Temperature that the device sends.", DEVICE.one(lambda d: d.temperature_c), CELSIUS
+    ),
+    _gauge(
+        "imud_frame_problem", "1 while gravity or heading contradicts the attitude or the configuration, else 0.",
+        FRAME.one(lambda frame: bool(frame.problem)),
     ),
     _gauge("imud_status_bits", "Status word of the newest sample.", DEVICE.one(lambda d: d.status_bits)),
     _counter(
@@ -385,6 +403,37 @@ SETTINGS_FAMILIES: Final = (
     ),
 )  # fmt: skip
 
+# --- from shared memory -----------------------------------------------------------------------------------------------
+
+RING_FAMILIES: Final = (
+    _gauge(
+        "imud_ring_written", "1 while the device's ring in shared memory is there and written, else 0.",
+        RING.one(lambda ring: ring.written),
+    ),
+    _gauge(
+        "imud_attitude_radians", "Attitude of the newest sample.",
+        _vector("angle", ANGLES, lambda motion: motion.attitude_rad), RADIANS,
+    ),
+    _gauge(
+        "imud_acceleration_norm_meters_per_second_squared", "Length of the mean acceleration of the last second.",
+        MOTION.one(lambda motion: motion.accel_norm_m_s2), ACCELERATION,
+    ),
+    _gauge(
+        "imud_vibration_rms_meters_per_second_squared",
+        "RMS of the acceleration's deviation from its mean of each second.",
+        _vector("axis", AXES, lambda motion: motion.vibration_rms_m_s2), ACCELERATION,
+    ),
+    _gauge(
+        "imud_vibration_peak_meters_per_second_squared",
+        "Largest deviation of the acceleration from its mean of each second.",
+        _vector("axis", AXES, lambda motion: motion.vibration_peak_m_s2), ACCELERATION,
+    ),
+    _gauge(
+        "imud_motion_span_seconds", "Time from the oldest to the newest sample that vibration was computed over.",
+        MOTION.one(lambda motion: motion.span_ns), SECONDS,
+    ),
+)  # fmt: skip
+
 LATENCY: Final = Histogram(
     "imud_sample_latency_seconds",
     "Time from the measurement to its publication.",
@@ -433,6 +482,7 @@ FAMILIES: Final[tuple[Family | Histogram, ...]] = (
     *TIME_FAMILIES,
     *LINE_FAMILIES,
     *SETTINGS_FAMILIES,
+    *RING_FAMILIES,
     LATENCY,
     *CLIENT_FAMILIES,
 )

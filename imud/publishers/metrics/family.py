@@ -5,7 +5,7 @@ record that the values are in, and leaves out devices that have none, because ab
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, Generic, TypeVar
 
@@ -18,6 +18,7 @@ from prometheus_client.core import (
 )
 
 from imud.contracts.status import ClientStatus, DeviceStatus
+from imud.publishers.metrics.rings import RingView
 from imud.units import NS_PER_S, PPM_PER_ONE
 
 T = TypeVar("T")
@@ -39,6 +40,10 @@ class Snapshot:
     client_samples_sent: int = 0
     """Samples sent to clients, those that disconnected included, as seen at scrapes."""
     client_samples_dropped: int = 0
+    rings: Mapping[str, str] = field(default_factory=dict)
+    """Path of the ring by device; empty where there is none though there should be."""
+    views: Mapping[str, RingView] = field(default_factory=dict)
+    """What was found in these rings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +60,8 @@ NO_UNIT: Final = Unit("")
 BYTES: Final = Unit("bytes")
 CELSIUS: Final = Unit("celsius")
 HERTZ: Final = Unit("hertz")
+RADIANS: Final = Unit("radians")
+ACCELERATION: Final = Unit("meters_per_second_squared")
 RATIO: Final = Unit("ratio", PPM_PER_ONE)
 SECONDS: Final = Unit("seconds", NS_PER_S)
 
@@ -129,22 +136,24 @@ class Histogram:
         return metric
 
 
+Parts = Iterable[tuple[str, T | None]]
+"""The name of each device and a record of it; None for a device without it: its metrics are absent."""
+
+
 @dataclass(frozen=True, slots=True)
 class DevicePart(Generic[T]):
-    """A record of the device's status; the label `device` of its values is the device's name."""
+    """A record of each device; the label `device` of its values is the device's name."""
 
-    find: Callable[[DeviceStatus], T | None]
-    """None for a device without it: its metrics are absent."""
+    find: Callable[[Snapshot], Parts[T]]
 
     def one(self, read: Callable[[T], float | None]) -> Reader:
         """Reads one value without further labels; absent where it is None."""
 
         def lines(snapshot: Snapshot) -> Iterator[tuple[tuple[str], float]]:
-            for device in snapshot.devices:
-                part = self.find(device)
+            for name, part in self.find(snapshot):
                 value = None if part is None else read(part)
                 if value is not None:
-                    yield (device.name,), value
+                    yield (name,), value
 
         return Reader(("device",), lines)
 
@@ -152,13 +161,17 @@ class DevicePart(Generic[T]):
         """Reads values by one further label."""
 
         def lines(snapshot: Snapshot) -> Iterator[tuple[tuple[str, str], float]]:
-            for device in snapshot.devices:
-                part = self.find(device)
+            for name, part in self.find(snapshot):
                 if part is not None:
-                    for name, value in read(part).items():
-                        yield (device.name, name), value
+                    for key, value in read(part).items():
+                        yield (name, key), value
 
         return Reader(("device", label), lines)
+
+
+def status_part(find: Callable[[DeviceStatus], T | None]) -> DevicePart[T]:
+    """A record that `find` finds in the status of a device."""
+    return DevicePart(lambda snapshot: ((device.name, find(device)) for device in snapshot.devices))
 
 
 def daemon(read: Callable[[Snapshot], float]) -> Reader:

@@ -2,7 +2,7 @@
 
 `/scrapes` says how often `/metrics` was asked and how long ago, which `imud doctor` asks without being counted.
 
-    HTTP thread ──call_soon_threadsafe──▶ event loop: status, clients ──▶ HTTP thread: render, send
+    HTTP thread ──call_soon_threadsafe──▶ event loop: status, clients ──▶ HTTP thread: rings, render, send
 
 The event loop gives a snapshot of plain records and goes on. Rendering holds Python's global lock, so the HTTP
 thread pauses for PAUSE_S before every metric and every SAMPLES_PER_TURN lines of it: measured with 16 devices
@@ -32,6 +32,7 @@ from imud.event import Event
 from imud.log import messages_dropped
 from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
+from imud.publishers.metrics.rings import RingReader
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.units import NS_PER_S
 
@@ -58,11 +59,18 @@ class MetricsSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields
     """IP address to listen on; `0.0.0.0` is every network of this machine. There is no password."""
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 9321
     """TCP port; 0 takes any free one."""
+    motion: bool = True
+    """Whether attitude, acceleration and vibration are among the metrics, computed from the rings in shared memory."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for what is no address to listen on."""
         if not is_ip_address(self.address) and self.address != "localhost":
             raise ValueError(f"address: expected an IP address such as 127.0.0.1 or ::1, got {shown(self.address)}")
+
+
+def pause() -> None:
+    """Let another thread run that waits for Python's global lock."""
+    time.sleep(PAUSE_S)
 
 
 class Scrapes(msgspec.Struct, frozen=True):
@@ -134,7 +142,7 @@ class _PausingList(list[Line]):
 class Renderer:
     """The registry of all metrics and the text made from it. Synchronization: the HTTP thread."""
 
-    def __init__(self, pause: Callable[[], None] = lambda: time.sleep(PAUSE_S)) -> None:
+    def __init__(self, pause: Callable[[], None] = pause) -> None:
         self._registry = CollectorRegistry()
         self._collector = DaemonCollector(pause)
         self._registry.register(self._collector)
@@ -168,6 +176,7 @@ class MetricsPublisher:
         self._events: Counter[tuple[str, str]] = Counter()
         self._tick_ns = context.now_ns()
         self._renderer = Renderer()
+        self._rings = RingReader(pause, motion=settings.motion)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server: ScrapeServer | None = None
         self._scrapes = 0
@@ -224,13 +233,15 @@ class MetricsPublisher:
         if request.path != "/metrics":
             return HttpResponse("404 Not Found", b"there is only /metrics\n")
         self._scrapes += 1
-        self._scraped_ns = self._context.now_ns()
+        now_ns = self._scraped_ns = self._context.now_ns()
         try:
             snapshot = await self._ask_loop()
         except TimeoutError:
             seconds = f"{self._snapshot_s:g}"
             return HttpResponse("503 Service Unavailable", f"the daemon gave no status within {seconds} s\n".encode())
-        return self._renderer.render(snapshot, request.accept)
+        newest = {device.name: device.newest_seq for device in snapshot.devices}
+        views = self._rings.look(snapshot.rings, newest, now_ns)
+        return self._renderer.render(replace(snapshot, views=views), request.accept)
 
     async def _ask_loop(self) -> Snapshot:
         """Get a snapshot from the daemon's event loop. Raises TimeoutError when the loop is stuck or has ended."""
@@ -243,14 +254,15 @@ class MetricsPublisher:
 
     def _give_snapshot(self, answer: "Future[Snapshot]") -> None:
         if answer.set_running_or_notify_cancel():
-            age_ns = self._context.now_ns() - self._tick_ns
+            context = self._context
             answer.set_result(
                 Snapshot(
-                    self._context.status(),
-                    self._context.clients(),
+                    context.status(),
+                    context.clients(),
                     tuple(self._events.items()),
-                    age_ns,
+                    context.now_ns() - self._tick_ns,
                     messages_dropped(),
+                    rings=dict.fromkeys(context.without_ring, "") | context.rings,
                 )
             )
 

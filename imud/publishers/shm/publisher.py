@@ -110,6 +110,7 @@ class ShmPublisher:
         self._places.pop(name, None)
         ring = self._rings.pop(name, None)
         self._context.rings.pop(name, None)
+        self._context.without_ring.discard(name)
         if ring is not None:
             ring.close()
 
@@ -200,6 +201,7 @@ class ShmPublisher:
             return False
         place.problem = ""
         context.rings[name] = str(ring_path(directory.path, name))
+        context.without_ring.discard(name)
         if self._group_id is not None and not ring.group_given:
             self._warn_of_group(f"cannot be given files by user {os.geteuid()}, who is not in it")
         return True
@@ -209,6 +211,7 @@ class ShmPublisher:
         if str(error) != place.problem:
             log.error("shm: no ring for %s: %s; trying again every second", name, error)
         place.problem, place.retry_ns = str(error), now_ns + RETRY_NS
+        self._context.without_ring.add(name)
 
     def _find_group(self) -> int | None:
         try:

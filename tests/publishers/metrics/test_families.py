@@ -14,12 +14,24 @@ from imud.contracts.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, 
 from imud.event import EventKind
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers.metrics.families import FAMILIES, LINE_FAMILIES, POLLING_FAMILIES, TIME_FAMILIES
-from imud.publishers.metrics.family import BYTES, CELSIUS, HERTZ, RATIO, SECONDS, Family, MetricType, Snapshot
+from imud.publishers.metrics.family import (
+    ACCELERATION,
+    BYTES,
+    CELSIUS,
+    HERTZ,
+    RADIANS,
+    RATIO,
+    SECONDS,
+    Family,
+    MetricType,
+    Snapshot,
+)
 from imud.publishers.metrics.publisher import SAMPLES_PER_TURN, ClientTotals, Renderer
+from imud.publishers.metrics.rings import RingView
 from imud.sample import Sync
 from imud.utc.rmc_feed import Refusal
 from tests.support.files import ROOT
-from tests.support.metrics import LINES, UTC, client, device, equipped
+from tests.support.metrics import FRAME, LINES, UTC, client, device, equipped, views
 
 Key = tuple[str, frozenset[tuple[str, str]]]
 
@@ -239,6 +251,43 @@ def test_every_number_of_the_parts_has_a_metric() -> None:
                 assert changed != before, f"{part}.{field.name}"
 
 
+def test_rings_and_motion_are_shown() -> None:
+    angle = views("bow")["bow"]
+    assert angle.motion is not None
+    bare = angle.motion._replace(attitude_rad=None, accel_norm_m_s2=None, vibration_rms_m_s2=None)
+    shown = rendered(Snapshot(views={"bow": angle, "gone": RingView(False), "bare": RingView(True, bare)}))
+    rms, peak = "imud_vibration_rms_meters_per_second_squared", "imud_vibration_peak_meters_per_second_squared"
+    norm = "imud_acceleration_norm_meters_per_second_squared"
+    found = {name: value for name, value in shown.items() if ("device", "bow") in name[1]}
+    assert found == {
+        key("imud_ring_written", device="bow"): 1,
+        key("imud_attitude_radians", device="bow", angle="roll"): 0.1,
+        key("imud_attitude_radians", device="bow", angle="pitch"): -0.2,
+        key("imud_attitude_radians", device="bow", angle="yaw"): 3.0,
+        key(norm, device="bow"): 9.81,
+        **{key(rms, device="bow", axis=axis): value for axis, value in (("x", 0.01), ("y", 0.02), ("z", 0.03))},
+        **{key(peak, device="bow", axis=axis): value for axis, value in (("x", 0.04), ("y", 0.05), ("z", 0.06))},
+        key("imud_motion_span_seconds", device="bow"): 12.5,
+    }
+    assert {name: value for name, value in shown.items() if ("device", "gone") in name[1]} == {
+        key("imud_ring_written", device="gone"): 0
+    }
+    assert {name for name, labels in shown if ("device", "bare") in labels} == {
+        "imud_ring_written", peak, "imud_motion_span_seconds",
+    }  # fmt: skip
+
+
+def test_a_contradiction_of_gravity_is_shown() -> None:
+    snapshot = Snapshot((
+        device("good", 0, frame=FRAME), device("bad", 1, frame=msgspec.structs.replace(FRAME, problem="upside down")),
+        device("unknown", 2),
+    ))  # fmt: skip
+    shown = rendered(snapshot)
+    assert shown[key("imud_frame_problem", device="good")] == 0
+    assert shown[key("imud_frame_problem", device="bad")] == 1
+    assert key("imud_frame_problem", device="unknown") not in shown
+
+
 def test_state_and_sync_are_one_hot() -> None:
     shown = rendered(Snapshot(DEVICES))
     for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
@@ -321,7 +370,8 @@ def test_rendering_pauses_often() -> None:
         pauses += 1
 
     devices = [equipped(f"d{n}", n) for n in range(16)]
-    body = Renderer(pause).render(Snapshot(devices), "").body
+    snapshot = Snapshot(devices, views=views(*(device.name for device in devices)))
+    body = Renderer(pause).render(snapshot, "").body
     lines = sum(line.startswith(b"imud_") for line in body.splitlines())
     assert lines > 900
     assert pauses >= lines / SAMPLES_PER_TURN
@@ -367,7 +417,7 @@ def test_names_say_type_and_unit() -> None:
             assert (family.type is MetricType.INFO) == family.name.endswith("_info")
             stem = family.name.removesuffix("_total")
             assert stem.endswith(family.unit.name)
-            for unit in (BYTES, CELSIUS, HERTZ, RATIO, SECONDS):
+            for unit in (ACCELERATION, BYTES, CELSIUS, HERTZ, RADIANS, RATIO, SECONDS):
                 assert stem.endswith("_" + unit.name) == (family.unit is unit), family.name
 
 

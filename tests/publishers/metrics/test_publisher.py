@@ -5,6 +5,7 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse_text
@@ -16,6 +17,7 @@ from imud.event import Event, EventKind
 from imud.publishers import PUBLISHERS
 from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
 from tests.support.metrics import LIMIT_S, ask, device, read_all
+from tests.support.rings import DEVICE, Board
 
 DEVICES = (device("front", 0), device("rear", 1))
 
@@ -82,6 +84,29 @@ def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
             assert line == "HTTP/1.1 200 OK"
             assert "Content-Type: application/json" in head
             assert body == '{"scrapes":1,"age_s":4.0}'  # the clock of the test goes on 2 s a look: status, and here
+
+    asyncio.run(run())
+
+
+def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
+    """Samples that are in shared memory when the scrape comes; a device without a ring shows as such."""
+    board = Board(tmp_path)
+    newest = device(DEVICE, newest_seq=10)
+    board.now_ns = 20_000_000
+    board.publish(range(1, 11))
+    board.tick(0)
+    context = PublisherContext(
+        lambda: [newest], 1, lambda: board.now_ns, rings=board.context.rings, without_ring={"other"}
+    )
+
+    async def run() -> None:
+        for motion in (True, False):
+            async with publisher(context, motion=motion) as served:
+                body = (await ask(served.port))[2]
+            assert f'imud_ring_written{{device="{DEVICE}"}} 1.0' in body
+            assert 'imud_ring_written{device="other"} 0.0' in body
+            assert (f'imud_motion_span_seconds{{device="{DEVICE}"}} 0.009' in body) == motion
+            assert (f'imud_acceleration_norm_meters_per_second_squared{{device="{DEVICE}"}}' in body) == motion
 
     asyncio.run(run())
 

@@ -405,6 +405,7 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
         for _ in range(25):
             board.tick()
         board.publish([1, 2, 3])
+    assert (board.context.rings, board.context.without_ring) == ({}, {DEVICE})
     [record] = (record for record in caplog.records if record.levelno == logging.ERROR)
     assert re.search(r"imud.imu0 cannot be made, 20480 bytes: No space left .* fewer `slots`", record.getMessage())
     assert not list(tmp_path.iterdir())
@@ -413,6 +414,7 @@ def test_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: py
         board.publish([4])
         assert [s.seq for s in reader.read().samples] == [4]
         assert reader.missed == 0
+    assert (board.context.rings, board.context.without_ring) == ({DEVICE: str(board.path)}, set())
     board.publisher.close()
 
 
@@ -429,6 +431,7 @@ def test_failed_ring_is_tried_once_a_second(tmp_path: Path, monkeypatch: pytest.
         board.tick()
     assert [(at - START_NS) // 1_000_000 for at in tries] == [0, 1000, 2000, 3000]
     board.publisher.close()
+    assert not board.context.without_ring
 
 
 def test_directory_that_is_not_there(tmp_path: Path) -> None:

@@ -1,0 +1,192 @@
+"""Attitude, acceleration and vibration of each device, from its ring in shared memory when metrics are asked for.
+
+Nothing is added to the way of a sample: the HTTP thread copies the newest slots out of the file of the ring (pread,
+which has no SIGBUS) and computes over columns of them. The work is bounded: once a second however often metrics are
+asked for, SAMPLES_MAX slots of a device, in pieces of one second of samples and one axis, with a pause after each.
+
+    slots ──▶ time stamps ──▶ the span: since the look before, at least SPAN_MIN_NS, at most what was copied
+                              blocks of BLOCK_NS ──▶ mean and deviations of each axis ──▶ RMS and peak over all blocks
+
+Vibration is the deviation from the mean of the block: what is slower than about 1 Hz, gravity included, is not in it,
+and its RMS does not depend on the length of the span.
+
+A slot needs no CRC here. The snapshot of the scrape comes from the thread that writes, so slots up to its newest sample
+are whole; and `newest_seq`, read again after the copy, says which of the oldest were overwritten meanwhile.
+"""
+
+import math
+import os
+import struct
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
+from itertools import compress
+from operator import mul
+from typing import Final, NamedTuple
+
+from imud.errors import ServerError
+from imud.formats.ring import HEADER_BYTES, HEARTBEAT_LIMIT_NS, OPEN_FLAGS, STATE_LIVE, RingHeader, decode_header
+from imud.formats.slot import HAS_ACCEL, HAS_EULER, SLOT_BYTES, SLOT_FIELDS
+from imud.sample import Vector3
+from imud.units import NS_PER_S
+
+LOOK_NS: Final = NS_PER_S
+"""Rings are read at most once in this time; scrapes in between get the same values."""
+SAMPLES_MAX: Final = 4096
+"""Slots of a device that are read: all of a ring of the usual size, 4 s at 1 kHz; 1 MB and some 2 ms of CPU."""
+SPAN_MIN_NS: Final = 10 * NS_PER_S
+"""A second scraper must not shorten what the first one sees."""
+BLOCK_NS: Final = NS_PER_S
+BLOCK_SAMPLES_MIN: Final = 8
+"""Fewer samples in a second say nothing of vibration."""
+OVERTAKEN_SLOTS: Final = 8
+"""Beside the slot that is written now: a reader may see stores of the writer in another order."""
+
+_OFFSETS: Final = {field.name: field.offset for field in SLOT_FIELDS}
+_WORDS: Final = SLOT_BYTES // 8
+_SEQ, _T_NS, _ACCEL = (_OFFSETS[name] // 8 for name in ("seq", "t_ns", "accel_m_s2"))
+_PRESENT: Final = _OFFSETS["present"] // 4
+_EULER: Final = struct.Struct(f"<{_OFFSETS['euler_rad']}x3d")
+
+
+class MotionValues(NamedTuple):
+    """Values of one device over the newest samples; None for what it does not send."""
+
+    span_ns: int
+    """From the oldest sample to the newest one that were used."""
+    attitude_rad: Vector3 | None
+    """Roll, pitch, yaw of the newest sample, in the convention that is published."""
+    accel_norm_m_s2: float | None
+    """Length of the mean acceleration over the newest block."""
+    vibration_rms_m_s2: Vector3 | None
+    """X, Y, Z; None also where no block has BLOCK_SAMPLES_MIN samples."""
+    vibration_peak_m_s2: Vector3 | None
+    """Largest deviation from the mean of its block."""
+
+
+class RingView(NamedTuple):
+    """State of the ring of one device."""
+
+    written: bool
+    """Whether the file is there and the daemon writes it."""
+    motion: MotionValues | None = None
+    """None without samples in the span, or where it is not wanted."""
+
+
+class RingReader:
+    """Reader of the rings of all devices. Synchronization: the HTTP thread."""
+
+    def __init__(self, pause: Callable[[], None], *, motion: bool) -> None:
+        self._pause = pause
+        self._motion = motion
+        self._looked_ns: int | None = None
+        self._views: dict[str, RingView] = {}
+
+    def look(self, rings: Mapping[str, str], newest: Mapping[str, int], now_ns: int) -> Mapping[str, RingView]:
+        """The views by device; those of the last look if it was less than LOOK_NS ago.
+
+        `rings` has the path of the ring by device, empty where there is none though there should be; `newest` the
+        number of the newest sample. Both are of one moment of the event loop; `now_ns` is about that time.
+        """
+        before_ns = self._looked_ns
+        if before_ns is None or now_ns - before_ns >= LOOK_NS:
+            since_ns = now_ns - SPAN_MIN_NS if before_ns is None else min(before_ns, now_ns - SPAN_MIN_NS)
+            self._looked_ns = now_ns
+            self._views = {
+                name: self._view(path, newest.get(name, 0), since_ns, now_ns) for name, path in rings.items()
+            }
+        return self._views
+
+    def _view(self, path: str, newest: int, since_ns: int, now_ns: int) -> RingView:
+        try:
+            fd = os.open(path, OPEN_FLAGS)
+        except OSError:  # an empty path is one of them
+            return RingView(False)
+        try:
+            header = _header(fd, path)
+            written = header.state == STATE_LIVE and now_ns - header.heartbeat_ns < HEARTBEAT_LIMIT_NS
+            motion = motion_of(_newest_slots(fd, path, header, newest), since_ns, self._pause) if self._motion else None
+        except (OSError, ServerError):
+            return RingView(False)
+        finally:
+            os.close(fd)
+        return RingView(written, motion)
+
+
+def _header(fd: int, path: str) -> RingHeader:
+    return decode_header(os.pread(fd, HEADER_BYTES, 0), path)
+
+
+def _newest_slots(fd: int, path: str, header: RingHeader, newest: int) -> bytes:
+    """Up to SAMPLES_MAX slots up to the number `newest`, oldest first, without gaps in their numbers."""
+    count = header.slot_count
+    newest = min(newest, header.newest_seq)
+    oldest = max(header.first_seq, newest + 1 - min(count, SAMPLES_MAX))
+    first, end = oldest % count, oldest % count + max(newest + 1 - oldest, 0)
+    copied = _pread_slots(fd, first, min(end, count)) + _pread_slots(fd, 0, end - count)
+    after = _header(fd, path)
+    gone = max(after.newest_seq + 2 + OVERTAKEN_SLOTS - count, after.first_seq) - oldest
+    slots = copied[max(gone, 0) * SLOT_BYTES :]
+    numbers = memoryview(slots).cast("Q")[_SEQ::_WORDS].tolist()
+    return slots if numbers == list(range(newest + 1 - len(numbers), newest + 1)) else b""
+
+
+def _pread_slots(fd: int, first: int, end: int) -> bytes:
+    return os.pread(fd, (end - first) * SLOT_BYTES, HEADER_BYTES + first * SLOT_BYTES) if end > first else b""
+
+
+def motion_of(slots: bytes, since_ns: int, pause: Callable[[], None] = lambda: None) -> MotionValues | None:
+    """MotionValues over the slots whose time stamps are not before `since_ns`, oldest first; None for none."""
+    view = memoryview(slots)
+    times = view.cast("q")[_T_NS::_WORDS].tolist()
+    first = bisect_left(times, since_ns)
+    if first == len(times):
+        return None
+    view, times = view[first * SLOT_BYTES :], times[first:]
+    bits = view.cast("I")[_PRESENT :: SLOT_BYTES // 4].tolist()
+    attitude = _EULER.unpack_from(view, len(view) - SLOT_BYTES) if bits[-1] & HAS_EULER else None
+    numbers = view.cast("d")
+    axes: list[list[float]] = [
+        numbers[_ACCEL + axis :: _WORDS].tolist()  # type: ignore[misc]  # typeshed says integers, whatever the format
+        for axis in range(3)
+    ]
+    span_ns = times[-1] - times[0]
+    if not all(present & HAS_ACCEL for present in set(bits)):
+        having = [present & HAS_ACCEL for present in bits]
+        times, axes = list(compress(times, having)), [list(compress(axis, having)) for axis in axes]
+    blocks = _blocks(times)
+    if not blocks:
+        return MotionValues(span_ns, attitude, None, None, None)
+    means = [_mean(axis[slice(*blocks[0])]) for axis in axes]
+    deviations = [_deviation(axis, blocks, pause) for axis in axes]
+    rms, peak = zip(*deviations, strict=True) if None not in deviations else (None, None)
+    return MotionValues(span_ns, attitude, math.hypot(*means), rms, peak)
+
+
+def _blocks(times: list[int]) -> list[tuple[int, int]]:
+    """First index and end of each block of BLOCK_NS, newest first: the newest is a whole one."""
+    blocks, end = [], len(times)
+    while end:
+        first = bisect_left(times, times[end - 1] - BLOCK_NS + 1)
+        blocks.append((first, end))
+        end = first
+    return blocks
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _deviation(
+    axis: list[float], blocks: list[tuple[int, int]], pause: Callable[[], None]
+) -> tuple[float, float] | None:
+    """RMS and peak of the deviation from the mean of the block; None where all blocks are too small."""
+    squares, used, peak = 0.0, 0, 0.0
+    for first, end in blocks:
+        if end - first >= BLOCK_SAMPLES_MIN:
+            pause()
+            block = axis[first:end]
+            mean = _mean(block)
+            squares += max(sum(map(mul, block, block)) - len(block) * mean * mean, 0.0)
+            peak = max(peak, max(block) - mean, mean - min(block))
+            used += len(block)
+    return (math.sqrt(squares / used), peak) if used else None

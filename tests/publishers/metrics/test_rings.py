@@ -1,0 +1,233 @@
+"""MotionValues from the ring: values by hand, bounded work, and no slot that the writer overtook."""
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from imud.formats.slot import SLOT_BYTES, encode_slot
+from imud.publishers.metrics.rings import OVERTAKEN_SLOTS, SAMPLES_MAX, MotionValues, RingReader, RingView, motion_of
+from imud.sample import Sample, Sync, Vector3
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.rings import DEVICE, SLOTS, START_NS, Board
+
+G = 9.81
+
+
+def slot(seq: int, t_ns: int, accel: Vector3 | None, euler: Vector3 | None = None) -> bytes:
+    return encode_slot(Sample("bow", seq, t_ns, 1, Sync.ARRIVAL, t_ns, 0, accel_m_s2=accel, euler_rad=euler), 0)
+
+
+def slots(accelerations: Sequence[Vector3 | None], rate_hz: int = 100, start_ns: int = 0) -> bytes:
+    period_ns = NS_PER_S // rate_hz
+    return b"".join(slot(n + 1, start_ns + n * period_ns, accel) for n, accel in enumerate(accelerations))
+
+
+def motion(data: bytes, since_ns: int = 0) -> MotionValues:
+    found = motion_of(data, since_ns)
+    assert found is not None
+    return found
+
+
+def test_vibration_by_hand() -> None:
+    """X rests, Y is ±0.5 about 0.1, Z is 9.81 with 9 samples of 0 and one of 1 in ten: variance 0.09."""
+    found = motion(slots([(0.0, 0.1 + (0.5 if n % 2 else -0.5), G + (n % 10 == 3)) for n in range(100)]))
+    assert found.vibration_rms_m_s2 == pytest.approx((0.0, 0.5, 0.3), abs=1e-6)
+    assert found.vibration_peak_m_s2 == pytest.approx((0.0, 0.5, 0.9), abs=1e-9)
+    assert found.accel_norm_m_s2 == pytest.approx(math.hypot(0.0, 0.1, G + 0.1), rel=1e-12)
+    assert found.span_ns == 990 * NS_PER_MS
+
+
+def test_slow_motion_is_no_vibration_and_the_span_changes_no_rms() -> None:
+    """A turn of the sensor in 20 s moves gravity from Z to X; the vibration is a sine of 25 Hz, amplitude 0.2."""
+
+    def at(n: int) -> Vector3:
+        turn = math.pi / 2 * n / 2000
+        return G * math.sin(turn), 0.2 * math.sin(2 * math.pi * 25 * n / 100), G * math.cos(turn)
+
+    data = slots([at(n) for n in range(2000)])
+    long, short = motion(data), motion(data, since_ns=17 * NS_PER_S)
+    assert (long.span_ns, short.span_ns) == (19_990 * NS_PER_MS, 2_990 * NS_PER_MS)
+    for found in (long, short):
+        assert found.vibration_rms_m_s2 is not None
+        x, y, z = found.vibration_rms_m_s2
+        assert y == pytest.approx(0.2 / math.sqrt(2), rel=1e-9)
+        assert x < 0.23  # in one second gravity moves by 0.77 m/s² at most, whose standard deviation is 0.22
+        assert z < 0.23
+    assert long.vibration_peak_m_s2 is not None
+    assert max(long.vibration_peak_m_s2) < 0.4
+
+
+def test_the_norm_is_that_of_the_last_second() -> None:
+    found = motion(slots([(0.0, 0.0, 2 * G)] * 150 + [(0.0, 3.0, 4.0)] * 100))
+    assert found.accel_norm_m_s2 == pytest.approx(5.0)
+    assert found.vibration_peak_m_s2 == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)  # the step is between two seconds
+
+
+def test_blocks_do_not_reach_over_a_gap() -> None:
+    before = slots([(0.0, 0.0, G)] * 50)
+    after = slots([(0.0, G, 0.0)] * 50, start_ns=3600 * NS_PER_S)
+    found = motion(before + after)
+    assert found.vibration_rms_m_s2 == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert found.span_ns == 3600 * NS_PER_S + 490 * NS_PER_MS
+
+
+def test_what_is_not_sent_is_absent() -> None:
+    assert motion_of(b"", 0) is None
+    assert motion_of(slots([(0.0, 0.0, G)]), 1) is None  # older than the span
+    angles = motion(slot(1, 5, None, (0.1, 0.2, 0.3)))
+    assert angles == MotionValues(0, (0.1, 0.2, 0.3), None, None, None)
+    few = motion(slots([(0.0, 0.0, G)] * 7, rate_hz=7))
+    assert few.accel_norm_m_s2 == pytest.approx(G)
+    assert few.vibration_rms_m_s2 is few.vibration_peak_m_s2 is None
+    assert motion(slots([(0.0, 0.0, G)] * 8, rate_hz=10)).vibration_rms_m_s2 is not None
+
+
+def test_samples_without_acceleration_among_others_are_left_out() -> None:
+    data: list[Vector3 | None] = [(0.5 if n % 4 == 0 else -0.5, 0.0, G) if n % 2 == 0 else None for n in range(100)]
+    found = motion(slots(data))
+    assert found.vibration_rms_m_s2 == pytest.approx((0.5, 0.0, 0.0), abs=1e-6)
+    assert found.accel_norm_m_s2 == pytest.approx(G)
+
+
+def test_every_block_and_axis_pauses() -> None:
+    pauses = []
+    assert motion_of(slots([(0.0, 0.0, G)] * 1000), 0, lambda: pauses.append(1)) is not None
+    assert len(pauses) == 3 * 10
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+
+
+def look(board: Board, newest: int, *, motion: bool = True) -> RingView:
+    reader = RingReader(lambda: None, motion=motion)
+    return reader.look({DEVICE: str(board.path)}, {DEVICE: newest}, board.now_ns)[DEVICE]
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Board:
+    """A ring of 64 slots; sample n is of n ms and has n m/s² on X."""
+    return Board(tmp_path)
+
+
+def test_a_ring_that_has_wrapped_is_read_in_order(board: Board) -> None:
+    board.publish(range(1, 151))
+    board.now_ns = 160 * NS_PER_MS
+    board.tick(0)
+    found = look(board, 150)
+    assert found.written
+    assert found.motion is not None
+    assert found.motion.span_ns == 54 * NS_PER_MS  # 96 to 150: 9 slots could be overwritten while they are copied
+    assert found.motion.accel_norm_m_s2 == pytest.approx(math.hypot(123.0, 123.25, 123.5))
+
+
+def test_only_samples_of_the_snapshot_are_used(board: Board) -> None:
+    board.publish(range(1, 41))
+    board.now_ns = 0
+    found = look(board, 30)
+    assert found.motion is not None
+    assert found.motion.span_ns == 29 * NS_PER_MS
+    assert look(board, 0).motion is None
+
+
+@pytest.mark.parametrize("more", [1, 10, 54, 63, 64, 65, 500])
+def test_slots_that_are_overwritten_during_the_copy_are_left_out(
+    board: Board, more: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The writer goes on by `more` samples after the copy was made; what may be torn is not used."""
+    board.publish(range(1, 65))
+    board.now_ns = 0
+    real = os.pread
+    copied: list[int] = []
+
+    def pread(fd: int, size: int, at: int) -> bytes:
+        data = real(fd, size, at)
+        if size >= SLOT_BYTES and at and not copied:
+            copied.append(size)
+            board.publish(range(65, 65 + more))
+        return data
+
+    monkeypatch.setattr(os, "pread", pread)
+    found = look(board, 64)
+    assert copied
+    left = SLOTS - 1 - OVERTAKEN_SLOTS - more
+    if left > 0:
+        assert found.motion is not None
+        assert found.motion.span_ns == (left - 1) * NS_PER_MS
+    else:
+        assert found.motion is None
+
+
+def test_slots_whose_numbers_do_not_follow_are_not_used(board: Board) -> None:
+    board.publish(range(1, 31))
+    board.now_ns = 0
+    assert look(board, 30).motion is not None
+    board.poke(4096 + 20 * SLOT_BYTES, (7).to_bytes(8, "little"))
+    assert look(board, 30).motion is None
+
+
+def test_a_ring_is_written_while_its_file_is_there_and_beats(board: Board) -> None:
+    board.publish(range(1, 31))
+    board.tick()
+    assert look(board, 30).written
+    board.now_ns += NS_PER_S
+    assert not look(board, 30).written
+    board.tick()
+    assert look(board, 30).written
+    board.poke(0, b"another!")
+    assert look(board, 30) == RingView(False)
+    board.path.unlink()
+    assert look(board, 30) == RingView(False)
+    reader = RingReader(lambda: None, motion=True)
+    assert reader.look({"bow": ""}, {}, START_NS) == {"bow": RingView(False)}
+
+
+def test_motion_is_off_by_a_switch(board: Board) -> None:
+    board.publish(range(1, 31))
+    board.tick()
+    assert look(board, 30, motion=False) == RingView(True)
+
+
+def test_many_scrapes_of_one_second_are_one_look(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+    board.publish(range(1, 31))
+    board.tick()
+    opened: list[str] = []
+    real = os.open
+
+    def counted(path: str, flags: int) -> int:
+        opened.append(path)
+        return real(path, flags)
+
+    monkeypatch.setattr(os, "open", counted)
+    reader = RingReader(lambda: None, motion=True)
+    rings, newest = {DEVICE: str(board.path)}, {DEVICE: 30}
+    first = reader.look(rings, newest, board.now_ns)
+    for later_ns in range(0, NS_PER_S, NS_PER_S // 100):
+        assert reader.look(rings, newest, board.now_ns + later_ns) is first
+    assert len(opened) == 1
+    reader.look(rings, newest, board.now_ns + NS_PER_S)
+    assert len(opened) == 2
+
+
+def test_the_span_is_the_time_since_the_look_before_but_ten_seconds_at_least(tmp_path: Path) -> None:
+    board = Board(tmp_path, slots=SAMPLES_MAX, now_ns=0)
+    reader = RingReader(lambda: None, motion=True)
+
+    def span_s(now_s: float) -> float:
+        view = reader.look({DEVICE: str(board.path)}, {DEVICE: 4000}, round(now_s * NS_PER_S))[DEVICE]
+        assert view.motion is not None
+        return view.motion.span_ns / NS_PER_S
+
+    for seq in range(1, 4001, 100):  # samples at 100 Hz up to 40 s
+        data = [
+            Sample(DEVICE, n, n * 10 * NS_PER_MS, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(0.0, 0.0, G))
+            for n in range(seq, seq + 100)
+        ]
+        board.publish_samples(data)
+    assert span_s(40.0) == 10.0
+    assert span_s(41.5) == 8.5  # the last sample is of 40 s, the span begins at 31.5
+    reader = RingReader(lambda: None, motion=True)
+    span_s(15.0)
+    assert span_s(40.0) == 25.0
