@@ -21,7 +21,8 @@ class SerialPort:
     """A serial port."""
 
     path: str
-    """Device path for the configuration: the by-id name where there is one, else by-path, else the node."""
+    """Device path for the configuration: the by-id name where there is one and it is this adapter's alone, else
+    by-path, else the node."""
     node: str
     """The device node, for example `/dev/ttyUSB0`."""
     title: str
@@ -29,10 +30,22 @@ class SerialPort:
 
 
 def list_ports(dev: Path = Path("/dev"), sys: Path = Path("/sys")) -> list[SerialPort]:
-    """List all ports that have hardware, by node name in natural order."""
-    aliases = _aliases(dev)
+    """List all ports that have hardware, by node name in natural order.
+
+    Of equal adapters without serial numbers, all have the same by-id name, and which of them it leads to changes with
+    the order in which they were plugged in: they are named by the socket that they are in.
+    """
+    ids, paths = (_aliases(dev / "serial" / directory) for directory in ALIAS_DIRECTORIES)
     nodes = sorted(_nodes(dev, sys), key=lambda node: (node.name.rstrip("0123456789"), len(node.name), node.name))
-    return [SerialPort(aliases.get(node.name, str(node)), str(node), _usb_title(sys, node.name)) for node in nodes]
+    titles = {node.name: _usb_title(sys, node.name) for node in nodes}
+    nameless = {title for name, title in titles.items() if title and name not in ids}
+    found = []
+    for node in nodes:
+        title = titles[node.name]
+        names = (paths, ids) if title in nameless else (ids, paths)
+        path = next((known[node.name] for known in names if node.name in known), str(node))
+        found.append(SerialPort(path, str(node), title))
+    return found
 
 
 def _nodes(dev: Path, sys: Path) -> Iterator[Path]:
@@ -47,12 +60,11 @@ def _is_real(entry: Path) -> bool:
     return kind != UNKNOWN_TYPE if kind else (entry / "device").exists()
 
 
-def _aliases(dev: Path) -> dict[str, str]:
-    """Stable names by node name; by-id goes before by-path."""
+def _aliases(directory: Path) -> dict[str, str]:
+    """Stable names by node name."""
     found: dict[str, str] = {}
-    for directory in ALIAS_DIRECTORIES:
-        for link in sorted((dev / "serial" / directory).glob("*")):
-            found.setdefault(os.path.basename(os.path.realpath(link)), str(link))
+    for link in sorted(directory.glob("*")):
+        found.setdefault(os.path.basename(os.path.realpath(link)), str(link))
     return found
 
 

@@ -60,6 +60,23 @@ def test_without_by_id_the_path_and_then_the_node_is_the_name(dev: Path, sys: Pa
     ]
 
 
+def test_equal_adapters_without_serial_numbers_are_named_by_their_sockets(dev: Path, sys: Path) -> None:
+    """Both have the same by-id name, which leads to the one that was plugged in last."""
+    for name in ("ttyUSB0", "ttyUSB1"):
+        usb(dev, sys, name, product="CH340")
+        (dev / "serial" / "by-path" / f"pci-{name[-1]}").symlink_to(f"../../{name}")
+    (dev / "serial" / "by-id" / "usb-1a86_CH340").symlink_to("../../ttyUSB1")
+    assert [port.path for port in list_ports(dev, sys)] == [f"{dev}/serial/by-path/pci-{n}" for n in (0, 1)]
+
+
+def test_ports_of_one_adapter_keep_their_names(dev: Path, sys: Path) -> None:
+    for number in (0, 1):
+        usb(dev, sys, f"ttyUSB{number}", product="FT2232H", serial="A1")
+        (dev / "serial" / "by-id" / f"usb-FT2232H-if0{number}").symlink_to(f"../../ttyUSB{number}")
+        (dev / "serial" / "by-path" / f"pci-{number}").symlink_to(f"../../ttyUSB{number}")
+    assert [port.path for port in list_ports(dev, sys)] == [f"{dev}/serial/by-id/usb-FT2232H-if0{n}" for n in (0, 1)]
+
+
 def test_ports_without_hardware_and_other_terminals_are_left_out(dev: Path, sys: Path) -> None:
     native(dev, sys, "ttyS0", "4")
     native(dev, sys, "ttyS4", "0")
