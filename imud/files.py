@@ -65,17 +65,20 @@ def read_regular(path: str | os.PathLike[str], bytes_max: int) -> bytes:
         return file.read(bytes_max)
 
 
-def replace_file(path: Path, content: bytes) -> None:
+def replace_file(path: Path, content: bytes, *, mode: int = 0o640, owner: tuple[int, int] | None = None) -> None:
     """Write a file that is the old one or the new one, whole, whenever the process or the machine stops.
 
+    With `owner` (uid, gid) it is given to them, and has exactly `mode`; without, the umask takes its bits from `mode`.
     Raises OSError; the old file is left then. What stands at the temporary name is removed, not followed.
     """
     temporary = path.with_name(path.name + ".new")
     with suppress(FileNotFoundError):
         temporary.unlink()
     try:
-        with open(os.open(temporary, WRITE_FLAGS, 0o640), "wb") as file:
+        with open(os.open(temporary, WRITE_FLAGS, mode), "wb") as file:
             file.write(content)
+            if owner is not None:
+                _own(file.fileno(), mode, owner)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -83,6 +86,15 @@ def replace_file(path: Path, content: bytes) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise
+
+
+def _own(descriptor: int, mode: int, owner: tuple[int, int]) -> None:
+    """Set owner and mode where they differ: a file system without them (vfat) refuses even to keep them."""
+    now = os.fstat(descriptor)
+    if (now.st_uid, now.st_gid) != owner:
+        os.fchown(descriptor, *owner)
+    if stat.S_IMODE(now.st_mode) != mode:
+        os.fchmod(descriptor, mode)
 
 
 def _check_regular(status: os.stat_result, path: str | os.PathLike[str]) -> None:

@@ -35,6 +35,9 @@ COMMANDS = {
     "demo": Subcommand("imud.cli.demo.command:DEMO", "run the daemon on a simulated sensor and show what it does"),
     "check": Subcommand("imud.cli.run:CHECK", "check a configuration file without opening any port"),
     "probe": Subcommand("imud.cli.probe.command:PROBE", "list what is attached"),
+    "setup": Subcommand(
+        "imud.cli.setup.command:SETUP", "find what is attached, configure it, start the service; or take that back"
+    ),
     "doctor": Subcommand("imud.cli.doctor.command:DOCTOR", "look for what is wrong, and say what to do next"),
     "modbus": Subcommand("imud.cli.modbus.command:MODBUS", "find modules on an RS-485 line and give them addresses"),
     "decode": Subcommand("imud.cli.decode:DECODE", "raw capture in, one JSON object per message out"),

@@ -118,7 +118,7 @@ def _chips(lines: DeviceLines) -> Iterator[str]:
 
 def daemon_user(at: Surroundings) -> Person | None:
     """The user of the service, with the groups that the unit adds; without a service the one that asks."""
-    users = _entries(at, "passwd")
+    users = entries(at, "passwd")
     if at.installed:
         wanted = at.unit_value("User") or "root"
         entry = next((entry for entry in users if wanted in (entry[0], entry[2])), None)
@@ -131,7 +131,7 @@ def daemon_user(at: Surroundings) -> Person | None:
     named = (
         {at.unit_value("Group"), *" ".join(at.unit.get("SupplementaryGroups", [])).split()} if at.installed else set()
     )
-    for group in _entries(at, "group"):
+    for group in entries(at, "group"):
         if group[0] in named or group[2] in named or name in group[3].split(","):
             gids.add(int(group[2]))
     own = frozenset(gids)
@@ -148,7 +148,7 @@ def _may_open(person: Person, mode: int, uid: int, gid: int) -> bool:
     return mode & (stat.S_IROTH | stat.S_IWOTH) == stat.S_IROTH | stat.S_IWOTH
 
 
-def _entries(at: Surroundings, database: str) -> list[list[str]]:
+def entries(at: Surroundings, database: str) -> list[list[str]]:
     """Lines of /etc/passwd or /etc/group that are whole."""
     lines = [line.split(":") for line in (at.text(f"/etc/{database}") or "").splitlines()]
     return [
@@ -159,7 +159,7 @@ def _entries(at: Surroundings, database: str) -> list[list[str]]:
 
 
 def _names_of(at: Surroundings, database: str) -> dict[int, str]:
-    return {int(entry[2]): entry[0] for entry in _entries(at, database)}
+    return {int(entry[2]): entry[0] for entry in entries(at, database)}
 
 
 def _name(at: Surroundings, path: str) -> str:

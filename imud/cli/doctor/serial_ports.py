@@ -25,14 +25,14 @@ def serial_paths(at: Surroundings) -> list[str]:
 def ports_present(at: Surroundings) -> Findings:
     """Look whether each configured port exists, and list those that do where one does not."""
     there = list_ports(at.at("/dev"), at.at("/sys"))
-    names = ", ".join(_path(at, port.path) for port in there) or "none"
+    names = ", ".join(at.outside(port.path) for port in there) or "none"
     paths = serial_paths(at)
     for path in paths:
         node = at.at(path)
         if not node.exists():
             yield error(f"{path} is not there; ports of this machine: {names}", _absent(path, bool(there)))
         elif path.startswith(("/dev/ttyUSB", "/dev/ttyACM")):
-            stable = next((_path(at, port.path) for port in there if _path(at, port.node) == path), path)
+            stable = next((at.outside(port.path) for port in there if at.outside(port.node) == path), path)
             if stable.startswith(STABLE):
                 yield note(f"{path} may have another number after replugging", f"name it {stable} in the configuration")
             else:
@@ -129,9 +129,3 @@ def latency_timer(at: Surroundings) -> Findings:
             )
         else:
             yield ok(f"the latency timer of {path} is {timer_ms} ms")
-
-
-def _path(at: Surroundings, path: str) -> str:
-    """A path below the root as it is without one."""
-    root = str(at.root).rstrip("/")
-    return path.removeprefix(root)

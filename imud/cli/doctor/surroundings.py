@@ -93,6 +93,10 @@ class Surroundings:
         """Return where an absolute path lies below the root."""
         return self.root / str(path).lstrip("/")
 
+    def outside(self, path: str | Path) -> str:
+        """Return a path below the root as it is without one."""
+        return str(path).removeprefix(str(self.root).rstrip("/"))
+
     def text(self, path: str | Path) -> str | None:
         """Return the content of a file without blanks around it; None where it cannot be read."""
         try:
@@ -132,6 +136,10 @@ class Surroundings:
             return self._ask(), None
         except (ImudError, TimeoutError, msgspec.ValidationError) as error:
             return None, error
+
+    def status_now(self) -> list[DeviceStatus]:
+        """Ask the daemon for the status of every device. Raises ImudError, TimeoutError, msgspec.ValidationError."""
+        return self._ask()
 
     @property
     def status(self) -> list[DeviceStatus] | None:
@@ -175,15 +183,19 @@ class Surroundings:
         return self.unit_value("LoadState") == "loaded"
 
 
-def run_command(words: Sequence[str]) -> CommandOutput:
-    """Run a command with the C locale and a time limit. Raises FileNotFoundError, TimeoutError, OSError."""
+def run_command(words: Sequence[str], limit_s: float | None = None) -> CommandOutput:
+    """Run a command with the C locale, for COMMAND_S or `limit_s` at most.
+
+    Raises FileNotFoundError, TimeoutError, OSError.
+    """
+    limit_s = COMMAND_S if limit_s is None else limit_s
     try:
         done = subprocess.run(
-            list(words), stdin=subprocess.DEVNULL, capture_output=True, timeout=COMMAND_S, check=False,
+            list(words), stdin=subprocess.DEVNULL, capture_output=True, timeout=limit_s, check=False,
             env=os.environ | {"LC_ALL": "C", "SYSTEMD_COLORS": "0"},
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        raise TimeoutError(f"{words[0]} did not end within {COMMAND_S:g} s") from None
+        raise TimeoutError(f"{words[0]} did not end within {limit_s:g} s") from None
     text = done.stdout.decode("utf-8", "replace")[-OUTPUT_CHARACTERS_MAX:]
     complaint = done.stderr.decode("utf-8", "replace").strip().splitlines()
     return CommandOutput(done.returncode, text, complaint[-1] if complaint else "")

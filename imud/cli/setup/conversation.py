@@ -1,0 +1,70 @@
+"""What `imud setup` says and asks: text in 80 columns on standard output, questions on the terminal."""
+
+import sys
+import textwrap
+from collections.abc import Sequence
+from typing import Final
+
+from imud.cli.output import table
+from imud.cli.setup.attached import Attached
+from imud.errors import BadArgument
+from imud.log import MESSAGE_CHARACTERS_MAX, printable
+
+WIDTH: Final = 80
+HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER OR PRODUCT", "CONFIGURED AS")
+TITLE_WIDTH: Final = 28
+ANSWERS_MAX: Final = 10
+"""Wrong answers to one question after which it is given up."""
+
+
+class Conversation:
+    """Standard output and the terminal. Synchronization: one thread."""
+
+    def __init__(self, *, ask: bool, silent: bool = False) -> None:
+        """Without `ask` every question has its default answer."""
+        self.asks = ask
+        self._silent = silent
+
+    def say(self, text: str = "", indent: str = "") -> None:
+        """Print a paragraph."""
+        if not self._silent:
+            words = printable(text, MESSAGE_CHARACTERS_MAX)
+            print(textwrap.fill(words, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
+
+    def show(self, lines: Sequence[str]) -> None:
+        """Print lines as they are: tables, lines of files."""
+        for line in lines if not self._silent else ():
+            print(printable(line, MESSAGE_CHARACTERS_MAX))
+
+    def agreed(self, question: str, *, default: bool) -> bool:
+        """Ask for yes or no. Raises BadArgument where there is no terminal to ask on."""
+        if not self.asks:
+            return default
+        word = self.answer(f"{question} [{'Y/n' if default else 'y/N'}]", "y" if default else "n")
+        return word.lower() in ("y", "yes")
+
+    def answer(self, question: str, default: str) -> str:
+        """Ask for a word; an empty answer is the default. Raises BadArgument where there is no terminal to ask on."""
+        if not self.asks:
+            return default
+        if not sys.stdin.isatty():
+            raise BadArgument("expected a terminal to ask on, or --yes")
+        try:
+            return input(f"{question} ").strip() or default
+        except EOFError:
+            raise BadArgument("expected an answer, got the end of the input: nothing more was changed") from None
+
+
+def attached_table(found: Sequence[Attached]) -> list[str]:
+    """Format what is attached, and below it why nothing was found on a port."""
+    rows = [
+        (one.node, f"{one.driver} {one.device}".strip() or "-", one.baud or "-", one.title[:TITLE_WIDTH] or "-",
+         one.configured or "-")
+        for one in found
+    ]  # fmt: skip
+    lines = table(HEAD, rows).splitlines()
+    for one in found:
+        if one.problem:
+            words = printable(f"{one.node}: {one.problem}", MESSAGE_CHARACTERS_MAX)
+            lines += textwrap.wrap(words, WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
+    return lines

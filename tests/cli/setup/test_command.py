@@ -1,0 +1,60 @@
+"""`imud setup` as a command: its arguments, and a look at this machine that changes nothing."""
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from imud.cli import main
+from imud.cli.doctor.surroundings import Surroundings
+from imud.cli.setup import command
+from imud.cli.setup.command import numbered, sudo_user
+
+
+@pytest.mark.parametrize(("text", "parts"), [("can0=500000", ("can0", 500000)), ("/dev/ttyUSB0", ("/dev/ttyUSB0", 0))])
+def test_names_with_a_rate(text: str, parts: tuple[str, int]) -> None:
+    assert numbered(text) == parts
+
+
+@pytest.mark.parametrize("text", ["", "=5", "can0=", "can0=fast", "can0=0", "can0=-5"])
+def test_names_without_a_usable_rate_are_refused(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="500000"):
+        numbered(text)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--json"], "expected --yes or --dry-run"),
+        (["--yes", "--can", "can0"], "expected the bit rate"),
+        (["--yes", "--can", "can0=2000000"], "expected for example can0=500000"),
+        (["--yes", "--can", "../x=500000"], "expected for example can0=500000"),
+        (["--yes", "--i2c", "/dev/i2c-1"], "expected the number of a bus"),
+    ],
+)
+def test_arguments_that_do_not_go_together(words: list[str], reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["setup", *words]) == 2
+    assert reason in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("value", "user"), [("ann", "ann"), ("root", ""), ("", "")])
+def test_the_user_that_ran_sudo(monkeypatch: pytest.MonkeyPatch, value: str, user: str) -> None:
+    monkeypatch.setenv("SUDO_USER", value)
+    assert sudo_user() == user
+
+
+def test_a_look_at_this_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the ports of a folder that has none; nothing of the machine is opened."""
+    real = Surroundings
+
+    def elsewhere(file: Path, *arguments: object, **more: object) -> object:
+        return real(file, *arguments, root=tmp_path, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(command, "Surroundings", elsewhere)
+    assert main(["setup", "--dry-run", "--json", "--socket", str(tmp_path / "none"), "-c", "/etc/imud.yaml"]) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"found": [], "changes": [], "made": False, "notes": [], "devices": []}
+    assert list(tmp_path.iterdir()) == []

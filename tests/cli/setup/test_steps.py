@@ -1,0 +1,411 @@
+"""`imud setup` as a whole on made-up machines: proposed, made, a second time, taken back, interrupted."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from imud import config
+from imud.cli.setup import changes, journal
+from imud.cli.setup.attached import Wanted
+from imud.contracts.status import DeviceState
+from imud.errors import BadArgument, ConfigError, ImudError
+from imud.files import replace_file
+from tests.cli.setup.conftest import Attachments, LivingMachine, Setup
+from tests.support.files import ROOT
+from tests.support.metrics import device
+
+BY_ID = "/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A1-if00-port0"
+EXAMPLE = (ROOT / "etc/imud.yaml").read_text()
+PORT = Wanted()
+
+
+@pytest.fixture
+def gateway(machine: LivingMachine, attachments: Attachments) -> LivingMachine:
+    """A gateway with the package installed, a sensor on a USB adapter, and a user who runs sudo."""
+    machine.usb_port("ttyUSB0", "usb-FTDI_FT232R_USB_UART_A1-if00-port0")
+    machine.write("/etc/imud.yaml", EXAMPLE)
+    attachments.hears(BY_ID, "hipnuc-uart")
+    machine.status = [device("imu")]
+    return machine
+
+
+def test_a_new_gateway_is_set_up_and_taken_back(
+    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = gateway.files()
+    assert setup.steps(user="ann").set_up(PORT, ()) == 0
+    out = capsys.readouterr().out
+    for words in ("/dev/ttyUSB0  hipnuc-uart", f"+      port: {BY_ID}", "999.5", "HI13", "0.045 ms", "Samples come."):
+        assert words in out, words
+    text = (gateway.root / "etc/imud.yaml").read_text()
+    (imu,) = config.parse(text, "imud.yaml").devices
+    assert (imu.name, imu.driver, imu.link_settings.port) == ("imu", "hipnuc-uart", BY_ID)  # type: ignore[attr-defined]
+    assert set(EXAMPLE.splitlines()) - set(text.splitlines()) < set(EXAMPLE.splitlines()[44:60])
+    assert (gateway.root / "etc/imud.yaml.DATE").read_text() == EXAMPLE
+    assert 'ATTR{latency_timer}="1"' in (gateway.root / "etc/udev/rules.d/61-imud-setup.rules").read_text()
+    assert gateway.units["imud.service"] == ["enabled", "active"]
+    assert "imud:x:990:ann\n" in (gateway.root / "etc/group").read_text()
+
+    assert setup.steps().undo() == 0
+    assert "Everything is as it was" in capsys.readouterr().out
+    assert gateway.files() == before
+    assert gateway.units["imud.service"] == ["disabled", "inactive"]
+    assert setup.steps().undo() == 0
+    assert "nothing to take back" in capsys.readouterr().out
+
+
+def test_a_second_run_changes_nothing(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    setup.steps(user="ann").set_up(PORT, ())
+    before, ran = gateway.files(), list(gateway.ran)
+    attachments.listened.clear()
+    capsys.readouterr()
+    assert setup.steps(user="ann", date="LATER").set_up(PORT, ()) == 0
+    out = capsys.readouterr().out
+    assert "Nothing to change." in out
+    assert "Changes:" not in out
+    assert attachments.listened == []  # the daemon has the port
+    assert (gateway.files(), gateway.ran) == (before, ran)
+
+
+def test_a_dry_run_changes_nothing_and_tells_all(
+    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = gateway.files()
+    steps = setup.steps(dry_run=True, user="ann")
+    assert steps.set_up(PORT, ()) == 0
+    assert (gateway.files(), gateway.ran) == (before, [])
+    out = capsys.readouterr().out
+    for words in ("device imu", "61-imud-setup.rules (new)", "usermod --append --groups imud ann",
+                  "systemctl enable imud.service", "systemctl restart imud.service"):  # fmt: skip
+        assert words in out
+    said = json.loads(steps.as_json())
+    assert len(said["changes"]) == 6
+    assert said["found"][0]["keys"] == {"driver": "hipnuc-uart", "uart": {"port": BY_ID}}
+    assert said["made"] is False
+
+
+def test_what_a_person_wrote_stays_and_devices_are_added(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments
+) -> None:
+    mine = (
+        "log_level: debug  # mine\ndevices:\n  bow:  # on the mast\n    driver: auto\n    uart: {port: /dev/ttyUSB7}\n"
+    )
+    gateway.write("/etc/imud.yaml", mine)
+    gateway.can("can0", up=True)
+    attachments.hears("can0", "hipnuc-canopen", "node 8", 500000)
+    gateway.status = [
+        device("bow", state=DeviceState.MISSING, problem="it is not there"),
+        device("imu"),
+        device("imu2"),
+    ]
+    assert setup.steps().set_up(PORT, (), wait_s=2) == 1  # bow is still missing
+    text = (gateway.root / "etc/imud.yaml").read_text()
+    assert [line for line in mine.splitlines() if line not in text.splitlines()] == []
+    devices = {one.name: one for one in config.parse(text, "imud.yaml").devices}
+    assert list(devices) == ["imu", "imu2", "bow"]
+    assert devices["imu2"].options.node == 8  # type: ignore[union-attr]
+    assert setup.steps().undo() == 0
+    assert (gateway.root / "etc/imud.yaml").read_text() == mine
+
+
+def test_a_running_daemon_is_left_running_and_reads_the_new_file(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments
+) -> None:
+    gateway.write("/etc/imud.yaml", "devices:\n  bow: {uart: {port: /dev/ttyUSB0}}\n")
+    gateway.hold("ttyUSB0", "imud run")
+    gateway.units["imud.service"] = ["enabled", "active"]
+    gateway.usb_port("ttyUSB1", "usb-B", serial="B")
+    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    gateway.status = [device("bow"), device("imu")]
+    assert setup.steps().set_up(PORT, ()) == 0
+    assert attachments.listened == ["/dev/serial/by-id/usb-B"]
+    assert [line for line in gateway.ran if line.startswith("systemctl")] == [
+        "systemctl try-reload-or-restart imud.service"
+    ]
+    assert setup.steps().undo() == 0
+    assert gateway.ran[-1].startswith("udevadm")
+    assert gateway.units["imud.service"] == ["enabled", "active"]
+
+
+def test_nothing_attached(machine: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]) -> None:
+    machine.write("/etc/imud.yaml", EXAMPLE)
+    before = machine.files()
+    assert setup.steps(user="ann").set_up(PORT, ()) == 1
+    out = capsys.readouterr().out
+    assert "no serial port and no CAN interface" in out
+    assert "No sensor was found. Next steps:" in out
+    assert "imud doctor" in out
+    assert (machine.files(), machine.ran) == (before, [])
+
+
+def test_a_user_without_rights_is_told_what_would_be_done(
+    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gateway.uid = 1000
+    before = gateway.files()
+    assert setup.steps().set_up(PORT, ()) == 1
+    out = capsys.readouterr().out
+    assert "systemctl enable imud.service" in out
+    assert "Nothing was changed: only root may." in out
+    assert gateway.files() == before
+    with pytest.raises(ImudError, match="only root"):
+        setup.steps().undo()
+
+
+def test_without_systemd_the_configuration_is_written(
+    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(gateway.root / "run")
+    assert setup.steps().set_up(PORT, ()) == 0
+    out = capsys.readouterr().out
+    assert "systemd does not run here, so no service is started" in out
+    assert "udev does not run" in out
+    assert BY_ID in (gateway.root / "etc/imud.yaml").read_text()
+    assert gateway.ran == []
+
+
+def test_a_configuration_with_a_mistake_is_not_touched(gateway: LivingMachine, setup: Setup) -> None:
+    gateway.write("/etc/imud.yaml", "devices: {bow: {}}\n")
+    with pytest.raises(ConfigError, match=r"imud.yaml:1:\d+: devices.bow"):
+        setup.steps().set_up(PORT, ())
+    assert gateway.ran == []
+
+
+def test_a_service_that_is_not_known_is_told(
+    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gateway.units.clear()
+    assert setup.steps().set_up(PORT, ()) == 0
+    assert "systemd does not know imud.service" in " ".join(capsys.readouterr().out.split())
+
+
+# --- questions --------------------------------------------------------------------------------------------------------
+
+
+def test_questions_name_and_leave_out(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments, answers: dict[str, str]
+) -> None:
+    gateway.usb_port("ttyUSB1", "usb-B", serial="B")
+    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    answers |= {"on /dev/ttyUSB0?": "-", "on /dev/ttyUSB1?": "mast", "also change": "y"}
+    gateway.status = [device("mast")]
+    assert setup.steps(ask=True, user="ann").set_up(PORT, ()) == 0
+    assert [one.name for one in config.load(gateway.root / "etc/imud.yaml").devices] == ["mast"]
+    assert (gateway.root / "etc/group").read_text().count(":ann\n") == 2
+
+
+def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
+    before = gateway.files()
+    answers["Make these changes?"] = "n"
+    assert setup.steps(ask=True).set_up(PORT, ()) == 1
+    assert (gateway.files(), gateway.ran) == (before, [])
+
+
+def test_without_a_terminal_questions_are_an_error(gateway: LivingMachine, setup: Setup) -> None:
+    with pytest.raises(BadArgument, match="--yes"):
+        setup.steps(ask=True).set_up(PORT, ())
+    assert gateway.ran == []
+
+
+# --- ports in use, consoles, CAN --------------------------------------------------------------------------------------
+
+
+def test_ports_of_others_and_consoles_are_not_opened(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gateway.hold("ttyUSB0", "gpsd")
+    gateway.uart("ttyAMA0", console=True)
+    assert setup.steps().set_up(PORT, ()) == 1
+    assert attachments.listened == []
+    out = capsys.readouterr().out
+    assert "it is in use by gpsd (pid 10)" in out
+    assert "a console of the kernel is on it" in out
+
+
+def test_a_console_is_taken_off_the_port_that_is_named(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gateway.uart("ttyAMA0", console=True)
+    (gateway.root / "dev/serial0").symlink_to("ttyAMA0")
+    line = "console=serial0,115200 console=tty1 root=PARTUUID=1-02 rootwait\n"
+    gateway.write("/boot/firmware/cmdline.txt", line)
+    attachments.hears("/dev/ttyAMA0", "imu61x-uart")
+    before = gateway.files()
+    gateway.status = [device("imu")]
+    assert setup.steps().set_up(Wanted(("/dev/serial0",)), ()) == 0
+    assert (gateway.root / "boot/firmware/cmdline.txt").read_text() == line.removeprefix("console=serial0,115200 ")
+    assert gateway.units["serial-getty@ttyAMA0.service"] == ["masked", "inactive"]
+    assert attachments.listened == ["/dev/ttyAMA0"]
+    assert "restart the machine" in capsys.readouterr().out
+    assert setup.steps().undo() == 0
+    assert gateway.files() == before
+    assert gateway.units["serial-getty@ttyAMA0.service"] == ["disabled", "active"]
+
+
+def test_a_can_interface_is_brought_up_before_the_search(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments
+) -> None:
+    gateway.can("can0")
+    gateway.units["systemd-networkd.service"] = ["enabled", "active"]
+    attachments.hears("can0", "imu61x-can", "base_id 101", 250000)
+    before = gateway.files()
+    run = gateway.run
+
+    def brings_up(words: list[str]) -> object:
+        if words[:2] == ["networkctl", "reconfigure"] or tuple(words[:2]) == ("networkctl", "reconfigure"):
+            gateway.can("can0", up=True)
+        return run(words)
+
+    gateway.run = brings_up  # type: ignore[method-assign,assignment]
+    gateway.status = [device("imu"), device("imu2")]
+    assert setup.steps().set_up(PORT, [("can0", 250000)]) == 0
+    text = (gateway.root / "etc/systemd/network/80-imud-can0.network").read_text()
+    assert "[CAN]\nBitRate=250000\n" in text
+    assert "can0" in attachments.listened
+    assert setup.steps().undo() == 0
+    assert gateway.files() == before
+    assert "ip link set can0 down" in gateway.ran
+
+
+# --- broken on purpose ------------------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+@pytest.mark.parametrize("step", range(14))
+def test_killed_at_any_step_all_is_taken_back(
+    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """Before or after each write, of a file or of the journal, and each command."""
+    before = gateway.files()
+    left = [step]
+
+    def fuse() -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise Killed
+
+    write, run = changes.write, gateway.run
+
+    def writes(*args: object) -> None:
+        fuse()
+        write(*args)  # type: ignore[arg-type]
+        fuse()
+
+    def runs(words: list[str]) -> object:
+        if words[0] in ("usermod",) or tuple(words[:2]) in (("systemctl", "enable"), ("systemctl", "restart")):
+            fuse()
+            output = run(words)
+            fuse()
+            return output
+        return run(words)
+
+    monkeypatch.setattr(changes, "write", writes)
+    gateway.run = runs  # type: ignore[method-assign,assignment]
+    ended = False
+    try:
+        assert setup.steps(user="ann").set_up(PORT, ()) == 0
+        ended = True
+    except Killed:
+        pass
+    assert ended == (step >= 12)
+    monkeypatch.undo()
+    gateway.run = run  # type: ignore[method-assign]
+    assert setup.steps().undo() == 0
+    assert gateway.files() == before
+    assert gateway.units["imud.service"] == ["disabled", "inactive"]
+
+
+def test_a_full_disk_stops_before_the_change_that_could_not_be_recorded(
+    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = gateway.files()
+    replace = replace_file
+    count = [0]
+
+    def full(path: Path, content: bytes, **more: object) -> None:
+        count[0] += 1
+        if count[0] == 5:
+            raise OSError(28, "No space left on device", str(path))
+        replace(path, content, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(journal, "replace_file", full)
+    with pytest.raises(OSError, match="No space"):
+        setup.steps().set_up(PORT, ())
+    assert "2 of 5 changes were made; `sudo imud setup --undo` takes them back" in capsys.readouterr().out
+    assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
+    monkeypatch.undo()
+    assert setup.steps().undo() == 0
+    assert gateway.files() == before
+
+
+def test_a_file_changed_since_is_left_and_the_rest_taken_back(
+    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    setup.steps().set_up(PORT, ())
+    mine = (gateway.root / "etc/imud.yaml").read_text() + "# mine\n"
+    gateway.write("/etc/imud.yaml", mine)
+    assert setup.steps().undo() == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "not taken back: /etc/imud.yaml was changed since `imud setup` wrote it: it is left as it is" in out
+    assert (gateway.root / "etc/imud.yaml").read_text() == mine
+    assert gateway.units["imud.service"] == ["disabled", "inactive"]
+    assert not (gateway.root / "etc/udev/rules.d/61-imud-setup.rules").exists()
+    gateway.write("/etc/imud.yaml", mine.removesuffix("# mine\n"))  # the person takes it back
+    assert setup.steps().undo() == 0
+    assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
+
+
+def test_a_link_in_place_of_the_configuration_is_followed(gateway: LivingMachine, setup: Setup) -> None:
+    gateway.write("/etc/kept/imud.yaml", EXAMPLE)
+    (gateway.root / "etc/imud.yaml").unlink()
+    (gateway.root / "etc/imud.yaml").symlink_to("kept/imud.yaml")
+    assert setup.steps().set_up(PORT, ()) == 0
+    assert (gateway.root / "etc/imud.yaml").is_symlink()
+    assert BY_ID in (gateway.root / "etc/kept/imud.yaml").read_text()
+    assert setup.steps().undo() == 0
+    assert (gateway.root / "etc/kept/imud.yaml").read_text() == EXAMPLE
+
+
+def test_a_link_in_place_of_the_rules_is_refused(gateway: LivingMachine, setup: Setup) -> None:
+    (gateway.root / "etc/udev/rules.d/61-imud-setup.rules").symlink_to("/dev/null")
+    with pytest.raises(ImudError, match="symbolic link to /dev/null"):
+        setup.steps().set_up(PORT, ())
+    assert gateway.ran == []
+
+
+def test_a_command_that_fails_ends_it_and_what_was_done_is_told(
+    gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gateway.failing["systemctl restart"] = "Job for imud.service failed."
+    with pytest.raises(ImudError, match=r"`systemctl restart imud.service` failed: Job for imud.service failed\."):
+        setup.steps().set_up(PORT, ())
+    assert "4 of 5 changes were made" in capsys.readouterr().out
+    gateway.failing.clear()
+    assert setup.steps().undo() == 0
+    assert gateway.units["imud.service"] == ["disabled", "inactive"]
+
+
+def test_two_at_a_time_are_refused(gateway: LivingMachine, setup: Setup) -> None:
+    with journal.locked(gateway.surroundings()), pytest.raises(ImudError, match="another `imud setup`"):
+        setup.steps().set_up(PORT, ())
+    assert gateway.ran == []
+
+
+def test_a_journal_that_nobody_can_read_is_an_error(gateway: LivingMachine, setup: Setup) -> None:
+    gateway.write("/var/lib/imud-setup/journal.json", "[")
+    with pytest.raises(ImudError, match="not what imud wrote"):
+        setup.steps().undo()
+
+
+def test_only_root_may_read_the_journal(gateway: LivingMachine, setup: Setup) -> None:
+    setup.steps().set_up(PORT, ())
+    folder = gateway.root / "var/lib/imud-setup"
+    assert (folder.stat().st_mode & 0o777, (folder / "journal.json").stat().st_mode & 0o777) == (0o700, 0o600)
+    assert "imud.yaml" in (folder / "journal.json").read_text()
