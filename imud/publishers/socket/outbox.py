@@ -7,7 +7,8 @@ while `publish` has used up its time.
 Order is kept. Two queues hold what waits, joined by an order number, because they are bounded differently: samples go
 oldest first when there are too many, replies never, but a client for which too many gather is disconnected. A message
 that was sent in part is finished before anything else and cannot be dropped. A queue of samples holds references to
-deliveries, which all clients of one form share and which are encoded when the first of them sends them.
+deliveries, which all clients of one form share: messages, or, where `publish` had no time to encode, the batch, which
+is encoded when the first client sends it.
 """
 
 import array
@@ -39,9 +40,13 @@ class Limits:
 
 
 class Delivery:
-    """Samples of one batch in one form, or those of `chosen` indices; encoded on first use, for all clients."""
+    """Samples of one batch in one form, or those of `chosen` indices; encoded on first use, for all clients.
 
-    __slots__ = ("_messages", "batch", "chosen", "count", "each_bytes", "encoding", "order")
+    What is encoded does not hold the batch: a sample is some thirty small objects, whose memory the interpreter keeps
+    for good when thousands have waited (20 clients of 100 devices that do not read for 8 s: 29 MB, as messages 11).
+    """
+
+    __slots__ = ("_batch", "_chosen", "_messages", "count", "device", "each_bytes", "encoding", "order")
 
     def __init__(
         self,
@@ -52,9 +57,10 @@ class Delivery:
         chosen: Sequence[int] | None = None,
     ) -> None:
         self.order = order
-        self.batch = batch
+        self.device = batch.device
         self.encoding = encoding
-        self.chosen = chosen
+        self._batch = batch if messages is None else None
+        self._chosen = chosen
         self.count = len(batch.samples) if chosen is None else len(chosen)
         self._messages = messages
         self.each_bytes = SAMPLE_BYTES + (encoding.message_bytes if messages is None else len(messages[0]))
@@ -63,11 +69,13 @@ class Delivery:
     def messages(self) -> Sequence[bytes]:
         """The samples as messages."""
         if self._messages is None:
-            encoding, batch = self.encoding, self.batch
-            if self.chosen is None:
+            encoding, batch = self.encoding, self._batch
+            assert batch is not None
+            if self._chosen is None:
                 self._messages = encoding.encode(batch)
             else:
-                self._messages = [encoding.encode_one(batch, index) for index in self.chosen]
+                self._messages = [encoding.encode_one(batch, index) for index in self._chosen]
+            self._batch = None
         return self._messages
 
 
@@ -260,7 +268,7 @@ class Outbox:
                 self._skip = 0
                 self._sample_count -= count
                 self._sample_bytes -= count * delivery.each_bytes
-            device = delivery.batch.device
+            device = delivery.device
             self._unreported[device] = self._unreported.get(device, 0) + count
             self.dropped += count
 
@@ -386,6 +394,6 @@ class Outbox:
         message = delivery.messages()[place]
         self.sent += 1
         if self._unreported:
-            message = delivery.encoding.with_dropped(message, delivery.batch.device, self._unreported)
+            message = delivery.encoding.with_dropped(message, delivery.device, self._unreported)
             self._unreported.clear()
         return message

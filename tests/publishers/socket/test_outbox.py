@@ -5,6 +5,7 @@ import json
 import os
 import random
 import socket
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ import pytest
 from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.publishers.socket.connection import Connection
-from imud.publishers.socket.encoding import JsonEncoding
-from imud.publishers.socket.outbox import Limits, Outbox, Pool
+from imud.publishers.socket.encoding import BinaryEncoding, JsonEncoding
+from imud.publishers.socket.outbox import Delivery, Limits, Outbox, Pool
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.waker import BYTE
 from tests.support.socket_rig import Peer, batch, run, serving, until
@@ -395,3 +396,27 @@ def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
         theirs.close()
 
     run(body)
+
+
+def test_what_waits_as_messages_holds_no_samples() -> None:
+    """Thousands of samples that waited once would leave their memory to the process for good."""
+    ours, theirs = socket.socketpair()
+    ours.setblocking(False)
+    encoding = BinaryEncoding()
+    outbox = Outbox(ours, Limits(4096, 1 << 22), Pool(1 << 26), Sink())
+    batches = [batch("imu0", seq) for seq in range(1, 2001)]
+    for one in batches:
+        Outbox.put_samples([outbox], encoding.encode(one), one, encoding)
+    assert outbox.queue_samples > 100
+    assert len({sys.getrefcount(each) for each in batches[:-1]}) == 1  # of those sent, and of those that wait
+    # encoded when it is sent: a batch that `publish` had no time for
+    late = batch("imu0", 2001)
+    references = [sys.getrefcount(late)]
+    delivery = Delivery(1 << 60, late, encoding, None)
+    references.append(sys.getrefcount(late))
+    assert delivery.messages() == encoding.encode(late)
+    references.append(sys.getrefcount(late))
+    assert references == [references[0], references[0] + 1, references[0]]
+    outbox.close()
+    ours.close()
+    theirs.close()
