@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.lab.host.errors import LabError
-from tests.lab.host.guest import Folder, Limits, run
+from tests.lab.host.errors import HungGuest, LabError
+from tests.lab.host.guest import MACHINE_LOG, Folder, Limits, run
+from tests.lab.host.monitor import QUESTIONS
 
 LONG = Limits(total_s=30.0, boot_s=30.0, silence_s=30.0)
 HANG = "echo $$ >pid; exec sleep 300"
@@ -18,10 +19,11 @@ HANG = "echo $$ >pid; exec sleep 300"
 def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Limits], tuple[int, bytes]]:
     """Runs a script as the guest, in the run's folder; returns its status and output."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tests.lab.host.monitor.ANSWER_S", 0.1)  # the scripts have no monitor
 
     def go(script: str, limits: Limits) -> tuple[int, bytes]:
         output = bytearray()
-        status = run(lambda _fds: ["sh", "-c", script], Folder(tmp_path), limits, output.extend)
+        status = run(lambda _fds, _monitor: ["sh", "-c", script], Folder(tmp_path), limits, output.extend)
         return status, bytes(output)
 
     return go
@@ -50,12 +52,12 @@ def test_output_comes_while_the_guest_runs(tmp_path: Path) -> None:
         seen.append(data)
         fifo.write_bytes(b"go")
 
-    assert run(lambda _fds: ["sh", "-c", script], Folder(tmp_path), LONG, passed_on) == 0
+    assert run(lambda _fds, _monitor: ["sh", "-c", script], Folder(tmp_path), LONG, passed_on) == 0
     assert seen == [b"first\n"]
 
 
 def test_uart_ends_are_passed_and_connected(tmp_path: Path) -> None:
-    def command(fds: tuple[int, int]) -> list[str]:
+    def command(fds: tuple[int, int], _monitor: int) -> list[str]:
         crossed = f"import os; os.write({fds[0]}, b'x'); assert os.read({fds[1]}, 1) == b'x'"
         return ["sh", "-c", f'python3 -I -c "{crossed}" && echo 0 >{tmp_path}/status']
 
@@ -111,6 +113,33 @@ def test_hung_guest_is_ended(start: Start, tmp_path: Path, script: str, limits: 
         start(script, limits)
     assert time.monotonic() - before_s < 10
     assert is_gone(int((tmp_path / "pid").read_text(encoding="ascii")))
+
+
+MONITOR = """import os, sys
+monitor = int(sys.argv[1])
+os.write(monitor, b"QEMU\\n(qemu) ")
+while True:
+    question = os.read(monitor, 100)
+    if question == b"nmi\\n":
+        break
+    for part in (b"answer to ", question, b"(qe", b"mu) "):
+        os.write(monitor, part)
+"""
+
+
+def test_hung_guest_is_examined(tmp_path: Path) -> None:
+    """Each question has its answer in the log, and the interrupt that ends the guest is the last of them."""
+    program = tmp_path / "monitor.py"
+    program.write_text(MONITOR, encoding="ascii")
+    limits = Limits(total_s=30.0, boot_s=30.0, silence_s=0.3)
+
+    def command(_fds: tuple[int, int], monitor: int) -> list[str]:
+        return ["sh", "-c", f": >{tmp_path}/alive; exec python3 -I {program} {monitor}"]
+
+    with pytest.raises(HungGuest):
+        run(command, Folder(tmp_path), limits, lambda _data: None)
+    answers = [f"answer to {question}" for question in QUESTIONS]
+    assert (tmp_path / MACHINE_LOG).read_text().split("\n(qemu) ") == ["QEMU", *answers, ""]
 
 
 def test_flood_of_output_does_not_defeat_the_limit(start: Start) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.lab.host import __main__ as program
-from tests.lab.host import environment, guest, kernel, packages
+from tests.lab.host import environment, guest, kernel, monitor, packages
 from tests.lab.host.errors import HungGuest
 from tests.lab.host.qemu import QEMU
 from tests.lab_host.conftest import FakeProgram
@@ -112,6 +112,7 @@ def test_a_guest_that_hangs_is_booted_once_more(
     status: int | None,
 ) -> None:
     monkeypatch.setattr(guest.Limits, "silence_s", 0.2)
+    monkeypatch.setattr(monitor, "ANSWER_S", 0.1)
     boots = tmp_path / "boots"
     hang = f"if [ $(wc -l <{boots}) -le {hangs} ]; then : >$share/alive; exec sleep 60; fi"
     fake_program(QEMU, f"{FIND_SHARE}\necho >>{boots}\n{hang}\necho 5 >$share/status")

@@ -8,7 +8,7 @@ from tests.lab.host.qemu import Machine
 
 def command(share: str = "/out/run-1") -> list[str]:
     """A machine's argument vector."""
-    return Machine(Path("/k/bzImage"), Path(share), Path(share) / "console.log", 512, 3, (7, 8)).command()
+    return Machine(Path("/k/bzImage"), Path(share), Path(share) / "console.log", 512, 3, (7, 8), 9).command()
 
 
 def test_host_root_is_read_only_and_share_is_not() -> None:
@@ -32,7 +32,7 @@ def test_processors_are_emulated_and_resets_end_it() -> None:
 
 
 def test_a_steady_clock_is_asked_for() -> None:
-    machine = Machine(Path("/k/bzImage"), Path("/out"), Path("/out/console.log"), 512, 1, (7, 8))
+    machine = Machine(Path("/k/bzImage"), Path("/out"), Path("/out/console.log"), 512, 1, (7, 8), 9)
     assert "-icount" not in machine.command()
     arguments = replace(machine, steady=True).command()
     assert arguments[arguments.index("-icount") + 1] == "shift=0"

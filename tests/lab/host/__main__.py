@@ -67,10 +67,10 @@ def boot(options: argparse.Namespace, python: environment.Python, built: Path) -
         (folder / "shown").write_text(shown, encoding="utf-8")
         (folder / "script").write_text(environment.script(python, command), encoding="utf-8")
 
-        def machine(uart_fds: tuple[int, int]) -> list[str]:
+        def machine(uart_fds: tuple[int, int], monitor_fd: int) -> list[str]:
             image, console = built / kernel.IMAGE, folder / "console.log"
             memory_mb, processors, steady = options.memory, options.processors, options.steady
-            return Machine(image, folder, console, memory_mb, processors, uart_fds, steady).command()
+            return Machine(image, folder, console, memory_mb, processors, uart_fds, monitor_fd, steady).command()
 
         start_s = time.time()
         try:

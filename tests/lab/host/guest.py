@@ -16,10 +16,12 @@ from pathlib import Path
 
 from tests.lab.host.diagnosis import cause, last_line, out_of_memory
 from tests.lab.host.errors import HungGuest, LabError
+from tests.lab.host.monitor import examine
 
 TICK_S = 0.5
 GOODBYE_S = 5.0  # from the status to the end of QEMU; it is about 0.1 s
 CHUNK_BYTES = 65536
+MACHINE_LOG = "machine.log"
 STEADY_SILENCE_S = 300.0
 """Between two signs of life of a guest whose clock counts instructions: on a busy host its 5 s took more than 60."""
 
@@ -57,39 +59,44 @@ class Folder:
 
 
 def run(
-    make_command: Callable[[tuple[int, int]], list[str]],
+    make_command: Callable[[tuple[int, int], int], list[str]],
     folder: Folder,
     limits: Limits,
     write: Callable[[bytes], object],
 ) -> int:
-    """Runs the command that `make_command(uart_fds)` gives and returns the guest's exit status.
+    """Runs the command that `make_command(uart_fds, monitor_fd)` gives and returns the guest's exit status.
 
     `write` receives the guest's output as it comes. LabError: the guest gave no status. QEMU never outlives
     this call, and dies with this process (`setpriv --pdeathsig`).
     """
     ends = socket.socketpair()
-    fds = (ends[0].fileno(), ends[1].fileno())
+    monitor, far_monitor = socket.socketpair()
+    fds, monitor_fd = (ends[0].fileno(), ends[1].fileno()), far_monitor.fileno()
     try:
         with open(folder.path / "qemu.log", "wb") as errors:
             process = subprocess.Popen(
-                ["setpriv", "--pdeathsig", "KILL", *make_command(fds)],
+                ["setpriv", "--pdeathsig", "KILL", *make_command(fds, monitor_fd)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                pass_fds=fds,
+                pass_fds=(*fds, monitor_fd),
                 start_new_session=True,  # Ctrl-C reaches the runner, which ends QEMU in its own order
             )
     finally:
-        for end in ends:
+        for end in (*ends, far_monitor):
             end.close()
     try:
         _watch(process, folder, limits, write)
         process.wait(GOODBYE_S)
+    except HungGuest:
+        examine(monitor, folder.path / MACHINE_LOG)
+        raise
     except subprocess.TimeoutExpired:
         pass  # the status decides
     finally:
         process.kill()
         process.wait()
+        monitor.close()
         if process.stdout:
             process.stdout.close()
     return _status(folder, process.returncode)

@@ -8,6 +8,8 @@ INIT = Path(__file__).resolve().parents[1] / "guest" / "init"
 SHARING = "security_model=none"
 ROOT_FLAGS = "trans=virtio,version=9p2000.L,msize=262144,cache=loose"
 """cache=loose: nobody writes through this mount, and without it each import asks the host again."""
+PANIC_BY_NMI = "unknown_nmi_panic panic_print=0x5"
+"""A panic says what every task waits for, and which timers are set; `examine` causes one in a hung guest."""
 STEADY = ("-icount", "shift=0")
 """An instruction takes 2^0 ns; a guest that waits, waits as long by the host's clock."""
 
@@ -25,6 +27,8 @@ class Machine:
     processors: int
     uart_fds: tuple[int, int]
     """The two ends of a socket pair: the guest's extra UARTs, wired to each other."""
+    monitor_fd: int
+    """A socket on which QEMU answers questions about the machine."""
     steady: bool = False
     """Whether time in the guest is what its instructions make it, 1 ns each, and not the host's."""
 
@@ -45,15 +49,15 @@ class Machine:
             *("-device", "virtio-serial-pci", "-device", "virtserialport,chardev=live"),
             *("-chardev", f"socket,id=uart1,fd={first_fd}", "-chardev", f"socket,id=uart2,fd={second_fd}"),
             *("-device", "pci-serial-2x,chardev1=uart1,chardev2=uart2"),
+            *("-chardev", f"socket,id=monitor,fd={self.monitor_fd}", "-mon", "chardev=monitor,mode=readline"),
             *(STEADY if self.steady else ()),
             *("-object", "can-bus,id=can", "-device", "kvaser_pci,canbus=can", "-device", "kvaser_pci,canbus=can"),
         ]
 
     def kernel_arguments(self) -> str:
         """The kernel's command line."""
-        return (
-            f'console=ttyS0 panic=-1 tsc=reliable root=hostroot rootfstype=9p rootflags={ROOT_FLAGS} ro init="{INIT}"'
-        )
+        root = f'root=hostroot rootfstype=9p rootflags={ROOT_FLAGS} ro init="{INIT}"'
+        return f"console=ttyS0 panic=-1 {PANIC_BY_NMI} tsc=reliable {root}"
 
 
 def _escaped(path: Path) -> str:

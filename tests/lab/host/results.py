@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tests.lab.host.errors import LabError
 
-LOGS = ("console.log", "qemu.log")
+LOGS = ("console.log", "qemu.log", "machine.log")
 REPORT = "junit.xml"
 LEFTOVER_S = 86400
 
