@@ -21,6 +21,7 @@ from imud.links.uart.port_list import list_ports
 
 SHARED: Final = ("socketcan", "rs485", "i2c", "spi")
 """Links on which several devices may be, and which nobody has for himself."""
+MODEM_MANAGER: Final = ", which looks for modems on new ports for half a minute: run this again then"
 CONSOLE: Final = "a console of the kernel is on it"
 
 
@@ -117,7 +118,8 @@ def look(
         if here.configured:
             found.append(_as_configured(at, here))
         elif others:
-            found.append(msgspec.structs.replace(here, problem=f"it is in use by {', '.join(others)}"))
+            waits = MODEM_MANAGER if port.holders.startswith("ModemManager") else ""
+            found.append(msgspec.structs.replace(here, problem=f"it is in use by {', '.join(others)}{waits}"))
         elif port.console and node not in freed:
             found.append(msgspec.structs.replace(here, problem=f"{CONSOLE}: name the port if a sensor is wired to it"))
         else:

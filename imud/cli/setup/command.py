@@ -73,6 +73,8 @@ def check(args: argparse.Namespace) -> None:
     """Raises BadArgument for arguments that do not go together."""
     if args.json and not (args.yes or args.dry_run):
         raise BadArgument("--json: expected --yes or --dry-run beside it, since questions are asked on the terminal")
+    if args.json and args.undo:
+        raise BadArgument("--json: expected it without --undo, which has nothing to report but text")
     for bus in args.i2c:
         if not bus.isdecimal():
             raise BadArgument(f"--i2c: expected the number of a bus, 1 for /dev/i2c-1, got {bus!r}")

@@ -153,7 +153,10 @@ def _service(at: Surroundings, made: SetupPlan) -> None:
         made.changes.append(
             CommandChange("imud starts with the machine", words, back, ("systemctl", "is-enabled", UNIT))
         )
-    if state(at, UNIT, "is-active") != "active":
+    if (activity := state(at, UNIT, "is-active")) != "active":
+        if activity == "failed":  # too many starts are refused for ten minutes else
+            words = ("systemctl", "reset-failed", UNIT)
+            made.changes.append(CommandChange("its failures are forgotten", words, (), ("true",)))
         words = ("systemctl", "restart", UNIT)
         back = (("systemctl", "stop", UNIT),)
         made.changes.append(CommandChange("imud starts now", words, back, ("systemctl", "is-active", UNIT)))

@@ -215,7 +215,7 @@ class SetupSteps:
             before = len(journal.records)
             try:
                 notes = journal.carry_out(changes)
-            except (ImudError, OSError):
+            except (ImudError, OSError, KeyboardInterrupt):
                 done = sum(record.done for record in journal.records[before:])
                 self._talk.say(f"{done} of {len(changes)} changes were made; `sudo imud setup --undo` takes them back")
                 raise

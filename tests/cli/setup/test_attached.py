@@ -38,6 +38,11 @@ def test_a_port_that_is_asked_by_modbus_is_not_listened_to(gateway: LivingMachin
     assert [one.keys for one in here if one.driver] == [keys]
 
 
+def test_modem_manager_lets_go_of_a_port(gateway: LivingMachine, attachments: Attachments) -> None:
+    gateway.hold("ttyUSB0", "ModemManager")
+    assert "run this again" in found(gateway, attachments)[0].problem
+
+
 def test_a_configured_port_is_shown_with_what_the_daemon_says(gateway: LivingMachine, attachments: Attachments) -> None:
     gateway.configure("bow: {uart: {port: /dev/serial/by-id/usb-A}}", "mast: {uart: {port: /dev/ttyUSB1}}")
     gateway.units["imud.service"] = ["enabled", "active"]

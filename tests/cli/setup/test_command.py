@@ -27,6 +27,7 @@ def test_names_without_a_usable_rate_are_refused(text: str) -> None:
     ("words", "reason"),
     [
         (["--json"], "expected --yes or --dry-run"),
+        (["--json", "--yes", "--undo"], "expected it without --undo"),
         (["--yes", "--can", "can0"], "expected the bit rate"),
         (["--yes", "--can", "can0=2000000"], "expected for example can0=500000"),
         (["--yes", "--can", "../x=500000"], "expected for example can0=500000"),

@@ -392,6 +392,12 @@ def test_a_command_that_fails_ends_it_and_what_was_done_is_told(
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
 
 
+def test_a_service_that_failed_too_often_is_started(gateway: LivingMachine, setup: Setup) -> None:
+    gateway.units["imud.service"] = ["enabled", "failed"]
+    assert setup.steps().set_up(PORT, ()) == 0
+    assert gateway.ran[-2:] == ["systemctl reset-failed imud.service", "systemctl restart imud.service"]
+
+
 def test_two_at_a_time_are_refused(gateway: LivingMachine, setup: Setup) -> None:
     with journal.locked(gateway.surroundings()), pytest.raises(ImudError, match="another `imud setup`"):
         setup.steps().set_up(PORT, ())
