@@ -1,11 +1,14 @@
 """Plain text for people: tables and histograms."""
 
+import textwrap
 from collections.abc import Iterable, Sequence
 from math import floor, log10
 from typing import Final
 
 from imud.log import MESSAGE_CHARACTERS_MAX, printable
 
+COLUMNS: Final = 80
+"""Width of a terminal that texts fit."""
 WIDTH: Final = 40
 """Characters of the longest bar."""
 BARS: Final = 12
@@ -24,6 +27,22 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
     numbers = [all(_is_number(line[i]) for line in cells[1:] if line[i] not in NO_VALUE) for i in range(len(head))]
     return "\n".join(_line(line, widths, numbers) for line in cells)
+
+
+def shortened(text: str, width: int) -> str:
+    """Return `text` in at most `width` characters, with … for what is left out in its middle: both ends tell most."""
+    if len(text) <= width:
+        return text
+    end = (width - 1) // 2
+    return f"{text[: width - 1 - end]}…{text[len(text) - end :]}"
+
+
+def paragraph(label: str, text: str) -> list[str]:
+    """Lines of at most COLUMNS characters: the label, and beside it the text, whose longer words are shortened."""
+    room = COLUMNS - len(label)
+    words = " ".join(shortened(word, room) for word in printable(text, MESSAGE_CHARACTERS_MAX).split())
+    lines = textwrap.wrap(words, room, break_on_hyphens=False) or [""]
+    return [f"{label if not number else ' ' * len(label)}{line}".rstrip() for number, line in enumerate(lines)]
 
 
 def histogram(values: Sequence[float], unit: str) -> list[str]:

@@ -71,7 +71,7 @@ def check(args: argparse.Namespace) -> int:
     names = ", ".join(device.name for device in settings.devices) or "none"
     print(f"{args.file}: good; devices: {names}")
     for device in settings.devices:
-        for note in limits_of(device):
+        for note in (*limits_of(device), *absent_capture(device)):
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
     return 0
 
@@ -83,6 +83,12 @@ def limits_of(device: DeviceConfig) -> Sequence[str]:
     return DRIVERS[device.driver].limits(
         declared_values(device.declared), device.lines or DeviceLines(), device.rmc is not None
     )
+
+
+def absent_capture(device: DeviceConfig) -> Sequence[str]:
+    """Say that the recording of a replay is not there, which a port may be for a while and a file seldom is."""
+    path = getattr(device.link_settings, "path", "") if device.link == "replay" else ""
+    return (f"{path} is not there: imud waits for it",) if path and not Path(path).exists() else ()
 
 
 def standard_input() -> bytes:

@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect
-from imud.cli.output import table
+from imud.cli.output import shortened, table
 from imud.cli.streams import complain
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
@@ -17,6 +17,9 @@ from imud.frames.conventions import Convention
 from imud.sample import SAMPLE_SCHEMA, Sample
 from imud.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
 
+NAME_WIDTH: Final = 10
+ERROR_LARGE_MS: Final = 100.0
+"""From here on, ms without decimals."""
 LOOK_S: Final = 2.0
 """Time between two looks at the states of the watched devices."""
 FIELD_HEAD: Final = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
@@ -97,17 +100,20 @@ def as_json(sample: Sample) -> str:
 
 
 def as_text(sample: Sample) -> str:
-    """Format a sample as one line: seconds, degrees, °/s; acceleration stays in m/s²."""
-    words = [
-        f"{sample.device:12} {sample.t_ns / NS_PER_S:14.6f} s ±{sample.t_err_ns / NS_PER_MS:6.3f} ms {sample.sync:10}"
-    ]
+    """Format a sample as at most two lines of 80 columns: seconds, degrees, °/s; acceleration stays in m/s²."""
+    name = shortened(sample.device, NAME_WIDTH)
+    error_ms = sample.t_err_ns / NS_PER_MS
+    error = f"{error_ms:6.3f}" if error_ms < ERROR_LARGE_MS else f"{error_ms:6.0f}"
+    first = [f"{name:{NAME_WIDTH}} {sample.t_ns / NS_PER_S:14.6f} s ±{error} ms {sample.sync:10}"]
     if sample.euler_rad is not None:
-        words.append("rpy " + " ".join(f"{a / RAD_PER_DEG:8.3f}" for a in sample.euler_rad) + " °")
+        first.append("rpy " + " ".join(f"{a / RAD_PER_DEG:7.2f}" for a in sample.euler_rad) + " °")
+    second = []
     if sample.gyro_rad_s is not None:
-        words.append("gyro " + " ".join(f"{w / RAD_PER_DEG:8.3f}" for w in sample.gyro_rad_s) + " °/s")
+        second.append("gyro " + " ".join(f"{w / RAD_PER_DEG:8.2f}" for w in sample.gyro_rad_s) + " °/s")
     if sample.accel_m_s2 is not None:
-        words.append("accel " + " ".join(f"{a:7.3f}" for a in sample.accel_m_s2) + " m/s²")
-    return "  ".join(words)
+        second.append("accel " + " ".join(f"{a:7.3f}" for a in sample.accel_m_s2) + " m/s²")
+    lines = ["  ".join(first).rstrip(), *(["    " + "  ".join(second)] if second else [])]
+    return "\n".join(lines)
 
 
 def schema_arguments(parser: argparse.ArgumentParser) -> None:

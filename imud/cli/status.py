@@ -1,17 +1,29 @@
 """`imud status`: state, rate, clock, losses and ledger of each device."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket, connect, statuses
-from imud.cli.output import times
+from imud.cli.arguments import CliCommand, add_socket, connect
+from imud.cli.output import paragraph, times
 from imud.contracts.device_settings import SettingsState, SettingsStatus
 from imud.contracts.settings import shown
-from imud.contracts.status import DeviceStatus, FrameStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
+from imud.contracts.status import (
+    DeviceState,
+    DeviceStatus,
+    FrameStatus,
+    LinesStatus,
+    PollingStatus,
+    SerialLineCounters,
+    UtcStatus,
+)
 from imud.ledger import bytes_open, frames_open, lost
 from imud.units import NS_PER_MS, NS_PER_US
+
+WELL: Final = (DeviceState.RUNNING, DeviceState.FINISHED)
+"""States that need nobody's attention."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,38 +35,62 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print one block per device; 1 when a ledger does not close or a device does not run."""
     with connect(args) as client:
-        devices = statuses(client)
+        answer = client.status()
+    devices = msgspec.convert(answer["devices"], list[DeviceStatus])
     if args.json:
-        print(msgspec.json.encode(devices).decode())
+        print(msgspec.json.encode(answer).decode())
     else:
-        print("\n\n".join(block(device) for device in devices))
-    return 0 if all(d.state in ("running", "finished") and closes(d.ledger) for d in devices) else 1
+        print(page(devices))
+    return 0 if all(d.state in WELL and closes(d.ledger) for d in devices) else 1
+
+
+def page(devices: Sequence[DeviceStatus]) -> str:
+    """Format the blocks of all devices, and what to do where one does not run."""
+    parts = [block(device) for device in devices]
+    if any(device.state not in WELL for device in devices):
+        parts.append("`sudo imud doctor` looks for the cause, and says what to do next")
+    return "\n\n".join(parts)
 
 
 def block(status: DeviceStatus) -> str:
-    """Format the block of one device."""
+    """Format the block of one device, in 80 columns."""
     clock, ledger = status.clock, status.ledger
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
-    lines = [
-        f"{status.name}: {status.state}" + (f" ({status.problem})" if status.problem else ""),
-        f"  link      {status.link}, driver {status.driver}, opened {times(status.connects)}",
-        f"  identity  {words}",
-        f"  rate      {status.rate_hz:.1f} Hz seen, {status.expected_rate_hz:.1f} Hz by the device's clock",
-        f"  clock     {clock.sync}, skew {clock.skew_ppm:+.2f} ppm, residual {clock.residual_ns / NS_PER_US:.1f} µs, "
-        f"error {clock.t_err_ns / NS_PER_MS:.3f} ms, {clock.resets} resets",
-        f"  latency   {latency(status)}",
-        f"  samples   {ledger['samples']}; lost {lost(ledger)}"
-        f" (device {ledger['lost_gap_device']}, damaged {ledger['lost_crc']},"
-        f" overrun {ledger['lost_overrun']}, queue {ledger['lost_queue']}),"
-        f" {ledger['lost_unknown']} gaps of unknown size",
-        f"  bytes     {ledger['bytes_in']} = {ledger['bytes_in_good_frames']} in good frames"
-        f" + {ledger['bytes_in_bad_frames']} in bad frames + {ledger['bytes_skipped']} skipped"
-        f" + {ledger['bytes_pending']} pending: {'closed' if closes(ledger) else 'DOES NOT CLOSE'}",
-        f"  kernel    {status.kernel.overrun} overruns, {status.kernel.framing} framing, {status.kernel.parity} parity",
+    rows = [
+        ("link", f"{status.link}, driver {status.driver}, opened {times(status.connects)}"),
+        ("identity", words),
+        ("rate", f"{status.rate_hz:.1f} Hz seen, {status.expected_rate_hz:.1f} Hz by the device's clock"),
+        (
+            "clock",
+            f"{clock.sync}, skew {clock.skew_ppm:+.2f} ppm, residual {clock.residual_ns / NS_PER_US:.1f} µs, "
+            f"error {clock.t_err_ns / NS_PER_MS:.3f} ms, {clock.resets} resets",
+        ),
+        ("latency", latency(status)),
+        (
+            "samples",
+            f"{ledger['samples']}; lost {lost(ledger)} (device {ledger['lost_gap_device']}, damaged "
+            f"{ledger['lost_crc']}, overrun {ledger['lost_overrun']}, queue {ledger['lost_queue']}), "
+            f"{ledger['lost_unknown']} gaps of unknown size",
+        ),
+        (
+            "bytes",
+            f"{ledger['bytes_in']} = {ledger['bytes_in_good_frames']} in good frames"
+            f" + {ledger['bytes_in_bad_frames']} in bad frames + {ledger['bytes_skipped']} skipped"
+            f" + {ledger['bytes_pending']} pending: {'closed' if closes(ledger) else 'DOES NOT CLOSE'}",
+        ),
+        (
+            "kernel",
+            f"{status.kernel.overrun} overruns, {status.kernel.framing} framing, {status.kernel.parity} parity",
+        ),
     ]
     if status.frame is not None:
-        lines.insert(3, f"  axes      {axes(status.frame)}")
-    return "\n".join([*lines, *(f"  {name:<10}{words}" for name, words in parts(status))])
+        rows.insert(2, ("axes", axes(status.frame)))
+    lines = paragraph(f"{status.name}: ", str(status.state))
+    if status.problem:
+        lines += paragraph("  ", status.problem)
+    for name, text in (*rows, *parts(status)):
+        lines += paragraph(f"  {name:<10}", text)
+    return "\n".join(lines)
 
 
 def axes(frame: FrameStatus) -> str:

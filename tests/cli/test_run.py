@@ -67,6 +67,17 @@ def test_the_host_of_gpsd(host: str, good: bool, tmp_path: Path, capsys: pytest.
     assert ("devices.a.rmc.host: expected" in capsys.readouterr().err) is not good
 
 
+def test_check_notes_a_recording_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    there, file = tmp_path / "a.cap", tmp_path / "imud.yaml"
+    there.touch()
+    file.write_text(
+        f"devices:\n  a: {{driver: hipnuc-uart, replay: {{path: {there}, speed: maximum}}}}\n"
+        f"  b: {{driver: hipnuc-uart, replay: {{path: {there}2}}}}\n"
+    )
+    assert main(["check", str(file)]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == [f"{file}:3: note: b: {there}2 is not there: imud waits for it"]
+
+
 def test_check_says_what_a_device_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "imud.yaml"
     file.write_text(

@@ -20,13 +20,23 @@ def test_a_line_for_people_has_people_s_units() -> None:
         ONE, euler_rad=(0.1, -0.2, 3.0), gyro_rad_s=(1.0, 0.0, -1.0), accel_m_s2=(0.0, 0.5, 9.8)
     )
     assert as_text(whole) == (
-        "bow               12.345679 s ± 0.250 ms edge        rpy    5.730  -11.459  171.887 °  "
-        "gyro   57.296    0.000  -57.296 °/s  accel   0.000   0.500   9.800 m/s²"
+        "bow             12.345679 s ± 0.250 ms edge        rpy    5.73  -11.46  171.89 °\n"
+        "    gyro    57.30     0.00   -57.30 °/s  accel   0.000   0.500   9.800 m/s²"
     )
 
 
+def test_the_longest_lines_have_80_columns() -> None:
+    longest = Sample(
+        "n" * 31 + "m", 1, 9_999_999_000_000_000, 5_000_000_000, Sync.REGRESSION, 0, 0, euler_rad=(-3.14,) * 3,
+        gyro_rad_s=(-40.0,) * 3, accel_m_s2=(-156.9,) * 3,
+    )  # fmt: skip
+    first, second = as_text(longest).splitlines()
+    assert (len(first), len(second)) == (80, 78)
+    assert first.startswith("nnnnn…nnnm 9999999.000000 s ±  5000 ms regression  rpy")
+
+
 def test_absent_fields_are_left_out() -> None:
-    assert as_text(ONE).endswith(" ms edge      ")
+    assert as_text(ONE).endswith(" ms edge")
     assert json.loads(as_json(ONE)) == {
         "device": "bow", "seq": 7, "t_ns": 12_345_678_900, "t_err_ns": 250_000, "sync": "edge",
         "t_rx_ns": 12_350_000_000, "utc_ns": 0,
@@ -55,7 +65,8 @@ def test_watch_ends_after_count_samples(tmp_path: Path, capsys: pytest.CaptureFi
         finally:
             ended.set()
             sender.join()
-    lines = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr().out.splitlines()
+    lines = printed if "--json" in form else [" ".join(pair) for pair in zip(printed[::2], printed[1::2], strict=True)]
     assert len(lines) == 3
     assert all("imu0" in line for line in lines)
     turned = "--convention" in form

@@ -1,13 +1,19 @@
 """What `imud status` prints of a device."""
 
+import json
+from pathlib import Path
+
 import msgspec
 import pytest
 from msgspec.structs import replace
 
-from imud.cli.status import axes, block, driven, parts, utc, watched
-from imud.contracts.status import FrameStatus, LinesStatus, UtcStatus
+from imud.cli import main
+from imud.cli.status import axes, block, driven, page, parts, utc, watched
+from imud.client import Client
+from imud.contracts.status import DeviceState, FrameStatus, LinesStatus, UtcStatus
 from imud.frames.conventions import Heading
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
+from tests.support.socket_rig import daemon
 
 
 def test_a_device_without_parts_has_no_rows_of_them() -> None:
@@ -18,37 +24,72 @@ def test_a_device_without_parts_has_no_rows_of_them() -> None:
 def test_parts_of_the_identity_have_names() -> None:
     identity = {"product": "IMU61x", "serial_number": "0032", "firmware": "10203", "hardware_version": "2"}
     lines = block(replace(device("bow"), identity=identity)).splitlines()
-    assert "  identity  product IMU61x, serial_number 0032, firmware 10203, hardware_version 2" in lines
+    at = lines.index("  identity  product IMU61x, serial_number 0032, firmware 10203, hardware_version")
+    assert lines[at + 1] == "            2"
     assert "  identity  not known" in block(replace(device("bow"), identity={})).splitlines()
 
 
 def test_axes_heading_and_what_contradicts_them() -> None:
     frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
     lines = block(replace(device("bow"), frame=frame)).splitlines()
-    assert lines[3] == (
-        "  axes      ned-frd, body: x forward; heading true by a declination of -3.5° (its z axis points down)"
-    )
+    at = lines.index("  axes      ned-frd, body: x forward; heading true by a declination of -3.5°")
+    assert lines[at + 1] == "            (its z axis points down)"
     own = replace(frame, frame="sensor: x right", convention="device", declination_deg=None, problem="")
     assert axes(own) == "sensor: x right; heading true"
 
 
 def test_polling_is_shown_for_a_device_that_is_polled() -> None:
-    assert block(device("front", polling=POLLING)).splitlines()[-1] == (
-        "  polling   1000 reads, 20 late, 3 missed, 4 stale, 5 failed; 70.0 µs after the deadline, 8000.0 at worst;"
-        " vanished 6 times"
-    )
+    assert block(device("front", polling=POLLING)).splitlines()[-2:] == [
+        "  polling   1000 reads, 20 late, 3 missed, 4 stale, 5 failed; 70.0 µs after the",
+        "            deadline, 8000.0 at worst; vanished 6 times",
+    ]
 
 
 def test_every_part_has_its_row() -> None:
-    assert block(equipped("bow")).splitlines()[-6:] == [
-        "  line      11 requests unanswered; 12 bytes unasked, 13 strange; 14 echoes (all devices of the line)",
+    assert block(equipped("bow")).splitlines()[-10:] == [
+        "  line      11 requests unanswered; 12 bytes unasked, 13 strange; 14 echoes (all",
+        "            devices of the line)",
         "  sout      5000 edges, 7 lost",
-        "  alarm     ACTIVE, raised 3 times; 2 edges, 0 lost (/dev/gpiochip0 is not there)",
+        "  alarm     ACTIVE, raised 3 times; 2 edges, 0 lost (/dev/gpiochip0 is not",
+        "            there)",
         "  pps       60 edges, 0 lost",
         "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, 900.0 at worst",
-        "  utc       gpsd at 127.0.0.1:2947: 100 sentences, 90 sent, not sent: stale 7, busy 3;"
-        " 59 pulses, 1 ignored; chronyd accepted 40, refused 19 (chronyd does not take samples)",
+        "  utc       gpsd at 127.0.0.1:2947: 100 sentences, 90 sent, not sent: stale 7,",
+        "            busy 3; 59 pulses, 1 ignored; chronyd accepted 40, refused 19",
+        "            (chronyd does not take samples)",
     ]
+
+
+def test_long_names_fit_80_columns_and_keep_both_ends() -> None:
+    port = "/dev/serial/by-id/usb-Silicon_Labs_CP2102N_USB_to_UART_Bridge_Controller_7cb5c9f6a1e4e811-if00-port0"
+    missing = device("n" * 32, link=f"{port} at 115200 baud", state=DeviceState.MISSING, problem=f"{port} is not there")
+    lines = block(missing).splitlines()
+    assert max(map(len, lines)) == 80
+    assert lines[0] == f"{'n' * 32}: missing"
+    assert lines[1].startswith("  /dev/serial/by-id/usb-Silicon")
+    assert lines[1].endswith("-if00-port0")
+    assert "…" in lines[1]
+    assert lines[2] == "  is not there"
+
+
+def test_json_is_all_that_the_socket_sends(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("imud.cli.status.closes", lambda ledger: True)  # the server of the test has not all of it
+    with daemon(tmp_path) as served:
+        with Client(served.path) as client:
+            said = client.status()
+        main(["status", "--socket", str(served.path), "--json"])
+        shown = json.loads(capsys.readouterr().out)
+        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket"}
+        assert shown["devices"] == said["devices"]
+
+
+def test_a_device_that_does_not_run_has_its_reason_and_the_next_step() -> None:
+    assert "doctor" not in page([device("bow"), device("mast", state=DeviceState.FINISHED)])
+    text = page([device("bow"), device("mast", state=DeviceState.MISSING, problem="/dev/x is not there: the cable?")])
+    assert "mast: missing\n  /dev/x is not there: the cable?\n" in text
+    assert text.endswith("\n\n`sudo imud doctor` looks for the cause, and says what to do next")
 
 
 @pytest.mark.parametrize(("alarm", "words"), [(True, "ACTIVE"), (False, "inactive"), (None, "level not known")])

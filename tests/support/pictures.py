@@ -15,8 +15,12 @@ from math import hypot
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from imud.attitude import IDENTITY, Matrix3, matrix_times, transposed
+from imud.cli.arguments import statuses
 from imud.cli.demo.command import daemon, device, simulator
+from imud.cli.status import page
 from imud.client import Client
 from imud.frames.conventions import FLU_LEVEL, RFU_ENU, Convention, body_axes
 from imud.frames.mounting import matrix_from_axes
@@ -29,6 +33,7 @@ from tests.support.files import ROOT
 FOLDER = ROOT / "docs/pictures"
 NAMES = "font-family='DejaVu Sans, Verdana, sans-serif'"
 RATE_HZ, SECONDS, SEED = 100, 60, 7
+PORT = "/dev/ttyUSB0"
 COMMANDS = ("devices", "status", "watch --rate 5 --count 6")
 """What the terminal shows."""
 
@@ -78,14 +83,17 @@ def session() -> list[str]:
             with Client(path, timeout_s=20) as client:
                 for _ in zip(client.watch(), range(20 * RATE_HZ), strict=False):
                     pass
+                found = [
+                    msgspec.structs.replace(one, link=one.link.replace(str(folder / "port"), PORT))
+                    for one in statuses(client)
+                ]
             for words in COMMANDS:
                 argv = [sys.executable, "-m", "imud", *words.split(), "--socket", path]
                 done = subprocess.run(argv, capture_output=True, text=True, timeout=30, check=True)
-                lines += [
-                    f"$ imud {words}",
-                    *done.stdout.replace(str(folder / "port"), "/dev/ttyUSB0").splitlines(),
-                    "",
-                ]
+                said = done.stdout.replace(str(folder / "port"), PORT)
+                if words == "status":  # its lines end where the name of the port makes them end
+                    said = page(found)
+                lines += [f"$ imud {words}", *said.splitlines(), ""]
     return lines[:-1]
 
 

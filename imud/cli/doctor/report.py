@@ -8,10 +8,10 @@ import msgspec
 
 from imud.cli.doctor.finding import DoctorCheck, DoctorFinding, Severity
 from imud.cli.doctor.surroundings import Surroundings
+from imud.cli.output import COLUMNS
 from imud.errors import ImudError
 from imud.log import MESSAGE_CHARACTERS_MAX, printable
 
-WIDTH: Final = 80
 MARGIN: Final = 13
 """Width of the column of severities."""
 STATUS: Final = {Severity.ERROR: 2, Severity.WARNING: 1}
@@ -76,7 +76,7 @@ def page(examined: Sequence[Examined]) -> str:
     """All findings by check, those in order first, and the verdict."""
     findings = [finding for one in examined for finding in one.findings]
     findings.sort(key=lambda finding: _RANK[finding.severity])
-    return "\n".join([*(_block(finding) for finding in findings), "", *textwrap.wrap(verdict(examined), WIDTH)])
+    return "\n".join([*(_block(finding) for finding in findings), "", *textwrap.wrap(verdict(examined), COLUMNS)])
 
 
 _RANK: Final = {
@@ -94,7 +94,7 @@ def _block(finding: DoctorFinding) -> str:
 
 
 def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(printable(text, MESSAGE_CHARACTERS_MAX), WIDTH - MARGIN, break_on_hyphens=False)
+    return textwrap.wrap(printable(text, MESSAGE_CHARACTERS_MAX), COLUMNS - MARGIN, break_on_hyphens=False)
 
 
 def as_json(examined: Sequence[Examined]) -> bytes:

@@ -5,14 +5,14 @@ import textwrap
 from collections.abc import Sequence
 from typing import Final
 
-from imud.cli.output import table
+from imud.cli.output import COLUMNS, paragraph, shortened, table
 from imud.cli.setup.attached import Attached
 from imud.errors import BadArgument
 from imud.log import MESSAGE_CHARACTERS_MAX, printable
 
-WIDTH: Final = 80
-HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER OR PRODUCT", "CONFIGURED AS")
-TITLE_WIDTH: Final = 28
+HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER", "CONFIGURED")
+TITLE_WIDTH: Final = 16
+NAME_WIDTH: Final = 10
 ANSWERS_MAX: Final = 10
 """Wrong answers to one question after which it is given up."""
 
@@ -29,7 +29,9 @@ class Conversation:
         """Print a paragraph."""
         if not self._silent:
             words = printable(text, MESSAGE_CHARACTERS_MAX)
-            print(textwrap.fill(words, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
+            print(
+                textwrap.fill(words, COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+            )
 
     def show(self, lines: Sequence[str]) -> None:
         """Print lines as they are: tables, lines of files."""
@@ -58,13 +60,17 @@ class Conversation:
 def attached_table(found: Sequence[Attached]) -> list[str]:
     """Format what is attached, and below it why nothing was found on a port."""
     rows = [
-        (one.node, f"{one.driver} {one.device}".strip() or "-", one.baud or "-", one.title[:TITLE_WIDTH] or "-",
-         one.configured or "-")
+        (
+            one.node,
+            f"{one.driver} {one.device}".strip() or "-",
+            one.baud or "-",
+            shortened(one.title, TITLE_WIDTH) or "-",
+            shortened(one.configured, NAME_WIDTH) or "-",
+        )
         for one in found
-    ]  # fmt: skip
+    ]
     lines = table(HEAD, rows).splitlines()
     for one in found:
         if one.problem:
-            words = printable(f"{one.node}: {one.problem}", MESSAGE_CHARACTERS_MAX)
-            lines += textwrap.wrap(words, WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
+            lines += paragraph("  ", f"{one.node}: {one.problem}")
     return lines

@@ -5,12 +5,14 @@ from typing import Final
 
 import msgspec
 
-from imud.cli.output import table
+from imud.cli.output import shortened, table
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ImudError
 from imud.units import NS_PER_MS
 
 HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "PRODUCT", "CLOCK ERROR")
+NAME_WIDTH: Final = 24
+PRODUCT_WIDTH: Final = 20
 LOOK_S: Final = 0.5
 """Time between two looks."""
 SETTLE_S: Final = 4.0
@@ -71,4 +73,5 @@ def _runs(one: DeviceStatus) -> bool:
 
 def _row(one: DeviceStatus) -> tuple[object, ...]:
     error = f"{one.clock.t_err_ns / NS_PER_MS:.3f} ms" if _runs(one) else "-"
-    return one.name, one.state, one.rate_hz, one.identity.get("product", "-"), error
+    product = shortened(one.identity.get("product", "-"), PRODUCT_WIDTH)
+    return shortened(one.name, NAME_WIDTH), one.state, one.rate_hz, product, error

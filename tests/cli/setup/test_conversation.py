@@ -59,4 +59,11 @@ def test_the_table_has_the_node_and_reasons_below() -> None:
     assert lines[1].split()[:3] == ["/dev/ttyUSB0", "hipnuc-uart", "115200"]
     assert lines[1].endswith("bow")
     assert lines[3].startswith("  can0: nothing is heard")
-    assert lines[4].startswith("    ")
+    assert lines[4].startswith("  ")
+
+
+def test_the_widest_table_has_80_columns() -> None:
+    widest = Attached(
+        "/dev/ttyUSB10", "/dev/ttyUSB10", "t" * 90, "hipnuc-nmea2000", "source 253", 1_000_000, {}, "n" * 32
+    )
+    assert max(map(len, attached_table([widest]))) == 80

@@ -61,4 +61,6 @@ def test_the_table_has_rate_product_and_error() -> None:
     ).splitlines()
     assert head.split() == ["DEVICE", "STATE", "RATE", "HZ", "PRODUCT", "CLOCK", "ERROR"]
     assert bow.split() == ["bow", "running", "999.5", "HI13", "0.045", "ms"]
+    named = device("n" * 32, identity={"product": "p" * 40}, state=DeviceState.SEARCHING, rate_hz=1000.5)
+    assert max(map(len, samples_table([named]).splitlines())) <= 80
     assert mast.split() == ["mast", "missing", "999.5", "-", "-"]
