@@ -12,7 +12,6 @@ import struct
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count
 from math import isfinite
 from typing import Any, Final
 
@@ -57,11 +56,12 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     if not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA:  # `pressure_of`; a call each costs a tenth of a frame
         temperature, pressure = temperature_beside(temperature, pressure), None
+    word = low + 256 * high
     return Measurement(
         size, trailing, ms,
         (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
         (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-        low + 256 * high if word_is_status else None, None if word_is_status else low + 256 * high,
+        word if word_is_status else None, None if word_is_status else word,
     )  # fmt: skip
 
 
@@ -70,21 +70,26 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
 
     `trailing` bytes follow the first frame.
     """
-    make, g, rad, tesla = Measurement, M_S2_PER_G, RAD_PER_DEG, T_PER_UT
+    g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     low_pa, high_pa = PRESSURE_MIN_PA, PRESSURE_MAX_PA
-    return [
-        make(
-            size, left, ms,
-            (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
-            (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad),
-            temperature if (is_air := low_pa <= pressure <= high_pa) else temperature_beside(temperature, pressure),
-            pressure if is_air else None, None,
-            low + 256 * high if word_is_status else None, None if word_is_status else low + 256 * high,
-        )
-        for left, (
-            low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
-        ) in zip(count(trailing, -size), HI91_VALUES.iter_unpack(hi91s))
-    ]  # fmt: skip
+    made: list[Measurement] = []
+    make, keep = Measurement, made.append
+    for (
+        low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
+    ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
+        if not low_pa <= pressure <= high_pa:
+            temperature, pressure = temperature_beside(temperature, pressure), None  # noqa: PLW2901
+        word = low + 256 * high
+        keep(
+            make(
+                size, trailing, ms,
+                (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
+                (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+                word if word_is_status else None, None if word_is_status else word,
+            )
+        )  # fmt: skip
+        trailing -= size
+    return made
 
 
 def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:

@@ -17,9 +17,11 @@ from imud.frames.conventions import Heading
 from imud.sample import Vector3
 from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 
-_CRC_START: Final = 0xFFFFFFFE
+CRC_START: Final = 0xFFFFFFFE
 """`zlib.crc32` inverts its start value and its result: this start value stands for the register value 1."""
-_CRC_FINAL: Final = 0xFFFFFFFF
+CRC_INVERSION: Final = 0xFFFFFFFF
+"""What turns the result of `zlib.crc32` into the register's value. It is that result, too, over anything followed by
+its own check value, which leaves 0 in the register."""
 
 
 def crc32(data: bytes | bytearray | memoryview) -> int:
@@ -28,7 +30,7 @@ def crc32(data: bytes | bytearray | memoryview) -> int:
     It covers everything before the check value, frame header included (the manual's note 2 of table 2 and its table
     in chapter 5 are misprinted). The check value of "123456789" is 0x3A8639CB.
     """
-    return zlib.crc32(data, _CRC_START) ^ _CRC_FINAL
+    return zlib.crc32(data, CRC_START) ^ CRC_INVERSION
 
 
 # --- units: floats of the device are in g, °/s, ° and °C --------------------------------------------------------------

@@ -68,11 +68,8 @@ class FrameFinder:
         """Incomplete rest of the bytes: begins with a sync word, or is the first half of one."""
         self._bad_ahead = 0
         """Claimed rest of a damaged frame, in bytes from the begin of the tail."""
-
-    @property
-    def idle(self) -> bool:
-        """Whether the next bytes can be decoded without the earlier ones."""
-        return not (self._tail or self._bad_ahead)
+        self.idle = True
+        """Whether the next bytes can be decoded without the earlier ones. To be read only."""
 
     def feed(self, data: bytes) -> Sequence[Frame | BadFrame]:
         """Add bytes in the order they came; return what they completed. Never raises for any bytes."""
@@ -101,6 +98,7 @@ class FrameFinder:
         self._ledger.bytes_skipped += len(self._tail)
         self._tail = b""
         self._bad_ahead = 0
+        self.idle = True
         self._ledger.bytes_pending = 0
 
     def _scan(self, data: bytes, drop_before: int, at: int = 0) -> list[Frame | BadFrame]:
@@ -121,6 +119,7 @@ class FrameFinder:
             at = waiting
         self._tail = data[at:]
         self._bad_ahead = max(self._bad_ahead - at, 0)
+        self.idle = not (self._tail or self._bad_ahead)
         self._ledger.bytes_pending = total - at
         return found
 

@@ -2,10 +2,12 @@
 
 import struct
 from math import inf, nan, pi, sqrt
+from random import Random
 
+import msgspec
 import pytest
 
-from imud.attitude import matrix_from_quat
+from imud.attitude import matrix_from_quat, quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, ReplyFrame
 from imud.devices.imu61x.common.family import crc32
 from imud.devices.imu61x.uart.codec import (
@@ -121,6 +123,35 @@ def test_a_run_ends_before_a_frame_that_is_damaged_or_not_finite() -> None:
                 assert event == same
         assert run.ledger.snapshot() == one_by_one.ledger.snapshot()
         assert run.ledger.closes()
+
+
+def test_a_run_goes_on_past_frames_whose_timer_or_large_values_look_like_infinity() -> None:
+    """High bytes 0x7F and 0xFF, in which NaN and infinity are looked for: of the timer, and of finite 2e38."""
+    late = [with_crc(AHRS_HEX.replace("78563412", f"785634{high}")) for high in ("7F", "FF")]
+    large = with_crc(AHRS_HEX.replace("00001242", struct.pack("<f", -2e38).hex()))
+    for frame in (*late, large):
+        run, alone = codec(), codec()
+        events = run.feed(GOLDEN + frame + GOLDEN)
+        found = [event for event in events if isinstance(event, Measurement)]
+        assert [event.trailing_bytes for event in found] == [108, 54, 0]
+        assert msgspec.structs.replace(found[1], trailing_bytes=0) == only(alone.feed(frame))
+        assert run.ledger.frames_not_finite == alone.ledger.frames_not_finite == 0
+        assert run.ledger.closes()
+
+
+def test_the_quaternion_is_that_of_the_attitude_module_to_the_last_bit() -> None:
+    random = Random(5)
+    frames = [
+        encode_ahrs(
+            timer_us=number, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), temperature_c=20,
+            euler_rad=(random.uniform(-pi, pi), random.uniform(-pi / 2, pi / 2), random.uniform(-pi, pi)),
+        )
+        for number in range(100)
+    ]  # fmt: skip
+    for event in (*codec().feed(b"".join(frames)), *map(only, map(codec().feed, frames))):
+        assert isinstance(event, Measurement)
+        assert event.euler_rad is not None
+        assert event.quat_wxyz == quat_from_euler_zyx(event.euler_rad)
 
 
 def test_a_run_begins_with_what_waited_of_the_read_before() -> None:
