@@ -1,16 +1,18 @@
 """The daemon with a polled device: its bus has a thread and real time here."""
 
 import asyncio
+import sys
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from time import monotonic_ns
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
 from imud.config import Config
 from imud.daemon import Daemon
 from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.worker import SWITCH_INTERVAL_S, BusThread
 from tests.support.polled_bus_bench import PolledBusBench
 
 
@@ -53,3 +55,19 @@ def test_mistake_in_the_bus_thread_ends_the_daemon(bench: PolledBusBench) -> Non
 
     with pytest.raises(ZeroDivisionError, match="a mistake"):
         asyncio.run(body())
+
+
+def _raise(error: BaseException) -> NoReturn:
+    raise error
+
+
+@pytest.mark.parametrize(("before_s", "after_s"), [(0.005, SWITCH_INTERVAL_S), (0.0001, 0.0001)])
+def test_a_bus_thread_need_not_wait_5_ms_for_the_interpreter(before_s: float, after_s: float) -> None:
+    """A reader at 1 kHz beside a loop that computes; an interval that is shorter already stays."""
+    kept = sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(before_s)
+        BusThread("bus", lambda: 1_000_000_000, _raise).end()
+        assert sys.getswitchinterval() == pytest.approx(after_s, abs=2e-6)
+    finally:
+        sys.setswitchinterval(kept)
