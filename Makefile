@@ -2,6 +2,7 @@
 # make lab    tests on a booted kernel          make chaos  random faults on a booted kernel (ARGS="--seed N --seconds S")
 # make soak   100 devices, 20 clients, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
+#                                                                   (14 minutes; ARGS=--short: at most 5)
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make pictures   the pictures of README.md and docs/frames.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
@@ -50,9 +51,9 @@ bench-instructions: $(VENV)/made
 bench-compare: $(VENV)/made
 	$(BIN)/python -m tests.bench.compare --base $(BASE) $(ARGS)
 
-# valgrind, which counts instructions
+# valgrind, which counts instructions; gpsd, which imud is compared with
 bench-deps:
-	apt-get install --yes --no-install-recommends valgrind
+	apt-get install --yes --no-install-recommends valgrind gpsd
 
 audit: $(VENV)/made
 	$(BIN)/python -m tests.audit

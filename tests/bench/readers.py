@@ -86,6 +86,24 @@ def subscribe(path: str, encoding: str, bare: bool) -> tuple[socket.socket, byte
     return sock, reply[2]
 
 
+def count_attitudes(buffer: bytearray, seen: Latency, now_ns: int) -> None:
+    """Take whole lines of gpsd off the front of `buffer`."""
+    end = buffer.rfind(b"\n") + 1
+    for _ in range(buffer.count(b'"class":"ATT"', 0, end)):
+        seen.add("gpsd", seen.samples, 0, now_ns)
+    del buffer[:end]
+
+
+def subscribe_to_gpsd(port: int) -> tuple[socket.socket, bytes]:
+    """Connect to gpsd and ask for all its reports; returns the socket and the bytes that came after the answer."""
+    sock = socket.create_connection(("127.0.0.1", port))
+    sock.sendall(b'?WATCH={"enable":true,"json":true};\n')
+    got = b""
+    while b'"class":"WATCH"' not in got or not got.endswith(b"\n"):
+        got += sock.recv(CHUNK)
+    return sock, b""
+
+
 def receive(socks: list[tuple[socket.socket, bytes]], on_bytes: object, seen: Latency, until_ns: int) -> None:
     """Receive on all sockets until they end, standard input closes or it is `until_ns`."""
     assert callable(on_bytes)
@@ -121,7 +139,8 @@ def percentile(ordered: list[int], share: float) -> float:
 def main() -> None:
     """Run as `python -m tests.bench.readers`."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--socket", required=True)
+    parser.add_argument("--socket", default="")
+    parser.add_argument("--gpsd", type=int, metavar="PORT", help="clients of gpsd instead")
     parser.add_argument("--clients", type=int, default=1)
     parser.add_argument("--encoding", choices=["json", "binary"], default="binary")
     parser.add_argument("--bare", action="store_true")
@@ -137,9 +156,12 @@ def main() -> None:
             times = mmap.mmap(file.fileno(), 8 * args.frames, access=mmap.ACCESS_READ)
     seen = Latency(times, args.skip)
     stuck = subscribe(args.socket, args.encoding, args.bare) if args.stuck else None
-    socks = [subscribe(args.socket, args.encoding, args.bare) for _ in range(args.clients)]
+    if args.gpsd:
+        socks = [subscribe_to_gpsd(args.gpsd) for _ in range(args.clients)]
+    else:
+        socks = [subscribe(args.socket, args.encoding, args.bare) for _ in range(args.clients)]
     print("ready", flush=True)
-    on_bytes = count_binary if args.encoding == "binary" else count_json
+    on_bytes = count_attitudes if args.gpsd else count_binary if args.encoding == "binary" else count_json
     receive(socks, on_bytes, seen, time.monotonic_ns() + int(args.seconds * 1e9))
     ordered = sorted(seen.latencies_ns)
     shares = {"p50_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}

@@ -2,7 +2,8 @@
 
 Prints one line with the slave paths, waits for a line on standard input, writes, prints how many frames each pty took.
 Frame i carries i in its pressure field, and the time of its write stands in an array of i64 in the file `--times`, so
-that a reader knows each sample's true moment without any cost on the measured side.
+that a reader knows each sample's true moment without any cost on the measured side. With `--udp PORT` attitude
+sentences of NMEA 0183 go to that port instead, for gpsd.
 """
 
 import argparse
@@ -10,10 +11,14 @@ import binascii
 import mmap
 import os
 import pty
+import socket
 import struct
 import sys
 import time
 import tty
+from collections.abc import Callable
+from functools import reduce
+from operator import xor
 
 from imud.devices.hipnuc.uart.codec import encode_hi91
 from imud.signals.gpio.kernel_interface import EVENT, RISING
@@ -21,6 +26,9 @@ from imud.units import uart_byte_ns
 
 LATE_LIMIT_NS = 50_000_000
 """A writer this late has lost its deadlines: it counts them and starts anew."""
+
+MakeFrame = Callable[[int], bytes | bytearray]
+"""Makes frame i."""
 
 PULSE_NS = 82 * uart_byte_ns(921_600) + 80_000
 """From the rising edge of SOUT to the last byte of a frame: a pty has no wire, so the edge is set back by it."""
@@ -52,22 +60,43 @@ def template() -> bytearray:
     return bytearray(frame)
 
 
-def play(masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, edges: int = -1) -> int:
+def hi91_frames(rate_hz: float) -> MakeFrame:
+    """Return what makes frame i."""
+    frame = template()
+    crc, pack = binascii.crc_hqx, struct.pack_into
+    head = crc(bytes(frame[:4]), 0)
+
+    def make(i: int) -> bytearray:
+        pack("<f", frame, 10, float(i))
+        pack("<I", frame, 14, int(i * 1000 / rate_hz))
+        pack("<H", frame, 4, crc(frame[6:], head))
+        return frame
+
+    return make
+
+
+def sentence(i: int) -> bytes:
+    """$OHPR of a digital compass: heading, pitch, roll, temperature, depth, magnetic field, acceleration, turn."""
+    angle = i % 3600 / 10
+    body = f"OHPR,{angle:.1f},-2.5,1.3,30.1,0.0,48.2,20.1,-3.4,-43.6,9.81,0.12,-0.05,9.79,0.0,0.1,0.2,0.3,0.0"
+    check = reduce(xor, body.encode())
+    return f"${body}*{check:02X}\r\n".encode()
+
+
+def play(
+    masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, make: MakeFrame, edges: int = -1
+) -> int:
     """Write `frames` frames to every master, in `phases` groups over each period; return how many were refused.
 
     With a descriptor for `edges`, the event of a pulse on SOUT goes there right before each frame.
     """
-    frame = template()
-    crc, pack = binascii.crc_hqx, struct.pack_into
-    head = crc(bytes(frame[:4]), 0)
+    pack = struct.pack_into
     period_ns = int(1e9 / rate_hz)
     groups = [masters[i::phases] for i in range(phases)]
     refused = 0
     start_ns = time.monotonic_ns() + 10_000_000
     for i in range(frames):
-        pack("<f", frame, 10, float(i))
-        pack("<I", frame, 14, int(i * 1000 / rate_hz))
-        pack("<H", frame, 4, crc(frame[6:], head))
+        frame = make(i)
         for phase, group in enumerate(groups):
             due_ns = start_ns + i * period_ns + phase * period_ns // phases
             wait_ns = due_ns - time.monotonic_ns()
@@ -95,15 +124,25 @@ def main() -> None:
     parser.add_argument("--frames", type=int, required=True)
     parser.add_argument("--phases", type=int, default=1)
     parser.add_argument("--times", required=True)
+    parser.add_argument("--udp", type=int, metavar="PORT")
     parser.add_argument("--edges", help="FIFO that gets the events of SOUT")
     args = parser.parse_args()
     with open(args.times, "r+b") as file:
         times = mmap.mmap(file.fileno(), 8 * args.frames)
+    if args.udp:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.connect(("127.0.0.1", args.udp))
+            print(flush=True)
+            sys.stdin.readline()
+            print(play([sock.fileno()], args.rate, args.frames, 1, times, sentence), flush=True)
+            sys.stdin.readline()
+        return
     pairs = open_ptys(args.devices)
     print(*(os.ttyname(slave) for _, slave in pairs), flush=True)
     sys.stdin.readline()
     edges = os.open(args.edges, os.O_WRONLY) if args.edges else -1
-    print(play([master for master, _ in pairs], args.rate, args.frames, args.phases, times, edges), flush=True)
+    masters, make = [master for master, _ in pairs], hi91_frames(args.rate)
+    print(play(masters, args.rate, args.frames, args.phases, times, make, edges), flush=True)
     sys.stdin.readline()
 
 

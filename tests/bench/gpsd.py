@@ -1,0 +1,117 @@
+"""The daemon against gpsd: one device at 1 kHz, ten clients that get all of it as JSON, in turns in one run.
+
+gpsd is given attitude sentences ($OHPR) of about the size of an HI91 frame, which it reports as ATT objects over TCP;
+imud HI91 frames, over its UNIX socket. Each client gets each sample at once; a third measurement lets imud gather
+samples for 10 ms, which gpsd cannot. The sentences come in UDP datagrams: on a pseudo-terminal gpsd 3.22 stands still
+after the first read without bytes, until another descriptor wakes it. Needs gpsd (`make bench-deps`); without it there
+are no rows.
+Run by itself: python -m tests.bench.gpsd
+"""
+
+import json
+import shutil
+import socket
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from time import monotonic, sleep
+
+from tests.bench.rig import END_S, REST_CORES, SERVER_CORE, START_LIMIT_S, Load, Process, cpu_ns, run
+from tests.bench.rows import Row, at_most
+
+LOAD = Load(clients=10, encoding="json", warm_s=1.5)
+ROUNDS = 3
+GATHERED_MS = 10
+RATIO_MOST = 0.8
+GATHERED_RATIO_MOST = 0.4
+LOST_MOST = 0.01
+"""gpsd drops what a client does not take at once; more than this, and it did less work than asked for."""
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    """Return a port of 127.0.0.1 that nobody has."""
+    with socket.socket(socket.AF_INET, kind) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def start_gpsd(stack: ExitStack, program: str, port: int, input_port: int) -> int:
+    """Start gpsd alone on one core, reading datagrams; return its process id. Raises TimeoutError."""
+    command = [program, "-N", "-n", "-S", str(port), f"udp://127.0.0.1:{input_port}"]
+    gpsd = subprocess.Popen(["taskset", "-c", str(*SERVER_CORE), *command], stderr=subprocess.DEVNULL)
+    stack.callback(gpsd.wait)
+    stack.callback(gpsd.terminate)
+    end = monotonic() + START_LIMIT_S
+    while monotonic() < end:
+        try:
+            socket.create_connection(("127.0.0.1", port)).close()
+        except OSError:
+            sleep(0.05)
+        else:
+            return gpsd.pid
+    raise TimeoutError(f"gpsd did not listen within {START_LIMIT_S} s")
+
+
+def gpsd_us(program: str, load: Load) -> float:
+    """CPU time of gpsd per sample, µs. Raises RuntimeError where the first client did not get the samples."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
+        times = Path(name) / "times"
+        times.write_bytes(bytes(8 * load.frames))
+        port, input_port = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
+        pid = start_gpsd(stack, program, port, input_port)
+        arguments = ["--rate", str(load.rate_hz), "--frames", str(load.frames), "--times", str(times)]
+        writer = stack.enter_context(
+            Process(REST_CORES, "-m", "tests.bench.writer", *arguments, "--udp", str(input_port))
+        )
+        writer.line()
+        arguments = ["--gpsd", str(port), "--clients", str(load.clients)]
+        readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *arguments))
+        readers.line()
+        writer.say("go")
+        sleep(load.warm_s)
+        before_ns, begun = cpu_ns(pid), monotonic()
+        sleep(load.seconds - END_S)
+        used_ns, elapsed = cpu_ns(pid) - before_ns, monotonic() - begun
+        refused = int(writer.line())
+        sleep(0.05)  # what is on its way arrives
+        readers.say("end")
+        got = json.loads(readers.line())["samples"]
+    if refused or got < load.frames * (1 - LOST_MOST):
+        raise RuntimeError(f"gpsd: {got} of {load.frames} samples came, {refused} were not sent")
+    return used_ns / 1e3 / (elapsed * load.rate_hz)
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """CPU per sample of both, and the medians of the ratios of all rounds."""
+    program = shutil.which("gpsd", path="/usr/sbin:/usr/local/sbin:/usr/bin")
+    if program is None:
+        print("# gpsd is not installed: `make bench-deps` installs it, as root", flush=True)
+        return
+    load = replace(LOAD, seconds=2.0 if quick else 6.0)
+    figures = [
+        (gpsd_us(program, load), *(run(replace(load, coalesce_ms=held)).cpu_us_per_sample for held in (0, GATHERED_MS)))
+        for _ in range(1 if quick else ROUNDS)
+    ]
+    theirs, at_once, gathered = zip(*figures, strict=True)
+    name = f"1 kHz, {load.clients} json clients"
+    yield Row(f"{name}: CPU per sample, gpsd", median(theirs), "us")
+    yield Row(f"{name}: CPU per sample, imud beside gpsd", median(at_once), "us")
+    yield Row(f"{name}: CPU per sample, imud, {GATHERED_MS} ms gathered", median(gathered), "us")
+    for words, ours, most in (
+        ("", at_once, RATIO_MOST),
+        (f", {GATHERED_MS} ms gathered", gathered, GATHERED_RATIO_MOST),
+    ):
+        ratio = median(a / b for a, b in zip(ours, theirs, strict=True))
+        yield at_most(f"{name}: imud / gpsd{words}", ratio, "x", most)
+
+
+if __name__ == "__main__":
+    from tests.bench.__main__ import show
+
+    for row in rows():
+        print(show(row))
