@@ -111,7 +111,7 @@ def rows(quick: bool = False) -> Iterator[Row]:
         yield from stall_rows(f"metrics: loop stall, {devices} devices", paused, STALL_MS_MAX)
     slots = motion_slots()
     yield Row(f"metrics: motion of a device, {SAMPLES_MAX} samples, CPU", motion_ms(slots, repeats), "ms")
-    moving = asyncio.run(stalls_ms(partial(motion_of, slots, 0, pause), repeats))
+    moving = asyncio.run(stalls_ms(partial(motion_of, slots, 0, lambda _: pause()), repeats))
     yield from stall_rows("metrics: loop stall, motion of a device", moving, STALL_MS_MAX)
 
 

@@ -2,7 +2,7 @@
 
 Nothing is added to the way of a sample: the HTTP thread copies the newest slots out of the file of the ring (pread,
 which has no SIGBUS) and computes over columns of them. The work is bounded: once a second however often metrics are
-asked for, SAMPLES_MAX slots of a device, in pieces of one second of samples and one axis, with a pause after each.
+asked for, SAMPLES_MAX slots of a device, with a pause for every VALUES_PER_TURN values.
 
     slots ──▶ time stamps ──▶ the span: since the look before, at least SPAN_MIN_NS, at most what was copied
                               blocks of BLOCK_NS ──▶ mean and deviations of each axis ──▶ RMS and peak over all blocks
@@ -35,6 +35,8 @@ SAMPLES_MAX: Final = 4096
 """Slots of a device that are read: all of a ring of the usual size, 4 s at 1 kHz; 1 MB and some 2 ms of CPU."""
 SPAN_MIN_NS: Final = 10 * NS_PER_S
 """A second scraper must not shorten what the first one sees."""
+VALUES_PER_TURN: Final = 4096
+"""Values that are read or summed up without a pause: 0.3 ms. A pause is long where many programs want the CPU."""
 BLOCK_NS: Final = NS_PER_S
 BLOCK_SAMPLES_MIN: Final = 8
 """Fewer samples in a second say nothing of vibration."""
@@ -78,6 +80,8 @@ class RingReader:
     def __init__(self, pause: Callable[[], None], *, motion: bool) -> None:
         self._pause = pause
         self._motion = motion
+        self._values = 0
+        """Since the last pause."""
         self._looked_ns: int | None = None
         self._views: dict[str, RingView] = {}
 
@@ -104,12 +108,18 @@ class RingReader:
         try:
             header = _header(fd, path)
             written = header.state == STATE_LIVE and now_ns - header.heartbeat_ns < HEARTBEAT_LIMIT_NS
-            motion = motion_of(_newest_slots(fd, path, header, newest), since_ns, self._pause) if self._motion else None
+            motion = motion_of(_newest_slots(fd, path, header, newest), since_ns, self._used) if self._motion else None
         except (OSError, ServerError):
             return RingView(False)
         finally:
             os.close(fd)
         return RingView(written, motion)
+
+    def _used(self, values: int) -> None:
+        self._values += values
+        if self._values >= VALUES_PER_TURN:
+            self._values = 0
+            self._pause()
 
 
 def _header(fd: int, path: str) -> RingHeader:
@@ -134,8 +144,11 @@ def _pread_slots(fd: int, first: int, end: int) -> bytes:
     return os.pread(fd, (end - first) * SLOT_BYTES, HEADER_BYTES + first * SLOT_BYTES) if end > first else b""
 
 
-def motion_of(slots: bytes, since_ns: int, pause: Callable[[], None] = lambda: None) -> MotionValues | None:
-    """MotionValues over the slots whose time stamps are not before `since_ns`, oldest first; None for none."""
+def motion_of(slots: bytes, since_ns: int, used: Callable[[int], None] = lambda _: None) -> MotionValues | None:
+    """Motion over the slots whose time stamps are not before `since_ns`, oldest first; None for none.
+
+    `used` is called with the number of values after every piece of work.
+    """
     view = memoryview(slots)
     times = view.cast("q")[_T_NS::_WORDS].tolist()
     first = bisect_left(times, since_ns)
@@ -149,6 +162,7 @@ def motion_of(slots: bytes, since_ns: int, pause: Callable[[], None] = lambda: N
         numbers[_ACCEL + axis :: _WORDS].tolist()  # type: ignore[misc]  # typeshed says integers, whatever the format
         for axis in range(3)
     ]
+    used(len(times))
     span_ns = times[-1] - times[0]
     if not all(present & HAS_ACCEL for present in set(bits)):
         having = [present & HAS_ACCEL for present in bits]
@@ -157,7 +171,7 @@ def motion_of(slots: bytes, since_ns: int, pause: Callable[[], None] = lambda: N
     if not blocks:
         return MotionValues(span_ns, attitude, None, None, None)
     means = [_mean(axis[slice(*blocks[0])]) for axis in axes]
-    deviations = [_deviation(axis, blocks, pause) for axis in axes]
+    deviations = [_deviation(axis, blocks, used) for axis in axes]
     rms, peak = zip(*deviations, strict=True) if None not in deviations else (None, None)
     return MotionValues(span_ns, attitude, math.hypot(*means), rms, peak)
 
@@ -177,16 +191,16 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _deviation(
-    axis: list[float], blocks: list[tuple[int, int]], pause: Callable[[], None]
+    axis: list[float], blocks: list[tuple[int, int]], used: Callable[[int], None]
 ) -> tuple[float, float] | None:
     """RMS and peak of the deviation from the mean of the block; None where all blocks are too small."""
-    squares, used, peak = 0.0, 0, 0.0
+    squares, size, peak = 0.0, 0, 0.0
     for first, end in blocks:
         if end - first >= BLOCK_SAMPLES_MIN:
-            pause()
             block = axis[first:end]
             mean = _mean(block)
             squares += max(sum(map(mul, block, block)) - len(block) * mean * mean, 0.0)
             peak = max(peak, max(block) - mean, mean - min(block))
-            used += len(block)
-    return (math.sqrt(squares / used), peak) if used else None
+            size += len(block)
+            used(len(block))
+    return (math.sqrt(squares / size), peak) if size else None

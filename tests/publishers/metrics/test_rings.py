@@ -92,10 +92,10 @@ def test_samples_without_acceleration_among_others_are_left_out() -> None:
     assert found.accel_norm_m_s2 == pytest.approx(G)
 
 
-def test_every_block_and_axis_pauses() -> None:
-    pauses = []
-    assert motion_of(slots([(0.0, 0.0, G)] * 1000), 0, lambda: pauses.append(1)) is not None
-    assert len(pauses) == 3 * 10
+def test_every_piece_of_work_is_told() -> None:
+    pieces: list[int] = []
+    assert motion_of(slots([(0.0, 0.0, G)] * 1000), 0, pieces.append) is not None
+    assert pieces == [1000, *[100] * 30]
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
@@ -182,6 +182,19 @@ def test_a_ring_is_written_while_its_file_is_there_and_beats(board: Board) -> No
     assert look(board, 30) == RingView(False)
     reader = RingReader(lambda: None, motion=True)
     assert reader.look({"bow": ""}, {}, START_NS) == {"bow": RingView(False)}
+
+
+def test_a_pause_for_every_so_many_values(tmp_path: Path) -> None:
+    """Few devices with few samples make none; 4096 samples are read, then summed up in four blocks on three axes."""
+    for count, expected in ((100, 0), (4096, 3)):
+        pauses: list[int] = []
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        board = Board(folder, slots=SAMPLES_MAX, now_ns=0)
+        board.publish(range(1, count + 1))
+        reader = RingReader(lambda pauses=pauses: pauses.append(1), motion=True)  # type: ignore[misc]
+        reader.look({DEVICE: str(board.path)}, {DEVICE: count}, 0)
+        assert len(pauses) == expected
 
 
 def test_motion_is_off_by_a_switch(board: Board) -> None:
