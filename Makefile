@@ -3,6 +3,7 @@
 # make soak   100 devices, 20 clients, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 #                                                                   (14 minutes; ARGS=--short: at most 5)
+# make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make pictures   the pictures of README.md and docs/frames.md, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
@@ -18,7 +19,7 @@ ARGS ?=
 LAB_OPTIONS ?= --steady
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try
+.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try monitoring-deps
 
 all: check
 
@@ -87,6 +88,9 @@ deb-try: deb
 
 deb-deps:
 	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap
+
+monitoring-deps:
+	apt-get install --yes --no-install-recommends prometheus prometheus-alertmanager
 
 lab-deps:
 	tests/lab/deps

@@ -2,7 +2,7 @@
 
 The tables of docs/configuration.md come from the settings classes, those of docs/commands.md, docs/calibration.md
 and docs/settings.md from the drivers' actions, calibrations and device settings, and those of
-docs/shm.md from the layout of shared memory.
+docs/shm.md from the layout of shared memory; the one of docs/monitoring.md comes from the rules for Prometheus.
 
 docs/socket.schema.json has the JSON Schema of every message of the UNIX socket, made from the types. It is open, as the
 protocol is: members that a reader does not know are allowed. `MessageChecker` is closed: a message of a server of the
@@ -47,6 +47,7 @@ from imud.publishers.socket.rpc import METHODS
 from imud.runtime.settings.difference import described_settings
 from imud.signals.line_actions import RESET, TRIGGER
 from imud.utc.source import RmcSettings
+from tests.monitoring.alert_table import alert_table
 from tests.support.files import ROOT
 
 # --- docs/configuration.md --------------------------------------------------------------------------------------------
@@ -424,6 +425,7 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/calibration.md": lambda: {"calibrations": calibrations_table()},
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
+    "docs/monitoring.md": lambda: {"alerts": alert_table()},
 }
 """The generated parts of each page by the name that their marks have."""
 

@@ -430,7 +430,7 @@ def test_alerts_use_metrics_that_exist() -> None:
         "ImudDown", "ImudDeviceDown", "ImudSamplesLost", "ImudSyncLost", "ImudLedgerOpen",
     }  # fmt: skip
     for alert in alerts:
-        used = set(re.findall(r"\bimud_\w+", alert["expr"]))
+        used = {re.sub("_(bucket|count)$", "", name) for name in re.findall(r"\b(?:imud|process)_\w+", alert["expr"])}
         assert used <= shown_names(), alert["alert"]
         assert used or "up{" in alert["expr"]
         assert {"summary", "description"} <= set(alert["annotations"])

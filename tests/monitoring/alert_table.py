@@ -1,0 +1,26 @@
+"""Table: the alerts of docs/monitoring.md, made from the rules themselves (`python -m tests.support.references`)."""
+
+import re
+from typing import Final
+
+from tests.monitoring.prometheus import RULES, alerts_of
+
+PARTS: Final = ("description", "cause", "next_step")
+"""Annotations that are columns of the table."""
+
+
+def alert_table() -> str:
+    """A row for every alert."""
+    rows = ["| alert | severity, after | meaning | likely causes | next step |", "|---|---|---|---|---|"]
+    for alert in alerts_of(RULES.read_text()):
+        name, wait = alert["alert"], alert.get("for", "")
+        severity = alert["labels"]["severity"] + (f", {wait}" if wait else ", at once")
+        cells = [_cell(alert["annotations"][part]) for part in PARTS]
+        rows.append(f'| <a id="{name}"></a>`{name}` | {severity} | {" | ".join(cells)} |')
+    return "\n".join(rows)
+
+
+def _cell(text: str) -> str:
+    """The text in one cell; pages of docs/ as links."""
+    linked = re.sub(r"docs/(\w+\.md)", r"[\1](\1)", " ".join(text.split()))
+    return linked.replace("|", "\\|")

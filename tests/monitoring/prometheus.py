@@ -1,0 +1,178 @@
+"""A real Prometheus for tests: its configuration, its process, its HTTP API; and the alerting rules, as they are and
+with all times shortened.
+"""
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import pytest
+import yaml
+
+from tests.support.daemon_process import wait_until
+from tests.support.files import ROOT
+
+RULES: Final = ROOT / "etc/prometheus/imud.rules.yml"
+LIMIT_S: Final = 60.0
+INTERVAL_MS: Final = 500
+"""Between scrapes, and between evaluations of the rules; where a scrape takes long, `Pace` makes it longer."""
+DURATION: Final = re.compile(r"\b(\d+)([smh])\b")
+UNIT_MS: Final = {"s": 1000, "m": 60_000, "h": 3_600_000}
+
+
+def needs(*programs: str) -> pytest.MarkDecorator:
+    """Skip a test, with the reason, where a program is not installed."""
+    missing = [program for program in programs if shutil.which(program) is None]
+    return pytest.mark.skipif(
+        bool(missing), reason=f"{', '.join(missing)} not installed: `make monitoring-deps` installs it"
+    )
+
+
+def alerts_of(text: str) -> list[dict[str, Any]]:
+    """The alerts of a file of rules."""
+    return [rule for group in yaml.safe_load(text)["groups"] for rule in group["rules"]]
+
+
+def shortened(text: str, divisor: int) -> str:
+    """The rules with every `for` and every range divided; nothing else changes."""
+
+    def shorter(found: re.Match[str]) -> str:
+        return f"{int(found[1]) * UNIT_MS[found[2]] // divisor}ms"
+
+    lines = []
+    for line in text.splitlines():
+        if re.match(r"\s+for: ", line):
+            line = DURATION.sub(shorter, line)  # noqa: PLW2901 - the changed line
+        elif "[" in line and "next_step" not in line:
+            line = re.sub(r"\[(\d+[smh])\]", lambda found: f"[{DURATION.sub(shorter, found[1])}]", line)  # noqa: PLW2901
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+class Pace(NamedTuple):
+    """How fast a test lets the time of the rules pass on this machine."""
+
+    interval_ms: int = INTERVAL_MS
+    divisor: int = 45
+    """Of the times of the rules: 15 minutes are 20 s."""
+
+    @classmethod
+    def of(cls, scrape_s: float) -> "Pace":
+        """So that a scrape that takes thrice as long as this one is in time; at the most four times slower."""
+        slower = min(max(3000 * scrape_s / cls().interval_ms, 1.0), 4.0)
+        return cls(round(cls().interval_ms * slower), round(cls().divisor / slower))
+
+
+class Alert(NamedTuple):
+    """An alert that is pending or fires."""
+
+    name: str
+    device: str
+    instance: str
+    state: str
+    labels: Mapping[str, str]
+    annotations: Mapping[str, str]
+
+
+class RealPrometheus:
+    """A running Prometheus. Synchronization: none required."""
+
+    def __init__(self, folder: Path, port: int) -> None:
+        self._targets = folder / "targets.json"
+        self._url = f"http://127.0.0.1:{port}"
+
+    def scrape(self, *ports: int) -> None:
+        """Scrape these ports of this machine from now on, and no others."""
+        fresh = self._targets.with_suffix(".new")
+        fresh.write_text(json.dumps([{"targets": [f"127.0.0.1:{port}" for port in ports]}]))
+        fresh.rename(self._targets)
+
+    def get(self, path: str, **parameters: str) -> Any:
+        """The data of an answer of the API."""
+        query = f"?{urllib.parse.urlencode(parameters)}" if parameters else ""
+        with urllib.request.urlopen(f"{self._url}/api/v1/{path}{query}", timeout=LIMIT_S) as answer:
+            found = json.load(answer)
+        assert found["status"] == "success", found
+        return found["data"]
+
+    def ready(self) -> bool:
+        """Whether it answers."""
+        try:
+            with urllib.request.urlopen(f"{self._url}/-/ready", timeout=LIMIT_S) as answer:
+                return bool(answer.status == 200)
+        except OSError:
+            return False
+
+    def alerts(self) -> list[Alert]:
+        """All alerts that are pending or fire."""
+        found = []
+        for alert in self.get("alerts")["alerts"]:
+            labels = alert["labels"]
+            names = labels["alertname"], labels.get("device", ""), labels.get("instance", "")
+            found.append(Alert(*names, alert["state"], labels, alert["annotations"]))
+        return found
+
+    def query(self, expression: str) -> list[dict[str, Any]]:
+        """The vector that an expression gives now."""
+        result: list[dict[str, Any]] = self.get("query", query=expression)["result"]
+        return result
+
+    def query_range(self, expression: str, start_s: float, end_s: float, step_s: float) -> list[dict[str, Any]]:
+        """The matrix that an expression gives."""
+        times = {"start": f"{start_s:.3f}", "end": f"{end_s:.3f}", "step": f"{step_s:.3f}"}
+        result: list[dict[str, Any]] = self.get("query_range", query=expression, **times)["result"]
+        return result
+
+
+def free_port() -> int:
+    """A TCP port that was free just now."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port: int = server.getsockname()[1]
+        return port
+
+
+def configuration(folder: Path, interval_ms: int, rules: Sequence[str]) -> str:
+    """prometheus.yml: job imud with its targets from a file."""
+    names = ("scrape_interval", "scrape_timeout", "evaluation_interval")
+    times = json.dumps(dict.fromkeys(names, f"{interval_ms}ms"))
+    return f"""\
+global: {times}
+rule_files: {json.dumps(list(rules))}
+scrape_configs:
+  - job_name: imud
+    file_sd_configs: [{{files: [{folder}/targets.json], refresh_interval: 1s}}]
+"""
+
+
+@contextmanager
+def real_prometheus(folder: Path, rules: str = "", pace: Pace | None = None) -> Iterator[RealPrometheus]:
+    """Run Prometheus in a folder with these rules; it scrapes nothing yet."""
+    port = free_port()
+    running = RealPrometheus(folder, port)
+    running.scrape()
+    (folder / "rules.yml").write_text(rules or "groups: []\n")
+    file = folder / "prometheus.yml"
+    file.write_text(configuration(folder, (pace or Pace()).interval_ms, [str(folder / "rules.yml")]))
+    argv = [
+        "prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'tsdb'}", "--log.level=warn",
+        f"--web.listen-address=127.0.0.1:{port}",
+    ]  # fmt: skip
+    with (
+        (folder / "prometheus.log").open("w") as log,
+        subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log) as process,
+    ):
+        try:
+            wait_until(lambda: running.ready() or process.poll() is not None, "Prometheus is ready", LIMIT_S)
+            assert process.poll() is None, (folder / "prometheus.log").read_text()
+            yield running
+        finally:
+            process.terminate()
+            process.wait(LIMIT_S)

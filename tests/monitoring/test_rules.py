@@ -1,0 +1,117 @@
+"""Rules, examples and documents of monitoring, by Prometheus' and Alertmanager's own tools."""
+
+import re
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.monitoring.alert_table import PARTS
+from tests.monitoring.prometheus import DURATION, RULES, UNIT_MS, alerts_of, needs, shortened
+from tests.support.files import ROOT
+
+FOLDER = RULES.parent
+TESTS = Path(__file__).with_name("imud.rules.test.yml")
+ALERTS = {alert["alert"]: alert for alert in alerts_of(RULES.read_text())}
+LIMIT_S = 300
+
+
+def run(*argv: str) -> str:
+    """Run a tool; what it says."""
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@needs("promtool")
+@pytest.mark.timeout(LIMIT_S)
+def test_prometheus_accepts_rules_and_configuration() -> None:
+    assert f"{len(ALERTS)} rules found" in run("promtool", "check", "rules", str(RULES))
+    run("promtool", "check", "config", str(FOLDER / "prometheus.yml"))
+
+
+@needs("amtool")
+def test_alertmanager_accepts_its_configuration() -> None:
+    file = str(FOLDER / "alertmanager.yml")
+    assert "SUCCESS" in run("amtool", "check-config", file)
+    for severity, receiver in (("critical", "on-call"), ("warning", "operators")):
+        labels = ("alertname=ImudDeviceDown", f"severity={severity}", "device=bow")
+        assert run("amtool", "config", "routes", "test", f"--config.file={file}", *labels).strip() == receiver
+
+
+def test_inhibitions_name_alerts_that_exist() -> None:
+    for rule in yaml.safe_load((FOLDER / "alertmanager.yml").read_text())["inhibit_rules"]:
+        for matcher in rule["source_matchers"] + rule["target_matchers"]:
+            for name in re.findall(r"\bImud\w+", matcher):
+                assert name in ALERTS
+
+
+@needs("promtool")
+@pytest.mark.timeout(LIMIT_S)  # 5 s of CPU
+def test_every_alert_waits_fires_and_clears() -> None:
+    assert "SUCCESS" in run("promtool", "test", "rules", str(TESTS))
+
+
+def test_every_alert_has_a_case_that_fires_and_others_that_do_not() -> None:
+    outcomes = defaultdict(list)
+    for case in yaml.safe_load(TESTS.read_text())["tests"]:
+        for check in case["promql_expr_test"]:
+            (name,) = re.findall(r'alertname="(\w+)"', check["expr"])
+            assert name == case["name"]
+            outcomes[name].append(bool(check["exp_samples"]))
+        assert outcomes[case["name"]][-3:] == [False, True, False], case["name"]
+        assert len(case["input_series"]) > 1 or case["name"] == "ImudTemperature"
+    assert outcomes.keys() == ALERTS.keys()
+
+
+@pytest.mark.parametrize("name", ALERTS)
+def test_an_alert_says_what_to_do(name: str) -> None:
+    alert = ALERTS[name]
+    assert name.startswith("Imud")
+    assert set(alert["annotations"]) == {"summary", *PARTS, "runbook"}
+    assert alert["labels"]["severity"] in ("warning", "critical")
+    page, _, anchor = alert["annotations"]["runbook"].partition("#")
+    assert anchor == name
+    assert f'<a id="{anchor}"></a>' in (ROOT / page).read_text()
+    assert "$labels" in alert["annotations"]["summary"] or name == "ImudNotScraped"
+
+
+def test_shortened_rules_differ_in_times_only() -> None:
+    fast = {alert["alert"]: alert for alert in alerts_of(shortened(RULES.read_text(), 60))}
+    assert fast.keys() == ALERTS.keys()
+
+    def milliseconds(text: str) -> list[int]:
+        return [int(number) * UNIT_MS[unit] for number, unit in DURATION.findall(text)]
+
+    for name, alert in ALERTS.items():
+        quick = fast[name]
+        assert quick["annotations"] == alert["annotations"]
+        assert quick["labels"] == alert["labels"]
+        assert quick.get("for", "0ms") == f"{sum(milliseconds(alert.get('for', '')), 0) // 60}ms"
+        ranges = [time // 60 for text in re.findall(r"\[\w+\]", alert["expr"]) for time in milliseconds(text)]
+        assert [int(time) for time in re.findall(r"\[(\d+)ms\]", quick["expr"])] == ranges
+        assert re.sub(r"\[\w+\]", "", quick["expr"]) == re.sub(r"\[\w+\]", "", alert["expr"])
+
+
+# --- the examples of the page --------------------------------------------------------------------------------
+
+PAGE = (ROOT / "docs/monitoring.md").read_text()
+EXAMPLES = dict(re.findall(r"^```yaml\n# ([\w.-]+\.yml)[^\n]*\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL))
+
+
+@needs("promtool")
+@pytest.mark.timeout(LIMIT_S)
+def test_examples_of_the_page_are_accepted(tmp_path: Path) -> None:
+    assert EXAMPLES.keys() == {"prometheus.yml", "imud-targets.yml", "my.rules.yml"}
+    for name, text in EXAMPLES.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / RULES.name).write_text(RULES.read_text())
+    run("promtool", "check", "config", str(tmp_path / "prometheus.yml"))
+    run("promtool", "check", "rules", str(tmp_path / "my.rules.yml"))
+
+
+@pytest.mark.parametrize("name", ["prometheus.yml", "imud-targets.yml"])
+def test_examples_of_the_page_are_the_files(name: str) -> None:
+    assert yaml.safe_load(EXAMPLES[name]) == yaml.safe_load((FOLDER / name).read_text())
