@@ -23,7 +23,8 @@ def examine(monitor: socket.socket, log: Path) -> None:
         file.write(_answer(monitor))  # the banner
         for question in (*QUESTIONS, "nmi"):
             monitor.sendall(question.encode() + b"\n")
-            file.write(_answer(monitor))
+            _echo, _, answer = _answer(monitor).partition(b"\n")  # the echo has a line for each key that is pressed
+            file.write(question.encode() + b"\n" + answer)
             file.flush()
         monitor.settimeout(PANIC_S)
         while monitor.recv(4096):
