@@ -68,7 +68,7 @@ soak: $(VENV)/made
 pictures: $(VENV)/made
 	$(BIN)/python -m tests.support.pictures
 
-# Coverage-guided fuzzing: ARGS="--seconds 10" in CI, ARGS="--seconds 3600 --target stream/" by hand.
+# Coverage-guided fuzzing: ARGS="--seconds 60 --seed 25" in CI, ARGS="--seconds 3600 --target stream/" by hand.
 $(VENV)/made-fuzz: $(VENV)/made
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev,fuzz]' || echo "atheris cannot be installed"
 	@touch $@

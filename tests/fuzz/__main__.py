@@ -2,6 +2,7 @@
 
 make fuzz                                            60 s each with atheris, else with hypothesis
 make fuzz ARGS="--seconds 3600 --target stream/"     an hour for each target whose name has this in it
+make fuzz ARGS="--seed 7"                            the same inputs in the same order, as far as the time goes
 make fuzz ARGS="--replay FILE --target shm/ring"     one input, with its traceback
 make fuzz ARGS="--corpus"                            writes tests/fuzz/corpus anew from the targets' seeds
 """
@@ -10,6 +11,7 @@ import argparse
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -61,19 +63,22 @@ class Result:
         )
 
 
-def fuzz(target: str, engine: str, seconds: float) -> Result:
-    """Fuzz one target in a process of its own."""
+def fuzz(target: str, engine: str, seconds: float, seed: int) -> Result:
+    """Fuzz one target in a process of its own; with a seed above 0 begin with the inputs in the tree and no others."""
     folder = BUILD / target.replace("/", "-")
-    grown = folder / "corpus"
+    grown = folder / ("corpus-of-seed" if seed else "corpus")
+    if seed:
+        shutil.rmtree(grown, ignore_errors=True)
     grown.mkdir(parents=True, exist_ok=True)
-    seeds = corpus.folder_of(target)
-    command = [sys.executable, "-m", "tests.fuzz.worker", engine, target, str(seconds), str(folder)]
+    paths = [str(path) for path in corpus.inputs_of(target)]
+    command = [sys.executable, "-m", "tests.fuzz.worker", engine, target, str(seconds), str(seed), str(folder)]
+    command += [str(grown), *paths]
     if engine == "clang":
-        command = c_header.command(folder, seconds)
+        command = c_header.command(seconds, seed, folder, grown, paths)
     before = _artifacts(folder)
     begin_s = time.monotonic()
     with _log(target).open("wb") as log:
-        status = _run([*command, str(grown), *([str(seeds)] if seeds.is_dir() else [])], log.fileno(), seconds)
+        status = _run(command, log.fileno(), seconds)
     text = _log(target).read_text(errors="replace")
     coverage = _COVERAGE.findall(text)
     edges, features, inputs = coverage[-1] if coverage else ("-", "-", "-")
@@ -87,11 +92,16 @@ def _run(command: Sequence[str], log: int, seconds: float) -> int:
     try:
         done = subprocess.run(
             command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, check=False, timeout=seconds + STARTING_S,
-            env=c_header.environment(), preexec_fn=_be_nice,
+            env=environment(), preexec_fn=_be_nice,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return 1
     return done.returncode
+
+
+def environment() -> dict[str, str]:
+    """Of a target's process: the order of sets is the same in each."""
+    return {**c_header.environment(), "PYTHONHASHSEED": "0"}
 
 
 def _be_nice() -> None:
@@ -137,6 +147,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make fuzz")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="for each target (default %(default)s)")
     parser.add_argument("--target", action="append", default=[], help="part of a target's name; may be given again")
+    parser.add_argument("--seed", type=int, default=0, help="of what is tried; 0, the default: by the clock")
     parser.add_argument("--jobs", type=int, default=JOBS, help="targets at a time (default %(default)s)")
     parser.add_argument("--engine", choices=("auto", "atheris", "hypothesis"), default="auto")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="run one input through --target")
@@ -153,7 +164,8 @@ def main() -> int:
     BUILD.mkdir(parents=True, exist_ok=True)
     print(_HEADINGS, flush=True)
     with ThreadPoolExecutor(args.jobs) as pool:
-        running = [pool.submit(fuzz, name, engine, args.seconds) for name, engine in plan(args.target, args.engine)]
+        planned = plan(args.target, args.engine)
+        running = [pool.submit(fuzz, name, engine, args.seconds, args.seed) for name, engine in planned]
         results = []
         for each in running:
             results.append(each.result())

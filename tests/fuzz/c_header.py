@@ -3,10 +3,12 @@
 import os
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from tests.fuzz.shm import base
+from tests.fuzz.worker import libfuzzer_options
 from tests.support.files import ROOT
 
 TARGET: Final = "c-header"
@@ -32,11 +34,11 @@ def build(folder: Path) -> str:
     return f"it does not compile: {done.stderr.strip()}" if done.returncode else ""
 
 
-def command(folder: Path, seconds: float) -> list[str]:
-    """The command that fuzzes; the corpora are to be appended."""
+def command(seconds: float, seed: int, folder: Path, grown: Path, inputs: Sequence[str]) -> list[str]:
+    """The command that fuzzes."""
+    options = libfuzzer_options(seconds, seed, folder, inputs)
     return [
-        str(folder.parent / _PROGRAM), f"-max_total_time={max(int(seconds), 1)}", f"-max_len={INPUT_BYTES_MAX}",
-        f"-timeout={INPUT_S_MAX}", f"-artifact_prefix={folder}/", "-print_final_stats=1",
+        str(folder.parent / _PROGRAM), f"-max_len={INPUT_BYTES_MAX}", f"-timeout={INPUT_S_MAX}", *options, str(grown),
     ]  # fmt: skip
 
 

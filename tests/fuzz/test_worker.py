@@ -1,5 +1,6 @@
 """The engines themselves: what fails is found, saved and reported; what holds is not."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 
 from tests.fuzz import __main__ as runner
 from tests.fuzz import worker
+from tests.fuzz.corpus import inputs_of
 from tests.fuzz.target import Target
 from tests.support.files import ROOT
 
@@ -24,19 +26,31 @@ def test_hypothesis_saves_what_fails(
     corpus.mkdir()
     (corpus / "seed").write_bytes(b"a[b")
     monkeypatch.setattr(worker, "load", lambda _name: Target(run, list))  # type: ignore[arg-type]
-    assert worker.fuzz_with_hypothesis("any", 0.2, tmp_path, [str(corpus)]) == status
+    assert worker.fuzz_with_hypothesis("any", 0.2, 1, tmp_path, [corpus / "seed"]) == status
     found = list(tmp_path.glob("crash-*"))
     assert [path.read_bytes() for path in found] == ([b"["] if status else [])
     assert "stat::number_of_executed_units: " in capsys.readouterr().out
 
 
-def test_atheris_runs_where_it_is_installed(tmp_path: Path) -> None:
+def test_atheris_tries_the_same_again_with_the_same_seed(tmp_path: Path) -> None:
+    """Which inputs were kept, and after how many; one of the runs comes further than the other."""
     pytest.importorskip("atheris")
-    command = [sys.executable, "-m", "tests.fuzz.worker", "atheris", "utc/rmc", "1", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "stat::number_of_executed_units: " in done.stderr
-    assert not list(tmp_path.glob("crash-*"))
+    kept = []
+    for folder in (tmp_path / "first", tmp_path / "second"):
+        (folder / "grown").mkdir(parents=True)
+        inputs = map(str, inputs_of("utc/rmc"))
+        options = ["-m", "tests.fuzz.worker", "atheris", "utc/rmc", "1", "7", str(folder), str(folder / "grown")]
+        done = subprocess.run(
+            [sys.executable, *options, *inputs], cwd=ROOT, capture_output=True, text=True, check=False,
+            env=runner.environment(),
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert "stat::number_of_executed_units: " in done.stderr
+        assert not list(folder.glob("crash-*"))
+        kept.append(re.findall(r"^#(\d+)\t(NEW|REDUCE).* (corp: \S+)", done.stderr, re.MULTILINE))
+    shared = min(map(len, kept))
+    assert shared > 5
+    assert kept[0][:shared] == kept[1][:shared]
 
 
 def test_a_result_shows_its_findings() -> None:

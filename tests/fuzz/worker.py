@@ -1,4 +1,4 @@
-"""Fuzzes one target in this process: `python -m tests.fuzz.worker ENGINE TARGET SECONDS FOLDER CORPUS...`.
+"""Fuzzes one target in this process: `python -m tests.fuzz.worker ENGINE TARGET SECONDS SEED FOLDER GROWN INPUT...`.
 
 Started by `tests.fuzz.__main__` for each target, because atheris instruments a module when it is imported, and ends
 the process at a finding. The last lines say what was done, in the words of libFuzzer for both engines.
@@ -48,7 +48,7 @@ class Atheris(Protocol):
         ...
 
 
-def fuzz_with_atheris(name: str, seconds: float, folder: Path, corpora: Sequence[str]) -> None:
+def fuzz_with_atheris(name: str, seconds: float, seed: int, folder: Path, grown: Path, inputs: Sequence[str]) -> None:
     """Fuzz, guided by the coverage of the package `imud`."""
     atheris = cast(Atheris, importlib.import_module("atheris"))
     with atheris.instrument_imports(include=["imud", "prometheus_client"]):
@@ -59,12 +59,27 @@ def fuzz_with_atheris(name: str, seconds: float, folder: Path, corpora: Sequence
         return target.mend(found, random)[:size] if random.random() < MEND_SHARE else found
 
     options = [
-        f"-max_total_time={max(int(seconds), 1)}", f"-max_len={target.bytes_max}", f"-timeout={INPUT_S_MAX}",
-        f"-rss_limit_mb={MEMORY_MB_MAX}", f"-artifact_prefix={folder}/", "-print_final_stats=1", "-len_control=0",
-        *_dictionary(target, folder),
+        f"-max_len={target.bytes_max}", f"-timeout={INPUT_S_MAX}", f"-rss_limit_mb={MEMORY_MB_MAX}", "-len_control=0",
+        *libfuzzer_options(seconds, seed, folder, inputs), *_dictionary(target, folder), str(grown),
     ]  # fmt: skip
-    atheris.Setup([sys.argv[0], *options, *corpora], target.run, custom_mutator=mutated)
+    atheris.Setup([sys.argv[0], *options], target.run, custom_mutator=mutated)
     atheris.Fuzz()
+
+
+def libfuzzer_options(seconds: float, seed: int, folder: Path, inputs: Sequence[str]) -> list[str]:
+    """What the fuzzers of Python and of C have in common; a seed of 0 is that of the clock.
+
+    For a seed to decide what is tried, inputs are named in order (that of a folder is chance), the corpus is not read
+    again every second, and how rare a feature is has no weight, for a few of them come and go.
+    """
+    options = [f"-max_total_time={max(int(seconds), 1)}", f"-artifact_prefix={folder}/", "-print_final_stats=1"]
+    if seed:
+        options += [f"-seed={seed}", "-reload=0", "-entropic=0"]
+    if inputs:
+        file = folder / "inputs"
+        file.write_text(",".join(inputs))
+        options.append(f"-seed_inputs=@{file}")
+    return options
 
 
 def _dictionary(target: Target, folder: Path) -> list[str]:
@@ -75,14 +90,14 @@ def _dictionary(target: Target, folder: Path) -> list[str]:
     return [f"-dict={file}"] if words else []
 
 
-def fuzz_with_hypothesis(name: str, seconds: float, folder: Path, corpora: Sequence[str]) -> int:
+def fuzz_with_hypothesis(name: str, seconds: float, seed: int, folder: Path, paths: Sequence[Path]) -> int:
     """Fuzz with mutations of the corpus, not guided by coverage. Returns the status of the process."""
     from hypothesis import HealthCheck, find, settings
     from hypothesis import strategies as st
     from hypothesis.errors import NoSuchExample
 
     target = load(name)
-    known = [path.read_bytes() for corpus in corpora for path in sorted(Path(corpus).iterdir())] or [b""]
+    known = [path.read_bytes() for path in paths] or [b""]
     inputs = st.one_of(
         st.binary(max_size=256),
         st.builds(
@@ -105,7 +120,7 @@ def fuzz_with_hypothesis(name: str, seconds: float, folder: Path, corpora: Seque
         return False
 
     quick = settings(max_examples=200, database=None, deadline=None, suppress_health_check=list(HealthCheck))
-    random = Random(0)
+    random = Random(seed)
     while time.monotonic() < end_s:
         try:
             found = find(inputs, fails, settings=quick, random=Random(random.getrandbits(64)))
@@ -132,11 +147,12 @@ def _escaped(word: bytes) -> str:
 
 def main() -> int:
     """Run as `python -m tests.fuzz.worker`."""
-    engine, name, seconds, folder, *corpora = sys.argv[1:]
+    engine, name, seconds, seed, folder, grown, *inputs = sys.argv[1:]
     if engine == "atheris":
-        fuzz_with_atheris(name, float(seconds), Path(folder), corpora)
+        fuzz_with_atheris(name, float(seconds), int(seed), Path(folder), Path(grown), inputs)
         return 0
-    return fuzz_with_hypothesis(name, float(seconds), Path(folder), corpora)
+    paths = [*map(Path, inputs), *sorted(Path(grown).iterdir())]
+    return fuzz_with_hypothesis(name, float(seconds), int(seed), Path(folder), paths)
 
 
 if __name__ == "__main__":
