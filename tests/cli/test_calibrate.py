@@ -1,33 +1,22 @@
 """`imud calibrate` on a running daemon with a simulated module at rest."""
 
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from subprocess import PIPE, Popen
 
 import pytest
 
 from imud.cli import main
 from imud.cli.calibrate import progress_line
 from imud.event import Event, EventKind
-from tests.support.daemon_process import RunningDaemon, running_daemon
+from tests.support.daemon_process import RunningDaemon, daemon_with_module
 
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     """A daemon with a simulated HiPNUC module that does not move."""
-    folder = tmp_path_factory.mktemp("calibrate")
-    argv = [sys.executable, "-m", "imud.sim", "--device", "hipnuc-uart", "--path", str(folder / "port")]
-    with Popen([*argv, "--motion", "still"], stdin=PIPE, stdout=PIPE, text=True) as simulator:
-        assert simulator.stdout is not None
-        assert simulator.stdout.readline()
-        device = {"driver": "hipnuc-uart", "uart": {"port": str(folder / "port"), "baud": 115200}}
-        with running_daemon(folder, {"bow": device}) as daemon:
-            daemon.wait_for("bow", "running")
-            yield daemon
-        simulator.terminate()
-        simulator.communicate()
+    with daemon_with_module(tmp_path_factory.mktemp("calibrate"), "--motion", "still") as daemon:
+        yield daemon
 
 
 def calibrate(daemon: RunningDaemon, *words: str) -> int:
@@ -86,16 +75,8 @@ def test_progress_as_a_bar() -> None:
 
 
 def test_a_module_on_rs485_is_levelled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    argv = [sys.executable, "-m", "imud.sim", "--device", "hipnuc-modbus", "--path", str(tmp_path / "port")]
-    with Popen([*argv, "--motion", "still"], stdin=PIPE, stdout=PIPE, text=True) as simulator:
-        assert simulator.stdout is not None
-        assert simulator.stdout.readline()
-        line = {"line": str(tmp_path / "port"), "baud": 115200, "address": 80}
-        with running_daemon(tmp_path, {"bow": {"driver": "hipnuc-modbus", "rs485": line}}) as daemon:
-            daemon.wait_for("bow", "running")
-            assert calibrate(daemon, "level", "--yes", "--save") == 0
-        simulator.terminate()
-        simulator.communicate()
+    with daemon_with_module(tmp_path, "--motion", "still", driver="hipnuc-modbus") as daemon:
+        assert calibrate(daemon, "level", "--yes", "--save") == 0
     out = capsys.readouterr().out
     assert "\nverified\n  roll: " in out
     assert out.endswith("  saved\n")

@@ -1,31 +1,20 @@
 """`imud command` on a running daemon with a simulated module."""
 
-import sys
 from collections.abc import Iterator
-from subprocess import PIPE, Popen
 
 import pytest
 
 from imud.cli import main
 from imud.cli.arguments import argument
 from imud.errors import BadArgument
-from tests.support.daemon_process import RunningDaemon, running_daemon
+from tests.support.daemon_process import RunningDaemon, daemon_with_module
 
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     """A daemon with a simulated HiPNUC module."""
-    folder = tmp_path_factory.mktemp("command")
-    argv = [sys.executable, "-m", "imud.sim", "--device", "hipnuc-uart", "--path", str(folder / "port")]
-    with Popen(argv, stdin=PIPE, stdout=PIPE, text=True) as simulator:
-        assert simulator.stdout is not None
-        assert simulator.stdout.readline()
-        device = {"driver": "hipnuc-uart", "uart": {"port": str(folder / "port"), "baud": 115200}}
-        with running_daemon(folder, {"bow": device}) as daemon:
-            daemon.wait_for("bow", "running")
-            yield daemon
-        simulator.terminate()
-        simulator.communicate()
+    with daemon_with_module(tmp_path_factory.mktemp("command")) as daemon:
+        yield daemon
 
 
 def test_the_list(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,6 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from subprocess import PIPE, Popen
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from imud import config
 from imud.cli import main
 from imud.client import Client
 from imud.contracts.device_settings import declared_values
-from tests.support.daemon_process import RunningDaemon, running_daemon
+from tests.support.daemon_process import RunningDaemon, daemon_with_module
 
 DECLARED = {"mode": "9-axis", "output": {"hi91": 50}}
 
@@ -22,18 +21,8 @@ DECLARED = {"mode": "9-axis", "output": {"hi91": 50}}
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     """A daemon with a simulated module, which differs from what is declared."""
-    folder = tmp_path_factory.mktemp("settings")
-    argv = [sys.executable, "-m", "imud.sim", "--device", "hipnuc-uart", "--path", str(folder / "port")]
-    with Popen(argv, stdin=PIPE, stdout=PIPE, text=True) as simulator:
-        assert simulator.stdout is not None
-        assert simulator.stdout.readline()
-        uart = {"port": str(folder / "port"), "baud": 115200}
-        device = {"driver": "hipnuc-uart", "uart": uart, "settings": DECLARED}
-        with running_daemon(folder, {"bow": device}) as daemon:
-            daemon.wait_for("bow", "running")
-            yield daemon
-        simulator.terminate()
-        simulator.communicate()
+    with daemon_with_module(tmp_path_factory.mktemp("settings"), settings=DECLARED) as daemon:
+        yield daemon
 
 
 class Terminal(io.StringIO):

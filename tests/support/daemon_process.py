@@ -112,3 +112,27 @@ def running_daemon(
     assert "Traceback" not in text, text
     assert "ResourceWarning" not in text, text
     assert not daemon.socket.exists()
+
+
+@contextmanager
+def daemon_with_module(
+    folder: Path, *options: str, driver: str = "hipnuc-uart", **device: Any
+) -> Iterator[RunningDaemon]:
+    """A daemon that runs `bow`, a simulated module on a pseudo-terminal, or on RS-485 for Modbus.
+
+    `options` are those of the simulator, `device` keys of the configuration.
+    """
+    port = str(folder / "port")
+    uart, rs485 = {"port": port, "baud": 115200}, {"line": port, "baud": 115200, "address": 80}
+    link = {"rs485": rs485} if driver == "hipnuc-modbus" else {"uart": uart}
+    argv = [sys.executable, "-m", "imud.sim", "--device", driver, "--path", port, *options]
+    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as simulator:
+        assert simulator.stdout is not None
+        assert simulator.stdout.readline()
+        try:
+            with running_daemon(folder, {"bow": {"driver": driver, **link, **device}}) as daemon:
+                daemon.wait_for("bow", "running")
+                yield daemon
+        finally:
+            simulator.terminate()
+            simulator.communicate()

@@ -8,13 +8,14 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from math import radians
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import pytest
 
 from imud.contracts.action import Target
 from imud.contracts.can import CanCodec, CanDriver
-from imud.contracts.codec import CodecEvent, ReplyFrame, message_of
+from imud.contracts.codec import CodecEvent, ReplyFrame, StreamCodec, message_of
+from imud.contracts.device_settings import Written
 from imud.contracts.polling import Transfer
 from imud.contracts.session import Outcome, Reply, Request, RequestScript, Session
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
@@ -59,6 +60,82 @@ def run_script(script: RequestScript[T], ask: Callable[[Request], Outcome]) -> T
     except StopIteration as end:
         value: T = end.value
         return value
+
+
+class SerialModule(Protocol):
+    """A simulated module behind a UART."""
+
+    @property
+    def baud(self) -> int:
+        """Its rate now."""
+        ...
+
+    def advance(self, now_ns: int) -> list[Burst]:
+        """What it sent up to now."""
+        ...
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """What it hears."""
+        ...
+
+
+M = TypeVar("M", bound=SerialModule)
+
+
+class SerialLine(Generic[M]):
+    """A module that has booted, and the host's end of its line: requests of scripts go out, replies come in."""
+
+    def __init__(self, module: M, codec: StreamCodec, ledger: Ledger) -> None:
+        self.now_ns = BEGIN_NS
+        self.module = module
+        self.baud = module.baud
+        """Rate of the host's end."""
+        self.connected = True
+        """Whether the host's transmit line reaches the module."""
+        self.ledger = ledger
+        self.codec = codec
+        self.session = Session(ledger)
+        self.asked: list[str] = []
+        """Names of the requests sent, pauses left out."""
+
+    def wait(self, duration_ms: float) -> list[CodecEvent]:
+        """Let time pass; return what the host heard."""
+        events: list[CodecEvent] = []
+        end_ns = self.now_ns + round(duration_ms * NS_PER_MS)
+        while self.now_ns < end_ns:
+            self.now_ns = min(self.now_ns + UART_STEP_MS * NS_PER_MS, end_ns)
+            baud = self.module.baud
+            for burst in self.module.advance(self.now_ns):
+                events += self.codec.feed(heard(burst.data, baud, self.baud))
+        assert self.ledger.closes()
+        return events
+
+    def send(self, data: bytes) -> None:
+        """Send bytes at the line's rate."""
+        if self.connected and data:
+            self.module.receive(heard(data, self.baud, self.module.baud), self.now_ns)
+
+    def ask(self, request: Request) -> Outcome:
+        """One request to its outcome."""
+        if request.baud:
+            self.baud = request.baud
+        if request.payload:
+            self.asked.append(request.name)
+        self.send(self.session.start(request, self.now_ns))
+        if request.silent:
+            return Reply(())
+        while True:
+            events = self.wait(UART_STEP_MS)
+            messages = [message for event in events if (message := message_of(event)) is not None]
+            outcomes: list[Outcome | None] = [self.session.on_message(message, self.now_ns) for message in messages]
+            outcomes += [self.session.on_sample(event) for event in events if isinstance(event, Measurement)]
+            for outcome in (*outcomes, self.session.on_time(self.now_ns)):
+                if outcome is not None:
+                    return outcome
+
+    def run(self, script: RequestScript[T]) -> T:
+        """Run a request script to its end; return its value, raise what it raises."""
+        return run_script(script, self.ask)
 
 
 # --- HiPNUC on UART ---------------------------------------------------------------------------------------------------
@@ -129,53 +206,13 @@ def hardware_of(behaviour: Behaviour, **hardware: Any) -> HipnucHardware:
     return replace(HIPNUC_STILL, behaviour=behaviour, **hardware)
 
 
-class HipnucLine:
-    """A module that has booted, and the host's end of its line: requests of scripts go out, replies come in."""
+class HipnucLine(SerialLine[HipnucModule]):
+    """A HiPNUC module on its line."""
 
     def __init__(self, settings: ModuleSettings | None = None, hardware: HipnucHardware = HIPNUC_STILL) -> None:
-        self.now_ns = BEGIN_NS
-        self.module = HipnucModule(BEGIN_NS, settings, hardware)
-        self.baud = self.module.baud
-        """Rate of the host's end."""
-        self.ledger = Ledger()
-        self.codec = HipnucCodec(self.ledger, HipnucSettings())
-        self.session = Session(self.ledger)
-        self.asked: list[str] = []
-        """Names of the requests sent, pauses left out."""
+        ledger = Ledger()
+        super().__init__(HipnucModule(BEGIN_NS, settings, hardware), HipnucCodec(ledger, HipnucSettings()), ledger)
         self.wait(hardware.boot_ms)
-
-    def wait(self, duration_ms: float) -> list[CodecEvent]:
-        """Let time pass; return what the host heard."""
-        events: list[CodecEvent] = []
-        end_ns = self.now_ns + round(duration_ms * NS_PER_MS)
-        while self.now_ns < end_ns:
-            self.now_ns = min(self.now_ns + UART_STEP_MS * NS_PER_MS, end_ns)
-            baud = self.module.baud
-            for burst in self.module.advance(self.now_ns):
-                events += self.codec.feed(heard(burst.data, baud, self.baud))
-        assert self.ledger.closes()
-        return events
-
-    def ask(self, request: Request) -> Outcome:
-        """One request to its outcome."""
-        if request.baud:
-            self.baud = request.baud
-        payload = self.session.start(request, self.now_ns)
-        if payload:
-            self.asked.append(request.name)
-            self.module.receive(heard(payload, self.baud, self.module.baud), self.now_ns)
-        if request.silent:
-            return Reply(())
-        while True:
-            messages = [message for event in self.wait(UART_STEP_MS) if (message := message_of(event)) is not None]
-            outcomes = [self.session.on_message(message, self.now_ns) for message in messages]
-            for outcome in (*outcomes, self.session.on_time(self.now_ns)):
-                if outcome is not None:
-                    return outcome
-
-    def run(self, script: RequestScript[T]) -> T:
-        """Run a request script to its end; return its value, raise what it raises."""
-        return run_script(script, self.ask)
 
     def act(self, name: str, *, fixed_baud: int = 0, **arguments: Any) -> Any:
         """Carry out an action of the driver; return its answer, raise what it raises."""
@@ -261,6 +298,24 @@ class CanBench:
         result: object = self.run_script(action.script(self.target(), action.arguments(given)))
         return result
 
+    def present(self) -> dict[str, Any]:
+        """The module's settings, read by the driver."""
+        assert self.driver.device_settings is not None
+        return self.run_script(self.driver.device_settings.read(self.target()))
+
+    def set_for_good(self, name: str, value: object) -> Written:
+        """Write a setting as the driver does, save it and restart the module."""
+        settings = self.driver.device_settings
+        assert settings is not None
+        write, save, restart = settings.table[name].write, settings.save, settings.restart
+        assert write is not None
+        assert save is not None
+        assert restart is not None
+        written: Written = self.run_script(write(self.target(), value))
+        self.run_script(save(self.target()))
+        self.run_script(restart(self.target()))
+        return written
+
     def _ask(self, request: Request) -> Outcome:
         if request.settings is not None:
             self.settings = request.settings
@@ -322,64 +377,17 @@ class J1939Bench(CanBench):
 IMU61X_STILL = Imu61xHardware(motion=AT_REST, skew_ppm=0)
 
 
-class Imu61xBench:
-    """A device that has booted, the time, and the host's end of the line."""
+class Imu61xBench(SerialLine[Imu61xModule]):
+    """An IMU61x on its line."""
 
     def __init__(self, settings: Imu61xSettings | None = None, hardware: Imu61xHardware = IMU61X_STILL) -> None:
-        self.now_ns = BEGIN_NS
-        self.module = Imu61xModule(BEGIN_NS, settings, hardware)
-        self.line_baud = self.module.baud
-        self.connected = True
-        """Whether the host's transmit line reaches the device."""
-        self.ledger = Ledger()
-        self.codec = Imu61xCodec(self.ledger)
-        self.session = Session(self.ledger)
-        self.asked: list[str] = []
-        """Names of the requests sent, pauses left out."""
-        self.wait(self.module.hardware.boot_ms)
-
-    def wait(self, duration_ms: float) -> list[CodecEvent]:
-        """Let time pass; return what the host heard."""
-        events: list[CodecEvent] = []
-        end_ns = self.now_ns + round(duration_ms * NS_PER_MS)
-        while self.now_ns < end_ns:
-            self.now_ns = min(self.now_ns + UART_STEP_MS * NS_PER_MS, end_ns)
-            baud = self.module.baud
-            for burst in self.module.advance(self.now_ns):
-                events += self.codec.feed(heard(burst.data, baud, self.line_baud))
-        assert self.ledger.closes()
-        return events
+        ledger = Ledger()
+        super().__init__(Imu61xModule(BEGIN_NS, settings, hardware), Imu61xCodec(ledger), ledger)
+        self.wait(hardware.boot_ms)
 
     def samples(self, duration_ms: float) -> list[Measurement]:
         """Let time pass; return the measurements."""
         return [event for event in self.wait(duration_ms) if isinstance(event, Measurement)]
-
-    def send(self, data: bytes) -> None:
-        """Send bytes at the line's rate."""
-        if self.connected and data:
-            self.module.receive(heard(data, self.line_baud, self.module.baud), self.now_ns)
-
-    def ask(self, request: Request) -> Outcome:
-        """One request to its outcome."""
-        if request.baud:
-            self.line_baud = request.baud
-        if request.payload:
-            self.asked.append(request.name)
-        self.send(self.session.start(request, self.now_ns))
-        if request.silent:
-            return Reply(())
-        while True:
-            events = self.wait(UART_STEP_MS)
-            messages = [message for event in events if (message := message_of(event)) is not None]
-            outcomes: list[Outcome | None] = [self.session.on_message(message, self.now_ns) for message in messages]
-            outcomes += [self.session.on_sample(event) for event in events if isinstance(event, Measurement)]
-            for outcome in (*outcomes, self.session.on_time(self.now_ns)):
-                if outcome is not None:
-                    return outcome
-
-    def run(self, script: RequestScript[T]) -> T:
-        """Run a request script to its end; return its value, raise what it raises."""
-        return run_script(script, self.ask)
 
     def restart(self) -> None:
         """Switch off and on, and wait until it has booted."""

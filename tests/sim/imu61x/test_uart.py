@@ -198,15 +198,15 @@ def test_the_acknowledgement_of_a_new_rate_comes_at_the_old_one() -> None:
     assert acknowledged(far, c.set_baud(921600)) == 0
     far.wait(10)
     assert far.module.baud == 921600
-    far.line_baud = 921600
+    far.baud = 921600
     assert parameter(far, Parameter.BAUD) == 921600
 
 
 def test_what_is_sent_at_another_rate_is_not_understood() -> None:
     far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
-    far.line_baud = 460800
+    far.baud = 460800
     far.send(c.factory_reset().payload)
-    far.line_baud = 115200
+    far.baud = 115200
     assert far.wait(100) == []
 
 

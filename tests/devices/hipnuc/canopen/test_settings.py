@@ -1,7 +1,5 @@
 """The table of settings, read and written over all kinds of nodes."""
 
-from typing import Any
-
 import msgspec
 import pytest
 
@@ -36,11 +34,6 @@ def bench(request: pytest.FixtureRequest) -> CanopenBench:
     return made
 
 
-def present(bench: CanopenBench) -> dict[str, Any]:
-    found: dict[str, Any] = bench.run_script(SETTINGS.read(bench.target()))
-    return found
-
-
 def test_the_driver_has_them_in_this_order() -> None:
     assert DRIVER.device_settings is SETTINGS
     assert list(VALUES) == list(SETTINGS.table)
@@ -48,7 +41,7 @@ def test_the_driver_has_them_in_this_order() -> None:
 
 def test_present_values_are_read_and_nothing_is_written(bench: CanopenBench) -> None:
     told = bench.module.hardware.variant.reads == "answered"
-    assert present(bench) == (DELIVERED if told else {})
+    assert bench.present() == (DELIVERED if told else {})
     assert all(data[0] == 0x40 for _, data in bench.sent)
 
 
@@ -57,18 +50,12 @@ def test_a_setting_written_saved_and_restarted_is_what_is_read(name: str) -> Non
     for variant in NODE_VARIANTS.values():
         bench = CanopenBench(NodeSettings(), boot_ms=100, variant=variant)
         bench.run(200_000_000)
-        setting = SETTINGS.table[name]
         for value in VALUES[name]:
-            assert setting.write is not None
-            assert SETTINGS.save is not None
-            assert SETTINGS.restart is not None
-            written = bench.run_script(setting.write(bench.target(), value))
+            written = bench.set_for_good(name, value)
             is_read = variant.reads == "answered"
             assert (written in (Written.VERIFIED, Written.PENDING)) == is_read
-            bench.run_script(SETTINGS.save(bench.target()))
-            bench.run_script(SETTINGS.restart(bench.target()))
             if is_read:
-                assert setting.agrees(value, present(bench)[name])
+                assert SETTINGS.table[name].agrees(value, bench.present()[name])
 
 
 def test_values_are_those_of_the_type() -> None:

@@ -1,7 +1,5 @@
 """The table of settings, read and written over all kinds of modules."""
 
-from typing import Any
-
 import msgspec
 import pytest
 
@@ -29,11 +27,6 @@ def bench(request: pytest.FixtureRequest) -> J1939Bench:
     return made
 
 
-def present(bench: J1939Bench) -> dict[str, Any]:
-    found: dict[str, Any] = bench.run_script(SETTINGS.read(bench.target()))
-    return found
-
-
 def test_the_driver_has_them_in_this_order() -> None:
     assert DRIVER.device_settings is SETTINGS
     assert list(VALUES) == list(SETTINGS.table)
@@ -43,7 +36,7 @@ def test_present_values_are_read_and_nothing_is_written(bench: J1939Bench) -> No
     told = bench.module.hardware.variant.reads != "ignored"
     sent = {f"{pgn}_interval_ms": 100 for pgn in ("ff34", "ff37", "ff3d", "ff41")}  # others are not on
     rest = {"x_reversed": False, "y_reversed": False, "bit_rate": 500_000, "address": 8}
-    assert present(bench) == (sent | rest if told else {})
+    assert bench.present() == (sent | rest if told else {})
     assert all(data[2:] == bytes.fromhex("03 00 01 00 00 00") for _, data in bench.sent)
 
 
@@ -52,18 +45,12 @@ def test_a_setting_written_saved_and_restarted_is_what_is_read(name: str) -> Non
     for variant in J1939_VARIANTS.values():
         bench = J1939Bench(boot_ms=100, variant=variant)
         bench.run(200_000_000)
-        setting = SETTINGS.table[name]
         for value in VALUES[name]:
-            assert setting.write is not None
-            assert SETTINGS.save is not None
-            assert SETTINGS.restart is not None
-            written = bench.run_script(setting.write(bench.target(), value))
+            written = bench.set_for_good(name, value)
             is_read = variant.reads != "ignored"
             assert (written in (Written.VERIFIED, Written.PENDING)) == is_read
-            bench.run_script(SETTINGS.save(bench.target()))
-            bench.run_script(SETTINGS.restart(bench.target()))
             if is_read:
-                assert setting.agrees(value, present(bench)[name])
+                assert SETTINGS.table[name].agrees(value, bench.present()[name])
 
 
 def test_values_are_those_of_the_type() -> None:

@@ -18,7 +18,7 @@ from tests.support.simulated_modules import Imu61xBench, done, every_variant, im
 def act(far: Imu61xBench, name: str, options: Imu61xUartSettings | None = None, **arguments: Any) -> Any:
     """Have the device do it."""
     action = ACTIONS[name]
-    return far.run(action.script(Target(options, far.line_baud), action.arguments(arguments)))
+    return far.run(action.script(Target(options, far.baud), action.arguments(arguments)))
 
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
@@ -45,7 +45,7 @@ def test_every_action_in_every_variant(variant: str, name: str) -> None:
         act(far, name, options, **ARGUMENTS.get(name, {}))
     far.samples(1000)
     assert bool(far.samples(100)) is (name != "stop_streaming")
-    assert far.line_baud == far.module.baud
+    assert far.baud == far.module.baud
 
 
 ORDERS = (
@@ -62,7 +62,7 @@ def test_every_order_to_a_device_that_refuses_is_an_error(name: str) -> None:
     with pytest.raises(CommandError):
         act(far, name, **ARGUMENTS.get(name, {}))
     assert far.module.settings == far.module.flash == settings
-    assert far.line_baud == 115200
+    assert far.baud == 115200
     assert len(far.samples(100)) >= 15
 
 
@@ -110,7 +110,7 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
 def test_baud_is_followed() -> None:
     far = imu61x_bench()
     assert act(far, "baud", baud=460800) == BaudChange(460800, saved=True)
-    assert far.line_baud == far.module.baud == 460800
+    assert far.baud == far.module.baud == 460800
 
 
 @pytest.mark.parametrize("name", ["baud", "factory_reset"])
@@ -161,7 +161,7 @@ def test_restart_and_factory_reset_keep_contact() -> None:
     act(far, "baud", baud=921600)
     assert getattr(act(far, "restart"), "product", "") == "IMU61x"
     act(far, "factory_reset")
-    assert far.line_baud == far.module.baud == 115200
+    assert far.baud == far.module.baud == 115200
 
 
 @pytest.mark.parametrize(

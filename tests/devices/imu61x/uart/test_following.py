@@ -85,7 +85,7 @@ def test_a_device_that_does_not_come_back_is_no_reply() -> None:
 def test_the_baud_rate_changes_and_the_device_is_kept(variant: str, baud: int, present: int) -> None:
     far = variant_bench(variant, Imu61xSettings(baud=present))
     change = far.run(following.change_baud(baud, present, done=done(variant)))
-    assert change.baud == baud == far.line_baud == far.module.baud
+    assert change.baud == baud == far.baud == far.module.baud
     assert change.saved is (variant != "no K1")
     assert far.module.flash.baud == baud
     assert far.module.flash.mode is OutputMode.STREAM
@@ -98,7 +98,7 @@ def test_the_baud_rate_changes_and_the_device_is_kept(variant: str, baud: int, p
 def test_without_save_flash_is_written_only_where_the_rate_comes_into_force_in_no_other_way(variant: str) -> None:
     far = variant_bench(variant)
     far.run(following.change_baud(460800, 115200, done=done(variant), save=False))
-    assert far.line_baud == far.module.baud == 460800
+    assert far.baud == far.module.baud == 460800
     at_start = far.module.hardware.behaviour.baud_acts_at_start
     assert far.module.flash.baud == (460800 if at_start else 115200)
 
@@ -113,7 +113,7 @@ def test_a_baud_rate_that_does_not_carry_the_output_rate_is_refused(baud: int) -
         )
         with pytest.raises(BadArgument, match=words):
             far.run(following.change_baud(baud, 921600))
-        assert (far.line_baud, far.module.baud, far.module.flash.baud) == (921600, 921600, 921600)
+        assert (far.baud, far.module.baud, far.module.flash.baud) == (921600, 921600, 921600)
     else:
         far.run(following.change_baud(baud, 921600))
     assert len(far.samples(100)) >= 35
@@ -123,7 +123,7 @@ def test_the_line_comes_back_when_the_device_keeps_its_rate() -> None:
     far = imu61x_bench(refuses=frozenset({Command.SET_PARAMETER}))
     with pytest.raises(Rejected, match="stays at 115200 baud"):
         far.run(following.change_baud(921600, 115200))
-    assert far.line_baud == 115200
+    assert far.baud == 115200
     assert streams(far)
 
 
@@ -131,7 +131,7 @@ def test_a_rate_that_is_not_saved_because_the_device_refuses_is_an_error() -> No
     far = imu61x_bench(refuses=frozenset({Command.SAVE}))
     with pytest.raises(Rejected, match="save: expected result 0"):
         far.run(following.change_baud(921600, 115200))
-    assert far.line_baud == far.module.baud == 921600
+    assert far.baud == far.module.baud == 921600
     assert streams(far)
 
 
@@ -142,7 +142,7 @@ def test_a_device_that_is_lost_was_not_saved(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("imud.sim.imu61x.uart.changed", wrong)
     with pytest.raises(NoReply, match="switch its power off and on: nothing was saved"):
         far.run(following.change_baud(460800, 115200))
-    assert far.line_baud == 115200
+    assert far.baud == 115200
     far.restart()
     assert streams(far)
 
@@ -159,7 +159,7 @@ def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[o
     far.connected = False
     with pytest.raises(NoReply, match="nothing was changed"):
         far.run(change())
-    assert far.line_baud == 115200
+    assert far.baud == 115200
     assert "factory reset" not in far.asked
     assert not any(name.startswith("set parameter") for name in far.asked)
     assert streams(far)
@@ -175,7 +175,7 @@ def test_factory_reset_is_read_back_and_the_line_follows(variant: str, present: 
     settings = Imu61xSettings(baud=present, rate_hz=200, filter_control=0, i2c_address=0x1B)
     far = variant_bench(variant, settings)
     change = far.run(following.factory_reset(present, done=done(variant)))
-    assert change.baud == far.line_baud == far.module.baud == 115200
+    assert change.baud == far.baud == far.module.baud == 115200
     assert far.module.flash == far.module.settings == Imu61xSettings()
     assert streams(far)
 

@@ -28,7 +28,7 @@ FACTORY = {
 
 
 def target(far: Imu61xBench, variant: str = "obeys while it streams") -> Target:
-    return Target(Imu61xUartSettings(result_done=done(variant)), far.line_baud)
+    return Target(Imu61xUartSettings(result_done=done(variant)), far.baud)
 
 
 def read(far: Imu61xBench, variant: str = "obeys while it streams") -> dict[str, Any]:
