@@ -104,9 +104,12 @@ def test_a_rate_is_learned_from_four_equal_steps() -> None:
     assert not booked(numbers, 1, learns=True).balanced
 
 
-def test_a_hole_that_no_sample_has_ended_may_be_in_the_losses() -> None:
-    holes = [Hole(2, True), Hole(3, False, is_open=True)]
+@pytest.mark.parametrize(("unknown_most", "known"), [(0, [True, False, False]), (1, [True, True, False])])
+def test_a_hole_with_a_sample_on_one_side_may_be_in_the_losses(unknown_most: int, known: list[bool]) -> None:
+    """It is a gap of unknown size only where a sample has ended it."""
+    holes = [Hole(2, True), Hole(3, False, unknown_most, is_open=True)]
     assert [account(9, holes, lost, 0, 1).balanced for lost in (1, 2, 6, 7)] == [False, True, True, False]
+    assert [account(9, holes, 2, unknown, 1).balanced for unknown in (0, 1, 2)] == known
 
 
 def polled(*asked: tuple[float, Answer] | tuple[float, Answer, float]) -> PollLog:

@@ -134,7 +134,7 @@ class Chaos:
             holes.append(accounts.Hole(missing, is_certain=False, is_open=True))
         if samples and any(trouble.end_ns > samples[-1].t_rx_ns for trouble in troubles):
             missing = round((now.at_ns - samples[-1].t_ns) / log.period_ns)
-            holes.append(accounts.Hole(missing, is_certain=False, is_open=True))
+            holes.append(accounts.Hole(missing, is_certain=False, unknown_most=0, is_open=True))
         self._book(name, holes, before, now, what)
         assert was.polling is not None
         assert is_now.polling is not None

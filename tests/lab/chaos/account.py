@@ -14,7 +14,8 @@ from nothing to all, or it is counted within one sample. Hence, with the ledger'
 
     holes - (the U largest uncertain ones) - (one for each of the rest) <= lost <= holes + (one for each uncertain one)
 
-and U is at most what there are uncertain ones. Without an uncertain hole `lost` is exactly the truth.
+and U is at most what there are uncertain ones. Without an uncertain hole `lost` is exactly the truth. A polled device
+whose first reads failed has such a gap before its first sample; the time after the newest sample is in no gap yet.
 """
 
 from collections.abc import Sequence
@@ -58,7 +59,7 @@ class Hole(NamedTuple):
     unknown_most: int = 1
     """So many unknown gaps it may count for."""
     is_open: bool = False
-    """Whether there is a sample on one side of it only: no other one came yet, or none before."""
+    """Whether there is a sample on one side of it only: no other one came yet (`unknown_most` is 0), or none before."""
 
 
 class Account(NamedTuple):
@@ -136,4 +137,5 @@ def account(samples: int, holes: Sequence[Hole], lost: int, unknown: int, outage
     uncertain = sorted((hole for hole in holes if not hole.is_certain and not hole.is_open), reverse=True)
     least = true - sum(hole.missing for hole in uncertain[:unknown]) - sum(h.missing > 0 for h in uncertain[unknown:])
     most = true + len(uncertain) + sum(hole.missing + 1 for hole in holes if hole.is_open)
-    return Account(samples, lost, true, least, most, unknown, sum(h.unknown_most for h in uncertain), outages)
+    unknown_most = sum(hole.unknown_most for hole in holes if not hole.is_certain)
+    return Account(samples, lost, true, least, most, unknown, unknown_most, outages)
