@@ -16,6 +16,7 @@ import time
 import msgspec
 
 from imud.formats.slot import SLOT_BYTES
+from tests.bench.writer import FIRST_PA
 
 LENGTH = struct.Struct("<I")
 SEQ_AND_PRESSURE = struct.Struct("<Q192xd")
@@ -55,7 +56,7 @@ def count_binary(buffer: bytearray, seen: Latency, now_ns: int) -> None:
         if buffer[body] != 0x7B or length == SLOT_BYTES:
             for slot in range(body, body + length, SLOT_BYTES):
                 seq, pressure = SEQ_AND_PRESSURE.unpack_from(buffer, slot)
-                seen.add(struct.unpack_from("<H", buffer, slot + 60)[0], seq, int(pressure), now_ns)
+                seen.add(struct.unpack_from("<H", buffer, slot + 60)[0], seq, int(pressure) - FIRST_PA, now_ns)
         at = body + length
     del buffer[:at]
 
@@ -66,7 +67,7 @@ def count_json(buffer: bytearray, seen: Latency, now_ns: int) -> None:
     for line in bytes(buffer[:end]).splitlines():
         params = msgspec.json.decode(line).get("params", {})
         if "seq" in params:
-            seen.add(params["device"], params["seq"], int(params["pressure_pa"]), now_ns)
+            seen.add(params["device"], params["seq"], int(params["pressure_pa"]) - FIRST_PA, now_ns)
     del buffer[:end]
 
 

@@ -1,9 +1,9 @@
 """A process that plays N HiPNUC modules into N ptys at a fixed rate, as cheaply as Python can.
 
 Prints one line with the slave paths, waits for a line on standard input, writes, prints how many frames each pty took.
-Frame i carries i in its pressure field, and the time of its write stands in an array of i64 in the file `--times`, so
-that a reader knows each sample's true moment without any cost on the measured side. With `--udp PORT` attitude
-sentences of NMEA 0183 go to that port instead, for gpsd.
+Frame i carries FIRST_PA + i in its pressure field, and the time of its write stands in an array of i64 in the file
+`--times`, so that a reader knows each sample's true moment without any cost on the measured side. With `--udp PORT`
+attitude sentences of NMEA 0183 go to that port instead, for gpsd.
 """
 
 import argparse
@@ -29,6 +29,9 @@ LATE_LIMIT_NS = 50_000_000
 
 MakeFrame = Callable[[int], bytes | bytearray]
 """Makes frame i."""
+
+FIRST_PA = 2000
+"""Of frame 0: imud takes what is below 1000 Pa or above 120 kPa for no pressure."""
 
 PULSE_NS = 82 * uart_byte_ns(921_600) + 80_000
 """From the rising edge of SOUT to the last byte of a frame: a pty has no wire, so the edge is set back by it."""
@@ -67,7 +70,7 @@ def hi91_frames(rate_hz: float) -> MakeFrame:
     head = crc(bytes(frame[:4]), 0)
 
     def make(i: int) -> bytearray:
-        pack("<f", frame, 10, float(i))
+        pack("<f", frame, 10, float(FIRST_PA + i))
         pack("<I", frame, 14, int(i * 1000 / rate_hz))
         pack("<H", frame, 4, crc(frame[6:], head))
         return frame
