@@ -18,12 +18,14 @@ from imud.contracts.codec import StreamCodec
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
 from imud.devices.hipnuc.uart.codec import HipnucCodec, HipnucSettings
-from imud.devices.imu61x.can.codec import Imu61xCanCodec, Imu61xCanSettings, encode_set
+from imud.devices.imu61x.can.codec import BASE_ID, Imu61xCanCodec, Imu61xCanSettings, encode_set
 from imud.devices.imu61x.uart.codec import Imu61xCodec, encode_ahrs
+from imud.formats.can import pack_frame
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import encode_slot
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
+from imud.links.can.frame_reader import FrameReader
 from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.runtime.path import PathContext, StreamPath
@@ -174,6 +176,22 @@ def _canopen(total: int, _directory: str) -> Run:
     return _taking([partial(codec.feed_frame, can_id, False, data, t_ns) for can_id, data, t_ns in frames])
 
 
+def _can_read(frames: int, total: int, _directory: str) -> Run:
+    """Reads of so many frames; datagrams of the loop device take the place of the bus's."""
+    sender, receiver = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    receiver.bind(("127.0.0.1", 0))
+    receiver.setblocking(False)
+    sender.connect(receiver.getsockname())
+    reader, raw = FrameReader(receiver, lambda _classes, _data: False), pack_frame(BASE_ID, False, bytes(8))
+
+    def read(_kept_open: socket.socket = receiver) -> None:
+        for _ in range(frames):
+            sender.send(raw)
+        assert len(reader.read()) == frames
+
+    return _taking([read] * total)
+
+
 # --- clock, slot, ring ----------------------------------------------------------------------------------------------
 
 
@@ -317,6 +335,8 @@ STAGES: Final = (
     CountedStage("decode HI91, a frame per read", _hi91_single, 200),
     CountedStage("decode AHRS, reads of 4096 bytes", _ahrs_bulk, 3, AHRS_BLOCK),
     CountedStage("decode AHRS, a frame per read", _ahrs_single, 200),
+    CountedStage("CAN link, a frame per read", partial(_can_read, 1), 200),
+    CountedStage("CAN link, 10 frames per read", partial(_can_read, 10), 20, 10),
     CountedStage("decode IMU61x CAN, a frame", _imu61x_can, 250),
     CountedStage("decode CANopen, a frame", _canopen, 240),
     CountedStage("clock, a sample", _clock, 1000),

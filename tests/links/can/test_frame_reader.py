@@ -138,3 +138,13 @@ def test_layout_of_the_kernels_frame() -> None:
     assert pack_frame(0x65, True, b"")[:4] == struct.pack("=I", 0x8000_0065)
     with pytest.raises(ValueError, match="no CAN frame"):
         pack_frame(0x800, False, b"")
+
+
+def test_a_loss_that_is_read_alone_marks_the_first_frame_of_the_next_read(wire: Wire) -> None:
+    wire.error_means_loss = True
+    wire.sender.send(RAW_FRAME.pack(0x2000_0004, 8, bytes([0, 1, 0, 0, 0, 0, 0, 0])))
+    assert wire.reader.read() == []
+    wire.send(5)
+    assert [frame.after_loss for frame in wire.reader.read()] == [True]
+    wire.send(6)
+    assert [frame.after_loss for frame in wire.reader.read()] == [False]
