@@ -10,6 +10,7 @@
 # make audit  items of both manuals: code and tests of each
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
+# make lab-debian   boots Debian 12 and 13 with systemd and checks the package there (as root; tests/lab_debian/README.md)
 # make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
 SHELL := /bin/sh
 PYTHON ?= python3
@@ -17,9 +18,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 LAB_OPTIONS ?= --steady
+RIG_OPTIONS ?=
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try monitoring-deps
+.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try monitoring-deps lab-debian lab-debian-deps
 
 all: check
 
@@ -100,6 +102,13 @@ lab: $(VENV)/made
 
 chaos: $(VENV)/made
 	tests/lab/run $(CHAOS_OPTIONS) --exec '$(BIN)/python -m tests.lab.chaos $(ARGS)'
+
+# As root; RIG_OPTIONS="--suite trixie" ARGS=replug: one release, one group of checks.
+lab-debian: $(VENV)/made
+	tests/lab_debian/run $(RIG_OPTIONS) $(ARGS)
+
+lab-debian-deps: deb-deps
+	tests/lab_debian/deps amd64
 
 clean:
 	rm -rf build $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -271,7 +271,19 @@ def test_tests_write_no_private_members(file: Path) -> None:
 
 # --- a test by the path of its module ---------------------------------------------------------------------------------
 
-ELSEWHERE = ("audit", "bench", "lab", "lab_host", "include", "fuzz", "attack", "support", "packaging", "monitoring")
+ELSEWHERE = (
+    "audit",
+    "bench",
+    "lab",
+    "lab_host",
+    "lab_debian",
+    "include",
+    "fuzz",
+    "attack",
+    "support",
+    "packaging",
+    "monitoring",
+)
 """Folders of tests that mirror no package: measurements, kernels, the C header, foreign bytes, helpers, packages, and
 what Prometheus makes of the metrics."""
 

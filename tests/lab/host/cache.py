@@ -27,10 +27,13 @@ LOCK_WAIT_S = 45 * 60  # a cold build takes 5 minutes on two idle cores; a share
 LOCK_POLL_S = 0.2
 
 
-def cache_root() -> Path:
-    """The cache folder. LabError if its path has characters that make cannot carry."""
+def cache_root(suffix: str = "") -> Path:
+    """The cache folder; with a suffix one beside it, which has a lock of its own.
+
+    LabError if its path has characters that make cannot carry.
+    """
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    root = Path(os.environ.get("IMUD_LAB_CACHE") or Path(base) / "imud-lab").absolute()
+    root = Path(f"{os.environ.get('IMUD_LAB_CACHE') or Path(base) / 'imud-lab'}{suffix}").absolute()
     if any(character.isspace() or character in ":#$," for character in str(root)):
         raise LabError(f"cache folder {str(root)!r}: make needs a path without spaces and :#$, (set IMUD_LAB_CACHE)")
     return root
@@ -74,9 +77,9 @@ def locked(root: Path, say: Callable[[str], None], wait_s: float = LOCK_WAIT_S) 
         yield
 
 
-def find(name: str) -> Path | None:
-    """The finished folder `name`, marked as used now; None if it is not in the cache."""
-    folder = cache_root() / name
+def find(name: str, root: Path | None = None) -> Path | None:
+    """The finished folder `name` of `root` (cache_root()), marked as used now; None if it is not in the cache."""
+    folder = (root or cache_root()) / name
     try:
         os.utime(folder)
     except FileNotFoundError:
@@ -84,19 +87,21 @@ def find(name: str) -> Path | None:
     return folder
 
 
-def get(name: str, make: Callable[[Path], None], needed_bytes: int, say: Callable[[str], None]) -> Path:
-    """The folder `name` of the cache; if it is absent, `make(folder)` fills a new one that is then renamed.
+def get(
+    name: str, make: Callable[[Path], None], needed_bytes: int, say: Callable[[str], None], root: Path | None = None
+) -> Path:
+    """The folder `name` of `root` (cache_root()); if it is absent, `make(folder)` fills a new one that is then renamed.
 
     Safe against any number of processes at once: one makes, the others wait and take its result. A failed
     or killed make leaves nothing under `name`. The lock is not recursive: `make` must not call this.
     """
-    root = cache_root()
+    root = root or cache_root()
     try:
         root.mkdir(parents=True, exist_ok=True)
-        found = find(name)
+        found = find(name, root)
         if found is None:
             with locked(root, say):
-                found = find(name) or _make_locked(root, name, make, needed_bytes)
+                found = find(name, root) or _make_locked(root, name, make, needed_bytes)
     except OSError as error:
         raise LabError(f"cache folder {root}: {error}") from error
     return found

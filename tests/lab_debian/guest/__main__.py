@@ -1,0 +1,59 @@
+"""The guest's program: `python3 -m tests.lab_debian.guest ARCHITECTURE [GROUP...]` runs its checks, or groups of them.
+
+Exit status: 0 all passed, 1 some failed.
+"""
+
+import sys
+from collections.abc import Callable
+from typing import TypeAlias
+
+from tests.lab_debian.guest import (
+    first_contact,
+    installation,
+    outputs,
+    removal,
+    replug,
+    rights,
+    sandbox,
+    service,
+    unit_tests,
+)
+from tests.lab_debian.guest.checks import Checks
+from tests.lab_debian.guest.system import SHARE, Host, uptime_s
+
+Group: TypeAlias = Callable[[Checks, Host], None]
+
+GROUPS: dict[str, Group] = {
+    "installation": installation.check,
+    "service": service.check,
+    "rights": rights.check,
+    "sandbox": sandbox.check,
+    "outputs": outputs.check,
+    "replug": replug.check,
+    "doctor": first_contact.check_doctor,
+    "setup": first_contact.check_setup,
+    "streaming": service.check_streaming,
+    "unit-tests": unit_tests.check,
+    "removal": removal.check,
+}
+"""In the order in which they run: the first leaves the package installed and the second the service running."""
+RUNS = {  # setup is run by its name only, until it has been through a whole run
+    "amd64": ("service", "rights", "sandbox", "outputs", "replug", "doctor", "removal"),
+    "arm64": ("streaming", "sandbox", "doctor", "unit-tests"),
+}
+
+
+def main(arguments: list[str]) -> int:
+    """The program."""
+    architecture, *groups = arguments
+    checks = Checks(SHARE / "results.json")
+    host = Host()
+    for name in ("installation", *(groups or RUNS[architecture])):
+        checks.begin(name)
+        GROUPS[name](checks, host)
+    print(f"{checks.summary()}, {uptime_s():.0f} s after the kernel's start", flush=True)
+    return 1 if checks.failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,102 @@
+"""Named checks with their times, and waiting for what has no event. Runs in the guest, on the system's own Python.
+
+with checks("the service is READY after its start"):
+    ...                                              any exception is a failure; the run goes on
+checks.figure("start to READY", 8.1, "s")            measured, printed with the results
+"""
+
+import contextlib
+import json
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T")
+
+LIMIT_S = 180.0
+"""For anything that must happen: an emulated guest on a busy host is tens of times slower than a real machine."""
+POLL_S = 0.1
+LINES_SHOWN = 12
+
+
+class Failed(Exception):
+    """A check did not find what it expected; its text says what came instead."""
+
+
+class Checks:
+    """The checks of one run, in their order."""
+
+    def __init__(self, results: Path) -> None:
+        self._results = results
+        self._rows: list[dict[str, object]] = []
+        self._figures: list[dict[str, object]] = []
+        self._group = ""
+
+    def begin(self, group: str) -> None:
+        """Name the group that the next checks belong to."""
+        self._group = group
+
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """One check: an exception fails it and is printed; the run goes on after the block."""
+        start_s = time.monotonic()
+        why = ""
+        try:
+            yield
+        except Failed as error:
+            why = str(error)
+        except Exception as error:  # noqa: BLE001 - whatever happens in a check fails it, and no other
+            why = "".join(traceback.format_exception(error))
+        taken_s = time.monotonic() - start_s
+        print(f"{'FAIL' if why else 'PASS'} {taken_s:6.1f} s  {self._group}: {name}", flush=True)
+        for line in why.splitlines()[-LINES_SHOWN:]:
+            print(f"       {line}", flush=True)
+        self._rows.append({"group": self._group, "name": name, "seconds": round(taken_s, 2), "why": why})
+        self._save()
+
+    def figure(self, name: str, value: float, unit: str) -> None:
+        """Keep and print a figure that was measured."""
+        print(f"     {value:8.2f} {unit}  {self._group}: {name}", flush=True)
+        self._figures.append({"group": self._group, "name": name, "value": value, "unit": unit})
+        self._save()
+
+    def skip(self, name: str, why: str) -> None:
+        """Say that something is not checked, and why."""
+        print(f"SKIP           {self._group}: {name}: {why}", flush=True)
+
+    @property
+    def failed(self) -> list[str]:
+        """Names of the checks that failed."""
+        return [f"{row['group']}: {row['name']}" for row in self._rows if row["why"]]
+
+    def summary(self) -> str:
+        """One line about the run."""
+        failed = self.failed
+        return f"{len(self._rows)} checks, {len(failed)} failed{': ' if failed else ''}{'; '.join(failed)}"
+
+    def _save(self) -> None:
+        self._results.write_text(json.dumps({"checks": self._rows, "figures": self._figures}, indent=1))
+
+
+def wait_until(found: Callable[[], T | None], what: str, limit_s: float = LIMIT_S) -> T:
+    """Return what `found()` gives as soon as that is true. Failed with `what` after `limit_s`."""
+    give_up_s = time.monotonic() + limit_s
+    while not (value := found()):
+        if time.monotonic() >= give_up_s:
+            raise Failed(f"not within {limit_s:.0f} s: {what} (last: {value!r})")
+        time.sleep(POLL_S)
+    return value
+
+
+def expect(what: str, got: object, wanted: object) -> None:
+    """Failed unless `got` is what is wanted."""
+    if got != wanted:
+        raise Failed(f"{what}: expected {wanted!r}, got {got!r}")
+
+
+def expect_in(part: str, whole: str, what: str) -> None:
+    """Failed unless `part` is in `whole`."""
+    if part not in whole:
+        raise Failed(f"{what}: expected {part!r} in: {whole.strip()[-1500:]}")

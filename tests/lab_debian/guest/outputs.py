@@ -1,0 +1,57 @@
+"""What imud works with, under the unit's confinement: metrics on another address, gpsd over TCP."""
+
+import os
+from pathlib import Path
+
+from tests.lab_debian.guest.checks import Checks, expect, expect_in, wait_until
+from tests.lab_debian.guest.service import CAN, USB, metrics
+from tests.lab_debian.guest.system import (
+    Host,
+    background,
+    configure,
+    device,
+    must,
+    pid,
+    run,
+    start_service,
+    wait_streaming,
+)
+
+METRICS_PORT = 9400
+GPSD_PORT = 2947
+NOTHING_YET = "has no sentences yet"
+"""What the daemon says of a gpsd that answers and has no receiver."""
+REALTIME = "[Service]\nCPUSchedulingPolicy=rr\nCPUSchedulingPriority=10\n"
+
+
+def check(checks: Checks, _host: Host) -> None:
+    """Each with the daemon's own configuration for it."""
+    with checks("metrics on all addresses and another port"):
+        configure(f"metrics: {{address: 0.0.0.0, port: {METRICS_PORT}}}\n{USB}{CAN}")
+        start_service()
+        wait_streaming("usb")
+        must("ip", "address", "replace", "192.0.2.1/32", "dev", "lo")
+        wait_until(lambda: metrics(f"http://192.0.2.1:{METRICS_PORT}"), "metrics on another address")
+    with checks("the daemon reaches a real gpsd over TCP"):
+        background("labgpsd", "/usr/sbin/gpsd", "-N", "-n", "-S", str(GPSD_PORT), "/dev/null")
+        configure(USB.replace("115200}", "115200}\n    rmc: {source: gpsd}") + CAN)
+        start_service()
+        wait_streaming("usb")
+        wait_until(lambda: NOTHING_YET in str((device("usb") or {}).get("utc")), "gpsd, which has no receiver")
+        must("systemctl", "stop", "labgpsd")
+        wait_until(lambda: NOTHING_YET not in str((device("usb") or {}).get("utc")), "the loss of gpsd")
+    with checks("real-time scheduling by a drop-in, as docs/operate.md has it"):
+        folder = Path("/etc/systemd/system/imud.service.d")
+        folder.mkdir()
+        (folder / "realtime.conf").write_text(REALTIME)
+        must("systemctl", "daemon-reload")
+        configure(USB + CAN)
+        start_service()
+        wait_streaming("usb")
+        expect("policy", os.sched_getscheduler(pid()), os.SCHED_RR)
+        (folder / "realtime.conf").unlink()
+        folder.rmdir()
+        must("systemctl", "daemon-reload")
+    start_service()
+    wait_streaming("usb")
+    expect_in("active", run("systemctl", "is-active", "imud").stdout, "service")

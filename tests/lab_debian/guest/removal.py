@@ -1,0 +1,59 @@
+"""Upgrade, removal and purge of the package while the service runs."""
+
+from pathlib import Path
+
+from tests.lab_debian.guest.checks import Checks, expect, expect_in
+from tests.lab_debian.guest.service import CAN, USB
+from tests.lab_debian.guest.system import CONFIG, Host, must, pid, run, shown, start_service, wait_streaming
+
+STATE = Path("/var/lib/imud")
+LIMIT_S = 900
+
+
+def check(checks: Checks, _host: Host) -> None:
+    """The end of the package's life."""
+    CONFIG.write_text(f"# mine\n{USB}{CAN}")
+    start_service()
+    wait_streaming("usb")
+    with checks("an upgrade restarts the service and keeps configuration, state and what is enabled"):
+        before = pid()
+        must("apt-get", "--quiet", "--yes", "install", "/run/lab/next.deb", limit_s=LIMIT_S)
+        expect_in("lab1", must("dpkg-query", "--show", "imud"), "version")
+        wait_streaming("usb")
+        assert pid() != before, "the process is the old one"
+        assert CONFIG.read_text().startswith("# mine"), "the configuration is another"
+        assert any(STATE.iterdir()), "the state is gone"
+        expect("enabled", run("systemctl", "is-enabled", "imud").stdout.strip(), "enabled")
+    with checks("a service that is stopped stays so over an upgrade"):
+        must("systemctl", "stop", "imud")
+        must("apt-get", "--quiet", "--yes", "reinstall", "/run/lab/next.deb", limit_s=LIMIT_S)
+        expect("active", run("systemctl", "is-active", "imud").stdout.strip(), "inactive")
+        start_service()
+    with checks("a removal stops the service and keeps configuration and state"):
+        must("apt-get", "--quiet", "--yes", "remove", "imud", limit_s=LIMIT_S)
+        expect("active", run("systemctl", "is-active", "imud").stdout.strip(), "inactive")
+        assert not Path("/usr/lib/imud").exists(), "files are left in /usr/lib/imud"
+        assert CONFIG.exists(), "the configuration is gone"
+        assert STATE.exists(), "the state is gone"
+        assert not Path("/run/imud").exists(), "the runtime directory is left"
+    with checks("a purge leaves nothing but the users and groups"):
+        must("apt-get", "--quiet", "--yes", "purge", "imud", limit_s=LIMIT_S)
+        left = must(
+            "find",
+            "/etc",
+            "/usr",
+            "/var/lib",
+            "/run",
+            "/dev/shm",
+            "-xdev",
+            "-iname",
+            "*imud*",
+            "-not",
+            "-path",
+            "/run/lab/*",
+        )
+        expect("left", [line for line in left.splitlines() if "/var/lib/dpkg/" not in line], [])
+        must("getent", "group", "imud")
+    with checks("no unit has failed in the end"):
+        expect("load state", shown("LoadState"), "not-found")
+        expect("failed units", run("systemctl", "--failed", "--no-legend", "--plain").stdout.strip(), "")

@@ -1,0 +1,39 @@
+"""The USB adapter is pulled out and plugged in again, ten times: samples come back, quietly, and with the product."""
+
+import time
+
+from tests.lab_debian.guest.checks import Checks, Failed, expect, wait_until
+from tests.lab_debian.guest.system import Host, device, journal, mark, wait_streaming
+
+ROUNDS = 10
+
+
+def check(checks: Checks, host: Host) -> None:
+    """All rounds; each has its figure."""
+    wait_streaming("usb")
+    product = wait_until(lambda: (device("usb") or {})["identity"].get("product"), "the product before")
+    taken: list[float] = []
+    for number in range(1, ROUNDS + 1):
+        with checks(f"unplugged and plugged, {number} of {ROUNDS}: samples, no wrong warning, the product"):
+            taken.append(one_round(host, product))
+            checks.figure(f"node to samples, round {number}", taken[-1], "s")
+    if taken:
+        checks.figure("node to samples, median", sorted(taken)[len(taken) // 2], "s")
+        checks.figure("node to samples, worst", max(taken), "s")
+
+
+def one_round(host: Host, product: str) -> float:
+    """Pull, wait until the daemon has seen it, plug; return seconds from the node to the first fresh sample."""
+    since = mark()
+    host.unplug()
+    wait_until(lambda: (device("usb") or {}).get("state") not in ("running", None), "the device is seen to be gone")
+    node_s = host.plug()
+    wait_streaming("usb")
+    taken_s = time.monotonic() - node_s
+    wait_until(lambda: (device("usb") or {})["identity"].get("product"), "the product after", limit_s=30)
+    expect("product", (device("usb") or {})["identity"]["product"], product)
+    said = journal(since)
+    for word in ("may not be opened", "usermod", "EPERM"):
+        if word in said:
+            raise Failed(f"the log says {word!r}: {said}")
+    return taken_s

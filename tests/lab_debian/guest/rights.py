@@ -1,0 +1,36 @@
+"""Who may read, who may change, who may nothing."""
+
+from tests.lab_debian.guest.checks import Checks, expect, expect_in
+from tests.lab_debian.guest.system import PYTHON, RINGS, SOCKET, Host, add_user, must, run, wait_streaming
+
+READ_RING = "from imud.client import Ring\nwith Ring('usb') as ring: print(ring.latest().seq > 0)"
+WRITE_RING = f"open('{RINGS}/imud.usb', 'r+b')"
+
+
+def check(checks: Checks, _host: Host) -> None:
+    """Members of imud, members of imud-control, the daemon's user, and strangers."""
+    add_user("reader", "imud")
+    add_user("chief", "imud", "imud-control")
+    add_user("stranger")
+    wait_streaming("usb")
+    with checks("a member of imud reads the socket and the ring"):
+        must("runuser", "-u", "reader", "--", "imud", "devices")
+        expect("ring", run(PYTHON, "-c", READ_RING, user="reader").stdout.strip(), "True")
+    with checks("a member of imud changes nothing"):
+        refused = run("imud", "command", "usb", "output", "message=HI91", "rate_hz=100", user="reader")
+        assert refused.returncode, "the command was carried out"
+        expect_in("imud-control", refused.stdout, "refusal")
+        expect_in("Permission denied", run(PYTHON, "-c", WRITE_RING, user="reader").stdout, "writing to a ring")
+    with checks("a member of imud-control changes a module"):
+        must("runuser", "-u", "chief", "--", "imud", "command", "--yes", "usb", "output", "message=HI91", "rate_hz=100")
+    with checks("a stranger reads neither socket nor ring, and is told why"):
+        refused = run("imud", "devices", user="stranger")
+        assert refused.returncode, "the stranger may read"
+        expect_in("imud", refused.stdout, "refusal")
+        assert run(PYTHON, "-c", READ_RING, user="stranger").returncode, "the stranger reads the ring"
+    with checks("only imud makes names beside socket and rings"):
+        for user in ("reader", "chief", "stranger"):
+            for folder in (SOCKET.rpartition("/")[0], str(RINGS), "/var/lib/imud"):
+                assert run("touch", f"{folder}/mine", user=user).returncode, f"{user} makes a file in {folder}"
+    with checks("the daemon may not become another user or root"):
+        expect_in("NoNewPrivs:\t1", must("sh", "-c", "cat /proc/$(systemctl show -P MainPID imud)/status"), "status")

@@ -1,0 +1,164 @@
+"""The unit's confinement: systemd's own score, what the process may not do, and that devices of all kinds open."""
+
+import json
+import re
+from pathlib import Path
+
+from tests.lab_debian.guest.checks import Checks, Failed, expect, expect_in, wait_until
+from tests.lab_debian.guest.system import (
+    Host,
+    configure,
+    confined,
+    device,
+    journal,
+    mark,
+    must,
+    pid,
+    run,
+    start_service,
+    wait_streaming,
+)
+
+SCORE_MAX = 2.1
+"""Of the rest 0.4 are for adjtimex, which tells whether the clock is synchronised (docs/operate.md)."""
+FORBIDDEN = {
+    "write to /usr": "open('/usr/probe', 'w')",
+    "write to /etc": "open('/etc/probe', 'w')",
+    "read a home": "import os; os.listdir('/root')",
+    "see other users' processes": "import os; assert os.path.exists('/proc/1/cmdline')",
+    "read the kernel's log": "open('/dev/kmsg')",
+    "open a disk": "import os; os.open('/dev/vda', os.O_RDONLY)",
+    "open memory": "import os; os.open('/dev/mem', os.O_RDONLY)",
+    "set the clock": "import time; time.clock_settime(time.CLOCK_REALTIME, time.time())",
+    "make a namespace": "import ctypes; l = ctypes.CDLL(None, use_errno=True); assert not l.unshare(0x10000000)",
+    "map memory that is written and executed": "import mmap; mmap.mmap(-1, 4096, prot=7)",
+    "open a packet socket": "import socket; socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)",
+    "load a module": "import ctypes; l = ctypes.CDLL(None, use_errno=True); assert not l.syscall(175, 0, 0, 0)",
+    "make a node": "import os, stat; os.mknod('/var/lib/imud/n', stat.S_IFCHR | 0o600, os.makedev(1, 3))",
+    "make a set-uid file": "import os; open('/var/lib/imud/s', 'w'); os.chmod('/var/lib/imud/s', 0o4755)",
+}
+"""What the confined user must not be able to do, as Python that raises when it is refused."""
+NEEDED = {
+    "ask the kernel for the clock's state": (
+        "import ctypes; b = ctypes.create_string_buffer(512); assert ctypes.CDLL(None).adjtimex(b) >= 0"
+    ),
+    "give its files to the group that may read": (
+        "import os; f = '/var/lib/imud/probe'; open(f, 'w').close(); os.chown(f, -1, os.getgid()); os.unlink(f)"
+    ),
+    "read when the machine was started, for the metrics of the process": "open('/proc/stat').read()",
+}
+"""What imud does besides opening devices; a setting that breaks it would be seen late or never."""
+NODES = ("/dev/ttyUSB0", "/dev/ttyS1", "/dev/ttyAMA0", "/dev/i2c-0", "/dev/spidev0.0", "/dev/gpiochip0")
+TRY_ALL = """
+import json, os
+said = {}
+for name, code in SNIPPETS.items():
+    ours, theirs = os.pipe()
+    if (child := os.fork()) == 0:
+        why = ''
+        try:
+            exec(code, {})
+        except BaseException as error:
+            why = f'{type(error).__name__}: {error}'
+        os.write(theirs, why.encode())
+        os._exit(0)
+    os.close(theirs)
+    said[name] = open(ours).read()
+    ended = os.waitpid(child, 0)[1]
+    if ended:
+        said[name] = f'Error: ended with {ended}'
+print(json.dumps(said), flush=True)
+"""
+NOT_CONFINING = (
+    *("Type", "Exec", "Restart", "Watchdog", "Notify", "User", "Group", "Timeout", "Runtime", "Success"),
+    *("After", "Wants", "Before", "Condition", "StartLimit", "Description", "Documentation", "WantedBy"),
+)
+"""Begins of names of the unit's settings that a transient unit does not take, or gets otherwise."""
+OPEN = """
+import errno, os
+try:
+    os.close(os.open('{node}', os.O_RDWR | os.O_NONBLOCK | os.O_NOCTTY))
+except OSError as error:
+    if error.errno != errno.EBUSY:  # allowed, and the daemon has it for itself
+        raise
+"""
+
+
+def check(checks: Checks, _host: Host) -> None:
+    """Everything under the settings of the unit as it is installed."""
+    with checks(f"systemd-analyze security gives at most {SCORE_MAX}"):
+        said = must("systemd-analyze", "security", "--no-pager", "imud.service")
+        found = re.search(r"Overall exposure level for imud\.service: ([\d.]+)", said)
+        if found is None:
+            raise Failed(said)
+        checks.figure("exposure (systemd-analyze security)", float(found[1]), "of 10")
+        open_points = [line for line in said.splitlines() if line.startswith("✗")]
+        print("\n".join(f"       {line[:110]}" for line in open_points), flush=True)
+        assert float(found[1]) <= SCORE_MAX, f"score {found[1]}"
+    with checks("the process has no capability, a system call filter and no new privileges"):
+        status = Path(f"/proc/{pid()}/status").read_text()
+        for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"):
+            expect(name, re.search(rf"{name}:\t(\w+)", status)[1], "0" * 16)  # type: ignore[index]
+        expect_in("Seccomp:\t2", status, "status")
+        expect_in("NoNewPrivs:\t1", status, "status")
+    settings = properties()
+    nodes = {node: OPEN.format(node=node) for node in present_nodes(checks)}
+    results = tried({**FORBIDDEN, **NEEDED, **nodes}, settings)
+    for name in FORBIDDEN:
+        with checks(f"confined as the unit is, a program may not {name}"):
+            if "Error" not in results[name]:
+                raise Failed(results[name] or "it could")
+    for name in NEEDED:
+        with checks(f"confined as the unit is, a program may {name}"):
+            expect("result", results[name], "")
+    for node in nodes:
+        with checks(f"{node} opens under the unit's settings"):
+            expect("result", results[node], "")
+    check_buses(checks)
+
+
+def present_nodes(checks: Checks) -> list[str]:
+    """One node of each kind that this machine has."""
+    must("modprobe", "i2c-dev")
+    run("modprobe", "i2c-stub", "chip_addr=0x18")
+    must("udevadm", "settle")
+    for node in NODES:
+        if not Path(node).exists():
+            checks.skip(f"{node} opens under the unit's settings", "this machine has none")
+    return [node for node in NODES if Path(node).exists()]
+
+
+def tried(snippets: dict[str, str], settings: list[str]) -> dict[str, str]:
+    """Run each piece of Python in a process of its own under the settings; what it raised, empty for nothing."""
+    said = confined(f"SNIPPETS = {snippets!r}\n{TRY_ALL}", *settings)
+    for line in said.splitlines():
+        if line.startswith("{"):
+            found: dict[str, str] = json.loads(line)
+            return found
+    raise Failed(said or "the confined program said nothing")
+
+
+def check_buses(checks: Checks) -> None:
+    """The daemon itself opens an I2C bus and says that nothing answers, not that it may not."""
+    if not Path("/dev/i2c-0").exists():
+        checks.skip("the daemon opens an I2C bus", "this machine has none")
+        return
+    with checks("the daemon opens an I2C bus and finds nothing there, which is not a right that is missing"):
+        before = Path("/etc/imud.yaml").read_text()
+        since = mark()
+        configure(before + "  keel:\n    driver: imu61x-i2c\n    i2c: {bus: 0, address: 24, rate_hz: 1}\n")
+        start_service()
+        wait_until(lambda: (device("keel") or {}).get("problem"), "a problem of the device")
+        problem = device("keel")["problem"]  # type: ignore[index]
+        if "may not" in problem or "may not be opened" in journal(since):
+            raise Failed(problem)
+        configure(before)
+        must("systemctl", "reload", "imud")
+        wait_streaming("usb")
+
+
+def properties() -> list[str]:
+    """The settings of the unit's [Service] section that confine, for a transient unit."""
+    lines = must("systemctl", "cat", "imud.service").splitlines()
+    settings = [line for line in lines if re.match(r"[A-Z]\w+=", line)]
+    return [line for line in settings if not line.startswith(NOT_CONFINING)]

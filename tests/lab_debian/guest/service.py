@@ -1,0 +1,172 @@
+"""The life of the service: start, watchdog, reload, kill, a configuration that cannot be used."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from tests.lab_debian.guest.checks import Checks, expect, expect_in, wait_until
+from tests.lab_debian.guest.system import (
+    PYTHON,
+    RINGS,
+    UNIT,
+    Host,
+    ask,
+    background,
+    configure,
+    device,
+    journal,
+    mark,
+    must,
+    pid,
+    run,
+    shown,
+    start_service,
+    wait_streaming,
+)
+
+USB = """\
+devices:
+  usb:
+    driver: hipnuc-uart
+    uart: {port: /dev/ttyUSB0, baud: 115200}
+"""
+CAN = """\
+  can:
+    driver: hipnuc-canopen
+    options: {node: 8}
+    socketcan: {interface: vcan0}
+"""
+CAN_RATE_HZ = 20
+START_LIMIT_S = 400
+"""Above TimeoutStartSec=, so that systemd's own limit is the one that is seen."""
+
+
+def check(checks: Checks, host: Host) -> None:
+    """All of it."""
+    check_streaming(checks, host)
+    check_reload(checks)
+    check_ends(checks)
+    check_refused_starts(checks)
+
+
+def check_reload(checks: Checks) -> None:
+    """`systemctl reload`, with a file that can be used and with one that cannot."""
+    with checks("reload of a changed file keeps the process and the devices that did not change"):
+        before, seq = pid(), newest("usb")
+        configure(USB)
+        must("systemctl", "reload", UNIT)
+        wait_until(lambda: device("can") is None, "the device that is not in the file any more is gone")
+        expect("process", pid(), before)
+        assert newest("usb") >= seq, "the device that did not change began anew"
+        configure(USB + CAN)
+        must("systemctl", "reload", UNIT)
+        wait_streaming("can")
+    with checks("reload of a file with a mistake changes nothing and is in the log"):
+        before, since = pid(), mark()
+        configure(USB.replace("baud:", "bauds:") + CAN)
+        run("systemctl", "reload", UNIT)
+        wait_until(lambda: "bauds" in journal(since), "the mistake in the log")
+        expect("process", pid(), before)
+        expect("active", shown("ActiveState"), "active")
+        wait_streaming("usb")
+        configure(USB + CAN)
+        must("systemctl", "reload", UNIT)
+
+
+def check_ends(checks: Checks) -> None:
+    """The ends of a daemon: hung, killed, stopped."""
+    with checks("a daemon that hangs is killed by the watchdog and started again"):
+        before, restarts, since = pid(), int(shown("NRestarts")), mark()
+        os.kill(before, signal.SIGSTOP)
+        start_s = time.monotonic()
+        wait_until(lambda: int(shown("NRestarts")) > restarts, "another start")
+        wait_until(lambda: pid() not in (0, before), "another process")
+        checks.figure("SIGSTOP to another process", time.monotonic() - start_s, "s")
+        wait_until(lambda: "watchdog" in journal(since).lower(), "the watchdog in the journal")
+        wait_streaming("usb")
+        wait_streaming("can")
+    with checks("a daemon that is killed is started again, with its rings"):
+        before = pid()
+        run("systemctl", "kill", "--signal", "SIGKILL", UNIT)
+        start_s = time.monotonic()
+        wait_until(lambda: pid() not in (0, before), "another process")
+        wait_streaming("usb")
+        checks.figure("SIGKILL to samples again", time.monotonic() - start_s, "s")
+        expect("rings", sorted(path.name for path in RINGS.iterdir()), ["imud.can", "imud.usb"])
+    with checks("a stop is clean and leaves no ring and no socket"):
+        must("systemctl", "stop", UNIT)
+        expect("result", shown("Result"), "success")
+        assert not Path("/run/imud").exists(), "the runtime directory is left"
+
+
+def check_refused_starts(checks: Checks) -> None:
+    """Starts that must fail once, and starts that must not fail."""
+    with checks("a configuration that cannot be used is not tried again"):
+        configure("devices: {}: {}\n")
+        assert run("systemctl", "start", UNIT, limit_s=START_LIMIT_S).returncode, "it started"
+        time.sleep(2 * 2.5)  # RestartSec= is 2 s
+        expect("state", shown("ActiveState"), "failed")
+        expect("exit status", shown("ExecMainStatus"), "78")
+        expect("restarts", shown("NRestarts"), "0")
+    with checks("a metrics port that is taken does not end the service"):
+        background("busyport", "/usr/bin/python3", "-c", BUSY_PORT)
+        wait_until(lambda: "9321" in run("ss", "--listening", "--tcp", "--numeric").stdout, "a listener on the port")
+        configure(USB + CAN)
+        start_service()
+        wait_streaming("usb")
+        must("systemctl", "stop", "busyport")
+        wait_until(metrics, "metrics once the port is free")
+
+
+BUSY_PORT = """
+import signal, socket
+listener = socket.create_server(("127.0.0.1", 9321))
+signal.pause()
+"""
+
+
+def check_streaming(checks: Checks, _host: Host) -> None:
+    """A start with a sensor on USB and one on CAN, up to samples in every output."""
+    with checks("a virtual CAN bus with a simulated module"):
+        must("modprobe", "vcan")
+        if run("ip", "link", "show", "vcan0").returncode:
+            must("ip", "link", "add", "dev", "vcan0", "type", "vcan")
+            must("ip", "link", "set", "vcan0", "up")
+        command = (
+            f"sleep infinity | {PYTHON} -m imud.sim --device hipnuc-canopen --rate {CAN_RATE_HZ} --interface vcan0"
+        )
+        background("simcan", "sh", "-c", command)
+    with checks("the service starts and is READY"):
+        configure(USB + CAN)
+        start_s = time.monotonic()
+        must("systemctl", "enable", "--now", UNIT, limit_s=START_LIMIT_S)
+        checks.figure("start to READY", time.monotonic() - start_s, "s")
+        expect("active", shown("ActiveState"), "active")
+    with checks("both sensors stream"):
+        start_s = time.monotonic()
+        usb = wait_streaming("usb")
+        checks.figure("READY to samples", time.monotonic() - start_s, "s")
+        wait_streaming("can")
+        wait_until(lambda: (device("usb") or usb)["identity"].get("product"), "the product of the module on USB")
+    with checks("systemctl status says how many run"):
+        wait_until(lambda: shown("StatusText") == "2 of 2 devices running.", f"two: {shown('StatusText')}")
+    with checks("rings, socket and metrics have the samples"):
+        must(PYTHON, "-c", "from imud.client import Ring\nwith Ring('usb') as ring: assert ring.latest() is not None")
+        must("sh", "-c", "imud devices | grep --quiet 'usb.*running'")
+        wait_until(metrics, "metrics")
+    with checks("the log has priorities and begins with the version"):
+        said = must("journalctl", "--no-pager", "--output", "cat", "--unit", UNIT, "--priority", "info..info")
+        expect_in("has started", said, "log")
+        expect("lines with a priority in their text", [line for line in journal().splitlines() if line[:1] == "<"], [])
+
+
+def newest(name: str) -> int:
+    """Sequence number of the newest sample."""
+    return int(ask("poll", devices=[name])["samples"][0]["seq"])
+
+
+def metrics(where: str = "http://127.0.0.1:9321") -> bool:
+    """Whether the metrics answer and have samples of the sensor on USB."""
+    code = f"import urllib.request; print(urllib.request.urlopen('{where}/metrics', timeout=20).read().decode())"
+    return 'imud_samples_total{device="usb"' in run("/usr/bin/python3", "-c", code).stdout

@@ -1,0 +1,174 @@
+"""The guest's system as the checks see and change it: programs, units, users, the daemon's socket, the USB adapter."""
+
+import json
+import socket
+import subprocess
+import time
+from pathlib import Path
+from typing import IO, Any
+
+from tests.lab_debian.guest.checks import LIMIT_S, Failed, wait_until
+
+SHARE = Path("/run/lab")
+CONFIG = Path("/etc/imud.yaml")
+EXAMPLE = Path("/run/imud-example.yaml")
+"""The configuration as the package brought it."""
+SOCKET = "/run/imud/imud.sock"
+RINGS = Path("/run/imud/shm")
+PYTHON = "/usr/lib/imud/bin/python3"
+"""The package's own interpreter: it has imud, clients and simulators."""
+UNIT = "imud.service"
+NODE = Path("/dev/ttyUSB0")
+REQUESTS = "/dev/virtio-ports/requests"
+FRESH_NS = 1_000_000_000
+"""A sample that is younger was made just now."""
+
+
+def run(*command: str, limit_s: float = LIMIT_S, user: str = "", text: str = "") -> subprocess.CompletedProcess[str]:
+    """Run a program to its end, as `user` where one is given, with its two outputs as one."""
+    words = ["runuser", "-u", user, "--", *command] if user else list(command)
+    return subprocess.run(
+        words, input=text, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=limit_s, check=False
+    )
+
+
+def must(*command: str, limit_s: float = LIMIT_S) -> str:
+    """Run a program that must succeed; return its output. Failed with it otherwise."""
+    result = run(*command, limit_s=limit_s)
+    if result.returncode:
+        raise Failed(f"{' '.join(command)} ended with {result.returncode}: {result.stdout.strip()[-1500:]}")
+    return result.stdout
+
+
+def shown(name: str, unit: str = UNIT) -> str:
+    """A property of a unit."""
+    return must("systemctl", "show", "--value", "--property", name, unit).strip()
+
+
+def pid() -> int:
+    """Main process of the service; 0 while there is none."""
+    return int(shown("MainPID"))
+
+
+def configure(text: str) -> None:
+    """Write the daemon's configuration."""
+    CONFIG.write_text(text, encoding="utf-8")
+
+
+def journal(since: str = "") -> str:
+    """Messages of the service since a mark (`mark()`)."""
+    must("journalctl", "--sync")
+    after = ["--after-cursor", since] if since else []
+    return must("journalctl", "--no-pager", "--output", "cat", "--unit", UNIT, *after)
+
+
+def mark() -> str:
+    """The journal's end, for `journal`."""
+    must("journalctl", "--sync")
+    last = must("journalctl", "--no-pager", "--lines", "1", "--output", "json", "--output-fields", "MESSAGE").strip()
+    return str(json.loads(last)["__CURSOR"])
+
+
+def ask(method: str, **params: object) -> Any:
+    """The daemon's answer to one request. Raises OSError when nobody listens, Failed for an error."""
+    with socket.socket(socket.AF_UNIX) as sock, sock.makefile("r", encoding="utf-8") as lines:
+        sock.settimeout(LIMIT_S)
+        sock.connect(SOCKET)
+        request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+        sock.sendall(json.dumps(request).encode() + b"\n")
+        for line in lines:
+            message = json.loads(line)
+            if message.get("id") == 1:
+                if "error" in message:
+                    raise Failed(f"{method}: {message['error']}")
+                return message["result"]
+    raise Failed(f"{method}: the daemon closed the connection")
+
+
+def device(name: str) -> dict[str, Any] | None:
+    """Status of one device; None while the daemon does not answer or does not have it."""
+    try:
+        return next((found for found in ask("status")["devices"] if found["name"] == name), None)
+    except OSError:
+        return None
+
+
+def streams(name: str) -> dict[str, Any] | None:
+    """Status of the device when it runs and its newest sample is less than a second old; None otherwise."""
+    found = device(name)
+    if found is None or found["state"] != "running":
+        return None
+    try:
+        newest = ask("poll", devices=[name])
+    except OSError:
+        return None
+    fresh = any(newest["now_ns"] - sample["t_ns"] < FRESH_NS for sample in newest["samples"])
+    return found if fresh else None
+
+
+def wait_streaming(name: str, limit_s: float = LIMIT_S) -> dict[str, Any]:
+    """Status of the device once it streams."""
+    return wait_until(lambda: streams(name), f"samples of {name}: {(device(name) or {}).get('problem')}", limit_s)
+
+
+def start_service() -> None:
+    """Start the service from scratch, whatever it did before."""
+    run("systemctl", "reset-failed", UNIT)
+    must("systemctl", "restart", UNIT, limit_s=400)
+
+
+class Host:
+    """The program on the host that has the adapter's cable in its hand."""
+
+    def __init__(self) -> None:
+        self._port: IO[bytes] = open(REQUESTS, "r+b", buffering=0)  # noqa: SIM115 - open as long as the run
+
+    def ask(self, word: str) -> None:
+        """Have it done. Failed with its reason if it was not."""
+        self._port.write(f"{word}\n".encode())
+        reply = b""
+        while not reply.endswith(b"\n"):
+            reply += self._port.read(1)
+        if reply != b"ok\n":
+            raise Failed(f"{word}: the rig answered {reply.decode()!r}")
+
+    def unplug(self) -> None:
+        """Pull the adapter out; return when its node is gone."""
+        self.ask("unplug")
+        wait_until(lambda: not NODE.exists(), f"{NODE} gone")
+
+    def plug(self) -> float:
+        """Plug the adapter in; return CLOCK_MONOTONIC in seconds when its node was there, within 5 ms."""
+        self.ask("plug")
+        give_up_s = time.monotonic() + LIMIT_S
+        while not NODE.exists():
+            if time.monotonic() > give_up_s:
+                raise Failed(f"{NODE} did not come back")
+            time.sleep(0.005)
+        return time.monotonic()
+
+
+def background(unit: str, *command: str, properties: tuple[str, ...] = ()) -> None:
+    """Start a program as a transient service that later checks can stop by name."""
+    options = [word for text in properties for word in ("--property", text)]
+    must("systemd-run", "--quiet", "--collect", f"--unit={unit}", *options, *command)
+
+
+def confined(code: str, *properties: str, user: str = "imud") -> str:
+    """Output of a piece of Python that runs as the service's user and groups, with further properties of a unit."""
+    options = [f"User={user}", f"Group={user}", *properties]
+    words = [word for text in options for word in ("--property", text)]
+    return run("systemd-run", "--quiet", "--wait", "--pipe", "--collect", *words, "/usr/bin/python3", "-c", code).stdout
+
+
+def add_user(name: str, *groups: str) -> None:
+    """A user for the checks."""
+    if run("id", name).returncode:
+        must("useradd", "--create-home", name)
+    for group in groups:
+        must("usermod", "--append", "--groups", group, name)
+
+
+def uptime_s() -> float:
+    """Seconds since the guest's kernel started."""
+    return float(Path("/proc/uptime").read_text().split()[0])

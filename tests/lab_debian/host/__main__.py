@@ -1,0 +1,185 @@
+"""`tests/lab_debian/run`: boots Debian releases under QEMU, installs the package of imud, and runs the guest's checks.
+
+Exit status: 0 all checks passed, 1 some failed, 10 if the rig itself failed, with one line on standard error that says
+why; 130 and 143 after SIGINT and SIGTERM.
+"""
+
+import argparse
+import contextlib
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from tests.lab.host import guest, results
+from tests.lab.host.__main__ import LAB_FAILED, Parser, terminate
+from tests.lab.host.environment import ROOT
+from tests.lab.host.errors import HungGuest, LabError
+from tests.lab_debian.host import image, packages, requests
+from tests.lab_debian.host.machine import SENSOR, DebianMachine
+from tests.lab_debian.host.release import AMD64, ARM64, Release
+
+GUEST = Path(__file__).resolve().parents[1] / "guest"
+LIMITS = guest.Limits(total_s=3600.0, boot_s=1800.0, silence_s=300.0)
+"""On a busy host an emulated arm64 takes minutes to its first sign of life."""
+SIMULATOR_LIMIT_S = 60.0
+POLL_S = 0.05
+SIMULATED_RATE_HZ = 20
+"""QEMU's adapter buffers 384 bytes: four frames, 200 ms of a host that stalls."""
+BYTECODE = "__pycache__"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = Parser(prog="tests/lab_debian/run", allow_abbrev=False, description="Checks the package on Debian.")
+    options.add_argument("--ci", action="store_true", help="where it cannot run say so and succeed")
+    options.add_argument("--arm64", action="store_true", help="emulated arm64 and unit tests there, instead of amd64")
+    options.add_argument("--suite", choices=[release.suite for release in AMD64], help="only this release")
+    options.add_argument("--build-only", action="store_true", help="make images and packages, do not boot")
+    options.add_argument("--package", type=Path, metavar="DEB", help="install this package instead of building one")
+    options.add_argument("--exec", metavar="COMMAND", help="run this shell command in the guest instead of the checks")
+    options.add_argument("--venv", type=Path, default=ROOT / ".venv", help="default: .venv")
+    options.add_argument("--output", type=Path, default=ROOT / "build" / "lab-debian", help="default: build/lab-debian")
+    options.add_argument("only", nargs="*", metavar="GROUP", help="groups of checks to run, such as: replug rights")
+    return options
+
+
+def say(line: str) -> None:
+    """One line about the rig itself; standard output belongs to the guest."""
+    print(f"lab-debian: {line}", file=sys.stderr, flush=True)
+
+
+def chosen(options: argparse.Namespace) -> list[Release]:
+    """The releases to run. LabError if there is none of that name."""
+    found = [release for release in (ARM64 if options.arm64 else AMD64) if options.suite in (None, release.suite)]
+    if not found:
+        raise LabError(f"there is no {options.suite} for arm64, only {', '.join(r.suite for r in ARM64)}")
+    return found
+
+
+def program(options: argparse.Namespace, release: Release) -> str:
+    """What the guest runs."""
+    if options.exec:
+        return f"{options.exec}\n"
+    groups = " ".join([release.architecture, *options.only])
+    return f"exec python3 -B -m tests.lab_debian.guest {groups}\n"
+
+
+@contextlib.contextmanager
+def simulator(python: Path, node: Path) -> Iterator[int]:
+    """Process number of a simulated sensor behind the pseudo-terminal `node`. LabError if it does not start."""
+    command = [str(python), "-m", "imud.sim", "--path", str(node), "--rate", str(SIMULATED_RATE_HZ)]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT
+    )
+    try:
+        give_up_s = time.monotonic() + SIMULATOR_LIMIT_S
+        while not node.exists():
+            if process.poll() is not None or time.monotonic() >= give_up_s:
+                raise LabError(f"the simulated sensor did not start: {' '.join(command)}")
+            time.sleep(POLL_S)
+        yield process.pid
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdin:
+            process.stdin.close()
+
+
+def fill(folder: Path, release: Release, package: Path, options: argparse.Namespace) -> None:
+    """Put into the run's folder what the guest takes from there."""
+    shutil.copytree(GUEST, folder / GUEST.relative_to(ROOT), ignore=shutil.ignore_patterns(BYTECODE))
+    shutil.copy(package, folder / "imud.deb")
+    packages.next_version(package, folder)
+    (folder / "release").write_text(f"{release.suite}\n", encoding="ascii")
+    (folder / "script").write_text(program(options, release), encoding="utf-8")
+    if release.architecture == "arm64":
+        for part in ("tests", "imud", "etc", "docs", "systemd"):
+            shutil.copytree(ROOT / part, folder / "tree" / part, ignore=shutil.ignore_patterns(BYTECODE, "corpus"))
+        for file in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
+            shutil.copy(ROOT / file, folder / "tree" / file)
+
+
+def boot(options: argparse.Namespace, release: Release, made: image.Image, package: Path) -> int:
+    """One run of one guest; its status."""
+    output = options.output / release.name
+    failed, start_s = True, time.monotonic()
+    with results.run_folder(output) as folder, contextlib.ExitStack() as stack:
+        fill(folder, release, package, options)
+        sockets = stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-lab-"))
+        machine = DebianMachine(release, made, folder, Path(sockets))
+        python = options.venv.absolute() / "bin" / "python"
+        try:
+            with simulator(python, Path(sockets) / SENSOR) as sensor, requests.answered(Path(sockets), sensor):
+                status = guest.run(
+                    lambda _uart_fds, monitor_fd: machine.command(monitor_fd),
+                    guest.Folder(folder),
+                    LIMITS,
+                    guest.to_terminal,
+                )
+            failed = status != 0
+        finally:
+            kept = keep(folder, output, failed)
+            say(
+                f"{release.name}: the guest ran {time.monotonic() - start_s:.0f} s" + (f"; kept {kept}" if kept else "")
+            )
+    return status
+
+
+def keep(folder: Path, output: Path, failed: bool) -> str:
+    """Keep the guest's journal and results, and after a failure the logs of kernel and QEMU; what was kept for that."""
+    for name in ("journal.log", "results.json"):
+        (output / name).unlink(missing_ok=True)
+        if (folder / name).exists():
+            shutil.copy(folder / name, output / name)
+    logs = results.keep(folder, output, failed)
+    journal = [output / "journal.log"] if failed and (output / "journal.log").exists() else []
+    return ", ".join(str(path) for path in logs + journal)
+
+
+def lab(arguments: Sequence[str]) -> int:
+    """Everything; LabError for what is the rig's own failure."""
+    options = parser().parse_args(arguments)
+    releases = chosen(options)
+    for release in releases:
+        if why := packages.obstacle(release):
+            if not options.ci:
+                raise LabError(why)
+            say(f"left out: {why}")
+            return 0
+    worst = 0
+    for release in releases:
+        start_s = time.monotonic()
+        made = image.built(release, say)
+        package = options.package or packages.build(release, options.venv / "bin" / "python")
+        say(f"{release.name}: image and package after {time.monotonic() - start_s:.0f} s")
+        if options.build_only:
+            continue
+        try:
+            status = boot(options, release, made, package)
+        except HungGuest as error:
+            say(f"{error}; booting once more")
+            status = boot(options, release, made, package)
+        worst = max(worst, status)
+    return worst
+
+
+def main() -> int:
+    """The program."""
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        return lab(sys.argv[1:])
+    except LabError as error:
+        say(str(error))
+        return LAB_FAILED
+    except KeyboardInterrupt:
+        say("interrupted")
+        return 128 + signal.SIGINT
+
+
+if __name__ == "__main__":
+    sys.exit(main())

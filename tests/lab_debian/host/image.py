@@ -1,0 +1,225 @@
+"""Makes what QEMU boots, once per change of its inputs: a disk with Debian, its kernel, an initramfs.
+
+Packages come from where the host's apt takes them. Nothing of the guest runs but Debian's own maintainer scripts in a
+chroot; for a foreign architecture the host's kernel runs them by qemu-user (binfmt_misc). The kernel package is only
+unpacked, and the initramfs is made here: initramfs-tools takes minutes where it is emulated. Needs root.
+"""
+
+import gzip
+import lzma
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.lab.host import cache
+from tests.lab.host.errors import LabError
+from tests.lab_debian.host import release as release_module
+from tests.lab_debian.host.release import BOOT_MODULES, MODULES, Release
+
+ROOT_FILES = Path(__file__).resolve().parents[1] / "root"
+"""Copied over the guest's root."""
+DISK = "disk.ext4"
+KERNEL = "kernel"
+INITRAMFS = "initramfs.gz"
+DISK_BYTES = 2 << 30
+"""Of a sparse file; what is written goes elsewhere (`snapshot=on`)."""
+NEEDED_BYTES = 3 << 30
+STEP_LIMIT_S = 40 * 60
+CLEAN = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LC_ALL": "C"}
+"""The environment of every step: the host's own settings (of pip, of apt) stay out of the guest."""
+BINFMT = Path("/proc/sys/fs/binfmt_misc")
+FOREIGN = {"arm64": "aarch64"}
+"""Architectures that the host has not, and their names for qemu-user."""
+
+MASKED = (
+    *("serial-getty@.service", "getty@.service", "getty-static.service", "console-getty.service"),
+    *("apt-daily.timer", "apt-daily-upgrade.timer", "dpkg-db-backup.timer", "fstrim.timer", "e2scrub_all.timer"),
+    *("e2scrub_reap.service", "systemd-binfmt.service", "proc-sys-fs-binfmt_misc.automount"),
+    *(
+        "gpsd.service",
+        "gpsd.socket",
+        "chrony.service",
+        "systemd-pcrphase.service",
+        "systemd-networkd-wait-online.service",
+    ),
+)
+"""Units that cost an emulated machine time or disturb the checks, which start their own gpsd and chronyd."""
+
+INIT = """\
+#!/bin/busybox sh
+/bin/busybox mount -t devtmpfs dev /dev
+/bin/busybox mount -t proc proc /proc
+for module in /modules/*; do /bin/busybox insmod $module || echo "lab init failed: $module cannot be loaded"; done
+while [ ! -e /dev/vda ]; do /bin/busybox usleep 20000; done
+/bin/busybox mount -t ext4 -o rw,noatime /dev/vda /new || echo "lab init failed: /dev/vda cannot be mounted"
+/bin/busybox umount /proc
+/bin/busybox mount --move /dev /new/dev
+exec /bin/busybox switch_root /new /lib/systemd/systemd
+"""
+
+
+@dataclass(frozen=True)
+class Image:
+    """What QEMU boots."""
+
+    disk: Path
+    kernel: Path
+    initramfs: Path
+
+
+def built(release: Release, say: Callable[[str], None]) -> Image:
+    """The image of a release, made if it is not in the cache. LabError says why it cannot be made."""
+
+    def make(folder: Path) -> None:
+        say(f"{release.name}: making the image (some minutes, once)")
+        make_image(release, folder)
+
+    folder = cache.get(f"debian-{release.name}-{key(release)}", make, NEEDED_BYTES, say, cache.cache_root("-debian"))
+    return Image(folder / DISK, folder / KERNEL, folder / INITRAMFS)
+
+
+def key(release: Release) -> str:
+    """Changes with everything that shapes an image: its recipe, its lists, the files that are copied into it."""
+    files = sorted(path for path in ROOT_FILES.rglob("*") if path.is_file())
+    parts = [part for path in files for part in (str(path.relative_to(ROOT_FILES)).encode(), path.read_bytes())]
+    recipe = [Path(path).read_bytes() for path in (__file__, release_module.__file__)]
+    return cache.key_of(release.name.encode(), *recipe, *parts)
+
+
+def make_image(release: Release, folder: Path) -> None:
+    """Fill `folder` with disk, kernel and initramfs."""
+    root, tree, log = folder / "root", folder / "tree", folder / "build.log"
+    if release.architecture != "amd64" and not BINFMT.joinpath(f"qemu-{FOREIGN[release.architecture]}").exists():
+        step(["sh", "-c", f"mountpoint --quiet {BINFMT} || mount -t binfmt_misc binfmt_misc {BINFMT}"], log)
+        step(["update-binfmts", "--enable", f"qemu-{FOREIGN[release.architecture]}"], log)
+    try:
+        bootstrap(release, root, log, "minbase", release.packages)
+        bootstrap(release, tree, log, "extract", (f"linux-image-{release.architecture}", "busybox-static"))
+        if not (tree / "lib").exists():
+            (tree / "lib").symlink_to("usr/lib")  # where trixie's kernel package has its modules
+        kernel = next((tree / "boot").glob("vmlinuz-*"))
+        version = kernel.name.removeprefix("vmlinuz-")
+        step(["depmod", "--basedir", str(tree), version], log)
+        shutil.copy(kernel, folder / KERNEL)
+        write_initramfs(tree, version, folder / "early", folder / INITRAMFS, log)
+        copy_modules(tree, version, root, log)
+        prepare_root(root)
+        make_disk(root, folder / DISK, log)
+    finally:
+        for part in (root, tree, folder / "early"):
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def bootstrap(release: Release, folder: Path, log: Path, variant: str, packages: tuple[str, ...]) -> None:
+    """Put `packages` and what they need into `folder`, by mmdebstrap."""
+    main, security = archives()
+    suites = ((main, release.suite), (main, f"{release.suite}-updates"), (security, f"{release.suite}-security"))
+    sources = "".join(f"deb {uri} {suite} main\n" for uri, suite in suites)
+    command = [
+        *("mmdebstrap", "--verbose", "--mode=root", f"--variant={variant}", f"--architectures={release.architecture}"),
+        *(f"--include={','.join(packages)}", '--aptopt=Acquire::Languages "none"'),
+        *('--aptopt=APT::Install-Recommends "false"', '--aptopt=Acquire::Check-Valid-Until "false"'),
+        *(f"--dpkgopt=path-exclude=/usr/share/{part}/*" for part in ("man", "doc", "locale")),
+        *(release.suite, str(folder), "-"),
+    ]
+    step(command, log, sources)
+
+
+def archives() -> tuple[str, str]:
+    """URIs of Debian's archive and of its security updates, as the host's apt has them. LabError if it has none."""
+    query = ["apt-get", "indextargets", "--format", "$(CODENAME) $(REPO_URI)", "Created-By: Packages", "Origin: Debian"]
+    rows = subprocess.run(query, capture_output=True, text=True, check=False).stdout.splitlines()
+    uris = dict(row.split(" ", 1) for row in reversed(rows))
+    main = next((uri for name, uri in uris.items() if "-" not in name), "")
+    security = next((uri for name, uri in uris.items() if name.endswith("-security")), "")
+    if not main or not security:
+        raise LabError("apt knows no Debian archive, or none with security updates (apt-get update)")
+    return main, security
+
+
+def write_initramfs(tree: Path, version: str, work: Path, out: Path, log: Path) -> None:
+    """Write an initramfs that loads BOOT_MODULES, mounts /dev/vda and starts its systemd."""
+    for name in ("bin", "dev", "proc", "new", "modules"):
+        (work / name).mkdir(parents=True)
+    busybox = next(path for path in (tree / "bin/busybox", tree / "usr/bin/busybox") if path.exists())
+    shutil.copy(busybox, work / "bin/busybox")
+    for number, module in enumerate(files_of(tree, version, BOOT_MODULES)):
+        (work / "modules" / f"{number:03}.ko").write_bytes(unpacked(module))
+    (work / "init").write_text(INIT, encoding="ascii")
+    (work / "init").chmod(0o755)
+    names = "\n".join(["."] + [str(path.relative_to(work)) for path in sorted(work.rglob("*"))])
+    archive = work.with_suffix(".cpio")
+    step(["cpio", "--quiet", "--create", "--format=newc", "--owner=0:0", f"--file={archive}"], log, names, work)
+    out.write_bytes(gzip.compress(archive.read_bytes(), 1))
+    archive.unlink()
+
+
+def files_of(tree: Path, version: str, modules: tuple[str, ...]) -> list[Path]:
+    """Files of the modules and of what they need, in the order of loading; what the kernel has built in is left out."""
+    found: list[Path] = []
+    for name in modules:
+        query = ["modprobe", "--dirname", str(tree), "--set-version", version, "--show-depends", name]
+        listing = subprocess.run(query, capture_output=True, text=True, check=False, env=CLEAN).stdout
+        paths = [Path(line.split()[1]) for line in listing.splitlines() if line.startswith("insmod ")]
+        found += [path for path in paths if path not in found]
+    return found
+
+
+def unpacked(module: Path) -> bytes:
+    """A module's bytes; trixie packs them."""
+    return lzma.decompress(module.read_bytes()) if module.suffix == ".xz" else module.read_bytes()
+
+
+def copy_modules(tree: Path, version: str, root: Path, log: Path) -> None:
+    """Copy MODULES and BOOT_MODULES with what they need into the root file system."""
+    source = tree / "lib/modules" / version
+    target = root / "usr/lib/modules" / version
+    for module in files_of(tree, version, (*BOOT_MODULES, *MODULES)):
+        place = target / module.resolve().relative_to(source.resolve())
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(module, place)
+    for name in ("modules.builtin", "modules.builtin.modinfo", "modules.order"):
+        shutil.copy(source / name, target / name)
+    step(["depmod", "--basedir", str(root), version], log)
+
+
+def prepare_root(root: Path) -> None:
+    """Make the root file system start the rig's program and nothing that it has no use for."""
+    shutil.copytree(ROOT_FILES, root, dirs_exist_ok=True, symlinks=True)
+    (root / "etc/hostname").write_text("lab\n", encoding="ascii")
+    (root / "etc/fstab").write_text("", encoding="ascii")
+    (root / "etc/machine-id").write_text("", encoding="ascii")
+    units = root / "etc/systemd/system"
+    wanted = units / "multi-user.target.wants"
+    wanted.mkdir(parents=True, exist_ok=True)
+    (wanted / "lab.service").symlink_to("/etc/systemd/system/lab.service")
+    for name in MASKED:
+        (units / name).unlink(missing_ok=True)
+        (units / name).symlink_to("/dev/null")
+
+
+def make_disk(root: Path, disk: Path, log: Path) -> None:
+    """Write the root file system into a sparse ext4 image, without mounting it."""
+    with open(disk, "wb") as file:
+        file.truncate(DISK_BYTES)
+    options = ["-t", "ext4", "-O", "^has_journal", "-E", "lazy_itable_init=1,root_owner=0:0"]
+    step(["mke2fs", "-q", *options, "-d", str(root), str(disk)], log)
+
+
+def step(command: list[str], log: Path, text: str = "", folder: Path | None = None) -> None:
+    """Run one step at low priority with `text` as its input and its output in `log`. LabError quotes the last line."""
+    with open(log, "ab") as out:
+        out.write(f"+ {' '.join(command)}\n".encode())
+        out.flush()
+        try:
+            status = subprocess.run(
+                ["nice", "-n", "5", *command],
+                input=text.encode(), stdout=out, stderr=out, env=CLEAN, cwd=folder, timeout=STEP_LIMIT_S, check=False
+            ).returncode  # fmt: skip
+        except subprocess.TimeoutExpired as error:
+            raise LabError(f"{command[0]} did not end within {STEP_LIMIT_S} s") from error
+    if status:
+        lines = [line for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
+        raise LabError(f"{command[0]} failed: {lines[-1]}")

@@ -1,0 +1,147 @@
+"""The guest's machine: QEMU's command line, and its control by QMP."""
+
+import json
+import socket
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Self
+
+from tests.lab.host.errors import LabError
+from tests.lab_debian.host.image import Image
+from tests.lab_debian.host.release import Release
+
+PLATFORMS = {
+    "amd64": ("q35", "max", "ttyS0"),
+    "arm64": ("virt,gic-version=3", "cortex-a72", "ttyAMA0"),
+}
+"""Machine, processor and console by architecture. Processors are always emulated: results must not depend on KVM."""
+
+ADAPTER = {"driver": "usb-serial", "chardev": "imu", "id": "imu", "bus": "xhci.0"}
+"""An FTDI adapter to the guest: ftdi_sio, /dev/ttyUSB0, /dev/serial/by-id/usb-QEMU_…"""
+REQUESTS = "requests"
+"""Socket: what the guest asks the rig for, one line each."""
+QMP = "qmp"
+"""Socket: QEMU's control."""
+SENSOR = "sensor"
+"""Node of the simulated sensor that is behind the USB adapter."""
+CONSOLE_OPTIONS = "systemd.show_status=yes systemd.log_target=console"
+CONNECT_LIMIT_S = 60.0
+ANSWER_LIMIT_S = 60.0
+POLL_S = 0.05
+
+
+@dataclass(frozen=True)
+class DebianMachine:
+    """What differs from run to run."""
+
+    release: Release
+    image: Image
+    share: Path
+    """Folder that the guest may write, its /run/lab."""
+    sockets: Path
+    """Folder of REQUESTS, QMP and SENSOR: with a short name, since the path of a socket has 107 bytes at most."""
+    memory_mb: int = 1024
+    processors: int = 2
+
+    def command(self, monitor_fd: int) -> list[str]:
+        """QEMU's argument vector. The guest's live output is QEMU's standard output; `monitor_fd` is a socket."""
+        machine, processor, console = PLATFORMS[self.release.architecture]
+        return [
+            *(self.release.qemu, "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"),
+            *(
+                "-machine",
+                machine,
+                "-accel",
+                "tcg,thread=multi",
+                "-cpu",
+                processor,
+                "-smp",
+                str(self.processors),
+                "-m",
+                str(self.memory_mb),
+            ),
+            *("-kernel", str(self.image.kernel), "-initrd", str(self.image.initramfs)),
+            *("-append", f"console={console} panic=-1 mitigations=off {CONSOLE_OPTIONS}"),
+            *("-drive", f"file={_escaped(self.image.disk)},format=raw,if=none,id=root,snapshot=on,cache=unsafe"),
+            *("-device", "virtio-blk-pci,drive=root", "-device", "virtio-rng-pci"),
+            *("-virtfs", f"local,path={_escaped(self.share)},mount_tag=lab,security_model=none"),
+            *("-chardev", f"file,id=console,path={_escaped(self.share / 'console.log')}", "-serial", "chardev:console"),
+            *("-device", "virtio-serial-pci"),
+            *("-chardev", "file,id=live,path=/dev/stdout,append=on", "-device", "virtserialport,chardev=live,name=lab"),
+            *("-chardev", f"socket,id=requests,path={_escaped(self.sockets / REQUESTS)},server=on,wait=off"),
+            *("-device", "virtserialport,chardev=requests,name=requests"),
+            *("-chardev", f"socket,id=monitor,fd={monitor_fd}", "-mon", "chardev=monitor"),
+            *("-qmp", f"unix:{_escaped(self.sockets / QMP)},server=on,wait=off"),
+            *("-device", "qemu-xhci,id=xhci", "-chardev", f"serial,id=imu,path={_escaped(self.sockets / SENSOR)}"),
+            *("-device", ",".join([ADAPTER["driver"], *(f"{k}={v}" for k, v in ADAPTER.items() if k != "driver")])),
+        ]
+
+
+class Qmp:
+    """QEMU's control socket. Synchronization: one thread."""
+
+    def __init__(self, path: Path, limit_s: float = CONNECT_LIMIT_S) -> None:
+        """LabError if QEMU does not open the socket within `limit_s`."""
+        self._socket = connected(path, limit_s)
+        self._lines: IO[str] = self._socket.makefile("r", encoding="utf-8")
+        self._read()  # the greeting
+        self.ask({"execute": "qmp_capabilities"})
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_reason: object) -> None:
+        self._lines.close()
+        self._socket.close()
+
+    def plug(self) -> None:
+        """Plug the USB adapter in. LabError if QEMU refuses."""
+        self.ask({"execute": "device_add", "arguments": ADAPTER})
+
+    def unplug(self) -> None:
+        """Pull the USB adapter; return when it is gone. LabError if QEMU refuses."""
+        self.ask({"execute": "device_del", "arguments": {"id": ADAPTER["id"]}}, event="DEVICE_DELETED")
+
+    def ask(self, command: dict[str, object], event: str = "") -> None:
+        """Give a command; return after its answer and, where one is named, after the event. LabError on an error."""
+        self._socket.sendall(json.dumps(command).encode() + b"\n")
+        answered = happened = False
+        while not (answered and (happened or not event)):
+            message = self._read()
+            if "error" in message:
+                raise LabError(f"QEMU refused {command['execute']}: {message['error']}")
+            answered |= "return" in message
+            happened |= message.get("event") == event
+
+    def _read(self) -> dict[str, object]:
+        try:
+            line = self._lines.readline()
+        except OSError as error:
+            raise LabError(f"QEMU gave no answer: {error}") from error
+        if not line:
+            raise LabError("QEMU closed its control socket")
+        message: dict[str, object] = json.loads(line)
+        return message
+
+
+def connected(path: Path, limit_s: float) -> socket.socket:
+    """A connection to the socket at `path`, as soon as somebody listens there. LabError after `limit_s`."""
+    give_up_s = time.monotonic() + limit_s
+    while True:
+        sock = socket.socket(socket.AF_UNIX)
+        try:
+            sock.connect(str(path))
+        except OSError as error:
+            sock.close()
+            if time.monotonic() >= give_up_s:
+                raise LabError(f"nobody listens at {path} after {limit_s:.0f} s") from error
+            time.sleep(POLL_S)
+        else:
+            sock.settimeout(ANSWER_LIMIT_S)
+            return sock
+
+
+def _escaped(path: Path) -> str:
+    """QEMU's option syntax doubles commas inside values."""
+    return str(path).replace(",", ",,")

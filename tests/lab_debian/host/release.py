@@ -1,0 +1,51 @@
+"""Table: what the rig boots: release, architecture, and which packages and kernel modules are in it."""
+
+from dataclasses import dataclass
+
+PYTHONS = {"bookworm": "3.11", "trixie": "3.13"}
+"""Python of each release, the one that its package of imud is for."""
+
+SYSTEM = (
+    *("systemd", "systemd-sysv", "dbus", "udev", "kmod", "iproute2", "procps", "python3"),
+    *("can-utils", "gpiod", "i2c-tools", "pps-tools", "gpsd", "chrony"),
+)
+"""Debian's packages in the guest: the system itself, what sets it up, and the programs that imud works with."""
+
+UNIT_TESTS = ("python3-pytest", "python3-pytest-timeout", "python3-hypothesis", "gcc", "libc6-dev")
+"""What the unit tests need on an architecture that the host has not."""
+
+BOOT_MODULES = ("virtio_pci", "virtio_blk", "crc32c_generic", "ext4", "virtio_console", "9pnet_virtio", "9p", "autofs4")
+"""Loaded by the initramfs, in this order; some are built into some kernels."""
+
+MODULES = (
+    *("vcan", "can-raw", "can-j1939", "i2c-dev", "i2c-stub", "spidev", "pps-ldisc", "pps-gpio", "usbserial"),
+    *("ftdi_sio", "cdc-acm", "xhci-pci", "virtio-rng", "8250_pci", "rng-core", "gpio-pl061"),
+)
+"""Left to udev and the checks; what a kernel does not have is left out."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """One Debian that the rig boots."""
+
+    suite: str
+    architecture: str
+
+    @property
+    def name(self) -> str:
+        """As it stands in file names and results: trixie-arm64."""
+        return f"{self.suite}-{self.architecture}"
+
+    @property
+    def packages(self) -> tuple[str, ...]:
+        """Debian's packages in its root file system."""
+        return SYSTEM if self.architecture == "amd64" else (*SYSTEM, *UNIT_TESTS)
+
+    @property
+    def qemu(self) -> str:
+        """The program that emulates it."""
+        return {"amd64": "qemu-system-x86_64", "arm64": "qemu-system-aarch64"}[self.architecture]
+
+
+AMD64 = (Release("bookworm", "amd64"), Release("trixie", "amd64"))
+ARM64 = (Release("trixie", "arm64"),)

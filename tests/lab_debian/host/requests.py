@@ -1,0 +1,71 @@
+"""What the guest asks for while it runs: `plug` and `unplug` the USB adapter, a line each, answered by a line."""
+
+import contextlib
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+
+from tests.lab.host.errors import LabError
+from tests.lab_debian.host.machine import CONNECT_LIMIT_S, QMP, REQUESTS, Qmp, connected
+
+LINE_BYTES = 200
+DRAIN_S = 0.5
+"""For the bytes that the sensor wrote before it was stopped."""
+
+
+@contextlib.contextmanager
+def answered(sockets: Path, sensor_pid: int) -> Iterator[None]:
+    """Answer the guest's requests from a thread, until the end of the block or of QEMU.
+
+    `sensor_pid` is the process of the simulated sensor.
+    """
+    thread = threading.Thread(target=_serve_machine, args=(sockets, sensor_pid), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join(CONNECT_LIMIT_S + 1)
+
+
+def _serve_machine(sockets: Path, sensor_pid: int) -> None:
+    with (
+        contextlib.suppress(LabError),
+        Qmp(sockets / QMP) as qmp,
+        connected(sockets / REQUESTS, CONNECT_LIMIT_S) as guest,
+    ):
+        guest.settimeout(None)
+        serve(guest, {"plug": qmp.plug, "unplug": partial(unplug_quietly, qmp.unplug, sensor_pid)})
+
+
+def unplug_quietly(unplug: Callable[[], None], sensor_pid: int) -> None:
+    """Pull the adapter while no byte comes: QEMU 7.2 ends by a segmentation fault when one comes in between."""
+    os.kill(sensor_pid, signal.SIGSTOP)
+    try:
+        time.sleep(DRAIN_S)
+        unplug()
+    finally:
+        os.kill(sensor_pid, signal.SIGCONT)
+
+
+def serve(guest: socket.socket, actions: Mapping[str, Callable[[], None]]) -> None:
+    """Answer each line of `guest` by `ok` or by one line that says why not, until it closes."""
+    with contextlib.suppress(OSError), guest.makefile("rb") as lines:
+        while line := lines.readline(LINE_BYTES):
+            guest.sendall(f"{answer(line.decode('utf-8', 'replace').strip(), actions)}\n".encode())
+
+
+def answer(word: str, actions: Mapping[str, Callable[[], None]]) -> str:
+    """Carry out one request: `ok`, or why not."""
+    action = actions.get(word)
+    if action is None:
+        return f"expected one of {', '.join(sorted(actions))}, got {word!r}"
+    try:
+        action()
+    except LabError as error:
+        return str(error)
+    return "ok"
