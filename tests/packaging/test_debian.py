@@ -128,11 +128,14 @@ def test_the_version_is_that_of_the_package() -> None:
     assert re.match(r"imud \(@VERSION@-1~@RELEASE@\) @RELEASE@; ", (DEBIAN / "changelog").read_text())
 
 
-def test_sysusers_make_every_group_that_the_unit_names() -> None:
-    unit = (ROOT / "systemd/imud.service").read_text()
-    named = re.findall(r"^(?:Group|SupplementaryGroups)=(.*)$", unit, re.MULTILINE)
-    made = re.findall(r"^g (\S+)", (ROOT / "systemd/imud.sysusers.conf").read_text(), re.MULTILINE)
-    assert set(" ".join(named).split()) <= set(made)
+def test_sysusers_make_every_group_that_unit_and_udev_rules_name() -> None:
+    sysusers = (ROOT / "systemd/imud.sysusers.conf").read_text()
+    made = set(re.findall(r"^g (\S+)", sysusers, re.MULTILINE))
+    member_of = set(re.findall(r"^m imud (\S+)$", sysusers, re.MULTILINE))
+    unit = re.findall(r"^Group=(.*)$", (ROOT / "systemd/imud.service").read_text(), re.MULTILINE)
+    rules = re.findall(r'GROUP="(\w+)"', (ROOT / "etc/udev/60-imud.rules").read_text())
+    assert {*unit, *member_of} <= made
+    assert member_of == {"dialout", *rules}
 
 
 @pytest.mark.skipif(shutil.which("pkg-config") is None, reason="no pkg-config on this machine")

@@ -1,0 +1,200 @@
+"""Wire to client at 1 kHz on a busy machine: what the scheduling settings of a service bring, in turns.
+
+    writer, SCHED_FIFO ──pty──▶ kernel worker ──▶ imud, the setting under test ──▶ reader, SCHED_FIFO
+
+On every core a program computes without end, another writes to disk without end, and each is a session of its own, as
+the services of systemd are. A pty's bytes pass through a kernel worker, which competes with the programs as an ordinary
+task; those of a UART do not, so that the workers run at SCHED_FIFO while this measures, as do writer and reader: the
+figures are to be imud's. Needs root. `python -m tests.bench busy`, or more rounds: `python -m tests.bench.busy 6`.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import sleep
+
+from tests.bench.rig import CORES, Load, Process, configuration, wait_for
+from tests.bench.rows import Row, at_most
+
+HOG = "while True: pass"
+DISK = """
+import os, sys
+data = os.urandom(1 << 20)
+while True:
+    with open(sys.argv[1], "wb", buffering=0) as file:
+        for _ in range(64): file.write(data)
+        os.fsync(file.fileno())
+"""
+LOCK = "import ctypes; ctypes.CDLL(None).mlockall(3)"
+DAEMON = "import os, runpy; os.setsid(); runpy.run_module('imud', run_name='__main__')"
+FIFO_OF_OTHERS = 40
+GOAL_US = 1000.0
+ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a unit can say of its scheduling, by its directives' names."""
+
+    name: str
+    nice: int = 0
+    policy: int = os.SCHED_OTHER
+    priority: int = 0
+    core: bool = False
+    """CPUAffinity= with one core, which the others have too."""
+    lock: bool = False
+    """mlockall, which no directive does."""
+    weight: bool = False
+    """CPUWeight=: a share of the processors that counts among services, here by the session's own nice value."""
+
+
+SETTINGS = (
+    Setting("default"),
+    Setting("Nice=-15", nice=-15),
+    Setting("CPUWeight=10000", weight=True),
+    Setting("Nice=-15, CPUWeight=10000", nice=-15, weight=True),
+    Setting("CPUSchedulingPolicy=rr, 10", policy=os.SCHED_RR, priority=10),
+    Setting("CPUSchedulingPolicy=fifo, 10", policy=os.SCHED_FIFO, priority=10),
+    Setting("fifo, 10 and one core", policy=os.SCHED_FIFO, priority=10, core=True),
+    Setting("fifo, 10 and mlockall", policy=os.SCHED_FIFO, priority=10, lock=True),
+    Setting("default and mlockall", lock=True),
+)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Latency of one run, µs."""
+
+    p50_us: float
+    p99_us: float
+    max_us: float
+    lost: int
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """Median over the rounds of p50 and p99, and the worst of all, for each setting."""
+    table = measure(1 if quick else ROUNDS, 4.0 if quick else 10.0)
+    for setting in SETTINGS:
+        seen = table[setting]
+        p99_us = statistics.median(one.p99_us for one in seen)
+        name = f"busy machine, 1 kHz, {setting.name}"
+        yield Row(f"{name}: latency p50", statistics.median(one.p50_us for one in seen), "us")
+        limited = setting.policy != os.SCHED_OTHER
+        yield (
+            at_most(f"{name}: latency p99", p99_us, "us", GOAL_US)
+            if limited
+            else Row(f"{name}: latency p99", p99_us, "us")
+        )
+        yield Row(f"{name}: latency max", max(one.max_us for one in seen), "us")
+        yield Row(f"{name}: samples lost", float(sum(one.lost for one in seen)), "samples")
+
+
+def measure(rounds: int, seconds: float) -> dict[Setting, list[Seen]]:
+    """Run all settings in turns."""
+    table: dict[Setting, list[Seen]] = {setting: [] for setting in SETTINGS}
+    with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
+        for number in range(rounds):
+            for setting in SETTINGS if number % 2 == 0 else reversed(SETTINGS):
+                table[setting].append(run(setting, Load(seconds=seconds)))
+    return table
+
+
+@contextmanager
+def busy(folder: Path) -> Iterator[None]:
+    """Every core has a program that computes, and one more writes to `folder`."""
+    programs = [[sys.executable, "-c", HOG] for _ in CORES] + [[sys.executable, "-c", DISK, str(folder / "file")]]
+    lived = ["setpriv", "--pdeathsig", "KILL"]  # none outlives this process
+    running = [subprocess.Popen([*lived, *argv], start_new_session=True) for argv in programs]
+    try:
+        yield
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
+
+
+def run(setting: Setting, load: Load) -> Seen:
+    """One run of writer, daemon and reader under one setting."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-busy-") as name, ExitStack() as stack:
+        folder = Path(name)
+        (folder / "times").write_bytes(bytes(8 * load.frames))
+        argv = ["--rate", str(load.rate_hz), "--frames", str(load.frames), "--times", str(folder / "times")]
+        writer = stack.enter_context(Process(set(CORES), "-m", "tests.bench.writer", *argv))
+        ports = writer.line().split()
+        file = configuration(folder, ports, replace(load, shm=True))
+        command = f"{LOCK}; {DAEMON}" if setting.lock else DAEMON
+        server = stack.enter_context(Process(set(CORES), "-c", command, "run", "-c", str(file)))
+        wait_for(folder / "s")
+        sleep(1.0)
+        argv = ["--socket", str(folder / "s"), "--times", str(folder / "times"), "--frames", str(load.frames)]
+        argv += ["--skip", str(int(load.warm_s * load.rate_hz))]
+        reader = stack.enter_context(Process(set(CORES), "-m", "tests.bench.readers", *argv))
+        reader.line()
+        for other in (writer, reader):
+            os.sched_setscheduler(other.popen.pid, os.SCHED_FIFO, os.sched_param(FIFO_OF_OTHERS))
+        apply(setting, server.popen.pid)
+        stack.enter_context(workers_first())
+        writer.say("go")
+        refused = int(writer.line())
+        reader.say("end")
+        figures = json.loads(reader.line())
+    lost = refused + figures["gaps"] + load.frames - figures["samples"]
+    return Seen(figures["p50_us"], figures["p99_us"], figures["max_us"], lost)
+
+
+def apply(setting: Setting, pid: int) -> None:
+    """Set all threads of the daemon as systemd would have set its process before the start."""
+    for task in map(int, os.listdir(f"/proc/{pid}/task")):
+        os.setpriority(os.PRIO_PROCESS, task, setting.nice)
+        os.sched_setscheduler(task, setting.policy, os.sched_param(setting.priority))
+        os.sched_setaffinity(task, {CORES[-1]} if setting.core else set(CORES))
+    autogroup = Path(f"/proc/{pid}/autogroup")
+    if setting.weight and autogroup.exists():
+        autogroup.write_text("-19")
+
+
+@contextmanager
+def workers_first() -> Iterator[None]:
+    """The kernel's unbound workers, which pass a pty's bytes on, run before the programs, as an interrupt would."""
+    workers = unbound_workers()
+    _schedule(workers, os.SCHED_FIFO, FIFO_OF_OTHERS + 1)
+    try:
+        yield
+    finally:
+        _schedule(workers, os.SCHED_OTHER, 0)
+
+
+def unbound_workers() -> list[int]:
+    """Process numbers of the kernel's unbound workers with ordinary priority."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if (folder / "comm").read_text().startswith("kworker/u") and not (folder / "cmdline").read_text():
+                found.append(int(folder.name))
+    return found
+
+
+def _schedule(pids: Sequence[int], policy: int, priority: int) -> None:
+    for pid in pids:
+        with suppress(OSError):  # it has ended
+            os.sched_setscheduler(pid, policy, os.sched_param(priority))
+
+
+def main() -> None:
+    """Run as `python -m tests.bench.busy [ROUNDS]`: one line per setting and round."""
+    with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
+        for number in range(int(sys.argv[1]) if len(sys.argv) > 1 else ROUNDS):
+            for setting in SETTINGS if number % 2 == 0 else reversed(SETTINGS):
+                seen = run(setting, Load(seconds=8.0))
+                print(f"{setting.name:32} {seen}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
