@@ -74,6 +74,7 @@ class KnownIdentity:
         identity, settings = printable_identity(identity), printable_words(settings)
         shown = printable_words(self._describe(settings))
         now_ns, before, known = self._now_ns(), self.identity, self.shown_settings
+        identity = completed(identity, before)
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
             serial_number = identity.serial_number
@@ -85,6 +86,22 @@ class KnownIdentity:
             self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, **changed)
         self.identity, self.settings, self.shown_settings = identity, settings, shown
         self._on_settings(settings)
+
+
+def completed(identity: Identity, before: Identity) -> Identity:
+    """Return an identity with what its answer lost taken from the one before, if both can be of the same device.
+
+    An adapter that was just plugged in can lose bytes of the first answers.
+    """
+    pairs = ((identity.product, before.product), (identity.serial_number, before.serial_number))
+    if any(new and old and new != old for new, old in pairs):
+        return identity
+    return Identity(
+        identity.product or before.product,
+        identity.serial_number or before.serial_number,
+        identity.firmware or before.firmware,
+        before.details if identity.details is None else identity.details,
+    )
 
 
 def printable_identity(identity: Identity) -> Identity:

@@ -33,6 +33,33 @@ def test_a_device_that_never_said_its_number_is_no_other() -> None:
     assert not events
 
 
+def test_what_an_answer_lost_is_known_from_before() -> None:
+    """An adapter that was just plugged in: the first answers have lost bytes."""
+    events: list[Event] = []
+    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
+    whole = Identity("HI14", "A1", "1.5.6", {"BUILD": "x"})
+    known.update(whole, {})
+    for damaged in (Identity("HI14"), Identity("", "A1", "1.5.6"), Identity()):
+        known.update(damaged, {})
+        assert known.identity == whole
+    assert not events
+    known.update(Identity("HI14", "A1", "1.6.9", {"BUILD": "y"}), {})
+    assert known.identity == Identity("HI14", "A1", "1.6.9", {"BUILD": "y"})
+
+
+def test_nothing_is_taken_from_another_device() -> None:
+    events: list[Event] = []
+    known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: 5)
+    known.update(Identity("HI14", "A1", "1.5.6"), {})
+    known.update(Identity("", "B2"), {})
+    assert known.identity == Identity("", "B2")
+    assert [event.message for event in events] == ["another device: serial number B2, was A1"]
+    known.update(Identity("CH0"), {})
+    assert known.identity == Identity("CH0", "B2")
+    known.update(Identity("HI14"), {})
+    assert known.identity == Identity("HI14")
+
+
 def test_words_leave_out_what_is_empty() -> None:
     assert identity_words(Identity("HI14", details={"BUILD": "x", "EMPTY": ""})) == {"product": "HI14", "BUILD": "x"}
 

@@ -29,10 +29,14 @@ WAKE_HZ: Final = 100
 def identify() -> RequestScript[Identity]:
     """Ask for product, serial number and firmware (LOG VERSION).
 
-    `details` has every value by the device's own name; `firmware` is "1.5.6" for APP_VER=156. Raises NoReply, Rejected.
+    `details` has every value by the device's own name; `firmware` is "1.5.6" for APP_VER=156. A reply without a product
+    has lost bytes, as the first one after a plug can. Raises NoReply, Rejected.
     """
     outcome = yield ask(Query.VERSION)
-    version = parse_version(_lines(outcome, Query.VERSION))
+    lines = _lines(outcome, Query.VERSION)
+    version = parse_version(lines)
+    if not version.product:
+        raise NoReply(f"LOG VERSION: expected PNAME=... and other lines, got {' / '.join(lines)}; bytes were lost")
     firmware = "" if version.app_ver is None else ".".join(str(version.app_ver))
     return Identity(version.product, version.uuid, firmware, version.report.values)
 

@@ -52,6 +52,12 @@ def test_no_reply(lines: Sequence[str]) -> None:
         hold(identify(), lambda _: Silence(tuple(lines)))
 
 
+@pytest.mark.parametrize("lines", [("OK",), ("NAME=HI14R3", "UUID=043995698D6E1708", "OK")])
+def test_an_answer_that_lost_its_product_is_asked_for_again(lines: Sequence[str]) -> None:
+    with pytest.raises(NoReply, match=r"LOG VERSION: expected PNAME=.* bytes were lost"):
+        hold(identify(), lambda _: Reply(tuple(lines)))
+
+
 def test_refusal() -> None:
     with pytest.raises(Rejected, match="ERR 3"):
         hold(identify(), lambda _: Rejection(("ERR 3",)))
