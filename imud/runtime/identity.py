@@ -18,6 +18,8 @@ from imud.runtime.notices import Notices
 log = logging.getLogger(__name__)
 
 IDENTIFY_TRIES = 3
+IDENTIFY_AGAIN_S = (5, 30, 120)
+"""Pauses before a device that streams is asked again; then it is taken for one that cannot be asked (RX not wired)."""
 WORDS_MAX = 200
 """Settings or details of one device; the HI14 has the most, some 60."""
 

@@ -10,6 +10,7 @@ nothing and answers is not searched again: `answers` asks it where it is, before
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import Protocol
 
 from imud.errors import NothingHeard
@@ -63,6 +64,13 @@ class SearchLoop:
     @property
     def requested(self) -> bool:
         """Whether another search was requested and has not begun."""
+        return self._again.is_set()
+
+    async def requested_within(self, limit_s: float) -> bool:
+        """Wait `limit_s`, or until another search is requested; return whether it is."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(limit_s):
+                await self._again.wait()
         return self._again.is_set()
 
     def start(self) -> None:

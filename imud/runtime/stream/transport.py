@@ -19,7 +19,7 @@ from imud.runtime.detection import StreamFound
 from imud.runtime.detection.remembered import Remembered, RememberedDevice
 from imud.runtime.detection.rounds import StreamRound
 from imud.runtime.exchange import Exchange
-from imud.runtime.identity import IDENTIFY_TRIES
+from imud.runtime.identity import IDENTIFY_AGAIN_S, IDENTIFY_TRIES
 from imud.runtime.path import SamplePath, StreamPath
 from imud.runtime.search_loop import SearchLoop
 from imud.runtime.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext
@@ -139,8 +139,10 @@ class StreamTransport:
         """Ask for identity and settings, and start the streaming of a silent device, where asking is allowed."""
         driver = self.driver
         if self._may_ask and driver is not None:
-            await self._identify(IDENTIFY_TRIES)
+            answered = await self._identify(IDENTIFY_TRIES)
             await self._wake(driver)
+            if not answered:
+                await self._identify_later()
 
     async def _identify(self, tries: int) -> bool:
         """Ask for identity and settings; return whether the device answered."""
@@ -151,6 +153,12 @@ class StreamTransport:
         return await self._context.identity.ask(
             self._exchange, driver.identify, driver.read_settings, self._apply, tries
         )
+
+    async def _identify_later(self) -> None:
+        """Ask a device again that streams and has not answered: right after a plug its replies can be lost or late."""
+        for pause_s in IDENTIFY_AGAIN_S:
+            if await self._search.requested_within(pause_s) or await self._identify(1):
+                return
 
     async def read_back(self) -> None:
         """Ask for identity and settings again."""

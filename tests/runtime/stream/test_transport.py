@@ -280,6 +280,35 @@ def test_a_device_that_has_just_been_opened_is_given_time() -> None:
     play(story)
 
 
+@pytest.mark.parametrize("deaf_to", [3, 5, 6])
+def test_a_device_that_streams_and_did_not_answer_is_asked_again(deaf_to: int) -> None:
+    """Three tries, then one after 5, 30 and 120 s; a device that answers none of them is left alone."""
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured(identify=True))
+    ms = seen = asked = 0
+
+    def send() -> None:
+        nonlocal ms, seen, asked
+        ms += 250
+        assert rig.link.feed(hi91(ms), clock.now_ns())
+        for request in rig.link.written[seen:]:
+            seen += 1
+            asked += b"VERSION" in request
+            if asked > deaf_to:
+                reply = VERSION % b"043995698D6E1708" if b"VERSION" in request else b"COM1=115200\r\nOK\r\n"
+                assert rig.link.feed(reply, clock.now_ns())
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.until(lambda: rig.link.listening)
+        end_ns = clock.now_ns() + 300_000 * MS
+        await rig.until(lambda: clock.now_ns() > end_ns, limit_s=400.0, step=send, step_s=0.25)
+        assert asked == min(deaf_to + 1, 6)
+        assert rig.device.status().identity.get("product") == ("HI14R3" if deaf_to < 6 else None)
+
+    play_rigs(rigs, story, clock)
+
+
 @pytest.mark.parametrize("baud", [115200, "auto"])
 def test_the_time_unplugged_is_no_silence(baud: Any) -> None:
     """A device that was away for 6 s and needs another 3 s to start again is up once, and was never silent."""
