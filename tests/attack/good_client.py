@@ -1,7 +1,7 @@
 """A well-behaved client: watches every sample, asks `poll` every 10 ms; prints its figures when it gets a line.
 
-`python -m tests.attack.good_client SOCKET`. Frame i of the writer carries i in its pressure, so a gap there is a sample
-that is lost wherever it was lost: in the port, in the daemon, or on the way to this client.
+`python -m tests.attack.good_client SOCKET`. Frame i of the writer, at 1 kHz, carries i ms as its time, so a gap there
+is a sample that is lost wherever it was lost: in the port, in the daemon, or on the way to this client.
 """
 
 import json
@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import SLOT_BYTES, decode_slot
+from imud.units import NS_PER_MS
 
 ASK_S = 0.01
 
@@ -78,7 +79,8 @@ class Watcher:
             figures.dropped += message["params"].get("dropped", 0)
             return
         sample = decode_slot(body, "d0")
-        frame = round(sample.pressure_pa or 0)
+        assert sample.t_dev_ns is not None
+        frame = sample.t_dev_ns // NS_PER_MS
         if self._frame is not None:
             figures.lost += frame - self._frame - 1
         self._frame = frame
