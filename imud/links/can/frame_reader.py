@@ -43,16 +43,22 @@ STEADY_TRIES: Final = 3
 _COUNT_MASK: Final = 0xFFFF_FFFF
 _NO_DATA_FLAGS: Final = ERROR_FLAG | REMOTE_FLAG
 
-_WORD: Final = "Q" if struct.calcsize("P") == 8 else "I"
+_WORD_BYTES: Final = struct.calcsize("P")
 _CONTROL_BYTES: Final = 64
-_CONTROL: Final = struct.Struct(f"={_WORD}iiqq{_WORD}iiI{_CONTROL_BYTES - struct.calcsize(f'={_WORD}iiqq{_WORD}iiI')}x")
-"""Two control messages as the kernel writes them: (length, level, type, s, ns) and (length, level, type, count)."""
+_STAMP: Final = f"{_WORD_BYTES + 4}xiqq"  # length, level, type, s, ns
+_DROPS: Final = f"{_WORD_BYTES + 4}xiI"  # length, level, type, count
+_CONTROL: Final = struct.Struct(f"={_STAMP}{_DROPS}{_CONTROL_BYTES - struct.calcsize(f'={_STAMP}{_DROPS}')}x")
+"""Two control messages as the kernel writes them, without their lengths and levels."""
 
+_Rows = Iterable[tuple[tuple[Any, ...], tuple[Any, ...]]]
+"""Frames and their control messages, as unpacked."""
 OnErrorFrame = Callable[[int, bytes], bool]
 """Called with class bits and data of an error frame; returns whether frames are missing since."""
 
 
 libc: Final = ctypes.CDLL(None, use_errno=True)
+_receive: Final = ctypes.PyDLL(None, use_errno=True).recvmmsg
+"""For calls that never block: other threads need not be let in meanwhile."""
 
 
 class MessageHeader(ctypes.Structure):
@@ -82,6 +88,8 @@ class Vector(ctypes.Structure):
 
 
 _MESSAGE_BYTES: Final = ctypes.sizeof(MessageBuffers)
+_CONTROL_SIZE_WORD: Final = MessageHeader.control_bytes.offset // _WORD_BYTES
+"""Place of `control_bytes` in a header: of all that `recvmmsg` writes there, it reads this again."""
 _new_frame: Final[Callable[[tuple[int, bool, bytes, int, bool]], CanFrame]] = partial(tuple.__new__, CanFrame)
 """`CanFrame` at a third of the cost of its own constructor."""
 
@@ -111,8 +119,9 @@ class FrameReader:
         self._messages = (MessageBuffers * BATCH_FRAMES).from_buffer(self._headers)
         self._assign_buffers()
         self._fresh_headers = bytes(self._headers)
+        self._header_words = memoryview(self._headers).cast("L")  # as size_t on Linux
         self._receive = partial(
-            libc.recvmmsg, receiver.fileno(), self._messages, BATCH_FRAMES, int(socket.MSG_DONTWAIT), None
+            _receive, receiver.fileno(), self._messages, BATCH_FRAMES, int(socket.MSG_DONTWAIT), None
         )
         self._empty_ns = now_ns()
         self._newest_ns = self._empty_ns
@@ -125,26 +134,28 @@ class FrameReader:
         if count < 0:
             return self._failed(ctypes.get_errno(), begun_ns)
         offset_ns, now_ns = self._clocks()
-        frames = self._decoded(count, offset_ns, now_ns)
+        if count == 1:  # as on a quiet bus: not worth two iterators
+            only = RAW_FRAME.unpack_from(self._frames), _CONTROL.unpack_from(self._control)
+            frames = self._decoded((only,), offset_ns, now_ns)
+            self._header_words[_CONTROL_SIZE_WORD] = _CONTROL_BYTES
+        else:
+            frames = self._decoded(self._rows(count), offset_ns, now_ns)
+            header_bytes = count * _MESSAGE_BYTES
+            self._headers[:header_bytes] = self._fresh_headers[:header_bytes]
         if count < BATCH_FRAMES:
             self._empty_ns = begun_ns
-        header_bytes = count * _MESSAGE_BYTES
-        self._headers[:header_bytes] = self._fresh_headers[:header_bytes]
         return frames
 
-    def _rows(self, count: int) -> Iterable[tuple[tuple[Any, ...], tuple[Any, ...]]]:
-        """Frames and their control messages, as unpacked; one frame, as on a quiet bus, is not worth two iterators."""
-        if count == 1:
-            return ((RAW_FRAME.unpack_from(self._frames), _CONTROL.unpack_from(self._control)),)
+    def _rows(self, count: int) -> _Rows:
         raw = memoryview(self._frames)[: count * RAW_FRAME.size]
         control = memoryview(self._control)[: count * _CONTROL_BYTES]
         return zip(RAW_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True)
 
-    def _decoded(self, count: int, offset_ns: int, now_ns: int) -> list[CanFrame]:
+    def _decoded(self, rows: _Rows, offset_ns: int, now_ns: int) -> list[CanFrame]:
         frames: list[CanFrame] = []
         newest_ns, empty_ns, dropped, lost = self._newest_ns, self._empty_ns, self.dropped & _COUNT_MASK, self._lost
         newest_ns = max(newest_ns, empty_ns)
-        for (can_id, size, data), (_, _, kind, seconds, ns, _, _, drop_kind, drops) in self._rows(count):
+        for (can_id, size, data), (kind, seconds, ns, drop_kind, drops) in rows:
             if drop_kind == SO_RXQ_OVFL and drops != dropped:
                 self.dropped += (drops - dropped) & _COUNT_MASK
                 dropped, lost = drops, True

@@ -148,3 +148,27 @@ def test_a_loss_that_is_read_alone_marks_the_first_frame_of_the_next_read(wire: 
     assert [frame.after_loss for frame in wire.reader.read()] == [True]
     wire.send(6)
     assert [frame.after_loss for frame in wire.reader.read()] == [False]
+
+
+def test_a_drop_is_seen_after_reads_of_single_frames(wire: Wire) -> None:
+    """A read without drops needs less room for control messages; the next has all of it again."""
+    wire.receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
+    wire.send(1)
+    assert len(wire.reader.read()) == 1
+    wire.sender.send(pack_frame(2, False, b"") + bytes(4000))  # fills the buffer alone, and is cut to a frame
+    wire.send(3)
+    assert [(frame.can_id, frame.after_loss) for frame in wire.reader.read()] == [(2, False)]
+    wire.send(4)
+    assert [(frame.can_id, frame.after_loss) for frame in wire.reader.read()] == [(4, True)]
+    assert wire.reader.dropped == 1
+
+
+def test_a_frame_is_no_older_than_the_read_that_emptied_the_queue(wire: Wire) -> None:
+    wire.send(1)
+    time.sleep(0.01)
+    begun_ns = time.monotonic_ns()
+    wire.reader.read()
+    wire.send(2)
+    wire.wall_ahead_ns += HOUR_NS
+    (frame,) = wire.reader.read()
+    assert begun_ns <= frame.t_rx_ns <= time.monotonic_ns()
