@@ -3,12 +3,14 @@
 import json
 import re
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
 from tests.monitoring import dashboard
-from tests.monitoring.prometheus import needs
+from tests.monitoring.faults import Site, site
+from tests.monitoring.prometheus import LIMIT_S, Pace, RealPrometheus, free_port, needs, real_prometheus
 from tests.support.files import ROOT
 
 
@@ -59,3 +61,40 @@ def test_queries_use_metrics_that_exist() -> None:
     for title, expression in dashboard.queries():
         for metric in re.findall(r"\b(?:imud|process)_[a-z_]+", expression):
             assert re.sub("_(bucket|count|sum)$", "", metric) in documented, title
+
+
+# --- with a real Prometheus ----------------------------------------------------------------------------------------
+
+
+def without_data(prometheus: RealPrometheus) -> list[str]:
+    """Queries that give nothing, each with the title of its panel."""
+    return [
+        f"{title}: {expression}"
+        for title, expression in dashboard.queries()
+        if not prometheus.query(dashboard.filled_in(expression))
+    ]
+
+
+@needs("prometheus")
+@pytest.mark.timeout(900)
+def test_every_query_has_data(tmp_path: Path) -> None:
+    """Of a daemon with a device on RS-485, one with lines, and others."""
+    port = free_port()
+    (tmp_path / "site").mkdir()
+    with site(tmp_path / "site", port) as one, real_prometheus(tmp_path, pace=Pace.of(one.scrape_s())) as prometheus:
+        prometheus.scrape(port)
+        end = time.monotonic() + 2 * LIMIT_S
+        while missing := without_data(prometheus):
+            assert time.monotonic() < end, missing
+            time.sleep(0.5)
+        assert_devices_are_told_apart(prometheus, one)
+
+
+def assert_devices_are_told_apart(prometheus: RealPrometheus, one: Site) -> None:
+    """A query with the variable of the device filled in is of that device only."""
+    for title, expression in dashboard.queries():
+        if "$device" in expression:
+            for series in prometheus.query(dashboard.filled_in(expression, device="quiet")):
+                assert series["metric"].get("device", "quiet") == "quiet", title
+    devices = prometheus.query("count(max_over_time(imud_device_up[5m]))")  # whether or not the last scrape was in time
+    assert devices[0]["value"][1] == str(len(one.wires) + 2)

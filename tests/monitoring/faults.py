@@ -1,0 +1,359 @@
+"""A daemon on simulated devices, each with a fault of its own that can be switched on and off.
+
+    Feeder ──frames, 20 Hz──▶ Wire (pty) ──▶ Daemon in a thread ──▶ metrics
+    a simulated module, a module on RS-485, lines and PPS in memory ──▶ the same daemon
+
+The faults of `STATUS_FAULTS` cannot be made on a machine without the hardware, or are bugs of imud that do not exist:
+the state that the daemon shows is altered instead. Everything else really happens.
+"""
+
+import asyncio
+import logging
+import os
+import shutil
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from imud import config
+from imud.client import Client
+from imud.config import Config
+from imud.contracts.status import DeviceStatus, KernelCounters
+from imud.daemon import Daemon
+from imud.devices.hipnuc.uart.codec import encode_hi91
+from imud.errors import LinkError
+from imud.log import LogWriter
+from imud.runtime import event_loop
+from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.ports.lines import MemoryLines
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.daemon_process import wait_until, write_config
+from tests.support.pty_port import BAUD, plugged, slave, wired
+from tests.test_daemon import Cable
+
+PERIOD_MS: Final = 50
+LIMIT_S: Final = 120.0
+WIRES: Final = ("quiet", "gone", "flapping", "lossy", "noisy", "hot", "late", "jumping", "tilted", "lines", "mute")
+FLAP_S: Final = 1.5
+
+
+class Wire(Cable):
+    """A device that sends HI91 at 20 Hz, and what is wrong with it. Synchronization: the feeder's thread."""
+
+    plugged = True
+    silent = False
+    lose_every = flip_every = 0
+    """Of so many frames one."""
+    temperature_c = 20
+    hold = 1
+    """Frames that are kept back until there are so many."""
+    jump_ms = 0
+    """The device's time begins anew after so long."""
+    up_m_s2 = 9.8
+
+    def __init__(self, name: Path) -> None:
+        super().__init__(name)
+        self._held = b""
+        self._count = 0
+
+    def step(self, ms: int) -> None:
+        """Send the frame of this time."""
+        self._count += 1
+        if self.silent or (self.lose_every and self._count % self.lose_every == 0):
+            return
+        frame = bytearray(self._frame(ms % self.jump_ms if self.jump_ms else ms))
+        if self.flip_every and self._count % self.flip_every == 0:
+            frame[40] ^= 1
+        self._held += frame
+        if self._count % self.hold == 0:
+            self._flush()
+
+    def _flush(self) -> None:
+        held, self._held = self._held, b""
+        if self.plugged:
+            os.set_blocking(self.master, False)
+            with suppress(BlockingIOError):  # nobody reads now
+                os.write(self.master, held)
+
+    def _frame(self, ms: int) -> bytes:
+        wave = 0.3 * (1 if self._count % 4 < 2 else -1)
+        return encode_hi91(
+            system_time_ms=ms, accel_m_s2=(wave, 0.0, self.up_m_s2), gyro_rad_s=(0.0, 0.0, 0.0), mag_t=(0.0, 0.0, 0.0),
+            euler_rad=(0.0, 0.0, 0.5), quat_wxyz=(0.9689, 0.0, 0.0, 0.2474), temperature_c=self.temperature_c,
+            pressure_pa=1e5,
+        )  # fmt: skip
+
+    def swap(self) -> None:
+        """Pull the plug, or put it in."""
+        if self.plugged:
+            self.plugged = False
+            self.unplug()
+        else:
+            self.plug()
+            self.plugged = True
+
+
+def unpaid(status: DeviceStatus) -> DeviceStatus:
+    """A ledger that does not close."""
+    return msgspec.structs.replace(status, ledger={**status.ledger, "bytes_in": status.ledger["bytes_in"] + 1})
+
+
+class AlteredCounters:
+    """Errors of a port that grow with every look."""
+
+    def __init__(self, **steps: int) -> None:
+        self._steps = steps
+        self._looks = 0
+
+    def __call__(self, status: DeviceStatus) -> DeviceStatus:
+        self._looks += 1
+        grown = KernelCounters(**{name: step * self._looks for name, step in self._steps.items()})
+        return msgspec.structs.replace(status, kernel=grown)
+
+
+class AlteredDaemon(Daemon):
+    """A daemon whose shown state of some devices is altered. Synchronization: as Daemon; `altered` by one store."""
+
+    def __init__(self, settings: Config, **more: Any) -> None:
+        self.altered: Mapping[str, Callable[[DeviceStatus], DeviceStatus]] = {}
+        super().__init__(settings, **more)
+
+    def status(self) -> list[DeviceStatus]:
+        altered = self.altered
+        return [altered[one.name](one) if one.name in altered else one for one in super().status()]
+
+
+class Site:
+    """The daemon, its devices and their faults. Synchronization: the test's thread."""
+
+    def __init__(self, folder: Path, port: int, beside: Sequence[Wire] = ()) -> None:
+        self.folder = folder
+        self.port = port
+        self._beside = beside
+        """Wires of another daemon, which are fed as well."""
+        self.memory = MemoryLines(time.monotonic_ns)
+        self.faulty = False
+        self._stack = ExitStack()
+        self._clients: list[Client] = []
+        self._pps = True
+        self._looping: asyncio.AbstractEventLoop | None = None
+
+    def start(self) -> None:
+        """Start everything; nothing is wrong."""
+        stack, folder = self._stack, self.folder
+        (folder / "shm").mkdir()
+        self.wires = {}
+        for name in WIRES:
+            (folder / name).mkdir()
+            self.wires[name] = Wire(folder / name / "port")
+            stack.callback(self._unplug, self.wires[name])
+        (folder / "module").mkdir()
+        (folder / "boom").mkdir()
+        module = HipnucModule(time.monotonic_ns(), ModuleSettings(hi91=Output(PERIOD_MS)))
+        self._module = stack.enter_context(plugged(folder / "module/port", module))
+        self._slave = slave(80)
+        self._line, _ = stack.enter_context(wired(folder / "boom", self._slave))
+        settings = config.load(self._write(faulty=False))
+        self.daemon = AlteredDaemon(
+            settings, file=folder / "imud.yaml", state_dir=folder, lines=self.memory.maker
+        )  # fmt: skip
+        self._thread = threading.Thread(target=event_loop.run, args=(self._serve(),), name="daemon")
+        self._thread.start()
+        stack.callback(self._stop)
+        wait_until(self._answers, "the daemon's socket", LIMIT_S)
+        self._ended = threading.Event()
+        self._feeder = threading.Thread(target=self._feed, name="feeder")
+        self._feeder.start()
+        stack.callback(self._feeder.join)
+        stack.callback(self._ended.set)
+        self._log = stack.enter_context(_log_without_reader())
+
+    def close(self) -> None:
+        """Stop everything."""
+        self._stack.close()
+
+    def scrape_s(self) -> float:
+        """How long a scrape takes once all devices run, the longest of three."""
+        count = len(WIRES) + 2
+        wait_until(lambda: self._running() == count, "all devices run", LIMIT_S)
+
+        def once() -> float:
+            begin = time.monotonic()
+            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/metrics", timeout=LIMIT_S) as answer:
+                answer.read()
+            return time.monotonic() - begin
+
+        return max(once() for _ in range(3))
+
+    # --- faults ----------------------------------------------------------------------------------------------------
+
+    def break_everything(self) -> None:
+        """Switch every fault on."""
+        wires = self.wires
+        wires["gone"].silent = True
+        wires["lossy"].lose_every = 5
+        wires["noisy"].flip_every = 10
+        wires["hot"].temperature_c = 90
+        wires["late"].hold = 6
+        wires["jumping"].jump_ms = 500
+        wires["tilted"].up_m_s2 = -9.8
+        self._pps = False
+        self.in_loop(self._break_lines)
+        self.daemon.altered = {
+            "quiet": AlteredCounters(framing=3), "mute": AlteredCounters(bus_off=1), "tilted": unpaid,
+        }  # fmt: skip
+        self._write(faulty=True)
+        self.in_loop(self.daemon.reload)
+        for number in range(100):
+            self._log.emit(logging.makeLogRecord({"msg": f"message {number}", "levelno": logging.INFO}))
+        client = Client(self.folder / "imud.sock")
+        client.watch(encoding="json")  # and never read
+        self._clients.append(client)
+        shutil.move(self.folder / "shm", self.folder / "away")
+        self.faulty = True
+
+    def mend_everything(self) -> None:
+        """Switch every fault off."""
+        self.faulty = False
+        shutil.move(self.folder / "away", self.folder / "shm")
+        for client in self._clients:
+            client.close()
+        self.daemon.altered = {}
+        for wire in self.wires.values():
+            for name in ("silent", "lose_every", "flip_every", "temperature_c", "hold", "jump_ms", "up_m_s2"):
+                setattr(wire, name, getattr(Wire, name))
+        self._pps = True
+        self._write(faulty=False)
+        self.in_loop(self.daemon.reload)
+        self.in_loop(lambda: self.memory.inputs["lines alarm"].edge(time.monotonic_ns(), False))
+
+    def _break_lines(self) -> None:
+        inputs, now_ns = self.memory.inputs, time.monotonic_ns()
+        inputs["lines alarm"].edge(now_ns, True)
+        inputs["lines sout"].lose(7)
+        sout = inputs["late sout"]
+        sout.open_error = LinkError("the test took the chip away")
+        sout.vanish(sout.open_error)
+
+    def block_loop(self, seconds: float) -> None:
+        """Let nothing else run in the daemon's loop."""
+        self.in_loop(lambda: time.sleep(seconds))
+
+    def in_loop(self, call: Callable[[], object]) -> None:
+        """Run something in the daemon's loop."""
+        assert self._looping is not None
+        self._looping.call_soon_threadsafe(call)
+
+    # --- life ------------------------------------------------------------------------------------------------------
+
+    async def _serve(self) -> None:
+        self._looping = asyncio.get_running_loop()
+        await self.daemon.run()
+
+    def _stop(self) -> None:
+        self.in_loop(self.daemon.stop)
+        self._thread.join(LIMIT_S)
+        assert not self._thread.is_alive()
+
+    def _running(self) -> int:
+        with Client(self.folder / "imud.sock", timeout_s=LIMIT_S) as client:
+            return sum(one["state"] == "running" for one in client.status()["devices"])
+
+    def _answers(self) -> bool:
+        return (self.folder / "imud.sock").exists()
+
+    @staticmethod
+    def _unplug(wire: Wire) -> None:
+        if wire.plugged:
+            wire.swap()
+
+    def _feed(self) -> None:
+        begin, sent, pulses, flapped = time.monotonic(), 0, 0, 0.0
+        while not self._ended.wait(0.005):
+            age = time.monotonic() - begin
+            for number in range(sent, int(age * 1000) // PERIOD_MS):
+                for wire in (*self.wires.values(), *self._beside):
+                    wire.step(1000 + number * PERIOD_MS)
+                sent = number + 1
+            if int(age) > pulses:
+                pulses = int(age)
+                self._pulse(round((begin + pulses) * NS_PER_S))
+            if (self.faulty or not self.wires["flapping"].plugged) and age > flapped + FLAP_S:
+                flapped = age
+                self.wires["flapping"].swap()
+            if self.faulty:
+                self._slave.bad_crc = 1
+
+    def _pulse(self, t_ns: int) -> None:
+        if self._pps:
+            self.in_loop(lambda: self.memory.inputs["lines pps"].pulse(t_ns, 100 * NS_PER_MS))
+
+    def _write(self, *, faulty: bool) -> Path:
+        """The configuration; the faulty one declares what the modules are not, and a source that is not there."""
+
+        def uart(name: str, **more: Any) -> dict[str, Any]:
+            port = str(self.folder / name / "port")
+            return {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": 115200}, **more}
+
+        def line(number: int) -> dict[str, Any]:
+            return {"line": number, "chip": "gpiochip0"}
+
+        devices = {name: uart(name) for name in WIRES}
+        devices["lines"]["lines"] = {"sout": line(1), "pps": line(2), "alarm": line(3)}
+        devices["late"]["lines"] = {"sout": line(4)}
+        devices["module"] = uart("module", settings={"mode": "9-axis" if faulty else "6-axis"}, on_difference="report")
+        devices["module"]["identify"] = True
+        devices["boom"] = {
+            "driver": "hipnuc-modbus",
+            "rs485": {"line": str(self._line), "baud": BAUD, "address": 80, "reply_ms": 100, "rate_hz": 20},
+        }  # fmt: skip
+        if faulty:
+            devices["mute"] |= {"identify": True, "settings": {"mode": "9-axis"}}
+            devices["quiet"]["rmc"] = {"source": "gpsd", "tcp_port": 9}
+        return write_config(
+            self.folder, devices, log_level="info", metrics={"port": self.port},
+            shm={"directory": str(self.folder / "shm")},
+            socket={"path": str(self.folder / "imud.sock"), "queue_samples": 16},
+        )  # fmt: skip
+
+
+STATUS_FAULTS: Final = ("ImudBusErrors", "ImudBusOff", "ImudLedgerOpen")
+"""Alerts whose fault is an altered state; edges, pulses and levels of lines are those of lines in memory."""
+
+
+@contextmanager
+def _log_without_reader() -> Iterator[LogWriter]:
+    """A log whose reader does not read: a pipe that is full."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    log = LogWriter(writer, messages_max=10)
+    logging.getLogger().addHandler(log)
+    try:
+        yield log
+    finally:
+        logging.getLogger().removeHandler(log)
+        log.close()
+        os.close(reader)
+        os.close(writer)
+
+
+@contextmanager
+def site(folder: Path, port: int, beside: Sequence[Wire] = ()) -> Iterator[Site]:
+    """Run it; `port` is that of its metrics."""
+    one = Site(folder, port, beside)
+    try:
+        one.start()
+        yield one
+    finally:
+        one.close()
