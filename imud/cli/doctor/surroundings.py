@@ -27,6 +27,8 @@ from imud.utc.system_clock import KernelClock, kernel_clock
 
 COMMAND_S: Final = 5.0
 """Limit of the time that a command may take; each answers within a fraction of a second."""
+SYSTEM_PATH: Final = "/usr/sbin:/usr/bin:/sbin:/bin"
+"""Where commands of the system are, for users and services that have no such path."""
 OUTPUT_CHARACTERS_MAX: Final = 1 << 20
 """Of a command's output that are looked at, from its end."""
 TEXT_BYTES_MAX: Final = 65536
@@ -189,10 +191,11 @@ def run_command(words: Sequence[str], limit_s: float | None = None) -> CommandOu
     Raises FileNotFoundError, TimeoutError, OSError.
     """
     limit_s = COMMAND_S if limit_s is None else limit_s
+    path = f"{os.environ.get('PATH', '')}:{SYSTEM_PATH}"
     try:
         done = subprocess.run(
             list(words), stdin=subprocess.DEVNULL, capture_output=True, timeout=limit_s, check=False,
-            env=os.environ | {"LC_ALL": "C", "SYSTEMD_COLORS": "0"},
+            env=os.environ | {"LC_ALL": "C", "SYSTEMD_COLORS": "0", "PATH": path},
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise TimeoutError(f"{words[0]} did not end within {limit_s:g} s") from None
