@@ -93,6 +93,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """As the clock says."""
         return self._clock.now_ns() / NS_PER_S
 
+    async def shutdown_default_executor(self, timeout: float | None = None) -> None:  # noqa: ASYNC109
+        """Wait for the threads, which end in real time: the limit of Python 3.12 and newer is over at once here."""
+        await super().shutdown_default_executor()
+
 
 class LoopWorker:
     """A `Worker` of a bus that is no thread: its rounds are callbacks of the loop."""
