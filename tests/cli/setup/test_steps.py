@@ -131,6 +131,16 @@ def test_a_running_daemon_is_left_running_and_reads_the_new_file(
     assert gateway.units["imud.service"] == ["enabled", "active"]
 
 
+def test_an_example_that_the_daemon_uses_is_no_example(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments
+) -> None:
+    gateway.units["imud.service"] = ["enabled", "active"]
+    gateway.hold("ttyUSB0", "imud run")
+    assert setup.steps().set_up(PORT, ()) == 0
+    assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
+    assert attachments.listened == []
+
+
 def test_nothing_attached(machine: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]) -> None:
     machine.write("/etc/imud.yaml", EXAMPLE)
     before = machine.files()
