@@ -131,6 +131,14 @@ def test_a_running_daemon_is_left_running_and_reads_the_new_file(
     assert gateway.units["imud.service"] == ["enabled", "active"]
 
 
+def test_a_file_and_its_copy_keep_the_mode(gateway: LivingMachine, setup: Setup) -> None:
+    """Whatever the umask takes from new files."""
+    file, copy = gateway.root / "etc/imud.yaml", gateway.root / "etc/imud.yaml.DATE"
+    file.chmod(0o662)
+    assert setup.steps().set_up(PORT, ()) == 0
+    assert [path.stat().st_mode & 0o777 for path in (file, copy)] == [0o662, 0o662]
+
+
 def test_an_example_that_the_daemon_uses_is_no_example(
     gateway: LivingMachine, setup: Setup, attachments: Attachments
 ) -> None:
