@@ -37,8 +37,8 @@ GROUPS: dict[str, Group] = {
     "removal": removal.check,
 }
 """In the order in which they run: the first leaves the package installed and the second the service running."""
-RUNS = {  # setup is run by its name only, until it has been through a whole run
-    "amd64": ("service", "rights", "sandbox", "outputs", "replug", "doctor", "removal"),
+RUNS = {
+    "amd64": ("service", "rights", "sandbox", "outputs", "replug", "doctor", "setup", "removal"),
     "arm64": ("streaming", "sandbox", "doctor", "unit-tests"),
 }
 
