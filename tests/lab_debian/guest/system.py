@@ -11,7 +11,7 @@ from tests.lab_debian.guest.checks import LIMIT_S, Failed, wait_until
 
 SHARE = Path("/run/lab")
 CONFIG = Path("/etc/imud.yaml")
-EXAMPLE = Path("/run/imud-example.yaml")
+EXAMPLE = Path("/run/example.yaml")
 """The configuration as the package brought it."""
 SOCKET = "/run/imud/imud.sock"
 RINGS = Path("/run/imud/shm")
