@@ -71,7 +71,7 @@ class Daemon:
         self._file = file
         self._reloader: Reloader | None = None
         host = HostClock()
-        self._now_ns = host.now_ns
+        self._now_ns, self._follow_clocks = host.now_ns, host.utc_offset_ns
         self._factory = DeviceFactory(
             self._publish, self._send_event, host, state_dir=state_dir, lines=lines,
             configured=lambda: self.config.devices,
@@ -302,6 +302,7 @@ class Daemon:
     def _tick(self) -> None:
         """Call the ticks of all parts. An error here ends the process (`_on_loop_error`)."""
         now_ns = self._now_ns()
+        self._follow_clocks()  # also where no device is read for long: between two readings a rate is a mean
         for device in self._devices.values():
             device.tick(now_ns)
         for publisher in self._publishers.values():

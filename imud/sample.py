@@ -15,6 +15,10 @@ Quaternion = tuple[float, float, float, float]
 Pair = tuple[float, float]
 
 
+T_ERR_MOST: Final = 0xFFFF_FFFF
+"""`t_err_ns` is 32 bits wide wherever it is published."""
+
+
 class Sync(StrEnum):
     """Origin of a time stamp, worst first."""
 

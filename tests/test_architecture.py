@@ -292,6 +292,7 @@ CROSS_CUTTING = {
     "test_docs.py": "README.md, docs, Makefile",
     "test_daemon_signals.py": "the daemon as a process: log, reload, kill",
     "test_end_to_end.py": "the daemon as a process, with its clients",
+    "clock/test_steered_host.py": "the whole clock on hosts whose clocks are slewed, stepped, suspended or stopped",
     "publishers/shm/test_hostile.py": "the directory of the rings against other users",
     "cli/test_main.py": "`main` of imud/cli/__init__.py",
     "clock/test_accuracy.py": "every part of the clock against the truth of a simulation",

@@ -93,6 +93,7 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
         f"{status.name}: time stamps by {clock.sync}, error {clock.t_err_ns / NS_PER_US:.1f} µs (one sigma)",
         f"  offset    {clock.offset_ns / NS_PER_S:+.9f} s (host - device), skew {clock.skew_ppm:+.3f} ppm, "
         f"{clock.resets} resets",
+        f"  host      CLOCK_MONOTONIC is steered by {clock.steering_ppm:+.1f} ppm",
         f"  residual  {clock.residual_ns / NS_PER_US:.1f} µs (one sigma)",
         *(f"  {name:<10}{words}" for name, words in aids(status)),
         f"  read after measurement, {len(behind_ns)} samples:",

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Final
 
-from imud.units import NS_PER_S, NS_PER_US
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 BINS: Final = 64
 BIN_LONGEST_NS: Final = NS_PER_S
@@ -39,6 +39,11 @@ RECENT_NS: Final = 2 * NS_PER_S
 """Number of the newest bins, over at least this time, whose common delay is no delay of single messages."""
 LATENCIES_NS: Final = (200 * NS_PER_US, 600 * NS_PER_US, 2000 * NS_PER_US, 6000 * NS_PER_US)
 """Allowances for polling and wake-up on top of the longest wait, tried in turn until some line fits."""
+
+ENOUGH_POINTS: Final = 8
+ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
+ENOUGH_HOLDS: Final = 20
+"""A fit is used from this number of points on, and this time or number of periods of a latency timer."""
 
 Point = tuple[float, float]
 """(device ns, ns)."""
@@ -126,6 +131,11 @@ class ArrivalFit:
     def span_ns(self) -> int:
         """Device time between the oldest and the newest bin."""
         return self._open.device_ns - self._bins[0].device_ns
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the fit can be used."""
+        return self.count >= ENOUGH_POINTS and self.span_ns >= max(ENOUGH_SPAN_NS, ENOUGH_HOLDS * self.hold_ns)
 
     def set_pause(self, pause_ns: float, count: int) -> None:
         """Set the longest pause between messages that a read can end in, at most the timer's period.

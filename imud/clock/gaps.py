@@ -23,6 +23,9 @@ STEADY: Final = 2e-5
 KEPT_NS: Final = 600 * NS_PER_S
 """Messages that are late for so long are no starvation: the counter stood still."""
 
+GAP_PERIODS: Final = 1.5
+"""With less host time since the sample before, none is missing."""
+
 # --- arrivals -------------------------------------------------------------------------------------------------------
 STEPS_ALWAYS: Final = 4
 """So many steps are accepted at any arrival: messages that waited arrive together."""

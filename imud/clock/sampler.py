@@ -10,7 +10,8 @@ Per message (`SampleClock.sample`, then `_by_device`):
     time of measurement = fit − half of the bias that the link can hide (`link_delay`) + what is still slewed (`Slew`)
         └─ edges, a pulse per second and UTC improve on that (`steering`), where there are any
 
-Until the fit is known well enough, and for devices without time, a message is dated by its arrival.
+Until the fit is known well enough, and for devices without time, a message is dated by its arrival. All this is done in
+steady time, which nothing steers (`imud.host_clock`); what comes and goes is in CLOCK_MONOTONIC.
 
 Three rules hold for any input: `t_ns` rises strictly, is never after arrival, and a device clock that jumps starts a
 new fit instead of carrying the stamps along.
@@ -30,32 +31,25 @@ from imud.clock.device_time import (
     JUMP_LATE_NS,
     DeviceTime,
     JumpDetector,
-)
-from imud.clock.gaps import ArrivalLosses, CounterLine
+)  # fmt: skip
+from imud.clock.gaps import GAP_PERIODS, ArrivalLosses, CounterLine
 from imud.clock.intervals import SIGMA_OF_RANGE
 from imud.clock.link_delay import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
 from imud.clock.stamp_time import StampTime
-from imud.clock.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
+from imud.clock.steering import HOLDOVER_NS, SETTLED_AFTER_NS, AidingSources, Holdover, Slew
 from imud.contracts.lines import Edge
 from imud.contracts.status import ClockStatus
 from imud.contracts.timing import NO_TIME_BITS, Mark, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
-from imud.sample import Measurement, Sample, Sync
-from imud.units import NS_PER_MS, NS_PER_S
+from imud.host_clock import UNSTEERED, SteadyTime
+from imud.sample import T_ERR_MOST, Measurement, Sample, Sync
+from imud.units import NS_PER_S
 
-ENOUGH_POINTS: Final = 8
-ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
-ENOUGH_HOLDS: Final = 20
-"""A fit is used from this number of points on, and this time or number of periods of a latency timer."""
-HOLDOVER_NS: Final = 16 * NS_PER_S
-"""The same during holdover: a young fit swings, and holdover is 0.3 ms off by then at worst."""
 YOUNG_NS: Final = 32 * NS_PER_S
 YOUNG_FACTOR: Final = 1.5
 """A fit this short has not seen the timer's beat, and a stalled read in it weighs more."""
-T_ERR_MOST: Final = 0xFFFF_FFFF
-"""`t_err_ns` is 32 bits wide wherever it is published."""
-GAP_PERIODS: Final = 1.5
-"""With less host time since the sample before, none is missing."""
 _ARRIVAL: Final = Sync.ARRIVAL
+_T_ERR_MOST: Final = float(T_ERR_MOST)
+_EARLY_NS: Final = -JUMP_EARLY_NS
 
 
 class SampleClock:
@@ -65,35 +59,32 @@ class SampleClock:
     known), `hold_ns` how long an adapter may hold bytes back (USB latency timer). A counter with `tick_ns` 0 numbers
     the samples: it shows how many are missing, and the arrivals show when they were. Messages without that counter are
     dated by `pps_age_ms`, in ms modulo `stamp_modulus` (0: by arrival). `bits` are the status bits of the device that
-    concern time, `sout` and `sin` where on their edges the measurement is.
+    concern time, `sout` and `sin` where on their edges the measurement is. `host` is kept up to date by the caller.
 
     `missed` counts within one sample; for a gap where that cannot be known `on_unknown_gap` is called.
     Edges, triggers and UTC are given before the messages that follow them; without device time they are ignored.
     """
 
+    __slots__ = (
+        "_aiding", "_delay", "_device", "_error_ns", "_fit", "_fit_begin_ns", "_fit_bias_ns",
+        "_fit_error_ns", "_fit_sync", "_holdover", "_host", "_jump", "_known", "_line", "_losses", "_make_aiding",
+        "_on_unknown_gap", "_own_status", "_resets", "_seq", "_slew", "_spread", "_stamps", "_sync", "_t_err_ns",
+        "_t_ns", "_t_rx_ns", "_time", "missed",
+    )  # fmt: skip
+
     def __init__(
-        self,
-        device: str,
-        *,
-        tick_ns: int,
-        tick_modulus: int,
-        byte_ns: int,
-        hold_ns: int,
-        stamp_modulus: int = 0,
-        bits: TimeBits = NO_TIME_BITS,
-        sout: SoutTiming | None = None,
-        sin: TriggerTiming | None = None,
-        on_unknown_gap: Callable[[], None] = lambda: None,
-    ) -> None:
-        self._device = device
+        self, device: str, *, tick_ns: int, tick_modulus: int, byte_ns: int, hold_ns: int, stamp_modulus: int = 0,
+        bits: TimeBits = NO_TIME_BITS, sout: SoutTiming | None = None, sin: TriggerTiming | None = None,
+        host: SteadyTime = UNSTEERED, on_unknown_gap: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        self._device, self._host = device, host
         self._on_unknown_gap = on_unknown_gap
         self._make_aiding = partial(
-            AidingSources, tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming()
+            AidingSources, tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming(), host
         )
         self._aiding: AidingSources | None = None
         self._time = DeviceTime(tick_ns, tick_modulus, on_unknown_gap)
         self._losses = ArrivalLosses(0 if tick_ns else tick_modulus, on_unknown_gap)
-        self._by_number = tick_ns == 0
         self._stamps = StampTime(stamp_modulus) if stamp_modulus else None
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._spread = ArrivalSpread()
@@ -128,33 +119,41 @@ class SampleClock:
         if t_rx_ns < self._t_rx_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
             t_rx_ns = self._t_rx_ns
         size_bytes, ticks, byte_ns = m.size_bytes, m.dev_ticks, self._delay.byte_ns or 1
-        trailing_ns = m.trailing_bytes * byte_ns
-        arrival_ns = t_rx_ns - size_bytes * byte_ns - trailing_ns if t_begin_ns is None else t_begin_ns
+        trailing_ns, host = m.trailing_bytes * byte_ns, self._host
+        offset_ns, even_from_ns = host.offset_ns, host.even_from_ns
+        on_wire_ns = size_bytes * byte_ns + trailing_ns
+        arrival_ns = t_rx_ns - (on_wire_ns + offset_ns) if t_begin_ns is None else host.steady_ns(t_begin_ns)
+        if t_begin_ns is None and arrival_ns < even_from_ns:
+            arrival_ns = host.steady_ns(t_rx_ns) - on_wire_ns
         if ticks is None and self._stamps is not None and m.pps_age_ms is not None:
             ticks = self._stamped(self._stamps, m.pps_age_ms, arrival_ns)
-        if ticks is None or self._by_number:
+        if ticks is None or not self._time.tick_ns:
             wanted_ns, t_dev_ns, sync = self._by_arrival(ticks, arrival_ns, size_bytes), None, _ARRIVAL
         else:
             wanted_ns = self._by_device(ticks, arrival_ns, trailing_ns, t_rx_ns, size_bytes)
             t_dev_ns, sync = self._time.raw_ns, self._fit_sync
-        edge_seq, aiding, slew, own = None, self._aiding, self._slew, self._own_status
+        edge_seq = None
+        aiding, slew, own = self._aiding, self._slew, self._own_status
         if aiding is not None:
             if t_dev_ns is not None and (sync is not _ARRIVAL or self._holdover is not None):
                 wanted_ns, slew = self._steered(aiding, m, wanted_ns, arrival_ns), aiding.slew
                 sync, edge_seq = aiding.sync, aiding.edge_seq
             self._sync = sync
-        t_ns = wanted_ns if wanted_ns <= arrival_ns else arrival_ns
+        error_ns, steady_ns = self._error_ns, wanted_ns if wanted_ns <= arrival_ns else arrival_ns
+        t_ns = steady_ns + offset_ns
+        if steady_ns < even_from_ns:
+            t_ns, error_ns = min(host.monotonic_ns(steady_ns), t_rx_ns), error_ns + host.error_ns(steady_ns)
         if t_ns <= self._t_ns:
+            steady_ns += self._t_ns + 1 - t_ns
             t_ns = self._t_ns + 1
-        error_ns = self._error_ns
-        if t_ns != wanted_ns:
-            slew.add(t_ns - wanted_ns)
-            error_ns += abs(t_ns - wanted_ns)
+        if steady_ns != wanted_ns:
+            slew.add(steady_ns - wanted_ns)
+            error_ns += abs(steady_ns - wanted_ns)
         if t_ns > t_rx_ns:  # noqa: PLR1730 - as above
             t_rx_ns = t_ns
         self._t_ns, self._t_rx_ns = t_ns, t_rx_ns
         self._seq = seq = self._seq + 1
-        self._t_err_ns = t_err_ns = int(error_ns) + 1 if error_ns < T_ERR_MOST else T_ERR_MOST
+        self._t_err_ns = t_err_ns = int(error_ns) + 1 if error_ns < _T_ERR_MOST else T_ERR_MOST
         if aiding is not None and aiding.marks is not None:
             aiding.marks.add_sample(t_ns - aiding.sout_offset_ns, seq, self._period_ns())
         return Sample(
@@ -204,12 +203,12 @@ class SampleClock:
     def set_utc_reference(self, reference: UtcReference | None) -> None:
         """Set the host's estimate of UTC, or None. A device on UTC is recognised by it."""
         if reference is not None or self._aiding is not None:
-            self._aided().utc.set_reference(reference)
+            self._aided().set_utc_reference(reference)
 
     @property
     def utc_reference(self) -> UtcReference | None:
         """The host's estimate of UTC; None while it has none."""
-        return self._aiding.utc.reference if self._aiding else None
+        return self._aiding.utc_reference if self._aiding else None
 
     def set_own_status(self, bits: int | None) -> None:
         """Set the host's own bits, which `sample` adds to the status from now on; None for none."""
@@ -245,6 +244,7 @@ class SampleClock:
             sync=self._sync if aiding else self._fit_sync,
             offset_ns=self._t_ns - self._time.raw_ns if self._known else 0,
             skew_ppm=(1 / fit.slope - 1) * 1e6 if fit else 0.0,
+            steering_ppm=self._host.rate * 1e6,
             residual_ns=int(fit.residual_ns if fit else self._spread.sigma_ns),
             t_err_ns=self._t_err_ns,
             resets=self._resets + self._losses.resets,
@@ -296,7 +296,7 @@ class SampleClock:
         """Return the time of a message without device time; it may have a number."""
         spread, losses = self._spread, self._losses
         missed = 0
-        if self._by_number and ticks is not None:
+        if not self._time.tick_ns and ticks is not None:
             steps = losses.add_number(ticks, arrival_ns, spread.period_ns)
             if not steps:
                 self._spread = spread = ArrivalSpread()
@@ -304,7 +304,7 @@ class SampleClock:
             missed = losses.missed
         else:
             spread.add_arrival(arrival_ns)
-            if not self._by_number and not self._known:
+            if self._time.tick_ns and not self._known:
                 missed = losses.add_arrival(arrival_ns, is_first=not self._seq)
         self.missed = missed
         return self._less_bias(arrival_ns, size_bytes, spread.period_ns, spread.sigma_ns)
@@ -331,16 +331,17 @@ class SampleClock:
         if (
             time.watched
             and self._fit_sync is not _ARRIVAL
-            and (above_ns >= -JUMP_EARLY_NS or not self._ran_on(device_ns, arrival_ns))
+            and (above_ns >= _EARLY_NS or not self._ran_on(device_ns, arrival_ns))
             and time.absorb_correction(fit, before_ns, arrival_ns)
         ):
             device_ns = time.even_ns
             fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
             above_ns = arrival_ns - fit_ns
-        odd = above_ns < -JUMP_EARLY_NS or above_ns > JUMP_LATE_NS or self._jump.late_reads
+        odd = above_ns < _EARLY_NS or above_ns > JUMP_LATE_NS or self._jump.late_reads
         if odd and self._jump.is_jump(
-            fit, above_ns, device_ns - before_ns, self._known_error_ns, t_rx_ns, self._t_rx_ns
-        ):
+            fit, above_ns, device_ns - before_ns, None if self._fit_sync is _ARRIVAL else self._fit_error_ns, t_rx_ns,
+            self._t_rx_ns,
+        ):  # fmt: skip
             return self._after_jump(above_ns, ticks, arrival_ns, size_bytes)
         self.missed = time.missed
         if fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
@@ -358,10 +359,13 @@ class SampleClock:
                 return self._holdover.at(device_ns)
             return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
         slew = self._slew
-        left_ns = slew.advance(device_ns - before_ns, device_ns - self._fit_begin_ns) if slew.left_ns else 0.0
-        error_ns = self._fit_error_ns + fit.slope_error * (device_ns - fit.fitted_ns) + abs(left_ns) + time.doubt_ns
+        error_ns = self._fit_error_ns + fit.slope_error * (device_ns - fit.fitted_ns) + time.doubt_ns
+        fit_ns -= self._fit_bias_ns
+        if slew.left_ns:
+            left_ns = slew.advance(device_ns - before_ns, device_ns - self._fit_begin_ns)
+            fit_ns, error_ns = fit_ns + left_ns, error_ns + abs(left_ns)
         self._error_ns = error_ns if above_ns < JUMP_LATE_NS else error_ns + above_ns
-        return int(fit_ns - self._fit_bias_ns + left_ns)
+        return int(fit_ns)
 
     def _begin(self, ticks: int, arrival_ns: int, t_rx_ns: int) -> None:
         """Set the first stamp of a fit: of a new device, or of one whose clock runs on over a changed link."""
@@ -384,7 +388,7 @@ class SampleClock:
         """Set the first stamp of a counter that began anew, or was not read for a while, `missed` where it is known."""
         if missed is None and self._seq:
             period_ns = self._period_ns()
-            if not period_ns or arrival_ns - self._t_ns >= GAP_PERIODS * period_ns:
+            if not period_ns or arrival_ns - self._host.steady_ns(self._t_ns) >= GAP_PERIODS * period_ns:
                 self._on_unknown_gap()
         self.missed = missed or 0
         self._line = None
@@ -420,11 +424,12 @@ class SampleClock:
     def _hold_over(self, aiding: AidingSources, ticks: int, arrival_ns: int, utc_ns: int, missed: int | None) -> int:
         """Return the time of a message whose counter jumped to `utc_ns`, or within UTC; holdover begins there."""
         period_ns, tick_ns, error_ns = self._period_ns() or 1.0, self._time.tick_ns, float(self._t_err_ns)
-        steps = max(round((utc_ns - self._t_ns) / period_ns), 1)
-        t_ns = self._t_ns + int(steps * period_ns)
+        newest_ns = self._host.steady_ns(self._t_ns)
+        steps = max(round((utc_ns - newest_ns) / period_ns), 1)
+        t_ns = newest_ns + int(steps * period_ns)
         unknown = self._fit_sync is _ARRIVAL and self._holdover is None
         if unknown or abs(t_ns - utc_ns) > tick_ns + 2 * error_ns:
-            t_ns, error_ns = max(utc_ns, self._t_ns + 1), aiding.utc.tick_error_ns  # or the device samples anew
+            t_ns, error_ns = max(utc_ns, newest_ns + 1), aiding.utc.tick_error_ns  # or the device samples anew
         elif missed is None and error_ns + tick_ns < period_ns:
             missed = steps - 1
         self._begin_counter(ticks, arrival_ns, missed)
@@ -464,11 +469,10 @@ class SampleClock:
             self._fit_error_ns *= YOUNG_FACTOR
         if self._fit_sync is not _ARRIVAL:
             self._slew.set(published_ns - (fit_ns - self._fit_bias_ns))
-        elif fit.count >= ENOUGH_POINTS and fit.span_ns >= max(
-            ENOUGH_SPAN_NS if self._holdover is None else HOLDOVER_NS, ENOUGH_HOLDS * delay.hold_ns
-        ):
+        elif fit.is_enough and (self._holdover is None or fit.span_ns >= HOLDOVER_NS):
             self._fit_sync = Sync.REGRESSION
-            held_ns = self._holdover.at(device_ns) if self._holdover else self._t_ns + elapsed_ns * fit.slope
+            newest_ns = self._host.steady_ns(self._t_ns)
+            held_ns = self._holdover.at(device_ns) if self._holdover else newest_ns + elapsed_ns * fit.slope
             self._holdover = None
             self._slew.set(held_ns - (fit_ns - self._fit_bias_ns))
         if self._line is not None:
@@ -488,13 +492,9 @@ class SampleClock:
         self._error_ns = aiding.error_ns
         return t_ns
 
-    @property
-    def _known_error_ns(self) -> float | None:
-        return None if self._fit_sync is _ARRIVAL else self._fit_error_ns
-
     def _period_ns(self) -> float:
         """Host time between samples; 0 while unknown."""
-        if self._by_number:
-            return self._spread.period_ns
         time, fit = self._time, self._fit
+        if not time.tick_ns:
+            return self._spread.period_ns
         return time.period.period_ticks * time.tick_ns * (fit.slope if fit else 1.0)

@@ -20,7 +20,8 @@ from typing import Final
 from imud.clock.device_utc import DeviceUtc, PpsAge
 from imud.clock.edge_pairing import EdgePairing, EdgeStamp, MarkPairing, PulseDecoder, rising_edges
 from imud.contracts.lines import Edge
-from imud.contracts.timing import SIN_DELAY_US, SoutTiming, TimeBits, TriggerStamp, TriggerTiming
+from imud.contracts.timing import SIN_DELAY_US, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
+from imud.host_clock import SteadyTime
 from imud.sample import Measurement, Sync
 from imud.units import NS_PER_S, NS_PER_US
 
@@ -29,8 +30,10 @@ SLEW: Final = 500e-6
 SLEW_SETTLING: Final = 0.2
 """The same while the fit is young."""
 SETTLED_AFTER_NS: Final = 10 * NS_PER_S
+HOLDOVER_NS: Final = 16 * NS_PER_S
+"""A fit this long ends holdover: a young one swings, and holdover is 0.8 ms off by then at worst."""
 HOLDOVER_RATE: Final = 50e-6
-"""Largest rate error of CLOCK_MONOTONIC against UTC: a crystal's tolerance, where nothing steers it."""
+"""Largest rate error of steady time against UTC: a crystal's tolerance."""
 TICK_SHARE: Final = 0.5
 """Error of a tick's start: the instant of measurement within it is not known."""
 UNPAIRED_MOST: Final = 2
@@ -144,14 +147,17 @@ class AidingSources:
     """
 
     __slots__ = (
-        "_bits", "_device_ns", "_fix_ns", "_pps", "_pulses", "_sin_timing", "_source", "_sources", "_sout_timing",
-        "edge_seq", "error_ns", "marks", "sin", "slew", "sout", "sout_offset_ns", "sync", "utc",
+        "_bits", "_device_ns", "_fix_ns", "_host", "_pps", "_pulses", "_sin_timing", "_source", "_sources",
+        "_sout_timing", "edge_seq", "error_ns", "marks", "sin", "slew", "sout", "sout_offset_ns", "sync", "utc",
+        "utc_reference",
     )  # fmt: skip
 
     def __init__(
-        self, tick_ns: int, tick_modulus: int, bits: TimeBits, sout_timing: SoutTiming, sin_timing: TriggerTiming
-    ) -> None:
+        self, tick_ns: int, tick_modulus: int, bits: TimeBits, sout_timing: SoutTiming, sin_timing: TriggerTiming,
+        host: SteadyTime,
+    ) -> None:  # fmt: skip
         self._bits = bits
+        self._host = host
         self._sout_timing = sout_timing
         self._sin_timing = sin_timing
         self._pulses = PulseDecoder(int(sout_timing.width_us * NS_PER_US))
@@ -168,6 +174,8 @@ class AidingSources:
         """From a pulse on SOUT to its measurement."""
         self.marks: MarkPairing | None = None
         self.utc = DeviceUtc(tick_ns, tick_modulus)
+        self.utc_reference: UtcReference | None = None
+        """The host's estimate of UTC, against CLOCK_MONOTONIC; None while it has none."""
         self.slew = Slew()
         self.error_ns = 0.0
         """One-sigma error of the newest time."""
@@ -185,7 +193,8 @@ class AidingSources:
             sigma_ns = timing.bias_us * NS_PER_US / sqrt(3)
             self.sout = EdgeSource(pairing, self.sout_offset_ns, sigma_ns, self._bits.sync_out)
             self._sources.append(self.sout)
-        self.sout.pairing.add_events(self._pulses.decode(edges))
+        steady_ns = self._host.steady_ns
+        self.sout.pairing.add_events([(steady_ns(t_ns), number) for t_ns, number in self._pulses.decode(edges)])
 
     def on_divided_edges(self, edges: Sequence[Edge]) -> None:
         """Add edges of SOUT_DIV."""
@@ -201,13 +210,20 @@ class AidingSources:
             self.sin = EdgeSource(pairing, int(timing.offset_us * NS_PER_US), timing.bias_us * NS_PER_US / sqrt(3))
             self._sources.append(self.sin)
         for t_ns, err_ns, number in stamps:
-            self.sin.add_event((t_ns, number), err_ns)
+            self.sin.add_event((self._host.steady_ns(t_ns), number), err_ns)
 
     def on_pps_edges(self, edges: Sequence[Edge]) -> None:
         """Add edges of the pulse per second that the device's SIN gets."""
         if self._pps is None:
             self._pps = PpsAge()
-        self._pps.add_pulses(t_ns for t_ns, _ in rising_edges(edges))
+        self._pps.add_pulses(self._host.steady_ns(t_ns) for t_ns, _ in rising_edges(edges))
+
+    def set_utc_reference(self, reference: UtcReference | None) -> None:
+        """Set the host's present estimate of UTC, or None."""
+        self.utc_reference = reference
+        if reference is not None:  # UTC minus steady time
+            reference = UtcReference(reference.offset_ns + self._host.offset_ns, reference.error_ns)
+        self.utc.set_reference(reference)
 
     def restart(self) -> None:
         """Forget all that is relative to device time or to the fit: either began anew."""

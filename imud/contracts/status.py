@@ -34,7 +34,8 @@ class ClockStatus(msgspec.Struct, frozen=True):
     offset_ns: int = 0
     """Host CLOCK_MONOTONIC minus unwrapped device time, at the newest sample."""
     skew_ppm: float = 0.0
-    """Rate error of the device's clock against the host's, 1e-6; +40: it gains 40 µs per second."""
+    """Rate error of the device's clock against the host's, unsteered (CLOCK_MONOTONIC_RAW), 1e-6; +40: it gains 40 µs
+    per second."""
     residual_ns: int = 0
     """One-sigma spread of the lower envelope of arrival times around the fit."""
     t_err_ns: int = 0
@@ -53,6 +54,8 @@ class ClockStatus(msgspec.Struct, frozen=True):
     """Triggers on SIN that no frame answered."""
     reference_error_ns: int = 0
     """One-sigma error of the host's estimate of UTC; 0 without one."""
+    steering_ppm: float = 0.0
+    """How much faster than CLOCK_MONOTONIC_RAW CLOCK_MONOTONIC runs now, 1e-6: what an NTP client makes of it."""
 
 
 class KernelCounters(msgspec.Struct, frozen=True):

@@ -59,11 +59,14 @@ class Attachments:
     ) -> None:
         """Make the attachments that `config` has; `lines` makes the GPIO lines."""
         raise_event = notices.raise_event
-        self._utc: UtcKeeper | None = make_keeper(config, hooks.port, host.now_ns, host.utc_offset_ns)
+        self._utc: UtcKeeper | None = make_keeper(config, hooks.port, host)
         self._signals: SyncSignals | None = None
         if config.lines is not None:
             on_pulses = self._utc.on_pulses if self._utc is not None else None
-            self._signals = SyncSignals(config.name, config.lines, lines, raise_event, host.now_ns, on_pulses=on_pulses)
+            self._signals = SyncSignals(
+                config.name, config.lines, lines, raise_event, host.now_ns, on_pulses=on_pulses,
+                follow=host.utc_offset_ns,
+            )  # fmt: skip
         self._reset: ResetLine | None = make_reset(
             config.name, config.lines, lines, raise_event, host.now_ns, hooks.on_reset
         )

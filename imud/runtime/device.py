@@ -81,6 +81,7 @@ class Device:
         self.device_id = device_id
         self.ledger = Ledger()
         self._host = host
+        self._suspends = host.suspends
         self._notices = Notices(config.name, self.ledger, send_event)
         self._health = Health(self._notices)
         port = DevicePort(self._write, lambda: self._transport.bit_rate, self._is_busy)
@@ -143,6 +144,10 @@ class Device:
         transport.tick(now_ns)
         if path is None:
             return
+        if self._suspends != self._host.suspends:
+            self._suspends = self._host.suspends
+            if path.fresh:  # what it measured meanwhile is lost, and CLOCK_MONOTONIC does not show that time passed
+                self.ledger.add_unknown_gap()
         if now_ns - path.last_data_ns > IDLE_FLUSH_NS:
             path.flush(now_ns)
         if transport.receiving:

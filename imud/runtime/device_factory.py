@@ -53,7 +53,7 @@ class DeviceFactory:
         self._send_event = send_event
         self._host = host
         self._lines = lines
-        self._files = SettingsFiles(state_dir, lambda: host.now_ns() + host.utc_offset_ns(host.now_ns()))
+        self._files = SettingsFiles(state_dir, lambda: host.now_ns() + host.utc_offset_ns())
         self._polled_buses = PolledBuses(host.now_ns, start_worker)
         self._can_buses = CanBuses()
 

@@ -17,7 +17,7 @@ from imud.contracts.driver import Driver
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.formats.can import CanFrame
 from imud.frames.published import PublishedFrame
-from imud.host_clock import HostClock
+from imud.host_clock import UNSTEERED, HostClock, SteadyTime
 from imud.ledger import Ledger
 from imud.runtime.meters import LatencyMeter, LossMeter
 from imud.sample import Measurement, Sample
@@ -106,7 +106,7 @@ class SamplePath(ABC):
     def publish_events(self, events: Sequence[CodecEvent], t_rx_ns: int) -> None:
         """Publish the samples in what a codec made of something that came at `t_rx_ns`, as one batch."""
         samples: list[Sample] = []
-        self._sort(events, t_rx_ns, self._utc_offset_ns(t_rx_ns), samples)
+        self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
         if samples:
             self._finish(samples, t_rx_ns)
 
@@ -228,7 +228,7 @@ class CanPath(SamplePath):
         other devices come between them.
         """
         feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
-        utc_offset_ns = self._utc_offset_ns(self._now_ns())
+        utc_offset_ns = self._utc_offset_ns()
         t_rx_ns = self.last_data_ns
         for can_id, extended, data, t_rx_ns, after_loss in frames:
             if after_loss:
@@ -261,6 +261,7 @@ def make_clock(
     driver: Driver,
     before: SampleClock | None,
     *,
+    host: SteadyTime = UNSTEERED,
     byte_ns: int = 0,
     hold_ns: int = 0,
     on_unknown_gap: Callable[[], None] = lambda: None,
@@ -277,6 +278,7 @@ def make_clock(
         bits=driver.time_bits,
         sout=lines.sout.timing if lines is not None and lines.sout is not None else None,
         sin=lines.sin.timing if lines is not None and lines.sin is not None else None,
+        host=host,
         on_unknown_gap=on_unknown_gap,
     )
     if before is not None:

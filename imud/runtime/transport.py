@@ -61,7 +61,9 @@ class DeviceContext:
     def new_clock(self, driver: Driver, path: SamplePath | None) -> SampleClock:
         """Return a clock for what `driver` decodes, which continues that of the path before."""
         before = path.clock if path is not None else None
-        return make_clock(self.config, driver, before, on_unknown_gap=self.ledger.add_unknown_gap)
+        return make_clock(
+            self.config, driver, before, host=self.host.steady, on_unknown_gap=self.ledger.add_unknown_gap
+        )
 
 
 class Transport(Protocol):

@@ -16,6 +16,7 @@ from imud.contracts.lines import Edge
 from imud.contracts.link import StreamLink
 from imud.contracts.status import UtcStatus
 from imud.contracts.timing import UtcReference
+from imud.host_clock import UNSTEERED, HostClock, SteadyTime
 from imud.links import LINKS
 from imud.sample import Sample
 from imud.units import NS_PER_S
@@ -47,21 +48,23 @@ class UtcKeeper:
         self,
         source: RmcSource | None,
         port: DevicePort | None,
-        system: Callable[[int], UtcReference | None],
+        system: Callable[[], UtcReference | None],
         now_ns: Callable[[], int],
         *,
         rate_hz: int = 1,
         chrony: ChronyFeed | None = None,
+        steady: SteadyTime = UNSTEERED,
     ) -> None:
         """`source` and `port` are None if the device is fed no sentences.
 
-        `system` returns the system clock as a reference, from CLOCK_MONOTONIC as read last; `rate_hz` is the greatest
-        rate of sentences to the device.
+        `system` returns the system clock as a reference; `rate_hz` is the greatest rate of sentences to the device.
+        Pulses are fitted in `steady`: a line through them in a time that is slewed would be none.
         """
         self._source = source
         self._chrony = chrony
         self._pps = PpsReference(self._on_second if chrony is not None else None)
         self._system = system
+        self._steady = steady
         self._reference: UtcReference | None = None
         self._clock: SampleClock | None = None
         self._due_ns = 0
@@ -104,7 +107,7 @@ class UtcKeeper:
         """Add edges of the pulse per second that the device's SIN receives."""
         for edge in edges:
             if edge.rising:
-                self._pps.on_pulse(edge.t_ns)
+                self._pps.on_pulse(self._steady.steady_ns(edge.t_ns))
                 if self._feed is not None:
                     self._feed.on_pulse(edge.t_ns)
 
@@ -125,14 +128,20 @@ class UtcKeeper:
 
     def _update_reference(self, now_ns: int) -> None:
         self._due_ns = now_ns + ASK_NS
-        self._reference = _better(self._pps.reference(now_ns), self._system(now_ns))
+        by_system, by_pulses = self._system(), self._pps.reference(self._steady.steady_ns(now_ns))
+        if by_pulses is not None:
+            by_pulses = UtcReference(by_pulses.offset_ns - self._steady.offset_ns, by_pulses.error_ns)
+        if by_system is not None:  # the clock of a device counts on in steady time from here, until the next time
+            steered_ns = round(abs(self._steady.rate) * ASK_NS)
+            by_system = UtcReference(by_system.offset_ns, by_system.error_ns + steered_ns)
+        self._reference = _better(by_pulses, by_system)
         if self._clock is not None:
             self._clock.set_utc_reference(self._reference)
 
     def _on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
         """Use a sentence for the host first: its clock must know UTC before the device's time becomes UTC, or it takes
         that for a jump."""
-        self._pps.on_sentence(sentence, t_rx_ns)
+        self._pps.on_sentence(sentence, self._steady.steady_ns(t_rx_ns))
         if self._reference is None:
             self._update_reference(t_rx_ns)
         if self._feed is not None:
@@ -140,7 +149,7 @@ class UtcKeeper:
 
     def _on_second(self, t_ns: int, unix_s: int) -> None:
         if self._chrony is not None:
-            self._chrony.send_pulse(t_ns, unix_s)
+            self._chrony.send_pulse(self._steady.monotonic_ns(t_ns), unix_s)
 
 
 def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReference | None:
@@ -150,25 +159,21 @@ def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReferenc
     return one if one.error_ns <= other.error_ns else other
 
 
-def make_keeper(
-    config: DeviceConfig, port: DevicePort, now_ns: Callable[[], int], utc_offset_ns: Callable[[int], int]
-) -> UtcKeeper | None:
-    """Make the keeper that a device's configuration needs; None if it has neither sentences nor a pulse per second.
-
-    `now_ns` and `utc_offset_ns` as in `SourceContext`.
-    """
+def make_keeper(config: DeviceConfig, port: DevicePort, host: HostClock) -> UtcKeeper | None:
+    """Make the keeper that a device's configuration needs; None if it has neither sentences nor a pulse per second."""
+    now_ns, utc_offset_ns, steady = host.now_ns, host.utc_offset_ns, host.steady
     rmc, pps = config.rmc, config.lines.pps if config.lines is not None else None
     if rmc is None and pps is None:
         return None
     chrony = ChronyFeed(pps.chrony, utc_offset_ns) if pps is not None and pps.chrony else None
 
-    def system(just_now_ns: int) -> UtcReference | None:
-        return system_reference(kernel_clock(), utc_offset_ns(just_now_ns))
+    def system() -> UtcReference | None:
+        return system_reference(kernel_clock(), utc_offset_ns())
 
     if rmc is None:
-        return UtcKeeper(None, None, system, now_ns, chrony=chrony)
+        return UtcKeeper(None, None, system, now_ns, chrony=chrony, steady=steady)
     source = RMC_SOURCES[rmc.source](rmc, SourceContext(_serial_port, now_ns, utc_offset_ns))
-    return UtcKeeper(source, port, system, now_ns, rate_hz=rmc.rate_hz, chrony=chrony)
+    return UtcKeeper(source, port, system, now_ns, rate_hz=rmc.rate_hz, chrony=chrony, steady=steady)
 
 
 def _serial_port(path: str, baud: int) -> StreamLink:

@@ -38,9 +38,13 @@ class SyncSignals:
         now_ns: Callable[[], int],
         *,
         on_pulses: OnEdges | None = None,
+        follow: Callable[[], object] = int,
     ) -> None:
-        """`now_ns` is CLOCK_MONOTONIC. `on_pulses` receives the edges of PPS after the clock."""
-        self._raise_event, self._now_ns = raise_event, now_ns
+        """`now_ns` is CLOCK_MONOTONIC. `on_pulses` receives the edges of PPS after the clock.
+
+        `follow` is called before edges are delivered: it notes how CLOCK_MONOTONIC is steered, for their conversion.
+        """
+        self._raise_event, self._now_ns, self._follow = raise_event, now_ns, follow
         self._on_pulses = on_pulses
         self._clock: SampleClock | None = None
         self._alarm = AlarmMonitor(raise_event)
@@ -157,6 +161,7 @@ class SyncSignals:
 
     def _on_sout(self, edges: Sequence[Edge]) -> None:
         if self._clock is not None:
+            self._follow()
             self._clock.on_sout_edges(edges)
 
     def _on_divided(self, edges: Sequence[Edge]) -> None:
@@ -164,6 +169,7 @@ class SyncSignals:
             self._clock.on_divided_edges(edges)
 
     def _on_pps(self, edges: Sequence[Edge]) -> None:
+        self._follow()
         if self._clock is not None:
             self._clock.on_pps_edges(edges)
         if self._on_pulses is not None:
@@ -171,6 +177,7 @@ class SyncSignals:
 
     def _on_stamps(self, stamps: Sequence[TriggerStamp]) -> None:
         if self._clock is not None:
+            self._follow()
             self._clock.on_trigger_stamps(stamps)
 
     def _on_alarm(self, edges: Sequence[Edge]) -> None:

@@ -32,7 +32,7 @@ def encode(system_ns: int, offset_ns: int, *, pulse: bool, leap: int = 0) -> byt
 class ChronyFeed:
     """Sender of samples to chronyd. Never blocks. Synchronization: one thread."""
 
-    def __init__(self, path: str, utc_offset_ns: Callable[[int], int]) -> None:
+    def __init__(self, path: str, utc_offset_ns: Callable[[], int]) -> None:
         """`path` is chronyd's socket, which may not exist yet; `utc_offset_ns` as `SourceContext.utc_offset_ns`."""
         self.title = f"chronyd at {path}"
         self.problem = ""
@@ -50,7 +50,7 @@ class ChronyFeed:
 
         Call it soon after the pulse. Without the second chronyd needs another source for it (`lock`).
         """
-        system_ns = t_ns + self._utc_offset_ns(t_ns)
+        system_ns = t_ns + self._utc_offset_ns()
         second_s = (system_ns + HALF_NS) // NS_PER_S if unix_s is None else unix_s
         offset_ns = second_s * NS_PER_S - system_ns
         return self._send(encode(system_ns, offset_ns, pulse=unix_s is None))

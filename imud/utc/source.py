@@ -68,8 +68,8 @@ class SourceContext(NamedTuple):
     make_port: MakePort
     now_ns: Callable[[], int]
     """CLOCK_MONOTONIC."""
-    utc_offset_ns: Callable[[int], int]
-    """CLOCK_REALTIME minus CLOCK_MONOTONIC; its argument is CLOCK_MONOTONIC as read last."""
+    utc_offset_ns: Callable[[], int]
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC, now."""
 
 
 MakeSource = Callable[[RmcSettings, SourceContext], RmcSource]

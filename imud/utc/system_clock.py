@@ -89,7 +89,7 @@ class SystemClockSource:
         self,
         settings: RmcSettings,
         now_ns: Callable[[], int],
-        utc_offset_ns: Callable[[int], int],
+        utc_offset_ns: Callable[[], int],
         ask: Callable[[], KernelClock] = kernel_clock,
     ) -> None:
         """`now_ns` and `utc_offset_ns` as in `SourceContext`; `ask` reads the state of the clock."""
@@ -116,7 +116,7 @@ class SystemClockSource:
     def tick(self) -> None:
         """Deliver the sentence that is due, if any, and if the clock is good enough."""
         now_ns = self._now_ns()
-        utc_ns = now_ns + self._utc_offset_ns(now_ns)
+        utc_ns = now_ns + self._utc_offset_ns()
         named_ns = self._named_ns(utc_ns)
         if utc_ns % NS_PER_S < AFTER_NS or utc_ns % NS_PER_S >= LATEST_NS:
             return
@@ -130,7 +130,7 @@ class SystemClockSource:
     def wait_ns(self) -> int:
         """Return the time until the next sentence is due, ns."""
         now_ns = self._now_ns()
-        utc_ns = now_ns + self._utc_offset_ns(now_ns)
+        utc_ns = now_ns + self._utc_offset_ns()
         named_ns = self._named_ns(utc_ns)
         next_second_ns = (named_ns // NS_PER_S + 1) * NS_PER_S
         return min(named_ns + self._step_ns, next_second_ns) + AFTER_NS - utc_ns

@@ -13,10 +13,11 @@ from imud.contracts.status import DeviceState
 from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.errors import CommandError
 from imud.formats.can import RAW_FRAME, CanFrame
+from imud.host_clock import HostClock
 from imud.links.memory import MemoryCanLink, MemorySettings
 from imud.runtime.detection import can as detection
 from imud.sim.hipnuc.canopen import HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
-from imud.units import NS_PER_MS
+from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
 from tests.support.event_loops import VirtualClock
@@ -31,7 +32,10 @@ class CanopenDeviceBench:
         settings = MemorySettings(name="can0")
         config = DeviceConfig("bow", driver, options, False, "memory", settings)
         self.clock = VirtualClock()
-        self.rigs = DeviceRigs(self.clock.host)
+        self.asleep_ns = 0
+        now_ns = self.clock.now_ns
+        self.host = HostClock(now_ns, self.clock.realtime_ns, now_ns, lambda: now_ns() + self.asleep_ns)
+        self.rigs = DeviceRigs(self.host)
         self.rig = self.rigs.add(config, MemoryCanLink(settings))
         self.link = self.rig.can_link
         hardware = HipnucCanopenHardware(factory=NodeSettings(node=NODE), boot_ms=0, skew_ppm=0)
@@ -93,5 +97,20 @@ def test_a_node_that_does_not_answer_is_an_error() -> None:
         bench.deaf = True
         with pytest.raises(CommandError, match="node 9"):
             await bench.act("zero", zero="here")
+
+    play(bench, story())
+
+
+def test_what_a_device_measured_while_the_machine_was_suspended_is_a_gap_of_unknown_size() -> None:
+    bench = CanopenDeviceBench("hipnuc-canopen", HipnucCanopenSettings(node=NODE))
+
+    async def story() -> None:
+        samples = bench.rig.ledger.samples
+        await bench.until(lambda: bench.rig.ledger.samples > samples + 200)
+        before = bench.rig.ledger.lost_unknown
+        bench.asleep_ns += 2 * NS_PER_S
+        await bench.until(lambda: bench.rig.ledger.samples > samples + 400)
+        assert bench.host.suspends == 1
+        assert bench.rig.ledger.lost_unknown == before + 1
 
     play(bench, story())

@@ -9,6 +9,7 @@ from imud.config import DeviceConfig
 from imud.contracts.lines import DeviceLines, Edge, PpsSettings
 from imud.contracts.timing import UtcReference
 from imud.formats.rmc import build
+from imud.host_clock import HostClock
 from imud.links.memory import MemorySettings
 from imud.runtime import utc_keeper
 from imud.runtime.utc_keeper import DevicePort, UtcKeeper, make_keeper
@@ -56,7 +57,7 @@ class KeeperBench:
         self.keeper = UtcKeeper(
             self.source if source else None,
             port if source else None,
-            lambda _now_ns: self.system,
+            lambda: self.system,
             lambda: self.now_ns,
             chrony=cast(ChronyFeed, self.chrony),
         )
@@ -169,12 +170,12 @@ def test_close_releases_source_and_socket_and_nothing_starts_again() -> None:
     bench.source.started = 0
     bench.keeper.tick(BEGIN_NS, None)
     assert bench.source.started == 0
-    UtcKeeper(None, None, lambda _now_ns: None, lambda: 0).close()
+    UtcKeeper(None, None, lambda: None, lambda: 0).close()
 
 
 def test_a_keeper_that_was_closed_before_its_first_tick_starts_no_source() -> None:
     source = FakeSource()
-    keeper = UtcKeeper(source, None, lambda _now_ns: None, lambda: 0)
+    keeper = UtcKeeper(source, None, lambda: None, lambda: 0)
     keeper.close()
     keeper.tick(BEGIN_NS, None)
     assert source.started == 0
@@ -191,17 +192,18 @@ def test_problems_of_source_and_chrony_show(bench: KeeperBench) -> None:
 def test_the_system_clock_counts_only_while_something_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
     port = DevicePort(lambda _data: None, lambda: 9600, lambda: False)
-    keeper = make_keeper(
-        configured(None, PpsSettings(line="A")), port, lambda: BEGIN_NS, lambda now_ns: OFFSET_NS + now_ns
-    )
+    offset_ns, now_ns = [OFFSET_NS], lambda: BEGIN_NS
+    host = HostClock(now_ns, lambda: BEGIN_NS + offset_ns[0], now_ns)
+    keeper = make_keeper(configured(None, PpsSettings(line="A")), port, host)
     assert keeper is not None
     keeper.start(clock)
     monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(False, 100, 100))
     keeper.tick(BEGIN_NS, None)
     assert clock.utc_reference is None
     monkeypatch.setattr(utc_keeper, "kernel_clock", lambda: KernelClock(True, 100, 0))
+    offset_ns[0] += 37 * NS_PER_S
     keeper.tick(BEGIN_NS + NS_PER_S, None)
-    assert clock.utc_reference == UtcReference(OFFSET_NS + BEGIN_NS + NS_PER_S, 100_000)
+    assert clock.utc_reference == UtcReference(OFFSET_NS + 37 * NS_PER_S, 100_000)
     keeper.close()
 
 
@@ -220,7 +222,8 @@ def test_a_device_gets_what_it_is_configured_for(
 
     def make() -> UtcKeeper | None:
         port = DevicePort(written.append, lambda: 9600, lambda: False)
-        return make_keeper(configured(rmc, pps), port, lambda: now_ns[0], lambda _now_ns: OFFSET_NS)
+        host = HostClock(lambda: now_ns[0], lambda: now_ns[0] + OFFSET_NS, lambda: now_ns[0])
+        return make_keeper(configured(rmc, pps), port, host)
 
     real = make()
     assert (real is None) == (rmc is None and pps is None)

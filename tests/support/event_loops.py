@@ -60,7 +60,7 @@ class VirtualClock:
     @property
     def host(self) -> HostClock:
         """Both clocks of the host."""
-        return HostClock(self.now_ns, self.realtime_ns)
+        return HostClock(self.now_ns, self.realtime_ns, self.now_ns)
 
 
 class _JumpingSelector(selectors.DefaultSelector):

@@ -45,7 +45,7 @@ def device(name: str, number: int = 0, **changes: object) -> DeviceStatus:
         rate_hz=999.5 + number,
         expected_rate_hz=1000.25,
         newest_seq=123,
-        clock=ClockStatus(Sync.REGRESSION, 5_250_000_000, -40.0, 30_000, 45_000, 2),
+        clock=ClockStatus(Sync.REGRESSION, 5_250_000_000, -40.0, 30_000, 45_000, 2, steering_ppm=500.0),
         ledger=ledger,
         kernel=KernelCounters(7, 8, 9, 10),
         latency_buckets=tuple(range(1, len(LATENCY_BOUNDS_NS) + 2)),

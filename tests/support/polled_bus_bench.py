@@ -49,7 +49,7 @@ class PolledBusBench:
 
     def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[DeviceRig]]:
         """Devices at work."""
-        host = HostClock(self._time, self.clock.realtime_ns)
+        host = HostClock(self._time, self.clock.realtime_ns, self._time)
         return running(*configs, rigs=DeviceRigs(host, lines=self.lines.maker, start_worker=LoopWorker))
 
     def run(self, body: Coroutine[Any, Any, None]) -> None:

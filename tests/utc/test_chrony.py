@@ -29,7 +29,7 @@ def receiver(tmp_path: Path) -> Iterator[socket.socket]:
 
 def feed(receiver: socket.socket, ahead_ns: int = 0) -> ChronyFeed:
     """A feed on a host whose clock is `ahead_ns` ahead of UTC, and whose CLOCK_MONOTONIC is UTC less UTC_S."""
-    return ChronyFeed(receiver.getsockname(), lambda _now_ns: UTC_S * NS_PER_S + ahead_ns)
+    return ChronyFeed(receiver.getsockname(), lambda: UTC_S * NS_PER_S + ahead_ns)
 
 
 def test_the_layout_byte_by_byte() -> None:
@@ -138,7 +138,7 @@ def test_chronyd_takes_the_samples_and_sees_the_offset(chronyd: Path) -> None:
     limit_s = time.monotonic() + LIMIT_S
     while True:
         now_ns = time.monotonic_ns()
-        utc_ns = now_ns + utc_offset_ns(now_ns) + offset_ns
+        utc_ns = now_ns + utc_offset_ns() + offset_ns
         chrony.send_pulse(now_ns - utc_ns % NS_PER_S, utc_ns // NS_PER_S)
         source = sources(chronyd).get("IMUD")
         if source and source[5] != "0" and float(source[7]):

@@ -248,7 +248,7 @@ def test_the_row_makes_it_of_the_port_that_is_named() -> None:
         asked.append((path, baud))
         return Port()
 
-    context = SourceContext(make_port, time.monotonic_ns, lambda _now_ns: 0)
+    context = SourceContext(make_port, time.monotonic_ns, lambda: 0)
 
     async def scene() -> None:
         source = make_nmea(RmcSettings(source="nmea", port="/dev/ttyGNSS", baud=38400), context)

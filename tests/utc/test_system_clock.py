@@ -54,7 +54,7 @@ def test_a_kernel_that_may_not_be_asked_vouches_for_nothing() -> None:
 
 
 def test_the_offset_joins_both_clocks() -> None:
-    offset_ns = HostClock().utc_offset_ns(time.monotonic_ns())
+    offset_ns = HostClock().utc_offset_ns()
     assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the machine may stall in between
 
 
@@ -90,7 +90,7 @@ class SystemClockBench:
         self.source = SystemClockSource(
             RmcSettings(source="system", rate_hz=rate_hz),
             lambda: self.now_ns,
-            lambda _now_ns: OFFSET_NS,
+            lambda: OFFSET_NS,
             lambda: self.clock,
         )
         self.source.start(lambda sentence, t_rx_ns: self.got.append((sentence, t_rx_ns)))

@@ -229,8 +229,12 @@ DEVICE_FAMILIES: Final = (
         CLOCK.one(lambda clock: clock.offset_ns), SECONDS,
     ),
     _gauge(
-        "imud_clock_skew_ratio", "How much faster than the host's the device's clock runs; 4e-05 is 40 ppm.",
+        "imud_clock_skew_ratio", "How much faster than the unsteered host the device's clock runs; 4e-05: 40 ppm.",
         CLOCK.one(lambda clock: clock.skew_ppm), RATIO,
+    ),
+    _gauge(
+        "imud_clock_steering_ratio", "How much faster than unsteered CLOCK_MONOTONIC runs; 0.0005: a slew of 500 ppm.",
+        CLOCK.one(lambda clock: clock.steering_ppm), RATIO,
     ),
     _gauge(
         "imud_clock_residual_seconds", "One-sigma spread of arrival times around the fitted clock.",

@@ -84,7 +84,7 @@ class PolledPath(SamplePath):
 
     def on_readings(self, readings: Sequence[Reading]) -> str:
         """Process readings, oldest first; return why the device must be identified again, or an empty string."""
-        utc_offset_ns = self._utc_offset_ns(self._now_ns())
+        utc_offset_ns = self._utc_offset_ns()
         samples: list[Sample] = []
         gone = ""
         edges = self._edges

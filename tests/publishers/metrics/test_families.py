@@ -118,6 +118,7 @@ def test_values_in_base_units() -> None:
     expected = {
         "imud_clock_offset_seconds": 5.25,
         "imud_clock_skew_ratio": -4e-05,
+        "imud_clock_steering_ratio": 5e-04,
         "imud_clock_residual_seconds": 3e-05,
         "imud_clock_error_seconds": 4.5e-05,
         "imud_clock_resets_total": 2,

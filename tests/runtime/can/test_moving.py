@@ -30,7 +30,7 @@ class BusInProcess:
     def __init__(self, clock: VirtualClock, driver: str, options: Settings, *modules: CanModule) -> None:
         self.clock = clock
         self.modules = CanModules(modules)
-        self.rigs = DeviceRigs(HostClock(clock.now_ns, clock.realtime_ns))
+        self.rigs = DeviceRigs(HostClock(clock.now_ns, clock.realtime_ns, clock.now_ns))
         link = MemorySettings(baud=BIT_RATE, name="can0")
         self.rig: DeviceRig = self.rigs.add(DeviceConfig("bow", driver, options, True, "memory", link))
         self._passed_on = 0

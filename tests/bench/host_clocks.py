@@ -1,0 +1,145 @@
+"""The clock on hosts whose CLOCK_MONOTONIC is slewed: `python -m tests.bench.host_clocks` prints the table.
+
+The models of arrival run in steady time, which is the truth; CLOCK_MONOTONIC is made of it by rates that change, and
+read by a real `HostClock` at each read of the device. `--unseen` shows what comes out where the steering is not seen.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from imud.clock import SampleClock
+from imud.host_clock import UNSTEERED, HostClock
+from imud.sample import Measurement, Sample
+from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
+from imud.units import NS_PER_S, NS_PER_US
+from tests.bench.clock import BAUD_OF_RATE, TICK_MODULUS, TICK_NS, Accuracy, Point, accuracy
+
+UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S
+DECODE_NS: Final = 20 * NS_PER_US
+"""From a read to its decoding, when the clocks are read."""
+BEGIN_NS: Final = 1000 * NS_PER_S
+"""The models begin here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Steering:
+    """How CLOCK_MONOTONIC is slewed: from so many seconds of a run on, so many ppm fast."""
+
+    name: str
+    changes: tuple[tuple[float, float], ...] = ()
+
+    def monotonic_ns(self, steady_ns: int) -> int:
+        """CLOCK_MONOTONIC at a steady time; both are the same before the first change."""
+        moved_ns = 0
+        ends = [BEGIN_NS + int(s * NS_PER_S) for s, _ in self.changes[1:]] + [1 << 62]
+        for (begin_s, ppm), end_ns in zip(self.changes, ends, strict=False):
+            slewed_ns = min(steady_ns, end_ns) - BEGIN_NS - int(begin_s * NS_PER_S)
+            if slewed_ns <= 0:
+                break
+            moved_ns += slewed_ns * round(ppm) // 1_000_000
+        return steady_ns + moved_ns
+
+
+STEERINGS: Final = (
+    Steering("not steered"),
+    Steering("20 ppm all the time", ((-1000, 20),)),
+    Steering("500 ppm for 40 s, twice", ((30, 500), (70, -500), (110, 0))),
+    Steering("83,333 ppm for 5 s after start", ((2, 83_333), (7, 0))),
+    Steering("83,333 ppm back for 5 s", ((80, -83_333), (85, 0))),
+    Steering("400 ppm to and fro each second", tuple((s, 400 * (-1) ** s) for s in range(1, 120))),
+)
+
+
+class SteeredHost:
+    """A host whose clocks are read. `at` sets what time it is."""
+
+    def __init__(self, steering: Steering) -> None:
+        self.steering = steering
+        self.now_ns = BEGIN_NS
+        """Steady time."""
+        self.ahead_ns = UTC_AHEAD_NS
+        self.clock = HostClock(self.monotonic_ns, lambda: self.monotonic_ns() + self.ahead_ns, lambda: self.now_ns)
+
+    def monotonic_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+        return self.steering.monotonic_ns(self.now_ns)
+
+    def at(self, steady_ns: int) -> int:
+        """Set the time; returns CLOCK_REALTIME minus CLOCK_MONOTONIC as the daemon reads it then."""
+        self.now_ns = steady_ns
+        return self.clock.utc_offset_ns()
+
+
+class DatedArrival(NamedTuple):
+    """A sample beside its truth."""
+
+    sample: Sample
+    truth_ns: int
+    """CLOCK_MONOTONIC at the measurement."""
+
+    @property
+    def point(self) -> Point:
+        """As the table of `clock` has it."""
+        return Point(self.sample.t_ns - self.truth_ns, self.sample.t_err_ns, True, self.truth_ns)
+
+
+def clock_on(host: SteeredHost, model: ArrivalModel, *, unseen: bool = False) -> SampleClock:
+    """A clock as the pipeline would set it up for the model's link, on that host."""
+    return SampleClock(
+        "bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=model.profile.hold_ns,
+        host=UNSTEERED if unseen else host.clock.steady,
+    )  # fmt: skip
+
+
+def date(clock: SampleClock, host: SteeredHost, a: Arrival) -> DatedArrival:
+    """One message through the clock; the host's clocks are read when its decoding is done."""
+    offset_ns = host.at(a.t_rx_ns + DECODE_NS)
+    monotonic_ns = host.steering.monotonic_ns
+    m = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
+    return DatedArrival(clock.sample(m, monotonic_ns(a.t_rx_ns), offset_ns), monotonic_ns(a.t_ns))
+
+
+def run(model: ArrivalModel, steering: Steering, count: int, *, unseen: bool = False) -> list[DatedArrival]:
+    """The first samples of a model on a host that is steered."""
+    host = SteeredHost(steering)
+    host.at(model.begin_ns)
+    clock = clock_on(host, model, unseen=unseen)
+    return [date(clock, host, a) for a in model.run(count)]
+
+
+def rises(dated: Sequence[DatedArrival]) -> bool:
+    """Whether time rises strictly, and no sample is after its arrival."""
+    return all(a.sample.t_ns < b.sample.t_ns for a, b in pairwise(dated)) and all(
+        d.sample.t_ns <= d.sample.t_rx_ns for d in dated
+    )
+
+
+def figures(profile: ArrivalProfile, rate_hz: int, steering: Steering, seconds: int, *, unseen: bool) -> Accuracy:
+    """One cell."""
+    model = ArrivalModel(profile, rate_hz, 1, Crystal(50.0), BAUD_OF_RATE[rate_hz])
+    dated = run(model, steering, rate_hz * seconds, unseen=unseen)
+    assert rises(dated)
+    return accuracy([d.point for d in dated])
+
+
+def print_table(*, unseen: bool) -> None:
+    """The table of docs/clock.md, as Markdown."""
+    print(
+        "| host's clock | arrival | rate, Hz | σ, µs | rms, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    for steering in STEERINGS:
+        for profile, rate_hz in ((BARE_UART, 100), (USB_16MS, 100), (LOADED, 100), (BARE_UART, 1000)):
+            a = figures(profile, rate_hz, steering, 130 if rate_hz == 1000 else 150, unseen=unseen)
+            micro = " | ".join(f"{ns / 1000:.0f}" for ns in (a.sigma_ns, a.rms_ns, a.p999_ns, a.mean_t_err_ns))
+            print(
+                f"| {steering.name} | {profile.name} | {rate_hz} | {micro} | {a.share:.3f} | {a.share_settling:.3f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    print_table(unseen="--unseen" in sys.argv)
