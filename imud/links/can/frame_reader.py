@@ -6,8 +6,8 @@ time) and one more, with an exception, to find the queue empty.
 
 Kernel stamps are CLOCK_REALTIME. They are carried over to CLOCK_MONOTONIC with the offset of the two at the read, and
 held between the last time the queue was seen empty and now: a wall clock that was set between arrival and read cannot
-move a stamp out of that. The kernel begins to stamp some ms after the first socket of the machine asks for it; until
-then it fills in the time of the read.
+move a stamp out of that. Both clocks are slewed together: their difference is the same at arrival and read. The kernel
+begins to stamp some ms after the first socket of the machine asks for it; until then it fills in the time of the read.
 """
 
 import ctypes
@@ -38,7 +38,7 @@ SO_TIMESTAMPNS_NEW: Final = 64
 SO_RXQ_OVFL: Final = 40
 """Ask for the count of frames dropped because the receive buffer was full, and its type: u32."""
 STEADY_NS: Final = 20 * NS_PER_US
-"""Two clocks read further apart than this were interrupted: read again."""
+"""Two clocks read further apart than this were interrupted: read again, and use the closest of STEADY_TRIES."""
 STEADY_TRIES: Final = 3
 _COUNT_MASK: Final = 0xFFFF_FFFF
 _NO_DATA_FLAGS: Final = ERROR_FLAG | REMOTE_FLAG
@@ -176,11 +176,14 @@ class FrameReader:
 
     def _clocks(self) -> tuple[int, int]:
         """CLOCK_REALTIME less CLOCK_MONOTONIC, and CLOCK_MONOTONIC."""
-        for _ in range(STEADY_TRIES):
+        best_ns = offset_ns = now_ns = 0
+        for number in range(STEADY_TRIES):
             before_ns, wall_ns, now_ns = self._now_ns(), self._wall_ns(), self._now_ns()
-            if now_ns - before_ns <= STEADY_NS:
+            if number == 0 or now_ns - before_ns < best_ns:
+                best_ns, offset_ns = now_ns - before_ns, wall_ns - (before_ns + now_ns) // 2
+            if best_ns <= STEADY_NS:
                 break
-        return wall_ns - (before_ns + now_ns) // 2, now_ns
+        return offset_ns, now_ns
 
     def _failed(self, number: int, begun_ns: int) -> list[CanFrame]:
         if number in (errno.EAGAIN, errno.EINTR):

@@ -172,3 +172,22 @@ def test_a_frame_is_no_older_than_the_read_that_emptied_the_queue(wire: Wire) ->
     wire.wall_ahead_ns += HOUR_NS
     (frame,) = wire.reader.read()
     assert begun_ns <= frame.t_rx_ns <= time.monotonic_ns()
+
+
+def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wire: Wire) -> None:
+    """The thread is away between the two clocks each time: for 30 µs, then for 20 ms."""
+    away_ns, calls = [0, 0, 30_000, 0, 20_000_000, 0, 20_000_000], iter(range(7))
+    gone_ns = 0
+
+    def now_ns() -> int:
+        nonlocal gone_ns
+        gone_ns += away_ns[next(calls)] if begun else 0
+        return time.monotonic_ns() + gone_ns
+
+    begun = False
+    reader = FrameReader(wire.receiver, lambda _classes, _data: False, now_ns, lambda: time.time_ns() + gone_ns)
+    sent_ns = time.monotonic_ns()
+    wire.send(1)
+    begun = True
+    (frame,) = reader.read()
+    assert frame.t_rx_ns - sent_ns < 9_000_000
