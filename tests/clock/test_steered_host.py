@@ -92,6 +92,19 @@ def test_what_waited_for_a_stalled_host_is_dated_by_the_rate_of_its_own_time(ste
     assert sorted(settled)[int(0.95 * len(settled))] < 500 * NS_PER_US
 
 
+def test_a_read_that_waits_for_its_decoding_is_dated_by_the_rate_of_its_own_time() -> None:
+    """The clocks are read 50 ms after it: 83,333 ppm make 4 ms of that."""
+    host, clock = on(CHRONY)
+    to, dated = CHRONY.monotonic_ns, []
+    for a in model(BARE_UART).run(100 * SECONDS):
+        host.at(a.t_rx_ns + 50 * NS_PER_MS)
+        measured = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
+        dated.append(DatedArrival(clock.sample(measured, to(a.t_rx_ns), UTC_AHEAD_NS), to(a.t_ns)))
+    assert_honest(dated)
+    offs = sorted(abs(d.point.off_ns) for d in dated[1000:])
+    assert offs[int(0.97 * len(offs))] < 300 * NS_PER_US
+
+
 def steered_edges(edges: Sequence[Edge], steering: Steering) -> list[Edge]:
     """Edges as the kernel stamps them: by CLOCK_MONOTONIC."""
     return [edge._replace(t_ns=steering.monotonic_ns(edge.t_ns)) for edge in edges]
