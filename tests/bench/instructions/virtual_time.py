@@ -14,7 +14,7 @@ BEGIN_NS: Final = 1000 * NS_PER_S
 UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S
 
 _ns = [BEGIN_NS, BEGIN_NS + UTC_AHEAD_NS]
-_raw_ns = {time.CLOCK_MONOTONIC_RAW: BEGIN_NS}
+_by_clock = {time.CLOCK_MONOTONIC_RAW: BEGIN_NS, time.CLOCK_BOOTTIME: BEGIN_NS}
 _s = [BEGIN_NS / NS_PER_S]
 
 
@@ -23,7 +23,7 @@ def install() -> None:
     time.monotonic_ns = time.thread_time_ns = partial(_ns.__getitem__, 0)
     time.time_ns = partial(_ns.__getitem__, 1)
     time.monotonic = partial(_s.__getitem__, 0)
-    time.clock_gettime_ns = _raw_ns.__getitem__
+    time.clock_gettime_ns = _by_clock.__getitem__
 
 
 def now_ns() -> int:
@@ -34,5 +34,5 @@ def now_ns() -> int:
 def set_now(now_ns: int) -> None:
     """Set all clocks."""
     _ns[:] = now_ns, now_ns + UTC_AHEAD_NS
-    _raw_ns[time.CLOCK_MONOTONIC_RAW] = now_ns
+    _by_clock[time.CLOCK_MONOTONIC_RAW] = _by_clock[time.CLOCK_BOOTTIME] = now_ns
     _s[0] = now_ns / NS_PER_S
