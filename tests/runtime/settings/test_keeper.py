@@ -20,6 +20,7 @@ from imud.errors import BadArgument, CommandError
 from imud.event import Event, EventKind
 from imud.formats.can import CanFrame
 from imud.links.memory import MemoryCanLink, MemorySettings
+from imud.runtime.identity import IDENTIFY_AGAIN_S
 from imud.runtime.settings.flash import LIMIT_ASKED, LIMIT_ITSELF
 from imud.runtime.settings.keeper import READ_TRIES
 from imud.runtime.stream import transport as stream_transport
@@ -227,6 +228,7 @@ def test_a_device_that_does_not_tell_its_settings_is_asked_a_few_times() -> None
     async def story() -> None:
         await bench.until(lambda: bench.messages)
         assert bench.messages == ["settings could not be read, asked 3 times: GET: expected OK, got nothing"]
+        await bench.pass_s(sum(IDENTIFY_AGAIN_S) + 10)  # the identity is asked for with them, three times more
         asked = len(bench.module.commands)
         await bench.pass_s(300)
         assert len(bench.module.commands) == asked
