@@ -296,6 +296,7 @@ CROSS_CUTTING = {
     "publishers/shm/test_hostile.py": "the directory of the rings against other users",
     "cli/test_main.py": "`main` of imud/cli/__init__.py",
     "clock/test_accuracy.py": "every part of the clock against the truth of a simulation",
+    "clock/test_clock_table.py": "the stated error in cells of the table of adversities",
     "devices/test_every_row.py": "every driver",
     "devices/test_every_calibration.py": "the calibrations of every driver",
     "devices/test_every_stream_driver.py": "every driver of byte streams",

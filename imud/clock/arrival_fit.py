@@ -19,7 +19,7 @@ the lines between the bounds is the better estimate, and their spread is the err
 """
 
 from dataclasses import dataclass
-from math import inf, sqrt
+from math import inf, log, sqrt
 from typing import Final
 
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -32,18 +32,31 @@ SLOPE_HIGHEST: Final = 1 / 0.93
 """Host ns per device ns. Parts 4.08 % off nominal have been sold; past 7 % it is another tick, not a crystal."""
 SUPPORT_AT: Final = 0.75
 """Position of the chosen hull edge, as a share of the window."""
+ENOUGH_POINTS: Final = 8
+ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
+ENOUGH_HOLDS: Final = 20
+"""A fit is known from this number of points on, and this time or number of periods of a latency timer."""
 SPREAD_BINS: Final = 12
 """A fit under n bins is off by their mean distance times this over n, one sigma (by simulation, loaded host)."""
 RECENT_BINS: Final = 8
 RECENT_NS: Final = 2 * NS_PER_S
 """Number of the newest bins, over at least this time, whose common delay is no delay of single messages."""
+KNOWN_SIGMAS: Final = 4
+"""A slope that was known is within so many of its errors."""
+DRIFT_MOST: Final = 1e-6
+"""Change of a crystal's rate in a second, at most."""
 LATENCIES_NS: Final = (200 * NS_PER_US, 600 * NS_PER_US, 2000 * NS_PER_US, 6000 * NS_PER_US)
 """Allowances for polling and wake-up on top of the longest wait, tried in turn until some line fits."""
-
-ENOUGH_POINTS: Final = 8
-ENOUGH_SPAN_NS: Final = 100 * NS_PER_MS
-ENOUGH_HOLDS: Final = 20
-"""A fit is used from this number of points on, and this time or number of periods of a latency timer."""
+LATE_FACTOR: Final = 4.0
+"""Longest waits are twice the mean less the least, and a busy host is in the mean: with delays that fall off
+exponentially twice their mean is at most so many times the share of waits that the timer alone cannot explain, in
+periods of the timer."""
+HOLD_MESSAGES: Final = 32
+"""Number of messages that show whether the timer is what it was said to be."""
+HOLD_MOST_NS: Final = 16 * NS_PER_MS
+"""Longest timer that is believed without having been reported: the default of the common adapters."""
+LOWER_HALF: Final = 1 / (1 - log(2))
+"""Mean of exponentially distributed values over the mean of their lower half, which stalls are not in."""
 
 Point = tuple[float, float]
 """(device ns, ns)."""
@@ -52,7 +65,9 @@ Point = tuple[float, float]
 class _Bin:
     """The lowest point in an interval of device time, with the least and the mean wait of its messages."""
 
-    __slots__ = ("arrival_ns", "begin_ns", "count", "device_ns", "lowest", "wait", "wait_least", "wait_most")
+    __slots__ = (
+        "arrival_ns", "begin_ns", "count", "device_ns", "late", "late_ns", "lowest", "wait", "wait_least", "wait_most",
+    )  # fmt: skip
 
     def __init__(self, device_ns: int, arrival_ns: int, lowest: float, wait: float) -> None:
         self.begin_ns = device_ns
@@ -65,6 +80,10 @@ class _Bin:
         self.wait_least = wait
         self.wait_most = wait
         self.count = 1
+        self.late = 0
+        """Number of messages that waited for longer than the timer can hold them."""
+        self.late_ns = 0.0
+        """By how much, in all; `wait` is without that."""
 
     def longest_wait(self) -> float:
         """Longest time that the timer held a message, without the stalls of the host.
@@ -82,6 +101,8 @@ class _Bin:
         merged.wait_least = min(self.wait_least, after.wait_least)
         merged.wait_most = max(self.wait_most, after.wait_most)
         merged.count = self.count + after.count
+        merged.late = self.late + after.late
+        merged.late_ns = self.late_ns + after.late_ns
         return merged
 
 
@@ -93,22 +114,28 @@ class ArrivalFit:
     """
 
     __slots__ = (
-        "_bins", "_open", "_pause_count", "_pause_ns", "_until_ns", "_wait_most", "_width_ns", "count", "error_ns",
-        "fitted_ns", "hidden_ns", "hold_ns", "recent_ns", "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns",
-        "slope", "slope_error",
+        "_begin_ns", "_bins", "_open", "_pause_count", "_pause_ns", "_slope_known", "_slope_known_error", "_until_ns",
+        "_wait_most", "_width_ns", "count", "error_ns", "fitted_ns", "hidden_ns", "hold_ns",
+        "measured_hold_ns", "recent_ns", "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns", "slope",
+        "slope_error",
     )  # fmt: skip
 
-    def __init__(self, device_ns: int, arrival_ns: int, hold_ns: int = 0) -> None:
+    def __init__(
+        self, device_ns: int, arrival_ns: int, hold_ns: int = 0, slope: float = 1.0, slope_error: float = 0.07
+    ) -> None:
+        """Begin at a first arrival; `slope` may be known, with its one-sigma error, from an earlier fit."""
         self.ref_device_ns = device_ns
         self.ref_arrival_ns = arrival_ns
-        self.slope = 1.0
+        self.slope = slope
+        self._slope_known, self._slope_known_error = slope, KNOWN_SIGMAS * slope_error
+        self._begin_ns = device_ns
         self.fitted_ns = device_ns
         """Device time of the newest change of the fit."""
         self.count = 1
         """Number of arrivals."""
         self.error_ns = 0.0
         """One-sigma error of the fit at its newest end, as far as the spread of the points shows it."""
-        self.slope_error = 0.07
+        self.slope_error = slope_error
         self.residual_ns = 0.0
         """Root mean square distance of the bins' lowest points above the fit."""
         self.recent_ns = 0.0
@@ -119,6 +146,8 @@ class ArrivalFit:
         """Width of what a latency timer leaves open at the newest end (`feasible_lines`)."""
         self.shift_ns = hold_ns / 2
         """Distance from the fit down to the middle of the feasible lines, ns."""
+        self.measured_hold_ns = 0
+        """How long the adapter holds messages, where most wait for longer than it was said to hold them; else 0."""
         self._wait_most = float(hold_ns + LATENCIES_NS[0])
         self._pause_ns = float(hold_ns)
         self._pause_count = 1
@@ -132,10 +161,9 @@ class ArrivalFit:
         """Device time between the oldest and the newest bin."""
         return self._open.device_ns - self._bins[0].device_ns
 
-    @property
-    def is_enough(self) -> bool:
-        """Whether the fit can be used."""
-        return self.count >= ENOUGH_POINTS and self.span_ns >= max(ENOUGH_SPAN_NS, ENOUGH_HOLDS * self.hold_ns)
+    def is_known(self, least_ns: int) -> bool:
+        """Whether there are enough points, over `least_ns` or more."""
+        return self.count >= ENOUGH_POINTS and self.span_ns >= max(least_ns, ENOUGH_HOLDS * self.hold_ns)
 
     def set_pause(self, pause_ns: float, count: int) -> None:
         """Set the longest pause between messages that a read can end in, at most the timer's period.
@@ -151,12 +179,16 @@ class ArrivalFit:
         """
         self.count += 1
         wait = above_ns + trailing_ns
-        if wait > self._wait_most:  # noqa: PLR1730 - a call of min() costs 60 ns on the sample path
+        late_ns = 0.0
+        if wait > self._wait_most:
+            late_ns = wait - self._wait_most
             wait = self._wait_most  # the truth is under the fit: a timer alone cannot have held it for longer
         if device_ns >= self._until_ns:
             bin_ = _Bin(device_ns, arrival_ns, above_ns, wait)
             self._bins.append(bin_)
             self._open = bin_
+            if late_ns:
+                bin_.late, bin_.late_ns = 1, late_ns
             if len(self._bins) > BINS:
                 self._make_room()
             self._until_ns = device_ns + max(self._width_ns, 1)
@@ -165,6 +197,9 @@ class ArrivalFit:
         bin_ = self._open
         bin_.count += 1
         bin_.wait += wait
+        if late_ns:
+            bin_.late += 1
+            bin_.late_ns += late_ns
         if wait < bin_.wait_least:
             bin_.wait_least = wait
         elif wait > bin_.wait_most:
@@ -192,11 +227,17 @@ class ArrivalFit:
         origin = bins[0]
         x0, y0 = origin.device_ns, origin.arrival_ns
         hull = lower_hull([(float(b.device_ns - x0), float(b.arrival_ns - y0)) for b in bins])
-        slope, dx, dy = _edge_over(hull, SUPPORT_AT * (bins[-1].device_ns - x0), SLOPE_LOWEST, SLOPE_HIGHEST)
+        known, error = self._slope_known, self._slope_error_known(device_ns)
+        lowest, highest = max(known - error, SLOPE_LOWEST), min(known + error, SLOPE_HIGHEST)
+        slope, dx, dy = _edge_over(hull, SUPPORT_AT * (bins[-1].device_ns - x0), lowest, highest)
         self._move(x0 + int(dx), y0 + int(dy), slope)
         self._judge(device_ns)
         if self.hold_ns:
             self._look_through_timer(device_ns)
+
+    def _slope_error_known(self, device_ns: int) -> float:
+        """How far the slope can be from that of the fit before: less sure the longer ago that was."""
+        return self._slope_known_error + DRIFT_MOST * (device_ns - self._begin_ns) / NS_PER_S
 
     def _look_through_timer(self, device_ns: int) -> None:
         """Replace the fit by the middle of the lines that the timer leaves open."""
@@ -204,8 +245,13 @@ class ArrivalFit:
         upper = lower_hull([(float(b.device_ns - x0), b.lowest) for b in self._bins])
         lower = [(float(b.device_ns - x0), -f) for b, f in zip(self._bins, self._floors(), strict=True)]
         lower = [(xl, -f) for xl, f in lower_hull(lower)]
+        error = self._slope_error_known(device_ns)
+        flattest = max(self._slope_known - error - self.slope, -1.0)
+        steepest = min(self._slope_known + error - self.slope, 1.0)
         for latency_ns in LATENCIES_NS:
-            found = feasible_lines(upper, [(xl, f - latency_ns) for xl, f in lower], float(device_ns - x0))
+            found = feasible_lines(
+                upper, [(xl, f - latency_ns) for xl, f in lower], float(device_ns - x0), flattest, steepest
+            )
             if found is not None:
                 break
         else:
@@ -228,11 +274,30 @@ class ArrivalFit:
         A bin that stands out above its two neighbours on either side was stalled, and is brought down to them.
         """
         hold, pause, enough = self.hold_ns, self._pause_ns, self._pause_count
+        held = hold + LATE_FACTOR * hold * self._count_late()
         floors = [
-            max(b.longest_wait() - hold, b.lowest - pause if b.count >= enough else -hold - pause) for b in self._bins
+            max(b.longest_wait() - held, b.lowest - pause if b.count >= enough else -hold - pause)
+            if b.late_ns <= hold * b.count  # or the host stood still
+            else -hold - pause
+            for b in self._bins
         ]
         padded = [-inf, -inf, *floors, -inf, -inf]
         return [min(f, max(padded[i : i + 2] + padded[i + 3 : i + 5])) for i, f in enumerate(floors)]
+
+    def _count_late(self) -> float:
+        """Return the share of messages that waited for more than the timer; measure that where most did.
+
+        Waits that sweep a timer's period are half of it on the average. The periods of timers are powers of two, in ms.
+        """
+        bins, count = self._bins, sum([b.count for b in self._bins])
+        late, late_ns = sum([b.late for b in bins]), sum([b.late_ns for b in bins])
+        if 2 * late > count >= HOLD_MESSAGES and late_ns < late * HOLD_MOST_NS:  # or the host stood still
+            mean_ns = (sum([b.wait for b in bins]) + late_ns) / count
+            hold_ns = NS_PER_MS
+            while hold_ns < 2 * mean_ns and hold_ns < HOLD_MOST_NS:
+                hold_ns *= 2
+            self.measured_hold_ns = max(hold_ns, self.hold_ns)
+        return late / count
 
     def _move(self, ref_device_ns: int, ref_arrival_ns: int, slope: float) -> None:
         """Change the line, and with it all distances above it."""
@@ -250,14 +315,19 @@ class ArrivalFit:
         """Estimate the error of the fit from the distances of the bins above it."""
         bins = self._bins
         n = len(bins)
-        mean = sum(b.lowest for b in bins) / n
-        self.residual_ns = sqrt(sum(b.lowest * b.lowest for b in bins) / n)
+        lowest = sorted([b.lowest for b in bins])
+        half = (n + 1) // 2
+        mean = sum(lowest) / n
+        spread = min(mean, LOWER_HALF * sum(lowest[:half]) / half)
+        self.residual_ns = sqrt(sum([ns * ns for ns in lowest]) / n)
         recent = bins[-RECENT_BINS:]
         recent_span_ns = recent[-1].arrival_ns - recent[0].arrival_ns
         self.recent_ns = min(b.lowest for b in recent) if recent_span_ns > RECENT_NS else 0.0
-        self.error_ns = mean * min(1.0, SPREAD_BINS / n) + (0.0 if self.hold_ns else self.recent_ns)
+        share, late_ns = min(1.0, SPREAD_BINS / n), 0.0 if self.hold_ns else self.recent_ns
+        self.error_ns = spread * share + late_ns
         span = bins[-1].device_ns - bins[0].device_ns
-        self.slope_error = min(0.07, 2e-6 + 4 * self.error_ns / span) if n > 2 and span else 0.07
+        most = self._slope_error_known(device_ns) / KNOWN_SIGMAS
+        self.slope_error = min(most, 2e-6 + 4 * (mean * share + late_ns) / span) if n > 2 and span else most
         self.fitted_ns = device_ns
 
 
@@ -301,13 +371,16 @@ class FeasibleLines:
     slope_highest: float
 
 
-def feasible_lines(upper: list[Point], lower: list[Point], x: float) -> FeasibleLines | None:
+def feasible_lines(
+    upper: list[Point], lower: list[Point], x: float, flattest: float = -1.0, steepest: float = 1.0
+) -> FeasibleLines | None:
     """Return the lines under all points of `upper` and above all of `lower` up to `x`; None where there are none.
+
+    Their slopes are between `flattest` and `steepest`.
 
     The points are the corners of two convex chains; every pair of them bounds the slope, so with some ten corners each
     this is exact and cheap.
     """
-    steepest, flattest = 1.0, -1.0
     for xu, yu in upper:
         for xl, yl in lower:
             room, apart = yu - yl, xu - xl

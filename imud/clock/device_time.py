@@ -21,12 +21,18 @@ CONSISTENT: Final = 4
 CONSISTENT_LONGER: Final = 12
 """The same for a longer step than before: where one of ten messages is lost, every second minute at 1 kHz leaves the
 same hole four times in a row, and a period of two ticks for one would shift device time by a tick."""
+OFF_MOST: Final = 2.0
+"""Ticks by which steps of an uneven rate can differ from as many periods: one, and the error of the period."""
+STEADY_STEPS: Final = 64
+"""Number of equal steps in a row that were a rate: another one afterwards is a change of it."""
 GAP_FACTOR: Final = 1.5
 """While the period is not known, a step that is so much longer than the one before or after has a gap in it."""
 LEARNED_STEPS: Final = 4
 """A gap of more periods is not learned from: how many it has rests on the period itself."""
 WHOLE_AFTER: Final = 64
 """Number of equal steps after which the period is a whole number of ticks: a different step before was a loss."""
+WHOLE_OFF: Final = 0.5
+"""A whole number of ticks that is further from the mean is another rate."""
 EVERY_TICK: Final = 1.5
 """With a shorter period two samples can be in one tick; with a longer one it is the same sample."""
 MEMORY: Final = 4096
@@ -38,6 +44,8 @@ QUANTISED: Final = 0.29
 SETTLED_CHANGES: Final = 64
 """After so many steps that differ from the one before, the phase of an uneven rate within its ticks is known to a small
 part of one. At 400 Hz in ms that is 64 samples; a rate 50 ppm off 100 Hz takes ten minutes."""
+UNSETTLED_MOST: Final = 512
+"""Number of samples of a new rate within which its phase may settle; one that takes longer drifts slowly."""
 EVEN_FOR: Final = 64
 """Number of even samples after which one uneven step is the counter's, not the device's: its samples stay even."""
 FOLLOWED_NS: Final = 15 * NS_PER_US
@@ -56,6 +64,8 @@ CORRECTION_SPAN_NS: Final = 5 * NS_PER_S
 CORRECTION_SIGMAS: Final = 4
 CORRECTION_TICKS: Final = 0.5
 """Distance below the fit at which a message came before its sample, if that was taken at its stamp."""
+REPHASED_TICKS: Final = 1.05
+"""The same for a step that may be the first of another rate: its samples may be anywhere in their ticks."""
 
 # --- jumps ----------------------------------------------------------------------------------------------------------
 JUMP_EARLY_NS: Final = 5.0 * NS_PER_MS
@@ -76,8 +86,8 @@ class PeriodLearner:
     """
 
     __slots__ = (
-        "_before", "_candidate", "_count", "_even", "_on_unknown_gap", "_run", "_run_sum", "_sum", "changes",
-        "period_ticks",
+        "_before", "_candidate", "_count", "_even", "_odd_at", "_on_unknown_gap", "_run", "_run_sum", "_steady", "_sum",
+        "_uneven", "_uneven_sum", "changes", "is_new", "period_ticks",
     )  # fmt: skip
 
     def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
@@ -91,6 +101,14 @@ class PeriodLearner:
         self._candidate = 0
         self._run = 0
         self._run_sum = 0
+        self._uneven = self._uneven_sum = 0
+        """Steps in a row that are not the period exactly, and their sum."""
+        self._odd_at = 0.0
+        """Number of the last step that was no period."""
+        self._steady = False
+        """Whether there were many periods in a row before it; a period learned of steps with losses is no rate."""
+        self.is_new = False
+        """Whether the period is another since this was set to False: the device's rate was changed."""
         self.changes = 0
         """Times that a period of no whole number of ticks showed where in a tick it is; 0 where it is a whole one."""
 
@@ -139,10 +157,23 @@ class PeriodLearner:
 
     def _refine(self, ticks: int) -> None:
         self._run = 0
+        if self._even:
+            self._uneven = self._uneven_sum = 0
+        self._uneven += 1
+        self._uneven_sum += ticks
+        if self._uneven == CONSISTENT_LONGER:
+            count, total = self._uneven, self._uneven_sum
+            self._uneven = self._uneven_sum = 0
+            if abs(total - count * self.period_ticks) > OFF_MOST:
+                self._note_odd()
+                self._adopt(total, count, is_new=self._steady)
+                return
         self._average(ticks, 1)
         same, self._before = ticks == self._before, ticks
         self.changes += not same
         if same and self.changes <= 1 and self._count >= WHOLE_AFTER:
+            self.is_new = abs(ticks - self.period_ticks) > WHOLE_OFF
+            self._odd_at = 0.0
             self.period_ticks, self._sum, self._count, self.changes = float(ticks), float(ticks), 1.0, 0
         while self._count >= MEMORY:
             self._sum /= 2
@@ -150,6 +181,7 @@ class PeriodLearner:
 
     def _learn(self, ticks: int) -> bool:
         """Adopt another period when the last steps agree on it; return whether they do."""
+        self._uneven = self._uneven_sum = 0
         if self._run and abs(ticks - self._candidate) <= 1:
             self._run += 1
             self._run_sum += ticks
@@ -159,13 +191,28 @@ class PeriodLearner:
                 if longer > GAP_FACTOR * shorter + 1:
                     self._on_unknown_gap()
             self._candidate, self._run, self._run_sum = ticks, 1, ticks
-        if self._run < (CONSISTENT_LONGER if 0 < self.period_ticks < self._candidate else CONSISTENT):
+            self._note_odd()
+        longer = 0 < self.period_ticks < self._candidate
+        if self._run < (CONSISTENT_LONGER if longer or self._steady else CONSISTENT):
             return False
-        self._sum, self._count = float(self._run_sum), float(self._run)
-        self.period_ticks = self._sum / self._count
-        self._run = self._even = self.changes = 0
-        self._before = -1
+        self._adopt(self._run_sum, self._run, is_new=self._steady)
         return True
+
+    def _note_odd(self) -> None:
+        """Note a step that is no period, and whether there were many before."""
+        even = self._count + self._even - self._odd_at
+        if even:
+            self._steady = not 0 < even < STEADY_STEPS
+            self._odd_at += even
+
+    def _adopt(self, ticks: int, steps: int, *, is_new: bool) -> None:
+        """Take `ticks` over so many steps for the period from now on."""
+        self.is_new = is_new
+        self._odd_at, self._steady = 0.0, False
+        self._sum, self._count = float(ticks), float(steps)
+        self.period_ticks = self._sum / self._count
+        self._run = self._even = self._uneven = self._uneven_sum = self.changes = 0
+        self._before = -1
 
 
 class DeviceTime:
@@ -183,8 +230,8 @@ class DeviceTime:
     """
 
     __slots__ = (
-        "_even_for", "_gap", "_modulus", "_phase_ns", "_shift_ns", "_step_ns", "doubt_ns", "even_ns", "missed",
-        "period", "raw_ns", "tick_ns", "ticks", "uneven", "watched",
+        "_even_for", "_gap", "_modulus", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "doubt_ns", "even_ns",
+        "missed", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
     )  # fmt: skip
 
     def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
@@ -205,6 +252,10 @@ class DeviceTime:
         """Whether the newest step, after many even ones, is no whole number of periods by more than a tick."""
         self.doubt_ns = 0.0
         """By how much even samples were preferred to stamps, until an arrival confirms it."""
+        self._unsettled = 0
+        """Number of further samples within which the phase of a new rate within its ticks may become known."""
+        self.rephased = False
+        """Whether the device's rate was changed: where in their ticks the samples are now is anew."""
         self.watched = 0
         """Number of further samples whose device time is compared with their arrivals."""
         self.period = PeriodLearner(on_unknown_gap)
@@ -220,7 +271,7 @@ class DeviceTime:
         self.ticks = ticks
         self._phase_ns = self._shift_ns = self.doubt_ns = 0.0
         self.missed = self._gap = self.watched = self._even_for = 0
-        self.uneven = False
+        self.uneven = self.rephased = False
         self.raw_ns = self.even_ns = ticks % self._modulus * self.tick_ns
 
     def elapsed_ns(self, ticks: int) -> int:
@@ -251,6 +302,14 @@ class DeviceTime:
             self.even_ns += step * tick_ns
             return
         self.missed = missed = period.add_step(step)
+        if period.is_new:
+            period.is_new, self._unsettled = False, UNSETTLED_MOST
+            self._rephase()
+        elif self._unsettled:
+            self._unsettled -= 1
+            if period.changes >= SETTLED_CHANGES:
+                self._unsettled = 0
+                self._rephase()
         self._even_for += 1
         if self.watched:
             self.watched -= 1
@@ -266,6 +325,12 @@ class DeviceTime:
             if phase_ns != held_ns:
                 self._leave_tick(step, off_ns, phase_ns - held_ns)
         self.even_ns = self.raw_ns + int(self._phase_ns + self._shift_ns)
+
+    def _rephase(self) -> None:
+        """Note that device time before the newest sample does not show when the samples after it are."""
+        self.rephased, self.uneven = True, False
+        self.watched = self._gap = 0
+        self.doubt_ns = 0.0
 
     def _leave_tick(self, step: int, off_ns: float, over_ns: float) -> None:
         """Handle a sample that is even with those before only if it is `over_ns` outside of its tick."""
@@ -298,7 +363,8 @@ class DeviceTime:
             return False
         slope, device_ns = fit.slope, self.even_ns
         due_ns = fit.ref_arrival_ns + slope * (before_ns - fit.ref_device_ns)
-        early_ns = CORRECTION_TICKS * self.tick_ns + CORRECTION_SIGMAS * fit.error_ns
+        early_ns = CORRECTION_SIGMAS * fit.error_ns
+        early_ns += (REPHASED_TICKS if self.uneven else CORRECTION_TICKS) * self.tick_ns
         early_ns += fit.slope_error * max(min(device_ns - fit.fitted_ns, CORRECTION_MOST_NS), 0)
         above_ns = arrival_ns - due_ns - slope * (device_ns - before_ns)
         if self.uneven:
@@ -380,6 +446,10 @@ class JumpDetector:
     def reset(self) -> None:
         """Forget late reads: a new fit begins."""
         self.late_reads = 0
+
+    def stood_still(self, fit: ArrivalFit, error_ns: float) -> bool:
+        """Whether all of the newest messages are late: the device's clock stood still for a while."""
+        return fit.recent_ns > JUMP_EARLY_NS + JUMP_EARLY_SIGMAS * error_ns
 
     def is_jump(
         self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, error_ns: float | None, t_rx_ns: int, t_before_ns: int

@@ -15,7 +15,8 @@ from collections.abc import Iterable
 from math import sqrt
 from typing import Final
 
-from imud.clock.intervals import SIGMA_OF_RANGE, IntervalFit
+from imud.clock.intervals import IntervalFit
+from imud.clock.link_delay import SIGMA_OF_RANGE
 from imud.contracts.timing import UtcReference
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 

@@ -7,18 +7,17 @@ so. The fit of arrivals has no part in it, so that a link that misleads the fit 
 """
 
 from collections import deque
-from math import hypot, sqrt
+from math import hypot
 from typing import Final
 
 from imud.clock.arrival_fit import Point, feasible_lines, lower_hull
+from imud.clock.link_delay import SIGMA_OF_RANGE
 from imud.units import NS_PER_S, NS_PER_US
 
 BIN_NS: Final = NS_PER_S
 BINS: Final = 32
 """Half a minute: a crystal that drifts by 0.1 ppm/s leaves a straight line by 13 µs."""
 NARROWEST_NS: Final = 60 * NS_PER_US
-SIGMA_OF_RANGE: Final = 1 / sqrt(12)
-"""One-sigma error of a value that can be anywhere in a range, per width of the range."""
 APART_SIGMAS: Final = 1.75
 """A constant delay that hides in the fit is anything up to √3 of its sigmas: within that nothing contradicts."""
 

@@ -1,8 +1,10 @@
 """The delay of messages on a link: its constant part, which arrivals cannot show, and the spread of arrivals."""
 
+from math import sqrt
 from typing import Final
 
-from imud.units import NS_PER_MS, NS_PER_US
+from imud.clock.arrival_fit import ArrivalFit
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 WAKE_NS: Final = 100 * NS_PER_US
 """Shortest way from the interrupt to the reader, at most (30–100 µs on small boards)."""
@@ -12,6 +14,10 @@ USB_POLL_NS: Final = 125 * NS_PER_US
 """One micro-frame: the wait of a full adapter for the host's poll."""
 FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
 """Spread assumed of arrivals before any is known."""
+SIGMA_OF_RANGE: Final = 1 / sqrt(12)
+"""One-sigma error of a value that can be anywhere in a range, per width of the range."""
+SIGMA_OF_HIDDEN: Final = 0.36
+"""The same of what an adapter hides, which is more often at an end: packets go at once, or a timer begins with each."""
 SMOOTHING: Final = 1 / 32
 WIRE_SLACK: Final = 1.05
 """Messages that follow each other this much faster than the wire can carry them did not come over such a wire."""
@@ -40,6 +46,12 @@ class LinkDelay:
         """Whether the wire time fits the rate; a pty or a USB device accepts any baud rate."""
         return not period_ns or period_ns * WIRE_SLACK >= size_bytes * self.byte_ns
 
+    def corrected(self, fit: ArrivalFit, period_ns: float, size_bytes: int) -> "LinkDelay | None":
+        """Return the delay that arrivals show, where it is another: no such wire, or a longer timer than reported."""
+        if fit.span_ns >= NS_PER_S and not self.carries(period_ns, size_bytes):
+            return LinkDelay(0, self.hold_ns)
+        return LinkDelay(self.byte_ns, fit.measured_hold_ns) if fit.measured_hold_ns else None
+
     def held_ns(self, period_ns: float, size_bytes: int) -> float:
         """Longest time that an adapter's timer can hide behind bytes that follow.
 
@@ -49,6 +61,15 @@ class LinkDelay:
         if not period_ns:
             return self.hold_ns
         return min(self.hold_ns, max(period_ns - size_bytes * self.byte_ns, 0.0))
+
+    def bias_error_ns(self, hidden_ns: float) -> float:
+        """One-sigma error of the middle of what arrivals cannot show, of which an adapter hides `hidden_ns`."""
+        return SIGMA_OF_RANGE * self.floor_ns + SIGMA_OF_HIDDEN * hidden_ns
+
+    def before(self, arrival_ns: int, size_bytes: int, period_ns: float, sigma_ns: float) -> tuple[int, float]:
+        """Return (when a message was sent that arrived at `arrival_ns`, its error); arrivals spread by `sigma_ns`."""
+        bias_ns = self.floor_ns + self.held_ns(period_ns, size_bytes)
+        return arrival_ns - int(bias_ns / 2), SIGMA_OF_RANGE * bias_ns + sigma_ns
 
 
 class ArrivalSpread:

@@ -23,20 +23,13 @@ from functools import partial
 from math import hypot
 from typing import Final
 
-from imud.clock.arrival_fit import SLOPE_HIGHEST, ArrivalFit
-from imud.clock.device_time import (
-    FIRST_EARLY_NS,
-    JUMP_EARLY_NS,
-    JUMP_EARLY_SIGMAS,
-    JUMP_LATE_NS,
-    DeviceTime,
-    JumpDetector,
-)  # fmt: skip
-from imud.clock.gaps import GAP_PERIODS, ArrivalLosses, CounterLine
-from imud.clock.intervals import SIGMA_OF_RANGE
-from imud.clock.link_delay import FIRST_SPREAD_NS, ArrivalSpread, LinkDelay
+from imud.clock.arrival_fit import ENOUGH_SPAN_NS, SLOPE_HIGHEST, ArrivalFit
+from imud.clock.arrival_time import ArrivalTime
+from imud.clock.device_time import FIRST_EARLY_NS, JUMP_EARLY_NS, JUMP_LATE_NS, DeviceTime, JumpDetector
+from imud.clock.gaps import GAP_PERIODS, CounterLine
+from imud.clock.link_delay import FIRST_SPREAD_NS, LinkDelay
 from imud.clock.stamp_time import StampTime
-from imud.clock.steering import HOLDOVER_NS, SETTLED_AFTER_NS, AidingSources, Holdover, Slew
+from imud.clock.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
 from imud.contracts.lines import Edge
 from imud.contracts.status import ClockStatus
 from imud.contracts.timing import NO_TIME_BITS, Mark, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
@@ -45,7 +38,7 @@ from imud.sample import T_ERR_MOST, Measurement, Sample, Sync
 from imud.units import NS_PER_S
 
 YOUNG_NS: Final = 32 * NS_PER_S
-YOUNG_FACTOR: Final = 1.5
+YOUNG_FACTOR: Final = 1.2
 """A fit this short has not seen the timer's beat, and a stalled read in it weighs more."""
 _ARRIVAL: Final = Sync.ARRIVAL
 _T_ERR_MOST: Final = float(T_ERR_MOST)
@@ -66,10 +59,10 @@ class SampleClock:
     """
 
     __slots__ = (
-        "_aiding", "_delay", "_device", "_error_ns", "_fit", "_fit_begin_ns", "_fit_bias_ns",
-        "_fit_error_ns", "_fit_sync", "_holdover", "_host", "_jump", "_known", "_line", "_losses", "_make_aiding",
-        "_on_unknown_gap", "_own_status", "_resets", "_seq", "_slew", "_spread", "_stamps", "_sync", "_t_err_ns",
-        "_t_ns", "_t_rx_ns", "_time", "missed",
+        "_aiding", "_arrivals", "_delay", "_device", "_error_ns", "_fit", "_fit_begin_ns", "_fit_bias_ns",
+        "_fit_error_ns", "_fit_sync", "_holdover", "_host", "_jump", "_known", "_line", "_make_aiding",
+        "_on_unknown_gap", "_own_status", "_resets", "_seq", "_slew", "_stamps", "_sync", "_t_err_ns", "_t_ns",
+        "_t_rx_ns", "_time", "missed",
     )  # fmt: skip
 
     def __init__(
@@ -84,10 +77,9 @@ class SampleClock:
         )
         self._aiding: AidingSources | None = None
         self._time = DeviceTime(tick_ns, tick_modulus, on_unknown_gap)
-        self._losses = ArrivalLosses(0 if tick_ns else tick_modulus, on_unknown_gap)
         self._stamps = StampTime(stamp_modulus) if stamp_modulus else None
         self._delay = LinkDelay(byte_ns, hold_ns)
-        self._spread = ArrivalSpread()
+        self._arrivals = ArrivalTime(self._delay, 0 if tick_ns else tick_modulus, on_unknown_gap)
         self._line: CounterLine | None = None
         """Where the device's counter is by the fit when it was lowest; None until a fit is used."""
         self._jump = JumpDetector()
@@ -128,7 +120,7 @@ class SampleClock:
         if ticks is None and self._stamps is not None and m.pps_age_ms is not None:
             ticks = self._stamped(self._stamps, m.pps_age_ms, arrival_ns)
         if ticks is None or not self._time.tick_ns:
-            wanted_ns, t_dev_ns, sync = self._by_arrival(ticks, arrival_ns, size_bytes), None, _ARRIVAL
+            wanted_ns, t_dev_ns, sync = self._by_arrival(m, ticks, arrival_ns), None, _ARRIVAL
         else:
             wanted_ns = self._by_device(ticks, arrival_ns, trailing_ns, t_rx_ns, size_bytes)
             t_dev_ns, sync = self._time.raw_ns, self._fit_sync
@@ -171,7 +163,7 @@ class SampleClock:
         its one-sigma error, `t_rx_ns` right after the answer. A `t_ns` that does not rise is lifted, and the error too.
         """
         self.missed, self._fit_sync = 0, _ARRIVAL if edge_seq is None else Sync.EDGE
-        self._spread.add_arrival(t_ns)
+        self._arrivals.spread.add_arrival(t_ns)
         t_err_ns = min(t_err_ns + max(0, self._t_ns + 1 - t_ns), T_ERR_MOST)
         self._t_ns = t_ns = max(t_ns, self._t_ns + 1)
         self._t_rx_ns = t_rx_ns = max(t_rx_ns, self._t_rx_ns, t_ns)
@@ -245,9 +237,9 @@ class SampleClock:
             offset_ns=self._t_ns - self._time.raw_ns if self._known else 0,
             skew_ppm=(1 / fit.slope - 1) * 1e6 if fit else 0.0,
             steering_ppm=self._host.rate * 1e6,
-            residual_ns=int(fit.residual_ns if fit else self._spread.sigma_ns),
+            residual_ns=int(fit.residual_ns if fit else self._arrivals.spread.sigma_ns),
             t_err_ns=self._t_err_ns,
-            resets=self._resets + self._losses.resets,
+            resets=self._resets + self._arrivals.resets,
             hold_ns=self._delay.hold_ns,
             edges=first.pairing.events if first else 0,
             edges_unpaired=sout.pairing.events_unpaired if sout else 0,
@@ -259,7 +251,7 @@ class SampleClock:
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
         """Begin a new fit for another baud rate or port. `t_ns` goes on rising."""
         self._delay = LinkDelay(byte_ns, hold_ns)
-        self._spread = ArrivalSpread()
+        self._arrivals.change_link(self._delay)
         self._drop_fit()
 
     def restart(self) -> None:
@@ -268,8 +260,7 @@ class SampleClock:
         What is missing until then is counted if the device's counter ran on; else the gap is one of unknown size.
         """
         self._known = False
-        self._spread = ArrivalSpread()
-        self._losses.restart()
+        self._arrivals.restart()
         if self._stamps is not None:
             self._stamps.restart()
         self.missed = 0
@@ -292,28 +283,20 @@ class SampleClock:
             self._time.begin(stamps.before)
         return ticks
 
-    def _by_arrival(self, ticks: int | None, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of a message without device time; it may have a number."""
-        spread, losses = self._spread, self._losses
-        missed = 0
-        if not self._time.tick_ns and ticks is not None:
-            steps = losses.add_number(ticks, arrival_ns, spread.period_ns)
-            if not steps:
-                self._spread = spread = ArrivalSpread()
-            spread.add_arrival(arrival_ns, steps or 1)
-            missed = losses.missed
-        else:
-            spread.add_arrival(arrival_ns)
-            if self._time.tick_ns and not self._known:
-                missed = losses.add_arrival(arrival_ns, is_first=not self._seq)
-        self.missed = missed
-        return self._less_bias(arrival_ns, size_bytes, spread.period_ns, spread.sigma_ns)
+    def _by_arrival(self, m: Measurement, ticks: int | None, arrival_ns: int) -> int:
+        """Return the time of a message without device time, which may have a number; leave its error in `_error_ns`."""
+        arrivals = self._arrivals
+        t_ns = arrivals.date(
+            ticks, arrival_ns, m.size_bytes, alone=not self._known, triggered=m.pps_age_ms is not None,
+            is_first=not self._seq,
+        )  # fmt: skip
+        self.missed, self._error_ns = arrivals.missed, arrivals.error_ns
+        return t_ns
 
-    def _less_bias(self, arrival_ns: int, size_bytes: int, period_ns: float, sigma_ns: float) -> int:
-        """Return the time of a message by its arrival alone; leave its error in `_error_ns`."""
-        bias_ns = self._delay.floor_ns + self._delay.held_ns(period_ns, size_bytes)
-        self._error_ns = SIGMA_OF_RANGE * bias_ns + sigma_ns
-        return arrival_ns - int(bias_ns / 2)
+    def _less_bias(self, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of a message before the fit is used; leave its error in `_error_ns`."""
+        t_ns, self._error_ns = self._delay.before(arrival_ns, size_bytes, self._period_ns(), float(FIRST_SPREAD_NS))
+        return t_ns
 
     # --- by device time ------------------------------------------------------------------------------------------
 
@@ -322,12 +305,14 @@ class SampleClock:
         time, fit = self._time, self._fit
         if fit is None:
             self._begin(ticks, arrival_ns, t_rx_ns)
-            return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+            return self._less_bias(arrival_ns, size_bytes)
         before_ns = time.even_ns
         time.advance(ticks)
         device_ns = time.even_ns
         fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
         above_ns = arrival_ns - fit_ns
+        if time.rephased:
+            return self._begin_phase(fit, device_ns, arrival_ns, size_bytes)
         if (
             time.watched
             and self._fit_sync is not _ARRIVAL
@@ -345,11 +330,11 @@ class SampleClock:
             return self._after_jump(above_ns, ticks, arrival_ns, size_bytes)
         self.missed = time.missed
         if fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
-            if fit.recent_ns > JUMP_EARLY_NS + JUMP_EARLY_SIGMAS * self._fit_error_ns:
+            if self._jump.stood_still(fit, self._fit_error_ns):
                 self._resets += 1  # messages stay late: the device's clock stood still for a while
                 self._start_fit(arrival_ns)
-            elif fit.span_ns >= NS_PER_S and not self._delay.carries(self._period_ns(), size_bytes):
-                self._delay = LinkDelay(0, self._delay.hold_ns)
+            elif other := self._delay.corrected(fit, self._period_ns(), size_bytes):
+                self._delay = other
                 self._start_fit(arrival_ns)
             else:
                 fit_ns = self._refit(fit, device_ns, device_ns - before_ns, fit_ns, size_bytes)
@@ -357,7 +342,7 @@ class SampleClock:
             if self._holdover is not None:
                 self._error_ns = self._holdover.error_ns(device_ns)
                 return self._holdover.at(device_ns)
-            return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+            return self._less_bias(arrival_ns, size_bytes)
         slew = self._slew
         error_ns = self._fit_error_ns + fit.slope_error * (device_ns - fit.fitted_ns) + time.doubt_ns
         fit_ns -= self._fit_bias_ns
@@ -415,7 +400,7 @@ class SampleClock:
             self._resets += 1
             self._begin_counter(ticks, arrival_ns, None)
         self._start_fit(arrival_ns)
-        return self._less_bias(arrival_ns, size_bytes, self._period_ns(), FIRST_SPREAD_NS)
+        return self._less_bias(arrival_ns, size_bytes)
 
     def _ran_on(self, device_ns: int, arrival_ns: int) -> bool:
         """Whether a message below the fit is no earlier than the device's counter allows: the fit is late."""
@@ -440,11 +425,27 @@ class SampleClock:
         self._fit_begin_ns -= SETTLED_AFTER_NS  # time went on: corrections stay slow
         return t_ns
 
-    def _start_fit(self, arrival_ns: int) -> None:
+    def _begin_phase(self, fit: ArrivalFit, device_ns: int, arrival_ns: int, size_bytes: int) -> int:
+        """Return the time of a sample after the device's rate was changed: where in its tick it is now is not known.
+
+        The crystal is the same. Its rate is kept, and the former line until new arrivals show where the samples are.
+        """
+        self._time.rephased, self.missed = False, self._time.missed
+        holdover, slope, slope_error = self._holdover, fit.slope, fit.slope_error
+        if self._fit_sync is not _ARRIVAL:
+            t_ns = fit.ref_arrival_ns + slope * (device_ns - fit.ref_device_ns) - self._fit_bias_ns + self._slew.left_ns
+            error_ns = self._fit_error_ns + slope_error * (device_ns - fit.fitted_ns) + abs(self._slew.left_ns)
+            holdover = Holdover(device_ns, int(t_ns), error_ns, self._time.tick_ns, ENOUGH_SPAN_NS, slope, slope_error)
+        self._start_fit(arrival_ns, slope, slope_error)
+        self._holdover = holdover
+        self._error_ns = holdover.error_ns(device_ns) if holdover is not None else 0.0
+        return holdover.at(device_ns) if holdover is not None else self._less_bias(arrival_ns, size_bytes)
+
+    def _start_fit(self, arrival_ns: int, slope: float = 1.0, slope_error: float = SLOPE_HIGHEST - 1) -> None:
         """Begin a new fit at the present device time."""
         self._drop_fit()
         self._fit_begin_ns = self._time.even_ns
-        self._fit = ArrivalFit(self._fit_begin_ns, arrival_ns, self._delay.hold_ns)
+        self._fit = ArrivalFit(self._fit_begin_ns, arrival_ns, self._delay.hold_ns, slope, slope_error)
 
     def _drop_fit(self) -> None:
         self._fit = self._holdover = None
@@ -462,14 +463,13 @@ class SampleClock:
         published_ns = fit_ns_before - self._fit_bias_ns + self._slew.left_ns
         if period_ns:
             fit.set_pause(delay.held_ns(period_ns, size_bytes), int(delay.hold_ns / period_ns) + 2)
-        bias_ns = delay.floor_ns + fit.hidden_ns
         self._fit_bias_ns = delay.floor_ns / 2 + fit.shift_ns
-        self._fit_error_ns = hypot(fit.error_ns, SIGMA_OF_RANGE * bias_ns) + self._time.error_ns
+        self._fit_error_ns = hypot(fit.error_ns, delay.bias_error_ns(fit.hidden_ns)) + self._time.error_ns
         if delay.hold_ns and fit.span_ns < YOUNG_NS:
             self._fit_error_ns *= YOUNG_FACTOR
         if self._fit_sync is not _ARRIVAL:
             self._slew.set(published_ns - (fit_ns - self._fit_bias_ns))
-        elif fit.is_enough and (self._holdover is None or fit.span_ns >= HOLDOVER_NS):
+        elif fit.is_known(self._holdover.least_ns if self._holdover else ENOUGH_SPAN_NS):
             self._fit_sync = Sync.REGRESSION
             newest_ns = self._host.steady_ns(self._t_ns)
             held_ns = self._holdover.at(device_ns) if self._holdover else newest_ns + elapsed_ns * fit.slope
@@ -496,5 +496,5 @@ class SampleClock:
         """Host time between samples; 0 while unknown."""
         time, fit = self._time, self._fit
         if not time.tick_ns:
-            return self._spread.period_ns
+            return self._arrivals.spread.period_ns
         return time.period.period_ticks * time.tick_ns * (fit.slope if fit else 1.0)

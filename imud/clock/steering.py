@@ -80,29 +80,34 @@ class Slew:
 
 
 class Holdover:
-    """A line at the rate of UTC from where the old fit ended, until the new fit is used. Errors grow with time.
+    """A line from where the old fit ended, until the new fit is used. Errors grow with time.
 
-    What the old fit knew of the device's crystal no longer holds: the counter is UTC now.
+    By default at the rate of UTC: what the old fit knew of the device's crystal no longer holds where the counter is
+    UTC now.
     """
 
-    __slots__ = ("_device_ns", "_error_ns", "_t_ns")
+    __slots__ = ("_device_ns", "_error_ns", "_t_ns", "least_ns", "slope", "slope_error")
 
-    slope: Final = 1.0
-    """Host ns per device ns."""
-    slope_error: Final = HOLDOVER_RATE
-
-    def __init__(self, device_ns: int, t_ns: int, error_ns: float, tick_ns: int) -> None:
+    def __init__(
+        self, device_ns: int, t_ns: int, error_ns: float, tick_ns: int, least_ns: int = HOLDOVER_NS,
+        slope: float = 1.0, slope_error: float = HOLDOVER_RATE,
+    ) -> None:  # fmt: skip
         self._device_ns = device_ns
         self._t_ns = t_ns
         self._error_ns = hypot(error_ns, TICK_SHARE * tick_ns)
+        self.least_ns = least_ns
+        """Span of the new fit from which on it is used."""
+        self.slope = slope
+        """Host ns per device ns."""
+        self.slope_error = slope_error
 
     def at(self, device_ns: int) -> int:
         """Host time at `device_ns`."""
-        return self._t_ns + device_ns - self._device_ns
+        return self._t_ns + int(self.slope * (device_ns - self._device_ns))
 
     def error_ns(self, device_ns: int) -> float:
         """One-sigma error of `at`."""
-        return self._error_ns + HOLDOVER_RATE * (device_ns - self._device_ns)
+        return self._error_ns + self.slope_error * (device_ns - self._device_ns)
 
 
 @dataclass(slots=True, eq=False)

@@ -17,8 +17,8 @@ import msgspec
 from tests.bench.rows import Row
 
 PARTS = (
-    "decode", "clock", "clock_lines", "lines", "polling", "modbus", "can", "can_devices", "detect", "coalesce", "shm",
-    "socket", "metrics", "end_to_end", "gpsd", "sout",
+    "decode", "clock", "clock_table", "clock_lines", "lines", "polling", "modbus", "can", "can_devices", "detect",
+    "coalesce", "shm", "socket", "metrics", "end_to_end", "gpsd", "sout",
 )  # fmt: skip
 SHORT_LIMIT_S: Final = 300.0
 LAB_PARTS: Final = ("can",)

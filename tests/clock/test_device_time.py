@@ -403,7 +403,7 @@ def test_time_is_that_of_the_first_frame_and_says_its_error() -> None:
     for index in range(2000):
         if index % 50 in (7, 8):
             continue
-        delay_ns = int(random.expovariate(1 / (0.1 * NS_PER_MS)))
+        delay_ns = int((0.05 + random.expovariate(20)) * NS_PER_MS)  # the least in the middle of what links allow for
         made_of = numbered(made, index, index * PERIOD_NS + delay_ns, random.randrange(1 * NS_PER_MS, 6 * NS_PER_MS))
         assert made_of.sync is Sync.ARRIVAL
         assert made_of.t_dev_ns is None
@@ -413,3 +413,35 @@ def test_time_is_that_of_the_first_frame_and_says_its_error() -> None:
     assert sum(off < 3 for off in offs) / len(offs) > 0.98
     assert made.status().t_err_ns < 0.5 * NS_PER_MS
     assert abs(made.expected_rate_hz - 100) < 1
+
+
+# --- another rate -----------------------------------------------------------------------------------------------------
+
+
+def learned(steps: list[int]) -> PeriodLearner:
+    """A learner after so many steps."""
+    learner = PeriodLearner()
+    for step in steps:
+        learner.add_step(step)
+    return learner
+
+
+@pytest.mark.parametrize(
+    "steps", [[10] * 100 + [35] + [2, 3] * 6, [2, 3] * 100 + [20] * 12, [2] * 100 + [1] * 12, [5] * 100 + [4] * 12]
+)
+def test_a_change_of_rate_is_noticed_within_twelve_samples(steps: list[int]) -> None:
+    learner = learned(steps)
+    assert learner.is_new
+    assert learner.period_ticks == pytest.approx(sum(steps[-12:]) / 12, abs=0.1)
+
+
+@pytest.mark.parametrize("steps", [[10] * 100 + [35] + [2, 3] * 5, [2, 3] * 300, [1] * 999 + [2] + [1] * 40])
+def test_a_rate_that_goes_on_is_not_another(steps: list[int]) -> None:
+    assert not learned(steps).is_new
+
+
+def test_losses_are_no_change_of_rate() -> None:
+    """Of a stream that loses every second message, twelve in a row may look like half the rate."""
+    learner = learned([1, 2, 1, 1, 2] * 20 + [2] * 12 + [1] * 12)
+    assert learner.period_ticks == 1
+    assert not learner.is_new

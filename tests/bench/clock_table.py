@@ -1,0 +1,287 @@
+"""Whether the stated error is honest: every adversity on every link, `python -m tests.bench.clock_table` (2 minutes).
+
+A cell is one adversity on one kind of link, over several machines (`adversity`). Its figures, beside those of the
+commit in `clock_table.json`:
+
+    σ           root mean square of `t_ns` - truth, in µs, settled and settling together
+    settling    share of samples within 2 × t_err_ns in the first 30 s
+    settled     the same afterwards
+    t_err/rms   median of t_err_ns over σ, settled: an error stated far too large is as useless as one far too small
+
+What is aimed at: settling ≥ 0.95, settled ≥ 0.97, t_err/rms from 0.8 to 3, σ no worse than the base's.
+
+`--quick`: two machines instead of six. `--only TEXT`: cells whose name contains it. `--seeds FIRST`: other machines.
+`--base COMMIT`: compare with that commit, computed now. `--keep COMMIT`: the same, and keep its figures in the tree.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from math import sqrt
+from pathlib import Path
+from statistics import median
+from typing import Final, NamedTuple
+
+import msgspec
+
+from imud.clock import SampleClock
+from imud.units import NS_PER_MS, NS_PER_S, uart_byte_ns
+from tests.bench.adversity import (
+    CAN,
+    FT232,
+    LINKS,
+    LOADED,
+    LOG_NORMAL,
+    PARETO,
+    SECONDS,
+    STAMP_MODULUS,
+    UART,
+    USB_1,
+    USB_16,
+    Cell,
+    Device,
+    Link,
+    Stalls,
+    messages,
+)
+from tests.bench.compare import ROOT, checked_out
+from tests.bench.rows import Row, at_least
+
+FILE: Final = Path(__file__).with_suffix(".json")
+SETTLING_NS: Final = 30 * NS_PER_S
+MACHINES: Final = 6
+SETTLED_LEAST: Final = 0.97
+SETTLING_LEAST: Final = 0.95
+RATIO_LEAST: Final = 0.8
+RATIO_MOST: Final = 3.0
+WORSE_MOST: Final = 1.02
+"""σ may be so much of the base's: two runs of a changed clock are two draws."""
+
+
+class CellFigures(msgspec.Struct, frozen=True):
+    """Of a cell, over all its machines."""
+
+    sigma_us: float
+    settling: float
+    settled: float
+    ratio: float
+
+    def short_of(self, base: "CellFigures | None") -> list[str]:
+        """What was aimed at and is not reached."""
+        missed = []
+        if self.settling < SETTLING_LEAST:
+            missed.append("settling")
+        if self.settled < SETTLED_LEAST:
+            missed.append("settled")
+        if not RATIO_LEAST <= self.ratio <= RATIO_MOST:
+            missed.append("t_err/rms")
+        if base is not None and self.sigma_us > WORSE_MOST * base.sigma_us:
+            missed.append("σ")
+        return missed
+
+
+Figures = Mapping[str, CellFigures]
+
+
+class Dated(NamedTuple):
+    """A sample beside its truth."""
+
+    off_ns: int
+    t_err_ns: int
+    settling: bool
+
+
+# --- cells ----------------------------------------------------------------------------------------------------------
+
+FAST: Final = Link("uart-921600", 921_600)
+FAST_USB: Final = Link("usb-1ms-921600", 921_600, timer_ns=NS_PER_MS)
+SLOW_RATE: Final = Device(rates_hz=((0.0, 10.0),))
+TIMELESS: Final = Device(says="nothing")
+
+
+def cells() -> Iterator[Cell]:
+    """All cells of the table."""
+    for adversity in _everywhere():
+        for link in LINKS:
+            yield adversity.on(link)
+    for hz in (400.0, 1000.0):
+        device = Device(rates_hz=((0.0, hz),))
+        for link in (FAST, FAST_USB, replace(USB_16, name="usb-16ms-921600", baud=921_600)):
+            yield Cell(f"{hz:g} Hz", link, device)
+            yield Cell(f"{hz:g} Hz, loaded host", link, device, LOADED)
+    for link in LINKS:
+        fast = replace(link, baud=921_600 if link.baud else 0)
+        yield Cell("100 Hz to 400 to 50", fast, Device(rates_hz=((0.0, 100.0), (40.0, 400.0), (80.0, 50.0))))
+    for link in (USB_1, FT232):
+        untold = replace(link, name=f"{link.name}, told 1 ms", timer_ns=16 * NS_PER_MS, told_hold_ns=NS_PER_MS)
+        yield Cell("wrong timer", untold)
+        yield Cell("wrong timer, loaded host", untold, wake=LOADED)
+    yield from _timeless()
+    for link in LINKS:
+        yield Cell("hold-out: log-normal host", link, wake=LOG_NORMAL)
+        yield Cell(
+            "hold-out: log-normal host, 50 Hz to 125", link,
+            Device(rates_hz=((0.0, 50.0), (55.0, 125.0)), swing_ppm=3.0, swing_s=60.0), LOG_NORMAL,
+        )  # fmt: skip
+
+
+def _everywhere() -> Iterator[Cell]:
+    """Adversities for every link."""
+    yield Cell("plain", UART)
+    yield Cell("loaded host", UART, wake=LOADED)
+    yield Cell("Pareto wake-ups", UART, wake=PARETO)
+    yield Cell("10 Hz", UART, SLOW_RATE)
+    yield Cell("hub stalls 200 ms every 5 s", UART, stalls=Stalls(5 * NS_PER_S, 200 * NS_PER_MS))
+    yield Cell("stalls of 2 s", UART, stalls=Stalls(25 * NS_PER_S, 2 * NS_PER_S, 7 * NS_PER_S))
+    yield Cell("flood", UART, stalls=Stalls(350 * NS_PER_MS, 120 * NS_PER_MS))
+    yield Cell("bursts of loss", UART, Device(loss=0.01, loss_burst_s=(9.0, 0.4)))
+    yield Cell("temperature", UART, Device(swing_ppm=8.0, swing_s=100.0))
+    yield Cell("restart", UART, Device(restarts_s=(50.0,)))
+    yield Cell("wrap", UART, Device(ticks_before_wrap=60_000))
+
+
+def _timeless() -> Iterator[Cell]:
+    """Messages without device time."""
+    for host, wake in (("", PARETO), (", loaded host", LOADED)):
+        yield Cell(f"HI92{host}", UART, Device(says="stamp", size_bytes=54), wake)
+        yield Cell(f"HI92 on mark{host}", UART, Device(says="trigger", size_bytes=54), wake)
+        yield Cell(f"HI92 on mark{host}", USB_16, Device(says="trigger", size_bytes=54), wake)
+        yield Cell(f"TPDO{host}", CAN, TIMELESS, wake)
+        yield Cell(f"PGN 10 Hz{host}", CAN, replace(TIMELESS, rates_hz=((0.0, 10.0),)), wake)
+        yield Cell(f"numbered{host}", CAN, Device(says="number"), wake)
+        yield Cell(f"TPDO, loss{host}", CAN, replace(TIMELESS, loss=0.005), wake)
+        yield Cell(f"TPDO, stalls of 2 s{host}", CAN, TIMELESS, wake, Stalls(25 * NS_PER_S, 2 * NS_PER_S, 7 * NS_PER_S))
+
+
+# --- figures --------------------------------------------------------------------------------------------------------
+
+
+def clock_of(cell: Cell) -> SampleClock:
+    """A clock as the daemon sets it up for the cell's device and link."""
+    says = cell.device.says
+    return SampleClock(
+        "bench", tick_ns=0 if says == "number" else NS_PER_MS, tick_modulus=256 if says == "number" else 1 << 32,
+        byte_ns=uart_byte_ns(cell.link.baud), hold_ns=cell.link.hold_ns,
+        stamp_modulus=STAMP_MODULUS if says in {"stamp", "trigger"} else 0,
+    )  # fmt: skip
+
+
+def dated(cell: Cell, seed: int, of: int, seconds: int = SECONDS) -> Iterator[Dated]:
+    """The samples of one machine of so many."""
+    clock, settled_ns = clock_of(cell), 0
+    for message in messages(cell, seed, of, seconds):
+        settled_ns = settled_ns or message.truth_ns + SETTLING_NS
+        sample = clock.sample(message.measurement, message.t_rx_ns, 0, message.t_begin_ns)
+        yield Dated(sample.t_ns - message.truth_ns, sample.t_err_ns, message.truth_ns < settled_ns)
+
+
+def figures_of(cell: Cell, seeds: Sequence[int], seconds: int = SECONDS) -> CellFigures:
+    """Figures of a cell over machines."""
+    samples = [d for seed in seeds for d in dated(cell, seed, len(seeds), seconds)]
+    settled = [d for d in samples if not d.settling]
+    settling = [d for d in samples if d.settling]
+    rms_ns = sqrt(sum(d.off_ns**2 for d in settled) / len(settled))
+    return CellFigures(
+        round(sqrt(sum(d.off_ns**2 for d in samples) / len(samples)) / 1000, 1),
+        round(_share(settling), 4),
+        round(_share(settled), 4),
+        round(median(d.t_err_ns for d in settled) / rms_ns, 2),
+    )
+
+
+def _share(samples: Sequence[Dated]) -> float:
+    return sum(abs(d.off_ns) <= 2 * d.t_err_ns for d in samples) / len(samples)
+
+
+def table(seeds: Sequence[int], only: str = "") -> Iterator[tuple[str, CellFigures]]:
+    """Name and figures of each cell."""
+    for cell in cells():
+        if only in cell.name:
+            yield cell.name, figures_of(cell, seeds)
+
+
+# --- the base -------------------------------------------------------------------------------------------------------
+
+
+class Base(msgspec.Struct, frozen=True):
+    """Figures of another commit, all of the first six machines."""
+
+    commit: str
+    cells: dict[str, CellFigures]
+
+
+def kept_base() -> Base:
+    """The figures kept in the tree."""
+    return msgspec.json.decode(FILE.read_bytes(), type=Base)
+
+
+def base_of(commit: str, arguments: Sequence[str]) -> Base:
+    """Figures of a commit, computed now: its clock under this table."""
+    with checked_out(commit) as tree:
+        program = [sys.executable, "-P", "-m", "tests.bench.clock_table", "--json", *arguments]
+        places = os.pathsep.join((str(tree), str(ROOT)))
+        done = subprocess.run(
+            program, env={**os.environ, "PYTHONPATH": places}, cwd=tree, capture_output=True, check=True
+        )
+    return Base(commit, msgspec.json.decode(done.stdout, type=dict[str, CellFigures]))
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """The rows of `make bench`; the short form has the cells of a loaded host, on two machines."""
+    for name, got in table(range(2), "loaded host") if quick else table(range(MACHINES)):
+        yield Row(f"clock table: {name}, sigma", got.sigma_us, "us")
+        yield at_least(f"clock table: {name}, share settled", got.settled, "", SETTLED_LEAST)
+        yield at_least(f"clock table: {name}, share settling", got.settling, "", SETTLING_LEAST)
+        yield Row(f"clock table: {name}, median t_err / rms", got.ratio, "")
+
+
+def show(found: Iterable[tuple[str, CellFigures]], base: Figures) -> int:
+    """Print the table as Markdown, line by line; return how many cells miss something."""
+    print("| cell | σ, µs | settling | settled | t_err/rms | before: σ, µs | settling | settled | t_err/rms | missed |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    short = 0
+    for name, got in found:
+        was = base.get(name)
+        before = _cells_of(was) if was else "– | – | – | –"
+        missed = got.short_of(was)
+        short += bool(missed)
+        print(f"| {name} | {_cells_of(got)} | {before} | {', '.join(missed)} |", flush=True)
+    return short
+
+
+def _cells_of(got: CellFigures) -> str:
+    return f"{got.sigma_us:.0f} | {got.settling:.3f} | {got.settled:.3f} | {got.ratio:.2f}"
+
+
+def main() -> int:
+    """Run as `python -m tests.bench.clock_table`."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.clock_table")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--only", default="", metavar="TEXT")
+    parser.add_argument("--seeds", type=int, default=0, metavar="FIRST")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--base", metavar="COMMIT")
+    parser.add_argument("--keep", metavar="COMMIT")
+    args = parser.parse_args()
+    machines = 2 if args.quick else MACHINES
+    found = table(range(args.seeds, args.seeds + machines), args.only)
+    if args.json:
+        sys.stdout.buffer.write(msgspec.json.encode(dict(found)))
+        return 0
+    if args.base or args.keep:
+        arguments = ["--only", args.only, "--seeds", str(args.seeds), *(["--quick"] if args.quick else [])]
+        base = base_of(args.base or args.keep, arguments)
+        if args.keep:
+            FILE.write_bytes(msgspec.json.format(msgspec.json.encode(base)) + b"\n")
+    else:
+        base = kept_base() if machines == MACHINES and not args.seeds and FILE.exists() else Base("", {})
+    short = show(found, base.cells)
+    print(f"\n{short} cells miss something")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,59 @@
+"""The stated error in cells of `tests.bench.clock_table`, shortened: what was wrong once stays right."""
+
+from dataclasses import replace
+
+import pytest
+
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.adversity import CAN, LOADED, UART, USB_1, USB_16, Cell, Device, Link, Stalls, messages
+from tests.bench.clock_table import RATIO_LEAST, RATIO_MOST, clock_of, figures_of
+
+FAST = replace(UART, baud=921_600)
+CHANGED = Device(rates_hz=((0.0, 100.0), (32.0, 400.0), (37.0, 50.0)))
+TIMELESS = Device(says="nothing")
+STALLS = Stalls(20 * NS_PER_S, 2 * NS_PER_S, 12 * NS_PER_S)
+UNTOLD = Link("usb, told 1 ms", timer_ns=16 * NS_PER_MS, told_hold_ns=NS_PER_MS)
+
+CELLS = [
+    (Cell("100 Hz to 400 to 50", FAST, CHANGED), 700.0),
+    (Cell("loaded host", USB_1, wake=LOADED), 600.0),
+    (Cell("loaded host", USB_16, wake=LOADED), 1200.0),
+    (Cell("wrong timer", UNTOLD), 2500.0),
+    (Cell("TPDO, loaded host", CAN, TIMELESS, LOADED), 1500.0),
+    (Cell("numbered, loaded host", CAN, Device(says="number"), LOADED), 800.0),
+    (Cell("TPDO, stalls of 2 s", CAN, TIMELESS, stalls=STALLS), 300.0),
+    (Cell("stalls of 2 s", UART, stalls=STALLS), 150.0),
+]
+
+
+@pytest.mark.parametrize(("cell", "most_us"), CELLS, ids=lambda v: getattr(v, "name", ""))
+def test_the_stated_error_is_honest(cell: Cell, most_us: float) -> None:
+    got = figures_of(cell, (1, 3), 45)
+    assert got.settling >= 0.95
+    assert got.settled >= 0.97
+    assert got.sigma_us <= most_us
+
+
+@pytest.mark.parametrize(
+    "cell", [c for c, _ in CELLS if c.adversity in {"loaded host", "stalls of 2 s", "numbered, loaded host"}],
+    ids=lambda c: c.name,
+)  # fmt: skip
+def test_the_stated_error_is_neither_too_small_nor_too_large(cell: Cell) -> None:
+    """Over six machines: what no arrival shows is another delay on each."""
+    assert RATIO_LEAST <= figures_of(cell, range(6), 45).ratio <= RATIO_MOST
+
+
+def test_a_timer_longer_than_the_driver_says_is_measured() -> None:
+    clock = clock_of(Cell("wrong timer", UNTOLD))
+    for message in messages(Cell("wrong timer", UNTOLD), 1, 6, 5):
+        clock.sample(message.measurement, message.t_rx_ns, 0)
+    assert 12 * NS_PER_MS < clock.status().hold_ns <= 16 * NS_PER_MS
+
+
+def test_a_timer_that_is_as_the_driver_says_is_left_alone_on_a_busy_host() -> None:
+    for stalls in (None, Stalls(5 * NS_PER_S, 200 * NS_PER_MS)):
+        cell = Cell("loaded host", USB_1, wake=LOADED, stalls=stalls)
+        clock = clock_of(cell)
+        for message in messages(cell, 2, 6, 20):
+            clock.sample(message.measurement, message.t_rx_ns, 0)
+        assert clock.status().hold_ns == NS_PER_MS
