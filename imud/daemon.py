@@ -30,6 +30,7 @@ from imud.publishers import PUBLISHERS
 from imud.reload import Reloader
 from imud.runtime.device import Device
 from imud.runtime.device_factory import DeviceFactory
+from imud.runtime.latency.budget import LatencyBudget
 from imud.signals.gpio import GPIO_LINES
 from imud.units import NS_PER_S
 
@@ -77,9 +78,11 @@ class Daemon:
             configured=lambda: self.config.devices,
         )  # fmt: skip
         self._devices: dict[str, Device] = {}
+        self._latencies = LatencyBudget()
         self._context = PublisherContext(
-            self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns, self.ledgers
-        )
+            self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns, self.ledgers,
+            latencies=self._latencies,
+        )  # fmt: skip
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
@@ -109,6 +112,7 @@ class Daemon:
                 self._start_or_put_off(name)
             for name, publisher in self._extra.items():
                 self._start_publisher(name, publisher)
+                self._latencies.ask(name, 0)
             for device in self.config.devices:
                 self._start_device(device)
             gc.collect()
@@ -249,12 +253,14 @@ class Daemon:
             publisher.add_device(config.name, device_id)
         device = self._factory.make(config, device_id)
         self._devices[config.name] = device
+        self._latencies.add_device(config.name, device.set_need)
         task = asyncio.create_task(device.run(), name=config.name)
         task.add_done_callback(self._on_done)
         self._tasks[config.name] = task
 
     def _stop_device(self, name: str) -> None:
         self._tasks.pop(name).cancel()
+        self._latencies.remove_device(name)
         self._devices.pop(name).close()
         for publisher in self._publishers.values():
             publisher.remove_device(name)

@@ -38,6 +38,10 @@ def watch_arguments(parser: argparse.ArgumentParser) -> None:
         "--convention", choices=[str(one) for one in Convention], default=None,
         help="axes and angles of the samples (default: as configured)",
     )  # fmt: skip
+    parser.add_argument(
+        "--latency", type=float, default=None, metavar="MS",
+        help="samples may be so late, which costs less CPU (default: a period of the rate, at most 20; without one, 0)",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="one JSON object per line, SI units")
     parser.add_argument("--count", type=int, default=None, metavar="N", help="stop after N samples")
 
@@ -46,7 +50,10 @@ def watch(args: argparse.Namespace) -> int:
     """Print until interrupted, until N samples came, or until the daemon ends."""
     show = as_json if args.json else as_text
     with connect(args) as client:
-        samples = client.watch(args.device or None, rate_hz=args.rate, timeout_s=LOOK_S, convention=args.convention)
+        samples = client.watch(
+            args.device or None, rate_hz=args.rate, timeout_s=LOOK_S, convention=args.convention,
+            latency_ms=args.latency,
+        )  # fmt: skip
         states = DeviceNotes(client, args.device)
         shown = 0
         while args.count is None or shown < args.count:

@@ -202,7 +202,14 @@ def closes(ledger: dict[str, int]) -> bool:
 def latency(status: DeviceStatus) -> str:
     """Format the mean time from measurement to publication."""
     count = sum(status.latency_buckets)
-    return f"{status.latency_sum_ns / count / NS_PER_MS:.3f} ms mean over {count} samples" if count else "no samples"
+    mean = f"{status.latency_sum_ns / count / NS_PER_MS:.3f} ms mean over {count} samples" if count else "no samples"
+    return f"{mean}; {held(status)}"
+
+
+def held(status: DeviceStatus) -> str:
+    """Format how long samples wait to be processed together, and who decides it."""
+    wanted = f"{status.hold_wanted_ns / NS_PER_MS:g} ms allowed by {status.hold_by or 'everybody'}"
+    return f"samples wait {status.hold_ns / NS_PER_MS:g} ms to be processed together, {wanted}"
 
 
 STATUS = CliCommand(add_arguments, run)

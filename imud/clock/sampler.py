@@ -62,7 +62,7 @@ class SampleClock:
         "_aiding", "_arrivals", "_delay", "_device", "_error_ns", "_fit", "_fit_begin_ns", "_fit_bias_ns",
         "_fit_error_ns", "_fit_sync", "_holdover", "_host", "_jump", "_known", "_line", "_make_aiding",
         "_on_unknown_gap", "_own_status", "_resets", "_seq", "_slew", "_stamps", "_sync", "_t_err_ns", "_t_ns",
-        "_t_rx_ns", "_time", "missed",
+        "_t_rx_ns", "_time", "missed", "waited_ns",
     )  # fmt: skip
 
     def __init__(
@@ -70,8 +70,7 @@ class SampleClock:
         bits: TimeBits = NO_TIME_BITS, sout: SoutTiming | None = None, sin: TriggerTiming | None = None,
         host: SteadyTime = UNSTEERED, on_unknown_gap: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
-        self._device, self._host = device, host
-        self._on_unknown_gap = on_unknown_gap
+        self._device, self._host, self._on_unknown_gap = device, host, on_unknown_gap
         self._make_aiding = partial(
             AidingSources, tick_ns, tick_modulus, bits, sout or SoutTiming(), sin or TriggerTiming(), host
         )
@@ -82,23 +81,20 @@ class SampleClock:
         self._arrivals = ArrivalTime(self._delay, 0 if tick_ns else tick_modulus, on_unknown_gap)
         self._line: CounterLine | None = None
         """Where the device's counter is by the fit when it was lowest; None until a fit is used."""
-        self._jump = JumpDetector()
-        self._slew = Slew()
+        self._jump, self._slew = JumpDetector(), Slew()
         self._holdover: Holdover | None = None
         self._fit: ArrivalFit | None = None
         self._fit_begin_ns = 0  # device time
-        self._fit_bias_ns = 0.0
-        """Distance from the fit down to the time of measurement, ns."""
-        self._fit_error_ns = 0.0
+        self._fit_bias_ns = self._fit_error_ns = 0.0  # distance from the fit down to the time of measurement; its error
         self._fit_sync = Sync.ARRIVAL  # REGRESSION once the fit is used
         self._sync = Sync.ARRIVAL  # origin of the newest time stamp, where there are aiding sources
-        self._known = False  # whether device time has begun
+        self._known, self._resets = False, 0  # whether device time has begun
         self._seq = self._t_ns = self._t_rx_ns = self._t_err_ns = 0
         self._error_ns = 0.0  # one-sigma error of the newest time, before it is lifted or held back
-        self._resets = 0
         self._own_status: int | None = None
         self.missed = 0
         """Samples missing right before the newest one; one of unknown size is no part of it."""
+        self.waited_ns = 0  # set by the owner: how long the messages given next may have waited unread
 
     def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
         """Return the measurement with its place in time, as the next sample of the device.
@@ -296,6 +292,7 @@ class SampleClock:
     def _less_bias(self, arrival_ns: int, size_bytes: int) -> int:
         """Return the time of a message before the fit is used; leave its error in `_error_ns`."""
         t_ns, self._error_ns = self._delay.before(arrival_ns, size_bytes, self._period_ns(), float(FIRST_SPREAD_NS))
+        self._error_ns += self.waited_ns
         return t_ns
 
     # --- by device time ------------------------------------------------------------------------------------------
@@ -311,6 +308,9 @@ class SampleClock:
         device_ns = time.even_ns
         fit_ns = fit.ref_arrival_ns + fit.slope * (device_ns - fit.ref_device_ns)
         above_ns = arrival_ns - fit_ns
+        if waited := self.waited_ns and above_ns > 0.0:  # it may have come when the fit says, or that much later
+            arrival_ns -= int(min(above_ns, self.waited_ns))
+            above_ns = max(above_ns - self.waited_ns, 0.0)
         if time.rephased:
             return self._begin_phase(fit, device_ns, arrival_ns, size_bytes)
         if (
@@ -329,7 +329,7 @@ class SampleClock:
         ):  # fmt: skip
             return self._after_jump(above_ns, ticks, arrival_ns, size_bytes)
         self.missed = time.missed
-        if fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
+        if not waited and fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
             if self._jump.stood_still(fit, self._fit_error_ns):
                 self._resets += 1  # messages stay late: the device's clock stood still for a while
                 self._start_fit(arrival_ns)

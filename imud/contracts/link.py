@@ -71,6 +71,20 @@ class StreamLink(Link, Protocol):
     """Whether detection is to find the rate."""
     hold_ns: int
     """Longest time that the adapter holds bytes back (USB latency timer), ns; 0 for none."""
+    waiting_bytes: int
+    """So many bytes may wait unread while the link is paused, without any being lost; 0: it cannot be paused."""
+
+    def pause(self) -> None:
+        """Deliver nothing until `resume`: bytes wait in the kernel. For links with `waiting_bytes` only."""
+        ...
+
+    def take(self) -> bytes:
+        """Return all bytes that wait, of a paused link; its end is reported by `on_end`."""
+        ...
+
+    def resume(self) -> None:
+        """Deliver again as bytes come; no-op for a link that ended or is closed."""
+        ...
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         """Deliver bytes from now on. Needs a running loop and an open port."""
@@ -90,6 +104,9 @@ class CanLink(Link, Protocol):
     """Frames to deliver, effective when set. Other frames may be delivered as well."""
     bitrate: int
     """Rate of the bus in bit/s, known once open; 0 where there is none (virtual buses) or it is unknown."""
+    gather_ns: int
+    """Time for which frames may gather before they are delivered together, ns, effective when set; 0: at once.
+    Their times of arrival stay those of each frame. A link that cannot have frames gather ignores it."""
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Deliver frames from now on. Needs a running loop and an open bus."""

@@ -1,6 +1,6 @@
 """Contract of a publisher: it outputs samples and events, and never makes the pipeline wait."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
@@ -136,6 +136,28 @@ def _no_device(name: str) -> DeviceControl:
     raise CommandError(f"{name}: no such device")
 
 
+class Latencies(Protocol):
+    """Where consumers of samples ask for the latency they need: samples of a device may wait for the strictest."""
+
+    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
+        """Ask for samples of `devices` (None: of all) at most so late, in place of what `who` asked for before."""
+        ...
+
+    def release(self, who: str) -> None:
+        """Ask for nothing any more; no-op for one that does not ask."""
+        ...
+
+
+class NoLatencies:
+    """Where nothing waits, nothing need be asked for."""
+
+    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
+        """Ignore it."""
+
+    def release(self, who: str) -> None:
+        """Ignore it."""
+
+
 @dataclass(frozen=True, slots=True)
 class PublisherContext:
     """The parts of the daemon that publishers may use."""
@@ -154,6 +176,8 @@ class PublisherContext:
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
 
+    latencies: Latencies = field(default_factory=NoLatencies)
+    """How late samples may be; a publisher asks for what its readers need."""
     rings: dict[str, str] = field(default_factory=dict)
     """Path of the shared memory of each device that has some; kept by the publisher that makes it."""
     without_ring: set[str] = field(default_factory=set)

@@ -241,6 +241,12 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     """None for a device without lines."""
     utc: UtcStatus | None = None
     """None for a device that is neither fed sentences nor has its pulse per second at the host."""
+    hold_ns: int = 0
+    """How long its data waits at present to be processed together, ns; 0: each sample is processed as it comes."""
+    hold_wanted_ns: int = 0
+    """How long the consumers of its samples would let it wait, ns: the latency that the strictest of them asks for."""
+    hold_by: str = ""
+    """Who that is; empty while nobody asks."""
     declared: SettingsStatus | None = None
     """How its own settings compare with those that the configuration declares; None for a driver that does not know
     them, or is not known."""

@@ -29,6 +29,8 @@ class MemorySettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """Rate it pretends to have, in bit/s; 0 is none."""
     hold_ns: Annotated[int, Meta(ge=0)] = 0
     """Simulated hold time of an adapter, ns."""
+    waiting_bytes: Annotated[int, Meta(ge=0)] = 0
+    """Bytes that may wait while it is paused; 0: it cannot be."""
     writable: bool = True
     """Whether it pretends that a device listens."""
 
@@ -110,6 +112,10 @@ class MemoryLink(MemoryPort):
         self.hold_ns = settings.hold_ns
         self.bauds: list[int] = []
         """Every `set_baud`, in order."""
+        self.waiting_bytes = settings.waiting_bytes
+        self.paused = False
+        """Whether what is fed waits."""
+        self._waiting = b""
         self._on_data: OnData | None = None
 
     @property
@@ -118,11 +124,27 @@ class MemoryLink(MemoryPort):
         return self._on_data is not None
 
     def feed(self, data: bytes, t_rx_ns: int) -> bool:
-        """Deliver bytes as if read at `t_rx_ns`; False when the link is not started, and then they are lost."""
+        """Deliver bytes as if read at `t_rx_ns`, or keep them while paused; False, and lost, when it is not started."""
         if self._on_data is None:
             return False
-        self._on_data(data, t_rx_ns)
+        if self.paused:
+            self._waiting += data
+        else:
+            self._on_data(data, t_rx_ns)
         return True
+
+    def pause(self) -> None:
+        """Keep what is fed."""
+        self.paused = True
+
+    def take(self) -> bytes:
+        """Return what was fed since `pause`."""
+        data, self._waiting = self._waiting, b""
+        return data
+
+    def resume(self) -> None:
+        """Deliver what is fed from now on."""
+        self.paused = False
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         """Deliver what is fed from now on."""
@@ -137,6 +159,7 @@ class MemoryLink(MemoryPort):
 
     def _stop(self) -> None:
         self._on_data = None
+        self.paused, self._waiting = False, b""
 
 
 class MemoryCanLink(MemoryPort):
@@ -147,6 +170,8 @@ class MemoryCanLink(MemoryPort):
         self.bus = settings.name
         self.bitrate = self.baud
         self.filters: Sequence[CanFilter] = ()
+        self.gather_ns = 0
+        """Time for which frames may gather; nothing does here."""
         self.cyclic: Sequence[CyclicFrame] = ()
         """Frames passed to `send_cyclic`; empty when closed."""
         self._on_frames: OnFrames | None = None

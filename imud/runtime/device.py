@@ -33,6 +33,7 @@ from imud.runtime.attachments import AttachmentHooks, Attachments
 from imud.runtime.calibration.guide import Guide
 from imud.runtime.health import Health
 from imud.runtime.identity import KnownIdentity, identity_words
+from imud.runtime.latency.budget import Need
 from imud.runtime.meters import LatencyMeter, RateMeter
 from imud.runtime.notices import Notices
 from imud.runtime.path import SamplePath
@@ -107,6 +108,7 @@ class Device:
         self._line_differences: Mapping[str, str] = {}
         self._rate = RateMeter()
         self._connects = 0
+        self._need = Need(0, "")
         self._ended: asyncio.Future[LinkError | None] | None = None
 
     @property
@@ -124,6 +126,12 @@ class Device:
     def link(self) -> Link:
         """Link of the device."""
         return self._transport.link
+
+    def set_need(self, need: Need) -> None:
+        """Let samples wait for as long as their consumers allow; with lines, on which edges, triggers or an alarm
+        belong to samples, they never do."""
+        self._need = need if self._attachments.drain_edges is None else Need(0, "its lines")
+        self._transport.set_latency(self._need.latency_ns)
 
     async def run(self) -> None:
         """Keep the device alive until cancelled, or until a replay ends."""
@@ -148,7 +156,7 @@ class Device:
             self._suspends = self._host.suspends
             if path.fresh:  # what it measured meanwhile is lost, and CLOCK_MONOTONIC does not show that time passed
                 self.ledger.add_unknown_gap()
-        if now_ns - path.last_data_ns > IDLE_FLUSH_NS:
+        if now_ns - path.last_data_ns > IDLE_FLUSH_NS + transport.hold_ns:
             path.flush(now_ns)
         if transport.receiving:
             self._watch_flow(path, now_ns)
@@ -410,6 +418,9 @@ class Device:
             kernel=transport.link.kernel_counters(),
             latency_buckets=tuple(latency.buckets),
             latency_sum_ns=latency.sum_ns,
+            hold_ns=transport.hold_ns,
+            hold_wanted_ns=self._need.latency_ns,
+            hold_by=self._need.who,
             temperature_c=newest.temperature_c if newest else None,
             status_bits=newest.status if newest else None,
             status_words=status_words(driver.status_bits, newest.status) if driver and newest else (),

@@ -27,10 +27,11 @@ class Exchange:
         set_baud: Callable[[int], None] | None = None,
         follow: Callable[[Any], None] | None = None,
         listen: Callable[[Sequence[CanFilter]], None] | None = None,
+        on_busy: Callable[[bool], None] = lambda _busy: None,
     ) -> None:
         """`now_ns` reads CLOCK_MONOTONIC; `set_baud` changes the rate of the link, None where it has none; `follow`
         listens to the device by other settings of its driver, `listen` for further frames of a CAN bus, None where the
-        device has no number on a bus."""
+        device has no number on a bus. `on_busy` is called when a script begins (True) and when it has ended."""
         self._session = Session(ledger)
         self._write = write
         self._now_ns = now_ns
@@ -39,6 +40,7 @@ class Exchange:
         self.answered_ns = 0
         """CLOCK_MONOTONIC of the newest complete reply; 0 before the first."""
         self._listen = listen
+        self._on_busy = on_busy
         self._lock = asyncio.Lock()
         self._outcome: asyncio.Future[Outcome] | None = None
         self.wants_samples = False
@@ -51,6 +53,7 @@ class Exchange:
         """
         async with self._lock:
             undo = b""
+            self._on_busy(True)
             try:
                 request = next(script)
                 while True:
@@ -66,6 +69,7 @@ class Exchange:
                 if undo:
                     with suppress(LinkError, CommandError):  # the device is gone, and its state with it
                         self._write(undo)
+                self._on_busy(False)
 
     @property
     def busy(self) -> bool:

@@ -1,10 +1,12 @@
 """Meters of one device: rate, latency, loss by cause. Plain integers, evaluated when they are read."""
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
+from collections.abc import Sequence
 
 from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.ledger import Ledger
+from imud.sample import Sample
 from imud.units import NS_PER_S
 
 RATE_WINDOW_NS = 2 * NS_PER_S
@@ -41,10 +43,23 @@ class LatencyMeter:
         self.buckets = [0] * (len(LATENCY_BOUNDS_NS) + 1)
         self.sum_ns = 0
 
-    def add(self, latency_ns: int) -> None:
-        """Count one sample."""
-        self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
-        self.sum_ns += latency_ns
+    def add(self, now_ns: int, samples: Sequence[Sample]) -> None:
+        """Count samples that are published at `now_ns`, oldest first."""
+        if len(samples) == 1:
+            latency_ns = now_ns - samples[0].t_ns
+            self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
+            self.sum_ns += latency_ns
+            return
+        latencies = [now_ns - sample.t_ns for sample in reversed(samples)]  # rising, as times of samples do
+        self.sum_ns += sum(latencies)
+        buckets, begin = self.buckets, 0
+        for bucket in range(bisect_left(LATENCY_BOUNDS_NS, latencies[0]), len(LATENCY_BOUNDS_NS)):
+            end = bisect_right(latencies, LATENCY_BOUNDS_NS[bucket], begin)
+            buckets[bucket] += end - begin
+            if end == len(latencies):
+                return
+            begin = end
+        buckets[-1] += len(latencies) - begin
 
 
 class LossMeter:

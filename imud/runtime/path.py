@@ -146,10 +146,7 @@ class SamplePath(ABC):
             for sample in samples:
                 if sample.status is not None:
                     self._status_seen |= sample.status & mask
-        now_ns = self._now_ns()
-        add = self.latency.add
-        for sample in samples:
-            add(now_ns - sample.t_ns)
+        self.latency.add(self._now_ns(), samples)
 
 
 class SampleListener(Protocol):
@@ -179,6 +176,8 @@ class StreamPath(SamplePath):
         self.codec = codec
         self._listener = listener
         self._drain_edges = drain_edges
+        self.gathered: list[Sample] = []
+        """Samples that are not published yet, oldest first."""
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process bytes as read, with CLOCK_MONOTONIC right after the read."""
@@ -190,6 +189,27 @@ class StreamPath(SamplePath):
             self.publish_events(events, t_rx_ns)
             if self._listener is not None and self._listener.wants_samples:
                 self._pass_on(events, self._listener)
+
+    def gather(self, data: bytes, t_rx_ns: int, waited_ns: int = 0) -> bool:
+        """Process bytes, and keep their samples for `publish_gathered`; returns whether there are any.
+
+        The bytes waited in the kernel for up to `waited_ns`; 0: they were read as they came.
+        """
+        self.last_data_ns = t_rx_ns
+        events = self.codec.feed(data)
+        if not events:
+            return False
+        before = len(self.gathered)
+        self.clock.waited_ns = waited_ns
+        self._sort(events, t_rx_ns, self._utc_offset_ns(), self.gathered)
+        self.clock.waited_ns = 0
+        return len(self.gathered) > before
+
+    def publish_gathered(self) -> None:
+        """Publish the samples that were kept, as one batch."""
+        samples, self.gathered = self.gathered, []
+        if samples:
+            self._finish(samples, samples[-1].t_rx_ns)
 
     def _pass_on(self, events: Sequence[CodecEvent], listener: SampleListener) -> None:
         for event in events:

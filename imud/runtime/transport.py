@@ -113,6 +113,15 @@ class Transport(Protocol):
         """Whether a request script is running."""
         ...
 
+    @property
+    def hold_ns(self) -> int:
+        """How long data of the device waits at present to be processed together, ns."""
+        ...
+
+    def set_latency(self, latency_ns: int) -> None:
+        """Let samples wait so long from now on, ns; 0: not at all."""
+        ...
+
     async def wait_present(self) -> None:
         """Return when the link can be opened. Raises LinkError where it must not be."""
         ...

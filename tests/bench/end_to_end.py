@@ -20,7 +20,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         for clients in (1, 10) if quick else (1, 10, 100):
             yield from compare(Load(clients=clients, encoding=encoding, seconds=seconds), rounds=1 if quick else 3)
     yield from growth(seconds, (1, 16, 48) if quick else (1, 4, 16, 32, 48, 64))
-    yield from coalesced(seconds)
 
 
 def compare(load: Load, rounds: int) -> Iterator[Row]:
@@ -63,11 +62,3 @@ def growth(seconds: float, sizes: Sequence[int]) -> Iterator[Row]:
         if devices == 1:
             yield at_most("RSS with 1 device", imud.rss_mb, "MB", RSS_LIMIT_MB)
     yield at_least("devices at 1 kHz on one core without loss", float(most), "devices", DEVICES_AIM)
-
-
-def coalesced(seconds: float) -> Iterator[Row]:
-    """What holding a batch for 2 ms saves at 16 devices."""
-    load = Load(devices=16, seconds=seconds, phases=4)
-    plain, held = run(load), run(replace(load, coalesce_ms=2))
-    yield Row("16 devices, coalesce 2 ms: CPU against none", held.cpu_us_per_sample / plain.cpu_us_per_sample, "x")
-    yield Row("16 devices, coalesce 2 ms: latency p99", held.p99_us, "us")

@@ -25,7 +25,7 @@ from tests.bench.rows import Row, at_most
 
 LOAD = Load(clients=10, encoding="json", warm_s=1.5)
 ROUNDS = 3
-GATHERED_MS = 10
+GATHERED_MS = 10.0
 RATIO_MOST = 0.8
 GATHERED_RATIO_MOST = 0.4
 LOST_MOST = 0.01
@@ -94,17 +94,20 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         return
     load = replace(LOAD, seconds=2.0 if quick else 6.0)
     figures = [
-        (gpsd_us(program, load), *(run(replace(load, coalesce_ms=held)).cpu_us_per_sample for held in (0, GATHERED_MS)))
+        (
+            gpsd_us(program, load),
+            *(run(replace(load, latency_ms=held)).cpu_us_per_sample for held in (0.0, GATHERED_MS)),
+        )
         for _ in range(1 if quick else ROUNDS)
     ]
     theirs, at_once, gathered = zip(*figures, strict=True)
     name = f"1 kHz, {load.clients} json clients"
     yield Row(f"{name}: CPU per sample, gpsd", median(theirs), "us")
     yield Row(f"{name}: CPU per sample, imud beside gpsd", median(at_once), "us")
-    yield Row(f"{name}: CPU per sample, imud, {GATHERED_MS} ms gathered", median(gathered), "us")
+    yield Row(f"{name}: CPU per sample, imud, {GATHERED_MS:g} ms gathered", median(gathered), "us")
     for words, ours, most in (
         ("", at_once, RATIO_MOST),
-        (f", {GATHERED_MS} ms gathered", gathered, GATHERED_RATIO_MOST),
+        (f", {GATHERED_MS:g} ms gathered", gathered, GATHERED_RATIO_MOST),
     ):
         ratio = median(a / b for a, b in zip(ours, theirs, strict=True))
         yield at_most(f"{name}: imud / gpsd{words}", ratio, "x", most)

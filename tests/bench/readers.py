@@ -71,13 +71,13 @@ def count_json(buffer: bytearray, seen: Latency, now_ns: int) -> None:
     del buffer[:end]
 
 
-def subscribe(path: str, encoding: str, bare: bool) -> tuple[socket.socket, bytes]:
-    """Connect and ask for samples; returns the socket and the bytes that came after the reply."""
+def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> tuple[socket.socket, bytes]:
+    """Connect and ask for samples, as `wanted`; returns the socket and the bytes that came after the reply."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     if bare:
         return sock, b""
-    request = {"jsonrpc": "2.0", "id": 1, "method": "watch", "params": {"encoding": encoding}}
+    request = {"jsonrpc": "2.0", "id": 1, "method": "watch", "params": {"encoding": encoding, **wanted}}
     sock.sendall(json.dumps(request).encode() + b"\n")
     got = b""
     while got.count(b"\n") < 2:  # hello, then the reply
@@ -146,6 +146,7 @@ def main() -> None:
     parser.add_argument("--encoding", choices=["json", "binary"], default="binary")
     parser.add_argument("--bare", action="store_true")
     parser.add_argument("--stuck", action="store_true")
+    parser.add_argument("--watch", type=json.loads, default={}, help="more parameters of `watch`, as JSON")
     parser.add_argument("--times")
     parser.add_argument("--frames", type=int, default=0)
     parser.add_argument("--skip", type=int, default=0, help="frames at the beginning whose latency does not count")
@@ -156,11 +157,11 @@ def main() -> None:
         with open(args.times, "rb") as file:
             times = mmap.mmap(file.fileno(), 8 * args.frames, access=mmap.ACCESS_READ)
     seen = Latency(times, args.skip)
-    stuck = subscribe(args.socket, args.encoding, args.bare) if args.stuck else None
+    stuck = subscribe(args.socket, args.encoding, args.bare, args.watch) if args.stuck else None
     if args.gpsd:
         socks = [subscribe_to_gpsd(args.gpsd) for _ in range(args.clients)]
     else:
-        socks = [subscribe(args.socket, args.encoding, args.bare) for _ in range(args.clients)]
+        socks = [subscribe(args.socket, args.encoding, args.bare, args.watch) for _ in range(args.clients)]
     print("ready", flush=True)
     on_bytes = count_attitudes if args.gpsd else count_binary if args.encoding == "binary" else count_json
     receive(socks, on_bytes, seen, time.monotonic_ns() + int(args.seconds * 1e9))

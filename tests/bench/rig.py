@@ -39,7 +39,10 @@ class Load:
     warm_s: float = 3.0
     """Time before it that does not: the clock's first fits, and caches."""
     bare: bool = False
-    coalesce_ms: int = 0
+    latency_ms: float | None = None
+    """What clients and shared memory ask for; None: what they get without asking."""
+    client_hz: float | None = None
+    """Samples a second that a client asks for; None: all."""
     stuck: bool = False
     phases: int = 1
     shm: bool = True
@@ -131,7 +134,7 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         f"d{i}": {
             "driver": "hipnuc-uart",
             "identify": False,
-            "uart": {"port": port, "baud": 921600, "coalesce_ms": load.coalesce_ms},
+            "uart": {"port": port, "baud": 921600},
         }
         for i, port in enumerate(ports)
     }
@@ -141,7 +144,8 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         "log_level": "error",
         "state_dir": str(folder),
         "socket": {"path": str(folder / "s")},
-        "shm": {"enabled": load.shm, "directory": str(folder)},
+        "shm": {"enabled": load.shm, "directory": str(folder)}
+        | ({} if load.latency_ms is None else {"latency_ms": load.latency_ms}),
         "metrics": {"port": 0},
         "devices": devices,
     }
@@ -186,6 +190,8 @@ def start_readers(stack: ExitStack, folder: Path, load: Load) -> Process:
     args = ["--socket", str(folder / "s"), "--clients", str(load.clients), "--encoding", load.encoding]
     args += ["--times", str(folder / "times"), "--frames", str(load.frames)]
     args += ["--skip", str(int(load.warm_s * load.rate_hz))]
+    wanted = {"rate_hz": load.client_hz, "latency_ms": load.latency_ms}
+    args += ["--watch", json.dumps({name: value for name, value in wanted.items() if value is not None})]
     args += ["--bare"] * load.bare + ["--stuck"] * load.stuck
     readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *args))
     readers.line()
@@ -229,7 +235,7 @@ def run(load: Load) -> Outcome:
         p99_us=figures["p99_us"],
         max_us=figures["max_us"],
         received=figures["samples"],
-        gaps=figures["gaps"] + total - figures["samples"] if load.clients else 0,
+        gaps=figures["gaps"] + total - figures["samples"] if load.clients and load.client_hz is None else 0,
         refused=refused,
         rss_mb=memory_mb,
         statuses=statuses,

@@ -39,7 +39,7 @@ class Module:
         """For example `imu61x-can-101`."""
         return f"{self.driver}-{self.node}"
 
-    def config(self, interface: str, coalesce_ms: int) -> dict[str, object]:
+    def config(self, interface: str) -> dict[str, object]:
         """The device's keys."""
         driver = DRIVERS[self.driver]
         assert isinstance(driver, CanDriver)
@@ -48,7 +48,7 @@ class Module:
             "driver": self.driver,
             "options": options,
             "identify": False,
-            "socketcan": {"interface": interface, "coalesce_ms": coalesce_ms},
+            "socketcan": {"interface": interface},
         }
 
 

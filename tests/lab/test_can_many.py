@@ -18,7 +18,7 @@ from tests.support.daemon_process import RunningDaemon, running_daemon
 SECONDS = float(os.environ.get("IMUD_LAB_SECONDS", "6"))
 RATE_HZ = float(os.environ.get("IMUD_LAB_RATE_HZ", "20"))
 """Whole hertz, of which the period is whole milliseconds."""
-COALESCE_MS = int(os.environ.get("IMUD_LAB_COALESCE_MS", "50"))
+LATENCY_MS = float(os.environ.get("IMUD_LAB_LATENCY_MS", "50"))
 LIMIT_S = 60.0
 ASK_S = 0.5
 EDGE_S = 0.5
@@ -31,7 +31,7 @@ LOSSES = ("lost_gap_device", "lost_crc", "lost_overrun", "lost_queue")
 
 def collect(client: Client, seconds: float) -> dict[str, list[Sample]]:
     """What arrives in so many seconds; it is decoded afterwards, so that reading keeps up."""
-    watch = client.watch(encoding="binary")
+    watch = client.watch(encoding="binary", latency_ms=LATENCY_MS)
     names = {number: name for name, number in watch.device_ids.items()}
     taken: list[bytes] = []
     end = monotonic() + seconds
@@ -77,7 +77,7 @@ def losses(status: DeviceStatus) -> int:
 @pytest.mark.timeout(1800)
 def test_nine_devices_on_one_bus(vcan: CanInterface, tmp_path: Path) -> None:
     modules = fleet()
-    devices = {module.name: module.config(vcan.name, COALESCE_MS) for module in modules}
+    devices = {module.name: module.config(vcan.name) for module in modules}
     outputs = {"log_level": "info", "shm": {"enabled": False}, "metrics": {"enabled": False}}
     with (
         traffic(vcan.name, modules, RATE_HZ, SECONDS + SPARE_S) as bus,
@@ -94,7 +94,7 @@ def test_nine_devices_on_one_bus(vcan: CanInterface, tmp_path: Path) -> None:
         count = sum(len(samples) for samples in found.values())
         print(
             f"  CPU of the guest: daemon {used_s[0] / SECONDS:.0%}, {used_s[0] / count * 1e6:.0f} us per sample, "
-            f"player {used_s[1] / SECONDS:.0%}; coalesce_ms {COALESCE_MS}"
+            f"player {used_s[1] / SECONDS:.0%}; latency_ms {LATENCY_MS:g}"
         )
         for number, module in enumerate(modules):
             status, samples = after[module.name], found[module.name]

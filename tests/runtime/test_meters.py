@@ -3,6 +3,7 @@
 from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.ledger import Ledger
 from imud.runtime.meters import LatencyMeter, LossMeter, RateMeter
+from imud.sample import Sample, Sync
 
 S = 1_000_000_000
 
@@ -24,13 +25,32 @@ def test_rate_falls_to_zero_when_samples_stop() -> None:
 
 def test_latency_goes_into_the_bucket_whose_bound_it_does_not_exceed() -> None:
     meter = LatencyMeter()
-    meter.add(50_000)
-    meter.add(50_001)
-    meter.add(10**12)
+    for latency_ns in (50_000, 50_001, 10**12):
+        meter.add(2 * 10**12, published_after(latency_ns))
     assert meter.buckets[0] == 1
     assert meter.buckets[1] == 1
     assert meter.buckets[len(LATENCY_BOUNDS_NS)] == 1
     assert meter.sum_ns == 100_001 + 10**12
+
+
+def test_a_batch_goes_into_the_same_buckets_as_its_samples_alone() -> None:
+    latencies = [10**12, 50_000_001, 50_000_000, 20_000_000, 20_000_000, 5_000_001, 49_999, 7]
+    together, alone = LatencyMeter(), LatencyMeter()
+    together.add(2 * 10**12, published_after(*latencies))
+    for latency_ns in latencies:
+        alone.add(2 * 10**12, published_after(latency_ns))
+    assert together.buckets == alone.buckets
+    assert together.buckets[-1] == 2
+    assert together.buckets[0] == 2
+    assert together.sum_ns == alone.sum_ns == sum(latencies)
+
+
+def published_after(*latencies_ns: int) -> list[Sample]:
+    """Samples, oldest first, that are published at 2000 s."""
+    return [
+        Sample("bow", seq, 2 * 10**12 - latency_ns, 1, Sync.ARRIVAL, 0, 0)
+        for seq, latency_ns in enumerate(latencies_ns, start=1)
+    ]
 
 
 def test_loss_is_explained_by_damage_first_then_overruns_then_the_device() -> None:

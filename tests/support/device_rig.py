@@ -39,6 +39,8 @@ class DeviceRig:
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self.samples: list[Sample] = []
         self.batches = 0
+        self.published: list[tuple[int, list[Sample]]] = []
+        """Each batch with the time of its publication."""
         self.events: list[Event] = []
         self.now_ns = now_ns
         self.device: Device
@@ -177,6 +179,7 @@ class DeviceRigs:
         rig = self.rigs[batch.device]
         assert batch.device_id == rig.device.device_id
         rig.batches += 1
+        rig.published.append((self.host.now_ns(), list(batch.samples)))
         rig.samples += batch.samples
 
     def _send_event(self, event: Event) -> None:

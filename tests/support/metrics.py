@@ -44,6 +44,8 @@ def device(name: str, number: int = 0, **changes: object) -> DeviceStatus:
         settings={},
         rate_hz=999.5 + number,
         expected_rate_hz=1000.25,
+        hold_ns=5_000_000,
+        hold_wanted_ns=20_000_000,
         newest_seq=123,
         clock=ClockStatus(Sync.REGRESSION, 5_250_000_000, -40.0, 30_000, 45_000, 2, steering_ppm=500.0),
         ledger=ledger,

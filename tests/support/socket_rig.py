@@ -29,7 +29,7 @@ from imud.contracts.device_settings import (
     SettingsStatus,
     StepOutcome,
 )
-from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
+from imud.contracts.publisher import AS_SENT, Batch, Latencies, NoLatencies, PublisherContext
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, FrameStatus, KernelCounters
 from imud.errors import Rejected
 from imud.frames.conventions import Convention, Heading
@@ -109,10 +109,10 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
     )
 
 
-def context(now_ns: Callable[[], int] = lambda: NOW_NS) -> PublisherContext:
+def context(now_ns: Callable[[], int] = lambda: NOW_NS, latencies: Latencies | None = None) -> PublisherContext:
     """A daemon with the devices of `DEVICES`; its clock stands still if no other is given."""
     statuses = [device_status(*item) for item in DEVICES.items()]
-    return PublisherContext(lambda: statuses, EPOCH, now_ns, FakeControl)
+    return PublisherContext(lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies or NoLatencies())
 
 
 def set_rate(_target: Target, *, message: Literal["HI91", "HI92"], rate_hz: int) -> None:
@@ -210,12 +210,17 @@ def run(body: Callable[[], Awaitable[T]]) -> T:
 
 @asynccontextmanager
 async def serving(
-    directory: Path, now_ns: Callable[[], int] = lambda: NOW_NS, **settings: Any
+    directory: Path,
+    now_ns: Callable[[], int] = lambda: NOW_NS,
+    latencies: Latencies | None = None,
+    **settings: Any,
 ) -> AsyncIterator[SocketServer]:
     """A started server with two devices; closed at the end, and then nothing of it is left."""
     path = directory / "imud.sock"
     own_group = grp.getgrgid(os.getgid()).gr_name
-    server = SocketServer(SocketSettings(**{"path": str(path), "group": own_group, **settings}), context(now_ns))
+    server = SocketServer(
+        SocketSettings(**{"path": str(path), "group": own_group, **settings}), context(now_ns, latencies)
+    )
     server.start()
     for name, number in DEVICES.items():
         server.add_device(name, number)

@@ -160,6 +160,7 @@ class Port:
     baud = 9600
     auto_baud = False
     hold_ns = 0
+    waiting_bytes = 0
 
     def __init__(self, refusals: int = 0) -> None:
         self.opened = self.closed = 0
@@ -184,6 +185,12 @@ class Port:
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         self.on_data, self.on_end = on_data, on_end
         self.started.set()
+
+    def pause(self) -> None: ...
+    def resume(self) -> None: ...
+
+    def take(self) -> bytes:
+        return b""
 
     def write(self, data: bytes) -> None:
         raise AssertionError(data)

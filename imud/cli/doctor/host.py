@@ -135,7 +135,7 @@ def processor(at: Surroundings) -> Findings:
         told = f"load of {minutes:.1f} over 5 minutes on {cpus} processors"
         told += f", {waited:.0f} % of a minute spent waiting for one" if waited is not None else ""
         if minutes > LOAD_PER_CPU * cpus or (waited or 0.0) > PRESSURE_PERCENT:
-            yield warning(told, "`top`; nice other programs, lower rates or `coalesce_ms`; docs/operate.md")
+            yield warning(told, "`top`; nice other programs, lower rates or allow a latency; docs/latency.md")
         else:
             yield ok(told)
     for one in at.status or ():

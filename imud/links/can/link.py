@@ -27,10 +27,16 @@ from imud.links.can import netlink
 from imud.links.can.bus_state import WATCHED, BusState
 from imud.links.can.cyclic_sender import NO_MANAGER, KernelSender, LoopSender, Sender
 from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
+from imud.units import NS_PER_S
 
 NATIVE: Final = "socketcan"
 FRAME_BUFFER_BYTES: Final = 960
 """Bytes that the kernel charges a socket for one queued frame, about (222 fit the usual 208 KiB)."""
+FRAME_BITS: Final = 95
+"""A data frame of six bytes, without stuff bits: a full bus of these fills half the buffer while frames gather."""
+HIGHEST_BITRATE: Final = 1_000_000
+TURN_FRAMES: Final = 1024
+"""Frames that are read in one turn of the event loop at most."""
 CAN_RAW_ERR_FILTER: Final = 2
 """Option of SOL_CAN_RAW: classes of error frames to receive (linux/can/raw.h)."""
 SO_RCVBUFFORCE: Final = 33
@@ -46,8 +52,6 @@ class SocketCanSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fiel
     """Network interface, for example `can0` (`ip link` lists them); for another backend its channel."""
     receive_buffer_bytes: Annotated[int, Meta(ge=4096, le=1 << 26)] = 1 << 20
     """Kernel memory for frames that wait to be read, about 960 bytes each. The system may allow less."""
-    coalesce_ms: Annotated[int, Meta(ge=0, le=100)] = 0
-    """Time to gather frames before they are read: less CPU, more delay. Their time stamps stay the kernel's."""
     backend: Annotated[str, Meta(min_length=1)] = NATIVE
     """`socketcan`, or the name of another interface of python-can, for example `virtual` or `slcan`."""
     bitrate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
@@ -106,7 +110,7 @@ class SocketCanLink:
         """`open_socket` makes a bound, non-blocking socket whose messages are `struct can_frame`."""
         self._settings = settings
         self._open_socket = open_socket
-        self._coalesce_s = settings.coalesce_ms / 1000
+        self._gather_wanted_ns = self._gather_most_ns = self._gather_ns = 0
         self._timer: asyncio.TimerHandle | None = None
         self._sys = sys
         self._socket: socket.socket | None = None
@@ -133,6 +137,19 @@ class SocketCanLink:
         if self._socket is not None:
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
 
+    @property
+    def gather_ns(self) -> int:
+        """Time for which frames gather before they are read, ns; 0: they are read at once."""
+        return self._gather_ns
+
+    @gather_ns.setter
+    def gather_ns(self, gather_ns: int) -> None:
+        self._gather_wanted_ns = gather_ns
+        self._gather_ns = min(gather_ns, self._gather_most_ns)
+        if not self._gather_ns and self._timer is not None:
+            self._timer.cancel()
+            self._read_on_time()
+
     def absence(self) -> str:
         """Return why the interface cannot be used now; empty when it can. Raises LinkError if it is not of kind CAN."""
         return netlink.absence(self._settings.interface, self._sys)
@@ -153,13 +170,17 @@ class SocketCanLink:
         except OSError as error:
             raise self._explained(error) from error
         self._reader = FrameReader(self._socket, self._on_error_frame)
+        room_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        frame_ns = FRAME_BITS * NS_PER_S // (self.bitrate or HIGHEST_BITRATE)
+        self._gather_most_ns = room_bytes // FRAME_BUFFER_BYTES // 2 * frame_ns
+        self._gather_ns = min(self._gather_wanted_ns, self._gather_most_ns)
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Deliver frames from now on; a present problem of the bus is reported at once."""
         assert self._socket is not None
         self._on_frames, self._on_news, self._on_end = on_frames, on_news, on_end
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(self._socket.fileno(), self._read_coalescing if self._coalesce_s else self._read)
+        self._loop.add_reader(self._socket.fileno(), self._read)
         if problem := self._state.problem:
             on_news(problem, problem)
 
@@ -211,9 +232,33 @@ class SocketCanLink:
         if sender is not None:
             sender.close()
 
-    def _read(self) -> int:
-        """Read one batch; returns its number of frames, -1 when the bus ended. The loop calls again for the rest."""
-        assert self._reader is not None
+    def _read(self) -> None:
+        """Read one batch; the loop calls again for the rest. Where frames may gather, those that follow do."""
+        loop, opened = self._loop, self._socket
+        count = self._read_batch()
+        if self._gather_ns and count and loop is not None and opened is not None and opened is self._socket:
+            loop.remove_reader(opened.fileno())
+            self._timer = loop.call_later(self._gather_ns / NS_PER_S, self._read_on_time)
+
+    def _read_on_time(self) -> None:
+        """Read all that has gathered. A bus without frames is watched again."""
+        self._timer = None
+        loop, opened = self._loop, self._socket
+        count = total = self._read_batch()
+        while count >= BATCH_FRAMES // 2 and total < TURN_FRAMES:  # some of the batch may be no data frames
+            count = self._read_batch()
+            total += count
+        if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed
+            return
+        if total and self._gather_ns:
+            self._timer = loop.call_later(self._gather_ns / NS_PER_S, self._read_on_time)
+        else:
+            loop.add_reader(opened.fileno(), self._read)
+
+    def _read_batch(self) -> int:
+        """Read and deliver one batch; returns its number of frames, -1 when the bus ended."""
+        if self._reader is None:
+            return -1
         try:
             frames = self._reader.read()
         except OSError as error:
@@ -222,22 +267,6 @@ class SocketCanLink:
         if frames:
             self._on_frames(frames)
         return len(frames)
-
-    def _read_coalescing(self) -> None:
-        """A batch; when it emptied the queue, read again after `coalesce_ms`. A bus without frames is watched again."""
-        loop, opened = self._loop, self._socket
-        count = self._read()
-        if loop is None or opened is None or opened is not self._socket or count < 0:  # ended, or was closed
-            return
-        if count and self._timer is None:
-            loop.remove_reader(opened.fileno())
-        if count >= BATCH_FRAMES // 2:  # some of the batch may be no data frames
-            self._timer = loop.call_later(0, self._read_coalescing)
-        elif count:
-            self._timer = loop.call_later(self._coalesce_s, self._read_coalescing)
-        elif self._timer is not None:
-            self._timer = None
-            loop.add_reader(opened.fileno(), self._read_coalescing)
 
     def _on_error_frame(self, classes: int, data: bytes) -> bool:
         state = self._state

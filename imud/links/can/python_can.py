@@ -38,6 +38,8 @@ class PythonCanLink:
         self._on_end: OnEnd | None = None
         self.title = self.bus = f"{channel} ({backend})"
         self.bitrate = bitrate
+        self.gather_ns = 0
+        """No-op: the receiving thread decides how many frames it hands over at once."""
         self.writable = True
 
     @property

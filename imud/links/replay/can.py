@@ -38,6 +38,8 @@ class CanReplayLink(FileReplay):
         self.filters: Sequence[CanFilter] = ()
         self.bus = settings.path
         self.bitrate = 0
+        self.gather_ns = 0
+        """No-op: the recording decides what is delivered together."""
 
     def open(self) -> None:
         """Open the log and check that it has frames. Raises LinkMissing, LinkDenied, LinkError."""

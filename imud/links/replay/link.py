@@ -50,6 +50,17 @@ class ReplayLink(FileReplay):
         self.baud = settings.baud
         self.auto_baud = False
         self.hold_ns = 0
+        self.waiting_bytes = 0
+
+    def pause(self) -> None:
+        """No-op: a recording is not paused, for nothing wakes up for it but itself."""
+
+    def take(self) -> bytes:
+        """Nothing waits."""
+        return b""
+
+    def resume(self) -> None:
+        """No-op, as `pause`."""
 
     def open(self) -> None:
         """Open and check the capture. Raises LinkMissing, LinkDenied, LinkError."""

@@ -1,8 +1,8 @@
 """A serial port: UART, RS-232, USB adapter or USB virtual port, read inside the event loop.
 
 At 1 kHz the cost is the number of wake-ups and system calls (measured), so a wake-up is one read of all that is
-there and one time stamp. With `coalesce_ms` the descriptor is not watched at all while data flows: a timer
-reads it, and only a read that finds nothing goes back to waiting for the descriptor.
+there and one time stamp. A link that is paused does not watch its descriptor at all: bytes wait in the kernel until
+they are taken, or until the link is resumed.
 """
 
 import asyncio
@@ -28,11 +28,13 @@ from imud.links.uart.serial_port import (
     port_problem,
     request_low_latency,
 )
-from imud.units import NS_PER_MS
 
 READ_BYTES: Final = 65536
 FULL_READ_BYTES: Final = 2048
-"""A read of this size leaves more behind (n_tty hands over at most 4095): read again without waiting."""
+"""A read of this size may leave more behind (n_tty hands over at most 4095): read again."""
+WAITING_BYTES: Final = 2048
+"""Half of what the kernel's line discipline keeps (n_tty: 4095): at three quarters it stops a USB adapter's driver from
+taking bytes, and what the adapter itself keeps can be 256."""
 WRITE_QUEUE_BYTES: Final = 4096
 """Commands are some dozens of bytes; more waiting means that the port does not send."""
 DEFAULT_BAUD: Final = 115200
@@ -46,8 +48,6 @@ class UartSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Path of the port. `/dev/serial/by-id/…` names the adapter and survives replugging; `/dev/ttyUSB0` does not."""
     baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
     """Rate in bit/s, or `auto`: search at every rate of the device."""
-    coalesce_ms: Annotated[int, Meta(ge=0, le=100)] = 0
-    """Pause after a read before the next: fewer wake-ups and less CPU, as much more latency."""
     low_latency: bool = True
     """Ask driver and USB adapter to hand bytes over at once."""
 
@@ -66,9 +66,8 @@ class UartLink:
         self._on_data: OnData = _ignore_data
         self._on_end: OnEnd = _ignore_end
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._timer: asyncio.Handle | None = None
         self._unsent = bytearray()
-        self._coalesce_s = settings.coalesce_ms / 1000
+        self.waiting_bytes = WAITING_BYTES
         self.title = settings.port
         self.auto_baud = settings.baud == "auto"
         self.writable = True
@@ -91,13 +90,42 @@ class UartLink:
         self._counters = TtyCounters(self._fd)
         if self._settings.low_latency:
             request_low_latency(self._port, path, self._sys)
-        self.hold_ns = hold_ns(path, self._sys) + self._settings.coalesce_ms * NS_PER_MS
+        self.hold_ns = hold_ns(path, self._sys)
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         """Deliver bytes from now on."""
         self._on_data, self._on_end = on_data, on_end
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(self._fd, self._read_coalescing if self._coalesce_s else self._read)
+        self._loop.add_reader(self._fd, self._read)
+
+    def pause(self) -> None:
+        """Deliver nothing until `resume`: bytes wait in the kernel, and an end of the port is not seen."""
+        if self._loop is not None:
+            self._loop.remove_reader(self._fd)
+
+    def take(self) -> bytes:
+        """Return all bytes that wait. The end of the port is reported, with what came before it returned."""
+        data = b""
+        while self._loop is not None:
+            try:
+                piece = os.read(self._fd, READ_BYTES)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                self._end(error)
+                break
+            if not piece:
+                self._end(None)
+                break
+            data = data + piece if data else piece
+            if len(piece) < FULL_READ_BYTES:
+                break
+        return data
+
+    def resume(self) -> None:
+        """Deliver again as bytes come; no-op for a port that ended or is closed."""
+        if self._loop is not None:
+            self._loop.add_reader(self._fd, self._read)
 
     def write(self, data: bytes) -> None:
         """Send bytes; what the port does not accept at once is queued, up to WRITE_QUEUE_BYTES. Raises LinkError."""
@@ -135,39 +163,24 @@ class UartLink:
         if port is not None:
             port.close()
 
-    def _read(self) -> int:
-        """Read once; returns the size, 0 for no data, -1 for the end."""
+    def _read(self) -> None:
+        """Read once, and deliver what was read."""
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:
-            return 0
-        except OSError as error:
-            return self._end(error)
-        if not data:
-            return self._end(None)
-        self._on_data(data, time.monotonic_ns())
-        return len(data)
-
-    def _read_coalescing(self) -> None:
-        loop, fd = self._loop, self._fd
-        size = self._read()
-        if loop is None or fd < 0 or fd != self._fd or size < 0:  # ended, or closed by the receiver
             return
-        if size and self._timer is None:
-            loop.remove_reader(fd)
-        if size >= FULL_READ_BYTES:
-            self._timer = loop.call_soon(self._read_coalescing)
-        elif size:
-            self._timer = loop.call_later(self._coalesce_s, self._read_coalescing)
-        elif self._timer is not None:
-            self._timer = None
-            loop.add_reader(fd, self._read_coalescing)
+        except OSError as error:
+            self._end(error)
+            return
+        if not data:
+            self._end(None)
+            return
+        self._on_data(data, time.monotonic_ns())
 
-    def _end(self, error: OSError | None) -> int:
+    def _end(self, error: OSError | None) -> None:
         self._stop()
         reason = "hung up" if error is None else f"{os.strerror(error.errno or 0)}"
         self._on_end(LinkMissing(f"{self.title} is gone ({reason}): was the cable or the adapter pulled out?"))
-        return -1
 
     def _send(self, data: bytes | bytearray) -> int:
         try:
@@ -187,9 +200,6 @@ class UartLink:
             self._loop.remove_writer(self._fd)
 
     def _stop(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
         if self._loop is not None and self._fd >= 0:
             self._loop.remove_reader(self._fd)
             self._loop.remove_writer(self._fd)

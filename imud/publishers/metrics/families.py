@@ -71,7 +71,6 @@ def _with_sin(device: DeviceStatus) -> LinesStatus | None:
 
 
 def _triggered(device: DeviceStatus) -> ClockStatus | None:
-    """The clock of such a device."""
     return device.clock if _with_sin(device) is not None else None
 
 
@@ -219,6 +218,14 @@ DEVICE_FAMILIES: Final = (
     _gauge(
         "imud_sample_rate_expected_hertz", "Rate by the device's own time stamps; absent while unknown.",
         DEVICE.one(lambda d: d.expected_rate_hz or None), HERTZ,
+    ),
+    _gauge(
+        "imud_sample_hold_seconds", "How long data waits at present to be processed together; 0: it does not wait.",
+        DEVICE.one(lambda device: device.hold_ns), SECONDS,
+    ),
+    _gauge(
+        "imud_sample_hold_wanted_seconds", "How long the strictest consumer of the samples would let them wait.",
+        DEVICE.one(lambda device: device.hold_wanted_ns), SECONDS,
     ),
     _gauge(
         "imud_clock_sync", "1 for the present source of time stamps, 0 for the others.",

@@ -21,9 +21,12 @@ from imud.event import Event
 from imud.formats.ring import DIRECTORY, STATE_LIVE, RingHeader, ring_path
 from imud.publishers.shm.directory import RingDirectory, open_directory
 from imud.publishers.shm.ring import ShmRing
+from imud.units import NS_PER_MS
 
 log = logging.getLogger(__name__)
 
+ASKER: Final = "shared memory"
+"""Who asks for the latency of its settings."""
 RETRY_NS: Final = 1_000_000_000
 """A ring that cannot be made is tried again once a second: a full memory is not filled any faster."""
 OTHERS_WRITE: Final = 0o022
@@ -41,6 +44,9 @@ class ShmSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     look into both; another directory is named by their environment variable IMUD_SHM."""
     slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
     """Samples a ring holds, a power of two, 256 bytes each: 4096 are four seconds at 1 kHz and 1 MB per device."""
+    latency_ms: Annotated[float, msgspec.Meta(ge=0, le=50)] = 5.0
+    """Samples may be written so much later than they could be, several at once, which costs less CPU; 0: each at once.
+    Where a client of the socket asks for less, it is less for all."""
     group: str = "imud"
     """Group that may read, if it exists and imud may give files to it."""
     mode: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o640
@@ -88,6 +94,7 @@ class ShmPublisher:
         self._opened_directory()
         self._group_id = self._find_group()
         self._started = True
+        self._context.latencies.ask(ASKER, round(self._settings.latency_ms * NS_PER_MS))
 
     def add_device(self, name: str, device_id: int) -> None:
         """Make the device's ring; where that fails, log why and go on trying.
@@ -136,6 +143,7 @@ class ShmPublisher:
 
     def close(self) -> None:
         """Show the final ledgers, then close every ring; may be called twice."""
+        self._context.latencies.release(ASKER)
         if self._rings:
             self._show(self._context.now_ns())
         for name in list(self._places):

@@ -146,7 +146,9 @@ class Hub:
     def _forget_waker(self, connection: Connection, device: str) -> None:
         wanting = self._wanting_wake.get(device)
         if wanting is not None:
-            wanting.pop(connection, None)
+            if connection in wanting:
+                del wanting[connection]
+                self.context.latencies.release(_asker(connection, device))
             if not wanting:
                 del self._wanting_wake[device]
 
@@ -161,6 +163,7 @@ class Hub:
         self._quota.check_form(uid, subscription.key, self._forms_of(uid, connection))
         self.unsubscribe(connection)
         self._subscriptions[connection.number] = subscription
+        self.context.latencies.ask(_asker(connection), subscription.latency_ns, subscription.devices)
         for device, plan in self._plans.items():
             if subscription.matches(device):
                 plan.add(device, subscription, connection.outbox)
@@ -177,6 +180,7 @@ class Hub:
         """Send no more samples to a client; no-op if it watches none."""
         subscription = self._subscriptions.pop(connection.number, None)
         if subscription is not None:
+            self.context.latencies.release(_asker(connection))
             for device, plan in self._plans.items():
                 if subscription.matches(device):
                     plan.discard(subscription, connection.outbox)
@@ -189,11 +193,15 @@ class Hub:
         """Send no more events to a client; no-op if it gets none."""
         self._events.pop(connection.number, None)
 
-    def make_waker(self, connection: Connection, device: str) -> int:
-        """Make a descriptor that wakes a client after batches of `device`. Raises RpcError as `ClientWakers.make`."""
+    def make_waker(self, connection: Connection, device: str, latency_ns: int = 0) -> int:
+        """Make a descriptor that wakes a client after batches of `device`, so late at most.
+
+        Raises RpcError as `ClientWakers.make`.
+        """
         self._quota.check_waker(connection.peer, self._connections.values())
         fd = connection.wakers.make(device, self._quota.check_fds)
         self._wanting_wake.setdefault(device, {})[connection] = None
+        self.context.latencies.ask(_asker(connection, device), latency_ns, (device,))
         return fd
 
     def wakes(self, device: str) -> bool:
@@ -269,3 +277,8 @@ def post_all(connections: Iterable[Connection], body: bytes) -> None:
     """Send one JSON object to several clients."""
     for connection in connections:
         connection.post(body)
+
+
+def _asker(connection: Connection, notified: str = "") -> str:
+    """A client as who asks for a latency: for what it watches, or for being woken by a device."""
+    return f"client {connection.number}" + (f", notify {notified}" if notified else "")

@@ -39,13 +39,16 @@ class OptionsParams(msgspec.Struct):
 
 
 class WatchParams(msgspec.Struct):
-    """Parameters of `watch`; what is left out or null means all, all, every sample, JSON, as the device is set."""
+    """Parameters of `watch`; what is left out or null means all, all, every sample, JSON, as the device is set, and the
+    latency that goes with the rate."""
 
     devices: list[str] | None = None
     fields: list[str] | None = None
     rate_hz: float | None = None
     encoding: Form | None = None
     convention: Convention | None = None
+    latency_ms: float | None = None
+    """How late samples may be; 0: each at once."""
 
 
 class PollParams(msgspec.Struct):
@@ -67,6 +70,14 @@ class DeviceParams(msgspec.Struct):
     """Parameters of methods about one device."""
 
     device: str
+
+
+class NotifyParams(msgspec.Struct):
+    """Parameters of `notify`."""
+
+    device: str
+    latency_ms: float | None = None
+    """How late the descriptor may become readable; left out, null or 0: with each sample at once."""
 
 
 class CommandParams(msgspec.Struct):
@@ -200,6 +211,8 @@ class WatchResult(msgspec.Struct, omit_defaults=True):
     devices: dict[str, int]
     """The daemon's number of each device that is watched, as in slots."""
     rate_hz: float
+    latency_ms: float
+    """How late samples may be for this client."""
     convention: Convention | None = None
     """The one that was asked for; left out where none was."""
 
@@ -224,6 +237,7 @@ class NotifyResult(msgspec.Struct):
     """Result of `notify`, which carries the descriptor."""
 
     device: str
+    latency_ms: float
 
 
 class StopResult(msgspec.Struct):

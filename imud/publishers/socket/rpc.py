@@ -41,6 +41,7 @@ from imud.publishers.socket.messages import (
     Greeting,
     NoParams,
     NothingMore,
+    NotifyParams,
     NotifyResult,
     OptionsParams,
     OptionsResult,
@@ -60,11 +61,17 @@ from imud.publishers.socket.outbox import NO_FD
 from imud.publishers.socket.rights import Rights
 from imud.publishers.socket.subscription import Form, Subscription
 from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
+from imud.units import NS_PER_MS
 
 RATE_MIN_HZ: Final = 0.001
 """Slower than one sample in 1,000 s is a mistake of units more likely than a wish; `poll` serves it."""
 RATE_MAX_HZ: Final = 1_000_000
 """No sensor is as fast; far above, the count of periods would leave the range of a float."""
+
+LATENCY_MAX_MS: Final = 60_000
+"""More is a mistake of units more likely than a wish."""
+LATENCY_OF_RATE_MAX_MS: Final = 20.0
+"""A client that says only at which rate it wants samples gets them so late at most."""
 
 NAME_MAX: Final = 64
 """Characters of an action's name; the longest has fewer than half of it."""
@@ -233,10 +240,14 @@ def _watch(hub: Hub, connection: Connection, params: WatchParams) -> Answer:
     rate_hz = _rate(params.rate_hz)
     form = params.encoding or Form.JSON
     framed = connection.framed or form is Form.BINARY
-    wanted = Subscription(devices, fields, rate_hz, form, framed, params.convention, connection.text_numbers)
+    latency_ms = _latency_ms(params.latency_ms, rate_hz)
+    wanted = Subscription(
+        devices, fields, rate_hz, form, framed, params.convention, connection.text_numbers,
+        round(latency_ms * NS_PER_MS),
+    )  # fmt: skip
     hub.subscribe(connection, wanted)
     numbers = hub.devices if devices is None else {name: hub.devices[name] for name in devices}
-    result = WatchResult(form, dict(numbers), rate_hz, params.convention)
+    result = WatchResult(form, dict(numbers), rate_hz, latency_ms, params.convention)
     return Answer(result, framed_from_here=form is Form.BINARY)
 
 
@@ -273,10 +284,12 @@ def _events(hub: Hub, connection: Connection, params: EventsParams) -> Answer:
     return Answer(EventsResult(enable))
 
 
-def _notify(hub: Hub, connection: Connection, params: DeviceParams) -> Answer:
+def _notify(hub: Hub, connection: Connection, params: NotifyParams) -> Answer:
     """Send a descriptor that becomes readable with each batch of one device; it replaces an earlier one."""
     _known_devices(hub, [params.device])
-    return Answer(NotifyResult(params.device), hub.make_waker(connection, params.device))
+    latency_ms = _latency_ms(params.latency_ms, 0.0)
+    fd = hub.make_waker(connection, params.device, round(latency_ms * NS_PER_MS))
+    return Answer(NotifyResult(params.device, latency_ms), fd)
 
 
 # --- commands -------------------------------------------------------------------------------------------------------
@@ -368,7 +381,7 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "unwatch": Method(NoParams, _unwatch, acts=True, result=NothingMore),
     "poll": Method(PollParams, _poll, result=PollResult),
     "events": Method(EventsParams, _events, acts=True, result=EventsResult),
-    "notify": Method(DeviceParams, _notify, result=NotifyResult),
+    "notify": Method(NotifyParams, _notify, result=NotifyResult),
     "actions": Method(DeviceParams, _actions, result=list[ActionInfo]),
     "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
     "calibrations": Method(DeviceParams, _calibrations, result=list[CalibrationInfo]),
@@ -414,3 +427,12 @@ def _rate(rate_hz: float | None) -> float:
         message = f"rate_hz: expected 0 (every sample) or {RATE_MIN_HZ} … {RATE_MAX_HZ}, got {rate_hz}"
         raise RpcError(Code.INVALID_PARAMS, message)
     return float(rate_hz)
+
+
+def _latency_ms(latency_ms: float | None, rate_hz: float) -> float:
+    """The latency that is asked for; left out, a period of the rate, and 0 for every sample. Raises RpcError."""
+    if latency_ms is None:
+        return min(1000.0 / rate_hz, LATENCY_OF_RATE_MAX_MS) if rate_hz else 0.0
+    if not 0 <= latency_ms <= LATENCY_MAX_MS:  # false for NaN, too
+        raise RpcError(Code.INVALID_PARAMS, f"latency_ms: expected 0 (at once) … {LATENCY_MAX_MS}, got {latency_ms}")
+    return float(latency_ms)

@@ -82,6 +82,8 @@ class Subscription:
     """Axes and angles of samples; None for those of the device's configuration."""
     text_numbers: bool = False
     """Whether integers of JSON samples that may exceed 2⁵³ are text."""
+    latency_ns: int = 0
+    """How late samples may be; 0: each at once."""
     _paces: dict[str, Pace] = field(default_factory=dict)
 
     @property

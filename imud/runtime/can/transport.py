@@ -42,7 +42,10 @@ class CanTransport:
         self._now_ns = context.host.now_ns
         self._buses = buses
         self._remembered = remembered
-        self._exchange = Exchange(context.ledger, link.write, self._now_ns, follow=self._follow, listen=self._listen)
+        self._exchange = Exchange(
+            context.ledger, link.write, self._now_ns, follow=self._follow, listen=self._listen, on_busy=self._on_busy
+        )
+        self._latency_ns = 0
         self._also: Sequence[CanFilter] = ()
         """Frames that can answer the outstanding request although they are none of the device's replies."""
         self._search = SearchLoop(context.health, context.attachments, context.host, self._begin_search, self._ask)
@@ -104,6 +107,7 @@ class CanTransport:
             self.path.reset()
             self.path.begin(self._now_ns())
         link.filters = EVERYTHING
+        link.gather_ns = 0
         search = CanSearch(
             of_kind(DRIVERS.values(), CanDriver),
             self.where,
@@ -142,6 +146,7 @@ class CanTransport:
         assert path is not None
         self._round = None
         link.filters = driver.filters(self._options)
+        link.gather_ns = self._latency_ns
         path.clock.restart()
         first = driver.example_frames(Random(0))[0]
         bits = frame_bits(first.extended, len(first.data))
@@ -236,6 +241,20 @@ class CanTransport:
         return await self._exchange.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others)))
 
     # --- the flow ----------------------------------------------------------------------------------------------------
+
+    def set_latency(self, latency_ns: int) -> None:
+        """Let frames gather for so long."""
+        self._latency_ns = latency_ns
+        self._on_busy(self._exchange.busy)
+
+    def _on_busy(self, busy: bool) -> None:
+        """Have frames gather, unless a request waits for a reply or the device is searched for."""
+        self.link.gather_ns = 0 if busy or self._round is not None else self._latency_ns
+
+    @property
+    def hold_ns(self) -> int:
+        """How long frames gather at present, ns."""
+        return self.link.gather_ns
 
     def _on_frames(self, frames: Sequence[CanFrame]) -> None:
         if self._round is not None:

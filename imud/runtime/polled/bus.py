@@ -25,6 +25,8 @@ from imud.worker import BusThread, StartWorker
 T = TypeVar("T")
 
 IDLE_NS = 60 * NS_PER_S
+FAR_NS = 1 << 63
+"""Nothing is to be done before anything that may wait for it."""
 POLLS_IN_ROW = 8
 """Number of polls after which a script has its turn on a bus that is never idle."""
 READINGS_MAX = 10_000
@@ -49,6 +51,7 @@ class BusMember:
         self._deadlines = deadlines
         self._on_readings = on_readings
         self._left = False
+        self._latency_ns = 0
         self._polling = _Polling(link, deadlines, bus.now_ns, self._deliver)
         bus.command(lambda: bus.add(self._polling))
 
@@ -79,6 +82,12 @@ class BusMember:
         rate_hz, begin_ns, counts = self._link.rate_hz, self._bus.now_ns(), self._deadlines
         schedule = timetable or (Schedule(rate_hz, begin_ns, counts) if rate_hz else RoundRobin(begin_ns, counts))
         self.command(lambda: self._polling.start(polls, schedule))
+
+    def set_latency(self, latency_ns: int) -> None:
+        """Let readings wait so long before they are delivered together, ns; 0: not at all."""
+        if latency_ns != self._latency_ns:
+            self._latency_ns = latency_ns
+            self.command(lambda: self._polling.set_latency(latency_ns))
 
     def command(self, command: Callback) -> None:
         """Have the bus's thread run a function between two transfers, at once if it sleeps."""
@@ -119,6 +128,13 @@ class _Polling:
         self._due_ns: list[int] = []
         self._readings: list[Reading] = []
         self._problem: LinkError | None = None
+        self._latency_ns = 0
+        self._failed = False
+        """Whether one of the readings failed: the device may be gone, and is to be looked for at once."""
+
+    def set_latency(self, latency_ns: int) -> None:
+        """Let readings wait so long."""
+        self._latency_ns = latency_ns
 
     def start(self, polls: Sequence[Poll], schedule: Timetable) -> None:
         """Read from now on."""
@@ -148,12 +164,14 @@ class _Polling:
             self.scripts.popleft()
         return settle
 
-    def delivery(self) -> Callback | None:
-        """Return what delivers all that has gathered, to be called in the loop's thread; None for nothing."""
+    def delivery(self, next_ns: int) -> Callback | None:
+        """Return what delivers all that has gathered, to be called in the loop's thread; None for nothing, or where it
+        may wait until `next_ns`, when it is asked for again."""
         readings, problem, deliver = self._readings, self._problem, self._deliver
-        if not readings and problem is None:
+        waits = not readings or next_ns <= readings[0].end_ns + self._latency_ns
+        if waits and problem is None and not self._failed:
             return None
-        self._readings, self._problem = [], None
+        self._readings, self._problem, self._failed = [], None, False
         return lambda: deliver(readings, problem)
 
     def _read(self, number: int, transfer: Transfer) -> None:
@@ -168,6 +186,7 @@ class _Polling:
             self._problem = problem
             self.stop()
             return
+        self._failed = self._failed or error is not None
         if len(self._readings) < READINGS_MAX:
             self._readings.append(Reading(number, data, error, start_ns, self._now_ns()))
         else:
@@ -294,12 +313,12 @@ class PolledBus:
             self._in_row += 1
             polling.poll(schedule)
             if not polling.link.rate_hz:  # something is always due here: no idle moment comes to hand over in
-                self._hand_over()
+                self._hand_over(FAR_NS)
             return 0
         stepped, self._in_row = self._step_script(), 0
         if stepped:
             return 0
-        self._hand_over()
+        self._hand_over(schedule.due_ns if schedule is not None else FAR_NS)
         if commands:
             return 0
         return max(0, schedule.due_ns - self.now_ns()) if schedule is not None else IDLE_NS
@@ -323,11 +342,11 @@ class PolledBus:
                 return True
         return False
 
-    def _hand_over(self) -> None:
-        """Deliver all gathered results to the loop, with one wake-up."""
+    def _hand_over(self, next_ns: int) -> None:
+        """Deliver all gathered results that may not wait until `next_ns` to the loop, with one wake-up."""
         callbacks = self._callbacks
         for polling in self._polling:
-            delivery = polling.delivery()
+            delivery = polling.delivery(next_ns)
             if delivery is not None:
                 callbacks.append(delivery)
         if callbacks:

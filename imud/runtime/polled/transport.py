@@ -79,6 +79,7 @@ class PolledTransport:
         self._on_end: OnEnd | None = None
         self._vanished = 0
         self._lost_counted = 0
+        self._latency_ns = 0
 
     # --- the bus's life ----------------------------------------------------------------------------------------------
 
@@ -92,6 +93,7 @@ class PolledTransport:
         self._on_end = on_end
         self._health.searching()
         self._member = self._buses.get(self.link.bus).join(self.link, self._deadlines, self._on_readings)
+        self._member.set_latency(self.hold_ns)
 
     async def work(self) -> None:
         """Find, set up and read the device, repeatedly. Ends only with the bus."""
@@ -250,6 +252,19 @@ class PolledTransport:
             self._identify_again(message)
 
     # --- the flow ----------------------------------------------------------------------------------------------------
+
+    def set_latency(self, latency_ns: int) -> None:
+        """Let readings wait so long; polls keep their deadlines."""
+        self._latency_ns = latency_ns
+        if self._member is not None:
+            self._member.set_latency(self.hold_ns)
+
+    @property
+    def hold_ns(self) -> int:
+        """How long readings wait, ns: not where fewer than two would, nor where each edge wakes the loop anyhow."""
+        rate_hz = self.link.rate_hz
+        waits = self._ready is None and rate_hz and self._latency_ns >= 2 * NS_PER_S / rate_hz
+        return self._latency_ns if waits else 0
 
     def _on_readings(self, readings: Sequence[Reading], problem: LinkError | None) -> None:
         """Decode the readings of the bus's thread."""

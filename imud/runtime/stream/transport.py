@@ -20,6 +20,7 @@ from imud.runtime.detection.remembered import Remembered, RememberedDevice
 from imud.runtime.detection.rounds import StreamRound
 from imud.runtime.exchange import Exchange
 from imud.runtime.identity import IDENTIFY_AGAIN_S, IDENTIFY_TRIES
+from imud.runtime.latency.stream_hold import StreamHold
 from imud.runtime.path import SamplePath, StreamPath
 from imud.runtime.search_loop import SearchLoop
 from imud.runtime.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext
@@ -49,12 +50,17 @@ class StreamTransport:
         self._ledger = context.ledger
         self._now_ns = context.host.now_ns
         self._remembered = remembered
-        self._exchange = Exchange(context.ledger, self._send, self._now_ns, self._change_rate)
+        self._exchange = Exchange(
+            context.ledger, self._send, self._now_ns, self._change_rate, on_busy=lambda _busy: self._release()
+        )
         self._search = SearchLoop(
             context.health, context.attachments, context.host, self._begin_search, self._ask, self._still_answers
         )
         self._discard = _Discard(context.ledger)
         self._receiver: DataReceiver = self._discard
+        self._latency_ns = 0
+        self._hold: StreamHold | None = None
+        """What has samples wait; None while they must not."""
         self._fixed_baud = 0 if link.auto_baud else link.baud
         self._asked_ns = 0
         """CLOCK_MONOTONIC when identity and settings were asked for last."""
@@ -81,6 +87,7 @@ class StreamTransport:
     def stop(self) -> None:
         """End the search and close the link; may be called twice."""
         self._search.stop()
+        self._release()
         self.link.close()
         self._receiver = self._discard
 
@@ -98,6 +105,7 @@ class StreamTransport:
             assert isinstance(driver, StreamDriver)
             self._begin(StreamFound(driver, link.baud))
             return None
+        self._release()
         last = self._remembered.get(config.name)
         searching = StreamRound(config, link, self._ledger, last, self._begin, self._now_ns, may_ask=self._may_ask)
         self._receiver = searching
@@ -119,6 +127,7 @@ class StreamTransport:
         self._receiver = path
         for data, t_rx_ns in found.chunks:
             path.on_data(data, t_rx_ns)
+        self._receive()
 
     def _new_path(self, driver: StreamDriver) -> StreamPath:
         context = self._context
@@ -239,6 +248,32 @@ class StreamTransport:
 
     # --- the flow ----------------------------------------------------------------------------------------------------
 
+    def set_latency(self, latency_ns: int) -> None:
+        """Let samples wait so long."""
+        self._latency_ns = latency_ns if self.link.waiting_bytes else 0
+        if self.receiving:
+            self._receive()
+
+    @property
+    def hold_ns(self) -> int:
+        """How long samples wait at present, ns."""
+        return self._hold.hold_ns if self._hold is not None else 0
+
+    def _receive(self) -> None:
+        """Have bytes from now on received by the path: at once, or after a wait."""
+        path, latency_ns = self.path, self._latency_ns
+        assert path is not None
+        self._release()
+        self._receiver, self._hold = path, None
+        if latency_ns:
+            self._receiver = self._hold = StreamHold(self.link, path, lambda: self._exchange.busy, self._now_ns)
+            self._hold.latency_ns = latency_ns
+
+    def _release(self) -> None:
+        """Have all that waits processed now."""
+        if self._hold is not None:
+            self._hold.release()
+
     def _on_data(self, data: bytes, t_rx_ns: int) -> None:
         self._receiver.on_data(data, t_rx_ns)
 
@@ -318,7 +353,7 @@ class StreamTransport:
     @property
     def receiving(self) -> bool:
         """Whether bytes go to the device's codec."""
-        return self._receiver is self.path
+        return self._receiver is self.path or self._receiver is self._hold
 
     @property
     def hears_replies(self) -> bool:

@@ -17,7 +17,7 @@ from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
 from imud.links.can.link import SocketCanLink, SocketCanSettings
 
 LIMIT_S = 10.0
-COALESCE_MS = 40
+GATHER_MS = 10
 
 Ends = tuple[socket.socket, socket.socket, Path]
 
@@ -25,10 +25,11 @@ Ends = tuple[socket.socket, socket.socket, Path]
 class Bus:
     """A link whose socket is one of the loop device, what it delivered, and when it meant to look again."""
 
-    def __init__(self, ends: Ends, coalesce_ms: int) -> None:
+    def __init__(self, ends: Ends, gather_ms: int) -> None:
         receiver, sender, sys = ends
-        settings = SocketCanSettings(interface="lo", coalesce_ms=coalesce_ms)
+        settings = SocketCanSettings(interface="lo")
         self.link = SocketCanLink(settings, sys=sys, open_socket=lambda _settings, _filters: receiver.dup())
+        self.link.gather_ns = gather_ms * 1_000_000
         self.batches: list[list[CanFrame]] = []
         self.delivered_ns: list[int] = []
         self.ends: list[LinkError | None] = []
@@ -138,11 +139,11 @@ def test_frames_gather_and_keep_their_time(ends: Ends, monkeypatch: pytest.Monke
         bus.send(1)
         await bus.until(lambda: len(bus.batches) == 2)
 
-    bus = Bus(ends, COALESCE_MS)
+    bus = Bus(ends, GATHER_MS)
     bus.run(monkeypatch, story)
     assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2, 3, 4]]
-    assert bus.delays_s == [COALESCE_MS / 1000] * 2
-    assert bus.delivered_ns[1] - bus.delivered_ns[0] > 0.9 * COALESCE_MS * 1e6
+    assert bus.delays_s == [GATHER_MS / 1000] * 2
+    assert bus.delivered_ns[1] - bus.delivered_ns[0] > 0.9 * GATHER_MS * 1e6
     assert all(frame.t_rx_ns <= sent_ns[0] + 200_000 for frame in bus.batches[1])
 
 
@@ -152,10 +153,10 @@ def test_what_is_more_than_a_batch_is_read_at_once(ends: Ends, monkeypatch: pyte
         bus.send(0x700)
         await bus.until(lambda: len(bus.batches) == 4)
 
-    bus = Bus(ends, COALESCE_MS)
+    bus = Bus(ends, GATHER_MS)
     bus.run(monkeypatch, story)
     assert [len(batch) for batch in bus.batches] == [1, BATCH_FRAMES, BATCH_FRAMES, 5]
-    assert bus.delays_s == [COALESCE_MS / 1000, 0, 0, COALESCE_MS / 1000]
+    assert bus.delays_s == [GATHER_MS / 1000] * 2
 
 
 def test_a_bus_that_fell_silent_is_watched_again(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,3 +229,27 @@ def test_a_bus_that_ends_in_the_pause_says_so_once(ends: Ends, monkeypatch: pyte
     assert isinstance(ended, LinkMissing)
     assert bus.looks == 1
     assert len(bus.delays_s) == 1
+
+
+def test_what_gathers_is_read_when_nothing_may_wait_any_more(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(bus: Bus) -> None:
+        bus.then = lambda: bus.send(2)
+        bus.send(1)
+        await bus.until(lambda: bus.batches)
+        bus.link.gather_ns = 0
+        assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2]]
+        bus.send(3)
+        await bus.until(lambda: len(bus.batches) == 3)
+
+    bus = Bus(ends, GATHER_MS)
+    bus.run(monkeypatch, story)
+    assert bus.looks == 0
+    assert len(bus.delays_s) == 1
+
+
+def test_no_more_gathers_than_half_the_buffer_holds(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(bus: Bus) -> None:
+        room = ends[0].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 960
+        assert bus.link.gather_ns == room // 2 * 95_000  # frames of 95 bits at 1 Mbit/s
+
+    Bus(ends, 60_000).run(monkeypatch, story)

@@ -204,7 +204,7 @@ def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
 
 
 def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
-    link = UartLink(UartSettings(port=pty.path, coalesce_ms=1))
+    link = UartLink(UartSettings(port=pty.path))
 
     async def scene(receiver: Receiver) -> None:
         got = asyncio.Event()
@@ -216,7 +216,7 @@ def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
         link.start(on_data, receiver.on_end)
         pty.send(b"x")
         await asyncio.wait_for(got.wait(), LIMIT_S)
-        await asyncio.sleep(0.01)  # a timer that was left would read, and end the link
+        await asyncio.sleep(0.01)  # a reader that was left would read, and end the link
 
     assert play(link, scene).ends == []
 
@@ -390,52 +390,53 @@ def test_after_a_refusal_the_wait_ends_anyway(pty: PtyPort, monkeypatch: pytest.
         asyncio.run(asyncio.wait_for(link.wait_present(), LIMIT_S))
 
 
-def test_coalescing_gathers_what_comes_in_the_meantime(pty: PtyPort) -> None:
-    hold_s = 0.03
-
+def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
     async def scene(receiver: Receiver) -> None:
-        pty.send(b"a")
-        await receiver.until(lambda: receiver.data == b"a")
-        for byte in b"bcdef":
+        link.pause()
+        for byte in b"abc":
             pty.send(bytes([byte]))
-            for _ in range(5):
-                await asyncio.sleep(0)
-        await receiver.until(lambda: len(receiver.data) >= 6)
+        await asyncio.sleep(0.01)
+        assert receiver.data == b""
+        assert link.take() == b"abc"
+        assert link.take() == b""
+        link.resume()
+        pty.send(b"d")
+        await receiver.until(lambda: receiver.data == b"d")
 
-    link = UartLink(UartSettings(port=pty.path, coalesce_ms=30))
-    receiver = play(link, scene)
-    assert [data for data, _ in receiver.chunks] == [b"a", b"bcdef"]
-    (_, first_ns), (_, second_ns) = receiver.chunks
-    assert second_ns - first_ns >= hold_s * 0.99e9
-    assert link.hold_ns == 30 * NS_PER_MS
+    link = UartLink(UartSettings(port=pty.path))
+    assert play(link, scene).ends == []
 
 
-def test_coalescing_goes_back_to_waiting_and_sees_the_end(pty: PtyPort) -> None:
+def test_more_than_one_read_gives_is_taken_at_once(pty: PtyPort) -> None:
+    async def scene(_receiver: Receiver) -> None:
+        link.pause()
+        sent = bytes(range(256)) * 32
+        taken = b""
+        for at in range(0, len(sent), FULL_READ_BYTES):
+            pty.send(sent[at : at + FULL_READ_BYTES])
+        while len(taken) < len(sent):
+            taken += link.take()
+        assert taken == sent
+
+    link = UartLink(UartSettings(port=pty.path))
+    play(link, scene)
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_the_end_of_a_paused_port_is_reported_once(pty: PtyPort, resumed: bool) -> None:
     async def scene(receiver: Receiver) -> None:
-        for round_ in range(3):
-            pty.send(b"x")
-            await receiver.until(lambda wanted=round_ + 1: len(receiver.data) == wanted)  # type: ignore[misc]  # bound now
-            await asyncio.sleep(0.02)  # the read after 2 ms found nothing: it waits for the descriptor again
+        link.pause()
         pty.unplug()
-        await receiver.until(lambda: bool(receiver.ends))
+        await asyncio.sleep(0.01)
+        assert receiver.ends == []
+        assert link.take() == b""
+        assert len(receiver.ends) == 1
+        if resumed:
+            link.resume()
+        assert link.take() == b""
 
-    link = UartLink(UartSettings(port=pty.path, coalesce_ms=2))
+    link = UartLink(UartSettings(port=pty.path))
     assert len(play(link, scene).ends) == 1
-
-
-def test_coalescing_keeps_up_with_more_than_one_read_gives(pty: PtyPort) -> None:
-    size = 3 * FULL_READ_BYTES
-
-    async def scene(receiver: Receiver) -> None:
-        for _ in range(4):
-            pty.send(bytes(FULL_READ_BYTES))
-            while len(receiver.data) < FULL_READ_BYTES:
-                await asyncio.sleep(0)
-        await receiver.until(lambda: len(receiver.data) >= size)
-
-    link = UartLink(UartSettings(port=pty.path, coalesce_ms=100))
-    receiver = play(link, scene)
-    assert receiver.chunks[2][1] - receiver.chunks[0][1] < 90 * NS_PER_MS
 
 
 def test_the_latency_timer_is_lowered_and_what_remains_is_reported(pty: PtyPort, tmp_path: Path) -> None:
@@ -482,8 +483,6 @@ def test_the_row_and_its_settings() -> None:
         {"port": ""},
         {"port": "a", "baud": 0},
         {"port": "a", "baud": "fast"},
-        {"port": "a", "coalesce_ms": 101},
-        {"port": "a", "coalesce_ms": -1},
         {"port": "a", "speed": 9600},
     ],
 )

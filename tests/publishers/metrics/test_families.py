@@ -124,6 +124,8 @@ def test_values_in_base_units() -> None:
         "imud_clock_resets_total": 2,
         "imud_sample_rate_hertz": 999.5,
         "imud_sample_rate_expected_hertz": 1000.25,
+        "imud_sample_hold_seconds": 0.005,
+        "imud_sample_hold_wanted_seconds": 0.02,
         "imud_temperature_celsius": 36.5,
         "imud_status_bits": 4,
         "imud_device_connects_total": 3,

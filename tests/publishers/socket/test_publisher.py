@@ -72,7 +72,12 @@ def test_json_samples_have_the_names_of_the_design_and_no_absent_members(tmp_pat
     async def body() -> None:
         async with serving(tmp_path) as server:
             peer = await Peer.greeted(server)
-            assert await peer.result("watch") == {"encoding": "json", "devices": DEVICES, "rate_hz": 0.0}
+            assert await peer.result("watch") == {
+                "encoding": "json",
+                "devices": DEVICES,
+                "rate_hz": 0.0,
+                "latency_ms": 0.0,
+            }
             server.publish(batch("imu0", 7, 2))
             server.publish(batch("imu1", 1))
             first, second, other = await peer.messages(3)

@@ -21,7 +21,7 @@ async def notified(peer: Peer, device: str = "imu0") -> int:
     await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"notify","params":{"device":"%s"}}\n' % device.encode())
     await until(lambda: bool(select.select([peer.sock], [], [], 0)[0]))
     data, fds, _flags, _address = socket.recv_fds(peer.sock, 4096, 4)
-    assert data == b'{"jsonrpc":"2.0","id":1,"result":{"device":"%s"}}\n' % device.encode()
+    assert data == b'{"jsonrpc":"2.0","id":1,"result":{"device":"%s","latency_ms":0.0}}\n' % device.encode()
     (fd,) = fds
     return fd
 

@@ -188,6 +188,56 @@ def test_readings_come_in_order_with_their_times() -> None:
     run_virtually(clock, body())
 
 
+@pytest.mark.parametrize(("latency_ns", "together"), [(0, 1), (460_000, 1), (5_000_000, 11), (5_100_000, 11)])
+def test_readings_wait_and_their_polls_do_not(latency_ns: int, together: int) -> None:
+    """At 2 kHz in virtual time: the oldest reading is delivered before its latency would be over."""
+    clock = VirtualClock()
+    buses = virtual_buses(clock)
+    delivered: list[tuple[int, list[Reading]]] = []
+
+    async def body() -> None:
+        wire = Wire()
+        wire.takes_time = lambda: clock.advance(30_000)
+        bus = buses.get(wire.bus)
+        member = bus.join(wire, Deadlines(), lambda some, _problem: delivered.append((clock.now_ns(), list(some))))
+        member.set_latency(latency_ns)
+        member.start((Poll(ASK),))
+        await asyncio.sleep(0.1)
+        member.set_latency(0)
+        count = len(delivered)
+        await asyncio.sleep(0.002)
+        assert len(delivered) >= count + 4  # what waited, then each at once
+        buses.end()
+
+    run_virtually(clock, body())
+    assert {len(some) for at_ns, some in delivered[:-6]} == {together}
+    assert all(at_ns <= some[0].end_ns + latency_ns + 30_000 for at_ns, some in delivered)
+    starts = [reading.start_ns for _, some in delivered for reading in some]
+    assert [after - before for before, after in pairwise(starts)] == pytest.approx([500_000] * (len(starts) - 1), abs=2)
+
+
+def test_a_failed_reading_and_those_before_it_do_not_wait() -> None:
+    clock = VirtualClock()
+    buses = virtual_buses(clock)
+    delivered: list[list[Reading]] = []
+
+    async def body() -> None:
+        wire = Wire()
+        bus = buses.get(wire.bus)
+        member = bus.join(wire, Deadlines(), lambda some, _problem: delivered.append(list(some)))
+        member.set_latency(40_000_000)
+        member.start((Poll(ASK),))
+        await asyncio.sleep(0.0024)
+        assert delivered == []
+        wire.fail = TransferError(Trouble.ABSENT, "no")
+        await asyncio.sleep(0.0005)
+        (some,) = delivered
+        assert [reading.error is not None for reading in some] == [False] * 5 + [True]
+        buses.end()
+
+    run_virtually(clock, body())
+
+
 def test_script_has_its_turn_on_a_bus_that_is_never_idle() -> None:
     async def body(buses: PolledBuses) -> None:
         wire, sink = Wire(), Sink()

@@ -1,0 +1,141 @@
+"""What it does to the stamps that samples wait: `python -m tests.bench.clock_hold` prints the table of docs/latency.md.
+
+Three ways to read 1,000 samples a second a latency apart, from the same simulated arrivals:
+
+- at once: each message is read as it comes;
+- one in time: after a message that was read as it came, nothing is read for the latency; then all that gathered, which
+  the clock is told, and the next message is read as it comes (`imud.runtime.latency.stream_hold`);
+- by timer: all that gathered, a latency apart, and the clock takes that for an adapter's latency timer.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from imud.clock import SampleClock
+from imud.sample import Measurement, Sync
+from imud.sim.ports.arrival import BARE_UART, LOADED, USB_1MS, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
+from imud.units import NS_PER_MS
+from tests.bench.clock import BAUD_OF_RATE, CRYSTALS, TICK_MODULUS, TICK_NS, Accuracy, Point, accuracy
+from tests.bench.rows import Row, at_most
+
+PROFILES = (BARE_UART, USB_1MS, USB_16MS, LOADED)
+HOLDS_MS = {1000: (10, 50), 200: (20, 50)}
+SECONDS = 150
+
+
+class TimedRead(NamedTuple):
+    """A message as it was read."""
+
+    arrival: Arrival
+    t_rx_ns: int
+    trailing_bytes: int
+    waited_ns: int
+    """How long nothing had been read."""
+
+
+def at_once(arrivals: Sequence[Arrival], _hold_ns: int, _byte_ns: int) -> Iterator[TimedRead]:
+    """Every message as it comes."""
+    return (TimedRead(a, a.t_rx_ns, a.trailing_bytes, 0) for a in arrivals)
+
+
+def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int) -> Iterator[TimedRead]:
+    """One read as it comes, then one of all that has gathered."""
+    at = 0
+    while at < len(arrivals):
+        begun_ns = arrivals[at].t_rx_ns
+        while at < len(arrivals) and arrivals[at].t_rx_ns == begun_ns:
+            yield TimedRead(arrivals[at], begun_ns, arrivals[at].trailing_bytes, 0)
+            at += 1
+        end_ns = begun_ns + hold_ns
+        end = at
+        while end < len(arrivals) and arrivals[end].t_rx_ns <= end_ns:
+            end += 1
+        yield from _together(arrivals, at, end, end_ns, byte_ns, hold_ns)
+        at = end
+
+
+def by_timer(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int) -> Iterator[TimedRead]:
+    """All that has gathered, at even times."""
+    at, end_ns = 0, arrivals[0].t_rx_ns
+    while at < len(arrivals):
+        end = at
+        while end < len(arrivals) and arrivals[end].t_rx_ns <= end_ns:
+            end += 1
+        yield from _together(arrivals, at, end, end_ns, byte_ns, 0)
+        at, end_ns = end, end_ns + hold_ns
+
+
+def _together(
+    arrivals: Sequence[Arrival], at: int, end: int, t_rx_ns: int, byte_ns: int, waited_ns: int
+) -> Iterator[TimedRead]:
+    """Messages of one read; what has come of the next one trails."""
+    rest = 0
+    if end < len(arrivals) and byte_ns:
+        after = arrivals[end]
+        whole_ns = after.t_rx_ns - after.trailing_bytes * byte_ns
+        rest = min(max(after.size_bytes - (whole_ns - t_rx_ns) // byte_ns, 0), after.size_bytes - 1)
+    for number in range(at, end):
+        trailing = (end - 1 - number) * arrivals[number].size_bytes + rest
+        yield TimedRead(arrivals[number], t_rx_ns, trailing, waited_ns)
+
+
+Way = Callable[[Sequence[Arrival], int, int], Iterator[TimedRead]]
+WAYS: dict[str, Way] = {"at once": at_once, "one in time": one_in_time, "by timer": by_timer}
+
+
+def run(way: str, model: ArrivalModel, seconds: int, hold_ns: int) -> list[Point]:
+    """A model's samples through a new clock, in one of the ways."""
+    arrivals = list(model.run(int(model.rate_hz) * seconds))
+    told_ns = model.profile.hold_ns + hold_ns * (way == "by timer")
+    clock = SampleClock("bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=told_ns)
+    points = []
+    first = {True: at_once, False: WAYS[way]}
+    settle = next(i for i, a in enumerate(arrivals) if a.t_ns - arrivals[0].t_ns > 5_000 * NS_PER_MS)
+    begin = settle if way == "one in time" else 0  # nothing waits before the fit is used
+    for early, part in ((True, arrivals[:begin]), (False, arrivals[begin:])):
+        for a, t_rx_ns, trailing_bytes, waited_ns in first[early](part, hold_ns, model.byte_ns):
+            m = Measurement(a.size_bytes, trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
+            clock.waited_ns = waited_ns
+            s = clock.sample(m, t_rx_ns, 0)
+            points.append(Point(s.t_ns - a.t_ns, s.t_err_ns, s.sync is Sync.REGRESSION, a.t_ns))
+    return points
+
+
+def measure(way: str, profile: ArrivalProfile, rate_hz: int, crystal: Crystal, hold_ms: int) -> Accuracy:
+    """Figures of one cell."""
+    model = ArrivalModel(profile, rate_hz, 1, crystal, BAUD_OF_RATE[rate_hz])
+    return accuracy(run(way, model, SECONDS, hold_ms * NS_PER_MS))
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """The rows of `make bench`: σ with a wait of 10 ms beside that without."""
+    for profile in PROFILES[:1] if quick else PROFILES:
+        plain, held = (
+            measure(way, profile, 1000, CRYSTALS["+50 ppm"], 10).sigma_ns for way in ("at once", "one in time")
+        )
+        yield at_most(f"clock: sigma when samples wait 10 ms, against none, {profile.name}", held / plain, "x", 1.5)
+
+
+def main() -> None:
+    """Print the table, as Markdown."""
+    print("| arrival | rate, Hz | latency, ms | way | σ, µs | rms, µs | mean t_err, µs | in 2 t_err | settling |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for profile in PROFILES:
+        for rate_hz, holds_ms in HOLDS_MS.items():
+            for hold_ms in holds_ms:
+                for way in WAYS:
+                    found = [measure(way, profile, rate_hz, CRYSTALS[name], hold_ms) for name in ("+50 ppm", "drift")]
+                    figures = [
+                        "–".join(f"{ns / 1000:.0f}" for ns in sorted(getattr(one, name) for one in found))
+                        for name in ("sigma_ns", "rms_ns", "mean_t_err_ns")
+                    ]
+                    share, settling = min(a.share for a in found), min(a.share_settling for a in found)
+                    print(
+                        f"| {profile.name} | {rate_hz} | {hold_ms} | {way} | {' | '.join(figures)} "
+                        f"| {share:.3f} | {settling:.3f} |",
+                        flush=True,
+                    )
+
+
+if __name__ == "__main__":
+    main()

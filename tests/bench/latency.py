@@ -1,0 +1,68 @@
+"""What it saves that samples may wait: the daemon against the bare loop, which reads and sends each at once, in turns.
+
+`make bench ARGS=latency`. Every round runs each load once, so that all of them see the same machine; the median of the
+rounds' ratios is shown. Shared memory has its own default of 5 ms where nothing else is asked for.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from statistics import median
+
+from tests.bench.rig import Load, Outcome, run
+from tests.bench.rows import Row, at_least, at_most
+
+CPU_AIM = 0.25
+DEVICES_AIM = 96
+LATENCY_MS = 10.0
+FLEETS = (48, 64, 80, 96, 112)
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """Cost per sample with a latency, then how many devices one core serves."""
+    seconds, rounds = (2.0, 1) if quick else (4.0, 5)
+    for encoding in ("binary", "json"):
+        yield from compare(encoding, seconds, rounds)
+    yield from fleets(seconds)
+
+
+def compare(encoding: str, seconds: float, rounds: int) -> Iterator[Row]:
+    """Ten clients of one device at 1 kHz."""
+    at_once = Load(clients=10, encoding=encoding, seconds=seconds)
+    loads = {
+        "bare loop": replace(at_once, bare=True),
+        "at once": at_once,
+        "latency 10 ms": replace(at_once, latency_ms=LATENCY_MS),
+        "at 100 Hz": replace(at_once, client_hz=100.0),
+        "at 10 Hz, latency 20 ms": replace(at_once, client_hz=10.0, latency_ms=20.0),
+    }
+    found: dict[str, list[Outcome]] = {name: [] for name in loads}
+    for _ in range(rounds):
+        for name, load in loads.items():
+            found[name].append(run(load))
+    bare = found.pop("bare loop")
+    yield Row(f"10 {encoding} clients, bare loop: CPU per sample", median(o.cpu_us_per_sample for o in bare), "us")
+    for name, outcomes in found.items():
+        words = f"10 {encoding} clients, {name}"
+        yield Row(f"{words}: CPU per sample", median(o.cpu_us_per_sample for o in outcomes), "us")
+        ratio = median(a.cpu_us_per_sample / b.cpu_us_per_sample for a, b in zip(outcomes, bare, strict=True))
+        if name == "at once":
+            yield Row(f"{words}: CPU / bare loop", ratio, "x")
+        else:
+            yield at_most(f"{words}: CPU / bare loop", ratio, "x", CPU_AIM)
+        yield Row(f"{words}: latency p50", median(o.p50_us for o in outcomes), "us")
+        yield Row(f"{words}: latency p99", median(o.p99_us for o in outcomes), "us")
+        yield at_most(f"{words}: samples lost", float(max(o.lost for o in outcomes)), "samples", 0)
+
+
+def fleets(seconds: float) -> Iterator[Row]:
+    """Devices at 1 kHz on one core, one client of all of them."""
+    most = 0
+    for devices in FLEETS:
+        outcome = run(Load(devices=devices, seconds=seconds, phases=4, latency_ms=LATENCY_MS))
+        yield Row(f"{devices} devices, latency 10 ms: CPU per sample", outcome.cpu_us_per_sample, "us")
+        yield Row(f"{devices} devices, latency 10 ms: samples lost", float(outcome.lost), "samples")
+        yield Row(f"{devices} devices, latency 10 ms: share of one core", outcome.cpu_share, "")
+        if outcome.lost:
+            break
+        most = devices
+    yield at_least("devices at 1 kHz on one core, latency 10 ms, without loss", float(most), "devices", DEVICES_AIM)

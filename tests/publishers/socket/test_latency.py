@@ -1,0 +1,123 @@
+"""What latency the clients of the socket ask for, and that they ask no more when they leave."""
+
+import os
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.publishers.socket.publisher import SocketServer
+from tests.publishers.socket.test_waker import notified
+from tests.support.socket_rig import Peer, batch, run, serving, until
+
+Asked = dict[str, tuple[float, tuple[str, ...] | None]]
+
+
+class Latencies:
+    """Who asks for what, in ms."""
+
+    def __init__(self) -> None:
+        self.asked: Asked = {}
+
+    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
+        self.asked[who] = (latency_ns / 1e6, None if devices is None else tuple(devices))
+
+    def release(self, who: str) -> None:
+        self.asked.pop(who, None)
+
+
+@asynccontextmanager
+async def listening(directory: Path) -> AsyncIterator[tuple[SocketServer, Asked]]:
+    """A server, and what its clients ask for at any time."""
+    latencies = Latencies()
+    async with serving(directory, latencies=latencies) as server:
+        yield server, latencies.asked
+    assert latencies.asked == {}
+
+
+def play(directory: Path, story: Callable[[SocketServer, Asked, Peer], Awaitable[None]]) -> None:
+    """A story with one client."""
+
+    async def body() -> None:
+        async with listening(directory) as (server, asked):
+            peer = await Peer.greeted(server)
+            await story(server, asked, peer)
+            peer.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize(
+    ("params", "latency_ms"),
+    [
+        ({}, 0.0),
+        ({"rate_hz": 0}, 0.0),
+        ({"rate_hz": 1000}, 1.0),
+        ({"rate_hz": 100}, 10.0),
+        ({"rate_hz": 50}, 20.0),
+        ({"rate_hz": 1}, 20.0),
+        ({"rate_hz": 1, "latency_ms": 0}, 0.0),
+        ({"latency_ms": 7.5}, 7.5),
+        ({"rate_hz": 1000, "latency_ms": 60_000}, 60_000.0),
+        ({"rate_hz": 10, "latency_ms": None}, 20.0),
+    ],
+)
+def test_a_watch_asks_for_what_is_given_or_goes_with_its_rate(
+    tmp_path: Path, params: dict[str, Any], latency_ms: float
+) -> None:
+    async def story(_server: SocketServer, asked: Asked, peer: Peer) -> None:
+        reply = await peer.ask("watch", **params)
+        assert reply["result"]["latency_ms"] == latency_ms
+        assert asked == {"client 1": (latency_ms, None)}
+
+    play(tmp_path, story)
+
+
+@pytest.mark.parametrize("latency_ms", [-0.001, 60_001, 1e300])
+@pytest.mark.parametrize("method", ["watch", "notify"])
+def test_what_is_no_latency_is_refused(tmp_path: Path, method: str, latency_ms: float) -> None:
+    async def story(_server: SocketServer, asked: Asked, peer: Peer) -> None:
+        devices = {"devices": ["imu0"]} if method == "watch" else {"device": "imu0"}
+        _code, message = await peer.error(method, latency_ms=latency_ms, **devices)
+        assert message.startswith("latency_ms: expected 0 (at once) … 60000")
+        assert asked == {}
+
+    play(tmp_path, story)
+
+
+def test_another_watch_replaces_what_was_asked_and_unwatch_ends_it(tmp_path: Path) -> None:
+    async def story(_server: SocketServer, asked: Asked, peer: Peer) -> None:
+        await peer.ask("watch", latency_ms=5)
+        await peer.ask("watch", latency_ms=9, devices=["imu1"])
+        assert asked == {"client 1": (9.0, ("imu1",))}
+        await peer.ask("unwatch")
+        assert asked == {}
+
+    play(tmp_path, story)
+
+
+def test_who_leaves_asks_for_nothing_any_more(tmp_path: Path) -> None:
+    async def story(server: SocketServer, asked: Asked, peer: Peer) -> None:
+        other = await Peer.greeted(server)
+        fd = await notified(peer)
+        await other.ask("watch", latency_ms=3)
+        assert asked == {"client 1, notify imu0": (0.0, ("imu0",)), "client 2": (3.0, None)}
+        peer.close()
+        await until(lambda: len(server.hub.connections) == 1)
+        assert asked == {"client 2": (3.0, None)}
+        os.close(fd)
+        other.close()
+
+    play(tmp_path, story)
+
+
+def test_a_descriptor_that_is_closed_asks_for_nothing_any_more(tmp_path: Path) -> None:
+    async def story(server: SocketServer, asked: Asked, peer: Peer) -> None:
+        os.close(await notified(peer))
+        assert len(asked) == 1
+        server.publish(batch("imu0"))
+        await until(lambda: not asked)
+
+    play(tmp_path, story)
