@@ -382,3 +382,16 @@ def test_messages_that_waited_are_dated_by_the_fit(hold_ns: int) -> None:
         offs.append(abs(sample.t_ns - BEGIN_NS - number * NS_PER_MS))
     assert max(offs) < 1.2 * NS_PER_MS
     assert abs(clock.status().t_err_ns - before.t_err_ns) < 20_000
+
+
+def test_messages_that_waited_do_not_hold_the_fit_back() -> None:
+    """A crystal slows by 50 ppm: one message of ten shows it, and the others could all be on the old line."""
+    clock = make_clock()
+    feed(clock, steady(0, 0, 60_000, 1))
+    off_ns = 0
+    for number in range(60_000, 120_000):
+        true_ns = BEGIN_NS + number * NS_PER_MS + (number - 60_000) * 50
+        late_ms = (10 - number % 10) if number % 10 else 0
+        clock.waited_ns = 10 * NS_PER_MS if late_ms else 0
+        off_ns = clock.sample(message(number), true_ns + (late_ms + 1) * NS_PER_MS, 0).t_ns - true_ns
+    assert abs(off_ns) < 100_000
