@@ -56,6 +56,8 @@ class Wire(Cable):
     """Frames that are kept back until there are so many."""
     jump_ms = 0
     """The device's time begins anew after so long."""
+    behind_ms = 0
+    """How much earlier the device's time is than it was."""
     up_m_s2 = 9.8
 
     def __init__(self, name: Path) -> None:
@@ -68,7 +70,7 @@ class Wire(Cable):
         self._count += 1
         if self.silent or (self.lose_every and self._count % self.lose_every == 0):
             return
-        frame = bytearray(self._frame(ms % self.jump_ms if self.jump_ms else ms))
+        frame = bytearray(self._frame(ms % self.jump_ms if self.jump_ms else ms - self.behind_ms))
         if self.flip_every and self._count % self.flip_every == 0:
             frame[40] ^= 1
         self._held += frame
@@ -116,6 +118,17 @@ class AlteredCounters:
         self._looks += 1
         grown = KernelCounters(**{name: step * self._looks for name, step in self._steps.items()})
         return msgspec.structs.replace(status, kernel=grown)
+
+
+class AlteredGaps:
+    """Gaps of unknown size, one more with every look."""
+
+    def __init__(self) -> None:
+        self._looks = 0
+
+    def __call__(self, status: DeviceStatus) -> DeviceStatus:
+        self._looks += 1
+        return msgspec.structs.replace(status, ledger={**status.ledger, "lost_unknown": self._looks})
 
 
 class AlteredDaemon(Daemon):
@@ -201,13 +214,14 @@ class Site:
         wires["lossy"].lose_every = 5
         wires["noisy"].flip_every = 10
         wires["hot"].temperature_c = 90
-        wires["late"].hold = 6
-        wires["jumping"].jump_ms = 500
+        wires["late"].hold, wires["late"].behind_ms = 12, 5000  # the clock's fit begins anew, with late frames
+        wires["jumping"].jump_ms = 2 * PERIOD_MS
         wires["tilted"].up_m_s2 = -9.8
         self._pps = False
         self.in_loop(self._break_lines)
         self.daemon.altered = {
             "quiet": AlteredCounters(framing=3), "mute": AlteredCounters(bus_off=1), "tilted": unpaid,
+            "lossy": AlteredGaps(),
         }  # fmt: skip
         self._write(faulty=True)
         self.in_loop(self.daemon.reload)
@@ -226,8 +240,19 @@ class Site:
         for client in self._clients:
             client.close()
         self.daemon.altered = {}
+        self._slave.dead = False
+        self.memory.inputs["late sout"].open_error = None
         for wire in self.wires.values():
-            for name in ("silent", "lose_every", "flip_every", "temperature_c", "hold", "jump_ms", "up_m_s2"):
+            for name in (
+                "silent",
+                "lose_every",
+                "flip_every",
+                "temperature_c",
+                "hold",
+                "jump_ms",
+                "behind_ms",
+                "up_m_s2",
+            ):
                 setattr(wire, name, getattr(Wire, name))
         self._pps = True
         self._write(faulty=False)
@@ -289,7 +314,7 @@ class Site:
                 flapped = age
                 self.wires["flapping"].swap()
             if self.faulty:
-                self._slave.bad_crc = 1
+                self._slave.dead = int(10 * age) % 10 == 0
 
     def _pulse(self, t_ns: int) -> None:
         if self._pps:
@@ -324,7 +349,7 @@ class Site:
         )  # fmt: skip
 
 
-STATUS_FAULTS: Final = ("ImudBusErrors", "ImudBusOff", "ImudLedgerOpen")
+STATUS_FAULTS: Final = ("ImudGapsUnknown", "ImudBusErrors", "ImudBusOff", "ImudLedgerOpen")
 """Alerts whose fault is an altered state; edges, pulses and levels of lines are those of lines in memory."""
 
 

@@ -1,0 +1,265 @@
+"""Every alert by a real Prometheus: quiet without a fault, fires with it, clears after it. Two daemons are scraped:
+
+    site    in this process, a device per fault (`tests.monitoring.faults`)
+    spare   `imud run`, which is killed and started again, has no devices, and has few files to open
+
+All times of the rules are divided, by 45 where nothing else runs (15 minutes are 20 s); as they are they run in
+tests/monitoring/imud.rules.test.yml. The table that the test prints (`pytest -s`) says how long each alert took.
+"""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from tests.monitoring.faults import WIRES, Wire, site
+from tests.monitoring.prometheus import (
+    LIMIT_S,
+    RULES,
+    Alert,
+    Pace,
+    RealPrometheus,
+    alerts_of,
+    free_port,
+    needs,
+    real_prometheus,
+    shortened,
+)
+from tests.support.daemon_process import wait_until, write_config
+
+DEVICE_OF: Final = {
+    "ImudDeviceDown": "gone", "ImudReconnects": "flapping", "ImudRateLow": "lossy", "ImudSamplesLost": "lossy",
+    "ImudLossHigh": "lossy", "ImudGapsUnknown": "lossy", "ImudFramesDamaged": "noisy", "ImudBusErrors": "quiet",
+    "ImudBusOff": "mute", "ImudTransfersFail": "boom", "ImudTemperature": "hot", "ImudAlarm": "lines",
+    "ImudFrameProblem": "tilted", "ImudSettingsDiffer": "module", "ImudSettingsProblem": "mute",
+    "ImudClockErrorLarge": "late", "ImudLatencyHigh": "late", "ImudSyncLost": "jumping",
+    "ImudClockResets": "jumping", "ImudLineProblem": "late", "ImudEdgesLost": "lines", "ImudUtcProblem": "quiet",
+    "ImudPulsesMissing": "lines", "ImudRingStopped": "quiet", "ImudLedgerOpen": "tilted",
+}  # fmt: skip
+SITE_ALERTS: Final = ("ImudLoopLate", "ImudLogMessagesDropped", "ImudClientsTooSlow")
+SPARE_ALERTS: Final = ("ImudDown", "ImudRestarts", "ImudNoDevices", "ImudFilesNearLimit")
+
+
+STARTS: Final = 4
+WHEN_TOLD: Final = "import sys, imud.cli, imud.daemon; sys.stdin.readline(); sys.exit(imud.cli.main())"
+"""Everything that takes long at a start is done before it, so that starts are some seconds apart on a slow machine."""
+STUCK_S: Final = 1.0
+
+
+class Spare:
+    """`imud run` on one wire or on no device; killed and started STARTS times at most."""
+
+    def __init__(self, folder: Path, port: int) -> None:
+        self.folder = folder
+        self.port = port
+        self.wire = Wire(folder / "port")
+        self._waiting = [self._prepared() for _ in range(STARTS)]
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def _prepared(self) -> subprocess.Popen[bytes]:
+        argv = [sys.executable, "-c", WHEN_TOLD, "run", "--config", str(self.folder / "imud.yaml")]
+        time.sleep(0.05)  # the kernel tells the time of a start in ticks of 10 ms
+        with (self.folder / "log").open("ab") as log:
+            return subprocess.Popen(argv, stdin=subprocess.PIPE, stderr=log)
+
+    def start(self, *, devices: bool = True) -> None:
+        """Start a daemon; one that runs reads its configuration again."""
+        uart = {"port": str(self.wire.name), "baud": 115200}
+        entries = {"spare": {"driver": "hipnuc-uart", "identify": False, "uart": uart}} if devices else {}
+        write_config(self.folder, entries, metrics={"port": self.port}, log_level="error")
+        if self.process is not None:
+            self.process.send_signal(signal.SIGHUP)
+        else:
+            self.process = self._waiting.pop(0)
+            assert self.process.stdin is not None
+            self.process.stdin.write(b"\n")
+            self.process.stdin.flush()
+
+    def kill(self) -> None:
+        """As the kernel does where memory is short."""
+        assert self.process is not None
+        _end(self.process)
+        self.process = None
+
+    def limit_files(self, spare: int) -> None:
+        """Let it open so many files more than it has."""
+        assert self.process is not None
+        held = len(os.listdir(f"/proc/{self.process.pid}/fd"))
+        _, most = resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE)
+        resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (held + spare, most))
+
+    def close(self) -> None:
+        """End whatever there is."""
+        for process in (*self._waiting, *([self.process] if self.process else [])):
+            _end(process)
+        self.wire.unplug()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait(LIMIT_S)
+    if process.stdin is not None:
+        process.stdin.close()
+
+
+@contextmanager
+def spare_daemon(folder: Path, port: int) -> Iterator[Spare]:
+    folder.mkdir()
+    one = Spare(folder, port)
+    try:
+        one.start()
+        yield one
+    finally:
+        one.close()
+
+
+class Watcher:
+    """Which alerts fire, and since when in the present phase."""
+
+    def __init__(self, prometheus: RealPrometheus, expected: dict[str, tuple[str, str]]) -> None:
+        self._prometheus = prometheus
+        self._expected = expected
+        """Device and instance by alert."""
+        self.texts: dict[str, Alert] = {}
+        """Every alert as it fired last."""
+        self.begin(firing=True)
+
+    def begin(self, *, firing: bool) -> None:
+        """A phase in which alerts are to fire, or to clear."""
+        self._firing = firing
+        self._begin = time.monotonic()
+        self.after_s: dict[str, float] = {}
+
+    def look(self) -> set[str]:
+        """The expected alerts that fire now."""
+        fire = set()
+        for alert in self._prometheus.alerts():
+            if alert.state == "firing" and (alert.device, alert.instance) == self._expected[alert.name]:
+                fire.add(alert.name)
+                self.texts[alert.name] = alert
+        for name in self._expected:
+            if (name in fire) == self._firing:
+                self.after_s.setdefault(name, time.monotonic() - self._begin)
+        return fire
+
+    def wait(self, *names: str) -> None:
+        """Wait until all of them have fired, or cleared, in this phase."""
+        while missing := set(names) - self.after_s.keys():
+            late = f"not yet {'fired' if self._firing else 'cleared'}: {sorted(missing)}; {self.after_s}"
+            assert time.monotonic() < self._begin + 2 * LIMIT_S, late
+            time.sleep(0.1)
+            self.look()
+
+
+def wait_scraped(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
+    """Wait until a daemon that was started is seen, and no other."""
+    port = spare.port
+    before = prometheus.query(f'max_over_time(process_start_time_seconds{{instance="127.0.0.1:{port}"}}[10m])')
+
+    def seen() -> bool:
+        watcher.look()
+        now = prometheus.query(f'process_start_time_seconds{{instance="127.0.0.1:{port}"}}')
+        return bool(now) and float(now[0]["value"][1]) > float(before[0]["value"][1])
+
+    wait_until(seen, "the new daemon is scraped", LIMIT_S)
+
+
+def break_spare(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
+    """Down for a while, three new starts, no devices, and few files."""
+    spare.kill()
+    watcher.wait("ImudDown")
+    for devices in (True, True, False):
+        if spare.process is not None:
+            spare.kill()
+        spare.start(devices=devices)
+        wait_scraped(prometheus, watcher, spare)
+    spare.limit_files(4)
+
+
+def mend_spare(spare: Spare) -> None:
+    spare.limit_files(200)
+    spare.start()
+
+
+@needs("prometheus")
+@pytest.mark.timeout(1500)  # 67 s at a load of 3 on two cores
+def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
+    site_port, spare_port = free_port(), free_port()
+    text = RULES.read_text()
+    at_site, at_spare = (f"127.0.0.1:{port}" for port in (site_port, spare_port))
+    expected = {name: (device, at_site) for name, device in DEVICE_OF.items()}
+    expected |= dict.fromkeys(SITE_ALERTS, ("", at_site)) | dict.fromkeys(SPARE_ALERTS, ("", at_spare))
+    expected["ImudNotScraped"] = ("", "")
+    assert set(expected) == {alert["alert"] for alert in alerts_of(text)}
+    with ExitStack() as stack:
+        (tmp_path / "site").mkdir()
+        spare = stack.enter_context(spare_daemon(tmp_path / "spare", spare_port))
+        one = stack.enter_context(site(tmp_path / "site", site_port, beside=[spare.wire]))
+        pace = Pace.of(one.scrape_s())
+        prometheus = stack.enter_context(real_prometheus(tmp_path, shortened(text, pace.divisor), pace))
+        watcher = Watcher(prometheus, expected)
+        watcher.wait("ImudNotScraped")
+        fired = dict(watcher.after_s)
+        watcher.begin(firing=False)
+        prometheus.scrape(site_port, spare_port)
+        watcher.wait("ImudNotScraped")
+        cleared = {"ImudNotScraped": watcher.after_s["ImudNotScraped"]}
+        wait_calm(prometheus)
+
+        watcher.begin(firing=True)
+        begin = time.monotonic()
+        while "ImudLoopLate" not in watcher.after_s:  # alone: scrapes fail while the loop is stuck
+            one.block_loop(max(STUCK_S, 1.5 * pace.interval_ms / 1000))
+            time.sleep(2.17 * STUCK_S)  # out of step with the scrapes, of which one has to be in time
+            watcher.look()
+            assert time.monotonic() < begin + LIMIT_S
+        fired["ImudLoopLate"] = watcher.after_s["ImudLoopLate"]
+
+        watcher.begin(firing=True)
+        one.break_everything()
+        break_spare(prometheus, watcher, spare)
+        watcher.wait(*(expected.keys() - fired.keys()))
+        fired = watcher.after_s | fired
+
+        watcher.begin(firing=False)
+        one.mend_everything()
+        mend_spare(spare)
+        watcher.wait(*(expected.keys() - {"ImudNotScraped"}))
+        cleared = watcher.after_s | cleared
+        wait_calm(prometheus)
+    print(table(fired, cleared, watcher, pace))
+    for alert in watcher.texts.values():
+        for text in alert.annotations.values():
+            assert "<" not in text, text  # how Prometheus shows an error of a template, and <no value>
+
+
+def wait_calm(prometheus: RealPrometheus) -> None:
+    """Wait until every device runs and nothing fires, of any device."""
+    end = time.monotonic() + 2 * LIMIT_S
+    while wrong := unrest(prometheus):
+        assert time.monotonic() < end, wrong
+        time.sleep(0.2)
+
+
+def unrest(prometheus: RealPrometheus) -> list[str]:
+    """What fires, and what does not run."""
+    firing = [f"{alert.name} {alert.device}" for alert in prometheus.alerts() if alert.state == "firing"]
+    up = {one["metric"]["device"]: one["value"][1] == "1" for one in prometheus.query("imud_device_up")}
+    return firing + [f"{name} is not up" for name in (*WIRES, "boom", "module", "spare") if not up.get(name)]
+
+
+def table(fired: dict[str, float], cleared: dict[str, float], watcher: Watcher, pace: Pace) -> str:
+    """What was seen, for people."""
+    rows = [f"\n{'alert':24} {'fires after':>12} {'clears after':>13}  ({pace})"]
+    for name in sorted(fired):
+        summary = watcher.texts[name].annotations["summary"]
+        rows.append(f"{name:24} {fired[name]:10.1f} s {cleared[name]:11.1f} s  {summary}")
+    return "\n".join(rows)
