@@ -4,6 +4,7 @@
 # make test-pythons   the tests on every supported Python that is here; those that are missing are named
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 #                                                                   (14 minutes; ARGS=--short: at most 5)
+# make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make pictures   the pictures of README.md and docs/frames.md, into docs/pictures
@@ -37,6 +38,10 @@ demo: $(VENV)/made
 
 test: $(VENV)/made
 	$(BIN)/pytest $(ARGS)
+
+.PHONY: alerts
+alerts: $(VENV)/made
+	IMUD_ALERTS=1 $(BIN)/pytest -s tests/monitoring/test_alerts.py $(ARGS)
 
 # PYTHONS="3.12 3.13" takes only these.
 .PHONY: test-pythons
