@@ -39,8 +39,7 @@ class OptionsParams(msgspec.Struct):
 
 
 class WatchParams(msgspec.Struct):
-    """Parameters of `watch`; what is left out or null means all, all, every sample, JSON, as the device is set, and the
-    latency that goes with the rate."""
+    """Parameters of `watch`; left out or null: all, all, every sample, JSON, as the device is set, latency by rate."""
 
     devices: list[str] | None = None
     fields: list[str] | None = None
