@@ -1,6 +1,7 @@
 """The watch over a guest, with shell scripts in QEMU's place: every way to end, none of them a hang."""
 
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -140,6 +141,30 @@ def test_hung_guest_is_examined(tmp_path: Path) -> None:
         run(command, Folder(tmp_path), limits, lambda _data: None)
     answers = "".join(f"{question}\nanswer to {question}\n(qemu) " for question in QUESTIONS)
     assert (tmp_path / MACHINE_LOG).read_text() == f"QEMU\n(qemu) {answers}nmi\n"
+
+
+CONTINUED = """import os, pathlib, sys
+told = b""
+while len(told) < 20:
+    told += os.read(int(sys.argv[1]), 100)
+pathlib.Path("told").write_bytes(told)
+pathlib.Path("status").write_text("7")
+"""
+
+
+def test_silent_guest_is_stopped_and_continued_until_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It goes on at the second time."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "alive").touch()
+    limits = Limits(total_s=30.0, boot_s=30.0, silence_s=30.0, restart_s=0.3)
+
+    def command(_fds: tuple[int, int], monitor: int) -> list[str]:
+        return [sys.executable, "-I", "-c", CONTINUED, str(monitor)]
+
+    assert run(command, Folder(tmp_path), limits, lambda _data: None) == 7
+    assert (tmp_path / "told").read_bytes() == b"stop\ncont\n" * 2
 
 
 def test_flood_of_output_does_not_defeat_the_limit(start: Start) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from tests.lab.host.diagnosis import cause, last_line, out_of_memory
 from tests.lab.host.errors import HungGuest, LabError
-from tests.lab.host.monitor import examine
+from tests.lab.host.monitor import examine, stop_and_continue
 
 TICK_S = 0.5
 GOODBYE_S = 5.0  # from the status to the end of QEMU; it is about 0.1 s
@@ -35,6 +35,8 @@ class Limits:
     """From the start to the first sign of life; it is about 5 s on an idle machine."""
     silence_s: float = 60.0
     """Between two signs of life; the guest gives one every 5 s."""
+    restart_s: float = 30.0
+    """Silence after which QEMU is told to stop the guest and to continue it, and again after each such time."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def run(
         for end in (*ends, far_monitor):
             end.close()
     try:
-        _watch(process, folder, limits, write)
+        _watch(process, folder, limits, write, monitor)
         process.wait(GOODBYE_S)
     except HungGuest:
         examine(monitor, folder.path / MACHINE_LOG)
@@ -102,10 +104,16 @@ def run(
     return _status(folder, process.returncode)
 
 
-def _watch(process: subprocess.Popen[bytes], folder: Folder, limits: Limits, write: Callable[[bytes], object]) -> None:
+def _watch(
+    process: subprocess.Popen[bytes],
+    folder: Folder,
+    limits: Limits,
+    write: Callable[[bytes], object],
+    monitor: socket.socket,
+) -> None:
     """Returns when QEMU closed its output, or did not although the status is there; LabError on a limit."""
     assert process.stdout is not None
-    start_s = time.monotonic()
+    start_s = restarted_s = time.monotonic()
     with selectors.DefaultSelector() as selector:
         selector.register(process.stdout, selectors.EVENT_READ)
         while True:
@@ -116,7 +124,11 @@ def _watch(process: subprocess.Popen[bytes], folder: Folder, limits: Limits, wri
                 write(data)
             if (folder.age_s("status") or 0.0) > GOODBYE_S:
                 return
-            _check_limits(folder, limits, time.monotonic() - start_s)
+            now_s = time.monotonic()
+            _check_limits(folder, limits, now_s - start_s)
+            if min(folder.age_s("alive") or 0.0, now_s - restarted_s) > limits.restart_s:
+                restarted_s = now_s
+                stop_and_continue(monitor)
 
 
 def _check_limits(folder: Folder, limits: Limits, elapsed_s: float) -> None:

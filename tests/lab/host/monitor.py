@@ -1,11 +1,12 @@
-"""What a hung guest does: QEMU's monitor is asked, and the guest's kernel says what its tasks wait for.
+"""QEMU's monitor: a guest that stands still is continued, and a hung one is examined.
 
-Questions and answers go to a file. The last command is a non-maskable interrupt, which the guest's kernel takes
-whatever it does (`PANIC_BY_NMI` of the command line): it prints its tasks and timers on the console, and its panic
-ends QEMU.
+The examination asks the monitor, and the guest's kernel says what its tasks wait for. Questions and answers go to a
+file. The last command is a non-maskable interrupt, which the guest's kernel takes whatever it does (`PANIC_BY_NMI` of
+the command line): it prints its tasks and timers on the console, and its panic ends QEMU.
 """
 
 import socket
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,6 +15,13 @@ PROMPT = b"(qemu) "
 ANSWER_S = 10.0
 PANIC_S = 60.0
 """A panic that prints a hundred tasks takes a few seconds."""
+
+
+def stop_and_continue(monitor: socket.socket) -> None:
+    """Stop the guest and continue it, which wakes QEMU's processor thread; `examine` skips the answers."""
+    print("lab: a silent guest: QEMU is told to stop and to continue it", file=sys.stderr, flush=True)
+    with suppress(OSError):  # QEMU has ended, or reads nothing
+        monitor.sendall(b"stop\ncont\n", socket.MSG_DONTWAIT)
 
 
 def examine(monitor: socket.socket, log: Path) -> None:
