@@ -250,7 +250,10 @@ class StreamTransport:
 
     def set_latency(self, latency_ns: int) -> None:
         """Let samples wait so long."""
-        self._latency_ns = latency_ns if self.link.waiting_bytes else 0
+        latency_ns = latency_ns if self.link.waiting_bytes else 0
+        if latency_ns == self._latency_ns:
+            return  # another consumer asks for it
+        self._latency_ns = latency_ns
         if self.receiving:
             self._receive()
 
