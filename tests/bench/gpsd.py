@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import median
 from time import monotonic, sleep
 
-from tests.bench.rig import END_S, REST_CORES, SERVER_CORE, START_LIMIT_S, Load, Process, cpu_ns, run
+from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Load, Process, measure_cpu, run
 from tests.bench.rows import Row, at_most
 
 LOAD = Load(clients=10, encoding="json", warm_s=1.5)
@@ -72,13 +72,7 @@ def gpsd_us(program: str, load: Load) -> float:
         arguments = ["--gpsd", str(port), "--clients", str(load.clients)]
         readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *arguments))
         readers.line()
-        writer.say("go")
-        sleep(load.warm_s)
-        before_ns, begun = cpu_ns(pid), monotonic()
-        sleep(load.seconds - END_S)
-        used_ns, elapsed = cpu_ns(pid) - before_ns, monotonic() - begun
-        refused = int(writer.line())
-        sleep(0.05)  # what is on its way arrives
+        used_ns, elapsed, refused = measure_cpu(load, writer, pid)
         readers.say("end")
         got = json.loads(readers.line())["samples"]
     if refused or got < load.frames * (1 - LOST_MOST):

@@ -198,6 +198,18 @@ def start_readers(stack: ExitStack, folder: Path, load: Load) -> Process:
     return readers
 
 
+def measure_cpu(load: Load, writer: Process, pid: int) -> tuple[int, float, int]:
+    """Let the writer go; return the CPU time of process `pid`, ns, over how many seconds, and the refused frames."""
+    writer.say("go")
+    sleep(load.warm_s)
+    before_ns, begun = cpu_ns(pid), monotonic()
+    sleep(load.seconds - END_S)
+    used_ns, elapsed = cpu_ns(pid) - before_ns, monotonic() - begun
+    refused = int(writer.line())
+    sleep(0.05)  # what is on its way arrives
+    return used_ns, elapsed, refused
+
+
 def run(load: Load) -> Outcome:
     """One measurement from start to end."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
@@ -216,13 +228,7 @@ def run(load: Load) -> Outcome:
         server = start_server(stack, folder, ports, load)
         readers = start_readers(stack, folder, load)
         pid = server.popen.pid
-        writer.say("go")
-        sleep(load.warm_s)
-        before_ns, begun = cpu_ns(pid), monotonic()
-        sleep(load.seconds - END_S)
-        used_ns, elapsed = cpu_ns(pid) - before_ns, monotonic() - begun
-        refused = int(writer.line())
-        sleep(0.05)  # what is on its way arrives
+        used_ns, elapsed, refused = measure_cpu(load, writer, pid)
         memory_mb = rss_mb(pid)
         statuses = () if load.bare else tuple(ask(folder / "s"))
         readers.say("end")
