@@ -10,6 +10,7 @@ import shutil
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -129,8 +130,8 @@ def terminate(number: int, _frame: object) -> NoReturn:
     raise SystemExit(128 + number)
 
 
-def main() -> int:
-    """The program."""
+def run_program(lab: Callable[[list[str]], int], say: Callable[[str], None]) -> int:
+    """Run `lab` with the arguments of the command line, and return the exit status of the process."""
     signal.signal(signal.SIGTERM, terminate)
     try:
         return lab(sys.argv[1:])
@@ -140,6 +141,11 @@ def main() -> int:
     except KeyboardInterrupt:
         say("interrupted")
         return 128 + signal.SIGINT
+
+
+def main() -> int:
+    """The program."""
+    return run_program(lab, say)
 
 
 if __name__ == "__main__":

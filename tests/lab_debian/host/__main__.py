@@ -7,7 +7,6 @@ why; 130 and 143 after SIGINT and SIGTERM.
 import argparse
 import contextlib
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -16,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tests.lab.host import guest, results
-from tests.lab.host.__main__ import LAB_FAILED, Parser, terminate
+from tests.lab.host.__main__ import Parser, run_program
 from tests.lab.host.environment import ROOT
 from tests.lab.host.errors import HungGuest, LabError
 from tests.lab_debian.host import image, packages, requests
@@ -170,15 +169,7 @@ def lab(arguments: Sequence[str]) -> int:
 
 def main() -> int:
     """The program."""
-    signal.signal(signal.SIGTERM, terminate)
-    try:
-        return lab(sys.argv[1:])
-    except LabError as error:
-        say(str(error))
-        return LAB_FAILED
-    except KeyboardInterrupt:
-        say("interrupted")
-        return 128 + signal.SIGINT
+    return run_program(lab, say)
 
 
 if __name__ == "__main__":
