@@ -46,8 +46,8 @@ PACE_KNOWN: Final = 0.002
 """Relative error from which on samples are counted by the period."""
 PACE_FLOOR: Final = 1e-5
 """Relative error of the period at the least: crystals drift, and messages wait."""
-LATE_WINDOWS: Final = 4
-"""So many windows in a row that are late are another rate, not losses."""
+OFF_WINDOWS: Final = 4
+"""So many windows in a row that are late or early by more than the period explains are another rate."""
 UNCERTAIN: Final = 0.75
 """A gap is certain within one sample while the error of the period over it is no more of one."""
 RESUME_STEPS: Final = 8
@@ -111,8 +111,8 @@ class ArrivalPace:
     """
 
     __slots__ = (
-        "_begin_ns", "_count", "_due_ns", "_error", "_late_windows", "_least_ns", "_most_ns", "_steps", "_turn",
-        "_unjudged", "_until_ns", "period_ns",
+        "_begin_ns", "_count", "_due_ns", "_error", "_has_phase", "_least_ns", "_most_ns", "_off_windows", "_steps",
+        "_turn", "_unjudged", "_until_ns", "period_ns",
     )  # fmt: skip
 
     def __init__(self, turn: int = 1) -> None:
@@ -121,10 +121,8 @@ class ArrivalPace:
         """Time between samples; 0.0 while unknown."""
         self._error = 1.0
         """Relative error of the period."""
-        self._late_windows = 0
-        """Windows in a row that were late: each lost samples, or the rate is another."""
-        self._unjudged = 0
-        """Samples since the window that was judged last."""
+        self._off_windows = 0
+        """Windows in a row that were late or early: each lost samples or had a wrong phase, or the rate is another."""
         self.begin(0)
 
     @property
@@ -135,6 +133,10 @@ class ArrivalPace:
     def begin(self, arrival_ns: int) -> None:
         """Set the first message, or the first after a gap of unknown size; what is known of the period stays."""
         self._due_ns = float(arrival_ns)
+        self._has_phase = False
+        """Whether a window has shown how long the first message waited."""
+        self._unjudged = 0
+        """Samples since the window that was judged last."""
         self._begin_window(arrival_ns)
 
     def _begin_window(self, arrival_ns: int) -> None:
@@ -181,12 +183,15 @@ class ArrivalPace:
         return self._close(arrival_ns)
 
     def _close(self, arrival_ns: int) -> tuple[int, bool]:
-        """Judge a window, unless messages waited in it: then the next one shows what is missing."""
+        """Judge a window, unless messages waited in it: then the next one shows what is missing.
+
+        Where all were early none waited long: the phase or the rate is another.
+        """
         if not self.period_ns:
             return self._learn(arrival_ns)
         self._unjudged += self._steps
         found = 0, True
-        if self._most_ns - self._least_ns <= SETTLED_SPREAD_NS + self.period_ns / 2:
+        if self._most_ns < 0 or self._most_ns - self._least_ns <= SETTLED_SPREAD_NS + self.period_ns / 2:
             found = self._judge(arrival_ns)
             self._unjudged = 0
         self._begin_window(arrival_ns)
@@ -203,19 +208,23 @@ class ArrivalPace:
     def _judge(self, arrival_ns: int) -> tuple[int, bool]:
         """Tell samples that are missing from a period that is a little off, by the lateness that a window shares."""
         late_ns, turn_ns = self._least_ns, self._turn * self.period_ns
-        if self.is_known and 2 * late_ns >= turn_ns:
-            turns = round(late_ns / turn_ns)
-            self._due_ns += turns * turn_ns
-            self._late_windows += 1
-            if self._late_windows < LATE_WINDOWS:
-                return turns * self._turn, (turns + self._unjudged) * self._error < UNCERTAIN or self._turn > 1
-        self._late_windows = 0
         off = late_ns / (self._unjudged * self.period_ns)
+        has_phase, self._has_phase = self._has_phase, True
+        if self.is_known and (2 * late_ns >= turn_ns or off < -PACE_KNOWN):
+            self._off_windows += 1
+            if self._off_windows < OFF_WINDOWS:
+                turns = max(round(late_ns / turn_ns), 0)
+                self._due_ns += turns * turn_ns if turns else late_ns
+                if turns:
+                    return turns * self._turn, (turns + self._unjudged) * self._error < UNCERTAIN or self._turn > 1
+                return 0, not has_phase or late_ns * -2 < turn_ns
+        self._off_windows = 0
         if abs(off) > PACE_KNOWN:
             return self._learn(arrival_ns)
         self._due_ns += late_ns
-        self.period_ns *= 1 + off * (PACE_GAIN if self.is_known else 1.0)
-        self._error = max(abs(off), self._error * PACE_GAIN if self.is_known else abs(off), PACE_FLOOR)
+        if has_phase or not self.is_known:
+            self.period_ns *= 1 + off * (PACE_GAIN if self.is_known else 1.0)
+            self._error = max(abs(off), self._error * PACE_GAIN if self.is_known else abs(off), PACE_FLOOR)
         return 0, late_ns * -2 < turn_ns
 
 

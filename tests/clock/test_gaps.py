@@ -11,6 +11,7 @@ from typing import Final
 import pytest
 
 from imud.clock import SampleClock
+from imud.clock.gaps import ArrivalPace
 from imud.sample import Measurement
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -221,6 +222,46 @@ def test_what_the_pace_cannot_show_is_unknown(device: Device) -> None:
         one.stall(int(one.random.choice([0.7, 1, 2, 5, 10]) * NS_PER_S))
         one.run(int(one.random.choice([0.01, 0.1, 0.3, 1.5]) * NS_PER_S))
     assert unknown or abs(one.finish() - one.missed) <= STALLS
+
+
+def paced(pace: ArrivalPace, begin_ns: int, messages: int, late_ns: int = 0) -> tuple[int, int]:
+    """Add messages at 100 Hz; return how many samples they show to be missing, and how many windows were not sure."""
+    found = [pace.add_arrival(begin_ns + index * 10 * NS_PER_MS + late_ns) for index in range(messages)]
+    return sum(missed for missed, _ in found), sum(not certain for _, certain in found)
+
+
+@pytest.mark.parametrize("waited_ms", [0, 1, 18, 300])
+def test_a_first_message_that_waited_costs_nothing_that_is_known_of_the_pace(waited_ms: int) -> None:
+    pace = ArrivalPace()
+    pace.begin(BEGIN_NS)
+    assert paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000) == (0, 0)
+    period_ns = pace.period_ns
+    begin_ns = BEGIN_NS + 100 * NS_PER_S
+    pace.begin(begin_ns + waited_ms * NS_PER_MS)
+    assert paced(pace, begin_ns + 10 * NS_PER_MS, 300) == (0, 0)
+    assert pace.period_ns == pytest.approx(period_ns, rel=1e-6)
+    assert paced(pace, begin_ns + 33_010 * NS_PER_MS, 300) == (3000, 0), "an outage of 30 s is counted exactly"
+
+
+def test_messages_that_are_early_once_show_a_wrong_phase_and_no_other_rate() -> None:
+    pace = ArrivalPace()
+    pace.begin(BEGIN_NS)
+    paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000)
+    period_ns = pace.period_ns
+    begin_ns = BEGIN_NS + 60_010 * NS_PER_MS
+    assert paced(pace, begin_ns, 300, late_ns=-18 * NS_PER_MS) == (0, 1), "more than half a period is not sure"
+    assert pace.period_ns == pytest.approx(period_ns, rel=1e-6)
+    assert paced(pace, begin_ns + 33_000 * NS_PER_MS, 300, late_ns=-18 * NS_PER_MS) == (3000, 0)
+
+
+@pytest.mark.parametrize("period_ms", [5, 9.9, 10.1])
+def test_messages_that_are_off_in_every_window_are_of_another_rate(period_ms: float) -> None:
+    pace = ArrivalPace()
+    pace.begin(BEGIN_NS)
+    paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000)
+    for index in range(2000):
+        pace.add_arrival(BEGIN_NS + 60 * NS_PER_S + int((index + 1) * period_ms * NS_PER_MS))
+    assert pace.period_ns == pytest.approx(period_ms * NS_PER_MS, rel=2e-3)
 
 
 @pytest.mark.parametrize("device", COUNTED)
