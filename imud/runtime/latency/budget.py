@@ -8,7 +8,8 @@ A consumer asks once for all devices, those that appear later included, or for s
 asked for when it leaves. Where nobody asks, MOST_NS holds: nobody is there to see it.
 """
 
-from collections.abc import Callable, Collection
+from bisect import bisect_left, insort
+from collections.abc import Callable, Collection, Iterator
 from typing import Final, NamedTuple
 
 from imud.units import NS_PER_MS
@@ -35,22 +36,28 @@ OnNeed = Callable[[Need], None]
 class _Request(NamedTuple):
     """What one consumer asks for."""
 
-    latency_ns: int
-    devices: Collection[str] | None
+    need: Need
+    devices: frozenset[str] | None
     """None for all."""
 
 
 class LatencyBudget:
-    """The consumers' requests, and what they come to. Synchronization: the event loop's thread only."""
+    """The consumers' requests, and what they come to. Synchronization: the event loop's thread only.
+
+    Requests are kept in order, for each device that is named and for all: hundreds of clients may come and go at once.
+    """
 
     def __init__(self) -> None:
         self._requests: dict[str, _Request] = {}
+        self._common: list[Need] = []
+        """Requests that concern all devices, the strictest first."""
+        self._named: dict[str, list[Need]] = {}
+        """Those that name a device, by its name, the strictest first; also of devices that are not there."""
         self._devices: dict[str, tuple[Need, OnNeed]] = {}
 
     def add_device(self, name: str, on_need: OnNeed) -> None:
         """Add a device; `on_need` is called at once, and whenever that changes."""
-        self._devices[name] = (NOBODY, on_need)
-        need = min((_need(who, one) for who, one in self._requests.items() if _concerns(one, name)), default=NOBODY)
+        need = self._strictest(name)
         self._devices[name] = (need, on_need)
         on_need(need)
 
@@ -60,39 +67,53 @@ class LatencyBudget:
 
     def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
         """Ask for a latency of `devices` (None: of all) in place of what `who` asked for before."""
-        self._requests[who] = _Request(max(latency_ns, 0), devices)
-        self._settle()
+        need = Need(min(max(latency_ns, 0), MOST_NS), who)
+        self._replace(who, _Request(need, None if devices is None else frozenset(devices)))
 
     def release(self, who: str) -> None:
         """Ask for nothing any more; no-op for one that does not ask."""
-        if self._requests.pop(who, None) is not None:
-            self._settle()
+        self._replace(who, None)
 
     def need(self, device: str) -> Need:
         """Return what holds for a device."""
         return self._devices[device][0]
 
-    def _settle(self) -> None:
-        """Find the strictest request of each device, and tell devices whose latency or asker changed."""
-        common, named = NOBODY, dict[str, Need]()
-        for who, request in self._requests.items():
-            need = _need(who, request)
-            if request.devices is None:
-                common = min(common, need)
-                continue
-            for device in request.devices:
-                before = named.get(device)
-                named[device] = need if before is None else min(before, need)
-        for device, (before, on_need) in list(self._devices.items()):
-            now = min(common, named.get(device, common))
-            if now != before:
-                self._devices[device] = (now, on_need)
-                on_need(now)
+    def _replace(self, who: str, request: _Request | None) -> None:
+        """Put a request in the place of the one of `who` before; tell the devices for which that changes something."""
+        before, common = self._requests.pop(who, None), self._common[:1]
+        named = set[str]()
+        if before is not None:
+            for needs in self._lists(before):
+                del needs[bisect_left(needs, before.need)]
+            named.update(before.devices or ())
+        if request is not None:
+            self._requests[who] = request
+            for needs in self._lists(request):
+                insort(needs, request.need)
+            named.update(request.devices or ())
+        for device in named:
+            if not self._named[device]:
+                del self._named[device]
+        self._tell(named if self._common[:1] == common else list(self._devices))
 
+    def _lists(self, request: _Request) -> Iterator[list[Need]]:
+        """Where a request is kept."""
+        if request.devices is None:
+            yield self._common
+        else:
+            yield from (self._named.setdefault(device, []) for device in request.devices)
 
-def _need(who: str, request: _Request) -> Need:
-    return min(Need(request.latency_ns, who), NOBODY)
+    def _strictest(self, device: str) -> Need:
+        """Find what holds for a device."""
+        needs: list[Need] = [NOBODY, *self._common[:1], *self._named.get(device, [])[:1]]
+        return min(needs)
 
-
-def _concerns(request: _Request, device: str) -> bool:
-    return request.devices is None or device in request.devices
+    def _tell(self, devices: Collection[str]) -> None:
+        """Tell those of some devices whose latency or asker changed."""
+        for device in devices:
+            if device in self._devices:
+                before, on_need = self._devices[device]
+                now = self._strictest(device)
+                if now != before:
+                    self._devices[device] = (now, on_need)
+                    on_need(now)

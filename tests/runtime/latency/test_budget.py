@@ -1,5 +1,7 @@
 """Whose latency holds for which device."""
 
+from random import Random
+
 from imud.runtime.latency.budget import MOST_NS, NOBODY, LatencyBudget, Need
 from imud.units import NS_PER_MS
 
@@ -59,6 +61,49 @@ def test_a_device_that_appears_is_told_what_holds_already() -> None:
     budget.remove_device("bow")
     budget.ask("named", 3 * NS_PER_MS, ["bow"])
     assert Told(budget, "bow").now == (3, "named")
+
+
+def test_any_order_of_requests_comes_to_the_strictest_of_those_that_stand() -> None:
+    random, budget = Random(1), LatencyBudget()
+    names = ["bow", "stern", "mast", "gone"]
+    devices = {name: Told(budget, name) for name in names[:3]}
+    stand: dict[str, tuple[int, list[str] | None]] = {}
+    for _ in range(3000):
+        who = f"client {random.randrange(12)}"
+        if random.random() < 0.4:
+            stand.pop(who, None)
+            budget.release(who)
+        else:
+            latency_ns = random.choice([0, 5, 5, 20, 50, 80]) * NS_PER_MS
+            wanted = random.choice([None, random.sample(names, random.randrange(1, 4))])
+            stand[who] = latency_ns, wanted
+            budget.ask(who, latency_ns, wanted)
+        for name, device in devices.items():
+            needs = [Need(ns, who) for who, (ns, wanted) in stand.items() if wanted is None or name in wanted]
+            assert device.needs[-1] == budget.need(name) == min([*needs, NOBODY])
+
+
+def test_a_client_that_goes_costs_no_look_at_the_others() -> None:
+    budget, compared = LatencyBudget(), 0
+
+    class Counted(str):
+        """A name that counts how often it is compared."""
+
+        __slots__ = ()
+
+        def __lt__(self, other: str) -> bool:
+            nonlocal compared
+            compared += 1
+            return str.__lt__(self, other)
+
+    bow = Told(budget, "bow")
+    names = [Counted(f"client {number:04}") for number in range(1000)]
+    for name in names:
+        budget.ask(name, 0, ["bow"])
+    for name in names:
+        budget.release(name)
+    assert bow.now == (50, "")
+    assert compared < 1000 * 2 * 40, "a search of the list for each, and no more"
 
 
 def test_nothing_waits_longer_than_the_most_and_no_latency_is_negative() -> None:
