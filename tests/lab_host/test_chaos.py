@@ -9,7 +9,7 @@ from imud.sample import Sample, Sync
 from imud.sim import SIMULATORS
 from imud.sim.simulator import Burst, SimulatorOptions
 from tests.lab.chaos.account import KNOWN, Account, Hole, Interval, account, find_holes, sequence_faults
-from tests.lab.chaos.faults import PAUSE_S, ROUND_S, all_faults, plan
+from tests.lab.chaos.faults import PAUSE_S, ROUND_S, Fault, Planned, all_faults, plan, play
 from tests.lab.chaos.polls import Answer, Asked, LoggedRegisters, PollLog, block_replies
 from tests.lab.chaos.truth import BASE, LoggedModule, TruthLog, by_device_time, decoded, encoded, time_key
 from tests.lab.wire import Refuse
@@ -255,3 +255,24 @@ def test_a_plan_follows_from_its_seed_and_shares_no_resource() -> None:
             for later in planned[number + 1 :]:
                 if item.fault.resources & later.fault.resources:
                     assert later.begin_s >= item.begin_s + item.lasts_s + PAUSE_S - 1e-9
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.5, 4.0])
+def test_faults_of_one_resource_follow_each_other_also_where_the_host_is_late(late_s: float) -> None:
+    now_s, going, most = 100.0, list[Fault](), 0
+
+    def wait(seconds: float) -> None:
+        nonlocal now_s
+        now_s += seconds
+
+    def begin(item: Planned) -> None:
+        nonlocal now_s, most
+        assert not any(item.fault.resources & fault.resources for fault in going)
+        going.append(item.fault)
+        most = max(most, len(going))
+        now_s += late_s
+
+    for planned in plan(7, 120.0, all_faults(with_memory=True)):
+        play(planned, begin, going.remove, lambda: now_s, wait)
+        assert not going
+    assert most > 1, "faults of several resources go on together"

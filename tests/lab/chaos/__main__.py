@@ -25,7 +25,7 @@ from tests.lab.chaos import account as accounts
 from tests.lab.chaos.account import Account, Hole, Interval
 from tests.lab.chaos.daemon import Life, Snapshot, memory_control
 from tests.lab.chaos.far_side import FarSide
-from tests.lab.chaos.faults import Fault, Planned, all_faults, plan
+from tests.lab.chaos.faults import Fault, Planned, all_faults, plan, play
 from tests.lab.chaos.polls import Answer
 from tests.lab.tool import tool
 from tests.lab.waiting import wait_until
@@ -68,6 +68,16 @@ class Chaos:
         self.audit(f"before the end of life {self.lives}")
         end(self.life)
         self.life = self._born()
+
+    def begin(self, item: Planned) -> None:
+        """Make a fault."""
+        self.outage_begins(item.fault)
+        item.fault.begin(self, item.lasts_s)
+
+    def end(self, fault: Fault) -> None:
+        """Take a fault back."""
+        fault.end(self)
+        self.outage_ends(fault)
 
     def outage_begins(self, fault: Fault) -> None:
         """Note it for the devices that it concerns."""
@@ -219,27 +229,6 @@ class Chaos:
         return Life(self._folder, self._folder / "imud.yaml")
 
 
-def play(chaos: Chaos, planned: list[Planned], made: Counter[str]) -> None:
-    """One round: each fault begins and ends when it is due."""
-    begin_s = monotonic()
-    going: list[tuple[float, Fault]] = []
-    todo = list(planned)
-    while todo or going:
-        due_s, is_end = min([(end, True) for end, _ in going] + [(item.begin_s, False) for item in todo[:1]])
-        sleep(max(begin_s + due_s - monotonic(), 0))
-        if is_end:
-            fault = next(fault for end, fault in going if end == due_s)
-            going.remove((due_s, fault))
-            fault.end(chaos)
-            chaos.outage_ends(fault)
-        else:
-            item = todo.pop(0)
-            made[item.fault.name] += 1
-            chaos.outage_begins(item.fault)
-            item.fault.begin(chaos, item.lasts_s)
-            going.append((monotonic() - begin_s + item.lasts_s, item.fault))
-
-
 @contextmanager
 def small_disk(folder: Path) -> Iterator[Path]:
     """A file system of STATE_SIZE."""
@@ -288,7 +277,8 @@ def main(arguments: list[str] | None = None) -> int:
             try:
                 chaos.settle("start")
                 for number, planned in enumerate(plan(options.seed, options.seconds, faults), 1):
-                    play(chaos, planned, made)
+                    made.update(item.fault.name for item in planned)
+                    play(planned, chaos.begin, chaos.end)
                     chaos.settle(f"after round {number}")
                     print(
                         f"round {number}: {len(planned)} faults, violations {len(chaos.violations)}, "

@@ -6,9 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from random import Random
 from signal import SIGCONT, SIGHUP, SIGSTOP
+from time import monotonic, sleep
 from typing import Any, Final, NamedTuple, Protocol
 
 from imud.sim.ports.faults import FaultRates
@@ -101,6 +103,41 @@ def _round(random: Random, faults: list[Fault]) -> list[Planned]:
             free_s |= dict.fromkeys(fault.resources, at_s + lasts_s + PAUSE_S)
         at_s += random.expovariate(1 / EVERY_S)
     return planned
+
+
+def play(
+    planned: list[Planned],
+    begin: Callable[[Planned], None],
+    end: Callable[[Fault], None],
+    now_s: Callable[[], float] = monotonic,
+    wait: Callable[[float], None] = sleep,
+) -> None:
+    """One round: each fault begins and ends when it is due.
+
+    One that begins late, because the host or the guest was busy, ends late, and what shares a resource with it waits.
+    """
+    begin_s = now_s()
+    going: list[tuple[float, Fault]] = []
+    todo = list(planned)
+    free_s: dict[str, float] = {}
+    while todo or going:
+        ends = [(end_s, True) for end_s, _ in going]
+        begins = [
+            (max(item.begin_s, *(free_s.get(resource, 0.0) for resource in item.fault.resources)), False)
+            for item in todo[:1]
+        ]
+        due_s, is_end = min(ends + begins)
+        wait(max(begin_s + due_s - now_s(), 0))
+        if is_end:
+            fault = next(fault for end_s, fault in going if end_s == due_s)
+            going.remove((due_s, fault))
+            end(fault)
+            free_s |= dict.fromkeys(fault.resources, now_s() - begin_s + PAUSE_S)
+        else:
+            item = todo.pop(0)
+            free_s |= dict.fromkeys(item.fault.resources, inf)
+            begin(item)
+            going.append((now_s() - begin_s + item.lasts_s, item.fault))
 
 
 # --- what they do ----------------------------------------------------------------------------------------------------
