@@ -1,0 +1,80 @@
+"""The service unit as a file: how exposed systemd judges it, which system calls and networks it leaves open.
+
+What the settings do is checked on a booted system (tests/lab_debian/guest/sandbox.py).
+"""
+
+import re
+import shutil
+import subprocess
+from ipaddress import ip_address, ip_network
+
+import pytest
+
+from tests.support.files import ROOT
+
+UNIT = ROOT / "systemd" / "imud.service"
+EXPOSURE_MAX = 2.0
+"""docs/operate.md says what it is made of; the guest's check has the same limit."""
+OFFLINE_SINCE = 250
+"""Version of systemd whose systemd-analyze judges a file."""
+
+
+def values(name: str) -> list[str]:
+    """Words of all lines `NAME=` of the unit."""
+    return " ".join(re.findall(rf"^{name}=(.*)$", UNIT.read_text(), re.MULTILINE)).split()
+
+
+def analyze_version() -> int:
+    """Version of systemd-analyze; 0 without one."""
+    if shutil.which("systemd-analyze") is None:
+        return 0
+    said = subprocess.run(["systemd-analyze", "--version"], capture_output=True, text=True, check=True, timeout=30)
+    return int(said.stdout.split()[1])
+
+
+def exposure(text: str, folder: str) -> float:
+    """What `systemd-analyze security` says of a unit."""
+    path = f"{folder}/imud.service"
+    with open(path, "w") as file:
+        file.write(text)
+    argv = ["systemd-analyze", "security", "--offline=true", "--no-pager", path]
+    said = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60).stdout
+    found = re.search(r"Overall exposure level for imud\.service: ([\d.]+)", said)
+    assert found, said
+    return float(found[1])
+
+
+@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
+def test_systemd_judges_the_unit_as_little_exposed(tmp_path_factory: pytest.TempPathFactory) -> None:
+    folder = str(tmp_path_factory.mktemp("unit"))
+    text = UNIT.read_text()
+    assert exposure(text, folder) <= EXPOSURE_MAX
+    assert exposure(text.replace("\nIPAddressDeny=any\n", "\n"), folder) > EXPOSURE_MAX, "the judge sees a setting go"
+
+
+def test_of_the_calls_for_the_clock_only_those_that_read_it_are_allowed() -> None:
+    assert {name for name in values("SystemCallFilter") if "time" in name or "clock" in name or "adj" in name} == {
+        "adjtimex", "clock_adjtime", "clock_adjtime64"
+    }  # fmt: skip
+    assert "CapabilityBoundingSet=\n" in UNIT.read_text(), "with CAP_SYS_TIME they would set it"
+
+
+def test_only_this_machine_and_private_networks_are_reached() -> None:
+    assert values("IPAddressDeny") == ["any"]
+    allowed = values("IPAddressAllow")
+    assert {"localhost", "link-local"} <= set(allowed)
+    networks = [ip_network(word) for word in allowed if "/" in word]
+    assert len(networks) == len(allowed) - 2
+    for address in ("192.168.1.20", "10.0.0.7", "172.20.1.1", "100.101.1.2", "fd00::7"):
+        assert any(ip_address(address) in network for network in networks), address
+    for network in networks:
+        assert not network.is_global, network
+
+
+def test_the_documents_name_the_same_limit_and_no_setting_as_left_open_that_is_set() -> None:
+    text = (ROOT / "docs" / "operate.md").read_text()
+    assert f"`systemd-analyze security imud` gives {EXPOSURE_MAX} " in text
+    left_open = re.findall(r"^\| `(\w+)=(\w*)` \|", text, re.MULTILINE)
+    assert left_open
+    for name, value in left_open:
+        assert value not in values(name) if value else not values(name), name
