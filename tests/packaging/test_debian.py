@@ -14,7 +14,7 @@ from imud import __version__
 from tests.support.files import ROOT
 
 DEBIAN = ROOT / "packaging" / "debian"
-SCRIPTS = ("imud.postinst", "imud.prerm", "imud.postrm")
+SCRIPTS = ("imud-daemon.postinst", "imud-daemon.prerm", "imud-daemon.postrm")
 
 
 def fields(text: str) -> dict[str, str]:
@@ -47,7 +47,11 @@ def test_programs_of_the_package_are_shell(name: str) -> None:
 def run_script(name: str, *arguments: str, root: Path) -> None:
     """Run a maintainer script as dpkg does, with its paths below `root`."""
     text = (DEBIAN / name).read_text()
-    moved = re.sub(r"(?<![\w/])/(usr/lib/imud|var/lib/imud|run/udev|run/systemd/system)", rf"{root}/\1", text)
+    moved = re.sub(
+        r"(?<![\w/])/(usr/lib/imud|usr/lib/systemd/system|var/lib/imud|etc/imud|run/udev|run/systemd/system)",
+        rf"{root}/\1",
+        text,
+    )
     assert moved != text
     subprocess.run(["sh", "-c", moved, name, *arguments], check=True, timeout=30)
 
@@ -57,9 +61,9 @@ def test_only_a_purge_removes_the_state(tmp_path: Path) -> None:
     state.parent.mkdir(parents=True)
     state.touch()
     for action in ("remove", "upgrade", "disappear", "abort-install"):
-        run_script("imud.postrm", action, root=tmp_path)
+        run_script("imud-daemon.postrm", action, root=tmp_path)
         assert state.exists(), action
-    run_script("imud.postrm", "purge", root=tmp_path)
+    run_script("imud-daemon.postrm", "purge", root=tmp_path)
     assert not state.parent.exists()
 
 
@@ -69,11 +73,11 @@ def test_what_was_compiled_at_the_installation_goes_before_the_package(tmp_path:
     library.mkdir()
     (library / "one.py").touch()
     (tmp_path / "usr/lib/imud/bin/python3").symlink_to(sys.executable)
-    run_script("imud.postinst", "configure", "", root=tmp_path)
+    run_script("imud-daemon.postinst", "configure", "", root=tmp_path)
     assert list(library.rglob("*.pyc"))
-    run_script("imud.prerm", "remove", root=tmp_path)
+    run_script("imud-daemon.prerm", "remove", root=tmp_path)
     assert list(library.iterdir()) == [library / "one.py"]
-    run_script("imud.prerm", "remove", root=tmp_path / "nothing")
+    run_script("imud-daemon.prerm", "remove", root=tmp_path / "nothing")
 
 
 def test_a_removal_stops_the_service_and_an_upgrade_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,18 +87,18 @@ def test_a_removal_stops_the_service_and_an_upgrade_does_not(tmp_path: Path, mon
     stub.write_text(f'#!/bin/sh\necho "$@" >>{calls}\nexit 1\n')
     stub.chmod(0o755)
     monkeypatch.setenv("PATH", f"{stub.parent}:{os.environ['PATH']}")
-    run_script("imud.prerm", "remove", root=tmp_path)
+    run_script("imud-daemon.prerm", "remove", root=tmp_path)
     assert not calls.exists(), "no systemd runs"
     (tmp_path / "run/systemd/system").mkdir(parents=True)
-    run_script("imud.prerm", "upgrade", "0.2.0-1", root=tmp_path)
+    run_script("imud-daemon.prerm", "upgrade", "0.2.0-1", root=tmp_path)
     assert not calls.exists()
-    run_script("imud.prerm", "remove", root=tmp_path)
+    run_script("imud-daemon.prerm", "remove", root=tmp_path)
     assert calls.read_text() == "stop imud.service\n"
 
 
 def test_control_has_what_debian_wants() -> None:
     source, package = map(fields, (DEBIAN / "control").read_text().strip().split("\n\n"))
-    assert source["Source"] == package["Package"] == "imud"
+    assert source["Source"] == package["Package"] == "imud-daemon"
     assert {"Maintainer", "Section", "Priority", "Standards-Version"} <= source.keys()
     assert package["Architecture"] == "any"
     assert "@PYTHON@" in package["Depends"]
@@ -103,6 +107,34 @@ def test_control_has_what_debian_wants() -> None:
     assert len(summary) < 80
     assert rest
     assert all(len(line) <= 80 for line in rest)
+
+
+OTHERS = {
+    "imud": "/usr/bin/imud, imud.service, 60-imud.rules; github.com/richcreations/imud, version 1.6.1",
+    "libimud-dev": "/usr/include/imud.h; of the same project",
+}
+"""Packages of other projects, and the files that they and ours have at the same places."""
+
+
+def test_packages_that_have_the_same_files_exclude_this_one_and_are_not_taken_for_it() -> None:
+    _, package = map(fields, (DEBIAN / "control").read_text().strip().split("\n\n"))
+    assert package["Package"] not in OTHERS, "apt would upgrade the one to the other"
+    assert set(package["Conflicts"].split(", ")) == OTHERS.keys(), "without versions: whatever theirs is"
+    assert not {"Provides", "Replaces", "Breaks"} & package.keys(), "imud-mqtt and others of theirs depend on imud"
+    installed = (ROOT / "docs" / "install.md").read_text()
+    assert all(f"`{name}`" in installed for name in (package["Package"], *OTHERS))
+
+
+def test_a_late_purge_leaves_alone_what_another_package_has_at_the_same_places(tmp_path: Path) -> None:
+    unit, state = tmp_path / "usr/lib/systemd/system/imud.service", tmp_path / "var/lib/imud/theirs"
+    for path in (unit, state):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    run_script("imud-daemon.postrm", "purge", root=tmp_path)
+    assert state.exists()
+    unit.unlink()
+    run_script("imud-daemon.postrm", "purge", root=tmp_path)
+    assert not state.exists()
 
 
 def test_every_file_that_the_build_takes_is_there() -> None:
@@ -116,16 +148,16 @@ def test_every_file_that_the_build_takes_is_there() -> None:
 
 
 def test_overrides_have_reasons_and_the_launcher_its_own_python() -> None:
-    lines = (DEBIAN / "imud.lintian-overrides").read_text().splitlines()
+    lines = (DEBIAN / "imud-daemon.lintian-overrides").read_text().splitlines()
     assert lines[0].startswith("# ")
-    assert all(re.match(r"# |imud( \[arm64\])?: ", line) for line in lines)
+    assert all(re.match(r"# |imud-daemon( \[arm64\])?: ", line) for line in lines)
     assert (DEBIAN / "imud.py").read_text().startswith("#!/usr/lib/imud/bin/python3 -I\n")
 
 
 def test_the_version_is_that_of_the_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["version"] == __version__
-    assert re.match(r"imud \(@VERSION@-1~@RELEASE@\) @RELEASE@; ", (DEBIAN / "changelog").read_text())
+    assert re.match(r"imud-daemon \(@VERSION@-1~@RELEASE@\) @RELEASE@; ", (DEBIAN / "changelog").read_text())
 
 
 def test_sysusers_make_every_group_that_unit_and_udev_rules_name() -> None:

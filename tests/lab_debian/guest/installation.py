@@ -23,7 +23,7 @@ def check(checks: Checks, _host: Host) -> None:
         checks.figure("installation", time.monotonic() - start_s, "s")
         EXAMPLE.write_bytes(CONFIG.read_bytes())
     with checks("the package is as it was made, and its modules are compiled"):
-        changed = run("dpkg", "--verify", "imud").stdout.splitlines()
+        changed = run("dpkg", "--verify", "imud-daemon").stdout.splitlines()
         expect("dpkg --verify", [line for line in changed if not LEFT_OUT.search(line)], [])
         must("sh", "-c", "find /usr/lib/imud/lib -name '*.pyc' | grep --quiet .")
     with checks("nothing is started, nothing is enabled"):

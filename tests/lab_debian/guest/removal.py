@@ -20,7 +20,7 @@ def check(checks: Checks, _host: Host) -> None:
     with checks("an upgrade restarts the service and keeps configuration, state and what is enabled"):
         before = pid()
         must("apt-get", "--quiet", "--yes", "install", "/run/lab/next.deb", limit_s=LIMIT_S)
-        expect_in("lab1", must("dpkg-query", "--show", "imud"), "version")
+        expect_in("lab1", must("dpkg-query", "--show", "imud-daemon"), "version")
         wait_streaming("usb")
         assert pid() != before, "the process is the old one"
         assert CONFIG.read_text().startswith("# mine"), "the configuration is another"
@@ -32,14 +32,14 @@ def check(checks: Checks, _host: Host) -> None:
         expect("active", run("systemctl", "is-active", "imud").stdout.strip(), "inactive")
         start_service()
     with checks("a removal stops the service and keeps configuration and state"):
-        must("apt-get", "--quiet", "--yes", "remove", "imud", limit_s=LIMIT_S)
+        must("apt-get", "--quiet", "--yes", "remove", "imud-daemon", limit_s=LIMIT_S)
         expect("active", run("systemctl", "is-active", "imud").stdout.strip(), "inactive")
         assert not Path("/usr/lib/imud").exists(), "files are left in /usr/lib/imud"
         assert CONFIG.exists(), "the configuration is gone"
         assert STATE.exists(), "the state is gone"
         assert not Path("/run/imud").exists(), "the runtime directory is left"
     with checks("a purge leaves nothing but the users and groups"):
-        must("apt-get", "--quiet", "--yes", "purge", "imud", limit_s=LIMIT_S)
+        must("apt-get", "--quiet", "--yes", "purge", "imud-daemon", limit_s=LIMIT_S)
         left = must(
             "find",
             "/etc",
