@@ -84,7 +84,7 @@ class PpsSettings(InputSettings, frozen=True, kw_only=True, forbid_unknown_field
     """The pulse per second."""
 
     chrony: str = ""
-    """Socket of chronyd's SOCK reference clock that the pulses are sent to, for example `/run/chrony/imud.sock`; empty
+    """Socket of chronyd's SOCK reference clock that the pulses are sent to, for example `/run/chrony.imud.sock`; empty
     for none. The second of each pulse must be known from `rmc`."""
 
 

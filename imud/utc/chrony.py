@@ -1,6 +1,6 @@
 """Samples for chronyd's SOCK reference clock: the error of the system clock at a pulse.
 
-chrony.conf(5), `refclock SOCK /run/chrony/imud.sock`: chronyd creates the socket and receives one datagram per sample,
+chrony.conf(5), `refclock SOCK /run/chrony.imud.sock`: chronyd creates the socket and receives one datagram per sample,
 in host byte order. The layout is that of chrony's `struct sock_sample` with 64-bit time, 40 bytes: accepted by a 64-bit
 chronyd, and by a 32-bit one with 64-bit time; since about chrony 4.7 every build converts it.
 

@@ -47,7 +47,7 @@ def test_every_line() -> None:
     bow, gimbal = parse(
         hipnuc(
             "sout: {line: 17, chip: gpiochip0, bias: pull-down}, sout_div: {line: D, divisor: 64}, "
-            "sin: {line: S, rate_hz: 0}, alarm: {line: A, active_low: true}, pps: {line: P, chrony: /run/chrony/imud.sock}"
+            "sin: {line: S, rate_hz: 0}, alarm: {line: A, active_low: true}, pps: {line: P, chrony: /run/chrony.imud.sock}"
         ),
         spi("reset: {line: R, hold_ms: 5, open_drain: true}, data_ready: {line: Y, edge: falling}"),
     )
@@ -56,7 +56,7 @@ def test_every_line() -> None:
         sout_div=DividedSettings(line="D", divisor=64),
         sin=TriggerSettings(line="S", rate_hz=0.0),
         alarm=InputSettings(line="A", active_low=True),
-        pps=PpsSettings(line="P", chrony="/run/chrony/imud.sock"),
+        pps=PpsSettings(line="P", chrony="/run/chrony.imud.sock"),
     )
     assert gimbal.lines == DeviceLines(
         reset=ResetSettings(line="R", hold_ms=5.0, open_drain=True), data_ready=ReadySettings(line="Y", edge="falling")
