@@ -11,7 +11,7 @@ from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.errors import CommandError
 from imud.event import Event
-from imud.formats.slot import encode_slot
+from imud.formats.slot import encode_slots
 from imud.frames.conventions import Convention
 from imud.frames.published import PublishedFrame, as_sent
 from imud.sample import Sample
@@ -44,8 +44,7 @@ class Batch:
     def slots(self) -> list[bytes]:
         """The samples as slots (`imud.formats.slot`), encoded on first use."""
         if self._slots is None:
-            device_id = self.device_id
-            self._slots = [encode_slot(sample, device_id) for sample in self.samples]
+            self._slots = encode_slots(self.samples, self.device_id)
         return self._slots
 
     def converted(self, convention: Convention | None) -> "Batch":

@@ -14,9 +14,10 @@ CRC-32 (IEEE 802.3, as zlib.crc32) is over bytes 0…251, the sequence number in
 
 import struct
 import sys
-import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
+from zlib import crc32
 
 import msgspec
 
@@ -117,11 +118,19 @@ _ZERO4: Quaternion = (0.0, 0.0, 0.0, 0.0)
 _ZERO2: Pair = (0.0, 0.0)
 
 
-def encode_slot(sample: Sample, device_id: int) -> bytes:
-    """`sample` as SLOT_BYTES bytes, CRC included. `device_id` is the daemon's number of the device, 0…65535.
+def encode_slots(samples: Sequence[Sample], device_id: int) -> list[bytes]:
+    """`samples` as SLOT_BYTES bytes each, CRC included. `device_id` is the daemon's number of the device, 0…65535.
 
     A value that its field cannot hold is replaced as `_fitted` says, so that no sample can stop the daemon.
     """
+    try:
+        return [_encode(sample, device_id) for sample in samples]
+    except struct.error:
+        return [encode_slot(sample, device_id) for sample in samples]
+
+
+def encode_slot(sample: Sample, device_id: int) -> bytes:
+    """One sample as `encode_slots` makes it."""
     try:
         return _encode(sample, device_id)
     except struct.error:
@@ -168,7 +177,7 @@ def _encode(sample: Sample, device_id: int) -> bytes:
         ax, ay, az, gx, gy, gz, mx, my, mz, qw, qx, qy, qz, roll, pitch, yaw, temperature, pressure, incli_x, incli_y,
         pps,
     )  # fmt: skip
-    return body + _CRC.pack(zlib.crc32(body))
+    return body + _CRC.pack(crc32(body))
 
 
 def _fitted(sample: Sample) -> Sample:
@@ -194,7 +203,7 @@ def _clipped(value: int, low: int, high: int) -> int:
 
 def slot_is_whole(slot: bytes) -> bool:
     """Whether the CRC of a slot matches its content."""
-    return len(slot) == SLOT_BYTES and zlib.crc32(slot[:CRC_OFFSET]) == _CRC.unpack_from(slot, CRC_OFFSET)[0]
+    return len(slot) == SLOT_BYTES and crc32(slot[:CRC_OFFSET]) == _CRC.unpack_from(slot, CRC_OFFSET)[0]
 
 
 def decode_slot(slot: bytes, device: str) -> Sample:

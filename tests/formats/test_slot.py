@@ -15,6 +15,7 @@ from imud.formats.slot import (
     SYNC_CODES,
     decode_slot,
     encode_slot,
+    encode_slots,
     slot_is_whole,
 )
 from imud.sample import Sample, Sync
@@ -178,3 +179,11 @@ def test_no_sample_can_stop_the_daemon(values: dict[str, int], accel: tuple[floa
     decoded = decode_slot(encode_slot(sample, 3), "imu0")
     assert decoded.accel_m_s2 == accel
     assert all(getattr(decoded, name) is not None for name in INTEGERS)
+
+
+def test_a_batch_is_its_samples_one_by_one_also_where_one_does_not_fit() -> None:
+    unfit = msgspec.structs.replace(FULL, t_err_ns=1 << 40, status=1 << 33)
+    for batch in ([FULL, BARE, FULL], [BARE, unfit, FULL], [unfit]):
+        slots = encode_slots(batch, 9)
+        assert slots == [encode_slot(sample, 9) for sample in batch]
+        assert [decode_slot(slot, "imu0").seq for slot in slots] == [sample.seq for sample in batch]

@@ -1,8 +1,9 @@
 """The writing side of one device's shared-memory ring (`imud.formats.ring`).
 
 A slot is written in three stores: invalid sequence number, payload with CRC, sequence number; then the header's
-`newest_seq`. Single words go through memoryviews cast to the word's type, because those make one aligned store:
-`struct.pack_into` first fills its target with zeros, which a reader could see.
+`newest_seq`. The slots of a batch share the store of the payloads (`_write_run`). Single words go through memoryviews
+cast to the word's type, because those make one aligned store: `struct.pack_into` first fills its target with zeros,
+which a reader could see.
 
 A store into a page that was cut off the file would end the daemon by SIGBUS. Only root and the daemon's own user may
 cut it; the size is looked at before each batch (lseek), which leaves the microseconds from there to the last store.
@@ -38,6 +39,8 @@ from imud.sample import Sample
 
 _lseek, _END = os.lseek, os.SEEK_END  # looked up once: called for every batch
 _CLOSED = struct.pack("<I", STATE_CLOSED)
+_INVALID = struct.pack("<Q", SEQ_INVALID)
+_PAYLOAD = slice(8, SLOT_BYTES)
 _LEDGER_PAYLOAD = slice(LEDGER_BLOCK_OFFSET + 8, LEDGER_BLOCK_OFFSET + LEDGER_BLOCK_BYTES)
 
 
@@ -75,6 +78,8 @@ class ShmRing:
             self._restore_size()
             self._newest = samples[-1].seq
             return
+        if len(slots) > 1 and self._write_run(samples[0].seq, samples[-1].seq, slots):
+            return
         memory, words, mask, newest = self._memory, self._words, self._mask, self._newest
         for sample, slot in zip(samples, slots):  # noqa: B905  # `strict` costs 0.1 µs; a batch has a slot per sample
             seq = sample.seq
@@ -87,6 +92,24 @@ class ShmRing:
                 words[FIRST_WORD] = seq
             newest = seq
         self._newest = newest
+
+    def _write_run(self, first: int, last: int, slots: Sequence[bytes]) -> bool:
+        """Write slots back to back: all are invalid before the first payload is stored, and until the last one is.
+
+        Returns False, with nothing written, where a number is missing before or between them, or the ring ends there.
+        """
+        count, begin = len(slots), first & self._mask
+        if first != self._newest + 1 or last != self._newest + count or begin + count > self._mask + 1:
+            return False
+        at = HEADER_BYTES + begin * SLOT_BYTES
+        words, numbers = self._words, range(at >> 3, (at + count * SLOT_BYTES) >> 3, SLOT_BYTES >> 3)
+        for word in numbers:
+            words[word] = SEQ_INVALID
+        self._memory[at + 8 : at + count * SLOT_BYTES] = _INVALID.join([slot[_PAYLOAD] for slot in slots])
+        for seq, word in enumerate(numbers, first):
+            words[word] = seq
+        self._newest = words[NEWEST_WORD] = last
+        return True
 
     def beat(self, now_ns: int) -> None:
         """Show that the daemon lives."""

@@ -22,7 +22,7 @@ from imud.devices.imu61x.can.codec import BASE_ID, Imu61xCanCodec, Imu61xCanSett
 from imud.devices.imu61x.uart.codec import Imu61xCodec, encode_ahrs
 from imud.formats.can import pack_frame
 from imud.formats.jsonrpc import encode_request, line_of
-from imud.formats.slot import encode_slot
+from imud.formats.slot import encode_slot, encode_slots
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.links.can.frame_reader import FrameReader
@@ -223,6 +223,11 @@ def _slot(total: int, _directory: str) -> Run:
     return _taking([partial(encode_slot, sample, 1) for sample in _samples(total)])
 
 
+def _slots(frames: int, total: int, _directory: str) -> Run:
+    samples = _samples(total * frames)
+    return _taking([partial(encode_slots, samples[at : at + frames], 1) for at in range(0, len(samples), frames)])
+
+
 def _context() -> PublisherContext:
     return PublisherContext(list, 1, virtual_time.now_ns, cpu_ns=virtual_time.now_ns)
 
@@ -341,6 +346,7 @@ STAGES: Final = (
     CountedStage("decode CANopen, a frame", _canopen, 240),
     CountedStage("clock, a sample", _clock, 1000),
     CountedStage("slot, a sample", _slot, 200),
+    CountedStage("slot, 20 samples in a batch", partial(_slots, 20), 20, 20),
     CountedStage("ring, a sample", partial(_ring, 1), 200),
     CountedStage("ring, 20 samples in a batch", partial(_ring, 20), 20, 20),
     CountedStage("socket, 1 binary client", partial(_socket, 1, "binary", 1), 160),

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from random import Random
 from typing import Any, Self
 
 import msgspec
@@ -134,6 +135,25 @@ def test_ring_wraps(board: Board) -> None:
     assert len(raw) == HEADER_BYTES + SLOTS * SLOT_BYTES
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_batches_leave_the_same_bytes_as_their_samples_one_by_one(tmp_path: Path, seed: int) -> None:
+    random = Random(seed)
+    for name in ("one", "many"):
+        (tmp_path / name).mkdir()
+    one, many = Board(tmp_path / "one"), Board(tmp_path / "many")
+    seq = 0
+    for _ in range(40):
+        numbers = []
+        for _ in range(random.choice((1, 2, 5, 20, SLOTS, SLOTS + 7))):
+            seq += 1 if random.random() < 0.97 else random.randint(2, 2 * SLOTS)
+            numbers.append(seq)
+        many.publish(numbers)
+        for number in numbers:
+            one.publish([number])
+        written = [board.path.read_bytes() for board in (one, many)]
+        assert written[0][OFFSETS["newest_seq"] :] == written[1][OFFSETS["newest_seq"] :]
+
+
 def test_gap_in_the_numbers_moves_the_first(board: Board) -> None:
     board.publish([1, 2])
     board.publish([7, 8])
@@ -193,6 +213,17 @@ def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         (slot_at(1) + 8, SLOT_BYTES - 8, slot[8:]),
         (slot_at(1), 8, 1),
         (OFFSETS["newest_seq"], 8, 1),
+    ]
+    notes.clear()
+    board.publish([2, 3])
+    slots = [encode_slot(make_sample(seq), 3)[8:] for seq in (2, 3)]
+    assert notes == [
+        (slot_at(2), 8, SEQ_INVALID),
+        (slot_at(3), 8, SEQ_INVALID),
+        (slot_at(2) + 8, 2 * SLOT_BYTES - 8, SEQ_INVALID.to_bytes(8, "little").join(slots)),
+        (slot_at(2), 8, 2),
+        (slot_at(3), 8, 3),
+        (OFFSETS["newest_seq"], 8, 3),
     ]
     notes.clear()
     board.tick()
