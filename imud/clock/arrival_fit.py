@@ -114,10 +114,9 @@ class ArrivalFit:
     """
 
     __slots__ = (
-        "_begin_ns", "_bins", "_open", "_pause_count", "_pause_ns", "_slope_known", "_slope_known_error", "_until_ns",
-        "_wait_most", "_width_ns", "count", "error_ns", "fitted_ns", "hidden_ns", "hold_ns",
-        "measured_hold_ns", "recent_ns", "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns", "slope",
-        "slope_error",
+        "_begin_ns", "_bins", "_open", "_pause_count", "_pause_ns", "_slope_known", "_slope_known_error", "_wait_most",
+        "_width_ns", "count", "error_ns", "fitted_ns", "hidden_ns", "hold_ns", "measured_hold_ns", "recent_ns",
+        "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns", "slope", "slope_error", "until_ns",
     )  # fmt: skip
 
     def __init__(
@@ -152,7 +151,8 @@ class ArrivalFit:
         self._pause_ns = float(hold_ns)
         self._pause_count = 1
         self._width_ns = 0
-        self._until_ns = device_ns + 1
+        self.until_ns = device_ns + 1
+        """Device time from which on an arrival begins a new bin, with which the fit changes."""
         self._open = _Bin(device_ns, arrival_ns, 0.0, 0.0)
         self._bins = [self._open]
 
@@ -183,7 +183,7 @@ class ArrivalFit:
         if wait > self._wait_most:
             late_ns = wait - self._wait_most
             wait = self._wait_most  # the truth is under the fit: a timer alone cannot have held it for longer
-        if device_ns >= self._until_ns:
+        if device_ns >= self.until_ns:
             bin_ = _Bin(device_ns, arrival_ns, above_ns, wait)
             self._bins.append(bin_)
             self._open = bin_
@@ -191,7 +191,7 @@ class ArrivalFit:
                 bin_.late, bin_.late_ns = 1, late_ns
             if len(self._bins) > BINS:
                 self._make_room()
-            self._until_ns = device_ns + max(self._width_ns, 1)
+            self.until_ns = device_ns + max(self._width_ns, 1)
             self._fit(device_ns)
             return True
         bin_ = self._open

@@ -136,6 +136,11 @@ class PeriodLearner:
         self._run = 0
         self._even += 1
 
+    def add_even_steps(self, count: int) -> None:
+        """Add so many steps that are exactly the period, at least one."""
+        self._run = 0
+        self._even += count
+
     def steps_in(self, ticks: int) -> int:
         """Return how many periods are in a longer step; the period must be known."""
         period = self.period_ticks
@@ -230,14 +235,14 @@ class DeviceTime:
     """
 
     __slots__ = (
-        "_even_for", "_gap", "_modulus", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "doubt_ns", "even_ns",
-        "missed", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
+        "_even_for", "_gap", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "doubt_ns", "even_ns", "missed",
+        "modulus", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
     )  # fmt: skip
 
     def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
         """`on_unknown_gap` is called for a gap in which the number of missing samples is not known."""
         self.tick_ns = tick_ns
-        self._modulus = tick_modulus
+        self.modulus = tick_modulus
         self.ticks = 0
         """The newest stamp."""
         self._phase_ns = 0.0
@@ -272,26 +277,26 @@ class DeviceTime:
         self._phase_ns = self._shift_ns = self.doubt_ns = 0.0
         self.missed = self._gap = self.watched = self._even_for = 0
         self.uneven = self.rephased = False
-        self.raw_ns = self.even_ns = ticks % self._modulus * self.tick_ns
+        self.raw_ns = self.even_ns = ticks % self.modulus * self.tick_ns
 
     def elapsed_ns(self, ticks: int) -> int:
         """Device time from the newest stamp to `ticks`, if the counter only went forward and wrapped once at most."""
-        return (ticks - self.ticks) % self._modulus * self.tick_ns
+        return (ticks - self.ticks) % self.modulus * self.tick_ns
 
     def missed_since(self, line: CounterLine, ticks: int, arrival_ns: int) -> int | None:
         """Return how many samples are missing since the newest one; None where the counter did not run on to `ticks`.
 
         The message is at `arrival_ns` and not read at once after the newest one: the counter may have turned meanwhile.
         """
-        step_ns, turn_ns, period = self.elapsed_ns(ticks), self._modulus * self.tick_ns, self.period
+        step_ns, turn_ns, period = self.elapsed_ns(ticks), self.modulus * self.tick_ns, self.period
         turns = line.turns(self.even_ns + step_ns, arrival_ns, turn_ns)
         if not period.period_ticks or not line.is_on_time(self.even_ns + step_ns + turns * turn_ns, arrival_ns):
             return None
-        return period.steps_in(step_ns // self.tick_ns + turns * self._modulus) - 1
+        return period.steps_in(step_ns // self.tick_ns + turns * self.modulus) - 1
 
     def advance(self, ticks: int) -> None:
         """Set the next stamp."""
-        step = (ticks - self.ticks) % self._modulus
+        step = (ticks - self.ticks) % self.modulus
         self.ticks = ticks
         tick_ns, period = self.tick_ns, self.period
         self.raw_ns += step * tick_ns
@@ -316,7 +321,7 @@ class DeviceTime:
             self.uneven = False
         if missed:
             self._gap, self.watched = missed, WATCHED
-            if step > self._modulus // 2:
+            if step > self.modulus // 2:
                 self._note_uneven(step)
         if step != period.period_ticks and (step or period.period_ticks < EVERY_TICK):
             off_ns = ((missed + 1) * period.period_ticks - step) * tick_ns
@@ -325,6 +330,16 @@ class DeviceTime:
             if phase_ns != held_ns:
                 self._leave_tick(step, off_ns, phase_ns - held_ns)
         self.even_ns = self.raw_ns + int(self._phase_ns + self._shift_ns)
+
+    def advance_evenly(self, ticks: int, steps: int) -> None:
+        """Set the newest of so many next stamps, each of which is exactly one period on; nothing may be watched."""
+        self.ticks = ticks
+        self.period.add_even_steps(steps)
+        self.missed = 0
+        self._even_for += steps
+        elapsed_ns = steps * int(self.period.period_ticks) * self.tick_ns
+        self.raw_ns += elapsed_ns
+        self.even_ns += elapsed_ns
 
     def _rephase(self) -> None:
         """Note that device time before the newest sample does not show when the samples after it are."""
@@ -347,7 +362,7 @@ class DeviceTime:
 
     def _note_uneven(self, step: int) -> None:
         """Note a step that lost samples do not explain; backward, if that is shorter than half a turn forward."""
-        self._step_ns = (step - self._modulus if step > self._modulus // 2 else step) * self.tick_ns
+        self._step_ns = (step - self.modulus if step > self.modulus // 2 else step) * self.tick_ns
         self.uneven = self.uneven or self._even_for >= EVEN_FOR
         self.watched = WATCHED
         self._even_for = 0
@@ -402,7 +417,7 @@ class DeviceTime:
         """Place the newest sample `periods` after the one before, which was at `before_ns`."""
         period_ns = self.period.period_ticks * self.tick_ns
         if self._step_ns < 0:
-            self.raw_ns -= self._modulus * self.tick_ns
+            self.raw_ns -= self.modulus * self.tick_ns
         self.even_ns = before_ns + round(periods * period_ns)
         self._shift_ns = self.even_ns - self.raw_ns - self._phase_ns
         self.missed, self._gap = periods - 1, 0

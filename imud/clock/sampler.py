@@ -18,7 +18,7 @@ new fit instead of carrying the stamps along.
 Synchronization: none; one thread.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import hypot
 from typing import Final
@@ -26,13 +26,13 @@ from typing import Final
 from imud.clock.arrival_fit import ENOUGH_SPAN_NS, SLOPE_HIGHEST, ArrivalFit
 from imud.clock.arrival_time import ArrivalTime
 from imud.clock.device_time import FIRST_EARLY_NS, JUMP_EARLY_NS, JUMP_LATE_NS, DeviceTime, JumpDetector
+from imud.clock.even_run import RunStart, add_even_run
 from imud.clock.gaps import GAP_PERIODS, CounterLine
 from imud.clock.link_delay import FIRST_SPREAD_NS, LinkDelay
 from imud.clock.stamp_time import StampTime
 from imud.clock.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
-from imud.contracts.lines import Edge
 from imud.contracts.status import ClockStatus
-from imud.contracts.timing import NO_TIME_BITS, Mark, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
+from imud.contracts.timing import NO_TIME_BITS, Mark, SoutTiming, TimeBits, TriggerTiming, UtcReference
 from imud.host_clock import UNSTEERED, SteadyTime
 from imud.sample import T_ERR_MOST, Measurement, Sample, Sync
 from imud.units import NS_PER_S
@@ -150,6 +150,26 @@ class SampleClock:
             m.incli_rad, m.status if own is None else own | (m.status or 0), m.pps_age_ms, edge_seq,
         )  # fmt: skip
 
+    def add_run(
+        self, samples: list[Sample], events: Sequence[object], at: int, t_rx_ns: int, utc_offset_ns: int
+    ) -> int:
+        """Append what `sample` makes of messages of one read from `at` on; return where one is not the usual case."""
+        time, fit, sync = self._time, self._fit, self._fit_sync
+        unusual = time.watched or time.rephased or self._jump.late_reads or self._slew.left_ns
+        if sync is _ARRIVAL or fit is None or unusual or self._aiding is not None:
+            return at
+        before = len(samples)
+        start = RunStart(
+            self._device, self._seq, self._t_ns, max(t_rx_ns, self._t_rx_ns), utc_offset_ns, self._delay.byte_ns or 1,
+            self.waited_ns, self._fit_bias_ns, self._fit_error_ns, sync, self._own_status,
+        )  # fmt: skip
+        error_ns = add_even_run(samples, events, at, start, time, fit, self._host)
+        if len(samples) > before:
+            newest = samples[-1]
+            self._seq, self._t_ns, self._t_rx_ns = newest.seq, newest.t_ns, newest.t_rx_ns
+            self._t_err_ns, self._error_ns, self.missed = newest.t_err_ns, error_ns, 0
+        return at + len(samples) - before
+
     def sample_polled(
         self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int, edge_seq: int | None = None
     ) -> Sample:
@@ -172,26 +192,17 @@ class SampleClock:
 
     # --- aiding sources ------------------------------------------------------------------------------------------
 
-    def on_sout_edges(self, edges: Sequence[Edge]) -> None:
-        """Add edges of SOUT, rising and falling."""
-        self._aided().on_sout_edges(edges)
-
-    def on_divided_edges(self, edges: Sequence[Edge]) -> None:
-        """Add edges of SOUT_DIV; `take_marks` returns which samples they belong to."""
-        self._aided().on_divided_edges(edges)
-
-    def on_trigger_stamps(self, stamps: Iterable[TriggerStamp]) -> None:
-        """Add triggers that the host gave on SIN, each answered by one message."""
-        self._aided().on_trigger_stamps(stamps)
-
-    def on_pps_edges(self, edges: Sequence[Edge]) -> None:
-        """Add edges of the pulse per second that the device's SIN gets; for messages with `pps_age_ms`."""
-        self._aided().on_pps_edges(edges)
+    @property
+    def aiding(self) -> AidingSources:
+        """Where edges and triggers are added, right before the messages that follow them; made on first use."""
+        if self._aiding is None:
+            self._aiding = self._make_aiding()
+        return self._aiding
 
     def set_utc_reference(self, reference: UtcReference | None) -> None:
         """Set the host's estimate of UTC, or None. A device on UTC is recognised by it."""
         if reference is not None or self._aiding is not None:
-            self._aided().set_utc_reference(reference)
+            self.aiding.set_utc_reference(reference)
 
     @property
     def utc_reference(self) -> UtcReference | None:
@@ -207,11 +218,6 @@ class SampleClock:
         marks = self._aiding.marks if self._aiding is not None else None
         return marks.take_marks() if marks is not None else []
 
-    def _aided(self) -> AidingSources:
-        if self._aiding is None:
-            self._aiding = self._make_aiding()
-        return self._aiding
-
     # --- state ---------------------------------------------------------------------------------------------------
 
     @property
@@ -225,11 +231,8 @@ class SampleClock:
     def status(self) -> ClockStatus:
         """Return the state of the estimate at the newest sample."""
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
-        aiding, reference = self._aiding, self.utc_reference
-        sout, sin = (aiding.sout, aiding.sin) if aiding else (None, None)
-        first = sout or sin
-        return ClockStatus(
-            sync=self._sync if aiding else self._fit_sync,
+        status = ClockStatus(
+            sync=self._sync if self._aiding else self._fit_sync,
             offset_ns=self._t_ns - self._time.raw_ns if self._known else 0,
             skew_ppm=(1 / fit.slope - 1) * 1e6 if fit else 0.0,
             steering_ppm=self._host.rate * 1e6,
@@ -237,12 +240,8 @@ class SampleClock:
             t_err_ns=self._t_err_ns,
             resets=self._resets + self._arrivals.resets,
             hold_ns=self._delay.hold_ns,
-            edges=first.pairing.events if first else 0,
-            edges_unpaired=sout.pairing.events_unpaired if sout else 0,
-            samples_unpaired=first.pairing.samples_unpaired if first else 0,
-            triggers_missed=sin.pairing.events_unpaired if sin else 0,
-            reference_error_ns=reference.error_ns if reference else 0,
         )
+        return self._aiding.add_status(status) if self._aiding else status
 
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
         """Begin a new fit for another baud rate or port. `t_ns` goes on rising."""

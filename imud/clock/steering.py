@@ -17,9 +17,12 @@ from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import Final
 
+import msgspec
+
 from imud.clock.device_utc import DeviceUtc, PpsAge
 from imud.clock.edge_pairing import EdgePairing, EdgeStamp, MarkPairing, PulseDecoder, rising_edges
 from imud.contracts.lines import Edge
+from imud.contracts.status import ClockStatus
 from imud.contracts.timing import SIN_DELAY_US, SoutTiming, TimeBits, TriggerStamp, TriggerTiming, UtcReference
 from imud.host_clock import SteadyTime
 from imud.sample import Measurement, Sync
@@ -189,6 +192,19 @@ class AidingSources:
         self.edge_seq: int | None = None
         """Number of the event of the newest sample; None where it has none."""
 
+    def add_status(self, status: ClockStatus) -> ClockStatus:
+        """Return the state of a clock with that of its aiding sources."""
+        sout, sin, reference = self.sout, self.sin, self.utc_reference
+        first = sout or sin
+        return msgspec.structs.replace(
+            status,
+            edges=first.pairing.events if first else 0,
+            edges_unpaired=sout.pairing.events_unpaired if sout else 0,
+            samples_unpaired=first.pairing.samples_unpaired if first else 0,
+            triggers_missed=sin.pairing.events_unpaired if sin else 0,
+            reference_error_ns=reference.error_ns if reference else 0,
+        )
+
     def on_sout_edges(self, edges: Sequence[Edge]) -> None:
         """Add edges of SOUT, rising and falling."""
         if self.sout is None:
@@ -202,13 +218,13 @@ class AidingSources:
         self.sout.pairing.add_events([(steady_ns(t_ns), number) for t_ns, number in self._pulses.decode(edges)])
 
     def on_divided_edges(self, edges: Sequence[Edge]) -> None:
-        """Add edges of SOUT_DIV."""
+        """Add edges of SOUT_DIV; `SampleClock.take_marks` returns which samples they belong to."""
         if self.marks is None:
             self.marks = MarkPairing()
         self.marks.add_pulses(rising_edges(edges))
 
     def on_trigger_stamps(self, stamps: Iterable[TriggerStamp]) -> None:
-        """Add triggers on SIN."""
+        """Add triggers that the host gave on SIN, each answered by one message."""
         if self.sin is None:
             timing = self._sin_timing
             pairing = EdgePairing(int(SIN_DELAY_US * NS_PER_US))

@@ -120,7 +120,15 @@ class SamplePath(ABC):
     ) -> None:
         """Pass each event to where it belongs; append samples. `t_begin_ns` is that of `SampleClock.sample`."""
         clock, loss = self.clock, self.loss
-        for event in events:
+        at, count = 0, len(events)
+        while at < count:
+            if t_begin_ns is None and count - at > 1:
+                after = clock.add_run(samples, events, at, t_rx_ns, utc_offset_ns)
+                if after > at:
+                    loss.bad_frames, at = 0, after
+                    continue
+            event = events[at]
+            at += 1
             if type(event) is Measurement:
                 samples.append(clock.sample(event, t_rx_ns, utc_offset_ns, t_begin_ns))
                 if clock.missed:

@@ -144,7 +144,7 @@ def speed_ns(*, edges: bool, count: int = 20_000) -> float:
             spent = 0
         begin = perf_counter_ns()
         if edges:
-            clock.on_sout_edges(read.edges)
+            clock.aiding.on_sout_edges(read.edges)
         for message, t_rx_ns in messages:
             clock.sample(message, t_rx_ns, 0)
         spent += perf_counter_ns() - begin

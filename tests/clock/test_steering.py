@@ -142,7 +142,7 @@ def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
     clock, dated = sout_clock(m), []
     clock.set_utc_reference(REFERENCE)
     for read in simulate_reads(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
-        clock.on_sout_edges(read.edges)
+        clock.aiding.on_sout_edges(read.edges)
         for a in read.arrivals:
             truth_ns = measured_ns(a)
             ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
@@ -214,7 +214,7 @@ def frames_with_bit(clock: SampleClock, *, every: int, knows: bool) -> list[int 
         at = BEGIN_NS + 10 * i * NS_PER_MS
         pulse = i % every == 0
         if pulse:
-            clock.on_sout_edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
+            clock.aiding.on_sout_edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
         m = Measurement(82, 0, 10 * i, status=0x1000 if pulse and knows else 0)
         numbers.append(clock.sample(m, at + 2 * NS_PER_MS, 0).edge_seq)
     return numbers
@@ -270,13 +270,13 @@ def give(clock: SampleClock, what: str, t_ns: int, number: int) -> None:
     """One thing that is no message."""
     edges = [Edge(t_ns, True, 2 * number + 1), Edge(t_ns + 80_000, False, 2 * number + 2)]
     if what == "edges":
-        clock.on_sout_edges(edges)
+        clock.aiding.on_sout_edges(edges)
     elif what == "pulses":
-        clock.on_pps_edges(edges)
+        clock.aiding.on_pps_edges(edges)
     elif what == "divided":
-        clock.on_divided_edges(edges)
+        clock.aiding.on_divided_edges(edges)
     elif what == "triggers":
-        clock.on_trigger_stamps([TriggerStamp(t_ns, 1000, number)])
+        clock.aiding.on_trigger_stamps([TriggerStamp(t_ns, 1000, number)])
     elif what == "reference":
         clock.set_utc_reference(UtcReference(-t_ns % (1000 * NS_PER_MS), 1000))
     elif what == "nothing known":
@@ -289,7 +289,7 @@ def test_divided_pulses_find_their_samples() -> None:
     for i in range(1000):
         at = BEGIN_NS + 10 * i * NS_PER_MS
         if i % 4 == 0:
-            clock.on_divided_edges([Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
+            clock.aiding.on_divided_edges([Edge(at + 3000, True, i + 1), Edge(at + 83_000, False, i + 2)])
         if i % 100 == 48:
             expected.append((i + 1, None))  # its sample is lost
             continue
