@@ -4,10 +4,11 @@ Plan: one `recvmmsg` per wake-up takes all that is there, up to BATCH_FRAMES, in
 allocated but the frames. Python's own `recvmsg` costs two system calls per frame (it asks for the interface's name each
 time) and one more, with an exception, to find the queue empty.
 
-Kernel stamps are CLOCK_REALTIME. They are carried over to CLOCK_MONOTONIC with the offset of the two at the read, and
-held between the last time the queue was seen empty and now: a wall clock that was set between arrival and read cannot
-move a stamp out of that. Both clocks are slewed together: their difference is the same at arrival and read. The kernel
-begins to stamp some ms after the first socket of the machine asks for it; until then it fills in the time of the read.
+Kernel stamps are CLOCK_REALTIME. They are carried over to CLOCK_MONOTONIC with the offset of the two at the read. A
+stamp that is then not between the last time the queue was seen empty and now is of before a step of the wall clock: it
+is carried over with the offset of that last time. Nothing moves a stamp out of these bounds. Both clocks are slewed
+together: their difference is the same at arrival and read. The kernel begins to stamp some ms after the first socket of
+the machine asks for it; until then it fills in the time of the read.
 """
 
 import ctypes
@@ -125,6 +126,8 @@ class FrameReader:
         )
         self._empty_ns = now_ns()
         self._newest_ns = self._empty_ns
+        self._empty_offset_ns = self._clocks()[0]
+        """CLOCK_REALTIME less CLOCK_MONOTONIC when frames were read and none was left."""
         self._lost = False
 
     def read(self) -> list[CanFrame]:
@@ -143,7 +146,7 @@ class FrameReader:
             header_bytes = count * _MESSAGE_BYTES
             self._headers[:header_bytes] = self._fresh_headers[:header_bytes]
         if count < BATCH_FRAMES:
-            self._empty_ns = begun_ns
+            self._empty_ns, self._empty_offset_ns = begun_ns, offset_ns
         return frames
 
     def _rows(self, count: int) -> _Rows:
@@ -164,15 +167,17 @@ class FrameReader:
                     lost |= self._on_error(can_id ^ ERROR_FLAG, data)
                 continue
             t_ns = seconds * NS_PER_S + ns - offset_ns if kind == SO_TIMESTAMPNS_NEW else now_ns
-            if t_ns > newest_ns:  # noqa: PLR1730 - a call costs a twentieth of a frame
-                newest_ns = t_ns
-            if newest_ns > now_ns:  # noqa: PLR1730
-                newest_ns = now_ns
+            newest_ns = t_ns if newest_ns < t_ns <= now_ns else self._bounded(t_ns, offset_ns, newest_ns, now_ns)
             whole = data if size == DATA_BYTES_MAX else data[:size]
             frames.append(_new_frame((can_id & EXTENDED_ID_MAX, can_id >= EXTENDED_FLAG, whole, newest_ns, lost)))
             lost = False
         self._newest_ns, self._lost = newest_ns, lost
         return frames
+
+    def _bounded(self, t_ns: int, offset_ns: int, newest_ns: int, now_ns: int) -> int:
+        """Carry over a stamp that is not after the frame before, or in the future: the wall clock may have been set."""
+        before_ns = t_ns + offset_ns - self._empty_offset_ns
+        return before_ns if newest_ns < before_ns <= now_ns else max(min(t_ns, now_ns), newest_ns)
 
     def _clocks(self) -> tuple[int, int]:
         """CLOCK_REALTIME less CLOCK_MONOTONIC, and CLOCK_MONOTONIC."""

@@ -13,6 +13,9 @@ from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
 
 HOUR_NS = 3600 * 10**9
 LIMIT_S = 5.0
+APART_S = 0.005
+"""Between frames, much more than the error of one reading of both clocks."""
+CLOCKS_NS = 1_000_000
 
 
 class Wire:
@@ -107,14 +110,30 @@ def test_drops_are_counted_and_marked_where_they_were(wire: Wire) -> None:
     assert not wire.reader.read()[0].after_loss
 
 
-@pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
-def test_a_wall_clock_set_between_arrival_and_read_moves_no_stamp_far(wire: Wire, step_ns: int) -> None:
-    empty_ns = time.monotonic_ns()
+@pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS, 0])
+def test_a_wall_clock_set_between_arrival_and_read_moves_no_stamp(wire: Wire, step_ns: int) -> None:
     wire.reader.read()
-    wire.send(1)
+    sent_ns = []
+    for can_id in range(1, 4):
+        time.sleep(APART_S)
+        sent_ns.append(time.monotonic_ns())
+        wire.send(can_id)
     wire.wall_ahead_ns += step_ns
-    (frame,) = wire.reader.read()
-    assert empty_ns <= frame.t_rx_ns <= time.monotonic_ns()
+    frames = wire.reader.read()
+    for frame, from_ns, to_ns in zip(frames, sent_ns, [*sent_ns[1:], time.monotonic_ns()], strict=True):
+        assert from_ns - CLOCKS_NS <= frame.t_rx_ns <= min(to_ns, from_ns + APART_S * 1e9) + CLOCKS_NS
+
+
+def test_frames_of_before_and_after_a_step_of_the_wall_clock_keep_their_order_and_bounds(wire: Wire) -> None:
+    wire.reader.read()
+    wire.wall_ahead_ns += HOUR_NS
+    begin_ns = time.monotonic_ns()
+    wire.send(1)
+    (first,) = wire.reader.read()
+    wire.wall_ahead_ns += HOUR_NS
+    wire.send(2)
+    (second,) = wire.reader.read()
+    assert begin_ns - CLOCKS_NS <= first.t_rx_ns < second.t_rx_ns <= time.monotonic_ns()
 
 
 def test_error_frames_go_their_own_way(wire: Wire) -> None:
