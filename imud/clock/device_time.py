@@ -87,11 +87,12 @@ class PeriodLearner:
 
     __slots__ = (
         "_before", "_candidate", "_count", "_even", "_odd_at", "_on_unknown_gap", "_run", "_run_sum", "_steady", "_sum",
-        "_uneven", "_uneven_sum", "changes", "is_new", "period_ticks",
+        "_uneven", "_uneven_sum", "changes", "is_gap", "is_new", "period_ticks",
     )  # fmt: skip
 
     def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
         self._on_unknown_gap = on_unknown_gap
+        self.is_gap = False  # whether the newest step that was no period was noted as a gap of unknown size
         self.period_ticks = 0.0
         """Mean step; 0 while unknown."""
         self._sum = 0.0
@@ -130,6 +131,10 @@ class PeriodLearner:
         if not period:
             return 0
         return self.steps_in(ticks) - 1
+
+    def restart(self) -> None:
+        """Forget the newest step: the counter began anew, or was not read for a while."""
+        self._run, self.is_gap = 0, False
 
     def add_even_step(self) -> None:
         """Add a step that is exactly the period."""
@@ -186,7 +191,7 @@ class PeriodLearner:
 
     def _learn(self, ticks: int) -> bool:
         """Adopt another period when the last steps agree on it; return whether they do."""
-        self._uneven = self._uneven_sum = 0
+        self._uneven, self._uneven_sum, self.is_gap = 0, 0, False
         if self._run and abs(ticks - self._candidate) <= 1:
             self._run += 1
             self._run_sum += ticks
@@ -194,6 +199,7 @@ class PeriodLearner:
             if self._run and not self.period_ticks:
                 shorter, longer = sorted((ticks, self._candidate))
                 if longer > GAP_FACTOR * shorter + 1:
+                    self.is_gap = True
                     self._on_unknown_gap()
             self._candidate, self._run, self._run_sum = ticks, 1, ticks
             self._note_odd()
@@ -264,8 +270,7 @@ class DeviceTime:
         self.watched = 0
         """Number of further samples whose device time is compared with their arrivals."""
         self.period = PeriodLearner(on_unknown_gap)
-        self.raw_ns = 0
-        """Unwrapped device time as stamped."""
+        self.raw_ns = 0  # unwrapped device time as stamped
         self.even_ns = 0
         """`raw_ns` plus the part of a tick that an even rate reveals; never falls while the clock runs on."""
         self.missed = 0
@@ -274,6 +279,7 @@ class DeviceTime:
     def begin(self, ticks: int) -> None:
         """Set the first stamp of a device, or the first after its clock started anew."""
         self.ticks = ticks
+        self.period.restart()
         self._phase_ns = self._shift_ns = self.doubt_ns = 0.0
         self.missed = self._gap = self.watched = self._even_for = 0
         self.uneven = self.rephased = False

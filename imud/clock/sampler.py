@@ -250,11 +250,10 @@ class SampleClock:
         self._drop_fit()
 
     def restart(self) -> None:
-        """Begin anew after the device or the link was away: the next stamp is no reset.
-
-        What is missing until then is counted if the device's counter ran on; else the gap is one of unknown size.
-        """
+        """Begin anew after the device or the link was away: the next stamp is no reset. What is missing until then is
+        counted if the device's counter ran on; else the gap is one of unknown size."""
         self._known = False
+        self._time.period.restart()
         self._arrivals.restart()
         if self._stamps is not None:
             self._stamps.restart()
@@ -370,7 +369,7 @@ class SampleClock:
 
     def _begin_counter(self, ticks: int, arrival_ns: int, missed: int | None) -> None:
         """Set the first stamp of a counter that began anew, or was not read for a while, `missed` where it is known."""
-        if missed is None and self._seq:
+        if missed is None and self._seq and not self._time.period.is_gap:
             period_ns = self._period_ns()
             if not period_ns or arrival_ns - self._host.steady_ns(self._t_ns) >= GAP_PERIODS * period_ns:
                 self._on_unknown_gap()

@@ -224,6 +224,22 @@ def test_what_the_pace_cannot_show_is_unknown(device: Device) -> None:
     assert unknown or abs(one.finish() - one.missed) <= STALLS
 
 
+@pytest.mark.parametrize("samples", range(1, 9))
+@pytest.mark.parametrize("away_ms", [100, 250, 1500])
+def test_a_restart_before_the_rate_is_known_is_one_gap(samples: int, away_ms: int) -> None:
+    unknown: list[int] = []
+    clock = make_clock(replace(HI91, rate_hz=10), unknown)
+    times_ms = [*range(0, samples * 100, 100), *((samples - 1) * 100 + away_ms + more for more in range(0, 5000, 100))]
+    for number, at_ms in enumerate(times_ms):
+        device_ms = 13_600 + at_ms if number < samples else 100 * (number - samples + 1)
+        sample = clock.sample(Measurement(FRAME_BYTES, 0, device_ms), BEGIN_NS + at_ms * NS_PER_MS, 0)
+        assert clock.missed == 0
+        assert sample.t_ns <= sample.t_rx_ns
+    assert len(unknown) == (1 if samples <= 4 or away_ms > 150 else 0), (
+        "with a rate, a device that was away 100 ms lost none"
+    )
+
+
 def paced(pace: ArrivalPace, begin_ns: int, messages: int, late_ns: int = 0) -> tuple[int, int]:
     """Add messages at 100 Hz; return how many samples they show to be missing, and how many windows were not sure."""
     found = [pace.add_arrival(begin_ns + index * 10 * NS_PER_MS + late_ns) for index in range(messages)]
