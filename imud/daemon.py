@@ -31,6 +31,7 @@ from imud.reload import Reloader
 from imud.runtime.device import Device
 from imud.runtime.device_factory import DeviceFactory
 from imud.runtime.latency.budget import LatencyBudget
+from imud.runtime.recording.tap import DeviceTaps
 from imud.signals.gpio import GPIO_LINES
 from imud.units import NS_PER_S
 
@@ -81,7 +82,8 @@ class Daemon:
         self._latencies = LatencyBudget()
         self._context = PublisherContext(
             self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns, self.ledgers,
-            latencies=self._latencies,
+            latencies=self._latencies, recording=DeviceTaps(self._devices, host), utc_offset_ns=host.utc_offset_ns,
+            raise_event=self._send_event,
         )  # fmt: skip
         self._extra = dict(extra or {})
         self._until_finished = until_finished

@@ -29,6 +29,8 @@ class EventKind(StrEnum):
     """Progress of a guided calibration; `detail` has kind, phase, and what was measured. At most twice a second."""
     ATTITUDE = "attitude"
     """Gravity contradicts the attitude or the mounting at rest; the message says what is likely wrong."""
+    RECORDER = "recorder"
+    """The recorder stopped, for example because the disk is full, went on, or lost records."""
     BAD_FRAME = "bad-frame"
     """A damaged or unknown frame was heard. Sent at most once a second and device."""
 

@@ -2,55 +2,70 @@
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from imud import config
 from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
+from imud.cli.recording.replay import Printer, begins_as_recording, play_recording
 from imud.cli.status import block
 from imud.contracts.can import CanDriver
-from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
 from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ImudError
-from imud.event import Event
+from imud.files import open_regular
+from imud.formats.capture import CaptureReader
 from imud.links import LINKS
 from imud.log import STDERR, log_to
 from imud.runtime import event_loop
 
 SPEEDS = ("recorded", "real", "maximum")
+DRIVER, SPEED, BAUD = "hipnuc-uart", "maximum", 115200
+NO_TIMES = (
+    "not known: the capture has bytes and no time of any read. Rate, skew, residual, error and latency cannot be told, "
+    "and the host times of the samples are made of the baud rate"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud replay`."""
     parser.add_argument(
-        "file", type=Path, metavar="FILE", help="capture, raw or time-stamped; for CAN a log of candump -L"
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="recording of imud, which needs no option; or a capture, raw or time-stamped; for CAN a log of candump -L",
     )
-    parser.add_argument("--driver", default="hipnuc-uart", choices=sorted(DRIVERS), help="default: %(default)s")
-    parser.add_argument("--speed", default="maximum", choices=SPEEDS, help="default: %(default)s")
-    parser.add_argument("--baud", type=int, default=115200, help="rate of a raw capture (default: %(default)s)")
+    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"of a capture (default: {DRIVER})")
+    parser.add_argument("--speed", choices=SPEEDS, help=f"of a capture (default: {SPEED})")
+    parser.add_argument("--baud", type=int, help=f"rate of a raw capture (default: {BAUD})")
     parser.add_argument(
         "--socket", type=Path, metavar="PATH", help="serve the samples on this socket, as the daemon does"
     )
     add_option(parser)
+    parser.add_argument(
+        "--fresh", action="store_true", help="of a recording: begin with empty clocks, not with those of the live run"
+    )
     parser.add_argument("--json", action="store_true", help="print every sample, one JSON object per line")
 
 
 def run(args: argparse.Namespace) -> int:
     """Play the file to its end; the ledger goes to standard error. 1 when there was no sample in it."""
+    if not args.file.is_file():
+        raise ImudError(f"{args.file}: expected a recording or a capture, found none")
     with log_to(STDERR, "warning"):
+        if begins_as_recording(str(args.file)):
+            return play_recording(args)
+        args.driver, args.speed, args.baud = args.driver or DRIVER, args.speed or SPEED, args.baud or BAUD
+        without_times = "" if has_times(args) else NO_TIMES
         status = play(args)
-    print(block(status), file=sys.stderr)
+    print(block(status, without_times), file=sys.stderr)
     return 0 if status.ledger["samples"] else 1
 
 
 def play(args: argparse.Namespace) -> DeviceStatus:
     """Play the file to its end and return the state of its device then. Raises ImudError."""
-    if not args.file.is_file():
-        raise ImudError(f"{args.file}: expected a capture file, found none")
     settings = config.parse(configuration(args), str(args.file))
     check(settings.devices[0])
     printer = Printer(lambda: daemon.stop())  # noqa: PLW0108 - the daemon is made with the printer
@@ -59,6 +74,14 @@ def play(args: argparse.Namespace) -> DeviceStatus:
     if printer.problem is not None:
         raise printer.problem
     return daemon.status()[0]
+
+
+def has_times(args: argparse.Namespace) -> bool:
+    """Whether the file says when its bytes were read: a stamped capture, or a log of a CAN bus."""
+    if isinstance(DRIVERS[args.driver], CanDriver):
+        return True
+    with open_regular(args.file) as file:
+        return CaptureReader(file).stamped
 
 
 def check(device: config.DeviceConfig) -> None:
@@ -98,48 +121,6 @@ def configuration(args: argparse.Namespace) -> str:
         },
     }
     return msgspec.json.encode(tree).decode()
-
-
-class Printer:
-    """A publisher that prints samples as JSON lines, as long as they can be written."""
-
-    def __init__(self, stop: Callable[[], None]) -> None:
-        """`stop` is called at the first line that cannot be written."""
-        self.problem: OSError | None = None
-        """Why lines could not be written; None while they can."""
-        self._stop = stop
-
-    def start(self) -> None:
-        """No-op: there is nothing to open."""
-
-    def add_device(self, name: str, device_id: int) -> None:
-        """No-op: every device is printed."""
-
-    def remove_device(self, name: str) -> None:
-        """No-op: nothing is kept per device."""
-
-    def publish(self, batch: Batch) -> None:
-        """One line per sample."""
-        self._output("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples))
-
-    def event(self, event: Event) -> None:
-        """No-op: events are in the log."""
-
-    def tick(self, now_ns: int) -> None:
-        """No-op: nothing depends on time."""
-
-    def close(self) -> None:
-        """Leave nothing in the buffer."""
-        self._output("", flush=True)
-
-    def _output(self, text: str, *, flush: bool = False) -> None:
-        if self.problem is not None:
-            return
-        try:
-            print(text, end="", flush=flush)
-        except OSError as error:
-            self.problem = error
-            self._stop()
 
 
 REPLAY = CliCommand(add_arguments, run)

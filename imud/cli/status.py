@@ -52,8 +52,9 @@ def page(devices: Sequence[DeviceStatus]) -> str:
     return "\n\n".join(parts)
 
 
-def block(status: DeviceStatus) -> str:
-    """Format the block of one device, in 80 columns."""
+def block(status: DeviceStatus, without_times: str = "") -> str:
+    """Format the block of one device, in 80 columns; `without_times` is why nothing can be told that has to do with
+    time."""
     clock, ledger = status.clock, status.ledger
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
     rows = [
@@ -83,6 +84,8 @@ def block(status: DeviceStatus) -> str:
             f"{status.kernel.overrun} overruns, {status.kernel.framing} framing, {status.kernel.parity} parity",
         ),
     ]
+    if without_times:
+        rows = [("times", without_times), *(row for row in rows if row[0] not in ("rate", "clock", "latency"))]
     if status.frame is not None:
         rows.insert(2, ("axes", axes(status.frame)))
     lines = paragraph(f"{status.name}: ", str(status.state))

@@ -6,9 +6,10 @@ from typing import Any, Final, Protocol
 
 from imud.contracts.action import Actions
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
+from imud.contracts.control.recording import NothingRecorded, RecordingSource
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.settings import Settings
-from imud.contracts.status import ClientStatus, DeviceStatus
+from imud.contracts.status import ClientStatus, DeviceStatus, RecorderStatus
 from imud.errors import CommandError
 from imud.event import Event
 from imud.formats.slot import encode_slots
@@ -174,7 +175,14 @@ class PublisherContext:
     """`ledgers` without the rest of the state, which costs five times as much; None: from `status`."""
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
-
+    recorder_sources: list[Callable[[], RecorderStatus]] = field(default_factory=list)
+    """The same of a recorder."""
+    recording: RecordingSource = field(default_factory=NothingRecorded)
+    """What there is to record."""
+    utc_offset_ns: Callable[[], int] = lambda: 0
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    raise_event: Callable[[Event], None] = lambda _event: None
+    """Sends an event of the daemon itself to all publishers."""
     latencies: Latencies = field(default_factory=NoLatencies)
     """How late samples may be; a publisher asks for what its readers need."""
     rings: dict[str, str] = field(default_factory=dict)

@@ -252,6 +252,25 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     them, or is not known."""
 
 
+class RecorderStatus(msgspec.Struct, frozen=True):
+    """State of the recorder."""
+
+    file: str
+    """Name of the present file; empty while nothing is recorded."""
+    problem: str
+    """Why nothing is recorded, one sentence; empty while it is."""
+    written_bytes: int
+    """Bytes written to files since the start."""
+    records: int
+    """Records in them."""
+    records_dropped: int
+    """Records that had no room because the disk was too slow."""
+    waiting_bytes: int
+    """Records that wait to be written."""
+    files_removed: int
+    """Files removed to keep within the budget."""
+
+
 class ClientStatus(msgspec.Struct, frozen=True):
     """One client of the UNIX socket."""
 

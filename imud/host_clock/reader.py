@@ -51,7 +51,7 @@ class HostClock:
 
     __slots__ = (
         "_asleep_ns", "_boottime_ns", "_due_ns", "_held_ns", "_least_ns", "_most_ns", "_offset_ns", "_raw_ns",
-        "_realtime_ns", "error_ns", "now_ns", "steady", "suspends",
+        "_realtime_ns", "error_ns", "now_ns", "on_measured", "steady", "suspends",
     )  # fmt: skip
 
     def __init__(
@@ -76,6 +76,8 @@ class HostClock:
         self._boottime_ns = boottime_ns or (monotonic_ns if raw_ns else kernel_clock("BOOTTIME"))
         self.suspends = 0
         """Times that the machine was suspended since the first reading, as of the last `utc_offset_ns`."""
+        self.on_measured: Callable[[int, int, int], None] | None = None
+        """Called after each measurement with what was added to `steady`: CLOCK_MONOTONIC, raw, and held raw."""
         self._asleep_ns = self._boottime_ns() - monotonic_ns()
         self._offset_ns = 0
         self._least_ns, self._most_ns = 1, 0  # nothing is between
@@ -99,6 +101,10 @@ class HostClock:
             self._measure()
         return self._offset_ns
 
+    def kept(self) -> tuple[int, int]:
+        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC as last measured, ns, and the suspends."""
+        return self._offset_ns, self.suspends
+
     def _measure(self) -> None:
         now_ns, realtime_ns, raw_ns = self.now_ns, self._realtime_ns, self._raw_ns
         best_ns = best_monotonic_ns = best_realtime_ns = best_raw_ns = 0
@@ -114,10 +120,13 @@ class HostClock:
         if error_ns <= self.error_ns or abs(offset_ns - self._offset_ns) > error_ns + self.error_ns:
             self._offset_ns = offset_ns  # measured better, or CLOCK_REALTIME was stepped
         self.error_ns = error_ns
-        self.steady.add_pair(best_monotonic_ns, best_raw_ns, self._held_ns, error_ns)
+        held_ns = self._held_ns
+        self.steady.add_pair(best_monotonic_ns, best_raw_ns, held_ns, error_ns)
         ahead_ns, tolerance_ns = best_realtime_ns - best_raw_ns, TOLERANCE_NS + best_ns
         self._least_ns, self._most_ns = ahead_ns - tolerance_ns, ahead_ns + tolerance_ns
         self._held_ns, self._due_ns = best_raw_ns, best_raw_ns + KEPT_NS
         asleep_ns = self._boottime_ns() - now_ns()  # not more than the truth, whenever the thread is preempted
         self.suspends += asleep_ns > self._asleep_ns + SUSPENDED_NS
         self._asleep_ns = max(self._asleep_ns, asleep_ns)
+        if self.on_measured is not None:
+            self.on_measured(best_monotonic_ns, best_raw_ns, held_ns)

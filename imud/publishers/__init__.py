@@ -9,5 +9,6 @@ PUBLISHERS: Table[PublisherType] = Table(
         "socket": "imud.publishers.socket.publisher:PUBLISHER",
         "shm": "imud.publishers.shm.publisher:PUBLISHER",
         "metrics": "imud.publishers.metrics.publisher:PUBLISHER",
+        "recorder": "imud.publishers.recorder.publisher:PUBLISHER",
     },
 )

@@ -18,6 +18,7 @@ import msgspec
 from imud.config import DeviceConfig
 from imud.contracts.action import Action, Actions, Risk
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
+from imud.contracts.control.recording import PutRecord
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
@@ -37,6 +38,7 @@ from imud.runtime.latency.budget import Need
 from imud.runtime.meters import LatencyMeter, RateMeter
 from imud.runtime.notices import Notices
 from imud.runtime.path import SamplePath
+from imud.runtime.recording.tap import DeviceTap
 from imud.runtime.settings.backup import SettingsFiles
 from imud.runtime.settings.keeper import SettingsKeeper
 from imud.runtime.transport import UNHEARD_NS, DeviceContext, Transport
@@ -89,10 +91,11 @@ class Device:
         hooks = AttachmentHooks(port, self._on_reset)
         self._attachments = Attachments(config, lines, hooks, self._notices, host)
         self._identity = KnownIdentity(self._notices, host.now_ns, self._on_settings, self._described)
+        self._tap = DeviceTap(config, device_id, self.ledger, host)
         self._transport = make_transport(
             DeviceContext(
                 config, device_id, host, self.ledger, self._notices, self._health, self._identity, self._attachments,
-                publish,
+                publish, self._tap,
             )
         )  # fmt: skip
         self._guide = Guide(self._transport.run_script, self._notices)
@@ -115,6 +118,11 @@ class Device:
     def state(self) -> DeviceState:
         """State now."""
         return self._health.state
+
+    @property
+    def tap(self) -> DeviceTap:
+        """Where a recording hears the device; it begins by `record`."""
+        return self._tap
 
     @property
     def driver_name(self) -> str:
@@ -236,11 +244,19 @@ class Device:
         """Whether nothing may be sent in between: a script runs, or a search sets other rates."""
         return self._transport.busy or not self._transport.receiving
 
+    def record(self, put: PutRecord) -> None:
+        """Describe the device as it is now, and pass on all that it delivers; `tap.end` ends it."""
+        self._tap.begin(
+            put, self._transport.where, identity_words(self._identity.identity), self._identity.shown_settings
+        )
+
     def _on_reset(self) -> None:
         self._transport.on_reset()
 
     def _on_settings(self, settings: Mapping[str, str]) -> None:
         """Compare lines with the settings that were read back."""
+        identity = identity_words(self._identity.identity)
+        self._tap.described(self._transport.where, identity, self._identity.shown_settings)
         driver = self._transport.driver
         read = driver.alarm_ranges if driver is not None else None
         self._attachments.set_alarm_ranges(read(settings) if read is not None else None)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from imud.clock import SampleClock
+from imud.clock.steering import AidingSources
 from imud.config import DeviceConfig
 from imud.contracts.can import CanCodec
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, Message, ReplyFrame, StreamCodec, TextLine
@@ -284,6 +285,19 @@ class CanPath(SamplePath):
         self.codec.reset()
 
 
+class DeviceClock(SampleClock):
+    """A clock whose methods can be replaced on the object itself: a recording hears its calls (`recording.tap`)."""
+
+    heard_aiding: Callable[[AidingSources], AidingSources] | None = None
+    """Returns what stands for the aiding sources while a recording hears their calls; None while none does."""
+
+    @property
+    def aiding(self) -> AidingSources:
+        """Where edges and triggers are added."""
+        made = super().aiding
+        return made if self.heard_aiding is None else self.heard_aiding(made)
+
+
 def make_clock(
     config: DeviceConfig,
     driver: Driver,
@@ -296,7 +310,7 @@ def make_clock(
 ) -> SampleClock:
     """Return the clock of a device that `driver` decodes; it continues the numbers and stamps of the one before."""
     lines = config.lines
-    clock = SampleClock(
+    clock = DeviceClock(
         config.name,
         tick_ns=driver.tick_ns,
         tick_modulus=driver.tick_modulus,

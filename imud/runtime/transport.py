@@ -24,6 +24,7 @@ from imud.runtime.health import Health
 from imud.runtime.identity import KnownIdentity
 from imud.runtime.notices import Notices
 from imud.runtime.path import PathContext, SamplePath, make_clock
+from imud.runtime.recording.tap import DeviceTap
 from imud.units import NS_PER_S
 
 UNHEARD_NS = 2 * NS_PER_S
@@ -45,6 +46,8 @@ class DeviceContext:
     identity: KnownIdentity
     attachments: Attachments
     publish: Callable[[Batch], None]
+    tap: DeviceTap
+    """Where a recording hears what goes into the path; the transport says when it makes another one."""
 
     def path_context(self, driver: Driver, link: Link, on_message: Callable[[Message, int], None]) -> PathContext:
         """Return what the sample path of what `driver` decodes needs; messages of the device go to `on_message`."""

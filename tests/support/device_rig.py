@@ -4,6 +4,7 @@
 """
 
 import asyncio
+import os
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
 from imud.event import Event, EventKind
+from imud.formats.recording.records import records_of
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.links import LINKS
@@ -24,6 +26,8 @@ from imud.links.memory import MemoryCanLink, MemoryLink
 from imud.runtime import event_loop
 from imud.runtime.device import Device
 from imud.runtime.device_factory import DeviceFactory
+from imud.runtime.recording.player import PlayedDevice, Player
+from imud.runtime.recording.tap import HostTap
 from imud.sample import Sample
 from imud.signals.gpio import GPIO_LINES
 from imud.worker import BusThread, StartWorker
@@ -42,6 +46,8 @@ class DeviceRig:
         self.published: list[tuple[int, list[Sample]]] = []
         """Each batch with the time of its publication."""
         self.events: list[Event] = []
+        self.recorded: list[bytes] = []
+        """Records of what it delivered, where `DeviceRigs.recording` says so."""
         self.now_ns = now_ns
         self.device: Device
 
@@ -121,6 +127,11 @@ class DeviceRig:
 class DeviceRigs:
     """Makes devices that share time, buses and lines, and keeps apart what comes out of them."""
 
+    recording = bool(os.environ.get("IMUD_RECORD_RIGS"))
+    """Whether devices are recorded from their begin to their end, and the replay is compared with what came out.
+
+    `IMUD_RECORD_RIGS=1 pytest tests/runtime tests/signals` does that in every test with rigs."""
+
     def __init__(
         self,
         host: HostClock | None = None,
@@ -132,6 +143,7 @@ class DeviceRigs:
     ) -> None:
         """Time, lines and workers are the real ones unless given; `configured` are all devices of the file."""
         self.host = host or HostClock()
+        self._host_tap = HostTap(self.host)
         self.rigs: dict[str, DeviceRig] = {}
         self.factory = DeviceFactory(
             self._publish,
@@ -153,7 +165,14 @@ class DeviceRigs:
             factory = self.factory
             transport = factory.on_stream(link) if isinstance(link, MemoryLink) else factory.on_can(link)
             rig.device = factory.make_on(config, number, transport)
+        if self.recording:
+            self.record(rig)
         return rig
+
+    def record(self, rig: DeviceRig) -> None:
+        """Record what a device delivers from now on; again for one that is recorded: describe it as it is now."""
+        self._host_tap.begin(rig.recorded.append)
+        rig.device.record(rig.recorded.append)
 
     @asynccontextmanager
     async def at_work(self) -> AsyncIterator[list[DeviceRig]]:
@@ -174,6 +193,9 @@ class DeviceRigs:
         assert all(one is None or isinstance(one, asyncio.CancelledError) for one in ended), ended
         assert not mistakes, mistakes
         assert all(rig.ledger.closes() for rig in rigs), [rig.ledger.snapshot() for rig in rigs]
+        if self.recording:
+            for rig in rigs:
+                check_replay(rig)
 
     def _publish(self, batch: Batch) -> None:
         rig = self.rigs[batch.device]
@@ -184,6 +206,20 @@ class DeviceRigs:
 
     def _send_event(self, event: Event) -> None:
         self.rigs[event.device].events.append(event)
+
+
+def check_replay(rig: DeviceRig) -> PlayedDevice:
+    """Replay what was recorded of a device, and compare samples and ledger with those of the run."""
+    rig.device.tap.check(rig.recorded.append)
+    samples: list[Sample] = []
+    player = Player(lambda batch: samples.extend(batch.samples))
+    player.play(record for one in rig.recorded for record in records_of(one))
+    (played,) = player.devices.values()
+    assert not played.fresh_starts
+    assert samples == rig.samples
+    assert played.ledger.snapshot() == rig.ledger.snapshot()
+    assert not played.differences
+    return played
 
 
 def device_config(name: str, driver: str, link: str, settings: dict[str, Any], **options: Any) -> DeviceConfig:

@@ -17,7 +17,7 @@ from prometheus_client.core import (
     Metric,
 )
 
-from imud.contracts.status import ClientStatus, DeviceStatus
+from imud.contracts.status import ClientStatus, DeviceStatus, RecorderStatus
 from imud.publishers.metrics.rings import RingView
 from imud.units import NS_PER_S, PPM_PER_ONE
 
@@ -44,6 +44,8 @@ class Snapshot:
     """Path of the ring by device; empty where there is none though there should be."""
     views: Mapping[str, RingView] = field(default_factory=dict)
     """What was found in these rings."""
+    recorders: Sequence[RecorderStatus] = ()
+    """One while there is a recorder."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from imud.event import Event
 from imud.log import messages_dropped
 from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
+from imud.publishers.metrics.recorder import RECORDER_FAMILIES
 from imud.publishers.metrics.rings import RingReader
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.units import NS_PER_S
@@ -120,7 +121,7 @@ class DaemonCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics of the snapshot, with pauses while they are rendered."""
-        for family in FAMILIES:
+        for family in (*FAMILIES, *(RECORDER_FAMILIES if self._snapshot.recorders else ())):
             metric = family.metric(self._snapshot)
             metric.samples = _PausingList(metric.samples, self._pause)
             yield metric
@@ -263,6 +264,7 @@ class MetricsPublisher:
                     context.now_ns() - self._tick_ns,
                     messages_dropped(),
                     rings=dict.fromkeys(context.without_ring, "") | context.rings,
+                    recorders=tuple(status() for status in context.recorder_sources),
                 )
             )
 

@@ -23,6 +23,7 @@ from imud.runtime.detection.rounds import EVERYTHING, CanRound
 from imud.runtime.exchange import Exchange
 from imud.runtime.identity import IDENTIFY_TRIES
 from imud.runtime.path import CanPath, SamplePath
+from imud.runtime.recording.tap import PathParts
 from imud.runtime.search_loop import SearchLoop
 from imud.runtime.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext
 from imud.units import NS_PER_S
@@ -138,6 +139,7 @@ class CanTransport:
         self._options = options
         self._codec = driver.make_codec(context.ledger, options)
         self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self._exchange.on_message))
+        context.tap.path_made(PathParts(self.path, driver.name, options))
 
     def _begin(self) -> None:
         """Give frames that come from now on to the device's codec."""
@@ -214,6 +216,7 @@ class CanTransport:
     def _apply(self, identity: Identity) -> None:
         if self.driver is not None and self._codec is not None:
             self.driver.apply_identity(self._codec, identity)
+            self._context.tap.codec_changed()
 
     def _follow(self, options: Settings) -> None:
         """Follow a script that has given the device another number: filters, codec, and what other devices know."""

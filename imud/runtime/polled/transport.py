@@ -31,6 +31,7 @@ from imud.runtime.polled.bus import BusMember, PolledBuses
 from imud.runtime.polled.data_ready import DataReady
 from imud.runtime.polled.path import PolledPath, PollTiming
 from imud.runtime.polled.schedule import Deadlines
+from imud.runtime.recording.tap import PathParts
 from imud.runtime.transport import UNHEARD_NS, DeviceContext
 from imud.units import NS_PER_MS, NS_PER_S
 
@@ -193,6 +194,7 @@ class PolledTransport:
         )
         self.driver = driver
         self.path = PolledPath(codec, timing, clock, context.path_context(driver, self.link, _ignore_message))
+        context.tap.path_made(PathParts(self.path, driver.name, device.options, timing.period_ns, timing.edges))
         return self.path
 
     def _candidates(self) -> list[PolledDriver]:

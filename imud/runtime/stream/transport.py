@@ -22,6 +22,7 @@ from imud.runtime.exchange import Exchange
 from imud.runtime.identity import IDENTIFY_AGAIN_S, IDENTIFY_TRIES
 from imud.runtime.latency.stream_hold import StreamHold
 from imud.runtime.path import SamplePath, StreamPath
+from imud.runtime.recording.tap import PathParts
 from imud.runtime.search_loop import SearchLoop
 from imud.runtime.transport import SILENT_SEARCH_NS, UNHEARD_NS, DeviceContext
 from imud.units import NS_PER_S, uart_byte_ns
@@ -132,10 +133,12 @@ class StreamTransport:
     def _new_path(self, driver: StreamDriver) -> StreamPath:
         context = self._context
         clock = context.new_clock(driver, self.path)
-        codec = driver.make_codec(self._ledger, self._config.options or driver.settings())
+        options = self._config.options or driver.settings()
+        codec = driver.make_codec(self._ledger, options)
         path_context = context.path_context(driver, self.link, self._exchange.on_message)
         self.driver = driver
         self.path = StreamPath(codec, clock, path_context, context.attachments.drain_edges, self._exchange)
+        context.tap.path_made(PathParts(self.path, driver.name, options))
         return self.path
 
     def _remember(self) -> None:
@@ -220,6 +223,7 @@ class StreamTransport:
     def _apply(self, identity: Identity) -> None:
         if self.driver is not None and self.path is not None:
             self.driver.apply_identity(self.path.codec, identity)
+            self._context.tap.codec_changed()
 
     def _send(self, data: bytes) -> None:
         """Send a request at the rate of the device. Raises CommandError while a search sets other rates, LinkError."""

@@ -10,7 +10,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families as parse_text
 
 import imud
-from imud.contracts.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState
+from imud.contracts.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState, RecorderStatus
 from imud.event import EventKind
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers.metrics.families import FAMILIES, LINE_FAMILIES, POLLING_FAMILIES, TIME_FAMILIES
@@ -386,7 +386,8 @@ def test_rendering_pauses_often() -> None:
 
 def shown_names() -> set[str]:
     """Names of all families as they stand after `# HELP`."""
-    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1)
+    recorder = RecorderStatus("a", "", 1, 2, 3, 4, 5)
+    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,))
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))
 

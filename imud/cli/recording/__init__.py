@@ -1,0 +1,1 @@
+"""Commands on recordings: their replay, and what is in them."""

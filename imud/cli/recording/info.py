@@ -1,0 +1,199 @@
+"""`imud info`: what is in a recording, and whether it is whole. Nothing is decoded: it is read as fast as the disk."""
+
+import argparse
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from imud.cli.arguments import CliCommand
+from imud.cli.output import paragraph
+from imud.errors import ImudError
+from imud.files import open_regular
+from imud.formats.recording import records
+from imud.formats.recording.file import RecordingReader
+from imud.formats.recording.records import (
+    CheckRecord,
+    DeviceRecord,
+    EndRecord,
+    Kind,
+    PathRecord,
+    Record,
+    SessionRecord,
+    decode_object,
+)
+from imud.ledger import lost
+from imud.units import NS_PER_S
+
+INPUTS: Final = (Kind.DATA, Kind.FRAMES, Kind.READINGS)
+
+
+@dataclass
+class DeviceContents:
+    """What a recording has of one device."""
+
+    name: str = ""
+    where: str = ""
+    driver: str = ""
+    identity: dict[str, str] = field(default_factory=dict)
+    reads: int = 0
+    """Records of data: reads of a port, or groups of frames or transfers that were read together."""
+    input_bytes: int = 0
+    edges: int = 0
+    events: int = 0
+    first: CheckRecord | None = None
+    last: CheckRecord | None = None
+
+    @property
+    def samples(self) -> int:
+        """Samples between the first check and the last."""
+        return self.last.seq - self.first.seq if self.first is not None and self.last is not None else 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second between them; 0 for not known."""
+        if self.first is None or self.last is None or self.last.t_ns <= self.first.t_ns:
+            return 0.0
+        return self.samples * NS_PER_S / (self.last.t_ns - self.first.t_ns)
+
+    @property
+    def lost(self) -> int:
+        """Samples lost between them, by every cause."""
+        if self.first is None or self.last is None:
+            return 0
+        return lost(self.last.ledger) - lost(self.first.ledger)
+
+
+class Contents:
+    """What a recording has."""
+
+    def __init__(self) -> None:
+        self.session: SessionRecord | None = None
+        self.end: EndRecord | None = None
+        self.devices: dict[int, DeviceContents] = {}
+        self.dropped = 0
+        """Records that the recorder dropped."""
+        self.newest_ns = 0
+
+    def add(self, record: Record) -> None:
+        """Look at one record. Raises ImudError for one that cannot be what a recorder wrote."""
+        device = self.devices.setdefault(record.device, DeviceContents())
+        if record.kind in INPUTS:
+            device.reads += 1
+            device.input_bytes += len(record.body)
+        elif record.kind == Kind.EDGES:
+            device.edges += len(records.decode_edges(record.body).edges)
+        elif record.kind == Kind.EVENT:
+            device.events += 1
+        elif record.kind == Kind.LOST:
+            self.dropped += records.decode_lost(record.body).records
+        elif record.kind == Kind.CLOCKS:
+            self.newest_ns = records.decode_clocks(record.body).monotonic_ns
+        else:
+            self._add_object(record, device)
+
+    def _add_object(self, record: Record, device: DeviceContents) -> None:
+        if record.kind == Kind.SESSION:
+            self.session = decode_object(record, SessionRecord)
+        elif record.kind == Kind.END:
+            self.end = decode_object(record, EndRecord)
+            self.newest_ns = self.end.t_ns if self.end is not None else 0
+        elif record.kind == Kind.DEVICE:
+            described = decode_object(record, DeviceRecord)
+            device.name, device.where, device.identity = described.name, described.where, described.identity
+            device.driver = device.driver or described.driver
+        elif record.kind == Kind.PATH:
+            device.driver = decode_object(record, PathRecord).driver
+        elif record.kind == Kind.CHECK:
+            device.last = decode_object(record, CheckRecord)
+            device.first = device.first or device.last
+
+    @property
+    def duration_s(self) -> float:
+        """From the begin to the newest record with a time; 0 for not known."""
+        begun_ns = self.session.t_ns if self.session is not None else 0
+        return max(0, self.newest_ns - begun_ns) / NS_PER_S if begun_ns else 0.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud info`."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="recording")
+    parser.add_argument("--json", action="store_true", help="one JSON object")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what is in the file; 1 where something of it is damaged, missing or was dropped."""
+    contents = Contents()
+    try:
+        with open_regular(args.file) as file:
+            reader = RecordingReader(file, str(args.file))
+            for record in reader:
+                contents.add(record)
+    except OSError as error:
+        raise ImudError(f"{args.file}: {error.strerror}") from error
+    told = summary(contents, reader)
+    print(msgspec.json.encode(told).decode() if args.json else page(told))
+    return 1 if told["damage"] or told["records_dropped"] else 0
+
+
+def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
+    """What is printed, as JSON has it."""
+    session, found = contents.session, reader.blocks
+    return {
+        "begun_utc_ns": session.utc_ns if session is not None else None,
+        "imud": session.imud if session is not None else "",
+        "host": session.host if session is not None else "",
+        "file_number": session.number if session is not None else None,
+        "duration_s": contents.duration_s,
+        "stored_bytes": reader.stored_bytes,
+        "plain_bytes": reader.plain_bytes,
+        "blocks": reader.blocks_read,
+        "damage": bool(found.bytes_bad or found.blocks_missing or reader.records_unreadable),
+        "problems": reader.problems,
+        "records_dropped": contents.dropped,
+        "devices": [
+            {
+                "name": one.name, "driver": one.driver, "link": one.where, "identity": one.identity,
+                "samples": one.samples, "rate_hz": one.rate_hz, "lost": one.lost, "reads": one.reads,
+                "input_bytes": one.input_bytes, "edges": one.edges, "events": one.events,
+            }
+            for one in contents.devices.values() if one.name
+        ],
+    }  # fmt: skip
+
+
+def page(told: dict[str, Any]) -> str:
+    """Format it for people, in 80 columns."""
+    begun = "not known"
+    if told["begun_utc_ns"] is not None:
+        begun = f"{datetime.fromtimestamp(told['begun_utc_ns'] // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    stored, plain = told["stored_bytes"], told["plain_bytes"]
+    samples = sum(device["samples"] for device in told["devices"])
+    size = f"{stored} bytes in {told['blocks']} blocks, {plain} unpacked"
+    if samples:
+        size += f"; {stored / samples:.1f} bytes per sample"
+    dropped = f"{told['records_dropped']} records were dropped, the disk was too slow"
+    rows = [
+        ("begun", f"{begun}, by imud {told['imud']} on {told['host']}, file {told['file_number']}"),
+        ("duration", f"{told['duration_s']:.1f} s"),
+        ("size", size),
+        ("dropped", dropped if told["records_dropped"] else "nothing"),
+        ("integrity", "; ".join(told["problems"]) or "whole"),
+    ]
+    lines = [line for name, text in rows for line in paragraph(f"{name:<11}", text)]
+    for device in told["devices"]:
+        identity = ", ".join(f"{name} {value}" for name, value in device["identity"].items()) or "not known"
+        lines += ["", *paragraph(f"{device['name']}: ", f"{device['link']}, driver {device['driver']}")]
+        parts = [
+            ("identity", identity),
+            ("samples", f"{device['samples']}, {device['rate_hz']:.1f} Hz; lost {device['lost']}"),
+            ("input", f"{device['input_bytes']} bytes in {device['reads']} records; {device['edges']} edges of lines"),
+            ("events", str(device["events"])),
+        ]
+        lines += [line for name, text in parts for line in paragraph(f"  {name:<9}", text)]
+    return "\n".join(lines)
+
+
+INFO = CliCommand(add_arguments, run)

@@ -1,0 +1,72 @@
+"""The directory of recordings: names of files, and the oldest removed so that all of them keep within a budget."""
+
+import os
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from imud.units import NS_PER_S
+
+SUFFIX: Final = ".imudrec"
+NAME: Final = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{6}\.imudrec")
+"""Files that the recorder makes, and only such are ever removed."""
+FILES_MAX: Final = 100_000
+"""Files looked at in one directory."""
+
+
+class RecordingFile(NamedTuple):
+    """A file of the directory."""
+
+    name: str
+    size: int
+
+
+class RecordingDirectory:
+    """The directory. Synchronization: one thread."""
+
+    def __init__(self, path: Path, keep_bytes: int) -> None:
+        self.path = path
+        self.removed = 0
+        """Files removed for the budget since the start."""
+        self._keep_bytes = keep_bytes
+
+    def make(self) -> None:
+        """Make the directory where it is missing. Raises OSError."""
+        self.path.mkdir(mode=0o750, parents=True, exist_ok=True)
+
+    def new_file(self, utc_ns: int, epoch: int, number: int) -> Path:
+        """Return the path of the next file: names sort by time, those of one run of the daemon go together."""
+        begun = datetime.fromtimestamp(utc_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
+        return self.path / f"{begun}-{epoch & 0xFFFF_FFFF:08x}-{number:06d}{SUFFIX}"
+
+    def files(self) -> list[RecordingFile]:
+        """Return the recordings in the directory, oldest first. Raises OSError."""
+        found = []
+        with os.scandir(self.path) as entries:
+            for entry in entries:
+                if NAME.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                    with suppress(FileNotFoundError):
+                        found.append(RecordingFile(entry.name, entry.stat(follow_symlinks=False).st_size))
+                if len(found) >= FILES_MAX:
+                    break
+        return sorted(found)
+
+    def make_room(self, reserve_bytes: int, present: str) -> Sequence[str]:
+        """Remove the oldest files but the present one, until the rest and `reserve_bytes` more are within the budget.
+
+        Returns their names. Raises OSError.
+        """
+        files = self.files()
+        total, removed = sum(file.size for file in files), list[str]()
+        for file in files:
+            if total + reserve_bytes <= self._keep_bytes:
+                break
+            if file.name != present:
+                (self.path / file.name).unlink(missing_ok=True)
+                total -= file.size
+                removed.append(file.name)
+        self.removed += len(removed)
+        return removed

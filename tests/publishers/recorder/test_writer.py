@@ -1,0 +1,128 @@
+"""The queue and the thread of the recorder: bounded, in order, whole blocks whatever the disk does."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from imud.formats.recording import records
+from imud.formats.recording.file import RecordingReader
+from imud.publishers.recorder.writer import RING_BYTES, SYNC_NS, RecordingWriter, RecordQueue
+from tests.support.event_loops import VirtualClock
+from tests.support.signal_bench import HandWorker
+
+
+class WriterBench:
+    """A queue and its thread, whose rounds the test calls."""
+
+    def __init__(self, bytes_max: int = 1 << 24) -> None:
+        self.clock = VirtualClock()
+        self.queue = RecordQueue(bytes_max)
+        self.workers: list[HandWorker] = []
+        self.writer = RecordingWriter(self.queue, self.clock.now_ns, self._start)
+
+    def _start(self, *args: object) -> HandWorker:
+        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # as StartWorker
+        return self.workers[-1]
+
+    def work(self) -> None:
+        self.workers[0].work()
+
+
+def record(number: int, size: int = 20) -> bytes:
+    return records.encode_data(0, number.to_bytes(4, "little") * (size // 4), number, -1)
+
+
+def read(path: Path) -> list[bytes]:
+    with path.open("rb") as file:
+        return [
+            records.encode(records.Kind(one.kind), one.device, one.body) for one in RecordingReader(file, path.name)
+        ]
+
+
+def test_records_are_in_the_file_after_a_round_each_in_its_own(tmp_path: Path) -> None:
+    bench = WriterBench()
+    first, second = tmp_path / "1", tmp_path / "2"
+    bench.queue.begin_file(first)
+    for number in range(5):
+        bench.queue.put(record(number))
+    bench.work()
+    assert read(first) == [record(number) for number in range(5)]
+    bench.queue.put(record(5))
+    bench.queue.begin_file(second)
+    bench.queue.put(record(6))
+    bench.work()
+    assert read(first) == [record(number) for number in range(6)]
+    assert read(second) == [record(6)]
+    assert bench.writer.written_bytes == first.stat().st_size + second.stat().st_size
+    assert bench.writer.records == 7
+    bench.writer.close()
+
+
+def test_the_thread_is_woken_for_a_full_block() -> None:
+    bench = WriterBench()
+    size = len(record(0, 1000))
+    for number in range(RING_BYTES // size + 1):
+        bench.queue.put(record(number, 1000))
+    assert bench.workers[0].rung == 1
+
+
+def test_what_has_no_room_is_dropped_and_counted(tmp_path: Path) -> None:
+    bench = WriterBench(bytes_max=4 * len(record(0)))
+    bench.queue.begin_file(tmp_path / "1")
+    for number in range(10):
+        bench.queue.put(record(number))
+    assert (bench.queue.dropped, bench.queue.dropped_bytes) == (6, 6 * len(record(0)))
+    assert not bench.queue.is_easy
+    bench.work()
+    assert bench.queue.is_easy
+    assert read(tmp_path / "1") == [record(number) for number in range(4)]
+    bench.writer.close()
+
+
+def test_a_full_disk_leaves_whole_blocks_and_ends_the_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, write = WriterBench(), os.write
+    bench.queue.begin_file(tmp_path / "1")
+    bench.queue.put(record(0))
+    bench.work()
+    whole = (tmp_path / "1").stat().st_size
+    monkeypatch.setattr(os, "write", lambda descriptor, data: write(descriptor, data[:10]))
+    bench.queue.put(record(1))
+    bench.work()
+    assert bench.writer.problem == os.strerror(errno.ENOSPC)
+    assert (tmp_path / "1").stat().st_size == whole
+    monkeypatch.undo()
+    bench.queue.put(record(2))
+    bench.work()
+    assert read(tmp_path / "1") == [record(0)]
+    assert bench.queue.waiting_bytes == 0
+    bench.queue.begin_file(tmp_path / "2")
+    bench.queue.put(record(3))
+    bench.work()
+    assert bench.writer.problem == ""
+    assert read(tmp_path / "2") == [record(3)]
+    bench.writer.close()
+
+
+def test_a_file_that_is_there_already_is_not_overwritten(tmp_path: Path) -> None:
+    bench = WriterBench()
+    (tmp_path / "1").write_bytes(b"mine")
+    bench.queue.begin_file(tmp_path / "1")
+    bench.queue.put(record(0))
+    bench.work()
+    assert bench.writer.problem == os.strerror(errno.EEXIST)
+    assert (tmp_path / "1").read_bytes() == b"mine"
+
+
+def test_the_file_is_synced_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, synced = WriterBench(), list[int]()
+    monkeypatch.setattr(os, "fdatasync", synced.append)
+    bench.queue.begin_file(tmp_path / "1")
+    for number in range(12):
+        bench.clock.advance(SYNC_NS // 4)
+        bench.queue.put(record(number))
+        bench.work()
+    assert len(synced) == 3
+    bench.writer.close()
+    assert len(synced) == 4

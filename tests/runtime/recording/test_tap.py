@@ -1,0 +1,103 @@
+"""Taps: nothing is different on path and clock while nobody listens, and everything is heard while somebody does."""
+
+from imud.config import DeviceConfig
+from imud.contracts.settings import NoSettings
+from imud.devices.hipnuc.uart.driver import DRIVER
+from imud.formats.recording.records import Kind, records_of
+from imud.ledger import Ledger
+from imud.runtime.path import PathContext, StreamPath, make_clock
+from imud.runtime.recording.tap import DeviceTap, HostTap, PathParts
+from tests.support.event_loops import VirtualClock
+from tests.support.files import hi91
+
+
+class TappedPath:
+    """A path with its tap."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.host = self.clock.host
+        self.ledger = Ledger()
+        config = DeviceConfig("bow", "hipnuc-uart", None, False, "uart", NoSettings())
+        context = PathContext(
+            "bow", 3, self.ledger, lambda _batch: None, lambda _message, _t: None, lambda _frame: None, lambda: 0,
+            self.host,
+        )  # fmt: skip
+        options = DRIVER.settings()
+        self.path = StreamPath(
+            DRIVER.make_codec(self.ledger, options), make_clock(config, DRIVER, None, host=self.host.steady), context
+        )
+        self.tap = DeviceTap(config, 3, self.ledger, self.host)
+        self.tap.path_made(PathParts(self.path, DRIVER.name, options))
+        self.heard: list[bytes] = []
+
+    def begin(self) -> None:
+        self.tap.begin(self.heard.append, "/dev/ttyUSB0", {}, {})
+
+    def kinds(self) -> list[int]:
+        return [record.kind for one in self.heard for record in records_of(one)]
+
+    def replaced(self) -> set[str]:
+        """Names of methods that are replaced on the objects themselves."""
+        path = self.path
+        return {
+            name for one in (path, path.clock, path.loss) for name in vars(one) if callable(getattr(type(one), name, 0))
+        }
+
+
+def test_while_nobody_listens_path_and_clock_are_as_their_classes_have_them() -> None:
+    one = TappedPath()
+    assert one.replaced() == set()
+    one.begin()
+    assert {"on_data", "gather", "restart", "link_changed", "missed"} <= one.replaced()
+    one.tap.end(one.heard.append)
+    assert one.replaced() == set()
+    one.path.on_data(hi91(0), 1)
+    assert one.kinds() == [Kind.DEVICE, Kind.PATH]
+
+
+def test_data_and_calls_are_heard_in_their_order_and_calls_of_calls_once() -> None:
+    one = TappedPath()
+    one.begin()
+    one.path.clock.link_changed(byte_ns=86_806, hold_ns=0)
+    one.path.on_data(hi91(0), 5)
+    one.path.flush(6)
+    assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.CALL, Kind.DATA, Kind.CALL]
+
+
+def test_two_recorders_hear_the_same_and_one_that_leaves_nothing_more() -> None:
+    one, other = TappedPath(), list[bytes]()
+    one.begin()
+    one.tap.begin(other.append, "", {}, {})
+    one.path.on_data(hi91(0), 5)
+    one.tap.end(one.heard.append)
+    one.path.on_data(hi91(10), 6)
+    assert one.heard[-1] == other[-2]
+    assert len(other) == 4
+
+
+def test_another_path_is_described_and_heard() -> None:
+    one = TappedPath()
+    one.begin()
+    before = one.path
+    two = TappedPath()
+    one.tap.path_made(PathParts(two.path, DRIVER.name, None))
+    before.on_data(hi91(0), 5)
+    assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.PATH]
+    two.path.on_data(hi91(0), 6)
+    assert one.kinds()[-1] == Kind.DATA
+
+
+def test_readings_of_the_clocks_are_heard() -> None:
+    clock = VirtualClock()
+    host, heard = clock.host, list[bytes]()
+    tap = HostTap(host)
+    tap.begin(heard.append)
+    assert [record.kind for one in heard for record in records_of(one)] == [Kind.CALL]
+    clock.advance(2_000_000_000)
+    host.utc_offset_ns()
+    assert [record.kind for record in records_of(heard[-1])] == [Kind.CLOCKS]
+    tap.end(heard.append)
+    clock.advance(2_000_000_000)
+    host.utc_offset_ns()
+    assert len(heard) == 2
