@@ -1,9 +1,11 @@
-"""A thread that sleeps from one deadline to the next: for a polled bus, or a trigger line.
+"""A thread that sleeps from one deadline, or edge of a line, to the next: for a polled bus, or a trigger line.
 
 A worker calls a function that returns how long it may sleep; tests call that function themselves, at times they choose
 (`tests/support/virtual_time.py`).
 """
 
+import os
+import select
 import sys
 import threading
 from collections.abc import Callable
@@ -24,6 +26,9 @@ on average, with this 92 to 98 µs; missed deadlines, 0.06 % and less, are not f
 scrape of the metrics (`scrape_server`) keeps samples waiting for 4.1 ms with the usual value and 300 silent clients,
 for 0.65 ms with this."""
 
+SELECT_FDS: Final = 1024
+"""Descriptors that `select` takes are below this (FD_SETSIZE)."""
+
 Round = Callable[[], int]
 """Does what is due, and returns after how many ns it is to be called again; 0 for at once."""
 
@@ -40,8 +45,24 @@ class Worker(Protocol):
         ...
 
 
+class WatchingWorker(Worker, Protocol):
+    """A worker whose sleep descriptors can end as well."""
+
+    def watch(self, fd: int, callback: Callable[[], None]) -> bool:
+        """Have a descriptor that becomes readable end the sleep: `callback` is called where the `Round` is, before it.
+
+        Once for what came since the last call; nothing is read. Returns whether that is possible. From any thread.
+        """
+        ...
+
+    def unwatch(self, fd: int) -> None:
+        """Call nothing for a descriptor, which may be closed already; no-op for one that is not watched."""
+        ...
+
+
 StartWorker = Callable[[str, Round, Callable[[BaseException], None]], Worker]
 """Starts a worker: its name, what it calls, and what is called with an exception, which ends it."""
+StartWatchingWorker = Callable[[str, Round, Callable[[BaseException], None]], WatchingWorker]
 
 
 def share_interpreter() -> None:
@@ -66,12 +87,60 @@ class WakeEvent:
             self._lock.release()
 
 
+class DescriptorWait:
+    """A wait that descriptors can end: each time that something comes, not for as long as it is there (EPOLLET), since
+    another thread reads it. `select` is what has a time-out in µs; that of epoll is in ms.
+    """
+
+    def __init__(self) -> None:
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._epoll = select.epoll()
+        self._epoll.register(self._bell, select.EPOLLIN | select.EPOLLET)
+        self._callbacks: dict[int, Callable[[], None]] = {}
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether `select` takes its descriptor: it does not where a thousand others are open."""
+        return self._epoll.fileno() < SELECT_FDS
+
+    def add(self, fd: int, callback: Callable[[], None]) -> None:
+        """Call `callback` in `wait` when something comes on a descriptor."""
+        self._callbacks[fd] = callback
+        self._epoll.register(fd, select.EPOLLIN | select.EPOLLET)
+
+    def discard(self, fd: int) -> None:
+        """Call nothing for it any more."""
+        if self._callbacks.pop(fd, None) is not None:
+            with suppress(OSError):  # closed, with which the kernel removed it
+                self._epoll.unregister(fd)
+
+    def wait(self, seconds: float) -> None:
+        """Return after so much time, when something came, or when `ring` was called since the last wait."""
+        select.select((self._epoll,), (), (), seconds)
+        for fd, _ in self._epoll.poll(0):
+            callback = self._callbacks.get(fd)
+            if callback is not None:
+                callback()
+
+    def ring(self) -> None:
+        """End the present wait, or the next. From any thread."""
+        os.eventfd_write(self._bell, 1)
+
+    def close(self) -> None:
+        """Release both descriptors."""
+        self._callbacks.clear()
+        self._epoll.close()
+        os.close(self._bell)
+
+
 class BusThread:
-    """A `Worker` that is a thread."""
+    """A `WatchingWorker` that is a thread."""
 
     def __init__(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
         self._work, self._failed = work, failed
         self._wake = WakeEvent()
+        self._descriptors: DescriptorWait | None = None
+        """The wait once a descriptor was watched: it costs twice as much."""
         self._ended = False
         share_interpreter()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -80,21 +149,42 @@ class BusThread:
     def ring(self) -> None:
         """End the present sleep, or skip the next. From any thread."""
         self._wake.ring()
+        if self._descriptors is not None:
+            self._descriptors.ring()
+
+    def watch(self, fd: int, callback: Callable[[], None]) -> bool:
+        """Have a descriptor end the sleep."""
+        descriptors = self._descriptors or DescriptorWait()
+        if not descriptors.is_usable:
+            descriptors.close()
+            return False
+        descriptors.add(fd, callback)
+        self._descriptors = descriptors
+        self._wake.ring()  # the thread may sleep in the other wait
+        return True
+
+    def unwatch(self, fd: int) -> None:
+        """Call nothing for a descriptor."""
+        if self._descriptors is not None:
+            self._descriptors.discard(fd)
 
     def end(self) -> None:
         """Stop after the present transfer; may be called twice."""
         self._ended = True
-        self._wake.ring()
+        self.ring()
         self._thread.join(END_LIMIT_S)
+        descriptors, self._descriptors = self._descriptors, None
+        if descriptors is not None and not self._thread.is_alive():
+            descriptors.close()
 
     def _run(self) -> None:
         _sharpen_timer()
-        work, wait = self._work, self._wake.wait
+        work = self._work
         try:
             while not self._ended:
                 rest_ns = work()
                 if rest_ns > 0 and not self._ended:
-                    wait(rest_ns / NS_PER_S)
+                    (self._descriptors or self._wake).wait(rest_ns / NS_PER_S)
         except BaseException as error:  # noqa: BLE001 - a defect of imud must end the daemon, not just this thread
             self._failed(error)
 

@@ -210,6 +210,10 @@ class InputLine(Protocol):
         """Deliver edges; without `watch` only when `drain` is called. Needs a running loop and an open line."""
         ...
 
+    def fileno(self) -> int:
+        """Return a descriptor on which something comes with each edge; -1 where there is none."""
+        ...
+
     def drain(self) -> None:
         """Deliver at once the edges that the kernel has buffered. Does not block."""
         ...

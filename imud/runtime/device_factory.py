@@ -27,7 +27,7 @@ from imud.runtime.settings.backup import SettingsFiles
 from imud.runtime.stream.transport import StreamTransport
 from imud.runtime.transport import DeviceContext
 from imud.signals.gpio import GPIO_LINES
-from imud.worker import BusThread, StartWorker
+from imud.worker import BusThread, StartWatchingWorker
 
 
 class DeviceFactory:
@@ -41,7 +41,7 @@ class DeviceFactory:
         *,
         state_dir: Path | None = None,
         lines: LineFactory = GPIO_LINES,
-        start_worker: StartWorker = BusThread,
+        start_worker: StartWatchingWorker = BusThread,
         configured: Callable[[], Sequence[DeviceConfig]] = lambda: (),
     ) -> None:
         """Found devices are remembered in `state_dir` (None: not beyond this run); `lines` makes the GPIO lines, and

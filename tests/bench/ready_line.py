@@ -46,6 +46,10 @@ class PipeInput:
         self._on_edges = on_edges
         asyncio.get_running_loop().add_reader(self._fd, self.drain)
 
+    def fileno(self) -> int:
+        """The pipe, on which something comes with each edge."""
+        return self._fd
+
     def drain(self) -> None:
         """Deliver what there is."""
         if self._on_edges is None:

@@ -30,7 +30,7 @@ from imud.runtime.recording.player import PlayedDevice, Player
 from imud.runtime.recording.tap import HostTap
 from imud.sample import Sample
 from imud.signals.gpio import GPIO_LINES
-from imud.worker import BusThread, StartWorker
+from imud.worker import BusThread, StartWatchingWorker
 from tests.support.event_loops import VirtualClock, run_virtually
 
 LIMIT_S = 10.0
@@ -138,7 +138,7 @@ class DeviceRigs:
         *,
         state_dir: Path | None = None,
         lines: LineFactory = GPIO_LINES,
-        start_worker: StartWorker = BusThread,
+        start_worker: StartWatchingWorker = BusThread,
         configured: Sequence[DeviceConfig] = (),
     ) -> None:
         """Time, lines and workers are the real ones unless given; `configured` are all devices of the file."""

@@ -112,6 +112,13 @@ class LoopWorker:
             self._next.cancel()
             self._next = self._loop.call_soon(self._run)
 
+    def watch(self, _fd: int, _callback: Callable[[], None]) -> bool:
+        """There are no descriptors in virtual time."""
+        return False
+
+    def unwatch(self, _fd: int) -> None:
+        """Nothing is watched."""
+
     def end(self) -> None:
         """No more; may be called twice."""
         if self._next is not None:

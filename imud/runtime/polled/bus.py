@@ -20,7 +20,7 @@ from imud.contracts.polling import Poll, Reading, Transfer, TransferScript
 from imud.errors import ImudError, LinkError, TransferError
 from imud.runtime.polled.schedule import Deadlines, RoundRobin, Schedule, Timetable
 from imud.units import NS_PER_S
-from imud.worker import BusThread, StartWorker
+from imud.worker import BusThread, StartWatchingWorker
 
 T = TypeVar("T")
 
@@ -92,6 +92,21 @@ class BusMember:
     def command(self, command: Callback) -> None:
         """Have the bus's thread run a function between two transfers, at once if it sleeps."""
         self._bus.command(command)
+
+    def watch(self, fd: int, callback: Callback) -> bool:
+        """Have the bus's thread call a function when something comes on a descriptor; return whether that is possible.
+
+        It reads nothing of it, and goes on with what is due then.
+        """
+        return fd >= 0 and self._bus.watch(fd, callback)
+
+    def unwatch(self, fd: int) -> None:
+        """Call nothing for a descriptor any more; it may be closed already."""
+        self._bus.unwatch(fd)
+
+    def note(self, command: Callback) -> None:
+        """Have the bus's thread run a function before what it does next, whenever that is."""
+        self._bus.note(command)
 
     def stop(self) -> None:
         """Read no more until `start`; what was read before is still delivered."""
@@ -249,7 +264,7 @@ class PolledBus:
     """A bus and its devices."""
 
     def __init__(
-        self, name: str, loop: asyncio.AbstractEventLoop, now_ns: Callable[[], int], start_worker: StartWorker
+        self, name: str, loop: asyncio.AbstractEventLoop, now_ns: Callable[[], int], start_worker: StartWatchingWorker
     ) -> None:
         self.now_ns = now_ns
         """CLOCK_MONOTONIC."""
@@ -281,8 +296,20 @@ class PolledBus:
 
     def command(self, command: Callback) -> None:
         """Have something done by the thread between two transfers."""
-        self._commands.append(command)
+        self.note(command)
         self._worker.ring()
+
+    def note(self, command: Callback) -> None:
+        """Have something done by the thread before what it does next."""
+        self._commands.append(command)
+
+    def watch(self, fd: int, callback: Callback) -> bool:
+        """Have the thread call a function when something comes on a descriptor."""
+        return self._worker.watch(fd, callback)
+
+    def unwatch(self, fd: int) -> None:
+        """Call nothing for a descriptor any more."""
+        self._worker.unwatch(fd)
 
     def end(self) -> None:
         """Stop the thread after the present transfer and close what is open; may be called twice."""
@@ -370,7 +397,7 @@ class PolledBus:
 class PolledBuses:
     """The buses in use, by name. Synchronization: the loop's thread."""
 
-    def __init__(self, now_ns: Callable[[], int], start_worker: StartWorker = BusThread) -> None:
+    def __init__(self, now_ns: Callable[[], int], start_worker: StartWatchingWorker = BusThread) -> None:
         """`now_ns` reads CLOCK_MONOTONIC; the buses are served by threads unless another worker is given."""
         self.now_ns = now_ns
         self._start_worker = start_worker

@@ -1,9 +1,11 @@
 """The data-ready line of a polled device: an edge triggers a read, and dates what was read.
 
-    edge ──kernel stamp──▶ loop ──ReadySchedule.on_edge──▶ bus's thread: read
-    read ──▶ loop: drain, ReadyEdges.match ──▶ clock
+    edge ──▶ bus's thread: ReadySchedule.noticed, read ──▶ loop: drain, ReadyEdges.match ──▶ clock
+      └─kernel stamp──▶ loop ──ReadySchedule.on_edges──▶ bus's thread: read, or how late the read was
 
-The edges up to the end of a read are drained from the kernel before one of them is assigned to the read.
+The bus's thread waits for the line itself, so that a loop that is busy does not delay a read. It takes nothing from the
+line: what the loop has taken before, the loop tells it, as all edges of a line without a descriptor. The edges up to
+the end of a read are drained from the kernel before one of them is assigned to the read.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,11 +43,13 @@ class DataReady:
         self._notices = notices
         self._now_ns = now_ns
         line = lines.make_input(_rising(settings), f"{device} data_ready", True)
-        self._watched = WatchedLine(line, self._on_edges, _ignore, self._report, now_ns)
+        self._watched = WatchedLine(line, self._on_edges, self._on_level, self._report, now_ns)
         self.edges = ReadyEdges(settings, round(NS_PER_S / rate_hz))
         """The edges, for the path that dates reads by them."""
         self._member: BusMember | None = None
         self._schedule: ReadySchedule | None = None
+        self._watched_fd = -1
+        """The line's descriptor while the bus's thread waits for it."""
         self._reported_by_edges = True
         self._closed = False
 
@@ -66,6 +70,7 @@ class DataReady:
 
     def stop(self) -> None:
         """Edges cause no more reads; may be called twice."""
+        self._unwatch()
         self._member = self._schedule = None
 
     def close(self) -> None:
@@ -78,10 +83,12 @@ class DataReady:
 
     def read(self, member: BusMember, polls: Sequence[Poll], counts: Deadlines, now_ns: int) -> None:
         """Read the device at its edges from now on; how that succeeds is counted in `counts`."""
+        self._unwatch()
         self._watched.tick(now_ns)
         self.edges.restart()
         self._member = member
         self._schedule = ReadySchedule(self._rate_hz, now_ns, counts)
+        self._watch()
         member.start(polls, self._schedule)
 
     def drain(self) -> None:
@@ -110,8 +117,29 @@ class DataReady:
         self.edges.on_edges(edges)
         member, schedule = self._member, self._schedule
         if member is not None and schedule is not None:
-            t_ns, interval_ns = edges[-1].t_ns, self.edges.interval_ns
-            member.command(lambda: schedule.on_edge(t_ns, interval_ns))
+            times_ns, interval_ns = [edge.t_ns for edge in edges], self.edges.interval_ns
+            tell = member.note if schedule.has_read(times_ns[-1]) else member.command
+            tell(lambda: schedule.on_edges(times_ns, interval_ns))
+
+    def _on_level(self, active: bool | None) -> None:
+        """Follow the line, which was opened, or closed (None); its level adds nothing to the edges."""
+        if active is None:
+            self._unwatch()
+        else:
+            self._watch()
+
+    def _watch(self) -> None:
+        """Have the bus's thread wait for the line, if it is open and that is possible."""
+        member, schedule, fd = self._member, self._schedule, self._watched.line.fileno()
+        if member is not None and schedule is not None and self._watched_fd < 0:
+            now_ns = self._now_ns
+            if member.watch(fd, lambda: schedule.noticed(now_ns())):
+                self._watched_fd = fd
+
+    def _unwatch(self) -> None:
+        if self._watched_fd >= 0 and self._member is not None:
+            self._member.unwatch(self._watched_fd)
+        self._watched_fd = -1
 
     def _report(self, problem: str) -> None:
         self._raise_event(problem)
@@ -126,7 +154,3 @@ def _rising(settings: ReadySettings) -> ReadySettings:
     if settings.edge == "rising":
         return settings
     return msgspec.structs.replace(settings, active_low=not settings.active_low, edge="rising")
-
-
-def _ignore(_active: bool | None) -> None:
-    """Ignore the level: it adds nothing to the edges."""

@@ -6,6 +6,8 @@ several devices share and that is to be used as much as it allows. Edges (`Ready
     edges ──none for QUIET_NS, and for three intervals──▶ deadlines ──two within QUIET_NS──▶ edges
 """
 
+from collections import deque
+from collections.abc import Sequence
 from typing import Final, Protocol
 
 from imud.signals.ready_edges import QUIET_NS
@@ -14,6 +16,8 @@ from imud.units import NS_PER_S
 LATE_SHARE: Final = 4
 """A read that begins later than a quarter of its period counts as late."""
 QUIET_INTERVALS: Final = 3
+UNMATCHED_MOST: Final = 64
+"""Reads whose edges are not known yet; the oldest are forgotten, and not counted."""
 
 
 class Deadlines:
@@ -106,9 +110,15 @@ class RoundRobin:
 
 class ReadySchedule:
     """Edges instead of deadlines. The first read is at once: a line that stays active until it is read makes no edge
-    before that. Synchronization: the bus's thread; `by_edges` is read by any thread."""
+    before that. Synchronization: the bus's thread; `by_edges` is read by any thread.
 
-    __slots__ = ("_deadlines", "_edge_ns", "_interval_ns", "_pending", "_start_ns", "by_edges", "counts", "due_ns")
+    An edge may be noticed (`noticed`) before its stamp is known (`on_edges`): one of both causes the read.
+    """
+
+    __slots__ = (
+        "_deadlines", "_edge_ns", "_interval_ns", "_pending", "_start_ns", "_starts", "_unstamped",
+        "by_edges", "counts", "due_ns",
+    )  # fmt: skip
 
     def __init__(self, rate_hz: float, begin_ns: int, counts: Deadlines) -> None:
         """`rate_hz` is that of the deadlines."""
@@ -120,6 +130,10 @@ class ReadySchedule:
         """Begin of the newest read."""
         self._pending = True
         """Whether the newest edge was not read yet."""
+        self._unstamped = False
+        """Whether the stamp of the edge that is to be read is not known yet."""
+        self._starts: deque[int] = deque(maxlen=UNMATCHED_MOST)
+        """Begins of reads of such edges, oldest first."""
         self.counts = counts
         self.by_edges = True
         """False while deadlines take the place of edges."""
@@ -131,16 +145,28 @@ class ReadySchedule:
         """Time between two reads, as it is now."""
         return self._interval_ns if self.by_edges else self._deadlines.period_ns
 
-    def on_edge(self, t_ns: int, interval_ns: int) -> None:
-        """Note the newest edge, and the time between it and the one before."""
+    def noticed(self, now_ns: int) -> None:
+        """Read at once: an edge came, whose stamp is not known yet."""
+        if self.by_edges:
+            self._pending = self._unstamped = True
+            self.due_ns = self._edge_ns = now_ns
+
+    def has_read(self, t_ns: int) -> bool:
+        """Whether a read began after this edge. From any thread."""
+        return t_ns <= self._start_ns
+
+    def on_edges(self, times_ns: Sequence[int], interval_ns: int) -> None:
+        """Note edges, oldest first, and the time between the two newest."""
+        t_ns = times_ns[-1]
+        self._count_reads(times_ns, interval_ns)
         if not self.by_edges and t_ns - self._edge_ns > QUIET_NS:  # one alone may be a disturbance
             self._edge_ns = t_ns
             return
         self.by_edges = True
         self._edge_ns, self._interval_ns = t_ns, interval_ns
         if t_ns > self._start_ns:
-            self._pending, self.due_ns = True, t_ns
-        else:
+            self._pending, self._unstamped, self.due_ns = True, False, t_ns
+        elif not self._unstamped:
             self._wait()
 
     def begun(self, start_ns: int) -> None:
@@ -152,7 +178,11 @@ class ReadySchedule:
         if not self.by_edges:
             self._deadlines.begun(start_ns)
             return
-        self.counts.served(start_ns - self.due_ns, self._interval_ns // LATE_SHARE)
+        if self._unstamped:
+            self._unstamped = False
+            self._starts.append(start_ns)
+        else:
+            self.counts.served(start_ns - self.due_ns, self._interval_ns // LATE_SHARE)
 
     def done(self, now_ns: int) -> None:
         """Wait for the next edge or deadline."""
@@ -161,6 +191,16 @@ class ReadySchedule:
         else:
             self._deadlines.done(now_ns)
             self.due_ns = self._deadlines.due_ns
+
+    def _count_reads(self, times_ns: Sequence[int], interval_ns: int) -> None:
+        """Count reads of edges that were noticed, by their stamps: each is of the newest edge before it."""
+        starts, at = self._starts, 0
+        while starts and at < len(times_ns):
+            start_ns, edge_ns = starts.popleft(), 0
+            while at < len(times_ns) and times_ns[at] <= start_ns:
+                edge_ns, at = times_ns[at], at + 1
+            if edge_ns:  # else it is of none
+                self.counts.served(start_ns - edge_ns, interval_ns // LATE_SHARE)
 
     def _wait(self) -> None:
         self._pending = False

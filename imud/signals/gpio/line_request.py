@@ -97,6 +97,10 @@ class GpioInput(_Line):
         if watch:
             self._loop.add_reader(self._fd, self.drain)
 
+    def fileno(self) -> int:
+        """Return the descriptor of the request; -1 while the line is closed."""
+        return self._fd
+
     def drain(self) -> None:
         """Read and deliver the buffered edges; one system call if there are none. Does not block."""
         if self._on_edges is None:

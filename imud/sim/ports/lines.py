@@ -74,6 +74,10 @@ class MemoryInput:
         if watch:
             self._loop.call_soon(self.drain)
 
+    def fileno(self) -> int:
+        """Return -1: edges come without the kernel."""
+        return -1
+
     def drain(self) -> None:
         """Deliver the buffered edges."""
         if self._on_edges is not None and self._waiting:

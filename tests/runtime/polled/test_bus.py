@@ -1,6 +1,7 @@
 """The thread of a bus: scripts get their turn, devices come and go, nothing is left behind."""
 
 import asyncio
+import os
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,7 +15,8 @@ from imud.contracts.polling import Poll, Reading, Transfer, TransferScript
 from imud.contracts.status import KernelCounters
 from imud.errors import DeviceRefused, LinkError, TransferError, Trouble
 from imud.runtime.polled.bus import BusMember, PolledBuses
-from imud.runtime.polled.schedule import Deadlines
+from imud.runtime.polled.schedule import Deadlines, ReadySchedule
+from imud.units import NS_PER_S
 from tests.support.event_loops import VirtualClock, run_virtually, virtual_buses
 
 ASK = Transfer((b"\x01",), 1)
@@ -321,3 +323,54 @@ def test_a_script_can_keep_its_device_from_being_read() -> None:
         member.leave()
 
     run(body)
+
+
+def test_an_edge_is_read_while_the_loop_is_busy() -> None:
+    """The thread waits for the line: nothing is read from the descriptor here, and the loop does not run."""
+
+    async def body() -> None:
+        edges, device = os.pipe2(os.O_NONBLOCK)
+        buses, wire, read = PolledBuses(monotonic_ns), Wire(), threading.Event()
+        wire.takes_time = read.set
+        member = joined(buses, wire, Sink())
+        schedule = ReadySchedule(1.0, monotonic_ns(), Deadlines())
+        assert not member.watch(-1, lambda: None)
+        assert member.watch(edges, lambda: schedule.noticed(monotonic_ns()))
+        try:
+            member.start((Poll(ASK),), schedule)
+            for number in range(1, 51):
+                assert read.wait(10)  # in the loop's thread
+                assert wire.count == number
+                read.clear()
+                os.write(device, b"x")
+            assert read.wait(10)
+            member.unwatch(edges)
+            member.unwatch(edges)
+            os.write(device, b"x")
+        finally:
+            buses.end()
+            os.close(edges)
+            os.close(device)
+        assert wire.count == 51
+
+    asyncio.run(body())
+
+
+def test_a_watched_line_does_not_keep_others_from_their_deadlines() -> None:
+    async def body() -> None:
+        edges, device = os.pipe2(os.O_NONBLOCK)
+        buses, wire, sink = PolledBuses(monotonic_ns), Wire(), Sink()
+        member = joined(buses, wire, sink)
+        assert member.watch(edges, lambda: None)
+        try:
+            member.start((Poll(ASK),))
+            await sink.enough.wait()
+        finally:
+            buses.end()
+            os.close(edges)
+            os.close(device)
+        starts = [reading.start_ns for reading in sink.readings]
+        assert min(b - a for a, b in pairwise(starts)) > 0
+        assert starts[-1] - starts[0] >= 0.9 * (len(starts) - 1) * NS_PER_S / wire.rate_hz - NS_PER_S / wire.rate_hz
+
+    asyncio.run(body())

@@ -7,21 +7,24 @@ from dataclasses import replace
 from itertools import pairwise
 from math import dist
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from imud.config import DeviceConfig
-from imud.contracts.lines import DeviceLines, OnEdges, OnLineEnd, ReadySettings
+from imud.contracts.lines import DeviceLines, LineFactory, OnEdges, OnLineEnd, ReadySettings
 from imud.contracts.status import DeviceState
 from imud.errors import LinkMissing
 from imud.event import EventKind
+from imud.runtime.polled.data_ready import DataReady
+from imud.runtime.polled.schedule import Deadlines, ReadySchedule
 from imud.sample import Sample, Sync
 from imud.sim.imu61x.registers import Imu61xRegisters
-from imud.sim.ports.lines import MemoryInput
+from imud.sim.ports.lines import MemoryInput, MemoryOutput
 from imud.units import NS_PER_S
 from tests.support.device_rig import DeviceRig
-from tests.support.event_loops import VirtualClock
+from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.polled_bus_bench import PolledBusBench
 
 MS = 1_000_000
@@ -291,3 +294,81 @@ def test_the_line_is_let_go_of_at_the_end(bench: PolledBusBench) -> None:
         assert not it.signal.line.is_open
 
     bench.run(body())
+
+
+class DescriptorLine(MemoryInput):
+    """A line with a descriptor."""
+
+    def fileno(self) -> int:
+        return 77 if self.is_open else -1
+
+
+class WatchingMember:
+    """What a bus's member is asked for."""
+
+    def __init__(self) -> None:
+        self.watched: dict[int, Callable[[], None]] = {}
+        self.noted = self.commands = 0
+
+    def watch(self, fd: int, callback: Callable[[], None]) -> bool:
+        if fd < 0:
+            return False
+        assert not self.watched
+        self.watched[fd] = callback
+        return True
+
+    def unwatch(self, fd: int) -> None:
+        del self.watched[fd]
+
+    def start(self, _polls: object, schedule: ReadySchedule) -> None:
+        self.schedule = schedule
+
+    def note(self, command: Callable[[], None]) -> None:
+        self.noted += 1
+        command()
+
+    def command(self, command: Callable[[], None]) -> None:
+        self.commands += 1
+        command()
+
+
+@in_loop
+async def test_the_thread_waits_for_a_line_with_a_descriptor_while_that_is_open_and_read() -> None:
+    line, clock, member, told = DescriptorLine(), VirtualClock(), WatchingMember(), list[str]()
+    notices: Any = SimpleNamespace(raise_event=lambda _t, _kind, message, **_detail: told.append(message))
+    maker = LineFactory(lambda *_: line, lambda *_: MemoryOutput())
+    ready = DataReady("imu", ReadySettings(line="Y"), maker, RATE_HZ, notices, clock.now_ns)
+    some: Any = member
+    line.open_error = LinkMissing("not there")
+    ready.read(some, (), Deadlines(), clock.now_ns())
+    assert not member.watched
+    line.open_error = None
+    clock.advance(10 * NS_PER_S)
+    ready.tick(clock.now_ns(), None)
+    assert set(member.watched) == {77}
+    clock.advance(EVERY_NS)
+    member.schedule.begun(clock.now_ns())
+    member.schedule.done(clock.now_ns())
+    clock.advance(EVERY_NS)
+    member.watched[77]()
+    assert member.schedule.due_ns == clock.now_ns()
+    line.edge(clock.now_ns(), True)
+    clock.advance(1000)
+    member.schedule.begun(clock.now_ns())
+    ready.drain()
+    assert (member.noted, member.commands) == (1, 0)  # it was read already
+    line.edge(clock.now_ns() + 1, True)
+    ready.drain()
+    assert (member.noted, member.commands) == (1, 1)
+    line.vanish(LinkMissing("pulled out"))
+    assert not member.watched
+    clock.advance(10 * NS_PER_S)
+    ready.tick(clock.now_ns(), None)
+    assert set(member.watched) == {77}
+    ready.stop()
+    assert not member.watched
+    ready.read(some, (), Deadlines(), clock.now_ns())
+    assert set(member.watched) == {77}
+    ready.close()
+    assert not member.watched
+    assert len(told) == 4

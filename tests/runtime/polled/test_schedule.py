@@ -127,7 +127,7 @@ def test_an_edge_is_due_at_once_and_nothing_without_one() -> None:
     assert made.due_ns == BEGIN + QUIET_NS
     for number in range(1, 100):
         t_ns = BEGIN + number * MS
-        made.on_edge(t_ns, MS)
+        made.on_edges([t_ns], MS)
         assert (made.due_ns, made.period_ns) == (t_ns, MS)
         read(made, t_ns + 100_000)
         assert made.due_ns == t_ns + QUIET_NS
@@ -139,7 +139,7 @@ def test_an_edge_is_due_at_once_and_nothing_without_one() -> None:
 def test_later_than_a_quarter_of_the_interval_is_late() -> None:
     made = by_edges()
     for number, late_ns in enumerate((250_000, 250_001, 900_000), 1):
-        made.on_edge(BEGIN + number * MS, MS)
+        made.on_edges([BEGIN + number * MS], MS)
         read(made, BEGIN + number * MS + late_ns, 0)
     assert made.counts.late == 2
 
@@ -147,12 +147,64 @@ def test_later_than_a_quarter_of_the_interval_is_late() -> None:
 def test_an_edge_that_was_read_already_is_not_read_again() -> None:
     """It was told late: a read that began after it had its values."""
     made = by_edges()
-    made.on_edge(BEGIN + MS, MS)
+    made.on_edges([BEGIN + MS], MS)
     read(made, BEGIN + 2 * MS + 100_000)
-    made.on_edge(BEGIN + 2 * MS, MS)
+    made.on_edges([BEGIN + 2 * MS], MS)
     assert made.due_ns == BEGIN + 2 * MS + QUIET_NS
-    made.on_edge(BEGIN + 2 * MS + 100_001, MS)
+    made.on_edges([BEGIN + 2 * MS + 100_001], MS)
     assert made.due_ns == BEGIN + 2 * MS + 100_001
+
+
+def test_an_edge_that_is_noticed_is_read_at_once_and_counted_by_its_stamp() -> None:
+    made = by_edges()
+    for number in range(1, 100):
+        t_ns = BEGIN + number * MS
+        made.noticed(t_ns + 30_000)
+        assert made.due_ns == t_ns + 30_000
+        told_first = number % 3 == 0  # the loop knows the stamp before the read begins
+        if told_first:
+            made.on_edges([t_ns], MS)
+            assert made.due_ns == t_ns
+        read(made, t_ns + 100_000)
+        assert made.has_read(t_ns)
+        assert made.due_ns == t_ns + (0 if told_first else 30_000) + QUIET_NS
+        if not told_first:
+            made.on_edges([t_ns], MS)
+            assert made.due_ns == t_ns + QUIET_NS  # not read again
+    made.on_edges([BEGIN + 100 * MS], MS)
+    assert (made.counts.polls, made.counts.late, made.counts.missed) == (100, 0, 0)
+    assert made.counts.sum_late_ns == 99 * 100_000
+    assert made.counts.worst_ns == 100_000
+
+
+def test_stamps_that_are_told_together_or_late_are_matched_with_their_reads() -> None:
+    made = by_edges()
+    for number in range(1, 6):
+        made.noticed(BEGIN + number * MS + 10_000)
+        read(made, BEGIN + number * MS + (300_000 if number == 4 else 20_000))
+    assert made.counts.polls == 1
+    made.on_edges([BEGIN + number * MS for number in range(1, 7)], MS)
+    assert (made.counts.polls, made.counts.late, made.counts.worst_ns) == (6, 1, 300_000)
+    made.noticed(BEGIN + 8 * MS + 10_000)  # 6 and 7 were not read
+    read(made, BEGIN + 8 * MS + 20_000)
+    made.on_edges([BEGIN + 7 * MS, BEGIN + 8 * MS], MS)
+    assert (made.counts.polls, made.counts.sum_late_ns) == (7, 4 * 20_000 + 300_000 + 20_000)
+
+
+def test_noticed_edges_end_and_come_back_as_others() -> None:
+    made = by_edges()
+    made.noticed(BEGIN + MS)
+    read(made, BEGIN + MS)
+    read(made, made.due_ns)
+    assert not made.by_edges
+    made.noticed(BEGIN + 600 * MS)  # one alone may be a disturbance: it is not read
+    assert made.due_ns < BEGIN + 600 * MS
+    made.on_edges([BEGIN + 600 * MS], 600 * MS)
+    assert not made.by_edges
+    made.on_edges([BEGIN + 601 * MS], MS)
+    assert made.by_edges
+    made.noticed(BEGIN + 602 * MS)
+    assert made.due_ns == BEGIN + 602 * MS
 
 
 def test_without_edges_deadlines_come_again() -> None:
@@ -170,7 +222,7 @@ def test_without_edges_deadlines_come_again() -> None:
 
 def test_rare_edges_are_waited_for_longer() -> None:
     made = by_edges()
-    made.on_edge(BEGIN + 400 * MS, 400 * MS)
+    made.on_edges([BEGIN + 400 * MS], 400 * MS)
     read(made, BEGIN + 400 * MS)
     assert made.due_ns == BEGIN + 1600 * MS
 
@@ -180,11 +232,11 @@ def test_one_edge_is_no_return_two_are() -> None:
     read(made, made.due_ns)
     t_ns = made.due_ns + 3 * MS
     deadline_ns = made.due_ns
-    made.on_edge(t_ns, QUIET_NS)
+    made.on_edges([t_ns], QUIET_NS)
     assert (made.by_edges, made.due_ns) == (False, deadline_ns)
-    made.on_edge(t_ns + QUIET_NS + 1, QUIET_NS)
+    made.on_edges([t_ns + QUIET_NS + 1], QUIET_NS)
     assert not made.by_edges
-    made.on_edge(t_ns + QUIET_NS + MS, MS)
+    made.on_edges([t_ns + QUIET_NS + MS], MS)
     assert (made.by_edges, made.due_ns) == (True, t_ns + QUIET_NS + MS)
 
 
