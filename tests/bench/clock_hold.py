@@ -3,8 +3,9 @@
 Three ways to read 1,000 samples a second a latency apart, from the same simulated arrivals:
 
 - at once: each message is read as it comes;
-- one in time: after a message that was read as it came, nothing is read for the latency; then all that gathered, which
-  the clock is told, and the next message is read as it comes (`imud.runtime.latency.stream_hold`);
+- one in time: after a message that was read as it came, all that gathered is read a latency apart, which the clock is
+  told; every 50 ms, or at once behind a latency timer, the next message is read as it comes
+  (`imud.runtime.latency.stream_hold`);
 - by timer: all that gathered, a latency apart, and the clock takes that for an adapter's latency timer.
 """
 
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from imud.clock import SampleClock
+from imud.runtime.latency.stream_hold import WATCH_NS
 from imud.sample import Measurement, Sync
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_1MS, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
 from imud.units import NS_PER_MS
@@ -33,12 +35,12 @@ class TimedRead(NamedTuple):
     """How long nothing had been read."""
 
 
-def at_once(arrivals: Sequence[Arrival], _hold_ns: int, _byte_ns: int) -> Iterator[TimedRead]:
+def at_once(arrivals: Sequence[Arrival], _hold_ns: int, _byte_ns: int, _watch_ns: int) -> Iterator[TimedRead]:
     """Every message as it comes."""
     return (TimedRead(a, a.t_rx_ns, a.trailing_bytes, 0) for a in arrivals)
 
 
-def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int) -> Iterator[TimedRead]:
+def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, watch_ns: int) -> Iterator[TimedRead]:
     """One read as it comes, then one of all that has gathered."""
     at = 0
     while at < len(arrivals):
@@ -47,14 +49,17 @@ def one_in_time(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int) -> Iter
             yield TimedRead(arrivals[at], begun_ns, arrivals[at].trailing_bytes, 0)
             at += 1
         end_ns = begun_ns + hold_ns
-        end = at
-        while end < len(arrivals) and arrivals[end].t_rx_ns <= end_ns:
-            end += 1
-        yield from _together(arrivals, at, end, end_ns, byte_ns, hold_ns)
-        at = end
+        while end_ns <= begun_ns + max(watch_ns, hold_ns):
+            end = at
+            while end < len(arrivals) and arrivals[end].t_rx_ns <= end_ns:
+                end += 1
+            yield from _together(arrivals, at, end, end_ns, byte_ns, hold_ns)
+            if end == at:
+                break
+            at, end_ns = end, end_ns + hold_ns
 
 
-def by_timer(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int) -> Iterator[TimedRead]:
+def by_timer(arrivals: Sequence[Arrival], hold_ns: int, byte_ns: int, _watch_ns: int) -> Iterator[TimedRead]:
     """All that has gathered, at even times."""
     at, end_ns = 0, arrivals[0].t_rx_ns
     while at < len(arrivals):
@@ -79,7 +84,7 @@ def _together(
         yield TimedRead(arrivals[number], t_rx_ns, trailing, waited_ns)
 
 
-Way = Callable[[Sequence[Arrival], int, int], Iterator[TimedRead]]
+Way = Callable[[Sequence[Arrival], int, int, int], Iterator[TimedRead]]
 WAYS: dict[str, Way] = {"at once": at_once, "one in time": one_in_time, "by timer": by_timer}
 
 
@@ -88,12 +93,13 @@ def run(way: str, model: ArrivalModel, seconds: int, hold_ns: int) -> list[Point
     arrivals = list(model.run(int(model.rate_hz) * seconds))
     told_ns = model.profile.hold_ns + hold_ns * (way == "by timer")
     clock = SampleClock("bench", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=model.byte_ns, hold_ns=told_ns)
+    watch_ns = 0 if model.profile.hold_ns else WATCH_NS
     points = []
     first = {True: at_once, False: WAYS[way]}
     settle = next(i for i, a in enumerate(arrivals) if a.t_ns - arrivals[0].t_ns > 5_000 * NS_PER_MS)
     begin = settle if way == "one in time" else 0  # nothing waits before the fit is used
     for early, part in ((True, arrivals[:begin]), (False, arrivals[begin:])):
-        for a, t_rx_ns, trailing_bytes, waited_ns in first[early](part, hold_ns, model.byte_ns):
+        for a, t_rx_ns, trailing_bytes, waited_ns in first[early](part, hold_ns, model.byte_ns, watch_ns):
             m = Measurement(a.size_bytes, trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
             clock.waited_ns = waited_ns
             s = clock.sample(m, t_rx_ns, 0)

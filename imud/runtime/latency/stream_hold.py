@@ -2,11 +2,14 @@
 
     ── watched ──▶ a sample is complete: dated by its arrival, kept
                       └─ paused: bytes gather in the kernel ──latency──▶ one read: dated by the fit of arrivals
-         ◀───────────────────── all kept samples are published as one batch ────┘
+                                   ▲                                       │ all kept samples are published as one batch
+                                   └──────────── until WATCH_NS ───────────┤
+         ◀───────────────────────────────── then ──────────────────────────┘
 
-One message of each round is read as it comes, so the fit of arrivals (`imud.clock`) goes on to learn from undelayed
-ones, and those that waited are dated by it. Where a message is dated by its own arrival (a device without time, a fit
-that is not used yet), or by edges, pulses or UTC, nothing waits; nor does anything while a request is unanswered.
+One message in WATCH_NS, or in each round, is read as it comes, so the fit of arrivals (`imud.clock`) goes on to learn
+from undelayed ones, and those that waited are dated by it. Where a message is dated by its own arrival (a device
+without time, a fit that is not used yet), or by edges, pulses or UTC, nothing waits; nor does anything while a request
+is unanswered.
 """
 
 import asyncio
@@ -23,6 +26,9 @@ GRID_NS: Final = NS_PER_MS
 """Rounds end at whole ms, so that many devices are served in one turn of the loop."""
 FIRST_NS: Final = 5 * NS_PER_MS
 """The first round is so long at most, before it is seen how much gathers; each next one at most twice as long."""
+WATCH_NS: Final = MOST_NS
+"""Time from one message that is read as it comes to the next: as with the longest latency. Each is a wake-up more.
+Behind an adapter with a latency timer it is each round: there the error of stamps would grow by half."""
 PERIODS_LEAST: Final = 2
 """With fewer samples in a round nothing is saved."""
 
@@ -44,7 +50,8 @@ class StreamHold:
         self._now_ns = now_ns
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
-        self._paused_ns = 0
+        self._paused_ns = self._watch_ns = 0
+        """When bytes began to gather, and when one is to be read as it comes again."""
         self._most_ns = FIRST_NS
         """Time in which no more gathers than may wait, by what gathered last."""
 
@@ -61,13 +68,12 @@ class StreamHold:
             path.publish_gathered()
         else:
             self._link.pause()
-            self._paused_ns = t_rx_ns
-            end_ns = t_rx_ns + hold_ns
-            wait_ns = hold_ns - end_ns % GRID_NS
-            self._timer = self._loop.call_later(wait_ns / NS_PER_S, self._end_round)
+            self._watch_ns = t_rx_ns if self._link.hold_ns else t_rx_ns + WATCH_NS
+            self._begin_round(t_rx_ns, hold_ns)
 
     def release(self) -> None:
         """Read and publish what waits now; the next samples may wait again. No-op while nothing waits."""
+        self._watch_ns = 0  # publishing may have led here: no round follows
         if self._timer is not None:
             self._timer.cancel()
             self._end_round()
@@ -78,6 +84,12 @@ class StreamHold:
         if latency_ns < PERIODS_LEAST * path.period_ns or path.clock.utc_reference is not None or self._is_busy():
             return 0
         return latency_ns
+
+    def _begin_round(self, now_ns: int, hold_ns: int) -> None:
+        """Let bytes gather in the kernel from now on."""
+        self._paused_ns = now_ns
+        wait_ns = hold_ns - (now_ns + hold_ns) % GRID_NS
+        self._timer = self._loop.call_later(wait_ns / NS_PER_S, self._end_round)
 
     def _end_round(self) -> None:
         self._timer = None
@@ -90,5 +102,11 @@ class StreamHold:
             path.gather(data, now_ns, waited_ns)
             most_ns = min(most_ns, link.waiting_bytes * waited_ns // len(data))
         self._most_ns = min(max(most_ns, 1), MOST_NS)
+        by_fit = bool(path.gathered) and path.gathered[-1].sync is Sync.REGRESSION
         path.publish_gathered()
-        link.resume()
+        hold_ns = self._allowed_ns()
+        if data and by_fit and hold_ns and now_ns + hold_ns <= self._watch_ns:
+            self.hold_ns = hold_ns
+            self._begin_round(now_ns, hold_ns)
+        else:
+            link.resume()

@@ -38,6 +38,8 @@ class Takes(MemoryLink):
     def __init__(self, settings: MemorySettings, clock: VirtualClock) -> None:
         super().__init__(settings)
         self.taken: list[tuple[int, int]] = []
+        self.resumed: list[int] = []
+        """When it was to be read as it comes again."""
         self._clock = clock
 
     def take(self) -> bytes:
@@ -45,13 +47,17 @@ class Takes(MemoryLink):
         self.taken.append((self._clock.now_ns(), len(data)))
         return data
 
+    def resume(self) -> None:
+        super().resume()
+        self.resumed.append(self._clock.now_ns())
+
 
 class HoldBench:
     """A module at 1 kHz and the device that reads it."""
 
-    def __init__(self, latency_ms: float, *, period_ms: int = 1, waiting_bytes: int = 2048) -> None:
+    def __init__(self, latency_ms: float, *, period_ms: int = 1, waiting_bytes: int = 2048, hold_ns: int = 0) -> None:
         self.clock = VirtualClock()
-        settings = MemorySettings(baud=921_600, waiting_bytes=waiting_bytes)
+        settings = MemorySettings(baud=921_600, waiting_bytes=waiting_bytes, hold_ns=hold_ns)
         self.link = Takes(settings, self.clock)
         rigs = self.rigs = DeviceRigs(self.clock.host)
         self.rig = rigs.add(DeviceConfig("bow", "hipnuc-uart", None, False, "memory", settings), self.link)
@@ -105,6 +111,55 @@ class HoldBench:
             (1000 + number * self._period_ms) * NS_PER_MS for number in range(1, self.sent + 1)
         ]
         assert not self.link.paused
+
+
+@pytest.mark.parametrize(("latency_ms", "rounds"), [(5, 10), (10, 5), (20, 2), (30, 1), (50, 1)])
+def test_one_message_in_50_ms_is_read_as_it_comes(latency_ms: int, rounds: int) -> None:
+    bench = HoldBench(latency_ms, waiting_bytes=1 << 16)
+
+    async def story() -> None:
+        await bench.send(200)
+        resumed, taken = len(bench.link.resumed), len(bench.link.taken)
+        await bench.send(rounds * latency_ms * 10 + 10)
+        assert len(bench.link.resumed) - resumed == pytest.approx(10, abs=1)
+        assert len(bench.link.taken) - taken == pytest.approx(10 * rounds, abs=rounds)
+        assert max(bench.waits_ns(-20)) <= latency_ms * NS_PER_MS
+
+    bench.play(story)
+
+
+def test_behind_a_latency_timer_one_message_of_each_round_is_read_as_it_comes() -> None:
+    bench = HoldBench(10, hold_ns=NS_PER_MS)
+
+    async def story() -> None:
+        await bench.send(200)
+        resumed, taken = len(bench.link.resumed), len(bench.link.taken)
+        await bench.send(210)
+        assert len(bench.link.resumed) - resumed == len(bench.link.taken) - taken == pytest.approx(20, abs=1)
+
+    bench.play(story)
+
+
+@pytest.mark.parametrize("before", [80, 90, 100, 110, 120])
+def test_a_latency_that_ends_while_samples_are_published_ends_the_wait(before: int) -> None:
+    bench = HoldBench(10)
+
+    class Leaving(list[tuple[int, list[Sample]]]):
+        """The client that lets samples wait leaves as it gets some."""
+
+        def append(self, item: tuple[int, list[Sample]]) -> None:
+            super().append(item)
+            bench.want(0, "client 2")
+
+    async def story() -> None:
+        await bench.send(before)
+        bench.rig.published = Leaving(bench.rig.published)
+        await bench.send(20)
+        assert not bench.link.paused
+        assert bench.sizes(-5) == [1] * 5
+        assert bench.device.status().hold_ns == 0
+
+    bench.play(story)
 
 
 def test_samples_of_a_latency_are_read_and_published_together() -> None:
