@@ -18,7 +18,7 @@ from tests.lab.host.errors import LabError
 from tests.lab_debian.host import __main__ as program
 from tests.lab_debian.host import image, packages, requests
 from tests.lab_debian.host.machine import DebianMachine, Qmp
-from tests.lab_debian.host.release import AMD64, ARM64, PYTHONS, Release
+from tests.lab_debian.host.release import AMD64, ARM64, MODULES, PYTHONS, Release
 from tests.lab_host.conftest import FakeProgram, fake_program
 
 __all__ = ["fake_program"]
@@ -181,6 +181,15 @@ def test_the_adapter_is_there_from_the_start_and_comes_back_the_same() -> None:
 
 def test_commas_in_paths_are_doubled() -> None:
     assert any("path=/o,,ut/run-1,mount_tag=lab" in argument for argument in machine(TRIXIE, "/o,ut/run-1"))
+
+
+def test_amd64_has_what_the_modules_of_its_buses_look_for() -> None:
+    arguments = machine(TRIXIE)
+    names = [arguments[i + 1] for i, word in enumerate(arguments) if word == "-smbios"]
+    assert names == ["type=1,manufacturer=PC Engines", "type=2,product=apu2"]
+    assert "isa-parallel,chardev=parallel" in arguments
+    assert {"pcengines-apuv2", "spi-butterfly"} <= set(MODULES)
+    assert not {"-smbios", "isa-parallel,chardev=parallel"} & set(machine(ARM64[0]))
 
 
 class FakeQemu:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from tests.lab_debian.guest import (
+    buses,
     first_contact,
     installation,
     outputs,
@@ -29,6 +30,7 @@ GROUPS: dict[str, Group] = {
     "rights": rights.check,
     "sandbox": sandbox.check,
     "outputs": outputs.check,
+    "buses": buses.check,
     "replug": replug.check,
     "doctor": first_contact.check_doctor,
     "setup": first_contact.check_setup,
@@ -38,7 +40,7 @@ GROUPS: dict[str, Group] = {
 }
 """In the order in which they run: the first leaves the package installed and the second the service running."""
 RUNS = {
-    "amd64": ("service", "rights", "sandbox", "outputs", "replug", "doctor", "setup", "removal"),
+    "amd64": ("service", "rights", "sandbox", "outputs", "buses", "replug", "doctor", "setup", "removal"),
     "arm64": ("streaming", "sandbox", "doctor", "unit-tests"),
 }
 
@@ -50,7 +52,11 @@ def main(arguments: list[str]) -> int:
     host = Host()
     for name in ("installation", *(groups or RUNS[architecture])):
         checks.begin(name)
-        GROUPS[name](checks, host)
+        try:
+            GROUPS[name](checks, host)
+        except Exception:
+            with checks("everything between the checks"):
+                raise
     print(f"{checks.summary()}, {uptime_s():.0f} s after the kernel's start", flush=True)
     return 1 if checks.failed else 0
 

@@ -62,6 +62,10 @@ class Checks:
         self._figures.append({"group": self._group, "name": name, "value": value, "unit": unit})
         self._save()
 
+    def note(self, text: str) -> None:
+        """Print what was found beside a check."""
+        print(f"       {text.strip()[:110]}", flush=True)
+
     def skip(self, name: str, why: str) -> None:
         """Say that something is not checked, and why."""
         print(f"SKIP           {self._group}: {name}: {why}", flush=True)

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from tests.lab_debian.guest.checks import Checks, expect, expect_in, wait_until
+from tests.lab_debian.guest.sandbox import PRIVATE, PUBLIC
 from tests.lab_debian.guest.service import CAN, USB, metrics
 from tests.lab_debian.guest.system import (
     Host,
@@ -30,8 +31,11 @@ def check(checks: Checks, _host: Host) -> None:
         configure(f"metrics: {{address: 0.0.0.0, port: {METRICS_PORT}}}\n{USB}{CAN}")
         start_service()
         wait_streaming("usb")
-        must("ip", "address", "replace", "192.0.2.1/32", "dev", "lo")
-        wait_until(lambda: metrics(f"http://192.0.2.1:{METRICS_PORT}"), "metrics on another address")
+        for address in (PUBLIC, PRIVATE):
+            must("ip", "address", "replace", f"{address}/32", "dev", "lo")
+        wait_until(lambda: metrics(f"http://{PRIVATE}:{METRICS_PORT}"), "metrics on another address")
+    with checks("metrics are not served to a public address"):
+        assert not metrics(f"http://{PUBLIC}:{METRICS_PORT}"), "they are"
     with checks("the daemon reaches a real gpsd over TCP"):
         background("labgpsd", "/usr/sbin/gpsd", "-N", "-n", "-S", str(GPSD_PORT), "/dev/null")
         configure(USB.replace("115200}", "115200}\n    rmc: {source: gpsd}") + CAN)

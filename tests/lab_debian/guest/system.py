@@ -1,6 +1,7 @@
 """The guest's system as the checks see and change it: programs, units, users, the daemon's socket, the USB adapter."""
 
 import json
+import re
 import socket
 import subprocess
 import time
@@ -60,6 +61,11 @@ def journal(since: str = "") -> str:
     must("journalctl", "--sync")
     after = ["--after-cursor", since] if since else []
     return must("journalctl", "--no-pager", "--output", "cat", "--unit", UNIT, *after)
+
+
+def console() -> str:
+    """What kernel and systemd said; systemd's own messages are there, and not in the journal (machine.py)."""
+    return (SHARE / "console.log").read_text("utf-8", "replace")
 
 
 def mark() -> str:
@@ -152,6 +158,26 @@ def background(unit: str, *command: str, properties: tuple[str, ...] = ()) -> No
     """Start a program as a transient service that later checks can stop by name."""
     options = [word for text in properties for word in ("--property", text)]
     must("systemd-run", "--quiet", "--collect", f"--unit={unit}", *options, *command)
+
+
+NOT_CONFINING = (
+    *("Type", "Exec", "Restart", "Watchdog", "Notify", "User", "Group", "Timeout", "Runtime", "Success"),
+    *("After", "Wants", "Before", "Condition", "StartLimit", "Description", "Documentation", "WantedBy"),
+)
+"""Begins of names of the unit's settings that a transient unit does not take, or gets otherwise."""
+
+
+def confinement() -> list[str]:
+    """The settings of the unit's [Service] section that confine, for a transient unit."""
+    lines = must("systemctl", "cat", UNIT).splitlines()
+    settings = [line for line in lines if re.match(r"[A-Z]\w+=", line) and not line.startswith(NOT_CONFINING)]
+    return [one for line in settings for one in _single_networks(line)]
+
+
+def _single_networks(setting: str) -> list[str]:
+    """A list of networks as one setting for each: systemd-run reads a word such as `localhost` only alone."""
+    name, _, value = setting.partition("=")
+    return [f"{name}={word}" for word in value.split()] if name.startswith("IPAddress") else [setting]
 
 
 def confined(code: str, *properties: str, user: str = "imud") -> str:

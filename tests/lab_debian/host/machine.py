@@ -19,6 +19,17 @@ PLATFORMS = {
 
 ADAPTER = {"driver": "usb-serial", "chardev": "imu", "id": "imu", "bus": "xhci.0"}
 """An FTDI adapter to the guest: ftdi_sio, /dev/ttyUSB0, /dev/serial/by-id/usb-QEMU_…"""
+BUSES = {
+    "amd64": (
+        *("-smbios", "type=1,manufacturer=PC Engines", "-smbios", "type=2,product=apu2"),
+        *("-chardev", "null,id=parallel", "-device", "isa-parallel,chardev=parallel"),
+    ),
+    "arm64": (),
+}
+"""Debian's kernel for amd64 has no gpio-sim, and no SPI controller that QEMU has. By these names pcengines-apuv2 takes
+the machine for a board whose GPIO registers are at an address where QEMU has nothing: lines without effect.
+spi-butterfly makes an SPI bus of a parallel port: one on which nothing answers. On arm64 `-M virt` has a PL061, and no
+SPI."""
 REQUESTS = "requests"
 """Socket: what the guest asks the rig for, one line each."""
 QMP = "qmp"
@@ -73,6 +84,7 @@ class DebianMachine:
             *("-device", "virtserialport,chardev=requests,name=requests"),
             *("-chardev", f"socket,id=monitor,fd={monitor_fd}", "-mon", "chardev=monitor"),
             *("-qmp", f"unix:{_escaped(self.sockets / QMP)},server=on,wait=off"),
+            *BUSES[self.release.architecture],
             *("-device", "qemu-xhci,id=xhci", "-chardev", f"serial,id=imu,path={_escaped(self.sockets / SENSOR)}"),
             *("-device", ",".join([ADAPTER["driver"], *(f"{k}={v}" for k, v in ADAPTER.items() if k != "driver")])),
         ]

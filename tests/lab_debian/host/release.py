@@ -20,8 +20,10 @@ BOOT_MODULES = ("virtio_pci", "virtio_blk", "crc32c_generic", "ext4", "virtio_co
 MODULES = (
     *("vcan", "can-raw", "can-j1939", "i2c-dev", "i2c-stub", "spidev", "pps-ldisc", "pps-gpio", "usbserial"),
     *("ftdi_sio", "cdc-acm", "xhci-pci", "virtio-rng", "8250_pci", "rng-core", "gpio-pl061"),
+    *("pcengines-apuv2", "parport_pc", "spi-butterfly"),
 )
-"""Left to udev and the checks; what a kernel does not have is left out."""
+"""Left to udev and the checks; what a kernel does not have is left out. The last row makes GPIO lines and an SPI bus on
+amd64 (machine.py)."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,173 @@
+"""The daemon on I2C, SPI and GPIO nodes of Debian's kernel, and its feed to Debian's chronyd, confined by its unit.
+
+Nothing answers on these buses: what is checked is that the daemon has the nodes and says so. The lab's own kernel
+(`make lab`) has devices on them.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.lab_debian.guest.checks import Checks, Failed, expect, wait_until
+from tests.lab_debian.guest.system import (
+    CONFIG,
+    PYTHON,
+    UNIT,
+    Host,
+    configure,
+    confined,
+    confinement,
+    device,
+    journal,
+    mark,
+    must,
+    run,
+    start_service,
+    wait_streaming,
+)
+
+SPI = Path("/sys/bus/spi")
+CHIP = Path("/dev/gpiochip0")
+FREE_LINE = """
+import gpiod
+with gpiod.Chip('/dev/gpiochip0') as chip:
+    print(next(line for line in range(chip.get_info().num_lines) if not chip.get_line_info(line).used))
+"""
+CHRONY_SOCKET = "/run/chrony.imud.sock"
+CHRONY = Path("/etc/systemd/system/chrony.service")
+CHRONY_FILES = {
+    "/etc/chrony/conf.d/imud.conf": f"refclock SOCK {CHRONY_SOCKET} refid IMUD poll 3\n",
+    "/etc/systemd/system/chrony.service.d/imud.conf": f"[Service]\nExecStartPost=+/bin/chown imud {CHRONY_SOCKET}\n",
+    "/etc/default/chrony": 'DAEMON_OPTS="-F 1 -x"\n',  # -x: the guest's clock stays as it is
+}
+"""As docs/time.md has them."""
+PULSES = 12
+FEED = f"""
+import sys, time
+sys.path[:0] = [{{path!r}}]
+from imud.utc.chrony import ChronyFeed
+feed = ChronyFeed({CHRONY_SOCKET!r}, lambda: time.time_ns() - time.monotonic_ns())
+for _ in range({PULSES}):
+    time.sleep(1 - time.time() % 1)
+    feed.send_pulse(time.monotonic_ns(), round(time.time()))
+print(feed.sent, feed.refused, feed.problem)
+"""
+
+
+def make_nodes() -> None:
+    """Make a node of each kind of bus that Debian's kernel has a driver for on QEMU's machine (machine.py)."""
+    must("modprobe", "i2c-dev")
+    run("modprobe", "i2c-stub", "chip_addr=0x18")
+    for module in ("pcengines-apuv2", "parport_pc", "spi-butterfly"):
+        run("modprobe", module)
+    for found in SPI.glob("devices/*"):
+        if not (found / "driver").exists():
+            (found / "driver_override").write_text("spidev")
+            (SPI / "drivers/spidev/bind").write_text(found.name)
+    must("udevadm", "settle")
+
+
+def check(checks: Checks, _host: Host) -> None:
+    """Each bus that is there, and chronyd."""
+    make_nodes()
+    check_i2c(checks)
+    check_gpio(checks)
+    check_spi(checks)
+    check_chrony(checks)
+
+
+@contextmanager
+def further_device(text: str) -> Iterator[str]:
+    """Add a device to the configuration, for as long as the block; the problem that the daemon has with it."""
+    before = CONFIG.read_text()
+    since = mark()
+    configure(before + text)
+    start_service()
+    wait_until(lambda: (device("keel") or {}).get("problem"), "a problem of the device")
+    problem: str = (device("keel") or {})["problem"]
+    try:
+        if "may not" in problem or "may not be opened" in journal(since):
+            raise Failed(problem)
+        yield problem
+    finally:
+        configure(before)
+        must("systemctl", "reload", UNIT)
+        wait_streaming("usb")
+
+
+def check_i2c(checks: Checks) -> None:
+    """A bus on which nothing answers."""
+    if not Path("/dev/i2c-0").exists():
+        checks.skip("the daemon opens an I2C bus", "this machine has none")
+        return
+    with (
+        checks("the daemon opens an I2C bus and finds nothing there, which is not a right that is missing"),
+        further_device("  keel:\n    driver: imu61x-i2c\n    i2c: {bus: 0, address: 24, rate_hz: 1}\n") as problem,
+    ):
+        checks.note(problem)
+
+
+def check_gpio(checks: Checks) -> None:
+    """A line that the daemon drives, of a chip whose lines make no interrupts."""
+    if not CHIP.exists():
+        checks.skip("the daemon drives a GPIO line", "this machine has no chip")
+        return
+    with checks("a GPIO chip belongs to its group"):
+        expect("group and mode", (CHIP.group(), CHIP.stat().st_mode & 0o777), ("gpio", 0o660))
+    with checks("the daemon drives a GPIO line, and says which one makes no interrupts"):
+        line = int(must(PYTHON, "-c", FREE_LINE))
+        lines = f"lines: {{reset: {{line: {line}, chip: gpiochip0}}}}"
+        with further_device(f"  keel:\n    driver: imu61x-uart\n    uart: {{port: /dev/ttyS7}}\n    {lines}\n"):
+            wait_until(lambda: (device("keel") or {}).get("lines"), "the lines of the device")
+            expect("problems of lines", (device("keel") or {})["lines"]["problems"], {})
+            held = [text for text in must("gpioinfo").splitlines() if "imud" in text]
+            expect("lines that imud holds", len(held), 1)
+            checks.note(held[0])
+
+
+def check_spi(checks: Checks) -> None:
+    """A bus on which nothing answers."""
+    nodes = sorted(Path("/dev").glob("spidev*"))
+    if not nodes:
+        checks.skip("the daemon opens an SPI bus", "this machine has none")
+        return
+    with checks("an SPI bus belongs to its group"):
+        expect("group and mode", (nodes[0].group(), nodes[0].stat().st_mode & 0o777), ("spi", 0o660))
+    text = f"  keel:\n    driver: imu61x-spi\n    spi: {{port: {nodes[0]}, mode: 0, rate_hz: 1}}\n"
+    with (
+        checks("the daemon transfers on an SPI bus and finds nothing there, which is not a right that is missing"),
+        further_device(text) as problem,
+    ):
+        checks.note(problem)
+
+
+def check_chrony(checks: Checks) -> None:
+    """Debian's chronyd with its own unit takes what the confined user sends."""
+    with checks("chronyd takes pulses that a program sends which is confined as the unit is"), configured_chronyd():
+        code = FEED.format(path=must(PYTHON, "-c", "import imud, os; print(os.path.dirname(imud.__path__[0]))").strip())
+        expect("sent, refused", confined(code, *confinement()).strip(), f"{PULSES} 0")
+        wait_until(lambda: "IMUD" in reached(), f"pulses at chronyd: {run('chronyc', 'sources').stdout}")
+
+
+@contextmanager
+def configured_chronyd() -> Iterator[None]:
+    """Run chronyd as docs/time.md has it, for as long as the block; nothing of it is left."""
+    CHRONY.unlink(missing_ok=True)  # masked by the rig
+    for name, text in CHRONY_FILES.items():
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(text)
+    must("systemctl", "daemon-reload")
+    try:
+        must("systemctl", "start", "chrony.service")
+        yield
+    finally:
+        run("systemctl", "stop", "chrony.service")
+        for name in CHRONY_FILES:
+            Path(name).unlink()
+        must("systemctl", "daemon-reload")
+
+
+def reached() -> list[str]:
+    """Sources of chronyd that something came from: their reach is not zero."""
+    rows = [row.split(",") for row in run("chronyc", "-c", "sources").stdout.splitlines()]
+    return [row[2] for row in rows if len(row) > 5 and int(row[5], 8)]
