@@ -48,6 +48,8 @@ class Load:
     shm: bool = True
     sout: bool = False
     """Whether the first device's SOUT is on a line."""
+    record_to: str = ""
+    """Directory that the daemon records to; empty for no recording."""
 
     @property
     def frames(self) -> int:
@@ -147,6 +149,7 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         "shm": {"enabled": load.shm, "directory": str(folder)}
         | ({} if load.latency_ms is None else {"latency_ms": load.latency_ms}),
         "metrics": {"port": 0},
+        "recorder": {"enabled": bool(load.record_to), "directory": load.record_to or str(folder)},
         "devices": devices,
     }
     file = folder / "imud.yaml"

@@ -23,9 +23,11 @@ class TappedPath:
             "bow", 3, self.ledger, lambda _batch: None, lambda _message, _t: None, lambda _frame: None, lambda: 0,
             self.host,
         )  # fmt: skip
-        options = DRIVER.settings()
+        options, gap = DRIVER.settings(), self.ledger.add_unknown_gap
         self.path = StreamPath(
-            DRIVER.make_codec(self.ledger, options), make_clock(config, DRIVER, None, host=self.host.steady), context
+            DRIVER.make_codec(self.ledger, options),
+            make_clock(config, DRIVER, None, host=self.host.steady, on_unknown_gap=gap),
+            context,
         )
         self.tap = DeviceTap(config, 3, self.ledger, self.host)
         self.tap.path_made(PathParts(self.path, DRIVER.name, options))

@@ -1,0 +1,179 @@
+"""Kills of what records, at random moments: every block that was written is whole, and replays as it ran.
+
+`python -m tests.bench.recorder_kills [WRITERS [DAEMONS]]`, 100 and 10 unless given, with SIGKILL:
+
+- writers: the recorder's thread in a process that gives it records as fast as it takes them, so that most kills are in
+  the middle of a write; the records that are left are the first ones, each whole, without a gap;
+- daemons: 0.2 to 3 s after their file has begun; of each file no byte is damaged and no block is missing, at most one
+  is cut short at the end, and the replay has the stamps, errors and ledgers of the run at every check. Printed is how
+  much of the time before the kill is missing.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import count
+from pathlib import Path
+from random import Random
+
+from imud.errors import ImudError
+from imud.formats.recording import records
+from imud.formats.recording.file import RecordingReader
+from imud.formats.recording.records import Kind
+from imud.publishers.recorder.writer import RecordingWriter, RecordQueue
+from imud.runtime.recording.player import Player
+from imud.worker import BusThread
+from tests.support.files import CaptureWriter, hi91
+
+RATE_HZ = 1000
+SECONDS = 5
+
+
+def capture(file: Path) -> None:
+    """A module at 1 kHz; the daemon plays it again and again."""
+    with file.open("wb") as out:
+        writer = CaptureWriter(out, driver="hipnuc-uart", baud=921600)
+        for number in range(RATE_HZ * SECONDS):
+            writer.write(hi91(number), number * 1_000_000)
+
+
+def configured(folder: Path) -> Path:
+    """The configuration of the daemon."""
+    file = folder / "imud.yaml"
+    file.write_text(f"""
+state_dir: {folder / "state"}
+recorder: {{enabled: true, directory: {folder / "recordings"}}}
+socket: {{enabled: false}}
+shm: {{enabled: false}}
+metrics: {{enabled: false}}
+devices:
+  bow: {{driver: hipnuc-uart, replay: {{path: {folder / "capture"}, speed: recorded, repeat: true}}}}
+""")
+    return file
+
+
+def new_files(folder: Path, before: set[Path]) -> list[Path]:
+    """Files that have begun since."""
+    return [one for one in (folder / "recordings").glob("*") if one not in before and one.stat().st_size]
+
+
+def run_and_kill(folder: Path, after_s: float) -> tuple[Path, int]:
+    """Run a daemon and kill it so long after its file has begun; returns the file, and CLOCK_MONOTONIC of the kill."""
+    before = set((folder / "recordings").glob("*"))
+    daemon = subprocess.Popen(
+        [sys.executable, "-m", "imud", "run", "--config", str(configured(folder))], stderr=subprocess.DEVNULL
+    )
+    try:
+        end_s = time.monotonic() + 60
+        while not (new := new_files(folder, before)):
+            assert daemon.poll() is None, f"the daemon ended with {daemon.returncode}"
+            assert time.monotonic() < end_s, "no file begins"
+            time.sleep(0.01)
+        time.sleep(after_s)
+        daemon.send_signal(signal.SIGKILL)
+        killed_ns = time.monotonic_ns()
+    finally:
+        daemon.kill()
+        daemon.wait()
+    return new[0], killed_ns
+
+
+def look_at(file: Path, killed_ns: int) -> tuple[int, float]:
+    """Samples in the file, and the seconds before the kill that are missing. Fails for whatever must not be."""
+    player = Player(lambda _batch: None)
+    newest_ns = 0
+    with file.open("rb") as opened:
+        reader = RecordingReader(opened, file.name)
+        for record in reader:
+            player.play([record])
+            if record.kind == Kind.DATA:
+                newest_ns = records.decode_data(record.body).t_rx_ns
+    assert (reader.blocks.bytes_bad, reader.blocks.blocks_missing, reader.records_unreadable) == (0, 0, 0), file
+    assert reader.stored_bytes + reader.blocks.bytes_cut == file.stat().st_size
+    devices = list(player.devices.values())
+    assert all(not device.differences for device in devices), devices[0].differences[:1]
+    return sum(device.ledger.samples for device in devices), (killed_ns - newest_ns) / 1e9
+
+
+def write_for_ever(file: Path) -> None:
+    """Give a writer numbered records, in a child that is killed."""
+    queue = RecordQueue()
+    writer = RecordingWriter(queue, time.monotonic_ns, BusThread)
+    queue.begin_file(file)
+    for number in count():
+        queue.put(records.encode_data(0, number.to_bytes(8, "little") * 10, number, -1))
+        while not queue.is_easy:
+            time.sleep(0.001)
+        assert not writer.problem, writer.problem
+
+
+def kill_writer(file: Path, after_s: float) -> tuple[int, bool]:
+    """Kill a writer so long after its start; returns the records that are left, and whether a block was cut."""
+    child = os.fork()
+    if not child:
+        try:
+            write_for_ever(file)
+        finally:
+            os._exit(1)
+    time.sleep(after_s)
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    assert os.WTERMSIG(status) == signal.SIGKILL, status
+    if not file.exists() or not file.stat().st_size:
+        return 0, False
+    with file.open("rb") as opened:
+        reader = RecordingReader(opened, file.name)
+        try:
+            numbers = [records.decode_data(record.body).t_rx_ns for record in reader]
+        except ImudError:  # the first block was cut
+            numbers = []
+    assert numbers == list(range(len(numbers)))
+    assert (reader.blocks.bytes_bad, reader.records_unreadable) == (0, 0)
+    assert reader.stored_bytes + reader.blocks.bytes_cut == file.stat().st_size
+    size = file.stat().st_size
+    file.unlink()
+    return len(numbers), reader.stored_bytes < size
+
+
+def kill_writers(kills: int) -> None:
+    """Kill that many and print what was left."""
+    random, left, cut = Random(2), 0, 0
+    with tempfile.TemporaryDirectory() as name:
+        for number in range(kills):
+            found, was_cut = kill_writer(Path(name) / str(number), random.uniform(0.0, 1.0))
+            left, cut = left + found, cut + was_cut
+    print(
+        f"{kills} writers killed, {cut} of them in the middle of a block: {left} records left, whole and without a gap"
+    )
+
+
+def main() -> int:
+    """Run as a program."""
+    kill_writers(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
+    daemons = int(sys.argv[2]) if len(sys.argv) > 2 else 10
+    if daemons:
+        kill_daemons(daemons)
+    return 0
+
+
+def kill_daemons(kills: int) -> None:
+    """Kill that many and print what was left."""
+    random, samples, missing = Random(1), 0, list[float]()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        capture(folder / "capture")
+        for _ in range(kills):
+            found, missing_s = look_at(*run_and_kill(folder, random.uniform(0.2, 3.0)))
+            samples += found
+            missing += [missing_s] if found else []
+    print(
+        f"{kills} daemons killed, {samples} samples in the files, all the same in the replay; missing before the kill: "
+        f"{sum(missing) / len(missing):.2f} s on average, {max(missing):.2f} s at most"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
