@@ -271,16 +271,19 @@ class ArrivalFit:
     def _floors(self) -> list[float]:
         """Lower bounds of the truth, bin by bin: the longest wait less the timer, and the least less the pause.
 
-        A bin that stands out above its two neighbours on either side was stalled, and is brought down to them.
+        The longest wait shows nothing where the host stood still, the least nothing where hardly a message came in
+        time, and a bound far above the fit is of a bin that was late as a whole. A bin that stands out above its two
+        neighbours on either side was stalled, and is brought down to them.
         """
         hold, pause, enough = self.hold_ns, self._pause_ns, self._pause_count
         held = hold + LATE_FACTOR * hold * self._count_late()
-        floors = [
-            max(b.longest_wait() - held, b.lowest - pause if b.count >= enough else -hold - pause)
-            if b.late_ns <= hold * b.count  # or the host stood still
-            else -hold - pause
-            for b in self._bins
-        ]
+        none = -hold - pause
+        floors = []
+        for b in self._bins:
+            longest = b.longest_wait() - held if b.late_ns <= hold * b.count else none
+            least = b.lowest - pause if b.count - b.late >= enough else none
+            floor = max(longest, least)
+            floors.append(floor if floor <= self._wait_most else none)
         padded = [-inf, -inf, *floors, -inf, -inf]
         return [min(f, max(padded[i : i + 2] + padded[i + 3 : i + 5])) for i, f in enumerate(floors)]
 
@@ -306,9 +309,14 @@ class ArrivalFit:
         for b in self._bins:
             lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
             was = b.arrival_ns - y_old - slope_old * (b.device_ns - x_old)
-            b.wait += (lowest - was) * b.count
-            b.wait_least += lowest - was
-            b.wait_most += lowest - was
+            change = lowest - was
+            b.wait += change * (b.count - b.late)
+            b.wait_least += change
+            b.wait_most += change
+            if b.late:
+                b.late_ns += change * b.late
+                if b.late_ns < 0.0:  # the fit was too low when they came
+                    b.late, b.late_ns = 0, 0.0
             b.lowest = lowest
 
     def _judge(self, device_ns: int) -> None:

@@ -16,8 +16,9 @@ FIRST_SPREAD_NS: Final = 2 * NS_PER_MS
 """Spread assumed of arrivals before any is known."""
 SIGMA_OF_RANGE: Final = 1 / sqrt(12)
 """One-sigma error of a value that can be anywhere in a range, per width of the range."""
-SIGMA_OF_HIDDEN: Final = 0.36
-"""The same of what an adapter hides, which is more often at an end: packets go at once, or a timer begins with each."""
+SIGMA_OF_HIDDEN: Final = sqrt((2 / 12 + 1 / 4) / 3)
+"""The same of what an adapter hides: anywhere in two cases of three; in the third at an end, where packets go at once,
+or a timer begins with each."""
 SMOOTHING: Final = 1 / 32
 WIRE_SLACK: Final = 1.05
 """Messages that follow each other this much faster than the wire can carry them did not come over such a wire."""

@@ -1,5 +1,6 @@
 """The fit under the arrivals, and the lines that a latency timer leaves open, against a brute-force search."""
 
+from collections.abc import Iterable
 from random import Random
 
 import pytest
@@ -57,6 +58,33 @@ def test_an_old_minimum_goes() -> None:
         device_ns = i * 10 * NS_PER_MS
         add(fit, device_ns, device_ns)
     assert abs(at(fit, device_ns) - device_ns) < 10
+
+
+# --- latency timers -------------------------------------------------------------------------------------------------
+
+
+def behind_timer(seconds: int, stalls_ns: Iterable[tuple[int, int]], hold_ns: int, pause_ns: int) -> ArrivalFit:
+    """A fit of messages every 10 ms that a timer of `hold_ns` hands over; none are in a stall from ns to ns."""
+    random, fit, stalls = Random(3), ArrivalFit(0, 0, hold_ns), tuple(stalls_ns)
+    fit.set_pause(pause_ns, hold_ns // (10 * NS_PER_MS) + 2)
+    for i in range(1, 100 * seconds):
+        sent_ns = i * 10 * NS_PER_MS
+        handed_ns = sent_ns + hold_ns - (sent_ns + 7_000_000 + i * 40) % hold_ns
+        handed_ns = next((until for since, until in stalls if since <= handed_ns < until), handed_ns)
+        device_ns, arrival_ns = sent_ns, handed_ns + int(random.expovariate(1 / 30_000))
+        trailing_ns = max(arrival_ns - sent_ns - pause_ns, 0)  # the wire is busy, but for the pause
+        fit.add_arrival(device_ns, arrival_ns - trailing_ns, trailing_ns, arrival_ns - trailing_ns - at(fit, device_ns))
+    return fit
+
+
+def test_messages_between_stalls_bound_what_a_timer_hides() -> None:
+    """A third of all messages is handed over late; the others show what they show on a quiet host."""
+    hold_ns, pause_ns = 16 * NS_PER_MS, 3 * NS_PER_MS
+    stalls = [(at_ms * NS_PER_MS, (at_ms + 120) * NS_PER_MS) for at_ms in range(0, 70_000, 350)]
+    fit = behind_timer(70, stalls, hold_ns, pause_ns)
+    assert fit.hidden_ns < 2 * pause_ns
+    device_ns = 70 * NS_PER_S
+    assert abs(at(fit, device_ns) - fit.shift_ns - device_ns) < 2 * pause_ns
 
 
 # --- feasible lines ---------------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from imud.units import NS_PER_MS, NS_PER_S
-from tests.bench.adversity import CAN, LOADED, UART, USB_1, USB_16, Cell, Device, Link, Stalls, messages
-from tests.bench.clock_table import RATIO_LEAST, RATIO_MOST, clock_of, figures_of
+from tests.bench.adversity import CAN, FRAMES, LOADED, UART, USB_1, USB_16, Cell, Device, Link, Stalls, messages
+from tests.bench.clock_table import RATIO_LEAST, RATIO_MOST, SLOW_RATE, clock_of, dated, figures_of
 
 FAST = replace(UART, baud=921_600)
 CHANGED = Device(rates_hz=((0.0, 100.0), (32.0, 400.0), (37.0, 50.0)))
@@ -57,3 +57,15 @@ def test_a_timer_that_is_as_the_driver_says_is_left_alone_on_a_busy_host() -> No
         for message in messages(cell, 2, 6, 20):
             clock.sample(message.measurement, message.t_rx_ns, 0)
         assert clock.status().hold_ns == NS_PER_MS
+
+
+def test_a_first_read_that_waited_bounds_nothing() -> None:
+    """What was sent in the first 200 ms arrives at once: no message in it shows how long the timer holds others."""
+    cell = Cell("hub stalls 200 ms every 5 s", FRAMES, stalls=Stalls(5 * NS_PER_S, 200 * NS_PER_MS))
+    later = list(dated(cell, 3, 6, 9))[200:]
+    assert max(abs(d.off_ns) for d in later) < NS_PER_MS
+
+
+def test_messages_that_a_young_fit_took_for_late_are_so_no_longer_when_it_has_moved() -> None:
+    """Else two such messages at 10 Hz widen what the timer leaves open for a minute."""
+    assert figures_of(Cell("10 Hz", USB_16, SLOW_RATE), (0, 4), 60).sigma_us < 1300
