@@ -37,7 +37,8 @@ def check(checks: Checks, _host: Host) -> None:
     with checks("metrics are not served to a public address"):
         assert not metrics(f"http://{PUBLIC}:{METRICS_PORT}"), "they are"
     with checks("the daemon reaches a real gpsd over TCP"):
-        background("labgpsd", "/usr/sbin/gpsd", "-N", "-n", "-S", str(GPSD_PORT), "/dev/null")
+        # without a receiver; with neither that nor a control socket bookworm's gpsd ends
+        background("labgpsd", "/usr/sbin/gpsd", "-N", "-n", "-S", str(GPSD_PORT), "-F", "/run/labgpsd.sock")
         configure(USB.replace("115200}", "115200}\n    rmc: {source: gpsd}") + CAN)
         start_service()
         wait_streaming("usb")
