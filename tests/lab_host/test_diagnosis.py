@@ -9,6 +9,9 @@ PANIC = (
 )
 OOPS = "[ 3.0] BUG: kernel NULL pointer dereference, address: 0\n[ 3.1] Kernel panic - not syncing: Fatal exception\n"
 KILLED = "[   20.5][  T91] Out of memory: Killed process 91 (python) total-vm:900kB\n[ 21.0] sysrq: Resetting\n"
+OF_A_CGROUP = (
+    "[ 4.0] Memory cgroup out of memory: Killed process 7 (python)\n[ 4.1] Out of memory and no killable processes...\n"
+)
 DEADLOCK = KILLED + "[ 22.0] Kernel panic - not syncing: System is deadlocked on memory\n"
 
 
@@ -25,6 +28,7 @@ DEADLOCK = KILLED + "[ 22.0] Kernel panic - not syncing: System is deadlocked on
             " Kernel panic - not syncing: VFS: Unable to mount root fs on unknown-block(0,0)",
         ),
         ("[ 1.0] Run /init as init process\n", None),
+        (OF_A_CGROUP, None),
         ("", None),
     ],
 )

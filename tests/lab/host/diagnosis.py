@@ -3,10 +3,7 @@
 import re
 
 CAUSES = (
-    (
-        r"Kernel panic - not syncing: System is deadlocked on memory|Out of memory and no killable",
-        "guest out of memory",
-    ),
+    (r"Kernel panic - not syncing: System is deadlocked on memory", "guest out of memory"),
     (r"VFS: Unable to mount root fs|Cannot open root device", "guest could not mount the host's root over 9p"),
     (r"Requested init .* failed|No working init found", "guest could not start its init"),
     (r"Out of memory: Killed process", "guest out of memory"),
