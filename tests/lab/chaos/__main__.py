@@ -168,7 +168,9 @@ class Chaos:
         if not result.balanced:
             self._show_holes(name, holes)
             uncertain = [hole.missing for hole in holes if not hole.is_certain]
-            self._violated(what, f"{name}: {result}, uncertain holes {uncertain}")
+            causes = {cause: is_now[cause] - was[cause] for cause in is_now if is_now[cause] > was[cause]}
+            causes = {cause: count for cause, count in causes.items() if cause.startswith("lost_")}
+            self._violated(what, f"{name}: {result}, uncertain holes {uncertain}, {causes}")
 
     def _show_holes(self, name: str, holes: list[Hole]) -> None:
         """Print what is between samples, by the time since the first of them."""
@@ -177,6 +179,8 @@ class Chaos:
             if hole.missing or not hole.is_certain:
                 t_ns, t_dev = sample.t_ns - samples[0].t_ns, (sample.t_dev_ns, after and after.t_dev_ns)
                 print(f"  {name}: {t_ns / 1e9:.3f} s, after sample {sample.seq}: {hole}, device time {t_dev}")
+                if name in self.far.polls and after is not None:
+                    print("    transfers:", self.far.polls[name].shown(sample.t_ns, after.t_rx_ns))
 
     def _counted_snapshot(self, what: str) -> Snapshot:
         """The state at a moment at which missed deadlines are in the ledger: it counts them ten times a second."""

@@ -68,6 +68,14 @@ class PollLog:
             first = bisect_right(self._asked, begin_ns, key=_time)
             return self._asked[first : bisect_right(self._asked, end_ns, key=_time)]
 
+    def shown(self, begin_ns: int, end_ns: int) -> str:
+        """Format transfers as `period:answer`, those that ask for no sample in brackets; the last 40."""
+        words = []
+        for asked in self.between(begin_ns - 1, end_ns)[-40:]:
+            word = f"{(asked.t_ns - begin_ns) / self.period_ns:.2f}:{asked.answer.value}"
+            words.append(word if asked.is_sample else f"({word})")
+        return " ".join(words)
+
     def strange(self, samples: Sequence[Sample]) -> list[int]:
         """`seq` of samples in whose read the device gave no good answer."""
         with self._lock:
