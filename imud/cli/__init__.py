@@ -45,6 +45,7 @@ COMMANDS = {
     "info": Subcommand("imud.cli.recording.info:INFO", "say what is in a recording, and whether it is whole"),
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
     "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
+    "top": Subcommand("imud.cli.top.command:TOP", "watch all devices in the terminal, redrawn in place"),
     "watch": Subcommand("imud.cli.samples:WATCH", "print samples as they come"),
     "clock": Subcommand(
         "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"

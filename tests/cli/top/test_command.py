@@ -1,0 +1,94 @@
+"""The thread that reads the daemon for `imud top`, and the command where it cannot run."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from queue import Queue
+
+import pytest
+
+from imud.cli import main
+from imud.cli.top.command import Feed
+from imud.cli.top.history import News
+from imud.event import Event, EventKind
+from tests.support.socket_rig import batch, daemon
+
+LIMIT_S = 10.0
+
+
+class Listener:
+    """Takes news; the test waits for what it needs."""
+
+    def __init__(self) -> None:
+        self._news: Queue[News] = Queue()
+        self.on_news = self._news.put
+
+    def wait_for(self, is_there: Callable[[News], object]) -> News:
+        while not is_there(news := self._news.get(timeout=LIMIT_S)):
+            pass
+        return news
+
+
+def test_status_samples_and_events_come(tmp_path: Path) -> None:
+    heard = Listener()
+    with daemon(tmp_path) as served:
+        feed = Feed(str(served.path), heard.on_news)
+        feed.start()
+        first = heard.wait_for(lambda news: news.statuses)
+        assert first.statuses is not None
+        assert [status.name for status in first.statuses] == ["imu0", "imu1"]
+        assert first.clients == 1
+        assert not first.problem
+        served.do(lambda server: server.publish(batch("imu0", 7)))
+        assert heard.wait_for(lambda news: news.samples).samples[-1].seq == 7
+        served.do(lambda server: server.event(Event(5, "imu1", EventKind.UP, "is there")))
+        assert heard.wait_for(lambda news: news.events).events[0].message == "is there"
+        feed.close()
+        feed.close()
+
+
+def test_the_page_of_a_device_gets_samples_of_it_only_until_the_overview_is_shown_again(tmp_path: Path) -> None:
+    heard = Listener()
+    with daemon(tmp_path) as served:
+        feed = Feed(str(served.path), heard.on_news)
+        feed.look_at("imu1")
+        feed.start()
+        heard.wait_for(lambda news: news.statuses)
+        served.do(lambda server: server.publish(batch("imu0", 1)))
+        served.do(lambda server: server.publish(batch("imu1", 2)))
+        assert {one.device for one in heard.wait_for(lambda news: news.samples).samples} == {"imu1"}
+        feed.look_at("gone")  # not in the configuration: all devices
+        heard.wait_for(lambda news: news.now_ns)
+        heard.wait_for(lambda news: news.now_ns)
+        served.do(lambda server: server.publish(batch("imu0", 3)))
+        assert heard.wait_for(lambda news: news.samples).samples[0].device == "imu0"
+        feed.close()
+
+
+def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> None:
+    heard = Listener()
+    with daemon(tmp_path) as served:
+        path = str(served.path)
+        feed = Feed(path, heard.on_news)
+        feed.start()
+        heard.wait_for(lambda news: news.statuses)
+    assert path in heard.wait_for(lambda news: news.problem).problem
+    with daemon(tmp_path):
+        assert not heard.wait_for(lambda news: news.statuses).problem
+        feed.close()
+
+
+def test_without_a_terminal_it_says_what_to_use_instead(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["top"]) == 2
+    assert "expected a terminal; `imud status` and `imud watch` write to anything" in capsys.readouterr().err
+
+
+def test_without_the_library_it_says_how_to_get_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for stream in (sys.stdin, sys.stdout):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    monkeypatch.setitem(sys.modules, "textual.app", None)
+    monkeypatch.delitem(sys.modules, "imud.cli.top.app", raising=False)
+    assert main(["top"]) == 2
+    assert "pip install 'imud[top]'" in capsys.readouterr().err

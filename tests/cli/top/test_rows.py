@@ -1,0 +1,99 @@
+"""Rows of the table of `imud top`: width, order, filter."""
+
+import msgspec
+import pytest
+
+from imud.cli.top.history import DeviceHistory
+from imud.cli.top.rows import AGE, LOST, NAME, RATE, STATE, VIEWS, WIDTH, chosen, duration, fitted, head, row
+from imud.contracts.status import DeviceState
+from imud.sample import Sync
+from imud.units import NS_PER_S
+from tests.support.metrics import device
+from tests.support.socket_rig import sample
+
+NOW_NS = sample().t_ns + NS_PER_S // 4
+
+
+def history(name: str = "imu0", number: int = 0, **changes: object) -> DeviceHistory:
+    """A device with a sample."""
+    one = DeviceHistory(device(name, number, **changes))
+    one.add(msgspec.structs.replace(sample(name), euler_rad=(0.5, -0.25, 3.0)))
+    return one
+
+
+def test_a_row_has_its_values_below_their_titles() -> None:
+    columns = VIEWS["motion"]
+    assert head(columns) == "DEVICE     STATE         HZ   AGE  LOST   ±µs  ROLL° PITCH°   YAW°   |a|  |ω|°"
+    assert row(history(), columns, NOW_NS) == (
+        "imu0       running    999.5 0.25s  4066    12   28.6  -14.3  171.9  9.76  53.6"
+    )
+
+
+def test_a_device_without_samples_has_dashes() -> None:
+    words = row(DeviceHistory(device("imu0", state=DeviceState.MISSING)), VIEWS["motion"], NOW_NS).split()
+    assert words == ["imu0", "missing", "999.5", "-", "4066", "-", "-", "-", "-", "-", "-"]
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("value", [1e-9, 12.3456, 9_999_999.0, 1e15])
+def test_every_row_is_as_wide_as_its_titles_and_fits_80_columns(view: str, value: float) -> None:
+    ledger = dict.fromkeys(device("x").ledger, int(value))
+    one = history(
+        "a-name-that-is-much-longer-than-the-column", ledger=ledger, rate_hz=value, temperature_c=-value,
+        expected_rate_hz=value, connects=int(value), state=DeviceState.SEARCHING,
+    )  # fmt: skip
+    one.add(
+        msgspec.structs.replace(
+            sample(seq=2), euler_rad=(-value,) * 3, accel_m_s2=(value,) * 3, gyro_rad_s=(value,) * 3,
+            t_err_ns=int(value * 1000), sync=Sync.REGRESSION,
+        )
+    )  # fmt: skip
+    columns = VIEWS[view]
+    text = row(one, columns, NOW_NS + int(value) * NS_PER_S)
+    assert len(text) <= len(head(columns)) <= WIDTH
+    assert len(text.split()) == len(columns)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.0, "0.00s"), (9.994, "9.99s"), (10.0, "10s"), (999.0, "999s"), (1000.0, "17m"), (59_900.0, "998m"),
+     (60_000.0, "17h"), (360_000.0, "4d"), (8.64e7, "1000d")],
+)  # fmt: skip
+def test_ages_have_five_characters_at_most(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "width", "text"),
+    [(12.34, 5, "12.3"), (12345.6, 5, "12346"), (123456.0, 5, "1.2e5"), (1234567.0, 4, "1e6"), (-1e300, 3, "###")],
+)
+def test_numbers_lose_digits_rather_than_the_column_its_width(value: float, width: int, text: str) -> None:
+    assert fitted(value, width, lambda number: f"{number:.1f}") == text
+
+
+def names(devices: list[DeviceHistory]) -> list[str]:
+    return [one.status.name for one in devices]
+
+
+def test_the_largest_number_and_the_worst_state_come_first() -> None:
+    devices = [history("b", 1), history("c", 0, state=DeviceState.FAILED), history("a", 2)]
+    assert names(chosen(devices, NAME, NOW_NS)) == ["a", "b", "c"]
+    assert names(chosen(devices, NAME, NOW_NS, backwards=True)) == ["c", "b", "a"]
+    assert names(chosen(devices, RATE, NOW_NS)) == ["a", "b", "c"]
+    assert names(chosen(devices, LOST, NOW_NS, backwards=True)) == ["c", "b", "a"]
+    assert names(chosen(devices, STATE, NOW_NS)) == ["c", "a", "b"]
+
+
+def test_a_device_without_samples_is_the_oldest() -> None:
+    devices = [history("a"), DeviceHistory(device("b"))]
+    assert names(chosen(devices, AGE, NOW_NS)) == ["b", "a"]
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [("", ["bow", "stern"]), ("BOW", ["bow"]), ("ttyusb1", ["stern"]), ("hi13 running", ["bow", "stern"]),
+     ("bow stern", []), ("power", ["stern"])],
+)  # fmt: skip
+def test_the_filter_looks_for_all_words_everywhere(words: str, found: list[str]) -> None:
+    devices = [history("bow", 0), history("stern", 1, problem="has no power")]
+    assert names(chosen(devices, NAME, NOW_NS, words=words)) == found
