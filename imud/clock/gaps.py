@@ -44,6 +44,8 @@ PACE_GAIN: Final = 0.5
 """Share of a window's drift that goes into the period."""
 PACE_KNOWN: Final = 0.002
 """Relative error from which on samples are counted by the period."""
+PACE_NEAR: Final = 0.05
+"""A first estimate of the period that is off by no more is corrected; one that is off by more is made anew."""
 PACE_FLOOR: Final = 1e-5
 """Relative error of the period at the least: crystals drift, and messages wait."""
 OFF_WINDOWS: Final = 4
@@ -219,10 +221,10 @@ class ArrivalPace:
                     return turns * self._turn, (turns + self._unjudged) * self._error < UNCERTAIN or self._turn > 1
                 return 0, not has_phase or late_ns * -2 < turn_ns
         self._off_windows = 0
-        if abs(off) > PACE_KNOWN:
+        if abs(off) > PACE_KNOWN and (self.is_known or abs(off) > PACE_NEAR or 2 * late_ns >= turn_ns):
             return self._learn(arrival_ns)
         self._due_ns += late_ns
-        if has_phase or not self.is_known:
+        if has_phase:  # else late by as much as the one message waited that set the phase
             self.period_ns *= 1 + off * (PACE_GAIN if self.is_known else 1.0)
             self._error = max(abs(off), self._error * PACE_GAIN if self.is_known else abs(off), PACE_FLOOR)
         return 0, late_ns * -2 < turn_ns

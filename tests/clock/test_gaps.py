@@ -259,6 +259,17 @@ def test_a_first_message_that_waited_costs_nothing_that_is_known_of_the_pace(wai
     assert paced(pace, begin_ns + 33_010 * NS_PER_MS, 300) == (3000, 0), "an outage of 30 s is counted exactly"
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_the_pace_is_known_within_80_messages_whatever_they_wait_up_to_a_twentieth_of_their_period(seed: int) -> None:
+    random, pace, period_ns = Random(seed), ArrivalPace(1 << 16), 100 * NS_PER_MS
+    pace.begin(BEGIN_NS + int(random.uniform(0, 0.05) * period_ns))
+    for index in range(1, 80):
+        missed, _ = pace.add_arrival(BEGIN_NS + index * period_ns + int(random.uniform(0, 0.05) * period_ns))
+        assert missed == 0
+    assert pace.is_known
+    assert pace.period_ns == pytest.approx(period_ns, rel=5e-3)
+
+
 def test_messages_that_are_early_once_show_a_wrong_phase_and_no_other_rate() -> None:
     pace = ArrivalPace()
     pace.begin(BEGIN_NS)
