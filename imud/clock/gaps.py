@@ -212,11 +212,11 @@ class ArrivalPace:
         late_ns, turn_ns = self._least_ns, self._turn * self.period_ns
         off = late_ns / (self._unjudged * self.period_ns)
         has_phase, self._has_phase = self._has_phase, True
-        if self.is_known and (2 * late_ns >= turn_ns or off < -PACE_KNOWN):
+        if self.is_known and (2 * late_ns >= turn_ns or abs(off) > PACE_KNOWN):
             self._off_windows += 1
             if self._off_windows < OFF_WINDOWS:
                 turns = max(round(late_ns / turn_ns), 0)
-                self._due_ns += turns * turn_ns if turns else late_ns
+                self._due_ns += turns * turn_ns if turns else min(late_ns, 0)  # late ones waited
                 if turns:
                     return turns * self._turn, (turns + self._unjudged) * self._error < UNCERTAIN or self._turn > 1
                 return 0, not has_phase or late_ns * -2 < turn_ns

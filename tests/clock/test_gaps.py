@@ -281,6 +281,17 @@ def test_messages_that_are_early_once_show_a_wrong_phase_and_no_other_rate() -> 
     assert paced(pace, begin_ns + 33_000 * NS_PER_MS, 300, late_ns=-18 * NS_PER_MS) == (3000, 0)
 
 
+@pytest.mark.parametrize("late_ms", [4, 40])
+def test_a_window_that_waited_as_a_whole_costs_nothing_that_is_known_of_the_pace(late_ms: int) -> None:
+    pace, step_ns = ArrivalPace(256), 100 * NS_PER_MS
+    pace.begin(BEGIN_NS)
+    for index in range(1, 400):
+        waits_ns = late_ms * NS_PER_MS if 200 <= index < 240 else 0
+        assert pace.add_arrival(BEGIN_NS + index * step_ns + waits_ns) == (0, True)
+        assert pace.is_known == (index >= 48)
+    assert pace.period_ns == pytest.approx(step_ns, rel=1e-4)
+
+
 @pytest.mark.parametrize("period_ms", [5, 9.9, 10.1])
 def test_messages_that_are_off_in_every_window_are_of_another_rate(period_ms: float) -> None:
     pace = ArrivalPace()
