@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from imud.errors import ImudError
+from imud.errors import ImudError, reason_of
 from imud.formats.can import CanFrame
 
 VERSION: Final = 1
@@ -296,7 +296,7 @@ def decode_object(record: Record, type_: type[Any]) -> Any:
     try:
         return msgspec.msgpack.decode(record.body, type=type_)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ImudError(f"a record of kind {record.kind} cannot be read: {error}") from None
+        raise ImudError(f"a record of kind {record.kind} cannot be read: {reason_of(error)}") from None
 
 
 def decode_data(body: bytes) -> DataRecord:

@@ -21,7 +21,7 @@ from imud.contracts.publisher import Batch
 from imud.contracts.settings import NoSettings
 from imud.contracts.timing import TriggerStamp, UtcReference
 from imud.devices import DRIVERS
-from imud.errors import ImudError, TransferError
+from imud.errors import ImudError, TransferError, reason_of
 from imud.formats.recording import records
 from imud.formats.recording.records import (
     CallRecord,
@@ -244,7 +244,7 @@ def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> Dev
             declination_deg=msgspec.convert(tree.get("declination_deg"), float | None),
         )  # fmt: skip
     except msgspec.ValidationError as error:
-        raise ImudError(f"{described.name}: its configuration cannot be read: {error}") from None
+        raise ImudError(f"{described.name}: its configuration cannot be read: {reason_of(error)}") from None
 
 
 def _give_edges(device: PlayedDevice, line: str, found: list[records.EdgeRecord]) -> None:

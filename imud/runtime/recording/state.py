@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import msgspec
 
-from imud.errors import ImudError
+from imud.errors import ImudError, reason_of
 
 MODULES: Final = (
     "imud.clock.", "imud.contracts.", "imud.devices.", "imud.formats.", "imud.runtime.meters",
@@ -73,7 +73,7 @@ class StateWriter:
         try:
             return msgspec.msgpack.encode(tree)
         except (OverflowError, TypeError, ValueError) as error:
-            raise StateError(f"the state cannot be written: {error}") from None
+            raise StateError(f"the state cannot be written: {reason_of(error)}") from None
 
     def _value(self, value: Any, path: str, depth: int) -> Any:  # noqa: PLR0911 - one for each kind of value
         if value is None or type(value) in (bool, int, float, str, bytes):
@@ -153,8 +153,8 @@ class StateReader:
         self._made: dict[int, Any] = {}
         try:
             self._tree = msgspec.msgpack.decode(state, type=dict[str, tuple[int, dict[str, Any]]])
-        except (msgspec.DecodeError, RecursionError) as error:
-            raise StateError(f"the state cannot be read: {error}") from None
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise StateError(f"the state cannot be read: {reason_of(error)}") from None
 
     def restore(self, name: str, root: object) -> None:
         """Give a root the attributes that were written; roots in the order in which they were written.
@@ -179,7 +179,7 @@ class StateReader:
         try:
             return self._object(written, depth + 1)
         except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
-            raise StateError(f"the state cannot be restored: {error!r}") from None
+            raise StateError(f"the state cannot be restored: {reason_of(error)}") from None
 
     def _object(self, written: list[Any], depth: int) -> Any:  # noqa: PLR0911 - one for each kind of value
         match written:

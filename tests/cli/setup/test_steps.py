@@ -42,7 +42,9 @@ def test_a_new_gateway_is_set_up_and_taken_back(
     text = (gateway.root / "etc/imud.yaml").read_text()
     (imu,) = config.parse(text, "imud.yaml").devices
     assert (imu.name, imu.driver, imu.link_settings.port) == ("imu", "hipnuc-uart", BY_ID)  # type: ignore[attr-defined]
-    assert set(EXAMPLE.splitlines()) - set(text.splitlines()) < set(EXAMPLE.splitlines()[44:60])
+    example = EXAMPLE.splitlines()
+    first_device = example[example.index("devices:") :][:16]
+    assert set(example) - set(text.splitlines()) < set(first_device)
     assert (gateway.root / "etc/imud.yaml.DATE").read_text() == EXAMPLE
     assert 'ATTR{latency_timer}="1"' in (gateway.root / "etc/udev/rules.d/61-imud-setup.rules").read_text()
     assert gateway.units["imud.service"] == ["enabled", "active"]

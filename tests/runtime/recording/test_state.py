@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from imud.clock import SampleClock
@@ -106,6 +106,7 @@ def test_an_attribute_that_this_version_does_not_have_is_an_error() -> None:
         StateReader(state, {}).restore("other", Holder(value=None))
 
 
+@example(b"\x81\xa5\x00\x00\x00\x00\x80")
 @given(st.binary(max_size=60))
 def test_no_bytes_raise_anything_else(data: bytes) -> None:
     try:
