@@ -82,5 +82,6 @@ class ReadyEdges:
             return None
         error_ns = self._error_ns
         if len(edges) > 1 and edges[1].t_ns <= end_ns:  # new values during the read: either
-            error_ns = hypot(error_ns, EITHER * (edges[1].t_ns - t_ns))
+            newest_ns = max(edge.t_ns for edge in edges if edge.t_ns <= end_ns)
+            error_ns = hypot(error_ns, EITHER * (newest_ns - t_ns))
         return Stamp(min(t_ns + self._offset_ns, start_ns), int(error_ns) + 1, number)

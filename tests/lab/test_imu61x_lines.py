@@ -123,6 +123,18 @@ class Stepped:
         truth = self.device.truth_at(self.device.epoch_ns + sample.edge_seq * STEP_NS)
         assert dist(sample.accel_m_s2, truth.accel_m_s2) < RESOLUTION_M_S2
 
+    def has_within_error(self, sample: Sample) -> None:
+        """It is the one of its edge, or of a later one that came while it was read; then its stated error says so."""
+        assert sample.edge_seq is not None
+        assert sample.accel_m_s2 is not None
+        truths = [self.device.truth_at(self.device.epoch_ns + n * STEP_NS) for n in range(1, len(self.stamps_ns) + 1)]
+        numbers = [
+            n for n, truth in enumerate(truths, 1) if dist(sample.accel_m_s2, truth.accel_m_s2) < RESOLUTION_M_S2
+        ]
+        assert len(numbers) == 1
+        assert numbers[0] >= sample.edge_seq
+        assert self.stamps_ns[numbers[0] - 1][0] - sample.t_ns <= 2 * sample.t_err_ns
+
 
 @pytest.fixture(params=["i2c", "spi8"])
 def stepped(request: pytest.FixtureRequest, gpio_chip: GpioChip) -> tuple[Stepped, DeviceConfig]:
@@ -167,7 +179,7 @@ def test_every_edge_is_one_sample(stepped: tuple[Stepped, DeviceConfig]) -> None
 
 
 def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple[Stepped, DeviceConfig]) -> None:
-    """Three renewals before the loop hears of one: a single read, which is of the last."""
+    """Ten renewals at once: a read goes on during some of them, and there is none for others."""
     it, config = stepped
 
     async def body() -> None:
@@ -178,18 +190,21 @@ def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple
             seen = rig.device.status().lines
             assert seen is not None
             for _ in range(5):
-                for _ in range(3):
+                for _ in range(10):
                     it.renew()
                 count = len(rig.samples)
                 await rig.until(lambda count=count: len(rig.samples) > count, "its sample", LIMIT_S)  # type: ignore[misc]  # binds it
             numbers = [sample.edge_seq or 0 for sample in rig.samples[1:]]
             for sample in rig.samples[1:]:
-                it.has(sample)
+                it.has_within_error(sample)
             missed = sum(b - a - 1 for a, b in pairwise(numbers))
-            assert missed >= 5
+            assert missed > 0
             rig.device.tick(monotonic_ns())
-            assert rig.device.ledger.lost_queue == missed
-            assert len(numbers) + missed == numbers[-1] == len(it.stamps_ns)
+            polling = rig.device.status().polling
+            assert polling is not None
+            lost, stale = rig.device.ledger.lost_queue, polling.stale  # what a read took early is stale at its edge
+            assert 0 < lost <= missed <= lost + stale
+            assert numbers[-1] <= len(it.stamps_ns) <= numbers[-1] + stale
 
     asyncio.run(body())
 
