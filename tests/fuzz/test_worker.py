@@ -58,3 +58,7 @@ def test_a_result_shows_its_findings() -> None:
     assert str(good).split() == ["utc/rmc", "atheris", "1000", "100", "82", "145", "22", "none"]
     bad = runner.Result("utc/rmc", "atheris", 1, 1.0, "-", "-", "-", (Path("build/fuzz/utc-rmc/crash-1"),), failed=True)
     assert str(bad).endswith("build/fuzz/utc-rmc/crash-1")
+
+
+def test_words_of_a_dictionary_are_ascii() -> None:
+    assert worker.escaped(b'aZ9_"\\\x00\x80\xff') == r"aZ9\x5F\x22\x5C\x00\x80\xFF"

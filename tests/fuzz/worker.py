@@ -86,7 +86,7 @@ def _dictionary(target: Target, folder: Path) -> list[str]:
     """The option that names a file of the target's words; none for a target without words."""
     words = target.words()
     file = folder / "words.dict"
-    file.write_text("".join(f'"{_escaped(word)}"\n' for word in words))
+    file.write_text("".join(f'"{escaped(word)}"\n' for word in words))
     return [f"-dict={file}"] if words else []
 
 
@@ -141,8 +141,9 @@ def _changed(target: Target, data: bytes, at: int, cut: int, put: bytes, seed: i
     return (target.mend(data, Random(seed)) if seed % 2 else data)[: target.bytes_max]
 
 
-def _escaped(word: bytes) -> str:
-    return "".join(chr(byte) if chr(byte).isalnum() else f"\\x{byte:02X}" for byte in word)
+def escaped(word: bytes) -> str:
+    """Format a word for a dictionary of libFuzzer, which has ASCII only."""
+    return "".join(chr(byte) if bytes([byte]).isalnum() else f"\\x{byte:02X}" for byte in word)
 
 
 def main() -> int:
