@@ -1,10 +1,10 @@
 """The screens and keys of `imud top`."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import ClassVar, Final, Protocol
 
-from textual.app import App, ComposeResult, SystemCommand
+from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, VerticalScroll
 from textual.message import Message
@@ -12,16 +12,14 @@ from textual.screen import Screen
 from textual.widgets import Footer, Input, Label, OptionList, RichLog, Sparkline, Static
 from textual.widgets.option_list import Option
 
-from imud.cli.status import block
+from imud.cli.status import WELL, block
 from imud.cli.top.history import CURVES, DeviceHistory, Fleet, News
 from imud.cli.top.rows import SORTS, TEXT_MAX, VIEWS, chosen, head, row
-from imud.contracts.status import DeviceState
 from imud.event import Event
 from imud.log import printable
 from imud.units import NS_PER_S
 
 EVENTS_KEPT: Final = 200
-SHOWN_WELL: Final = (DeviceState.RUNNING, DeviceState.FINISHED)
 
 
 def event_line(event: Event) -> str:
@@ -90,16 +88,9 @@ class TopApp(App[None]):
         self.push_screen(Overview())
         self._feed.start()
 
-    def _post(self, news: News) -> None:
-        self.post_message(NewsCame(news))
-
     def on_unmount(self) -> None:
         """End the feed."""
         self._feed.close()
-
-    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """None: there is no palette."""
-        return ()
 
     def look_at(self, device: str | None) -> None:
         """Show more of this device, less of the others."""
@@ -120,7 +111,7 @@ class TopApp(App[None]):
 
     def redraw(self) -> None:
         """Draw the screen that is shown."""
-        if isinstance(self.screen, Overview | DevicePage):
+        if isinstance(self.screen, TopScreen):
             self.screen.redraw()
 
     def action_pause(self) -> None:
@@ -140,12 +131,41 @@ class TopApp(App[None]):
         if self.problem:
             return printable(self.problem, TEXT_MAX)
         devices = self.fleet.devices.values()
-        well = sum(device.status.state in SHOWN_WELL for device in devices)
+        well = sum(device.status.state in WELL for device in devices)
         words = f"imud: {well} of {len(devices)} devices well, {self.fleet.clients} clients"
         return words + ("  PAUSED" if self.paused else "")
 
+    def _post(self, news: News) -> None:
+        self.post_message(NewsCame(news))
 
-class Overview(Screen[None]):
+
+class TopScreen(Screen[None]):
+    """A screen of the program, which is drawn once all its parts are there."""
+
+    is_ready = False
+
+    @property
+    def top(self) -> TopApp:
+        """The program."""
+        assert isinstance(self.app, TopApp)
+        return self.app
+
+    def redraw(self) -> None:
+        """Draw what the program knows now."""
+        if self.is_ready:
+            self.draw()
+
+    def begin(self) -> None:
+        """Draw for the first time."""
+        self.is_ready = True
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw everything; all parts are there."""
+        raise NotImplementedError
+
+
+class Overview(TopScreen):
     """The table of all devices."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -162,14 +182,6 @@ class Overview(Screen[None]):
         self.sort = SORTS[0]
         self.backwards = False
         self.words = ""
-        self._ready = False
-        """Whether all parts of the screen are there."""
-
-    @property
-    def top(self) -> TopApp:
-        """The program."""
-        assert isinstance(self.app, TopApp)
-        return self.app
 
     def compose(self) -> ComposeResult:
         """State, titles, rows, the words of the filter, keys."""
@@ -182,13 +194,10 @@ class Overview(Screen[None]):
     def on_mount(self) -> None:
         """Give the keys to the rows."""
         self.query_one("#rows").focus()
-        self._ready = True
-        self.redraw()
+        self.begin()
 
-    def redraw(self) -> None:
+    def draw(self) -> None:
         """Draw what changed; the row that was marked stays so."""
-        if not self._ready:
-            return
         top, columns = self.top, VIEWS[self.view]
         shown = chosen(
             top.fleet.devices.values(), self.sort, top.fleet.now_ns, backwards=self.backwards, words=self.words
@@ -258,7 +267,7 @@ class Overview(Screen[None]):
         self.query_one("#rows").focus()
 
 
-class DevicePage(Screen[None]):
+class DevicePage(TopScreen):
     """One device: its values over the last minute, its whole status, and events as they come."""
 
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,backspace", "app.pop_screen", "Back", key_display="esc")]
@@ -268,14 +277,6 @@ class DevicePage(Screen[None]):
         self._device = name
         self._shown: Event | None = None
         """The newest event in the list."""
-        self._ready = False
-        """Whether all parts of the screen are there."""
-
-    @property
-    def top(self) -> TopApp:
-        """The program."""
-        assert isinstance(self.app, TopApp)
-        return self.app
 
     def compose(self) -> ComposeResult:
         """State, curves, status, events, keys."""
@@ -292,16 +293,10 @@ class DevicePage(Screen[None]):
     def on_mount(self) -> None:
         """Ask for more samples of the device."""
         self.top.look_at(self._device)
-        self.call_after_refresh(self._begin)
+        self.call_after_refresh(self.begin)
 
-    def _begin(self) -> None:
-        self._ready = True
-        self.redraw()
-
-    def redraw(self) -> None:
+    def draw(self) -> None:
         """Draw everything."""
-        if not self._ready:
-            return
         self.query_one("#state", Static).update(self.top.state_line())
         device = self.top.fleet.devices.get(self._device)
         self.query_one("#block", Static).update(
