@@ -140,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
 
 def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
     """What is printed, as JSON has it."""
-    session, found = contents.session, reader.blocks
+    session = contents.session
     return {
         "begun_utc_ns": session.utc_ns if session is not None else None,
         "imud": session.imud if session is not None else "",
@@ -150,7 +150,7 @@ def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
         "stored_bytes": reader.stored_bytes,
         "plain_bytes": reader.plain_bytes,
         "blocks": reader.blocks_read,
-        "damage": bool(found.bytes_bad or found.blocks_missing or reader.records_unreadable),
+        "damage": reader.is_damaged,
         "problems": reader.problems,
         "records_dropped": contents.dropped,
         "devices": [

@@ -62,7 +62,7 @@ def _play(file: BinaryIO, args: argparse.Namespace) -> int:
         raise printer.problem
     devices = list(player.devices.values())
     print("\n\n".join(["\n".join(block(device)) for device in devices] + remarks(reader, player)), file=sys.stderr)
-    same = all(not device.differences for device in devices) and not player.lost and not reader.blocks.bytes_bad
+    same = all(not device.differences for device in devices) and not player.lost and not reader.is_damaged
     return 0 if same and any(device.ledger.samples for device in devices) else 1
 
 

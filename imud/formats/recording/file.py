@@ -94,6 +94,11 @@ class RecordingReader:
                 )
 
     @property
+    def is_damaged(self) -> bool:
+        """After iterating: whether blocks are damaged or missing. A file without its regular end need not be."""
+        return bool(self.blocks.bytes_bad or self.blocks.blocks_missing or self.records_unreadable)
+
+    @property
     def problems(self) -> list[str]:
         """After iterating: what is wrong with the file, one sentence each; empty for a whole one."""
         read, found = self.blocks, []
