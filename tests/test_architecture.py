@@ -336,6 +336,7 @@ TESTED_IN = {
     "imud.cli.probe.command": "cli/probe/test_can.py",
     "imud.cli.probe.report": "cli/probe/test_can.py",
     "imud.client.watch": "client/test_connection.py",
+    "imud.clock.period_learner": "clock/test_device_time.py",
     "imud.config.devices": "config/test_reading.py",
     "imud.config.keys": "config/test_reading.py",
     "imud.config.model": "config/test_reading.py",

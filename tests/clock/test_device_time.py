@@ -8,7 +8,8 @@ import pytest
 
 from imud.clock import SampleClock
 from imud.clock.arrival_fit import ArrivalFit
-from imud.clock.device_time import DeviceTime, PeriodLearner
+from imud.clock.device_time import DeviceTime
+from imud.clock.period_learner import PeriodLearner
 from imud.contracts.timing import UtcReference
 from imud.sample import Measurement, Sample, Sync
 from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
