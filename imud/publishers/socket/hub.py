@@ -14,7 +14,7 @@ from imud.publishers.socket.messages import DeviceNotice
 from imud.publishers.socket.outbox import Pool
 from imud.publishers.socket.quota import Quota, Seldom
 from imud.publishers.socket.serving import TokenBucket
-from imud.publishers.socket.subscription import DeliveryPlan, FormKey, Subscription
+from imud.publishers.socket.subscription import DeliveryPlan, Subscription
 
 log = logging.getLogger(__name__)
 
@@ -159,31 +159,30 @@ class Hub:
 
         Raises RpcError when its user has too many forms of samples.
         """
-        uid = connection.peer.uid
-        self._quota.check_form(uid, subscription.key, self._forms_of(uid, connection))
-        self.unsubscribe(connection)
+        old = self._subscriptions.get(connection.number)
+        self._quota.exchange_form(connection.peer.uid, old and old.key, subscription.key)
+        self._stop_sending(connection)
         self._subscriptions[connection.number] = subscription
         self.context.latencies.ask(_asker(connection), subscription.latency_ns, subscription.devices)
         for device, plan in self._plans.items():
             if subscription.matches(device):
                 plan.add(device, subscription, connection.outbox)
 
-    def _forms_of(self, uid: int, but: Connection) -> set[FormKey]:
-        """The forms of samples that other clients of a user get."""
-        return {
-            wanted.key
-            for number, wanted in self._subscriptions.items()
-            if number != but.number and self._connections[number].peer.uid == uid
-        }
-
     def unsubscribe(self, connection: Connection) -> None:
         """Send no more samples to a client; no-op if it watches none."""
+        subscription = self._stop_sending(connection)
+        if subscription is not None:
+            self._quota.exchange_form(connection.peer.uid, subscription.key, None)
+            self.context.latencies.release(_asker(connection))
+
+    def _stop_sending(self, connection: Connection) -> Subscription | None:
+        """Send what the client watches no more; returns what that was."""
         subscription = self._subscriptions.pop(connection.number, None)
         if subscription is not None:
-            self.context.latencies.release(_asker(connection))
             for device, plan in self._plans.items():
                 if subscription.matches(device):
                     plan.discard(subscription, connection.outbox)
+        return subscription
 
     def subscribe_events(self, connection: Connection, devices: Collection[str] | None) -> None:
         """Send events of `devices` (None for all) to a client from now on, in place of those before."""

@@ -11,6 +11,7 @@
 """
 
 import resource
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -67,6 +68,8 @@ class Quota:
         self._fd_end = fd_limit - min(RESERVED_FDS, fd_limit // 4)
         self._now_ns = now_ns
         self._connects: dict[int, TokenBucket] = {}
+        self._forms: dict[int, Counter[object]] = {}
+        """How many clients of each user watch samples in each form."""
 
     def refuse_client(self, peer: Peer, rights: Rights, fd: int, clients: Collection[Connected]) -> RpcError | None:
         """Why a client that has just connected with the right to read cannot stay; None if it can."""
@@ -95,11 +98,26 @@ class Quota:
                 Code.UNAVAILABLE, f"notify: uid {peer.uid} has {most} descriptors already, as many as it may"
             )
 
-    def check_form(self, uid: int, form: object, others: Collection[object]) -> None:
-        """Raises RpcError when the user's clients have FORMS_PER_USER other forms of samples, and not this one."""
-        if len(others) >= FORMS_PER_USER and form not in others:
+    def exchange_form(self, uid: int, old: object, new: object) -> None:
+        """Count that a client of the user watches samples in form `new` instead of `old`; None for nothing.
+
+        Raises RpcError, and counts nothing, when the user's clients have FORMS_PER_USER other forms, and not this one.
+        """
+        if old == new:
+            return
+        forms = self._forms.setdefault(uid, Counter())
+        others = len(forms) - (forms[old] == 1)
+        if new is not None and new not in forms and others >= FORMS_PER_USER:
             message = f"watch: uid {uid} has {FORMS_PER_USER} selections of fields already; leave `fields` out"
             raise RpcError(Code.UNAVAILABLE, message)
+        if new is not None:
+            forms[new] += 1
+        if old is not None:
+            forms[old] -= 1
+            if not forms[old]:
+                del forms[old]
+        if not forms:
+            del self._forms[uid]
 
     def check_fds(self, fds: Sequence[int]) -> None:
         """Raises RpcError when new descriptors are among those reserved; the caller closes them then."""

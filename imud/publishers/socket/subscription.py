@@ -84,13 +84,15 @@ class Subscription:
     """Whether integers of JSON samples that may exceed 2⁵³ are text."""
     latency_ns: int = 0
     """How late samples may be; 0: each at once."""
+    key: FormKey = field(init=False)
+    """What clients have in common that get the same messages."""
     _paces: dict[str, Pace] = field(default_factory=dict)
 
-    @property
-    def key(self) -> FormKey:
-        """What clients have in common that get the same messages."""
+    def __post_init__(self) -> None:
         json = self.form is Form.JSON
-        return self.form, self.fields if json else None, self.framed, self.convention, json and self.text_numbers
+        self.key = (
+            self.form, self.fields if json else None, self.framed, self.convention, json and self.text_numbers,
+        )  # fmt: skip
 
     def encoding(self) -> Encoding:
         """Make the encoding of these messages."""
@@ -112,12 +114,18 @@ class Subscription:
 class DeliveryGroup:
     """Clients that get samples of one device in the same form: each message is encoded once for all of them.
 
-    The lists are replaced, never changed: a client may leave while a batch is being sent to them.
+    The lists are replaced, never changed: a client may leave while a batch is being sent to them. They are made for the
+    next batch, not for each client that comes or goes: 256 clients that watch something else all the time cost the
+    group no more than its batches do.
     """
 
     def __init__(self, encoding: Encoding, order: Callable[[], int]) -> None:
         self.encoding = encoding
         self._order = order
+        self._paces: dict[Outbox, Pace | None] = {}
+        """The clients; None for one that gets every sample."""
+        self._changed = False
+        """Whether the lists are not those of the clients any more."""
         self._direct: list[list[Outbox]] = []
         """Of clients that get every sample, in lists of CLIENTS_PER_LOOK at most."""
         self._paced: list[tuple[Pace, Outbox]] = []
@@ -125,23 +133,23 @@ class DeliveryGroup:
     @property
     def is_small(self) -> bool:
         """Whether sending to all takes so little time that no look at the clock is needed."""
-        return len(self._direct) <= 1 and len(self._paced) <= CLIENTS_PER_LOOK
+        return len(self._paces) <= CLIENTS_PER_LOOK
 
     def add(self, outbox: Outbox, pace: Pace | None) -> None:
         """Add a client."""
-        if pace is None:
-            self._direct = _in_parts([*chain(*self._direct), outbox])
-        else:
-            self._paced = [*self._paced, (pace, outbox)]
+        self._paces[outbox] = pace
+        self._changed = True
 
     def discard(self, outbox: Outbox) -> bool:
         """Remove a client if it is there; return whether none is left."""
-        self._direct = _in_parts([one for one in chain(*self._direct) if one is not outbox])
-        self._paced = [(pace, one) for pace, one in self._paced if one is not outbox]
-        return not self._direct and not self._paced
+        self._paces.pop(outbox, None)
+        self._changed = True
+        return not self._paces
 
     def send(self, batch: Batch, now_ns: Callable[[], int], end_ns: int) -> None:
         """Send the batch to every client of the group until `end_ns`, then queue it for the others."""
+        if self._changed:
+            self._make_lists()
         encoding = self.encoding
         messages: Sequence[bytes] = ()
         if self._direct:
@@ -159,10 +167,17 @@ class DeliveryGroup:
 
     def defer(self, batch: Batch) -> None:
         """Queue the batch for every client of the group; it is encoded when the first of them is served."""
+        if self._changed:
+            self._make_lists()
         for chosen, outboxes in self._due(batch).items():
             _defer(outboxes, Delivery(self._order(), batch, self.encoding, None, chosen))
         if self._direct:
             _defer(chain(*self._direct), Delivery(self._order(), batch, self.encoding, None))
+
+    def _make_lists(self) -> None:
+        self._changed = False
+        self._direct = _in_parts([outbox for outbox, pace in self._paces.items() if pace is None])
+        self._paced = [(pace, outbox) for outbox, pace in self._paces.items() if pace is not None]
 
     def _due(self, batch: Batch) -> dict[tuple[int, ...], list[Outbox]]:
         """Which samples of the batch are due for clients that get only some, by their indices."""

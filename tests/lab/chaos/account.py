@@ -27,7 +27,7 @@ from imud.ledger import bytes_open, frames_open
 from imud.sample import Sample
 
 LEARNED: Final = 4
-"""So many equal steps in a row are a rate (imud.clock.device_time.CONSISTENT); before that no loss can be known."""
+"""So many equal steps in a row are a rate (imud.clock.period_learner.CONSISTENT); before that no loss can be known."""
 KNOWN: Final = 80
 """After so many samples since the device began, its counter is known over a link that was away. A fit needs 8
 (imud.clock.sampler.ENOUGH_POINTS), the pace of numbered samples four windows of 16 where one is disturbed

@@ -114,11 +114,20 @@ def test_wakers_of_all_clients_of_a_user_count() -> None:
 
 def test_selections_of_fields_are_limited() -> None:
     house = House()
-    others = set(range(quota.FORMS_PER_USER))
-    house.quota.check_form(1000, 3, others)
+    for form in range(1, 1 + quota.FORMS_PER_USER):
+        house.quota.exchange_form(1000, None, form)
+    house.quota.exchange_form(1000, None, 3)
+    for _ in range(2):  # a refusal counts nothing
+        with pytest.raises(RpcError, match="16 selections"):
+            house.quota.exchange_form(1000, None, 99)
     with pytest.raises(RpcError, match="16 selections"):
-        house.quota.check_form(1000, 99, others)
-    house.quota.check_form(1000, 99, others - {0})
+        house.quota.exchange_form(1000, 3, 99)  # another client has that form, too
+    house.quota.exchange_form(1001, None, 99)
+    house.quota.exchange_form(1000, 4, 99)  # its own form goes
+    house.quota.exchange_form(1000, 99, None)
+    house.quota.exchange_form(1000, None, 100)
+    with pytest.raises(RpcError, match="16 selections"):
+        house.quota.exchange_form(1000, None, 101)
 
 
 def test_a_frequent_message_is_logged_once_a_minute_with_its_count() -> None:
