@@ -5,7 +5,10 @@
 On every core a program computes without end, another writes to disk without end, and each is a session of its own, as
 the services of systemd are. A pty's bytes pass through a kernel worker, which competes with the programs as an ordinary
 task; those of a UART do not, so that the workers run at SCHED_FIFO while this measures, as do writer and reader: the
-figures are to be imud's. Needs root. `python -m tests.bench busy`, or more rounds: `python -m tests.bench.busy 6`.
+figures are to be imud's. What is left is the kernel's own, and is measured first: how late a program at SCHED_FIFO runs
+that only waits for a timer of 1 kHz (a kernel without preemption lets a write to disk go on for milliseconds).
+
+Needs root. `python -m tests.bench busy`, or more rounds: `python -m tests.bench.busy 6`.
 """
 
 import json
@@ -24,6 +27,16 @@ from tests.bench.rig import CORES, Load, Process, configuration, wait_for
 from tests.bench.rows import Row, at_most
 
 HOG = "while True: pass"
+TIMER = """
+import sys, time
+late_ns, due_ns = [], time.monotonic_ns()
+for _ in range(int(sys.argv[1])):
+    due_ns += 1_000_000
+    time.sleep(max(0, due_ns - time.monotonic_ns()) / 1e9)
+    late_ns.append(time.monotonic_ns() - due_ns)
+late_ns.sort()
+print(*(late_ns[int(len(late_ns) * share)] / 1e3 for share in (0.5, 0.99, 0.99999)))
+"""
 DISK = """
 import os, sys
 data = os.urandom(1 << 20)
@@ -80,7 +93,9 @@ class Seen:
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
     """Median over the rounds of p50 and p99, and the worst of all, for each setting."""
-    table = measure(1 if quick else ROUNDS, 4.0 if quick else 10.0)
+    floor, table = measure(1 if quick else ROUNDS, 4.0 if quick else 10.0)
+    yield Row("busy machine, a timer of 1 kHz alone, fifo: latency p99", floor.p99_us, "us")
+    yield Row("busy machine, a timer of 1 kHz alone, fifo: latency max", floor.max_us, "us")
     for setting in SETTINGS:
         seen = table[setting]
         p99_us = statistics.median(one.p99_us for one in seen)
@@ -96,14 +111,15 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         yield Row(f"{name}: samples lost", float(sum(one.lost for one in seen)), "samples")
 
 
-def measure(rounds: int, seconds: float) -> dict[Setting, list[Seen]]:
-    """Run all settings in turns."""
+def measure(rounds: int, seconds: float) -> tuple[Seen, dict[Setting, list[Seen]]]:
+    """Run the timer, then all settings in turns."""
     table: dict[Setting, list[Seen]] = {setting: [] for setting in SETTINGS}
     with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
+        floor = timer(seconds)
         for number in range(rounds):
             for setting in SETTINGS if number % 2 == 0 else reversed(SETTINGS):
                 table[setting].append(run(setting, Load(seconds=seconds)))
-    return table
+    return floor, table
 
 
 @contextmanager
@@ -118,6 +134,14 @@ def busy(folder: Path) -> Iterator[None]:
         for process in running:
             process.kill()
             process.wait()
+
+
+def timer(seconds: float) -> Seen:
+    """How late a program that waits for a timer of 1 kHz runs, at the policy of writer and reader."""
+    argv = ["chrt", "--fifo", str(FIFO_OF_OTHERS), sys.executable, "-c", TIMER, str(int(seconds * 1000))]
+    printed = subprocess.run(argv, stdout=subprocess.PIPE, text=True, check=True).stdout
+    p50_us, p99_us, max_us = map(float, printed.split())
+    return Seen(p50_us, p99_us, max_us, 0)
 
 
 def run(setting: Setting, load: Load) -> Seen:
@@ -190,6 +214,7 @@ def _schedule(pids: Sequence[int], policy: int, priority: int) -> None:
 def main() -> None:
     """Run as `python -m tests.bench.busy [ROUNDS]`: one line per setting and round."""
     with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
+        print(f"{'a timer alone, fifo':32} {timer(8.0)}", flush=True)
         for number in range(int(sys.argv[1]) if len(sys.argv) > 1 else ROUNDS):
             for setting in SETTINGS if number % 2 == 0 else reversed(SETTINGS):
                 seen = run(setting, Load(seconds=8.0))
