@@ -337,6 +337,7 @@ TESTED_IN = {
     "imud.cli.probe.report": "cli/probe/test_can.py",
     "imud.client.watch": "client/test_connection.py",
     "imud.clock.period_learner": "clock/test_device_time.py",
+    "imud.publishers.recorder.settings": "publishers/recorder/test_continuous.py",
     "imud.config.devices": "config/test_reading.py",
     "imud.config.keys": "config/test_reading.py",
     "imud.config.model": "config/test_reading.py",

@@ -42,6 +42,7 @@ COMMANDS = {
     "modbus": Subcommand("imud.cli.modbus.command:MODBUS", "find modules on an RS-485 line and give them addresses"),
     "decode": Subcommand("imud.cli.decode:DECODE", "raw capture in, one JSON object per message out"),
     "replay": Subcommand("imud.cli.replay:REPLAY", "run a recording or a capture through the daemon's whole path"),
+    "record": Subcommand("imud.cli.recording.record:RECORD", "record what devices deliver, or save the last minutes"),
     "info": Subcommand("imud.cli.recording.info:INFO", "say what is in a recording, and whether it is whole"),
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
     "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),

@@ -185,9 +185,30 @@ class Client:
         gives a new one.
         """
         self.call("notify", device=device, latency_ms=latency_ms)
-        if not self._fds:
-            raise ServerError("the daemon's answer to notify came without a descriptor")
-        return self._fds.pop()
+        return self._descriptor("notify")
+
+    # --- recordings -------------------------------------------------------------------------------------------------
+
+    def record(self, devices: Iterable[str] | None = None) -> int:
+        """A descriptor from which a recording is read, to end of file; the caller closes it.
+
+        None records all devices. It needs the permission to control. What is not read in time is missing in the
+        recording, which says so.
+        """
+        self.call("record.start", devices=_listed(devices))
+        return self._descriptor("record.start")
+
+    def stop_recording(self) -> int:
+        """End the recording of this connection; what waits still comes. Return how many records were not read."""
+        return int(self.call("record.stop")["records_dropped"])
+
+    def snapshot(self) -> tuple[int, float]:
+        """A descriptor from which the last minutes are read, as with `record`, and how long they are, s.
+
+        RpcError where the configuration has no flight recorder.
+        """
+        seconds = self.call("record.snapshot")["seconds"]
+        return self._descriptor("record.snapshot"), float(seconds)
 
     def kept_message(self, names: frozenset[str]) -> Message | None:
         """Return the oldest such message among those kept while waiting for another; None for none."""
@@ -223,6 +244,12 @@ class Client:
         if hello.protocol != PROTOCOL:
             raise ServerError(f"{self.path}: the daemon speaks protocol {hello.protocol}, this client {PROTOCOL}")
         return hello
+
+    def _descriptor(self, method: str) -> int:
+        """The descriptor that came with an answer. Raises ServerError for none."""
+        if not self._fds:
+            raise ServerError(f"the daemon's answer to {method} came without a descriptor")
+        return self._fds.pop()
 
     def _keep(self, message: Message) -> None:
         """Keep a message for another iterator; without one that reads, only the newest are kept."""

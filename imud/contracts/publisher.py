@@ -6,7 +6,7 @@ from typing import Any, Final, Protocol
 
 from imud.contracts.action import Actions
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
-from imud.contracts.control.recording import NothingRecorded, RecordingSource
+from imud.contracts.control.recording import NothingRecorded, RecordingSource, TakeSnapshot
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus, DeviceStatus, RecorderStatus
@@ -179,6 +179,8 @@ class PublisherContext:
     """The same of a recorder."""
     recording: RecordingSource = field(default_factory=NothingRecorded)
     """What there is to record."""
+    snapshots: list[TakeSnapshot] = field(default_factory=list)
+    """A flight recorder adds a callable while it is open."""
     utc_offset_ns: Callable[[], int] = lambda: 0
     """CLOCK_REALTIME minus CLOCK_MONOTONIC."""
     raise_event: Callable[[Event], None] = lambda _event: None

@@ -100,9 +100,9 @@ def look_at(file: Path, killed_ns: int) -> tuple[int, float]:
 
 def write_for_ever(file: Path) -> None:
     """Give a writer numbered records, in a child that is killed."""
-    queue = RecordQueue()
+    queue = RecordQueue[Path]()
     writer = RecordingWriter(queue, time.monotonic_ns, BusThread)
-    queue.begin_file(file)
+    queue.mark(file)
     for number in count():
         queue.put(records.encode_data(0, number.to_bytes(8, "little") * 10, number, -1))
         while not queue.is_easy:

@@ -15,6 +15,7 @@ from typing import Any, Literal, Self, TypeVar
 
 from imud.contracts.action import Action, Actions, Target
 from imud.contracts.control.calibration import Calibration, CalibrationResult, Calibrations, Check, Handling, Kept
+from imud.contracts.control.recording import NothingRecorded, RecordingSource
 from imud.contracts.device_settings import (
     AppliedSettings,
     AppliedStep,
@@ -109,10 +110,17 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
     )
 
 
-def context(now_ns: Callable[[], int] = lambda: NOW_NS, latencies: Latencies | None = None) -> PublisherContext:
+def context(
+    now_ns: Callable[[], int] = lambda: NOW_NS,
+    latencies: Latencies | None = None,
+    recording: RecordingSource | None = None,
+) -> PublisherContext:
     """A daemon with the devices of `DEVICES`; its clock stands still if no other is given."""
     statuses = [device_status(*item) for item in DEVICES.items()]
-    return PublisherContext(lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies or NoLatencies())
+    return PublisherContext(
+        lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies or NoLatencies(),
+        recording=recording or NothingRecorded(),
+    )  # fmt: skip
 
 
 def set_rate(_target: Target, *, message: Literal["HI91", "HI92"], rate_hz: int) -> None:
@@ -213,13 +221,14 @@ async def serving(
     directory: Path,
     now_ns: Callable[[], int] = lambda: NOW_NS,
     latencies: Latencies | None = None,
+    recording: RecordingSource | None = None,
     **settings: Any,
 ) -> AsyncIterator[SocketServer]:
     """A started server with two devices; closed at the end, and then nothing of it is left."""
     path = directory / "imud.sock"
     own_group = grp.getgrgid(os.getgid()).gr_name
     server = SocketServer(
-        SocketSettings(**{"path": str(path), "group": own_group, **settings}), context(now_ns, latencies)
+        SocketSettings(**{"path": str(path), "group": own_group, **settings}), context(now_ns, latencies, recording)
     )
     server.start()
     for name, number in DEVICES.items():

@@ -96,7 +96,7 @@ class Contents:
 
     def _add_object(self, record: Record, device: DeviceContents) -> None:
         if record.kind == Kind.SESSION:
-            self.session = decode_object(record, SessionRecord)
+            self.session = self.session or decode_object(record, SessionRecord)
         elif record.kind == Kind.END:
             self.end = decode_object(record, EndRecord)
             self.newest_ns = self.end.t_ns if self.end is not None else 0

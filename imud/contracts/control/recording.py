@@ -1,10 +1,15 @@
 """Contract of what can be recorded: a recorder asks for it by name, and is given records in their order."""
 
 from collections.abc import Callable, Sequence
+from socket import socket
 from typing import Protocol
 
 PutRecord = Callable[[bytes], None]
 """Takes a whole record (`imud.formats.recording.records`); returns at once. Called in the event loop's thread."""
+
+TakeSnapshot = Callable[[socket], float]
+"""Sends what a flight recorder has to a client's socket, a recording, and closes it; returns at once how many seconds
+that is. Raises ServerError. Called in the event loop's thread."""
 
 
 class RecordingSource(Protocol):

@@ -17,7 +17,7 @@ written before are whole. A reader takes a block whose CRC is right and looks fo
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import BinaryIO, Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import zstandard
 
@@ -68,13 +68,21 @@ class BlockEncoder:
         return b"".join((head, crc.to_bytes(_CRC_BYTES, "little"), stored))
 
 
+class ByteSource(Protocol):
+    """What blocks are read from: a file, or something like one."""
+
+    def read(self, size: int, /) -> bytes:
+        """Return at least one byte and at most `size`; none at the end."""
+        ...
+
+
 class BlockReader:
     """Reader of all whole blocks of a file, seekable or not. Iterate once.
 
     It never raises for any bytes: what is no block is passed over and counted.
     """
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: ByteSource) -> None:
         self._file = file
         self._buffer = b""
         self._at = 0

@@ -5,11 +5,11 @@ whose end or middle is missing, and says what that is.
 """
 
 from collections.abc import Iterator
-from typing import BinaryIO, Final
+from typing import Final
 
 from imud.errors import ImudError
 from imud.formats.recording import blocks, records
-from imud.formats.recording.blocks import BlockEncoder, BlockReader
+from imud.formats.recording.blocks import BlockEncoder, BlockReader, ByteSource
 from imud.formats.recording.records import Kind, Record, SessionRecord, decode_object, records_of
 
 BLOCK_BYTES: Final = 256 << 10
@@ -53,7 +53,7 @@ class RecordingReader:
     Raises ImudError, at the first record, for a file that is no recording or one of another version.
     """
 
-    def __init__(self, file: BinaryIO, name: str) -> None:
+    def __init__(self, file: ByteSource, name: str) -> None:
         """`name` is for messages."""
         self._name = name
         self.blocks = BlockReader(file)

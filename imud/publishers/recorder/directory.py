@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from threading import Lock
 from typing import Final, NamedTuple
 
 from imud.units import NS_PER_S
@@ -25,13 +26,16 @@ class RecordingFile(NamedTuple):
 
 
 class RecordingDirectory:
-    """The directory. Synchronization: one thread."""
+    """The directory. Synchronization: any thread."""
 
     def __init__(self, path: Path, keep_bytes: int) -> None:
         self.path = path
         self.removed = 0
         """Files removed for the budget since the start."""
+        self.in_use: set[str] = set()
+        """Names of files that are written at present, which are not removed."""
         self._keep_bytes = keep_bytes
+        self._lock = Lock()
 
     def make(self) -> None:
         """Make the directory where it is missing. Raises OSError."""
@@ -54,19 +58,20 @@ class RecordingDirectory:
                     break
         return sorted(found)
 
-    def make_room(self, reserve_bytes: int, present: str) -> Sequence[str]:
-        """Remove the oldest files but the present one, until the rest and `reserve_bytes` more are within the budget.
+    def make_room(self, reserve_bytes: int) -> Sequence[str]:
+        """Remove the oldest files that are not in use, until the rest and `reserve_bytes` more are within the budget.
 
         Returns their names. Raises OSError.
         """
-        files = self.files()
-        total, removed = sum(file.size for file in files), list[str]()
-        for file in files:
-            if total + reserve_bytes <= self._keep_bytes:
-                break
-            if file.name != present:
-                (self.path / file.name).unlink(missing_ok=True)
-                total -= file.size
-                removed.append(file.name)
-        self.removed += len(removed)
+        with self._lock:
+            files = self.files()
+            total, removed = sum(file.size for file in files), list[str]()
+            for file in files:
+                if total + reserve_bytes <= self._keep_bytes:
+                    break
+                if file.name not in self.in_use:
+                    (self.path / file.name).unlink(missing_ok=True)
+                    total -= file.size
+                    removed.append(file.name)
+            self.removed += len(removed)
         return removed

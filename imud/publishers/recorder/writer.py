@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 from imud.errors import reason_of
 from imud.formats.recording.file import RECORD_BYTES_MAX, BlockGatherer
@@ -29,15 +29,18 @@ SYNC_NS: Final = 5 * NS_PER_S
 """And on the disk so long after: so much is missing when the power fails."""
 FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_APPEND
 
+M = TypeVar("M")
+"""What stands between records, for example the path of a file that begins; never bytes."""
 
-class RecordQueue:
-    """Queue of records and of files that begin. Synchronization: one thread puts, one takes."""
+
+class RecordQueue(Generic[M]):
+    """Queue of records, and of marks between them. Synchronization: one thread puts, one takes."""
 
     def __init__(self, bytes_max: int = QUEUE_BYTES) -> None:
         self.dropped = 0
         """Records that had no room since the start."""
         self.dropped_bytes = 0
-        self._items: deque[bytes | Path] = deque()
+        self._items: deque[bytes | M] = deque()
         self._bytes_max = bytes_max
         self._put = self._taken = 0
         self._rung = 0
@@ -67,12 +70,12 @@ class RecordQueue:
             self._rung = self._put
             self.ring()
 
-    def begin_file(self, path: Path) -> None:
-        """Have all records from now on written to a new file."""
-        self._items.append(path)
+    def mark(self, mark: M) -> None:
+        """Add a mark after the records so far, for which there is always room, and wake the thread."""
+        self._items.append(mark)
         self.ring()
 
-    def take(self) -> bytes | Path | None:
+    def take(self) -> bytes | M | None:
         """Return the oldest item; None for none."""
         try:
             item = self._items.popleft()
@@ -86,7 +89,7 @@ class RecordQueue:
 class RecordingWriter:
     """The thread and its file. Synchronization: the counters are written by the thread and read by any."""
 
-    def __init__(self, queue: RecordQueue, now_ns: Callable[[], int], start_worker: StartWorker) -> None:
+    def __init__(self, queue: RecordQueue[Path], now_ns: Callable[[], int], start_worker: StartWorker) -> None:
         self.file_bytes = 0
         """Size of the present file."""
         self.written_bytes = 0

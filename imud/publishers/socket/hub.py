@@ -13,6 +13,7 @@ from imud.publishers.socket.connection import Connection
 from imud.publishers.socket.messages import DeviceNotice
 from imud.publishers.socket.outbox import Pool
 from imud.publishers.socket.quota import Quota, Seldom
+from imud.publishers.socket.recordings import ClientRecordings
 from imud.publishers.socket.serving import TokenBucket
 from imud.publishers.socket.subscription import DeliveryPlan, Subscription
 
@@ -45,6 +46,8 @@ class Hub:
         """Requests that take their time, by the number of the client."""
         self._wanting_wake: dict[str, dict[Connection, None]] = {}
         """Clients that have a descriptor to be woken by, by device."""
+        self.recordings = ClientRecordings(context, quota.check_fds)
+        """What clients record."""
         self._accepted = 0
         self._refused = 0
         self._evicted = 0
@@ -73,6 +76,7 @@ class Hub:
     def add_device(self, name: str, device_id: int) -> None:
         """Add a device; clients that watch all get its number before its first sample."""
         self._devices[name] = device_id
+        self.recordings.add_device(name, device_id)
         watching = self._subscriptions.items()
         everything = [self._connections[number] for number, wanted in watching if wanted.devices is None]
         post_all(everything, encode_notification("device", DeviceNotice(name, device_id)))
@@ -84,6 +88,7 @@ class Hub:
             matching = [number for number, wanted in self._subscriptions.items() if wanted.matches(name)]
             notice = encode_notification("device_removed", DeviceNotice(name, device_id))
             post_all([self._connections[number] for number in matching], notice)
+        self.recordings.remove_device(name)
         self._newest.pop(name, None)
         self._plans.pop(name, None)
 
@@ -101,6 +106,7 @@ class Hub:
 
     def event(self, event: Event) -> None:
         """Send an event to all clients that asked for it; those of the daemon itself ("") go to all that get any."""
+        self.recordings.event(event)
         device = event.device
         wanting = [
             self._connections[number]
@@ -234,6 +240,7 @@ class Hub:
         self._connections.pop(number, None)
         self.unsubscribe(connection)
         self._events.pop(number, None)
+        self.recordings.remove(connection)
         for device in list(self._wanting_wake):
             self._forget_waker(connection, device)
 
@@ -262,6 +269,7 @@ class Hub:
 
     def close(self) -> None:
         """Close every client and cancel what is still being carried out; may be called twice."""
+        self.recordings.close()
         for connection in list(self._connections.values()):
             connection.close()
         for task in list(self._work.values()):

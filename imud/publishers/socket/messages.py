@@ -110,6 +110,13 @@ class SettingsChangeParams(msgspec.Struct):
     save: bool | None = None
 
 
+class RecordParams(msgspec.Struct):
+    """Parameters of `record.start`."""
+
+    devices: list[str] | None = None
+    """Names; left out or null: all, also those that appear later."""
+
+
 # --- results --------------------------------------------------------------------------------------------------------
 
 
@@ -243,6 +250,29 @@ class StopResult(msgspec.Struct):
     """Result of `stop_calibration`."""
 
     stopped: bool
+
+
+class RecordResult(msgspec.Struct):
+    """Result of `record.start`, which carries the descriptor."""
+
+    devices: list[str] | None
+    """What is recorded; null for all."""
+
+
+class RecordStopResult(msgspec.Struct):
+    """Result of `record.stop`."""
+
+    stopped: bool
+    """Whether there was a recording; what waits for the client still comes before end of file."""
+    records_dropped: int
+    """Records that had no room because the client did not read; the recording says where."""
+
+
+class SnapshotResult(msgspec.Struct):
+    """Result of `record.snapshot`, which carries the descriptor."""
+
+    seconds: float
+    """How long the snapshot is."""
 
 
 # --- notifications --------------------------------------------------------------------------------------------------

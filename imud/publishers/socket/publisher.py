@@ -135,6 +135,7 @@ class SocketServer:
             self._side.scheduler.tick()
             self._pool.trim()
         self._quota.tick()
+        self.hub.recordings.tick(now_ns)
         if self._paused and self._listener is not None:
             self._paused = False
             asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)

@@ -122,7 +122,7 @@ class Quota:
     def check_fds(self, fds: Sequence[int]) -> None:
         """Raises RpcError when new descriptors are among those reserved; the caller closes them then."""
         if max(fds) >= self._fd_end:
-            raise RpcError(Code.UNAVAILABLE, "notify: the daemon has no descriptor to spare for clients")
+            raise RpcError(Code.UNAVAILABLE, "the daemon has no descriptor to spare for clients")
 
     def tick(self) -> None:
         """Forget users that have not connected lately."""

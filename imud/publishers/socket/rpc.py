@@ -47,11 +47,15 @@ from imud.publishers.socket.messages import (
     OptionsResult,
     PollParams,
     PollResult,
+    RecordParams,
+    RecordResult,
+    RecordStopResult,
     SchemaResult,
     SettingsChangeParams,
     SettingsParams,
     SlotMember,
     SlotSchema,
+    SnapshotResult,
     StatusResult,
     StopResult,
     WatchParams,
@@ -362,6 +366,27 @@ def _settings_apply(hub: Hub, connection: Connection, params: SettingsChangePara
     return hub.context.control(params.device).settings_apply(params.settings, save=bool(params.save))
 
 
+# --- recordings -----------------------------------------------------------------------------------------------------
+
+
+def _record_start(hub: Hub, connection: Connection, params: RecordParams) -> Answer:
+    """Send a descriptor from which the client reads a recording of what happens from now on."""
+    devices = _known_devices(hub, params.devices)
+    fd = hub.recordings.start(connection, devices)
+    return Answer(RecordResult(None if devices is None else list(devices)), fd)
+
+
+def _record_stop(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
+    """End the recording of this connection."""
+    return Answer(RecordStopResult(*hub.recordings.stop(connection)))
+
+
+def _record_snapshot(hub: Hub, connection: Connection, _params: NoParams) -> Answer:
+    """Send a descriptor from which the client reads what the flight recorder has."""
+    seconds, fd = hub.recordings.snapshot(connection)
+    return Answer(SnapshotResult(seconds), fd)
+
+
 def _refuse_second(hub: Hub, connection: Connection, method: str) -> None:
     if hub.busy(connection):
         raise RpcError(Code.UNAVAILABLE, f"{method}: the one before is not done yet; wait for its reply")
@@ -390,6 +415,9 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "settings.plan": Method(SettingsChangeParams, _settings_plan, Rights.CONTROL, result=SettingsPlan),
     "settings.apply": Method(SettingsChangeParams, _settings_apply, Rights.CONTROL, acts=True, result=AppliedSettings),
     "stop_calibration": Method(DeviceParams, _stop_calibration, Rights.CONTROL, acts=True, result=StopResult),
+    "record.start": Method(RecordParams, _record_start, Rights.CONTROL, result=RecordResult),
+    "record.stop": Method(NoParams, _record_stop, Rights.CONTROL, acts=True, result=RecordStopResult),
+    "record.snapshot": Method(NoParams, _record_snapshot, Rights.CONTROL, result=SnapshotResult),
 }
 
 

@@ -72,6 +72,8 @@ class ClientWakers:
 
     def __init__(self) -> None:
         self._wakers: dict[str, Waker] = {}
+        self._lent: list[socket.socket] = []
+        """Other descriptors of the client's whose replies wait to be sent."""
 
     def __contains__(self, device: object) -> bool:
         return device in self._wakers
@@ -85,7 +87,18 @@ class ClientWakers:
     @property
     def client_ends(self) -> int:
         """Descriptors of the client's that the daemon still holds because their replies wait to be sent."""
-        return sum(waker.client_end != NO_FD for waker in self._wakers.values())
+        return sum(waker.client_end != NO_FD for waker in self._wakers.values()) + len(self._lent)
+
+    def lend(self, sock: socket.socket) -> int:
+        """Take a socket whose descriptor is for the client, to be sent with the next reply, and close it then.
+
+        Raises RpcError while one before still waits to be sent, as `make`.
+        """
+        if self._lent:
+            message = "the reply with the descriptor before still waits for this client; read it, then ask again"
+            raise RpcError(Code.UNAVAILABLE, message)
+        self._lent.append(sock)
+        return sock.fileno()
 
     def make(self, device: str, check: Callable[[Sequence[int]], None]) -> int:
         """Make a descriptor for the client, to be sent with the next reply; it replaces the one of `device` before.
@@ -124,9 +137,15 @@ class ClientWakers:
         """All replies are sent, and their descriptors with them."""
         for waker in self._wakers.values():
             waker.handed_over()
+        self._close_lent()
 
     def close(self) -> None:
         """End all descriptors; may be called twice."""
         for waker in self._wakers.values():
             waker.close()
         self._wakers.clear()
+        self._close_lent()
+
+    def _close_lent(self) -> None:
+        while self._lent:
+            self._lent.pop().close()

@@ -25,8 +25,8 @@ def test_names_sort_by_time_and_are_known_again(tmp_path: Path) -> None:
 
 def test_the_oldest_are_removed_until_there_is_room(tmp_path: Path) -> None:
     directory = filled(tmp_path, 100, 40, 30, 20)
-    assert len(directory.make_room(10, "")) == 0
-    (removed,) = directory.make_room(11, "")
+    assert len(directory.make_room(10)) == 0
+    (removed,) = directory.make_room(11)
     assert removed.endswith("-000000.imudrec")
     assert [file.size for file in directory.files()] == [30, 20]
     assert directory.removed == 1
@@ -39,6 +39,7 @@ def test_the_present_file_and_files_of_others_stay(tmp_path: Path) -> None:
         path.write_bytes(bytes(50))
     (directory.path / "20251121T093147Z-00000000-000012.imudrec").symlink_to(foreign[0])
     newest = directory.files()[-1].name
-    directory.make_room(0, newest)
+    directory.in_use.add(newest)
+    directory.make_room(0)
     assert [file.name for file in directory.files()] == [newest]
     assert all(path.exists() for path in foreign)

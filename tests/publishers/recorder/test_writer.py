@@ -18,7 +18,7 @@ class WriterBench:
 
     def __init__(self, bytes_max: int = 1 << 24) -> None:
         self.clock = VirtualClock()
-        self.queue = RecordQueue(bytes_max)
+        self.queue = RecordQueue[Path](bytes_max)
         self.workers: list[HandWorker] = []
         self.writer = RecordingWriter(self.queue, self.clock.now_ns, self._start)
 
@@ -44,13 +44,13 @@ def read(path: Path) -> list[bytes]:
 def test_records_are_in_the_file_after_a_round_each_in_its_own(tmp_path: Path) -> None:
     bench = WriterBench()
     first, second = tmp_path / "1", tmp_path / "2"
-    bench.queue.begin_file(first)
+    bench.queue.mark(first)
     for number in range(5):
         bench.queue.put(record(number))
     bench.work()
     assert read(first) == [record(number) for number in range(5)]
     bench.queue.put(record(5))
-    bench.queue.begin_file(second)
+    bench.queue.mark(second)
     bench.queue.put(record(6))
     bench.work()
     assert read(first) == [record(number) for number in range(6)]
@@ -70,7 +70,7 @@ def test_the_thread_is_woken_for_a_full_block() -> None:
 
 def test_what_has_no_room_is_dropped_and_counted(tmp_path: Path) -> None:
     bench = WriterBench(bytes_max=4 * len(record(0)))
-    bench.queue.begin_file(tmp_path / "1")
+    bench.queue.mark(tmp_path / "1")
     for number in range(10):
         bench.queue.put(record(number))
     assert (bench.queue.dropped, bench.queue.dropped_bytes) == (6, 6 * len(record(0)))
@@ -83,7 +83,7 @@ def test_what_has_no_room_is_dropped_and_counted(tmp_path: Path) -> None:
 
 def test_a_full_disk_leaves_whole_blocks_and_ends_the_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench, write = WriterBench(), os.write
-    bench.queue.begin_file(tmp_path / "1")
+    bench.queue.mark(tmp_path / "1")
     bench.queue.put(record(0))
     bench.work()
     whole = (tmp_path / "1").stat().st_size
@@ -97,7 +97,7 @@ def test_a_full_disk_leaves_whole_blocks_and_ends_the_writing(tmp_path: Path, mo
     bench.work()
     assert read(tmp_path / "1") == [record(0)]
     assert bench.queue.waiting_bytes == 0
-    bench.queue.begin_file(tmp_path / "2")
+    bench.queue.mark(tmp_path / "2")
     bench.queue.put(record(3))
     bench.work()
     assert bench.writer.problem == ""
@@ -108,7 +108,7 @@ def test_a_full_disk_leaves_whole_blocks_and_ends_the_writing(tmp_path: Path, mo
 def test_a_file_that_is_there_already_is_not_overwritten(tmp_path: Path) -> None:
     bench = WriterBench()
     (tmp_path / "1").write_bytes(b"mine")
-    bench.queue.begin_file(tmp_path / "1")
+    bench.queue.mark(tmp_path / "1")
     bench.queue.put(record(0))
     bench.work()
     assert bench.writer.problem == os.strerror(errno.EEXIST)
@@ -118,7 +118,7 @@ def test_a_file_that_is_there_already_is_not_overwritten(tmp_path: Path) -> None
 def test_the_file_is_synced_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench, synced = WriterBench(), list[int]()
     monkeypatch.setattr(os, "fdatasync", synced.append)
-    bench.queue.begin_file(tmp_path / "1")
+    bench.queue.mark(tmp_path / "1")
     for number in range(12):
         bench.clock.advance(SYNC_NS // 4)
         bench.queue.put(record(number))

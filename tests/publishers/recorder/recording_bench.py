@@ -1,0 +1,87 @@
+"""What a recorder records, made by hand, and the context of a recorder whose time is the test's."""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from imud.contracts.control.recording import PutRecord
+from imud.contracts.publisher import PublisherContext
+from imud.event import Event
+from imud.formats.recording import records
+from imud.formats.recording.file import RecordingReader
+from imud.formats.recording.records import Kind, Record
+from imud.units import NS_PER_S
+from imud.worker import Round
+from tests.support.event_loops import VirtualClock
+from tests.support.signal_bench import HandWorker
+
+UTC_OFFSET_NS = 1_763_717_507 * NS_PER_S
+EPOCH = 0x5F3A9C01
+
+
+class HandSource:
+    """Devices whose records are made by hand."""
+
+    def __init__(self) -> None:
+        self.present = ["bow", "mast"]
+        self.listening: list[PutRecord] = []
+        self.on_begin: Callable[[], None] = lambda: None
+        """Called where a device is described: it takes its time."""
+
+    def names(self) -> Sequence[str]:
+        return self.present
+
+    def begin_host(self, put: PutRecord) -> None:
+        put(records.encode(Kind.CALL, records.NO_DEVICE, b""))
+
+    def begin(self, device: str, put: PutRecord) -> None:
+        put(records.encode(Kind.DEVICE, self.present.index(device), b""))
+        self.listening = [put]
+        self.on_begin()
+
+    def check(self, device: str, put: PutRecord) -> None:
+        put(records.encode(Kind.CHECK, self.present.index(device), b""))
+
+    def end(self, put: PutRecord) -> None:
+        self.listening = []
+
+    def deliver(self, size: int = 50) -> None:
+        for put in self.listening:
+            put(records.encode_data(0, os.urandom(size), 1, -1))
+
+
+class RecordingBench:
+    """Time, devices, events and workers of a part that records."""
+
+    def __init__(self) -> None:
+        self.clock, self.source = VirtualClock(), HandSource()
+        self.events: list[Event] = []
+        self.workers: list[HandWorker] = []
+        self.context = PublisherContext(
+            list, EPOCH, self.clock.now_ns, recording=self.source, utc_offset_ns=lambda: UTC_OFFSET_NS,
+            raise_event=self.events.append,
+        )  # fmt: skip
+
+    def start_worker(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> HandWorker:
+        """As `StartWorker`."""
+        self.workers.append(HandWorker(name, work, failed))
+        return self.workers[-1]
+
+    def advance(self, seconds: float) -> int:
+        """Let time pass; return CLOCK_MONOTONIC."""
+        self.clock.advance(round(seconds * NS_PER_S))
+        return self.clock.now_ns()
+
+
+def records_in(path: Path) -> list[Record]:
+    """The records of a recording, which must be whole and have its regular end."""
+    with path.open("rb") as file:
+        reader = RecordingReader(file, path.name)
+        found = list(reader)
+    assert reader.problems == []
+    return found
+
+
+def kinds_in(path: Path) -> list[int]:
+    """Their kinds."""
+    return [record.kind for record in records_in(path)]
