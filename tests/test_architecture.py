@@ -302,6 +302,7 @@ CROSS_CUTTING = {
     "devices/test_every_stream_driver.py": "every driver of byte streams",
     "devices/test_every_can_driver.py": "every driver on CAN",
     "devices/test_every_polled_driver.py": "every driver that is polled",
+    "devices/test_every_data_sheet.py": "the data sheet of every driver",
     "devices/test_every_device_settings.py": "the settings of every driver",
     "devices/hipnuc/canopen/test_peers.py": "the canopen library as a peer of codec and simulator",
     "devices/imu61x/test_one_truth.py": "one motion through every protocol of the family",
@@ -326,6 +327,8 @@ CROSS_CUTTING = {
 """Test modules that mirror no module of imud, and what they test."""
 
 TESTED_IN = {
+    "imud.devices.hipnuc.common.data_sheet": "devices/test_every_data_sheet.py",
+    "imud.devices.imu61x.common.data_sheet": "devices/test_every_data_sheet.py",
     "imud.reload": "test_daemon_signals.py",
     "imud.publishers.shm.directory": "publishers/shm/test_hostile.py",
     "imud.cli.doctor.finding": "cli/doctor/test_report.py",

@@ -10,6 +10,7 @@ from imud.contracts.codec import StreamCodec
 from imud.contracts.control.calibration import Calibrations
 from imud.contracts.device_settings import DeviceSettings
 from imud.contracts.lines import AlarmRanges, DeviceLines
+from imud.contracts.sensors.data_sheet import DataSheet
 from imud.contracts.session import RequestScript
 from imud.contracts.settings import Settings
 from imud.contracts.timing import NO_TIME_BITS, TimeBits
@@ -104,6 +105,8 @@ class Driver:
     """Bits of `Measurement.status` about time."""
     status_bits: Mapping[int, StatusBit] = field(default_factory=dict)
     """Meaning of the bits of `Measurement.status`, by number; those that are not known are left out."""
+    data_sheet: DataSheet = field(default_factory=DataSheet)
+    """What the vendor's manual states of noise, resolution and filters."""
     shown_settings: Callable[[Mapping[str, str]], Mapping[str, str]] = lambda settings: settings
     """Returns settings as they were read back by name and with units, for people."""
     line_differences: Callable[[Mapping[str, str], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}

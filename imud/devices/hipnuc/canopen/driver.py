@@ -5,6 +5,7 @@ from typing import Final
 
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import SAMPLE_COUNTER
+from imud.contracts.sensors.data_sheet import DataSheet
 from imud.devices.hipnuc.canopen.actions import ACTIONS
 from imud.devices.hipnuc.canopen.cia301 import (
     EMERGENCY,
@@ -16,10 +17,18 @@ from imud.devices.hipnuc.canopen.cia301 import (
     SYNC,
     TPDO_FUNCTIONS,
 )
-from imud.devices.hipnuc.canopen.codec import LAYOUTS, HipnucCanopenCodec, HipnucCanopenSettings, encode_tpdos
+from imud.devices.hipnuc.canopen.codec import (
+    ACCEL_M_S2_PER_LSB,
+    GYRO_RAD_S_PER_LSB,
+    LAYOUTS,
+    HipnucCanopenCodec,
+    HipnucCanopenSettings,
+    encode_tpdos,
+)
 from imud.devices.hipnuc.canopen.session import identify, read_settings
 from imud.devices.hipnuc.canopen.settings import SETTINGS
 from imud.devices.hipnuc.common.calibrations import inclinometer_zero
+from imud.devices.hipnuc.common.data_sheet import DOCUMENT
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.units import NS_PER_S, NS_PER_US
 
@@ -65,6 +74,7 @@ DRIVER: Final = CanDriver(
     tick_modulus=2,
     euler_convention="312 (Z-X-Y): pitch about X, roll about Y, yaw about Z counter-clockwise from above",
     navigation_frame="ENU",
+    data_sheet=DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB),
     actions=ACTIONS,
     calibrations=inclinometer_zero("5.4.1", ACTIONS),
     device_settings=SETTINGS,

@@ -7,6 +7,7 @@ from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import SAMPLE_COUNTER
 from imud.devices.hipnuc.common.calibrations import inclinometer_zero
+from imud.devices.hipnuc.common.data_sheet import REGISTERS
 from imud.devices.hipnuc.j1939 import messages, session
 from imud.devices.hipnuc.j1939.actions import ACTIONS
 from imud.devices.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Settings, encode
@@ -57,6 +58,7 @@ DRIVER: Final = CanDriver(
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above; "
     "NaN for an angle that the module does not send",
     navigation_frame="ENU",
+    data_sheet=REGISTERS,
     actions=ACTIONS,
     device_settings=SETTINGS,
     calibrations=inclinometer_zero("6.2.2", ACTIONS),

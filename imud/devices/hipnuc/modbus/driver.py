@@ -5,6 +5,7 @@ from typing import Final
 
 from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.polling import PolledDriver
+from imud.devices.hipnuc.common.data_sheet import REGISTERS
 from imud.devices.hipnuc.common.heading import heading_by_mode
 from imud.devices.hipnuc.common.main_status import MAIN_STATUS
 from imud.devices.hipnuc.modbus.actions import ACTIONS
@@ -41,6 +42,7 @@ DRIVER: Final = PolledDriver(
     tick_modulus=2**32,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
     navigation_frame="ENU",
+    data_sheet=REGISTERS,
     heading=heading_by_mode,
     link="rs485",
     targets=(FACTORY_ID, *(slave for slave in SLAVES if slave != FACTORY_ID)),

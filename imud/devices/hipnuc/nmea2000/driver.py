@@ -8,6 +8,7 @@ from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import SAMPLE_COUNTER, Identity
 from imud.contracts.session import says_nothing
+from imud.devices.hipnuc.common.data_sheet import FLOATS
 from imud.devices.hipnuc.nmea2000 import messages
 from imud.devices.hipnuc.nmea2000.codec import HipnucNmea2000Codec, HipnucNmea2000Settings, encode
 from imud.devices.hipnuc.nmea2000.messages import Reference
@@ -59,6 +60,7 @@ DRIVER: Final = CanDriver(
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above, "
     "0 with the bow to the north of the heading's reference; NaN for an angle that is not sent",
     navigation_frame="ENU",
+    data_sheet=FLOATS,
     heading=_heading,
     node_of=_node_of,
     node_settings=lambda source: HipnucNmea2000Settings(source=source),

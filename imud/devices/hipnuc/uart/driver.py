@@ -7,6 +7,7 @@ from typing import Any, Final
 from imud.attitude import euler312_from_quat, quat_normalized
 from imud.contracts.codec import StreamCodec
 from imud.contracts.driver import Identity, StreamDriver
+from imud.devices.hipnuc.common.data_sheet import FLOATS
 from imud.devices.hipnuc.common.heading import heading_by_mode
 from imud.devices.hipnuc.common.main_status import MAIN_STATUS
 from imud.devices.hipnuc.uart.actions import ACTIONS
@@ -70,6 +71,7 @@ DRIVER: Final = StreamDriver(
     alarm_ranges=alarm_ranges,
     time_bits=TIME_BITS,
     status_bits=MAIN_STATUS,
+    data_sheet=FLOATS,
     shown_settings=shown,
     line_differences=line_differences,
     declared_line_differences=declared_line_differences,

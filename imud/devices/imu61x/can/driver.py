@@ -15,6 +15,7 @@ from imud.devices.imu61x.can.codec import (
     Imu61xCanSettings,
     encode_set,
 )
+from imud.devices.imu61x.common.data_sheet import SHEET
 from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector, relative_heading
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
 from imud.frames.conventions import FLU_LEVEL
@@ -53,6 +54,7 @@ DRIVER: Final = CanDriver(
     tick_modulus=INDEX_MODULUS,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
+    data_sheet=SHEET,
     axes=FLU_LEVEL,
     heading=relative_heading,
     node_of=_node_of,

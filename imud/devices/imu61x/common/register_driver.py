@@ -15,6 +15,7 @@ from imud.contracts.device_settings import DeviceSettings, Setting
 from imud.contracts.driver import Identity, KeyProblem
 from imud.contracts.polling import PolledCodec, PolledDriver, TransferScript
 from imud.contracts.settings import Settings
+from imud.devices.imu61x.common.data_sheet import SHEET
 from imud.devices.imu61x.common.family import (
     ACCEL_FILTER,
     EULER_CONVENTION,
@@ -199,6 +200,7 @@ def register_driver(
         settings=settings,
         euler_convention=EULER_CONVENTION,
         navigation_frame=NAVIGATION_FRAME,
+        data_sheet=SHEET,
         axes=FLU_LEVEL,
         heading=relative_heading,
         lines=frozenset({"reset", "data_ready"}),

@@ -4,6 +4,7 @@ from random import Random
 from typing import Final
 
 from imud.contracts.driver import StreamDriver
+from imud.devices.imu61x.common.data_sheet import SHEET
 from imud.devices.imu61x.common.family import EULER_CONVENTION, NAVIGATION_FRAME, random_vector, relative_heading
 from imud.devices.imu61x.uart.actions import ACTIONS
 from imud.devices.imu61x.uart.calibrations import CALIBRATIONS
@@ -37,6 +38,7 @@ DRIVER: Final = StreamDriver(
     tick_modulus=TIMER_MODULUS,
     euler_convention=EULER_CONVENTION,
     navigation_frame=NAVIGATION_FRAME,
+    data_sheet=SHEET,
     axes=FLU_LEVEL,
     heading=relative_heading,
     lines=frozenset({"reset"}),

@@ -1,0 +1,1 @@
+"""Contracts about the sensors themselves: what their documents state."""
