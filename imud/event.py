@@ -1,8 +1,7 @@
 """Contract: events of a device other than samples, delivered to subscribers and to the log."""
 
-import logging
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Protocol
 
 import msgspec
 
@@ -34,15 +33,6 @@ class EventKind(StrEnum):
     """The recorder stopped, for example because the disk is full, went on, or lost records."""
     BAD_FRAME = "bad-frame"
     """A damaged or unknown frame was heard. Sent at most once a second and device."""
-
-
-LEVELS: Final = {
-    EventKind.UP: logging.INFO,
-    EventKind.SYNC: logging.INFO,
-    EventKind.MARK: logging.DEBUG,
-    EventKind.CALIBRATION: logging.DEBUG,
-}
-"""Kinds below a warning; marks are as frequent as camera triggers, progress of a calibration comes twice a second."""
 
 
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -20,7 +20,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud.formats",),
     ("imud.contracts", "imud.frames.settings"),
     ("imud.devices", "imud.clock", "imud.links", "imud.publishers", "imud.utc"),
-    ("imud.sim", "imud.config", "imud.client"),
+    ("imud.sim", "imud.config", "imud.client", "imud.analysis"),
     ("imud.signals",),
     ("imud.runtime",),
     ("imud.reload",),
@@ -29,6 +29,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 )
 LEAVES_LAYER = next(number for number, names in enumerate(LAYERS) if "imud.devices" in names)
 LEAVES = LAYERS[LEAVES_LAYER]
+PURE = ("imud.devices.", "imud.clock.", "imud.analysis.")
 IO_MODULES = {
     "asyncio", "fcntl", "io", "os", "pathlib", "select", "serial", "socket", "subprocess", "termios", "threading",
     "time",
@@ -101,8 +102,8 @@ def test_leaves_do_not_import_each_other(module: str) -> None:
             assert target == family or target.startswith(family + "."), f"{module} imports {target}"
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if m.startswith(("imud.devices.", "imud.clock."))])
-def test_codecs_and_clock_do_no_io(module: str) -> None:
+@pytest.mark.parametrize("module", [m for m in MODULES if m.startswith(PURE)])
+def test_codecs_clock_and_analysis_do_no_io(module: str) -> None:
     used = {name.partition(".")[0] for name in imports(MODULES[module])} & IO_MODULES
     assert not used, f"{module} imports {used}"
 
@@ -120,6 +121,17 @@ def test_there_is_no_import_cycle() -> None:
 
     for name in graph:
         visit(name, ())
+
+
+ANALYSIS = ("imud.analysis", "imud.cli.analysis")
+HEAVY = {"numpy", "scipy", "matplotlib"}
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if not m.startswith(ANALYSIS)])
+def test_only_the_analysis_imports_its_extra(module: str) -> None:
+    used = imports(MODULES[module])
+    assert not {name.partition(".")[0] for name in used} & HEAVY
+    assert not {name for name in used if name.startswith(ANALYSIS)}, "the analysis is loaded by its commands alone"
 
 
 def test_only_one_module_imports_gpiod() -> None:
@@ -327,6 +339,9 @@ CROSS_CUTTING = {
 """Test modules that mirror no module of imud, and what they test."""
 
 TESTED_IN = {
+    "imud.analysis.spectrum_plots": "analysis/test_noise_plots.py",
+    "imud.cli.analysis.noise_page": "cli/analysis/test_commands.py",
+    "imud.cli.analysis.spectrum_report": "cli/analysis/test_commands.py",
     "imud.devices.hipnuc.common.data_sheet": "devices/test_every_data_sheet.py",
     "imud.devices.imu61x.common.data_sheet": "devices/test_every_data_sheet.py",
     "imud.reload": "test_daemon_signals.py",

@@ -44,18 +44,19 @@ COMMANDS = {
     "replay": Subcommand("imud.cli.replay:REPLAY", "run a recording or a capture through the daemon's whole path"),
     "record": Subcommand("imud.cli.recording.record:RECORD", "record what devices deliver, or save the last minutes"),
     "info": Subcommand("imud.cli.recording.info:INFO", "say what is in a recording, and whether it is whole"),
+    "noise": Subcommand("imud.cli.analysis.commands:NOISE", "judge the noise of a sensor that lies still"),
+    "spectrum": Subcommand("imud.cli.analysis.commands:SPECTRUM", "show vibration by frequency, live or of a file"),
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
     "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
     "top": Subcommand("imud.cli.top.command:TOP", "watch all devices in the terminal, redrawn in place"),
-    "watch": Subcommand("imud.cli.live.watch:WATCH", "print samples as they come"),
-    "events": Subcommand("imud.cli.live.events:EVENTS", "print events as they come"),
+    "watch": Subcommand("imud.cli.samples:WATCH", "print samples as they come"),
     "clock": Subcommand(
         "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"
     ),
     "command": Subcommand("imud.cli.devices:COMMAND", "list the actions of a device, or carry one out"),
     "settings": Subcommand("imud.cli.settings:SETTINGS", "show, set, save or restore a device's own settings"),
     "calibrate": Subcommand("imud.cli.calibrate:CALIBRATE", "calibrate a device, guided step by step"),
-    "schema": Subcommand("imud.cli.schema:SCHEMA", "list the fields of a sample with units and frames"),
+    "schema": Subcommand("imud.cli.samples:SCHEMA", "list the fields of a sample with units and frames"),
 }
 
 

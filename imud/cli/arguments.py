@@ -1,9 +1,10 @@
 """Parts that several commands share: the type of a command, the daemon's socket, and arguments `NAME=VALUE`."""
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -13,6 +14,9 @@ from imud.contracts.driver import Driver
 from imud.contracts.settings import Settings, unknown_name, value_problem, wrong_values
 from imud.contracts.status import DeviceStatus
 from imud.errors import BadArgument
+
+SECONDS_OF: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+DURATION: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
 
 
 class CliCommand(NamedTuple):
@@ -63,6 +67,17 @@ def confirmed(what: str, risk: str, *, yes: bool) -> bool:
         return True
     print("nothing was done")
     return False
+
+
+# --- durations ----------------------------------------------------------------------------------------------------
+
+
+def duration_s(text: str) -> float:
+    """Read a duration, for example `10min`, `90s` or `2h`; a number alone is seconds. Raises ArgumentTypeError."""
+    found = DURATION.fullmatch(text.strip())
+    if found is None or found[2] not in SECONDS_OF or not float(found[1]):
+        raise argparse.ArgumentTypeError(f"expected a duration as 90s, 10min or 2h, got {text!r}")
+    return float(found[1]) * SECONDS_OF[found[2]]
 
 
 # --- NAME=VALUE -----------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ daemon opens none. What comes is looked at on the way, which gives the figures, 
 
 import argparse
 import os
-import re
 import select
 import signal
 import sys
@@ -17,7 +16,7 @@ from time import monotonic
 from types import FrameType
 from typing import BinaryIO, Final
 
-from imud.cli.arguments import CliCommand, add_socket, connect
+from imud.cli.arguments import CliCommand, add_socket, connect, duration_s
 from imud.cli.recording.info import Contents
 from imud.client import Client
 from imud.errors import BadArgument, ImudError, reason_of
@@ -30,16 +29,6 @@ GIVE_UP_S: Final = 10.0
 """How long the daemon may send nothing after it was asked to end the recording."""
 CHUNK_BYTES: Final = 1 << 16
 CLEAR_LINE: Final = "\r\x1b[2K"
-SECONDS_OF: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-DURATION: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
-
-
-def duration_s(text: str) -> float:
-    """Read a duration, for example `10min`, `90s` or `2h`; a number alone is seconds. Raises ArgumentTypeError."""
-    found = DURATION.fullmatch(text.strip())
-    if found is None or found[2] not in SECONDS_OF or not float(found[1]):
-        raise argparse.ArgumentTypeError(f"expected a duration as 90s, 10min or 2h, got {text!r}")
-    return float(found[1]) * SECONDS_OF[found[2]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
-from imud.cli.recording.record import duration_s
+from imud.cli.arguments import duration_s
 from tests.cli.recording.recorded_daemon import stamped_capture
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until
 from tests.support.files import ROOT

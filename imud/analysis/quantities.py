@@ -1,0 +1,100 @@
+"""Table: the quantities of a noise analysis with the units in which people and data sheets have them.
+
+A value in SI times the factor is the value in the unit. Gyroscopes: 1 rad/√s = 180/π · 60 deg/√h; accelerometers:
+1 m/s/√s = 1 (m/s²)/√Hz = 60 m/s/√h = 10⁶/g µg/√Hz, with g = 9.80665 m/s².
+"""
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from imud.contracts.sensors.data_sheet import SensorName
+from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
+
+S_PER_H: Final = 3600.0
+ROOT_S_PER_ROOT_H: Final = 60.0
+DEG_PER_RAD: Final = 1 / RAD_PER_DEG
+MG_PER_M_S2: Final = 1e3 / STANDARD_GRAVITY_M_S2
+UG_PER_M_S2: Final = 1e6 / STANDARD_GRAVITY_M_S2
+
+
+class ShownUnit(NamedTuple):
+    """A unit for people."""
+
+    name: str
+    factor: float
+    """Value in the unit per SI value."""
+
+
+class Quantity(NamedTuple):
+    """One figure of a sensor."""
+
+    key: str
+    """Its name in JSON, and of the coefficient in NoiseTerms where it is one."""
+    title: str
+    symbol: str
+    si: str
+    """ShownUnit in which it is computed."""
+    units: tuple[ShownUnit, ...]
+    """Units for people, the most usual first."""
+
+
+GYRO: Final = (
+    Quantity(
+        "random_walk", "angle random walk", "N", "rad/√s",
+        (ShownUnit("deg/√h", DEG_PER_RAD * ROOT_S_PER_ROOT_H),),
+    ),
+    Quantity(
+        "noise_density", "noise density", "√S", "rad/s/√Hz", (ShownUnit("deg/s/√Hz", DEG_PER_RAD),),
+    ),
+    Quantity("bias_instability", "bias instability", "B", "rad/s", (ShownUnit("deg/h", DEG_PER_RAD * S_PER_H),)),
+    Quantity(
+        "least_deviation", "least σ / 0.664", "", "rad/s", (ShownUnit("deg/h", DEG_PER_RAD * S_PER_H),),
+    ),
+    Quantity(
+        "rate_random_walk", "rate random walk", "K", "rad/s/√s",
+        (ShownUnit("deg/h/√h", DEG_PER_RAD * S_PER_H * ROOT_S_PER_ROOT_H),),
+    ),
+    Quantity("rate_ramp", "rate ramp", "R", "rad/s²", (ShownUnit("deg/h/h", DEG_PER_RAD * S_PER_H**2),)),
+    Quantity("quantisation", "quantisation", "Q", "rad", (ShownUnit("deg", DEG_PER_RAD),)),
+    Quantity("temperature_slope", "drift with temp.", "", "rad/s/K", (ShownUnit("deg/h/K", DEG_PER_RAD * S_PER_H),)),
+    Quantity("mean", "mean (bias)", "", "rad/s", (ShownUnit("deg/s", DEG_PER_RAD),)),
+    Quantity("spread", "std. deviation", "", "rad/s", (ShownUnit("deg/s", DEG_PER_RAD),)),
+)  # fmt: skip
+ACCEL: Final = (
+    Quantity(
+        "random_walk", "velocity random walk", "N", "m/s/√s",
+        (ShownUnit("m/s/√h", ROOT_S_PER_ROOT_H), ShownUnit("µg/√Hz", UG_PER_M_S2)),
+    ),
+    Quantity("noise_density", "noise density", "√S", "m/s²/√Hz", (ShownUnit("µg/√Hz", UG_PER_M_S2),)),
+    Quantity("bias_instability", "bias instability", "B", "m/s²", (ShownUnit("mg", MG_PER_M_S2),)),
+    Quantity("least_deviation", "least σ / 0.664", "", "m/s²", (ShownUnit("mg", MG_PER_M_S2),)),
+    Quantity(
+        "rate_random_walk", "acceleration r.w.", "K", "m/s²/√s", (ShownUnit("mg/√h", MG_PER_M_S2 * ROOT_S_PER_ROOT_H),),
+    ),
+    Quantity("rate_ramp", "acceleration ramp", "R", "m/s³", (ShownUnit("mg/h", MG_PER_M_S2 * S_PER_H),)),
+    Quantity("quantisation", "quantisation", "Q", "m/s", (ShownUnit("mm/s", 1e3),)),
+    Quantity("temperature_slope", "drift with temp.", "", "m/s²/K", (ShownUnit("µg/K", UG_PER_M_S2),)),
+    Quantity("mean", "mean", "", "m/s²", (ShownUnit("m/s²", 1.0),)),
+    Quantity("spread", "std. deviation", "", "m/s²", (ShownUnit("mg", MG_PER_M_S2),)),
+)  # fmt: skip
+QUANTITIES: Final[Mapping[SensorName, tuple[Quantity, ...]]] = {"gyro": GYRO, "accel": ACCEL}
+
+DEVIATION: Final[Mapping[SensorName, ShownUnit]] = {
+    "gyro": ShownUnit("deg/h", DEG_PER_RAD * S_PER_H),
+    "accel": ShownUnit("mg", MG_PER_M_S2),
+}
+"""ShownUnit of the Allan deviation in plots."""
+DENSITY: Final[Mapping[SensorName, ShownUnit]] = {
+    "gyro": ShownUnit("deg/s/√Hz", DEG_PER_RAD),
+    "accel": ShownUnit("µg/√Hz", UG_PER_M_S2),
+}
+TITLES: Final[Mapping[SensorName, str]] = {"gyro": "gyroscope", "accel": "accelerometer"}
+SI: Final[Mapping[SensorName, str]] = {"gyro": "rad/s", "accel": "m/s²"}
+
+
+def figure_text(value: float) -> str:
+    """Three digits of a figure, without an exponent where one can do without."""
+    if value == 0 or 1e-4 <= abs(value) < 1e6:
+        digits = f"{value:.3g}"
+        return f"{value:.0f}" if "e" in digits else digits
+    return f"{value:.2e}"

@@ -1,0 +1,315 @@
+"""Samples for an analysis, from a recording, a capture or a running daemon, with their origin and what is lost."""
+
+import argparse
+import sys
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from math import nan
+from time import monotonic
+from typing import Final
+
+import numpy as np
+
+from imud import config
+from imud.analysis.series import FloatArray, Readings
+from imud.cli.arguments import connect, statuses
+from imud.cli.recording.replay import begins_as_recording
+from imud.cli.replay import BAUD, DRIVER, check, configuration, has_times, serve
+from imud.contracts.publisher import Batch
+from imud.contracts.sensors.data_sheet import DataSheet
+from imud.contracts.status import DeviceStatus
+from imud.daemon import Daemon
+from imud.devices import DRIVERS
+from imud.errors import BadArgument, ImudError
+from imud.event import Event
+from imud.files import open_regular
+from imud.formats.recording.file import RecordingReader
+from imud.ledger import LEDGER_FIELDS
+from imud.log import STDERR, log_to
+from imud.runtime import event_loop
+from imud.runtime.recording.player import Player
+from imud.sample import Sample
+from imud.units import NS_PER_S
+
+SAMPLES_MOST: Final = 20_000_000
+"""14 hours at 400 Hz; they take 1.3 GB, and the analysis as much again."""
+SILENCE_S: Final = 5.0
+"""A live device that sends nothing for so long is named."""
+NOTE_S: Final = 1.0
+"""Time between two notes of progress."""
+_NONE3: Final = (nan, nan, nan)
+
+
+@dataclass(slots=True)
+class Taken:
+    """Samples and their provenance."""
+
+    source: str
+    """The file, or the daemon's socket."""
+    device: str = ""
+    driver: str = ""
+    link: str = ""
+    identity: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, str] = field(default_factory=dict)
+    begun_utc_ns: int | None = None
+    """UTC of the first sample; None where the capture has no time."""
+    readings: Readings | None = None
+    lost: dict[str, int] = field(default_factory=dict)
+    """Samples lost meanwhile, by the daemon's causes, those that are not zero."""
+    stamps: str = ""
+    """How the samples are dated, in words."""
+    notes: list[str] = field(default_factory=list)
+    """What else the reader of a report has to know."""
+
+    @property
+    def sheet(self) -> DataSheet:
+        """What the vendor's manual states."""
+        return DRIVERS[self.driver].data_sheet if self.driver in DRIVERS else DataSheet()
+
+
+class Collector:
+    """Collector of the samples of one device, in the order of arrival; also a publisher of a daemon that replays.
+
+    Before `skip_s` after the first sample nothing is kept, nor after `for_s` more.
+    """
+
+    def __init__(self, name: str = "", *, skip_s: float = 0.0, for_s: float | None = None) -> None:
+        self.name = name
+        """The device; empty for the only one."""
+        self.others: set[str] = set()
+        """Devices that were passed over although none was chosen."""
+        self.done = False
+        """Whether all that was asked for is there."""
+        self.first: Sample | None = None
+        self.newest: Sample | None = None
+        self.syncs: Counter[str] = Counter()
+        self.by_device_time = False
+        """Whether to date samples by the device's clock."""
+        self._chosen = bool(name)
+        self._skip_ns, self._for_ns = round(skip_s * NS_PER_S), None if for_s is None else round(for_s * NS_PER_S)
+        self._begin_ns: int | None = None
+        self._errors_ns = 0
+        self._times = array("q")
+        self._gyro, self._accel, self._temperature = array("d"), array("d"), array("d")
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def add(self, sample: Sample) -> None:
+        """Take one sample. Raises ImudError where there are more than fit."""
+        if self.done:
+            return
+        if not self.name:
+            self.name = sample.device
+        if sample.device != self.name:
+            if not self._chosen:
+                self.others.add(sample.device)
+            return
+        t_ns = sample.t_dev_ns if self.by_device_time else sample.t_ns
+        if t_ns is None:
+            raise BadArgument("the capture has no time of any read, and its messages no time of the device")
+        if self._begin_ns is None:
+            self._begin_ns = t_ns + self._skip_ns
+        if t_ns < self._begin_ns:
+            return
+        if self._for_ns is not None and t_ns - self._begin_ns > self._for_ns:
+            self.done = True
+            return
+        if len(self._times) >= SAMPLES_MOST:
+            raise BadArgument(f"expected at most {SAMPLES_MOST} samples: choose a part with --skip and --for")
+        self._keep(sample, t_ns)
+
+    def _keep(self, sample: Sample, t_ns: int) -> None:
+        self.first = self.first or sample
+        self.newest = sample
+        self.syncs[str(sample.sync)] += 1
+        self._errors_ns += sample.t_err_ns
+        self._times.append(t_ns)
+        self._gyro.extend(sample.gyro_rad_s or _NONE3)
+        self._accel.extend(sample.accel_m_s2 or _NONE3)
+        self._temperature.append(nan if sample.temperature_c is None else sample.temperature_c)
+
+    def drop_before(self, t_ns: int) -> None:
+        """Remove the samples before a time: a live view has no past."""
+        count = int(np.searchsorted(np.frombuffer(self._times, dtype=np.int64), t_ns)) if self._times else 0
+        del self._times[:count], self._temperature[:count], self._gyro[: 3 * count], self._accel[: 3 * count]
+
+    def readings(self) -> Readings:
+        """Copy what was collected into arrays."""
+        temperature = np.array(self._temperature)
+        return Readings(
+            np.array(self._times, dtype=np.int64), _sensor(self._gyro), _sensor(self._accel),
+            temperature if np.isfinite(temperature).any() else None,
+        )  # fmt: skip
+
+    def stamps(self) -> str:
+        """Describe how the samples are dated."""
+        if self.by_device_time:
+            return "the device's own clock; the capture has no time of any read, so the rate is as true as its crystal"
+        kinds = ", ".join(f"{100 * count / len(self):.3g} % {kind}" for kind, count in self.syncs.most_common())
+        return f"{kinds}; mean stated error {self._errors_ns / max(len(self), 1) / 1000:.3g} µs"
+
+    # --- as a publisher of a daemon -----------------------------------------------------------------------------------
+
+    def publish(self, batch: Batch) -> None:
+        """Take the samples."""
+        for sample in batch.samples:
+            self.add(sample)
+
+    def start(self) -> None:
+        """No-op: there is nothing to open."""
+
+    def add_device(self, name: str, device_id: int) -> None:
+        """No-op: a device is known by its samples."""
+
+    def remove_device(self, name: str) -> None:
+        """No-op: its samples stay."""
+
+    def event(self, event: Event) -> None:
+        """No-op: events are in the log."""
+
+    def tick(self, now_ns: int) -> None:
+        """No-op: nothing depends on time."""
+
+    def close(self) -> None:
+        """No-op: nothing is open."""
+
+
+def _sensor(values: "array[float]") -> FloatArray | None:
+    found = np.array(values).reshape(-1, 3)
+    return found if np.isfinite(found).any() else None
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def take_file(args: argparse.Namespace) -> Taken:
+    """Read the samples of `args.input`, a recording or a capture. Raises ImudError, OSError."""
+    with log_to(STDERR, "error"):
+        taken = take_recording(args) if begins_as_recording(args.input) else take_capture(args)
+    if taken.readings is None or not len(taken.readings.t_ns):
+        raise ImudError(f"{args.input}: expected samples, found none; `imud info` or `imud decode` say what is in it")
+    return taken
+
+
+def take_recording(args: argparse.Namespace) -> Taken:
+    """Play a recording; the stamps are those of the live run."""
+    for option, default in (("driver", None), ("option", []), ("baud", None)):
+        if getattr(args, option) != default:
+            raise BadArgument(f"--{option}: expected none with a recording, which has those of the live run")
+    collector = Collector(args.device or "", skip_s=args.skip or 0.0, for_s=args.duration)
+    taken, before = Taken(args.input), None
+    with open_regular(args.input) as file:
+        player = Player(collector.publish)
+        reader = RecordingReader(file, args.input)
+        for record in reader:
+            player.play((record,))
+            if collector.first is not None and before is None:
+                before = _ledgers(player)
+            if collector.done or collector.others:
+                break
+    names = [device.described.name for device in player.devices.values()]
+    if collector.others:
+        raise BadArgument(f"{args.input}: it has {', '.join(names)}: choose one with --device")
+    if args.device and args.device not in names:
+        raise BadArgument(f"--device {args.device}: expected one of the recording's, {', '.join(names)}")
+    for device in player.devices.values():
+        if device.described.name == collector.name:
+            taken.driver = device.driver.name if device.driver is not None else device.described.driver
+            taken.link, taken.identity = device.described.where, device.described.identity
+            taken.settings = device.described.settings
+            taken.notes += [f"clock: {why}" for why in device.fresh_starts[:1]]
+            taken.notes += [f"replay: {len(device.differences)} checks differ" for _ in device.differences[:1]]
+    taken.notes += list(reader.problems)
+    if player.lost:
+        taken.notes.append(f"{player.lost} records were dropped when the file was written")
+    after = _ledgers(player)
+    return _finished(taken, collector, _lost((before or {}).get(collector.name, {}), after.get(collector.name, {})))
+
+
+def _ledgers(player: Player) -> dict[str, dict[str, int]]:
+    return {device.described.name: device.ledger.snapshot() for device in player.devices.values()}
+
+
+def _lost(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
+    causes = [name for name in LEDGER_FIELDS if name.startswith("lost_")]
+    return {name: count for name in causes if (count := after.get(name, 0) - before.get(name, 0))}
+
+
+def take_capture(args: argparse.Namespace) -> Taken:
+    """Run a capture through the daemon's whole path."""
+    replayed = argparse.Namespace(
+        file=args.input, driver=args.driver or DRIVER, speed="maximum", baud=args.baud or BAUD, socket=None,
+        option=args.option,
+    )  # fmt: skip
+    settings = config.parse(configuration(replayed), str(args.input))
+    check(settings.devices[0])
+    collector = Collector(skip_s=args.skip or 0.0, for_s=args.duration)
+    collector.by_device_time = not has_times(replayed)
+    daemon = Daemon(settings, extra={"collect": collector}, until_finished=True)
+    event_loop.run(serve(daemon))
+    status = daemon.status()[0]
+    taken = Taken(args.input, driver=status.driver, link=status.link, identity=status.identity)
+    taken.settings = status.settings
+    finished = _finished(taken, collector, _lost({}, status.ledger))
+    finished.device, finished.begun_utc_ns = args.device or "capture", None
+    return finished
+
+
+def _finished(taken: Taken, collector: Collector, lost: dict[str, int]) -> Taken:
+    taken.device, taken.lost = collector.name, lost
+    taken.readings, taken.stamps = collector.readings(), collector.stamps() if len(collector) else ""
+    taken.begun_utc_ns = collector.first.utc_ns if collector.first is not None else None
+    return taken
+
+
+# --- a running daemon -------------------------------------------------------------------------------------------------
+
+
+def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lambda _passed_s, _count: None) -> Taken:
+    """Collect the samples of the device `args.input` for `args.duration`, or until interrupted.
+
+    `note` is called about once a second with the time passed and the number of samples. Raises ImudError; TimeoutError
+    in silence.
+    """
+    with connect(args) as asking, connect(args) as listening:
+        before = status_of(statuses(asking), args.input)
+        collector = Collector(args.input, skip_s=args.skip or 0.0, for_s=args.duration)
+        samples = listening.watch([args.input], timeout_s=SILENCE_S)
+        begun = noted = monotonic()
+        with suppress(KeyboardInterrupt):
+            for sample in samples:
+                collector.add(sample)
+                now = monotonic()
+                if now - noted >= NOTE_S:
+                    noted = now
+                    note(now - begun, len(collector))
+                if collector.done:
+                    break
+        after = status_of(statuses(asking), args.input)
+        taken = taken_of(after, args.socket)
+        dropped = samples.dropped.get(args.input, 0)
+    lost = _lost(before.ledger, after.ledger)
+    return _finished(taken, collector, lost | ({"dropped": dropped} if dropped else {}))
+
+
+def status_of(found: Iterable[DeviceStatus], name: str) -> DeviceStatus:
+    """Return the status of a device. Raises BadArgument with the names there are."""
+    known = {status.name: status for status in found}
+    if name not in known:
+        raise BadArgument(f"{name}: expected a file, or a device of the daemon ({', '.join(known) or 'it has none'})")
+    return known[name]
+
+
+def taken_of(status: DeviceStatus, socket: str) -> Taken:
+    """Begin the provenance of a live device."""
+    return Taken(f"live from {socket}", status.name, status.driver, status.link, status.identity, status.settings)
+
+
+def progress(passed_s: float, count: int) -> None:
+    """Say on a terminal how far it is."""
+    if sys.stderr.isatty():
+        print(f"\r{passed_s:.0f} s, {count} samples", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,75 @@
+"""Draws the pictures of docs/analysis.md: `python -m tests.analysis.pictures` (`make pictures`).
+
+Both are what the commands draw, of simulated sensors whose truth is known: `noise.svg` a gyroscope with coefficients of
+the table in docs/analysis.md, two hours at 100 Hz; `vibration.png` an accelerometer that is set to 400 Hz and whose
+crystal is 2 % fast, on a machine that starts, with 1 % of the samples missing.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from imud.analysis.noise import SensorNoise, sensor_noise
+from imud.analysis.noise_plots import deviation_figure
+from imud.analysis.quantities import DEG_PER_RAD, ROOT_S_PER_ROOT_H, S_PER_H
+from imud.analysis.series import Readings
+from imud.analysis.spectrum_plots import SensorVibration, spectrum_figure
+from imud.cli.analysis.noise_page import picture
+from imud.cli.analysis.spectrum_report import SpectrumSettings, sensor_vibration
+from tests.analysis.synthetic import flicker, random_walk, stamps_ns, white
+from tests.support.files import ROOT
+
+FOLDER: Final = ROOT / "docs/pictures"
+SEED: Final = 15
+RATE_HZ, HOURS = 100.0, 2
+N_DEG_SQRT_H, B_DEG_H, K_DEG_H_SQRT_H = 0.3, 4.0, 20.0
+"""Coefficients of all three axes."""
+VIBRATION_HZ, VIBRATION_S = 408.0, 60
+START_S, FULL_S, FULL_HZ = 15.0, 30.0, 48.3
+"""The machine starts, has its full speed, and turns so fast then."""
+
+
+def gyroscope() -> SensorNoise:
+    """The analysis of a gyroscope with known coefficients."""
+    random, count = np.random.default_rng(SEED), int(HOURS * S_PER_H * RATE_HZ)
+    axes = [
+        white(random, count, RATE_HZ, N_DEG_SQRT_H / DEG_PER_RAD / ROOT_S_PER_ROOT_H)
+        + flicker(random, count, B_DEG_H / DEG_PER_RAD / S_PER_H)
+        + random_walk(random, count, RATE_HZ, K_DEG_H_SQRT_H / DEG_PER_RAD / S_PER_H / ROOT_S_PER_ROOT_H)
+        for _ in range(3)
+    ]
+    values = np.stack(axes, axis=1)
+    return sensor_noise(Readings(stamps_ns(count, RATE_HZ), values, None, None), values)
+
+
+def machine() -> SensorVibration:
+    """The analysis of an accelerometer on a machine: imbalance, its double, and a resonance that it passes."""
+    random, count = np.random.default_rng(SEED), int(VIBRATION_HZ * VIBRATION_S)
+    t_s = np.arange(count) / VIBRATION_HZ
+    speed_hz = FULL_HZ * np.clip((t_s - START_S) / (FULL_S - START_S), 0, 1)
+    turn = 2 * np.pi * np.cumsum(speed_hz) / VIBRATION_HZ
+    imbalance = (speed_hz / FULL_HZ) ** 2
+    values = 0.03 * random.standard_normal((count, 3)) + np.array([0.0, 0.0, 9.8])
+    values[:, 0] += 1.2 * imbalance * np.sin(turn)
+    values[:, 2] += 0.8 * imbalance * np.cos(turn) + 0.25 * imbalance * np.sin(2 * turn)
+    values[:, 1] += 0.1 * np.sin(2 * np.pi * 100.0 * t_s)
+    keep = np.sort(random.choice(count, round(0.99 * count), replace=False))
+    readings = Readings(stamps_ns(count, VIBRATION_HZ)[keep], None, values[keep], None)
+    return sensor_vibration(readings, values[keep], SpectrumSettings(("accel",)))
+
+
+def noise_svg() -> bytes:
+    """The Allan deviation."""
+    return picture(deviation_figure("gyro", gyroscope()), ".svg")
+
+
+def vibration_png() -> bytes:
+    """Density and spectrogram."""
+    sensor = machine()
+    facts = f"set to 400 Hz, true rate {sensor.grid.rate_hz:.3f} Hz, {sensor.grid.missing} samples missing"
+    return picture(spectrum_figure({"accel": sensor}, "A machine that starts after 15 s", [facts]), ".png")
+
+
+if __name__ == "__main__":
+    (FOLDER / "noise.svg").write_bytes(noise_svg())
+    (FOLDER / "vibration.png").write_bytes(vibration_png())

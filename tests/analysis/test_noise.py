@@ -1,0 +1,109 @@
+"""A sensor at rest: density, corner of its filter, drift with temperature, disturbances, counts."""
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
+
+from imud.analysis.noise import corner_of, sensor_noise, step_of, temperature_drift
+from imud.analysis.series import FloatArray, Readings
+from imud.analysis.spectrum import power_spectrum
+from tests.analysis.synthetic import random_walk, stamps_ns, three, white
+
+RATE_HZ = 200.0
+COUNT = 60_000
+
+
+def readings_of(values: FloatArray, temperature_c: FloatArray | None = None) -> Readings:
+    return Readings(stamps_ns(len(values), RATE_HZ), values, None, temperature_c)
+
+
+def noise_of_three(seed: int, n: float = 1e-3, count: int = COUNT) -> FloatArray:
+    random = np.random.default_rng(seed)
+    return np.stack([white(random, count, RATE_HZ, n) for _ in range(3)], axis=1)
+
+
+def test_white_noise_of_three_axes() -> None:
+    values = noise_of_three(1) + np.array([0.1, -0.2, 0.3])
+    found = sensor_noise(readings_of(values), values)
+    for axis, mean in zip(found.axes, (0.1, -0.2, 0.3), strict=True):
+        assert axis.terms.random_walk.value == pytest.approx(1e-3, rel=0.05)
+        assert axis.density == pytest.approx(np.sqrt(2) * 1e-3, rel=0.05), "one-sided: √2 N"
+        assert axis.mean == pytest.approx(mean, abs=1e-3)
+        assert axis.spread == pytest.approx(1e-3 * np.sqrt(RATE_HZ), rel=0.02)
+        assert axis.drift is None
+        assert axis.bias_instability_most == pytest.approx(axis.least_deviation / 0.6643, rel=1e-3)
+    assert found.corner_hz is None
+    assert (found.disturbed_s, found.still_s) == (0, 300)
+    assert found.step is None
+
+
+def test_missing_samples_do_not_change_the_coefficients() -> None:
+    random = np.random.default_rng(2)
+    values = noise_of_three(2)
+    keep = np.sort(random.choice(COUNT, round(COUNT * 0.99), replace=False))
+    keep = keep[(keep < 20_000) | (keep > 20_500)]
+    readings = Readings(stamps_ns(COUNT, RATE_HZ)[keep], values[keep], None, None)
+    found = sensor_noise(readings, values[keep])
+    assert found.grid.missing == COUNT - len(keep) - (COUNT - 1 - keep[-1]) - keep[0]
+    assert len(found.grid.runs) == 2
+    for axis in found.axes:
+        assert axis.terms.random_walk.value == pytest.approx(1e-3, rel=0.05)
+
+
+def test_a_low_pass_filter_is_seen_and_the_coefficient_is_that_below_it() -> None:
+    b, a = butter(1, 20.0, fs=RATE_HZ)
+    values = lfilter(b, a, noise_of_three(3), axis=0)
+    found = sensor_noise(readings_of(values), values)
+    assert found.corner_hz == pytest.approx(20.0, rel=0.35)
+    assert found.tau_least_s == pytest.approx(5 / (found.corner_hz or 1))
+    for axis in found.axes:
+        assert axis.terms.random_walk.value == pytest.approx(1e-3, rel=0.07)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_random_walk_has_no_corner(seed: int) -> None:
+    walk = three(random_walk(np.random.default_rng(seed), COUNT, RATE_HZ, 1.0))
+    assert corner_of(power_spectrum([walk], RATE_HZ)) is None
+
+
+def test_drift_with_temperature() -> None:
+    temperature = np.linspace(20.0, 40.0, COUNT)
+    values = noise_of_three(6, 1e-4) + np.outer(temperature - 30, [1e-3, 0.0, -2e-3])
+    found = sensor_noise(readings_of(values, np.round(temperature)), values)
+    slopes = [axis.drift for axis in found.axes]
+    assert slopes[0] is not None
+    assert slopes[1] is not None
+    assert slopes[2] is not None
+    assert slopes[0].slope == pytest.approx(1e-3, rel=0.02)
+    assert slopes[0].r2 > 0.99
+    assert abs(slopes[1].slope) < 4 * slopes[1].sigma
+    assert slopes[1].r2 < 0.1
+    assert slopes[2].slope == pytest.approx(-2e-3, rel=0.02)
+
+
+def test_a_temperature_that_hardly_changes_has_no_slope() -> None:
+    temperature = np.linspace(20.0, 21.5, COUNT)
+    assert temperature_drift(temperature, noise_of_three(7)[:, 0], RATE_HZ) is None
+
+
+def test_temperatures_that_come_now_and_then_are_used() -> None:
+    temperature = np.full(COUNT, np.nan)
+    temperature[:: int(RATE_HZ)] = np.linspace(20.0, 40.0, COUNT // int(RATE_HZ))
+    values = noise_of_three(8, 1e-4) + np.outer(np.linspace(-10, 10, COUNT), [1e-3] * 3)
+    drift = sensor_noise(readings_of(values, temperature), values).axes[0].drift
+    assert drift is not None
+    assert drift.slope == pytest.approx(1e-3, rel=0.02)
+
+
+def test_seconds_in_which_it_was_moved_are_counted() -> None:
+    values = noise_of_three(9)
+    values[2000:2010] += 1.0
+    values[30_000:30_400] += np.sin(np.arange(400))[:, None]
+    assert sensor_noise(readings_of(values), values).disturbed_s == 3
+
+
+def test_counts_are_recognised() -> None:
+    values = np.round(noise_of_three(10) / 1.065e-3) * 1.065e-3
+    assert step_of(values) == pytest.approx(1.065e-3)
+    assert step_of(noise_of_three(10)) is None
+    assert step_of(np.zeros((100, 3))) is None

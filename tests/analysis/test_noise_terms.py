@@ -1,0 +1,115 @@
+"""Coefficients of synthetic noise are found within 5 %, and what a series cannot show is not made up."""
+
+import numpy as np
+import pytest
+
+from imud.analysis.allan import allan_curve
+from imud.analysis.noise_terms import BIAS_FACTOR, NoiseTerms, basis, noise_terms
+from imud.analysis.series import FloatArray
+from imud.errors import BadArgument
+from tests.analysis.synthetic import flicker, quantisation, ramp, random_walk, white
+
+RATE_HZ = 100.0
+COUNT = 1 << 18
+WITHIN = 0.05
+
+
+def terms_of(series: FloatArray, rate_hz: float = RATE_HZ) -> NoiseTerms:
+    return noise_terms(allan_curve([series[:, None]], rate_hz), 0)
+
+
+def test_the_factor_of_the_bias_instability() -> None:
+    assert pytest.approx(0.664, abs=5e-4) == BIAS_FACTOR
+
+
+def test_the_basis_by_hand() -> None:
+    assert basis(np.array([2.0]))[0] == pytest.approx([3 / 4, 1 / 2, 2 * np.log(2) / np.pi, 2 / 3, 2.0])
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_white_noise(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    found = terms_of(white(random, COUNT, RATE_HZ, 2e-4))
+    assert found.random_walk.value == pytest.approx(2e-4, rel=WITHIN)
+    assert found.rate_random_walk.value is None
+    assert found.rate_ramp.value is None
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_bias_instability_over_white_noise(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    found = terms_of(white(random, COUNT, RATE_HZ, 1e-4) + flicker(random, COUNT, 3e-3))
+    assert found.bias_instability.value == pytest.approx(3e-3, rel=WITHIN)
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_rate_random_walk_over_white_noise(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    found = terms_of(white(random, COUNT, RATE_HZ, 1e-3) + random_walk(random, COUNT, RATE_HZ, 1e-2))
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.rate_random_walk.value == pytest.approx(1e-2, rel=WITHIN)
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_quantisation_over_white_noise(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    found = terms_of(quantisation(random, COUNT, RATE_HZ, 1e-3) + white(random, COUNT, RATE_HZ, 1e-3))
+    assert found.quantisation.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_a_ramp_over_white_noise(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    found = terms_of(white(random, COUNT, RATE_HZ, 1e-3) + ramp(COUNT, RATE_HZ, 1e-5))
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.rate_ramp.value == pytest.approx(1e-5, rel=WITHIN)
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_all_of_a_gyroscope_together(seed: int) -> None:
+    random, count = np.random.default_rng(seed), 1 << 20
+    series = (
+        white(random, count, RATE_HZ, 1e-3) + flicker(random, count, 8e-3) + random_walk(random, count, RATE_HZ, 8e-3)
+    )
+    found = terms_of(series)
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.bias_instability.value == pytest.approx(8e-3, rel=WITHIN)
+    assert found.rate_random_walk.value == pytest.approx(8e-3, rel=WITHIN)
+
+
+def test_the_fit_makes_the_curve_again() -> None:
+    random = np.random.default_rng(31)
+    curve = allan_curve([white(random, COUNT, RATE_HZ, 1e-3)[:, None]], RATE_HZ)
+    fitted = noise_terms(curve, 0).deviation(curve.tau_s)
+    near = curve.freedom[:, 0] > 100
+    assert fitted[near] == pytest.approx(curve.deviation[near, 0], rel=0.15)
+
+
+def test_the_stated_spread_is_that_of_many_series() -> None:
+    random = np.random.default_rng(41)
+    found = [terms_of(white(random, 4096, 1.0, 1.0), 1.0).random_walk for _ in range(60)]
+    values = np.array([one.value for one in found], dtype=float)
+    stated = float(np.median([one.sigma for one in found]))
+    assert 0.5 < stated / values.std() < 3.0
+
+
+def test_a_bound_where_nothing_is_resolved() -> None:
+    random = np.random.default_rng(51)
+    found = terms_of(white(random, 4096, RATE_HZ, 1e-3))
+    assert found.rate_ramp.value is None
+    assert found.rate_ramp.below > 0
+
+
+def test_short_filtered_points_are_left_out() -> None:
+    random = np.random.default_rng(61)
+    smooth = np.convolve(white(random, COUNT, RATE_HZ, 1e-3), np.ones(8) / 8, mode="same")
+    curve = allan_curve([smooth[:, None]], RATE_HZ)
+    assert noise_terms(curve, 0, tau_least_s=0.8).random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    with pytest.raises(BadArgument, match="a longer series is needed"):
+        noise_terms(curve, 0, tau_least_s=curve.tau_s[-3])
+
+
+def test_a_constant_has_no_noise() -> None:
+    found = terms_of(np.zeros(500))
+    assert all(term.value is None for term in found)

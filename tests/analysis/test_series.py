@@ -1,0 +1,94 @@
+"""The grid of a series: rate, missing samples, runs, and what is filled."""
+
+import numpy as np
+import pytest
+
+from imud.analysis.series import FILL_MOST, Readings, even_runs, grid_of, with_values
+from imud.errors import BadArgument
+from tests.analysis.synthetic import stamps_ns
+
+
+def test_the_rate_is_that_of_the_stamps() -> None:
+    grid = grid_of(stamps_ns(1000, 408.0))
+    assert grid.rate_hz == pytest.approx(408.0, rel=1e-6)
+    assert grid.missing == 0
+    assert grid.runs == ((0, 1000),)
+    assert grid.duration_s == pytest.approx(1000 / 408)
+    assert "no sample is missing" in grid.words()
+
+
+def test_missing_samples_are_found_and_filled() -> None:
+    t_ns = np.delete(stamps_ns(1000, 100.0), [10, 500, 501])
+    grid = grid_of(t_ns)
+    assert (grid.missing, grid.filled, grid.runs) == (3, 3, ((0, 997),))
+    assert grid.place[9] == 9
+    assert grid.place[10] == 11
+    assert "3 samples are missing (0.30 %)" in grid.words()
+
+
+def test_a_longer_gap_ends_a_run() -> None:
+    gone = list(range(300, 300 + FILL_MOST + 1))
+    grid = grid_of(np.delete(stamps_ns(1000, 100.0), gone))
+    assert grid.runs == ((0, 300), (300, 995))
+    assert (grid.missing, grid.filled) == (5, 0)
+    assert "2 runs" in grid.words()
+
+
+@pytest.mark.parametrize("rate_hz", [300.0, 400.0, 667.0])
+def test_stamps_in_whole_milliseconds_hide_neither_rate_nor_gap(rate_hz: float) -> None:
+    t_ns = np.delete(stamps_ns(20_000, rate_hz), [5000]) // 1_000_000 * 1_000_000
+    grid = grid_of(t_ns)
+    assert grid.rate_hz == pytest.approx(rate_hz, rel=1e-5)
+    assert grid.missing == 1
+
+
+def test_the_pause_between_runs_does_not_move_the_rate() -> None:
+    first, second = stamps_ns(1000, 100.0), stamps_ns(1000, 100.0, 1_000_000_000 + 13_333_000_000)
+    grid = grid_of(np.concatenate((first, second)))
+    assert grid.rate_hz == pytest.approx(100.0, rel=1e-7)
+    assert len(grid.runs) == 2
+
+
+def test_scattered_stamps_are_said_to_hide_gaps() -> None:
+    random = np.random.default_rng(1)
+    t_ns = stamps_ns(5000, 200.0) + random.normal(0, 2e6, 5000).astype(np.int64)
+    t_ns = np.maximum.accumulate(t_ns) + np.arange(5000)
+    grid = grid_of(t_ns)
+    assert not grid.located
+    assert grid.missing == 0
+    assert grid.rate_hz == pytest.approx(200.0, rel=1e-4)
+    assert "too much to see single missing samples" in grid.words()
+
+
+def test_straight_lines_fill_for_noise_and_splines_for_vibration() -> None:
+    t_ns, keep = stamps_ns(400, 100.0), np.delete(np.arange(400), [200])
+    values = np.sin(2 * np.pi * 5.0 * np.arange(400) / 100.0)[:, None]
+    grid = grid_of(t_ns[keep])
+    (line,) = even_runs(grid, values[keep])
+    (smooth,) = even_runs(grid, values[keep], smooth=True)
+    assert len(line) == len(smooth) == 400
+    assert line[200, 0] == pytest.approx((values[199, 0] + values[201, 0]) / 2)
+    assert smooth[200, 0] == pytest.approx(values[200, 0], abs=2e-3)
+    assert abs(smooth[200, 0] - values[200, 0]) < abs(line[200, 0] - values[200, 0]) or values[200, 0] == 0
+    assert np.array_equal(line[keep], values[keep])
+
+
+@pytest.mark.parametrize(
+    ("t_ns", "words"),
+    [(stamps_ns(10, 100.0), "at least 64 samples"), (np.append(stamps_ns(100, 100.0), 5), "rise, sample 100 has not")],
+)
+def test_what_is_no_series_is_refused(t_ns: np.ndarray, words: str) -> None:
+    with pytest.raises(BadArgument, match=words):
+        grid_of(t_ns)
+
+
+def test_samples_without_a_value_are_left_out() -> None:
+    values = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0], [4.0, 5.0, 6.0]])
+    t_ns, found = with_values(np.array([1, 2, 3]), values)
+    assert t_ns.tolist() == [1, 3]
+    assert found.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+
+
+def test_the_duration_of_readings() -> None:
+    assert Readings(stamps_ns(101, 100.0), None, None, None).duration_s == pytest.approx(1.0)
+    assert Readings(np.array([], dtype=np.int64), None, None, None).duration_s == 0.0

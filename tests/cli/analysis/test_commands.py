@@ -1,0 +1,227 @@
+"""`imud noise` and `imud spectrum` from the command line: captures, recordings, a running daemon."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+
+from imud.cli import main
+from imud.cli.analysis.commands import bands_hz
+from imud.cli.output import COLUMNS
+from tests.cli.analysis.captures import frame, resting, shaken, write_capture
+from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
+from tests.support.daemon_process import RunningDaemon, running_daemon
+from tests.support.pty_port import PtyPort
+
+SET_HZ, TRUE_HZ, SHAKEN_HZ = 400.0, 408.0, 63.7
+SHEET = "source: a sheet\ngyro: {random_walk_deg_sqrt_h: 0.5}\naccel: {random_walk_m_s_sqrt_h: 0.001}\n"
+
+
+@pytest.fixture(scope="module")
+def shaken_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A module that is set to 400 Hz and whose crystal is 2 % fast, on a shaker; 1 % of its messages are missing."""
+    count = 16_000
+    missing = np.random.default_rng(1).choice(np.arange(2000, count), count // 100, replace=False).tolist()
+    accel, gyro = shaken(count, TRUE_HZ, SHAKEN_HZ)
+    file = tmp_path_factory.mktemp("shaken") / "shaken.capture"
+    return write_capture(file, accel, gyro, rate_hz=SET_HZ, fast=0.02, missing=missing)
+
+
+@pytest.fixture(scope="module")
+def resting_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A module at rest that becomes warmer."""
+    accel, gyro = resting(12_000, 100.0)
+    warm = np.linspace(25.0, 32.0, len(accel))
+    return write_capture(
+        tmp_path_factory.mktemp("resting") / "a.capture", accel, gyro, rate_hz=100.0, temperature_c=warm
+    )
+
+
+def test_a_line_is_found_at_the_true_rate(shaken_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["spectrum", "--json", "--skip", "5s", str(shaken_file)]) == 0
+    accel = json.loads(capsys.readouterr().out)["sensors"]["accel"]
+    assert accel["rate_hz"] == pytest.approx(TRUE_HZ, rel=1e-5)
+    assert accel["missing"] == pytest.approx(160, abs=2)
+    peak = accel["peaks"][0]
+    assert peak["frequency_hz"] == pytest.approx(SHAKEN_HZ, abs=0.05 * accel["bin_hz"])
+    assert peak["amplitude"][2] == pytest.approx(2.0, rel=0.03)
+    assert peak["images_hz"] == pytest.approx([TRUE_HZ - SHAKEN_HZ, TRUE_HZ + SHAKEN_HZ], abs=0.1)
+
+
+def test_a_spectrum_in_words(shaken_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "vibration.png"
+    words = ["spectrum", "--sensor", "accel", "--bands", "5-60,60-70", "-o", str(picture), str(shaken_file)]
+    assert main([*words, "--resolution", "0.5"]) == 0
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert "P1" in out
+    assert "60 to 70" in out
+    assert "gyroscope" not in out
+    for word in ("aliasing", "no manual states", "noise bandwidth", "are\n  missing", "Hann"):
+        assert word in out, word
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_noise_of_a_capture(resting_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = tmp_path / "sheet.yaml"
+    sheet.write_text(SHEET)
+    assert main(["noise", "--json", "--sheet", str(sheet), str(resting_file)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    gyro, accel = told["sensors"]["gyro"], told["sensors"]["accel"]
+    assert gyro["axes"]["y"]["random_walk"]["value"] == pytest.approx(1e-4, rel=0.05)
+    assert gyro["axes"]["y"]["random_walk"]["deg/√h"] == pytest.approx(1e-4 * 3437.747, rel=0.05)
+    assert accel["axes"]["z"]["random_walk"]["µg/√Hz"] == pytest.approx(5e-4 / 9.80665e-6, rel=0.05)
+    assert told["measurement"]["temperature_c"] == [25.0, 32.0]
+    assert gyro["compared"][0]["ratio"] == pytest.approx(0.34377 / 0.5, rel=0.05)
+    assert accel["compared"][0]["ratio"] == pytest.approx(0.03 / 0.001, rel=0.05)
+    assert len(gyro["allan"]["tau_s"]) == len(gyro["allan"]["deviation"][0]) == len(gyro["allan"]["noise"][2])
+
+
+@pytest.mark.parametrize("end", [".html", ".svg", ".png"])
+def test_a_report_for_a_supplier(
+    resting_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
+) -> None:
+    sheet, file = tmp_path / "sheet.yaml", tmp_path / f"report{end}"
+    sheet.write_text(SHEET)
+    assert main(["noise", "--sheet", str(sheet), "--for", "60s", "-o", str(file), str(resting_file)]) == 0
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= COLUMNS
+    for words in ("angle random walk N", "µg/√Hz", "of 0.5 deg/√h = 0.6", "times: within", "times: ABOVE", "a sheet"):
+        assert words in out, words
+    content = file.read_bytes()
+    if end != ".png":
+        text = content.decode()
+        assert "angle random walk" in text
+        assert "Allan deviation" in text
+        assert "src=" not in text
+        assert "<script" not in text
+        assert "hipnuc-uart" in text
+
+
+def test_without_a_sheet_the_report_says_what_the_manual_has(
+    resting_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["noise", "--for", "20s", str(resting_file)]) == 0
+    assert "no figure of noise for any model" in " ".join(capsys.readouterr().out.split())
+
+
+# --- recordings -------------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_of_two_devices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = run_recorded(tmp_path)[2]
+    assert main(["noise", str(file)]) == 2
+    assert "it has bow, mast: choose one with --device" in capsys.readouterr().err
+    assert main(["noise", "--device", "stern", str(file)]) == 2
+    assert "--device stern: expected one of the recording's, bow, mast" in capsys.readouterr().err
+    assert main(["noise", "--json", "--device", "bow", str(file)]) == 0
+    measurement = json.loads(capsys.readouterr().out)["measurement"]
+    assert measurement["samples"] == FRAMES
+    assert (measurement["device"], measurement["driver"]) == ("bow", "hipnuc-uart")
+    assert measurement["begun_utc_ns"] > 0
+    assert main(["noise", "--driver", "hipnuc-uart", str(file)]) == 2
+    assert "--driver: expected none with a recording" in capsys.readouterr().err
+
+
+# --- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+def test_a_raw_capture_is_dated_by_the_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    accel, gyro = resting(500, 100.0)
+    file = tmp_path / "raw"
+    file.write_bytes(b"".join(frame(10 * number, accel[number], gyro[number]) for number in range(500)))
+    assert main(["spectrum", str(file)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "even grid of 100.0000 Hz" in out
+    assert "as true as its crystal" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["noise", "-o", "a.pdf"], "ends in .html, .svg, .png"),
+        (["spectrum", "-o", "a.html"], "ends in .svg or .png"),
+        (["spectrum", "--resolution", "0.0001"], "resolution 0.0001 Hz: expected from"),
+        (["spectrum", "--bands", "10-900"], "expected 0 to 50 Hz"),
+        (["noise", "--skip", "1h"], "expected samples, found none"),
+        (["noise", "--sheet", "/nowhere"], "--sheet /nowhere"),
+        (["noise", "-o", "/nowhere/a.svg"], "/nowhere/a.svg"),
+    ],
+)
+def test_what_cannot_be_done_is_said(
+    resting_file: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    assert main([*words, str(resting_file)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_what_is_neither_file_nor_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["noise", "bow", "--socket", str(tmp_path / "none")]) == 2
+    assert "no daemon at" in capsys.readouterr().err
+    assert main(["noise", "bow", "--baud", "9600", "--socket", str(tmp_path / "none")]) == 2
+    assert "--baud: expected none with a device" in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_named(resting_file: Path) -> None:
+    program = (
+        f"import sys\nsys.modules['scipy'] = None\nfrom imud.cli import main\nmain(['noise', {str(resting_file)!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=True)
+    assert "imud noise: it needs scipy of the extra analysis: pip install 'imud[analysis]'" in done.stderr
+
+
+def test_the_daemon_does_not_load_the_extra() -> None:
+    program = "import sys, imud.daemon, imud.cli; imud.cli.build_parser(); print({'numpy', 'scipy'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=True)
+    assert done.stdout == "set()\n"
+
+
+def test_bands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bands_hz("5-50, 50-200.5") == ((5.0, 50.0), (50.0, 200.5))
+    with pytest.raises(SystemExit):
+        main(["spectrum", "--bands", "5,6", "file"])
+    assert "expected bands in Hz" in capsys.readouterr().err
+
+
+# --- a running daemon -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[RunningDaemon]:
+    """A daemon with one module that sends 100 messages a second, or nearly."""
+    port, ended = PtyPort(), Event()
+    accel, gyro = shaken(1000, 100.0, 12.0)
+
+    def send() -> None:
+        number = 0
+        while not ended.wait(0.01):
+            number += 1
+            port.send(frame(10 * number, accel[number % 1000], gyro[number % 1000]))
+
+    sender = Thread(target=send)
+    device = {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port.path, "baud": 115200}}
+    with running_daemon(tmp_path, {"bow": device}) as daemon:
+        sender.start()
+        try:
+            daemon.wait_for("bow", "running")
+            yield daemon
+        finally:
+            ended.set()
+            sender.join()
+            port.unplug()
+
+
+def test_a_live_device(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["spectrum", "--json", "--for", "1.5s", "--socket", str(daemon.socket), "bow"]) == 0
+    measurement = json.loads(capsys.readouterr().out)["measurement"]
+    assert measurement["device"] == "bow"
+    assert measurement["source"] == f"live from {daemon.socket}"
+    assert measurement["duration_s"] == pytest.approx(1.5, abs=0.1)
+    assert measurement["begun_utc_ns"] > 0
+    assert main(["noise", "--for", "1s", "--socket", str(daemon.socket), "stern"]) == 2
+    assert "stern: expected a file, or a device of the daemon (bow)" in capsys.readouterr().err

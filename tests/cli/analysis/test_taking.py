@@ -1,0 +1,96 @@
+"""Samples into arrays: which are taken, which are passed over, and what is said of them."""
+
+import numpy as np
+import pytest
+
+from imud.cli.analysis.taking import Collector, status_of
+from imud.contracts.publisher import Batch
+from imud.errors import BadArgument
+from imud.sample import Sample, Sync
+from imud.units import NS_PER_S
+
+
+def sample(number: int, device: str = "bow", **more: object) -> Sample:
+    t_ns = NS_PER_S + number * NS_PER_S // 10
+    values: dict[str, object] = {
+        "accel_m_s2": (0.0, 0.0, 9.8), "gyro_rad_s": (float(number), 0.0, 0.0), "t_dev_ns": number * NS_PER_S // 10,
+        **more,
+    }  # fmt: skip
+    return Sample(device, number + 1, t_ns, 1000, Sync.EDGE, t_ns, t_ns, **values)  # type: ignore[arg-type]
+
+
+def test_values_come_in_order_with_nan_for_what_is_absent() -> None:
+    collector = Collector()
+    collector.publish(Batch("bow", 0, [sample(0, temperature_c=20.0), sample(1, gyro_rad_s=None)]))
+    found = collector.readings()
+    assert found.t_ns.tolist() == [NS_PER_S, NS_PER_S + NS_PER_S // 10]
+    assert found.gyro_rad_s is not None
+    assert found.gyro_rad_s[0].tolist() == [0.0, 0.0, 0.0]
+    assert np.isnan(found.gyro_rad_s[1]).all()
+    assert found.temperature_c is not None
+    assert found.temperature_c[0] == 20.0
+    assert np.isnan(found.temperature_c[1])
+    assert collector.stamps() == "100 % edge; mean stated error 1 µs"
+
+
+def test_a_sensor_that_sends_nothing_is_none() -> None:
+    collector = Collector()
+    collector.add(sample(0, accel_m_s2=None))
+    found = collector.readings()
+    assert found.accel_m_s2 is None
+    assert found.temperature_c is None
+
+
+def test_a_part_of_the_time() -> None:
+    collector = Collector(skip_s=1.0, for_s=2.0)
+    for number in range(100):
+        collector.add(sample(number))
+    assert collector.done
+    assert collector.readings().gyro_rad_s is not None
+    taken = collector.readings().t_ns
+    assert taken[0] == 2 * NS_PER_S
+    assert taken[-1] == 4 * NS_PER_S
+
+
+def test_other_devices_are_passed_over_and_named_where_none_was_chosen() -> None:
+    for name, others in (("", {"stern"}), ("bow", set())):
+        collector = Collector(name)
+        collector.add(sample(0))
+        collector.add(sample(0, "stern"))
+        assert len(collector) == 1
+        assert collector.others == others
+
+
+def test_the_devices_own_time_where_reads_have_none() -> None:
+    collector = Collector()
+    collector.by_device_time = True
+    collector.add(sample(7))
+    assert collector.readings().t_ns.tolist() == [7 * NS_PER_S // 10]
+    assert "its crystal" in collector.stamps()
+    with pytest.raises(BadArgument, match="no time of the device"):
+        collector.add(sample(8, t_dev_ns=None))
+
+
+def test_a_live_view_drops_the_past() -> None:
+    collector = Collector()
+    for number in range(10):
+        collector.add(sample(number))
+    collector.drop_before(NS_PER_S + 6 * NS_PER_S // 10)
+    found = collector.readings()
+    assert len(found.t_ns) == len(collector) == 4
+    assert found.gyro_rad_s is not None
+    assert found.gyro_rad_s[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0]
+
+
+def test_more_samples_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.cli.analysis.taking.SAMPLES_MOST", 2)
+    collector = Collector()
+    collector.add(sample(0))
+    collector.add(sample(1))
+    with pytest.raises(BadArgument, match="at most 2 samples: choose a part"):
+        collector.add(sample(2))
+
+
+def test_a_device_that_is_not_there() -> None:
+    with pytest.raises(BadArgument, match="bow: expected a file, or a device of the daemon"):
+        status_of([], "bow")
