@@ -113,8 +113,8 @@ class ArrivalPace:
     """
 
     __slots__ = (
-        "_begin_ns", "_count", "_due_ns", "_error", "_has_phase", "_least_ns", "_most_ns", "_off_windows", "_steps",
-        "_turn", "_unjudged", "_until_ns", "period_ns",
+        "_begin_ns", "_count", "_due_ns", "_error", "_has_phase", "_least_ns", "_most_ns", "_off_ns", "_off_windows",
+        "_steps", "_turn", "_unjudged", "_until_ns", "period_ns",
     )  # fmt: skip
 
     def __init__(self, turn: int = 1) -> None:
@@ -125,6 +125,8 @@ class ArrivalPace:
         """Relative error of the period."""
         self._off_windows = 0
         """Windows in a row that were late or early: each lost samples or had a wrong phase, or the rate is another."""
+        self._off_ns = 0.0
+        """By how much the last of them was late; 0.0 where samples were missing in it, or it was early."""
         self.begin(0)
 
     @property
@@ -214,13 +216,18 @@ class ArrivalPace:
         has_phase, self._has_phase = self._has_phase, True
         if self.is_known and (2 * late_ns >= turn_ns or abs(off) > PACE_KNOWN):
             self._off_windows += 1
+            turns, before_ns = max(round(late_ns / turn_ns), 0), self._off_ns
+            self._off_ns = 0.0 if turns or late_ns < 0 else late_ns
+            if before_ns and self._off_ns and abs(late_ns - before_ns) <= PACE_KNOWN * self._unjudged * self.period_ns:
+                self._off_windows, self._off_ns = 0, 0.0
+                self._due_ns += late_ns  # the same again: it is not the rate that changed, but the phase
+                return 0, True
             if self._off_windows < OFF_WINDOWS:
-                turns = max(round(late_ns / turn_ns), 0)
                 self._due_ns += turns * turn_ns if turns else min(late_ns, 0)  # late ones waited
                 if turns:
                     return turns * self._turn, (turns + self._unjudged) * self._error < UNCERTAIN or self._turn > 1
                 return 0, not has_phase or late_ns * -2 < turn_ns
-        self._off_windows = 0
+        self._off_windows, self._off_ns = 0, 0.0
         if abs(off) > PACE_KNOWN and (self.is_known or abs(off) > PACE_NEAR or 2 * late_ns >= turn_ns):
             return self._learn(arrival_ns)
         self._due_ns += late_ns
