@@ -1,7 +1,7 @@
 """Contract: events of a device other than samples, delivered to subscribers and to the log."""
 
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, cast
 
 import msgspec
 
@@ -33,6 +33,11 @@ class EventKind(StrEnum):
     """The recorder stopped, for example because the disk is full, went on, or lost records."""
     BAD_FRAME = "bad-frame"
     """A damaged or unknown frame was heard. Sent at most once a second and device."""
+
+
+def kind_of(name: str) -> EventKind:
+    """Return the kind of this name; one that this imud does not know stays a plain string."""
+    return EventKind(name) if name in EventKind.__members__.values() else cast("EventKind", name)
 
 
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -46,6 +46,7 @@ COMMANDS = {
     "info": Subcommand("imud.cli.recording.info:INFO", "say what is in a recording, and whether it is whole"),
     "noise": Subcommand("imud.cli.analysis.commands:NOISE", "judge the noise of a sensor that lies still"),
     "spectrum": Subcommand("imud.cli.analysis.commands:SPECTRUM", "show vibration by frequency, live or of a file"),
+    "export": Subcommand("imud.cli.export.command:EXPORT", "write a recording or a capture as CSV or MCAP"),
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
     "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
     "top": Subcommand("imud.cli.top.command:TOP", "watch all devices in the terminal, redrawn in place"),

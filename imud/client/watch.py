@@ -2,13 +2,13 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, Final, Protocol, Self, cast
+from typing import Any, Final, Protocol, Self
 
 import msgspec
 
 from imud.contracts.settings import wrong_values
 from imud.errors import ServerError
-from imud.event import Event, EventKind
+from imud.event import Event, kind_of
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.sample import Sample
 
@@ -125,15 +125,8 @@ def sample_of(params: Mapping[str, Any]) -> Sample:
 def event_of(params: Mapping[str, Any]) -> Event:
     """Decode the event in a JSON notification. An unknown kind stays a plain string. Raises ServerError."""
     try:
-        kind = params["kind"]
-        known = kind in EventKind.__members__.values()
-        event = Event(
-            params["t_ns"],
-            params["device"],
-            EventKind(kind) if known else cast("EventKind", kind),
-            params["message"],
-            params.get("detail", {}),
-        )
+        kind = kind_of(params["kind"])
+        event = Event(params["t_ns"], params["device"], kind, params["message"], params.get("detail", {}))
     except KeyError as error:
         raise ServerError(f"an event without its member {error}") from error
     return event

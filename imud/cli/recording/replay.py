@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import BinaryIO
 
 import msgspec
@@ -19,10 +19,6 @@ from imud.runtime.recording.player import PlayedDevice, Player
 from imud.units import NS_PER_MS
 
 DIFFERENCES_SHOWN = 3
-
-
-class _Stopped(Exception):
-    """Nobody reads what is printed any more."""
 
 
 def begins_as_recording(path: str) -> bool:
@@ -46,28 +42,33 @@ def play_recording(args: argparse.Namespace) -> int:
 
 
 def _play(file: BinaryIO, args: argparse.Namespace) -> int:
-    def stop() -> None:
-        raise _Stopped
+    player = Player(print_samples if args.json else lambda _batch: None, fresh=args.fresh)
+    report, status = play(file, str(args.file), player)
+    sys.stdout.flush()
+    print(report, file=sys.stderr)
+    return status
 
-    printer = Printer(stop)
-    player = Player(printer.publish if args.json else lambda _batch: None, fresh=args.fresh)
-    reader = RecordingReader(file, str(args.file))
-    try:
-        player.play(reader)
-        if args.json:
-            printer.close()
-    except _Stopped:
-        pass
-    if printer.problem is not None:
-        raise printer.problem
+
+def print_samples(batch: Batch) -> None:
+    """Print one JSON line per sample. Raises OSError where it cannot be written."""
+    print("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples), end="")
+
+
+def play(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
+    """Play a recording to its end. Returns what came of it, for people, and the exit status of `imud replay`.
+
+    Raises ImudError, and what the player's publisher raises as OSError.
+    """
+    reader = RecordingReader(file, name)
+    player.play(reader)
     devices = list(player.devices.values())
-    print("\n\n".join(["\n".join(block(device)) for device in devices] + remarks(reader, player)), file=sys.stderr)
+    report = "\n\n".join(["\n".join(block(device)) for device in devices] + remarks(reader, player))
     same = all(not device.differences for device in devices) and not player.lost and not reader.is_damaged
-    return 0 if same and any(device.ledger.samples for device in devices) else 1
+    return report, 0 if same and any(device.ledger.samples for device in devices) else 1
 
 
-def block(device: PlayedDevice) -> list[str]:
-    """Format what came of a device, in 80 columns."""
+def block(device: PlayedDevice, without: Collection[str] = ()) -> list[str]:
+    """Format what came of a device, in 80 columns, without the rows of these names."""
     counts = device.ledger.snapshot()
     path = device.path
     newest = path.newest if path is not None else None
@@ -84,7 +85,8 @@ def block(device: PlayedDevice) -> list[str]:
     ]
     lines = paragraph(f"{device.described.name}: ", "replayed")
     for name, text in rows:
-        lines += paragraph(f"  {name:<10}", text)
+        if name not in without:
+            lines += paragraph(f"  {name:<10}", text)
     return lines
 
 

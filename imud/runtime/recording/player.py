@@ -22,6 +22,7 @@ from imud.contracts.settings import NoSettings
 from imud.contracts.timing import TriggerStamp, UtcReference
 from imud.devices import DRIVERS
 from imud.errors import ImudError, TransferError, reason_of
+from imud.event import Event, kind_of
 from imud.formats.recording import records
 from imud.formats.recording.records import (
     CallRecord,
@@ -65,6 +66,16 @@ class PlayedDevice:
     """Why the clock had to begin anew, which the live one did not."""
 
 
+class RecordedEvent(msgspec.Struct, frozen=True):
+    """An event as it was recorded, perhaps of a kind that this imud does not know."""
+
+    t_ns: int
+    device: str
+    kind: str
+    message: str
+    detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
+
+
 class PlayedClock(HostClock):
     """The host's clocks as they were recorded."""
 
@@ -82,23 +93,33 @@ class PlayedClock(HostClock):
 class Player:
     """Player of the records of one recording, in their order. Synchronization: one thread."""
 
-    def __init__(self, publish: Callable[[Batch], None], *, fresh: bool = False) -> None:
-        """With `fresh` clocks and codecs begin anew with the file; they do so with one of another version of imud."""
+    def __init__(
+        self,
+        publish: Callable[[Batch], None],
+        *,
+        fresh: bool = False,
+        on_event: Callable[[Event, int], None] = lambda _event, _utc_ns: None,
+    ) -> None:
+        """With `fresh` clocks and codecs begin anew with the file; they do so with one of another version of imud.
+
+        `on_event` gets events as they were noticed then, each with its CLOCK_REALTIME.
+        """
         self.devices: dict[int, PlayedDevice] = {}
         """By the daemon's number."""
         self.lost = 0
         """Records that the recorder dropped."""
         self._publish = publish
+        self._on_event = on_event
         self._host = PlayedClock()
         self._no_state = "it was asked for a fresh clock" if fresh else ""
         """Why states are not used."""
 
     def play(self, found: Iterable[Record]) -> None:
-        """Process records. Raises ImudError for one that cannot be what a recorder wrote."""
+        """Process records. Raises ImudError for one that cannot be what a recorder wrote, and OSErrors of `publish`."""
         for record in found:
             try:
                 self._play(record)
-            except ImudError:
+            except (ImudError, OSError):  # codecs and clocks do no I/O: the samples could not be written
                 raise
             except Exception as error:  # a codec with a forged state may fail anyhow
                 raise ImudError(f"a record of kind {record.kind} cannot be replayed: {error!r}") from error
@@ -115,6 +136,8 @@ class Player:
             self._begin(records.decode_object(record, SessionRecord))
         elif kind == Kind.LOST:
             self.lost += records.decode_lost(record.body).records
+        elif kind == Kind.EVENT:
+            self._event(records.decode_object(record, RecordedEvent))
         elif device is not None:
             self._play_device(device, record)
 
@@ -140,6 +163,10 @@ class Player:
     def _begin(self, session: SessionRecord) -> None:
         if session.imud != __version__:
             self._no_state = self._no_state or f"imud {session.imud} wrote the recording, this is {__version__}"
+
+    def _event(self, recorded: RecordedEvent) -> None:
+        event = Event(recorded.t_ns, recorded.device, kind_of(recorded.kind), recorded.message, recorded.detail)
+        self._on_event(event, event.t_ns + self._host.offset_ns)
 
     # --- the host ----------------------------------------------------------------------------------------------------
 

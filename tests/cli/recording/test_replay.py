@@ -1,7 +1,10 @@
 """`imud replay` of a recording: what the daemon published, line by line, from the file that it wrote meanwhile."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -73,6 +76,15 @@ def test_a_damaged_file_is_an_answer_of_no(
     (tmp_path / "damaged.imudrec").write_bytes(data)
     assert main(["replay", str(tmp_path / "damaged.imudrec")]) in (1, 2)
     assert "damaged" in capsys.readouterr().err
+
+
+def test_a_reader_that_goes_away_ends_it(recorded: Recorded) -> None:
+    argv = [sys.executable, "-m", "imud", "replay", "--json", str(recorded[0])]
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(argv, stdout=write, stderr=subprocess.PIPE, text=True, check=False, timeout=30)
+    os.close(write)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_file_that_only_begins_as_a_recording_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

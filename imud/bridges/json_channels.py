@@ -1,0 +1,278 @@
+"""Samples as JSON messages with JSON schemas: attitude and events in those of Foxglove, the others imud's own.
+
+    /NAME/imu/data       imud.Imu                  angular rate, specific force, attitude
+    /NAME/imu/mag        imud.MagneticField
+    /NAME/temperature    imud.Temperature          when it changes, and once a second
+    /NAME/pressure       imud.FluidPressure        when it changes, and once a second
+    /NAME/attitude       foxglove.FrameTransform   body in the navigation frame
+    /NAME/stamp          imud.SampleStamp          number, times and error of each sample, and what has no other place
+    /NAME/losses         imud.Losses               after each loss
+    /NAME/status         imud.DeviceStatus         of a live device, as `imud status --json` has it
+    /events              foxglove.Log
+
+Names of members are those of the ROS messages for the same thing, so that both dialects read the same in a viewer. What
+a sample does not have is left out; NaN is null. Covariances are there where they are known.
+"""
+
+from collections.abc import Callable, Sequence
+from math import isfinite
+from typing import Any, Final
+
+import msgspec
+
+from imud.bridges.channel import (
+    Deviations,
+    LossCounts,
+    MessageChannel,
+    MessageFrames,
+    MessageSchema,
+    StampedEvent,
+    Steady,
+    covariance,
+    topic,
+)
+from imud.contracts.status import DeviceStatus
+from imud.log import printable
+from imud.sample import SAMPLE_SCHEMA, Sample
+from imud.units import NS_PER_S
+
+LEVEL_INFO: Final = 2
+LEVEL_WARNING: Final = 3
+TEXT_MAX: Final = 4096
+"""Characters of a line in the log: of an event more than that has never been seen."""
+_encode: Final = msgspec.json.Encoder().encode
+
+Encoder = Callable[[Sample], bytes | None]
+Properties = dict[str, Any]
+
+# --- schemas ----------------------------------------------------------------------------------------------------------
+
+
+def _object(properties: Properties, *, always: Sequence[str] = ()) -> Properties:
+    made: Properties = {"type": "object", "properties": properties}
+    return made | ({"required": list(always)} if always else {})
+
+
+def _numbers(names: str, meaning: str = "") -> Properties:
+    made = _object({name: {"type": "number"} for name in names})
+    return made | ({"description": meaning} if meaning else {})
+
+
+def _matrix(meaning: str) -> Properties:
+    return {"type": "array", "items": {"type": "number"}, "minItems": 9, "maxItems": 9, "description": meaning}
+
+
+def _schema(name: str, properties: Properties) -> MessageSchema:
+    timestamp = _object({"sec": {"type": "integer"}, "nsec": {"type": "integer"}}, always=("sec", "nsec"))
+    whole = {"title": name, **_object({"timestamp": timestamp, **properties}, always=("timestamp",))}
+    return MessageSchema(name, "jsonschema", _encode(whole))
+
+
+_TEXT: Final = {"type": "string"}
+_NUMBER: Final = {"type": "number"}
+_INTEGER: Final = {"type": "integer"}
+_FIELD_TYPES: Final = {"string": _TEXT, "integer": _INTEGER, "number": _NUMBER}
+_STAMP: Final = (
+    "seq", "t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns", "t_dev_ns", "euler_rad", "incli_rad", "status",
+    "pps_age_ms", "edge_seq",
+)  # fmt: skip
+"""Fields of a sample that its stamp has."""
+
+
+def _field(name: str) -> Properties:
+    (row,) = (one for one in SAMPLE_SCHEMA if one.name == name)
+    kind = _FIELD_TYPES.get(row.type, {"type": "array", "items": _NUMBER})
+    return {**kind, "description": f"{row.meaning}{f', {row.unit}' if row.unit else ''}"}
+
+
+IMU_SCHEMA: Final = _schema(
+    "imud.Imu",
+    {
+        "frame_id": _TEXT,
+        "orientation": _numbers("xyzw", "rotation from the body to the navigation frame"),
+        "angular_velocity": _numbers("xyz", "rad/s"),
+        "linear_acceleration": _numbers("xyz", "specific force, m/s²"),
+        "orientation_covariance": _matrix("rad², about the axes of the body"),
+        "angular_velocity_covariance": _matrix("rad²/s²"),
+        "linear_acceleration_covariance": _matrix("m²/s⁴"),
+    },
+)
+MAGNETIC_SCHEMA: Final = _schema(
+    "imud.MagneticField",
+    {"frame_id": _TEXT, "magnetic_field": _numbers("xyz", "T"), "magnetic_field_covariance": _matrix("T²")},
+)
+STAMP_SCHEMA: Final = _schema("imud.SampleStamp", {name: _field(name) for name in _STAMP})
+LOSSES_SCHEMA: Final = _schema("imud.Losses", dict.fromkeys(LossCounts._fields[3:], _INTEGER))
+STATUS_SCHEMA: Final = _schema(
+    "imud.DeviceStatus",
+    {
+        "state": _TEXT, "problem": _TEXT, "rate_hz": _NUMBER, "expected_rate_hz": _NUMBER,
+        "clock": {"type": "object"}, "ledger": {"type": "object"}, "temperature_c": _NUMBER,
+    },
+)  # fmt: skip
+FRAME_TRANSFORM_SCHEMA: Final = _schema(
+    "foxglove.FrameTransform",
+    {
+        "parent_frame_id": _TEXT,
+        "child_frame_id": _TEXT,
+        "translation": _numbers("xyz"),
+        "rotation": _numbers("xyzw"),
+    },
+)
+LOG_SCHEMA: Final = _schema(
+    "foxglove.Log", {"level": _INTEGER, "message": _TEXT, "name": _TEXT, "file": _TEXT, "line": _INTEGER}
+)
+
+# --- messages ---------------------------------------------------------------------------------------------------------
+
+
+class JsonDialect:
+    """Messages in JSON."""
+
+    profile = ""
+
+    def samples(self, frames: MessageFrames) -> Sequence[MessageChannel[Sample]]:
+        """Channels of the samples of a device."""
+        name, noise = frames.device, frames.deviations
+        rows: tuple[tuple[str, MessageSchema, Encoder, Sequence[str]], ...] = (
+            ("imu/data", IMU_SCHEMA, _imu(frames), ("accel_m_s2", "gyro_rad_s", "quat_wxyz")),
+            ("imu/mag", MAGNETIC_SCHEMA, _mag(frames), ("mag_t",)),
+            ("temperature", *_scalar(frames, "temperature_c", "imud.Temperature", noise.temperature_c)),
+            ("pressure", *_scalar(frames, "pressure_pa", "imud.FluidPressure", noise.pressure_pa)),
+            ("attitude", FRAME_TRANSFORM_SCHEMA, _transform(frames), ("quat_wxyz",)),
+            ("stamp", STAMP_SCHEMA, _stamp, _STAMP),
+        )
+        return [
+            MessageChannel(topic(name, place), schema, "json", encode, frozenset(fields))
+            for place, schema, encode, fields in rows
+        ]
+
+    def losses(self, device: str) -> MessageChannel[LossCounts]:
+        """Channel of the losses of a device."""
+        return MessageChannel(topic(device, "losses"), LOSSES_SCHEMA, "json", _losses)
+
+    def events(self) -> MessageChannel[StampedEvent]:
+        """Channel of the events of all devices."""
+        return MessageChannel("/events", LOG_SCHEMA, "json", _log)
+
+    def status(self, device: str) -> MessageChannel[tuple[DeviceStatus, int]]:
+        """Channel of the status of a live device, each with the CLOCK_REALTIME at which it was asked for."""
+        return MessageChannel(topic(device, "status"), STATUS_SCHEMA, "json", _status)
+
+
+def timestamp(utc_ns: int) -> dict[str, int]:
+    """Return a stamp as the schemas of Foxglove have it."""
+    sec, nsec = divmod(utc_ns, NS_PER_S)
+    return {"sec": sec, "nsec": nsec}
+
+
+def _axes(values: Sequence[float]) -> dict[str, float]:
+    return dict(zip("xyz", values, strict=True))
+
+
+def _imu(frames: MessageFrames) -> Encoder:
+    body, known = frames.body, _known_covariances(frames.deviations)
+
+    def encode(sample: Sample) -> bytes | None:
+        gyro, accel, quat = sample.gyro_rad_s, sample.accel_m_s2, sample.quat_wxyz
+        if gyro is None and accel is None:
+            return None
+        message: dict[str, Any] = {"timestamp": timestamp(sample.utc_ns), "frame_id": body}
+        if quat is not None:
+            w, x, y, z = quat
+            message["orientation"] = {"x": x, "y": y, "z": z, "w": w}
+        if gyro is not None:
+            message["angular_velocity"] = _axes(gyro)
+        if accel is not None:
+            message["linear_acceleration"] = _axes(accel)
+        return _encode(message | known if known else message)
+
+    return encode
+
+
+def _known_covariances(noise: Deviations) -> dict[str, tuple[float, ...]]:
+    sigmas = {
+        "orientation_covariance": noise.attitude_rad,
+        "angular_velocity_covariance": noise.gyro_rad_s,
+        "linear_acceleration_covariance": noise.accel_m_s2,
+    }
+    return {name: covariance(sigma) for name, sigma in sigmas.items() if sigma is not None}
+
+
+def _mag(frames: MessageFrames) -> Encoder:
+    body, sigma = frames.body, frames.deviations.mag_t
+    known = {} if sigma is None else {"magnetic_field_covariance": covariance(sigma)}
+
+    def encode(sample: Sample) -> bytes | None:
+        mag = sample.mag_t
+        if mag is None:
+            return None
+        message = {"timestamp": timestamp(sample.utc_ns), "frame_id": body, "magnetic_field": _axes(mag)}
+        return _encode(message | known)
+
+    return encode
+
+
+def _scalar(
+    frames: MessageFrames, name: str, title: str, sigma: float | None
+) -> tuple[MessageSchema, Encoder, Sequence[str]]:
+    """A value without direction: its schema, what encodes it, its field."""
+    member = "temperature" if name == "temperature_c" else "fluid_pressure"
+    schema = _schema(title, {"frame_id": _TEXT, member: _field(name), "variance": _NUMBER})
+    known, steady = {} if sigma is None else {"variance": sigma * sigma}, Steady()
+
+    def encode(sample: Sample) -> bytes | None:
+        value: float | None = getattr(sample, name)
+        if value is None or not steady.passes(value, sample.utc_ns):
+            return None
+        return _encode({"timestamp": timestamp(sample.utc_ns), "frame_id": frames.body, member: value, **known})
+
+    return schema, encode, (name,)
+
+
+def _transform(frames: MessageFrames) -> Encoder:
+    navigation, body, nowhere = frames.navigation, frames.body, {"x": 0.0, "y": 0.0, "z": 0.0}
+
+    def encode(sample: Sample) -> bytes | None:
+        quat = sample.quat_wxyz
+        if quat is None or not isfinite(sum(quat)):
+            return None
+        w, x, y, z = quat
+        return _encode(
+            {
+                "timestamp": timestamp(sample.utc_ns), "parent_frame_id": navigation, "child_frame_id": body,
+                "translation": nowhere, "rotation": {"x": x, "y": y, "z": z, "w": w},
+            }
+        )  # fmt: skip
+
+    return encode
+
+
+def _stamp(sample: Sample) -> bytes:
+    message: dict[str, Any] = {"timestamp": timestamp(sample.utc_ns)}
+    for name in _STAMP:
+        value = getattr(sample, name)
+        if value is not None:
+            message[name] = value
+    return _encode(message)
+
+
+def _losses(losses: LossCounts) -> bytes:
+    return _encode({"timestamp": timestamp(losses.utc_ns), **dict(zip(losses._fields[3:], losses[3:], strict=True))})
+
+
+def _log(stamped: StampedEvent) -> bytes:
+    event = stamped.event
+    return _encode(
+        {
+            "timestamp": timestamp(stamped.utc_ns),
+            "level": LEVEL_WARNING if stamped.is_warning else LEVEL_INFO,
+            "message": printable(f"{event.kind}: {event.message}", TEXT_MAX),
+            "name": event.device or "imud", "file": "", "line": 0,
+        }
+    )  # fmt: skip
+
+
+def _status(told: tuple[DeviceStatus, int]) -> bytes:
+    status, utc_ns = told
+    return _encode({"timestamp": timestamp(utc_ns), **msgspec.to_builtins(status)})

@@ -1,0 +1,147 @@
+"""`imud export`: samples, losses and events of a recording or a capture as CSV or MCAP."""
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from imud import __version__
+from imud.bridges.json_channels import JsonDialect
+from imud.bridges.ros2_channels import Ros2Dialect
+from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
+from imud.cli.export.output import ExportFile
+from imud.cli.export.progress import Progress
+from imud.cli.export.sinks import TABLES, CsvSink, Sink
+from imud.cli.export.source import Exported, ExportFeed, export_capture, export_recording, times_of
+from imud.cli.recording.replay import begins_as_recording
+from imud.cli.streams import complain
+from imud.contracts.settings import unknown_name
+from imud.devices import DRIVERS
+from imud.errors import BadArgument, ImudError, reason_of
+from imud.files import open_regular
+from imud.frames.conventions import Convention
+from imud.log import STDERR, log_to
+from imud.runtime.recording.captures import KnownTimes
+from imud.sample import SAMPLE_FIELDS
+
+FORMATS: Final = ("csv", "mcap")
+SCHEMAS: Final = ("json", "ros2")
+DRIVER: Final = "hipnuc-uart"
+BAUD: Final = 115200
+MEGABYTE: Final = 1_000_000
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud export`."""
+    parser.add_argument(
+        "file", type=Path, metavar="FILE",
+        help="recording of imud; or a capture, raw or time-stamped; for CAN a log of candump -L",
+    )  # fmt: skip
+    parser.add_argument("--to", choices=FORMATS, required=True, help="format")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="OUT", help="file to write, whole or not at all (default: standard output)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
+    parser.add_argument(
+        "--device", action="append", default=[], metavar="NAME", help="only this one; may be given several times"
+    )
+    parser.add_argument(
+        "--fields", metavar="NAME,…",
+        help="columns of CSV; channels of MCAP that say something of one of them (default: all; `imud schema` lists)",
+    )  # fmt: skip
+    parser.add_argument("--table", choices=TABLES, help="rows of CSV (default: samples)")
+    parser.add_argument("--schema", choices=SCHEMAS, help="messages of MCAP (default: json)")
+    parser.add_argument(
+        "--convention", choices=[str(one) for one in Convention],
+        help="axes and angles (default: of CSV as they were published, of MCAP enu-flu as of REP-103)",
+    )  # fmt: skip
+    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"of a capture (default: {DRIVER})")
+    parser.add_argument("--baud", type=int, help=f"rate of a raw capture (default: {BAUD})")
+    add_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export; what came of it goes to standard error. 1 where `imud replay` of the same file says 1."""
+    check(args)
+    args.fields = None if args.fields is None else chosen_fields(args.fields)
+    is_recording = _is_recording(args)
+    with log_to(STDERR, "warning"), open_regular(args.file) as file:
+        progress = Progress(args.file.stat().st_size)
+        out = ExportFile(args.output, source=args.file, force=args.force, binary=args.to == "mcap")
+        with closing(progress), out, closing(_sink(args, file, out, is_recording=is_recording)) as sink:
+            convention = _convention(args)
+            feed = ExportFeed(sink, file, progress, args.device, convention)
+            done = _play(args, file, feed, is_recording=is_recording)
+            sink.finish()
+    size = f"{out.written_bytes / MEGABYTE:.1f} MB"
+    complain(f"{done.report}\n\n{feed.samples} samples to {out.name}, {size} in {progress.spent_s:.1f} s")
+    return done.status if feed.samples else 1
+
+
+def check(args: argparse.Namespace) -> None:
+    """Raises BadArgument for options that mean nothing together."""
+    for option, to in (("table", "csv"), ("schema", "mcap")):
+        if getattr(args, option) is not None and args.to != to:
+            raise BadArgument(f"--{option}: expected with --to {to} only, got --to {args.to}")
+    if args.fields is not None and args.table not in (None, "samples"):
+        raise BadArgument(f"--fields: expected with samples only, got --table {args.table}")
+
+
+def chosen_fields(text: str) -> tuple[str, ...]:
+    """Return the names in a list separated by commas, in its order. Raises BadArgument for one that is not known."""
+    names = tuple(name.strip() for name in text.split(","))
+    for number, name in enumerate(names):
+        if name not in SAMPLE_FIELDS:
+            raise BadArgument(f"--fields: {unknown_name('a field', name, SAMPLE_FIELDS)} (`imud schema` explains them)")
+        if name in names[:number]:
+            raise BadArgument(f"--fields: expected each field once, got {name} twice")
+    return names
+
+
+def _is_recording(args: argparse.Namespace) -> bool:
+    """Raises ImudError for a file that is not there, BadArgument for options of captures with a recording."""
+    try:
+        found = begins_as_recording(str(args.file))
+    except OSError as error:
+        raise ImudError(f"{args.file}: expected a recording or a capture: {reason_of(error)}") from error
+    for option, default in (("option", []), ("driver", None), ("baud", None)):
+        if found and getattr(args, option) != default:
+            raise BadArgument(f"--{option}: expected none with a recording, which has that of the live run")
+    if not found and args.device:
+        raise BadArgument("--device: expected with a recording only; a capture is of one device")
+    return found
+
+
+def _convention(args: argparse.Namespace) -> Convention | None:
+    if args.convention is not None:
+        return Convention(args.convention)
+    return Convention.ENU_FLU if args.to == "mcap" else None
+
+
+def _sink(args: argparse.Namespace, file: BinaryIO, out: ExportFile, *, is_recording: bool) -> Sink:
+    if args.to == "csv":
+        times = None if is_recording else times_of(file, DRIVERS[args.driver or DRIVER])
+        return CsvSink(out, args.table or "samples", args.fields, without_times=times is KnownTimes.NONE)
+    try:
+        from imud.bridges.mcap_file import McapFile
+        from imud.cli.export.mcap_sink import McapSink
+    except ModuleNotFoundError as error:
+        raise BadArgument(f"--to mcap: it needs {error.name}: pip install 'imud[export]'") from None
+    dialect = Ros2Dialect() if args.schema == "ros2" else JsonDialect()
+    convention = _convention(args)
+    assert convention is not None
+    words = {"imud": __version__, "source": args.file.name, "convention": str(convention)}
+    if not is_recording:
+        words["times"] = (times_of(file, DRIVERS[args.driver or DRIVER]) or KnownTimes.HOST).value
+    return McapSink(McapFile(out, dialect.profile, f"imud {__version__}", words), dialect, convention, args.fields)
+
+
+def _play(args: argparse.Namespace, file: BinaryIO, feed: ExportFeed, *, is_recording: bool) -> Exported:
+    if is_recording:
+        return export_recording(file, args.file, feed, args.device)
+    driver = DRIVERS[args.driver or DRIVER]
+    options = driver_settings(driver, given_options(driver, args.option))
+    return export_capture(file, args.file, feed, driver, options, args.baud or BAUD)
+
+
+EXPORT = CliCommand(add_arguments, run)

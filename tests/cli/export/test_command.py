@@ -1,0 +1,341 @@
+"""`imud export`: what comes out is what the daemon published, read back by csv, mcap and rosbags."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from imud.cli import main
+from imud.cli.export import command
+from imud.contracts.publisher import Batch
+from imud.event import Event, EventKind
+from imud.formats.recording.file import BlockGatherer, RecordingReader
+from imud.formats.recording.records import Kind, encode, encode_object
+from imud.frames.conventions import FLU_LEVEL, RFU_ENU, Convention
+from imud.frames.published import as_sent
+from imud.sample import Sample
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.cli.recording.recorded_daemon import FRAMES, run_recorded, stamped_capture
+from tests.support.files import hi91, imu61x_log
+
+EVENTS = (
+    Event(1000 * NS_PER_S, "bow", EventKind.UP, "is there", {"rate_hz": 100.0}),
+    Event(1001 * NS_PER_S, "mast", cast("EventKind", "new-kind"), "of a newer imud"),
+    Event(1002 * NS_PER_S, "", EventKind.RECORDER, "the disk is full"),
+)
+
+
+class Recorded(NamedTuple):
+    """A recording, and what its daemon published."""
+
+    file: Path
+    samples: list[Sample]
+
+    def of(self, device: str) -> list[Sample]:
+        """Samples of a device in the axes of REP-103."""
+        mine = [sample for sample in self.samples if sample.device == device]
+        frame = as_sent(RFU_ENU if device == "bow" else FLU_LEVEL)
+        return list(Batch(device, 0, mine, frame).converted(Convention.ENU_FLU).samples)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    _, collector, (file,) = run_recorded(tmp_path_factory.mktemp("recorded"))
+    return Recorded(with_events(file), collector.samples)
+
+
+def with_events(file: Path) -> Path:
+    """Put an event of each device, and one of a newer imud, before the end of a recording."""
+    gatherer, data = BlockGatherer(), b""
+    with file.open("rb") as stream:
+        for record in RecordingReader(stream, file.name):
+            if record.kind == Kind.END:
+                for event in EVENTS:
+                    data += gatherer.add(encode_object(Kind.EVENT, 0, event))
+            data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
+    file.write_bytes(data + gatherer.finish())
+    return file
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(StringIO(text, newline="")))
+
+
+# --- CSV --------------------------------------------------------------------------------------------------------------
+
+
+def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "--to", "csv", str(recorded.file)]) == 0
+    printed = capsys.readouterr()
+    found = rows(printed.out)
+    assert len(found) == len(recorded.samples) > FRAMES
+    for row, sample in zip(found, recorded.samples, strict=True):
+        assert (row["device"], int(row["seq"]), int(row["t_ns"])) == (sample.device, sample.seq, sample.t_ns)
+        assert (int(row["t_err_ns"]), row["sync"], int(row["utc_ns"])) == (sample.t_err_ns, sample.sync, sample.utc_ns)
+        assert sample.accel_m_s2 is not None
+        assert tuple(float(row[f"accel_{axis}_m_s2"]) for axis in "xyz") == sample.accel_m_s2
+    assert {row["mag_x_t"] for row in found if row["device"] == "mast"} == {""}
+    assert "the same as the live run" in printed.err
+    assert f"{len(found)} samples to standard output" in printed.err
+
+
+def test_csv_is_that_of_rfc_4180(recorded: Recorded, tmp_path: Path) -> None:
+    assert main(["export", "--to", "csv", "-o", str(tmp_path / "a.csv"), str(recorded.file)]) == 0
+    data = (tmp_path / "a.csv").read_bytes()
+    lines = data.split(b"\r\n")
+    assert lines[-1] == b""
+    assert b"\n" not in b"".join(lines)
+    assert len({line.count(b",") for line in lines[:-1]}) == 1
+
+
+def test_one_device_and_some_fields(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["export", "--to", "csv", "--device", "mast", "--fields", "gyro_rad_s,t_ns", str(recorded.file)]
+    assert main(words) == 0
+    found = rows(capsys.readouterr().out)
+    assert list(found[0]) == ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "t_ns"]
+    assert len(found) == sum(sample.device == "mast" for sample in recorded.samples)
+
+
+def test_events_and_losses_are_tables_of_their_own(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "--to", "csv", "--table", "events", str(recorded.file)]) == 0
+    events = rows(capsys.readouterr().out)
+    assert [(one["device"], one["kind"], one["t_ns"]) for one in events[-3:]] == [
+        (event.device, event.kind, str(event.t_ns)) for event in EVENTS
+    ]
+    newest = recorded.samples[-1]
+    for one in events[-3:]:
+        offset_ns = int(one["utc_ns"]) - int(one["t_ns"])
+        assert abs(offset_ns - (newest.utc_ns - newest.t_ns)) < NS_PER_MS
+    assert main(["export", "--to", "csv", "--table", "losses", str(recorded.file)]) == 0
+    losses = rows(capsys.readouterr().out)
+    assert {(one["device"], one["lost_crc"]) for one in losses} == {("bow", "0"), ("mast", "0")}
+
+
+# --- MCAP -------------------------------------------------------------------------------------------------------------
+
+
+def messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
+    with file.open("rb") as stream:
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False):
+            assert schema is not None
+            yield channel.topic, schema.name, message.log_time, message.data
+
+
+def test_mcap_with_json(recorded: Recorded, tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    assert main(["export", "--to", "mcap", "-o", str(out), str(recorded.file)]) == 0
+    found: dict[str, list[Any]] = {}
+    for topic, _, t_ns, data in messages(out):
+        found.setdefault(topic, []).append((t_ns, json.loads(data)))
+    assert set(found) == {
+        "/bow/imu/data", "/bow/imu/mag", "/bow/temperature", "/bow/pressure", "/bow/attitude", "/bow/stamp",
+        "/bow/losses", "/mast/imu/data", "/mast/temperature", "/mast/attitude", "/mast/stamp", "/mast/losses",
+        "/events",
+    }  # fmt: skip
+    for device in ("bow", "mast"):
+        samples = recorded.of(device)
+        for (t_ns, imu), (_, stamp), sample in zip(
+            found[f"/{device}/imu/data"], found[f"/{device}/stamp"], samples, strict=True
+        ):
+            assert t_ns == sample.utc_ns == imu["timestamp"]["sec"] * 10**9 + imu["timestamp"]["nsec"]
+            assert tuple(imu["linear_acceleration"].values()) == sample.accel_m_s2
+            assert tuple(imu["angular_velocity"].values()) == sample.gyro_rad_s
+            assert (stamp["seq"], stamp["t_err_ns"], stamp["sync"]) == (sample.seq, sample.t_err_ns, sample.sync)
+    frames = {one["child_frame_id"]: one["parent_frame_id"] for topic in ("bow", "mast")
+              for _, one in found[f"/{topic}/attitude"]}  # fmt: skip
+    assert frames == {"bow": "enu", "mast": "mast_level"}
+    assert [one["message"] for _, one in found["/events"]][-3:] == [
+        "up: is there", "new-kind: of a newer imud", "recorder: the disk is full"
+    ]  # fmt: skip
+
+
+def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    assert main(["export", "--to", "mcap", "--schema", "ros2", "-o", str(out), str(recorded.file)]) == 0
+    found: dict[str, list[Any]] = {}
+    with AnyReader([out]) as reader:
+        types = {connection.topic: connection.msgtype for connection in reader.connections}
+        for connection, t_ns, data in reader.messages():
+            found.setdefault(connection.topic, []).append((t_ns, reader.deserialize(data, connection.msgtype)))
+    assert types["/bow/imu/data"] == "sensor_msgs/msg/Imu"
+    assert types["/bow/imu/mag"] == "sensor_msgs/msg/MagneticField"
+    assert types["/bow/pressure"] == "sensor_msgs/msg/FluidPressure"
+    assert types["/tf"] == "tf2_msgs/msg/TFMessage"
+    assert types["/events"] == "rcl_interfaces/msg/Log"
+    for device in ("bow", "mast"):
+        for (t_ns, imu), (_, stamp), sample in zip(
+            found[f"/{device}/imu/data"], found[f"/{device}/stamp"], recorded.of(device), strict=True
+        ):
+            header, force, turn = imu.header, imu.linear_acceleration, imu.orientation
+            assert t_ns == sample.utc_ns == header.stamp.sec * 10**9 + header.stamp.nanosec
+            assert header.frame_id == device
+            assert (force.x, force.y, force.z) == sample.accel_m_s2
+            assert (turn.w, turn.x, turn.y, turn.z) == sample.quat_wxyz
+            assert (stamp.seq, stamp.t_ns, stamp.t_err_ns) == (sample.seq, sample.t_ns, sample.t_err_ns)
+    assert len(found["/tf"]) == len(recorded.samples)
+    assert found["/bow/losses"][0][1].lost_crc == 0
+
+
+def test_fields_choose_channels(recorded: Recorded, tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    words = ["--to", "mcap", "--fields", "mag_t,temperature_c", "--device", "bow", "-o", str(out)]
+    assert main(["export", *words, str(recorded.file)]) == 0
+    topics = {topic for topic, *_ in messages(out)}
+    assert topics == {"/bow/imu/mag", "/bow/temperature", "/bow/losses", "/events"}
+
+
+def test_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    words = ["--to", "mcap", "--convention", "ned-frd", "--device", "bow", "-o", str(out)]
+    assert main(["export", *words, str(recorded.file)]) == 0
+    found = [json.loads(data) for topic, _, _, data in messages(out) if topic in ("/bow/imu/data", "/bow/attitude")]
+    assert {one.get("frame_id", one.get("child_frame_id")) for one in found} == {"bow_frd"}
+    assert {one["linear_acceleration"]["z"] for one in found if "linear_acceleration" in one} == {-9.8}
+
+
+# --- captures ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_raw_capture_has_the_times_of_the_device_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(300)))
+    assert main(["export", "--to", "csv", str(tmp_path / "c.raw")]) == 0
+    printed = capsys.readouterr()
+    found = rows(printed.out)
+    assert len(found) == 300
+    for name in ("t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns"):
+        assert {row[name] for row in found} == {""}
+    assert [int(row["t_dev_ns"]) for row in found] == [10_000_000 * i for i in range(300)]
+    words = " ".join(printed.err.split())
+    assert "the capture has bytes and no time of any read" in words
+    assert "Hz" not in words
+    assert "live run" not in words
+
+
+def test_a_raw_capture_in_mcap(tmp_path: Path) -> None:
+    (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(30)))
+    out = tmp_path / "c.mcap"
+    assert main(["export", "--to", "mcap", "-o", str(out), str(tmp_path / "c.raw")]) == 0
+    stamps = [(t_ns, json.loads(data)) for topic, _, t_ns, data in messages(out) if topic == "/replay/stamp"]
+    assert [t_ns for t_ns, _ in stamps] == [10_000_000 * i for i in range(30)]
+    assert {one["t_err_ns"] for _, one in stamps} == {0xFFFF_FFFF}
+    with out.open("rb") as stream:
+        (metadata,) = [one.metadata for one in make_reader(stream).iter_metadata()]
+    assert "no time of any read" in metadata["times"]
+
+
+def test_a_stamped_capture_has_its_own_times(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = stamped_capture(tmp_path / "c.capture")
+    assert main(["export", "--to", "csv", str(file)]) == 0
+    printed = capsys.readouterr()
+    found = rows(printed.out)
+    assert len(found) == FRAMES
+    assert abs(int(found[-1]["t_ns"]) - (1000 * 10**9 + 299 * 10**7)) < 10**7
+    assert int(found[0]["utc_ns"]) < 10**7
+    assert "does not say what time of day that was" in " ".join(printed.err.split())
+
+
+def test_a_log_of_candump_has_the_wall_clock(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "can.log").write_text(imu61x_log(range(200)))
+    assert main(["export", "--to", "csv", "--driver", "imu61x-can", str(tmp_path / "can.log")]) == 0
+    printed = capsys.readouterr()
+    found = rows(printed.out)
+    assert len(found) == 200
+    assert abs(int(found[100]["utc_ns"]) - (1_763_717_507 * 10**9 + 100 * 10**7)) < 10**6
+    assert "the log has the wall clock only" in " ".join(printed.err.split())
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_recording_is_exported_as_far_as_it_goes_and_is_an_answer_of_no(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = recorded.file.read_bytes()
+    (tmp_path / "damaged").write_bytes(data[:-40] + bytes(20) + data)
+    out = tmp_path / "a.csv"
+    status = main(["export", "--to", "csv", "-o", str(out), str(tmp_path / "damaged")])
+    replayed = main(["replay", str(tmp_path / "damaged")])
+    assert status == replayed == 1
+    assert len(rows(out.read_text())) >= len(recorded.samples)
+    assert "damaged" in capsys.readouterr().err
+
+
+def test_what_is_no_recording_is_a_capture_without_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "noise").write_bytes(b"\x00" * 500)
+    assert main(["export", "--to", "csv", str(tmp_path / "noise")]) == 1
+    assert main(["export", "--to", "csv", str(tmp_path / "none")]) == 2
+    assert "expected a recording or a capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--to", "csv", "--schema", "ros2"], "--schema: expected with --to mcap only"),
+        (["--to", "mcap", "--table", "events"], "--table: expected with --to csv only"),
+        (["--to", "csv", "--fields", "acel_m_s2"], "acel_m_s2"),
+        (["--to", "csv", "--table", "events", "--fields", "t_ns"], "--fields: expected with samples only"),
+        (["--to", "csv", "--driver", "hipnuc-uart"], "--driver: expected none with a recording"),
+        (["--to", "csv", "--device", "stern"], "expected a device of the recording, which has bow, mast"),
+    ],
+)
+def test_options_that_mean_nothing(
+    words: list[str], expected: str, recorded: Recorded, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", *words, str(recorded.file)]) == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_polled_driver_has_no_captures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.raw").write_bytes(hi91(0))
+    assert main(["export", "--to", "csv", "--driver", "hipnuc-modbus", str(tmp_path / "c.raw")]) == 2
+    assert "expected a driver of bytes or of CAN frames" in capsys.readouterr().err
+
+
+def test_without_the_library_it_says_how_to_get_it(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.records", None)
+    monkeypatch.delitem(sys.modules, "imud.bridges.mcap_file", raising=False)
+    assert main(["export", "--to", "mcap", "-o", str(tmp_path / "a"), str(recorded.file)]) == 2
+    assert "pip install 'imud[export]'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_csv_needs_no_extra(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mcap"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["export", "--to", "csv", str(recorded.file)]) == 0
+
+
+def test_a_reader_that_goes_away_ends_it(recorded: Recorded) -> None:
+    for to in ("csv", "mcap"):
+        argv = [sys.executable, "-m", "imud", "export", "--to", to, str(recorded.file)]
+        read, write = os.pipe()
+        os.close(read)
+        done = subprocess.run(argv, stdout=write, stderr=subprocess.PIPE, text=True, check=False, timeout=30)
+        os.close(write)
+        assert done.returncode == 0, done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
+    for to in ("csv", "mcap"):
+        assert main(["export", "--to", to, "-o", "/dev/full", str(recorded.file)]) == 2
+        assert "/dev/full: No space left on device" in capsys.readouterr().err
+
+
+def test_defaults_are_those_of_replay() -> None:
+    from imud.cli import replay
+
+    assert (command.DRIVER, command.BAUD) == (replay.DRIVER, replay.BAUD)
