@@ -7,7 +7,7 @@
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
-# make pictures   the pictures of README.md, docs/frames.md and docs/analysis.md, into docs/pictures
+# make pictures   the pictures of README.md and docs/, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
 # make audit  items of both manuals: code and tests of each
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
@@ -81,6 +81,7 @@ soak: $(VENV)/made
 pictures: $(VENV)/made
 	$(BIN)/python -m tests.support.pictures
 	$(BIN)/python -m tests.analysis.pictures
+	$(BIN)/python -m tests.bench.clock_pictures
 
 # Coverage-guided fuzzing: ARGS="--seconds 60 --seed 25" in CI, ARGS="--seconds 3600 --target stream/" by hand.
 $(VENV)/made-fuzz: $(VENV)/made

@@ -1,7 +1,8 @@
 """How right and how fast the clock is: `python -m tests.bench.clock` prints the table, truth known from simulation.
 
 A row is one profile of arrival, rate and crystal; figures are of all its seeds, after the fit has settled for 70 s.
-The second table, of lines and UTC, is `clock_lines`. `--quick` takes one seed and fewer rows.
+The second table, of lines and UTC, is `clock_lines`. `--quick` takes one seed and fewer rows; `--keep` keeps them for
+docs/clock.md.
 """
 
 import sys
@@ -15,6 +16,7 @@ from imud.clock import SampleClock
 from imud.sample import Measurement, Sync
 from imud.sim.ports.arrival import BARE_UART, LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
 from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.clock_figures import ARRIVAL_HEAD, ArrivalFigures, Spread, keep
 from tests.bench.rows import Row, at_least, at_most
 
 TICK_NS = NS_PER_MS
@@ -153,26 +155,32 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 FIGURES = ("sigma_ns", "rms_ns", "p999_ns", "mean_t_err_ns")
 
 
-def spread(values: Sequence[float]) -> str:
-    """Least and greatest of some figures in whole µs."""
-    low, high = (f"{ns / 1000:.0f}" for ns in (min(values), max(values)))
-    return low if low == high else f"{low}–{high}"
+def _spread_us(values: Sequence[float]) -> Spread:
+    """Least and greatest of some figures, whole µs."""
+    return float(round(min(values) / 1000)), float(round(max(values) / 1000))
 
 
-def print_table(seeds: Sequence[int], rates: Sequence[int]) -> None:
-    """The table of docs/clock.md, as Markdown: each cell from the best to the worst of all crystals."""
-    print("| arrival | rate, Hz | σ, µs | rms, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling |")
-    print("|---|---|---|---|---|---|---|---|")
+def table(seeds: Sequence[int], rates: Sequence[int]) -> Iterator[ArrivalFigures]:
+    """The rows of the table of docs/clock.md: each from the best to the worst of all crystals."""
     for profile in PROFILES:
         for rate_hz in rates:
             all_of = [over_seeds(profile, rate_hz, crystal, seeds) for crystal in CRYSTALS.values()]
-            micro = " | ".join(spread([getattr(a, figure) for a in all_of]) for figure in FIGURES)
+            sigma, rms, p999, t_err = (_spread_us([getattr(a, figure) for a in all_of]) for figure in FIGURES)
             share, settling = min(a.share for a in all_of), min(a.share_settling for a in all_of)
-            print(f"| {profile.name} | {rate_hz} | {micro} | {share:.3f} | {settling:.3f} |", flush=True)
+            yield ArrivalFigures(profile.name, rate_hz, sigma, rms, p999, t_err, round(share, 3), round(settling, 3))
+
+
+def main() -> None:
+    """Print the table as Markdown; `--keep`: for docs/clock.md."""
+    quick = "--quick" in sys.argv
+    print(ARRIVAL_HEAD)
+    found = []
+    for one in table((1,), (1, 100, 1000)) if quick else table((1, 2, 3), tuple(SECONDS)):
+        found.append(one)
+        print(one.row(), flush=True)
+    if "--keep" in sys.argv and not quick:
+        keep(arrivals=found)
 
 
 if __name__ == "__main__":
-    if "--quick" in sys.argv:
-        print_table((1,), (1, 100, 1000))
-    else:
-        print_table((1, 2, 3), tuple(SECONDS))
+    main()

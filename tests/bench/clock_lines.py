@@ -1,5 +1,6 @@
 """How right the clock is with lines and UTC (as a program: the second table of docs/clock.md); its speed with SOUT."""
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from math import sqrt
 from time import perf_counter_ns
@@ -18,6 +19,7 @@ from imud.sim.ports.arrival import (
 )
 from imud.units import NS_PER_S
 from tests.bench.clock import BAUD_OF_RATE, CRYSTALS, TICK_NS, clock_for
+from tests.bench.clock_figures import LINE_HEAD, LineFigures, keep
 from tests.bench.line_model import LineFaults, restarted, simulate_reads
 from tests.bench.line_runs import (
     DatedSample,
@@ -105,12 +107,8 @@ def sigma_ns(offs: Sequence[int]) -> float:
     return sqrt(sum((off - mean) ** 2 for off in offs) / len(offs))
 
 
-def print_table() -> None:
-    """The table of docs/clock.md for lines and UTC, as Markdown."""
-    print(
-        "| source | over | rate, Hz | σ, µs | mean, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling | by it |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+def table() -> Iterator[LineFigures]:
+    """The rows of the table of docs/clock.md for lines and UTC."""
     for source, over, rate_hz, run in (*sout_cases(100), *sout_cases(1000), *other_cases()):
         dated = run()
         settled = after(dated, SETTLED_S)
@@ -120,10 +118,22 @@ def print_table() -> None:
             sigma_ns(offs), sum(offs) / len(offs), sorted(map(abs, offs))[int(len(offs) * 0.999)],
             sum(t.sample.t_err_ns for t in settled) / len(settled),
         )  # fmt: skip
-        micro = " | ".join(f"{ns / 1000:.0f}" if abs(ns) >= 10_000 else f"{ns / 1000:.1f}" for ns in figures)
         mine = sum(t.sample.sync.value not in ("arrival", "regression") for t in settled) / len(settled)
-        shares = f"{share_honest(settled):.3f} | {share_honest(settling):.3f} | {mine:.3f}"
-        print(f"| {source} | {over} | {rate_hz} | {micro} | {shares} |", flush=True)
+        shares = (share_honest(settled), share_honest(settling), mine)
+        yield LineFigures(
+            source, over, rate_hz, *(round(ns / 1000, 1) for ns in figures), *(round(share, 3) for share in shares)
+        )
+
+
+def main() -> None:
+    """Print the table as Markdown; `--keep`: for docs/clock.md."""
+    print(LINE_HEAD)
+    found = []
+    for one in table():
+        found.append(one)
+        print(one.row(), flush=True)
+    if "--keep" in sys.argv:
+        keep(lines=found)
 
 
 def speed_ns(*, edges: bool, count: int = 20_000) -> float:
@@ -169,4 +179,4 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 if __name__ == "__main__":
-    print_table()
+    main()

@@ -47,6 +47,7 @@ from imud.publishers.socket.rpc import METHODS
 from imud.runtime.settings.difference import described_settings
 from imud.signals.line_actions import RESET, TRIGGER
 from imud.utc.source import RmcSettings
+from tests.bench import clock_figures
 from tests.monitoring.alert_table import alert_table
 from tests.support.files import ROOT
 
@@ -426,6 +427,7 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
     "docs/monitoring.md": lambda: {"alerts": alert_table()},
+    "docs/clock.md": clock_figures.tables,
 }
 """The generated parts of each page by the name that their marks have."""
 

@@ -1,0 +1,114 @@
+"""Figures of docs/clock.md as they were measured, kept in `clock_figures.json`: its two long tables and both plots.
+
+`python -m tests.bench.clock --keep` and `python -m tests.bench.clock_lines --keep` measure and keep them;
+`python -m tests.support.references` makes the tables of them, `python -m tests.bench.clock_pictures` the plots.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+FILE: Final = Path(__file__).with_suffix(".json")
+ARRIVAL_HEAD: Final = (
+    "| arrival | rate, Hz | σ, µs | rms, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling |\n|" + "---|" * 8
+)
+LINE_HEAD: Final = (
+    "| source | over | rate, Hz | σ, µs | mean, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling | by it |\n|"
+    + "---|" * 10
+)
+WHOLE_FROM_US: Final = 10.0
+"""Above this, µs without decimals."""
+
+Spread = tuple[float, float]
+"""The best and the worst of all crystals."""
+
+
+class ArrivalFigures(msgspec.Struct, frozen=True):
+    """A profile of arrivals at one rate, over all crystals; µs."""
+
+    arrival: str
+    rate_hz: int
+    sigma_us: Spread
+    rms_us: Spread
+    p999_us: Spread
+    mean_t_err_us: Spread
+    share: float
+    """Within twice the stated error, settled; of the worst crystal."""
+    settling: float
+
+    def row(self) -> str:
+        """The row of the table."""
+        micro = " | ".join(map(spread, (self.sigma_us, self.rms_us, self.p999_us, self.mean_t_err_us)))
+        return f"| {self.arrival} | {self.rate_hz} | {micro} | {self.share:.3f} | {self.settling:.3f} |"
+
+
+class LineFigures(msgspec.Struct, frozen=True):
+    """A source of time at a line, over one link; µs."""
+
+    source: str
+    over: str
+    rate_hz: int
+    sigma_us: float
+    mean_us: float
+    p999_us: float
+    mean_t_err_us: float
+    share: float
+    settling: float
+    by_it: float
+    """Share of samples with this source or a better one."""
+
+    def row(self) -> str:
+        """The row of the table."""
+        micro = " | ".join(map(microseconds, (self.sigma_us, self.mean_us, self.p999_us, self.mean_t_err_us)))
+        shares = f"{self.share:.3f} | {self.settling:.3f} | {self.by_it:.3f}"
+        return f"| {self.source} | {self.over} | {self.rate_hz} | {micro} | {shares} |"
+
+
+class ClockFigures(msgspec.Struct, frozen=True):
+    """The file."""
+
+    arrivals: tuple[ArrivalFigures, ...] = ()
+    lines: tuple[LineFigures, ...] = ()
+
+
+def kept() -> ClockFigures:
+    """The figures in the tree."""
+    return msgspec.json.decode(FILE.read_bytes(), type=ClockFigures)
+
+
+def keep(*, arrivals: Sequence[ArrivalFigures] | None = None, lines: Sequence[LineFigures] | None = None) -> None:
+    """Replace one of the two tables of the file."""
+    old = kept() if FILE.exists() else ClockFigures()
+    new = ClockFigures(
+        old.arrivals if arrivals is None else tuple(arrivals), old.lines if lines is None else tuple(lines)
+    )
+    FILE.write_bytes(msgspec.json.format(msgspec.json.encode(new), indent=1) + b"\n")
+
+
+def spread(values: Spread) -> str:
+    """Least and greatest of some figures in whole µs."""
+    low, high = (f"{one:.0f}" for one in values)
+    return low if low == high else f"{low}–{high}"
+
+
+def microseconds(value: float) -> str:
+    """Format µs as the table of lines has them."""
+    return f"{value:.0f}" if abs(value) > WHOLE_FROM_US else f"{value:.1f}"
+
+
+def markdown(head: str, found: Iterable[ArrivalFigures | LineFigures]) -> Iterator[str]:
+    """A table, line by line."""
+    yield head
+    for one in found:
+        yield one.row()
+
+
+def tables() -> dict[str, str]:
+    """Both tables for docs/clock.md, by their marks; with blank lines around, or they are no tables in <details>."""
+    figures = kept()
+    return {
+        "arrivals": "\n" + "\n".join(markdown(ARRIVAL_HEAD, figures.arrivals)) + "\n",
+        "lines": "\n" + "\n".join(markdown(LINE_HEAD, figures.lines)) + "\n",
+    }
