@@ -9,7 +9,7 @@ from imud.contracts.control.calibration import CalibrationResult, Calibrations
 from imud.contracts.control.recording import NothingRecorded, RecordingSource, TakeSnapshot
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.settings import Settings
-from imud.contracts.status import ClientStatus, DeviceStatus, RecorderStatus
+from imud.contracts.status import ClientStatus, DeviceStatus, OutputStatus, RecorderStatus
 from imud.errors import CommandError
 from imud.event import Event
 from imud.formats.slot import encode_slots
@@ -177,6 +177,8 @@ class PublisherContext:
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
     recorder_sources: list[Callable[[], RecorderStatus]] = field(default_factory=list)
     """The same of a recorder."""
+    output_sources: list[Callable[[], Sequence[OutputStatus]]] = field(default_factory=list)
+    """The same of outputs that send sentences."""
     recording: RecordingSource = field(default_factory=NothingRecorded)
     """What there is to record."""
     snapshots: list[TakeSnapshot] = field(default_factory=list)

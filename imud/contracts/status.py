@@ -271,6 +271,21 @@ class RecorderStatus(msgspec.Struct, frozen=True):
     """Files removed to keep within the budget."""
 
 
+class OutputStatus(msgspec.Struct, frozen=True):
+    """One way out of an output that sends sentences."""
+
+    name: str
+    """Kind and address, for example `tcp 127.0.0.1:10110`."""
+    sent: int
+    """Sentences sent since the start; to each client, where there are several."""
+    dropped: int
+    """Sentences that were not sent because the way out had no room or was away."""
+    readers: int
+    """Clients that are connected; 1 for a port or an address while it takes what is sent, 0 while it does not."""
+    problem: str
+    """Why nothing is sent, one sentence; empty while it is."""
+
+
 class ClientStatus(msgspec.Struct, frozen=True):
     """One client of the UNIX socket."""
 

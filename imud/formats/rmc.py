@@ -16,6 +16,7 @@ from enum import StrEnum
 from time import gmtime
 from typing import Final, NamedTuple
 
+from imud.formats.nmea0183 import checksum
 from imud.units import NS_PER_MS, NS_PER_S
 
 SENTENCE_BYTES_MAX: Final = 120
@@ -99,14 +100,6 @@ def as_gprmc(sentence: bytes) -> bytes:
         raise ValueError(f"expected an RMC sentence, got {sentence[:SENTENCE_BYTES_MAX]!r}")
     body = b"GPRMC," + match[2]
     return b"$%b*%02X\r\n" % (body, checksum(body))
-
-
-def checksum(body: bytes) -> int:
-    """XOR of all bytes; `body` stands between `$` and `*`."""
-    result = 0
-    for byte in body:
-        result ^= byte
-    return result
 
 
 def _content(fields: Sequence[bytes]) -> Rmc | RmcFault:

@@ -10,5 +10,6 @@ PUBLISHERS: Table[PublisherType] = Table(
         "shm": "imud.publishers.shm.publisher:PUBLISHER",
         "metrics": "imud.publishers.metrics.publisher:PUBLISHER",
         "recorder": "imud.publishers.recorder.publisher:PUBLISHER",
+        "nmea0183": "imud.publishers.nmea0183.publisher:PUBLISHER",
     },
 )

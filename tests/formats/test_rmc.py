@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.formats.rmc import SENTENCE_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, checksum, parse
+from imud.formats.nmea0183 import checksum
+from imud.formats.rmc import SENTENCE_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, parse
 from imud.units import NS_PER_S
 
 

@@ -9,7 +9,7 @@ from random import Random
 from typing import Final
 
 from imud.contracts.timing import UtcReference
-from imud.formats import rmc
+from imud.formats.nmea0183 import checksum
 from imud.formats.rmc import SENTENCE_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, parse
 from imud.utc.rmc_feed import RmcFeed
 from imud.utc.sentence_stream import LINE_BYTES_MAX, SentenceSplitter
@@ -77,7 +77,7 @@ def mend(data: bytes, _random: Random) -> bytes:
     for number, line in enumerate(lines):
         begin, star = line.rfind(b"$"), line.rfind(b"*")
         if 0 <= begin < star:
-            lines[number] = line[: star + 1] + b"%02X\r" % rmc.checksum(line[begin + 1 : star])
+            lines[number] = line[: star + 1] + b"%02X\r" % checksum(line[begin + 1 : star])
     return b"\n".join(lines)
 
 
@@ -88,7 +88,7 @@ def rmc_seeds() -> list[bytes]:
         b"GNRMC,235960.5,A,,,,,,,311216,,,A,V", b"GPRMC,000000,A,,,,,,,010180", b"GPRMC,083559.,A,,,,,,,290299,,",
         b"GPRMC,083559.123456789,A,,,,,,,311279,,,D", b"GPRMC,245959,A,,,,,,,000000,,,A", b"GPGGA,1",
     ]  # fmt: skip
-    sentences = [b"$%b*%02X\r\n" % (body, rmc.checksum(body)) for body in bodies]
+    sentences = [b"$%b*%02X\r\n" % (body, checksum(body)) for body in bodies]
     own = [build(UTC_NS + step, valid=valid) for step in (0, 990_000_000) for valid in (True, False)]
     return [*sentences, *own, sentences[0][:-2], sentences[0].replace(b"A", b"B"), b"$" + b"x" * 130 + b"*00\r\n", b""]
 

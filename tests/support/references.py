@@ -101,8 +101,9 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
     """The default as one would write it; file modes in octal."""
     if field.required:
         return "needed"
-    octal = field.name == "mode" and isinstance(field.default, int)
-    return f"`{field.default:#o}`" if octal else f"`{shown(field.default)}`"
+    default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+    octal = field.name == "mode" and isinstance(default, int)
+    return f"`{default:#o}`" if octal else f"`{shown(default)}`"
 
 
 def settings_tables() -> str:

@@ -13,7 +13,8 @@ from time import monotonic_ns
 
 import pytest
 
-from imud.formats.rmc import Rmc, build, checksum, parse
+from imud.formats.nmea0183 import checksum
+from imud.formats.rmc import Rmc, build, parse
 from imud.units import NS_PER_S
 from imud.utc.receivers import GpsdSource
 from imud.utc.sentence_stream import Retry

@@ -7,7 +7,8 @@ import pytest
 from imud.contracts.timing import UtcReference
 from imud.devices.hipnuc.uart.driver import DRIVER
 from imud.errors import LinkError
-from imud.formats.rmc import as_gprmc, build, checksum
+from imud.formats.nmea0183 import checksum
+from imud.formats.rmc import as_gprmc, build
 from imud.ledger import Ledger
 from imud.sample import Measurement
 from imud.sim.hipnuc.uart.settings import HipnucHardware

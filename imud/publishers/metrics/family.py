@@ -17,7 +17,7 @@ from prometheus_client.core import (
     Metric,
 )
 
-from imud.contracts.status import ClientStatus, DeviceStatus, RecorderStatus
+from imud.contracts.status import ClientStatus, DeviceStatus, OutputStatus, RecorderStatus
 from imud.publishers.metrics.rings import RingView
 from imud.units import NS_PER_S, PPM_PER_ONE
 
@@ -46,6 +46,8 @@ class Snapshot:
     """What was found in these rings."""
     recorders: Sequence[RecorderStatus] = ()
     """One while there is a recorder."""
+    outputs: Sequence[OutputStatus] = ()
+    """Ways out of outputs that send sentences."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from imud.event import Event
 from imud.log import messages_dropped
 from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
+from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
 from imud.publishers.metrics.recorder import RECORDER_FAMILIES
 from imud.publishers.metrics.rings import RingReader
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
@@ -121,7 +122,9 @@ class DaemonCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics of the snapshot, with pauses while they are rendered."""
-        for family in (*FAMILIES, *(RECORDER_FAMILIES if self._snapshot.recorders else ())):
+        recorder = RECORDER_FAMILIES if self._snapshot.recorders else ()
+        outputs = OUTPUT_FAMILIES if self._snapshot.outputs else ()
+        for family in (*FAMILIES, *recorder, *outputs):
             metric = family.metric(self._snapshot)
             metric.samples = _PausingList(metric.samples, self._pause)
             yield metric
@@ -265,6 +268,7 @@ class MetricsPublisher:
                     messages_dropped(),
                     rings=dict.fromkeys(context.without_ring, "") | context.rings,
                     recorders=tuple(status() for status in context.recorder_sources),
+                    outputs=tuple(output for source in context.output_sources for output in source()),
                 )
             )
 

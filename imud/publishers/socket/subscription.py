@@ -1,6 +1,5 @@
 """What clients watch (devices, form, rate), and the plan by which a batch goes to all that watch its device."""
 
-import math
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -12,7 +11,7 @@ from imud.frames.conventions import Convention
 from imud.publishers.socket.encoding import BinaryEncoding, ConvertedEncoding, Encoding, JsonEncoding
 from imud.publishers.socket.outbox import Delivery, Outbox
 from imud.publishers.socket.serving import TokenBucket
-from imud.units import NS_PER_S
+from imud.publishers.thinning import Pace
 
 PUBLISH_NS: Final = 1_000_000
 """Sending a batch takes so long at most; the clients that are left are served by the scheduler, in several turns."""
@@ -30,34 +29,6 @@ class Form(StrEnum):
     """One notification per sample."""
     BINARY = "binary"
     """One slot of shared memory per sample."""
-
-
-class Pace:
-    """Thins the samples of one device to `rate_hz`: the first one at or after each due instant, never resampled.
-
-    Due instants are start + k / rate_hz in the time of the samples, k counted, so that rounding never adds up.
-    """
-
-    __slots__ = ("_period_ns", "_start_ns", "due_ns")
-
-    def __init__(self, rate_hz: float) -> None:
-        self._period_ns = NS_PER_S / rate_hz
-        self._start_ns: int | None = None
-        self.due_ns = 0
-        """A sample measured before this instant is not one to send."""
-
-    def is_due(self, t_ns: int) -> bool:
-        """Whether the sample measured at `t_ns` is one to send; if so, the next due instant is a later one."""
-        start_ns = self._start_ns
-        if start_ns is None:
-            start_ns = self._start_ns = t_ns
-        elif t_ns < self.due_ns:
-            return False
-        period_ns = self._period_ns
-        passed = math.floor((t_ns - start_ns) / period_ns)
-        due_ns = start_ns + math.ceil((passed + 1) * period_ns)
-        self.due_ns = due_ns if due_ns > t_ns else t_ns + 1  # a period below one ns, or a sum that rounds down
-        return True
 
 
 FormKey = tuple[Form, tuple[str, ...] | None, bool, Convention | None, bool]

@@ -10,7 +10,14 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families as parse_text
 
 import imud
-from imud.contracts.status import LATENCY_BOUNDS_NS, ClientStatus, ClockStatus, DeviceState, RecorderStatus
+from imud.contracts.status import (
+    LATENCY_BOUNDS_NS,
+    ClientStatus,
+    ClockStatus,
+    DeviceState,
+    OutputStatus,
+    RecorderStatus,
+)
 from imud.event import EventKind
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers.metrics.families import FAMILIES, LINE_FAMILIES, POLLING_FAMILIES, TIME_FAMILIES
@@ -387,13 +394,14 @@ def test_rendering_pauses_often() -> None:
 def shown_names() -> set[str]:
     """Names of all families as they stand after `# HELP`."""
     recorder = RecorderStatus("a", "", 1, 2, 3, 4, 5)
-    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,))
+    output = OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")
+    snapshot = Snapshot(DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,), outputs=(output,))
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))
 
 
 def test_every_metric_is_documented_and_nothing_else() -> None:
-    documented = set(re.findall(r"^\| `([a-z_]+)`", (ROOT / "docs/metrics.md").read_text(), re.MULTILINE))
+    documented = set(re.findall(r"^\| `([a-z0-9_]+)`", (ROOT / "docs/metrics.md").read_text(), re.MULTILINE))
     assert documented == shown_names()
 
 

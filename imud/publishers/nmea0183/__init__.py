@@ -1,0 +1,1 @@
+"""NMEA 0183: attitude and heading for plotters, autopilots, OpenCPN, Signal K and gpsd."""

@@ -1,0 +1,249 @@
+"""Ways out: what they take arrives whole, what they do not take is dropped and counted, and none of them waits."""
+
+import asyncio
+import os
+import socket
+import tty
+from collections.abc import Callable
+
+import pytest
+
+from imud.contracts.status import OutputStatus
+from imud.errors import ServerError
+from imud.publishers.nmea0183.outputs import CLIENTS_MAX, RETRY_FIRST_NS, STUCK_NS, SerialOutput, TcpOutput, UdpOutput
+from imud.publishers.nmea0183.outputs import open_serial as open_real_port
+from tests.support.event_loops import VirtualClock, in_loop
+
+LIMIT_S = 10.0
+ONE = b"$HEHDT,98.3,T*2F\r\n"
+BUSY = b"$" + b"x" * 60_000 + b"\r\n"
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Let the loop run until something has happened."""
+    async with asyncio.timeout(LIMIT_S):
+        while not condition():
+            await asyncio.sleep(0)
+
+
+async def connected(server: TcpOutput) -> socket.socket:
+    """A client that the server has."""
+    before = server.status().readers
+    sock = socket.create_connection(("127.0.0.1", server.port), timeout=LIMIT_S)
+    await until(lambda: server.status().readers == before + 1)
+    return sock
+
+
+def server(clock: VirtualClock) -> TcpOutput:
+    """A server on a free port."""
+    made = TcpOutput("127.0.0.1", 0, clock.now_ns)
+    made.open()
+    return made
+
+
+@in_loop
+async def test_every_client_gets_every_sentence() -> None:
+    made = server(VirtualClock())
+    first, second = await connected(made), await connected(made)
+    made.put(ONE * 2)
+    assert first.recv(100) == second.recv(100) == ONE * 2
+    assert made.status().sent == 4
+    assert made.status().dropped == 0
+    for sock in (first, second):
+        sock.close()
+    await until(lambda: made.status().readers == 0)
+    made.close()
+    made.close()
+
+
+@in_loop
+async def test_what_a_client_sends_is_ignored() -> None:
+    made = server(VirtualClock())
+    client = await connected(made)
+    client.sendall(b"?WATCH={}\r\n" * 1000)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    made.put(ONE)
+    assert client.recv(100) == ONE
+    client.close()
+    made.close()
+
+
+@in_loop
+async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconnected() -> None:
+    clock = VirtualClock()
+    made = server(clock)
+    client = await connected(made)
+    for _ in range(200):
+        made.put(BUSY)
+    status = made.status()
+    assert status.dropped > 100
+    assert status.sent + status.dropped == 200
+    got = bytearray()
+    client.settimeout(0)
+    while len(got) < status.sent * len(BUSY):  # the rest of the one cut off comes with the next
+        made.put(b"")
+        try:
+            got += client.recv(1 << 20)
+        except BlockingIOError:
+            await asyncio.sleep(0)
+    assert bytes(got) == BUSY * status.sent
+    for _ in range(200):
+        made.put(BUSY)
+    clock.advance(STUCK_NS)
+    made.tick(clock.now_ns())
+    assert made.status().readers == 1
+    clock.advance(1)
+    made.tick(clock.now_ns())
+    assert made.status().readers == 0
+    client.close()
+    made.close()
+
+
+@in_loop
+async def test_one_client_too_many_is_refused() -> None:
+    made = server(VirtualClock())
+    clients = [await connected(made) for _ in range(CLIENTS_MAX)]
+    one_more = socket.create_connection(("127.0.0.1", made.port), timeout=LIMIT_S)
+    one_more.setblocking(False)
+    closed: list[bytes] = []
+
+    def is_closed() -> bool:
+        try:
+            closed.append(one_more.recv(1))
+        except BlockingIOError:
+            return False
+        return True
+
+    await until(is_closed)
+    assert closed == [b""]
+    assert made.status().readers == CLIENTS_MAX
+    for sock in (*clients, one_more):
+        sock.close()
+    made.close()
+
+
+@in_loop
+async def test_a_port_that_is_taken() -> None:
+    made = server(VirtualClock())
+    with pytest.raises(ServerError, match=r"nmea0183\.tcp_port"):
+        TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
+    made.close()
+
+
+def test_datagrams() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(LIMIT_S)
+        made = UdpOutput("127.0.0.1", receiver.getsockname()[1])
+        made.put(ONE * 3)
+        assert receiver.recv(1000) == ONE * 3
+        assert (made.status().sent, made.status().dropped, made.status().readers) == (3, 0, 1)
+        made.close()
+
+
+def test_datagrams_without_a_way_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    made = UdpOutput("127.0.0.1", 9)
+    made.put(ONE + b"x" * 70_000)  # longer than a datagram can be
+    made.put(ONE + b"x" * 70_000)
+    assert (made.status().dropped, made.status().readers) == (2, 0)
+    assert "too long" in made.status().problem
+    assert len(caplog.records) == 1
+    made.close()
+
+
+class Port:
+    """A pseudo-terminal."""
+
+    def __init__(self) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.path = os.ttyname(self.slave)
+
+    def close(self) -> None:
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@in_loop
+async def test_a_serial_port_that_goes_away_is_opened_again() -> None:
+    clock, ports = VirtualClock(), [Port(), Port()]
+    tried: list[int] = []
+
+    def open_port(_port: str, baud: int) -> int:
+        tried.append(baud)
+        if len(tried) == 1:
+            raise FileNotFoundError(2, "No such file or directory")
+        return open_real_port(ports[0].path, baud)
+
+    made = SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns, open_port)
+    made.put(ONE)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().problem == "No such file or directory")
+    made.tick(clock.now_ns())
+    assert len(tried) == 1  # not yet
+    clock.advance(RETRY_FIRST_NS)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    made.put(ONE)
+    assert os.read(ports[0].master, 100) == ONE
+    ports[0].close()
+    made.put(ONE)
+    assert made.status().readers == 0
+    ports.pop(0)
+    clock.advance(2 * RETRY_FIRST_NS)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    made.put(ONE)
+    assert os.read(ports[0].master, 100) == ONE
+    assert made.status() == OutputStatus("serial /dev/ttyUSB9", 2, 2, 1, "")
+    assert tried == [38400] * 3
+    made.close()
+    made.close()
+    ports[0].close()
+
+
+@in_loop
+async def test_a_full_serial_line_drops_whole_sentences() -> None:
+    clock, port = VirtualClock(), Port()
+    made = SerialOutput(port.path, 4800, clock.now_ns)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    sentence = b"$" + b"y" * 60 + b"\r\n"
+    for _ in range(5000):
+        made.put(sentence)
+    status = made.status()
+    assert status.dropped > 0
+    got = bytearray()
+    while len(got) < status.sent * len(sentence):
+        got += os.read(port.master, 1 << 16)
+        made.put(b"")
+    assert bytes(got) == sentence * status.sent
+    made.close()
+    port.close()
+
+
+@in_loop
+async def test_a_port_that_opens_while_the_output_is_closed_is_closed() -> None:
+    clock, port = VirtualClock(), Port()
+    fds: list[int] = []
+
+    def open_port(path: str, baud: int) -> int:
+        fds.append(open_real_port(path, baud))
+        return fds[0]
+
+    made = SerialOutput(port.path, 4800, clock.now_ns, open_port)
+    made.tick(clock.now_ns())
+    made.close()
+
+    def is_closed() -> bool:
+        if not fds:
+            return False
+        try:
+            os.fstat(fds[0])
+        except OSError:
+            return True
+        return False
+
+    await until(is_closed)
+    port.close()

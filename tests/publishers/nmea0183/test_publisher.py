@@ -1,0 +1,307 @@
+"""The output as a whole: which device, when, by which axes; and a real gpsd that reads it."""
+
+import asyncio
+import json
+import shutil
+import socket
+import subprocess
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from math import radians
+
+import msgspec
+import pynmea2
+import pytest
+
+from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
+from imud.contracts.settings import wrong_values
+from imud.contracts.status import FrameStatus
+from imud.frames.conventions import Convention, Heading
+from imud.frames.published import PublishedFrame
+from imud.frames.settings import published_frame
+from imud.publishers.nmea0183.publisher import (
+    REFERENCE_NS,
+    USUAL_BYTES,
+    WHO,
+    Nmea0183,
+    Nmea0183Settings,
+    address_of,
+)
+from imud.publishers.nmea0183.sentences import Formatter, HeadingReference, make
+from imud.sample import Sample, Sync, Vector3
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.event_loops import VirtualClock, in_loop
+from tests.support.socket_rig import device_status
+
+LIMIT_S = 20.0
+NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (Debian package gpsd)"
+LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
+"""As a HiPNUC module sends it: right side down by 10°, bow up by 5°, heading 45°."""
+
+
+class Asked:
+    """Latencies that were asked for."""
+
+    def __init__(self) -> None:
+        self.of: dict[str, tuple[int, tuple[str, ...]]] = {}
+
+    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
+        self.of[who] = (latency_ns, tuple(devices or ()))
+
+    def release(self, who: str) -> None:
+        self.of.pop(who, None)
+
+
+class OutputBench:
+    """The output with devices by hand. Use in a running loop."""
+
+    def __init__(
+        self, *, heading: Heading = Heading.TRUE, declination_deg: float | None = 3.0, **settings: object
+    ) -> None:
+        self.clock, self.asked = VirtualClock(), Asked()
+        frame = FrameStatus("", "device", "", "", heading, declination_deg, {})
+        statuses = [
+            msgspec.structs.replace(device_status(name, n), frame=frame) for n, name in enumerate(("bow", "mast"))
+        ]
+        self.context = PublisherContext(lambda: statuses, 1, self.clock.now_ns, latencies=self.asked)
+        made = msgspec.convert({"tcp_port": 0, **settings}, Nmea0183Settings)
+        self.output = Nmea0183(made, self.context)
+        self.output.start()
+        self.output.add_device("bow", 0)
+        self.seq = 0
+        self.tick()
+
+    def tick(self) -> None:
+        self.clock.advance(REFERENCE_NS)
+        self.output.tick(self.clock.now_ns())
+
+    def reader(self) -> socket.socket:
+        """A client of the server."""
+        return socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S)
+
+    @property
+    def port(self) -> int:
+        return int(self.output.status()[0].name.rpartition(":")[2])
+
+    def publish(
+        self, count: int = 1, device: str = "bow", euler: Vector3 | None = LEFT_45, frame: PublishedFrame = AS_SENT,
+        gyro_z: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Samples at 1 kHz."""
+        samples = []
+        for _ in range(count):
+            self.seq += 1
+            t_ns = self.seq * NS_PER_MS
+            samples.append(
+                Sample(
+                    device, self.seq, t_ns, 0, Sync.ARRIVAL, t_ns, NS_PER_S + t_ns, euler_rad=euler,
+                    gyro_rad_s=(0.0, 0.0, gyro_z),
+                )
+            )  # fmt: skip
+        self.output.publish(Batch(device, 0, samples, frame))
+
+
+async def received(bench: OutputBench, reader: socket.socket) -> list[str]:
+    """Sentences that have come, without checksums, which are checked."""
+    data = reader.recv(65536).decode()
+    sentences = data.splitlines()
+    for one in sentences:
+        pynmea2.parse(one, check=True) if not one.startswith("$PASHR") else None
+    return [one.partition("*")[0].removeprefix("$") for one in sentences]
+
+
+async def ready_reader(bench: OutputBench) -> socket.socket:
+    """A client that the server has accepted."""
+    reader = bench.reader()
+    async with asyncio.timeout(LIMIT_S):
+        while not bench.output.status()[0].readers:
+            await asyncio.sleep(0)
+    return reader
+
+
+@in_loop
+async def test_each_sentence_has_its_own_rate() -> None:
+    bench = OutputBench(sentences={"HDT": 10.0, "ROT": 4.0})
+    reader = await ready_reader(bench)
+    for _ in range(100):
+        bench.publish(10)
+    got = await received(bench, reader)
+    assert got.count("HCHDT,45.0,T") == 10
+    assert got.count("TIROT,0.0,A") == 4
+    assert len(got) == 14
+    reader.close()
+    bench.output.close()
+
+
+@pytest.mark.parametrize("convention", [None, *Convention])
+def test_values_are_those_of_ships_whatever_the_axes_are(convention: Convention | None) -> None:
+    @in_loop
+    async def scene() -> None:
+        bench = OutputBench(sentences={"PASHR": 1.0, "HDG": 1.0, "XDR": 1.0, "ROT": 1.0})
+        reader = await ready_reader(bench)
+        frame = published_frame(None, convention, None, AS_SENT.device)
+        euler, gyro_z = LEFT_45, radians(-2.0)
+        if frame.rotation is not None:
+            as_sent = Sample("bow", 1, 0, 0, Sync.ARRIVAL, 0, 0, euler_rad=euler, gyro_rad_s=(0.0, 0.0, gyro_z))
+            turned = frame.rotation.sample(as_sent)
+            assert turned.euler_rad is not None
+            assert turned.gyro_rad_s is not None
+            euler, gyro_z = turned.euler_rad, turned.gyro_rad_s[2]
+        bench.publish(euler=euler, frame=frame, gyro_z=gyro_z)
+        got = await received(bench, reader)
+        assert got[0] == "PASHR,000001.001,45.00,T,+10.00,+5.00,,,,,0,0"
+        assert got[1] == "HCHDG,42.0,,,3.0,E"
+        rate_deg_min = float(got[3].split(",")[1])
+        assert 115 < rate_deg_min < 122  # 2° a second to starboard about the body's z axis
+        reader.close()
+        bench.output.close()
+
+    scene()
+
+
+@in_loop
+async def test_the_rate_of_turn_is_the_mean_since_the_last() -> None:
+    bench = OutputBench(sentences={"ROT": 10.0})
+    reader = await ready_reader(bench)
+    bench.publish(1, euler=(0.0, 0.0, 0.0))
+    for number in range(100):  # vibration of 500 Hz about a turn of 1° a second to starboard
+        bench.publish(1, euler=(0.0, 0.0, 0.0), gyro_z=radians(-1.0 + (20.0 if number % 2 else -20.0)))
+    assert await received(bench, reader) == ["TIROT,0.0,A", "TIROT,60.0,A"]
+    reader.close()
+    bench.output.close()
+
+
+@in_loop
+async def test_the_reference_is_looked_up_again() -> None:
+    bench = OutputBench(heading=Heading.RELATIVE, declination_deg=None, sentences={"HDT": 100.0})
+    reader = await ready_reader(bench)
+    bench.publish()
+    statuses = bench.context.status()
+    known = FrameStatus("", "device", "", "", Heading.TRUE, None, {})
+    statuses[0] = msgspec.structs.replace(statuses[0], frame=known)  # type: ignore[index]  # it is a list
+    bench.publish(20)
+    bench.tick()
+    bench.publish(20)
+    assert await received(bench, reader) == ["HCHDT,45.0,T"]
+    reader.close()
+    bench.output.close()
+
+
+@in_loop
+async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pytest.LogCaptureFixture) -> None:
+    bench = OutputBench(sentences={"HDT": 100.0})
+    assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("bow",))}
+    bench.output.add_device("mast", 1)
+    assert bench.asked.of == {}
+    assert "nmea0183.device: expected the name of one device (bow, mast), got none" in caplog.text
+    bench.output.remove_device("bow")
+    assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("mast",))}
+    bench.output.close()
+    assert bench.asked.of == {}
+    assert bench.context.output_sources == []
+
+    named = OutputBench(device="mast", sentences={"HDT": 100.0})
+    assert named.asked.of == {}
+    named.output.add_device("mast", 1)
+    named.tick()
+    reader = await ready_reader(named)
+    named.publish()
+    named.publish(device="mast")
+    assert await received(named, reader) == ["HCHDT,45.0,T"]
+    reader.close()
+    named.output.close()
+
+
+# --- settings -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"udp": ["plotter:10110"]}, "expected IP address and port such as"),
+        ({"udp": ["192.168.1.255"]}, "expected IP address and port such as"),
+        ({"udp": ["192.168.1.255:0"]}, "expected IP address and port such as"),
+        ({"udp": ["fe80::1:10110"]}, "expected IP address and port such as"),
+        ({"tcp_address": "boat"}, "expected an IP address"),
+        ({"sentences": {}}, "expected one at least"),
+        ({"sentences": {"GGA": 1}}, "keys HDG, HDM, HDT, PASHR, ROT, XDR"),
+        ({"sentences": {"HDT": 0}}, "a number from 0.01 to 100"),
+        ({"talker": "ii"}, "two capital letters"),
+        ({"serial_port": "/dev/ttyS0", "serial_baud": 4800}, "480 bytes a second, got 844"),
+    ],
+)
+def test_settings_that_are_refused(given: dict[str, object], words: str) -> None:
+    assert words in "; ".join(map(str, wrong_values(Nmea0183Settings, given)))
+
+
+def test_addresses() -> None:
+    assert address_of("192.168.1.255:10110") == ("192.168.1.255", 10110)
+    assert address_of("[fe80::1]:2000") == ("fe80::1", 2000)
+
+
+@pytest.mark.parametrize("kind", Formatter)
+def test_the_usual_size_of_a_sentence_is_no_less_than_a_full_one(kind: Formatter) -> None:
+    full = Sample(
+        "bow", 1, 0, 0, Sync.ARRIVAL, 0, NS_PER_S, euler_rad=(radians(-80), radians(-80), radians(211.5)),
+        gyro_rad_s=(0.0, 0.0, radians(-0.3)), temperature_c=23.4, pressure_pa=101_325.0,
+    )  # fmt: skip
+    made = make(kind, full, HeadingReference(Heading.TRUE, 12.6))
+    assert made is not None
+    assert len(made) <= USUAL_BYTES[kind]
+
+
+# --- a reader that no one here wrote --------------------------------------------------------------------------------
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+@contextmanager
+def gpsd(port: int, source: str) -> Iterator[None]:
+    """A gpsd that waits for no client."""
+    process = subprocess.Popen(["gpsd", "-N", "-n", "-b", "-S", str(port), source], stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(timeout=LIMIT_S)
+
+
+async def attitudes(port: int, bench: OutputBench, enough: int) -> list[dict[str, object]]:
+    """Attitude reports of gpsd while samples come."""
+    async with asyncio.timeout(LIMIT_S):
+        while True:
+            try:
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                break
+            except ConnectionRefusedError:
+                await asyncio.sleep(0.05)
+        writer.write(b'?WATCH={"enable":true,"json":true};\n')
+        found: list[dict[str, object]] = []
+        line = asyncio.ensure_future(reader.readline())
+        while len(found) < enough:
+            bench.publish(100)
+            done, _ = await asyncio.wait([line], timeout=0.05)
+            if done:
+                report = json.loads(line.result())
+                found += [report] if report["class"] == "ATT" else []
+                line = asyncio.ensure_future(reader.readline())
+        line.cancel()
+        writer.close()
+        await writer.wait_closed()
+    return found
+
+
+@pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
+@in_loop
+async def test_gpsd_reads_the_heading() -> None:
+    bench = OutputBench(sentences={"HDT": 10.0, "HDG": 10.0, "ROT": 10.0, "XDR": 2.0, "PASHR": 10.0})
+    port = free_port()
+    with gpsd(port, f"tcp://127.0.0.1:{bench.port}"):
+        found = await attitudes(port, bench, 4)
+    bench.output.close()
+    assert {report["heading"] for report in found} == {45.0}
