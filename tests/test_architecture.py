@@ -354,6 +354,7 @@ TESTED_IN = {
     "imud.cli.probe.command": "cli/probe/test_can.py",
     "imud.cli.probe.report": "cli/probe/test_can.py",
     "imud.bridges.ros2_types": "bridges/test_ros2_channels.py",
+    "imud.cli.foxglove.command": "cli/foxglove/test_server.py",
     "imud.cli.export.sinks": "cli/export/test_command.py",
     "imud.cli.export.mcap_sink": "cli/export/test_command.py",
     "imud.cli.export.source": "cli/export/test_command.py",

@@ -50,6 +50,9 @@ COMMANDS = {
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
     "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
     "top": Subcommand("imud.cli.top.command:TOP", "watch all devices in the terminal, redrawn in place"),
+    "foxglove": Subcommand(
+        "imud.cli.foxglove.command:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
+    ),
     "watch": Subcommand("imud.cli.samples:WATCH", "print samples as they come"),
     "clock": Subcommand(
         "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"

@@ -1,0 +1,6 @@
+"""`imud foxglove`: samples, attitude, events and status of the running daemon for Foxglove, Lichtblick and PlotJuggler.
+
+command   arguments, signals
+  ├──▶ relay    reads the daemon, connected again after its restart; asks for samples only while somebody looks
+  └──▶ server   the WebSocket server (foxglove-sdk), which the relay gives messages to
+"""

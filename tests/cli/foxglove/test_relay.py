@@ -1,0 +1,138 @@
+"""The relay between a daemon and a viewer: what is offered, what is sent, and when nothing is asked for."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Queue
+from threading import Thread
+from typing import Any, NamedTuple
+
+import msgspec
+
+from imud.bridges.channel import MessageChannel
+from imud.cli.foxglove.relay import Relay
+from imud.event import Event, EventKind
+from tests.support.socket_rig import batch, daemon
+
+LIMIT_S = 10.0
+OFFSET_NS = 1_000_000_000_000
+
+
+class Said(NamedTuple):
+    """What a viewer was given."""
+
+    topic: str
+    message: dict[str, Any]
+    utc_ns: int
+
+
+class FakeViewer:
+    """A viewer that keeps what it is given; the test waits for what it needs."""
+
+    def __init__(self) -> None:
+        self.is_looked_at = True
+        self.said: Queue[Said] = Queue()
+
+    def open(self, channel: MessageChannel[Any]) -> None:
+        self.said.put(Said(f"open {channel.topic}", {}, 0))
+
+    def close_topic(self, topic: str) -> None:
+        self.said.put(Said(f"close {topic}", {}, 0))
+
+    def send(self, channel: MessageChannel[Any], item: object, utc_ns: int) -> None:
+        data = channel.encode(item)
+        if data is not None:
+            self.said.put(Said(channel.topic, msgspec.json.decode(data), utc_ns))
+
+    def problem(self, text: str) -> None:
+        self.said.put(Said("problem", {"text": text}, 0))
+
+    def wait_for(self, topic: str, is_it: Callable[[Said], object] = lambda _said: True) -> Said:
+        while not ((said := self.said.get(timeout=LIMIT_S)).topic == topic and is_it(said)):
+            pass
+        return said
+
+
+@contextmanager
+def relaying(path: str | Path, viewer: FakeViewer, **options: Any) -> Iterator[Relay]:
+    relay = Relay(str(path), viewer, utc_offset_ns=lambda: OFFSET_NS, **options)
+    thread = Thread(target=relay.run)
+    thread.start()
+    try:
+        yield relay
+    finally:
+        relay.stop()
+        thread.join(LIMIT_S)
+        assert not thread.is_alive()
+
+
+def test_samples_come_in_the_axes_of_rep_103(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with daemon(tmp_path) as served, relaying(served.path, viewer):
+        viewer.wait_for("/imu1/status")
+        served.do(lambda server: server.publish(batch("imu0", 7)))
+        imu = viewer.wait_for("/imu0/imu/data")
+        # sensor: x right, y forward; body: x forward, y left
+        assert imu.message["linear_acceleration"] == {"x": -0.5, "y": -0.125, "z": 9.75}
+        assert imu.message["angular_velocity"] == {"x": 0.5, "y": -0.25, "z": -0.75}
+        assert imu.utc_ns == 1_790_000_000_007_000_000
+        stamp = viewer.wait_for("/imu0/stamp")
+        assert (stamp.message["seq"], stamp.message["t_err_ns"]) == (7, 12_000)
+
+
+def test_events_and_status_come(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with daemon(tmp_path) as served, relaying(served.path, viewer):
+        status = viewer.wait_for("/imu0/status")
+        assert (status.message["state"], status.message["rate_hz"]) == ("running", 1000.0)
+        served.do(lambda server: server.event(Event(5, "imu1", EventKind.DOWN, "is gone")))
+        event = viewer.wait_for("/events")
+        assert (event.message["name"], event.message["message"]) == ("imu1", "down: is gone")
+        assert (event.message["level"], event.utc_ns) == (3, 5 + OFFSET_NS)
+
+
+def test_while_nobody_looks_no_samples_are_asked_for_and_events_still_come(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    viewer.is_looked_at = False
+    with daemon(tmp_path) as served, relaying(served.path, viewer):
+        viewer.wait_for("/imu1/status")
+        served.do(lambda server: server.publish(batch("imu0", 1)))
+        served.do(lambda server: server.event(Event(5, "imu1", EventKind.UP, "is there")))
+        while (said := viewer.said.get(timeout=LIMIT_S)).topic != "/events":
+            assert said.topic != "/imu0/stamp" or said.message["seq"] != 2
+        viewer.wait_for("open /imu0/imu/data")  # from the newest sample, so that one can look
+        viewer.is_looked_at = True
+        viewer.wait_for("/imu0/status")
+        served.do(lambda server: server.publish(batch("imu0", 2)))
+        viewer.wait_for("/imu0/stamp", lambda said: said.message["seq"] == 2)
+
+
+def test_only_the_wanted_device_is_shown(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with daemon(tmp_path) as served, relaying(served.path, viewer, devices=["imu1"]):
+        first = viewer.said.get(timeout=LIMIT_S)
+        while first.topic != "/imu1/status":
+            assert not first.topic.startswith("/imu0")
+            first = viewer.said.get(timeout=LIMIT_S)
+        served.do(lambda server: server.publish(batch("imu0", 1)))
+        served.do(lambda server: server.publish(batch("imu1", 2)))
+        while (said := viewer.said.get(timeout=LIMIT_S)).topic != "/imu1/stamp":
+            assert not said.topic.startswith("/imu0")
+
+
+def test_it_goes_on_after_the_daemon_was_restarted(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with daemon(tmp_path) as served:
+        path = served.path
+        relay = relaying(path, viewer)
+        relay.__enter__()
+        viewer.wait_for("/imu0/status")
+    try:
+        assert str(path) in viewer.wait_for("problem", lambda said: said.message["text"]).message["text"]
+        with daemon(tmp_path) as served:
+            viewer.wait_for("problem", lambda said: not said.message["text"])
+            viewer.wait_for("/imu1/status")
+            served.do(lambda server: server.publish(batch("imu0", 9)))
+            viewer.wait_for("/imu0/stamp", lambda said: said.message["seq"] == 9)
+    finally:
+        relay.__exit__(None, None, None)

@@ -1,0 +1,201 @@
+"""The server of Foxglove's protocol, heard by aiohttp as a bare WebSocket client; and the command as a process."""
+
+import asyncio
+import json
+import re
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, closing
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from imud.bridges.channel import MessageFrames, StampedEvent
+from imud.bridges.json_channels import JsonDialect
+from imud.cli import main
+from imud.cli.foxglove import command
+from imud.cli.foxglove.server import FoxgloveServer
+from imud.errors import ServerError
+from tests.bridges.samples import EVENT, FULL, UTC_NS
+from tests.support.daemon_process import running_daemon
+from tests.test_daemon import cable, device
+
+SUBPROTOCOL = "foxglove.sdk.v1"
+MESSAGE_DATA = 1
+LIMIT_S = 15.0
+DIALECT = JsonDialect()
+
+
+class ProtocolClient:
+    """A client of the protocol: channels by topic, and messages of those that it subscribes to."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._socket = socket
+        self.channels: dict[str, dict[str, Any]] = {}
+        self.statuses: list[str] = []
+        self._topics: dict[int, str] = {}
+
+    async def receive(self, is_it: Callable[[str, int, Any], object]) -> tuple[str, int, Any]:
+        """The first message (topic, time, content) that is it; advertisements are noted meanwhile."""
+        while True:
+            got = await asyncio.wait_for(self._socket.receive(), LIMIT_S)
+            if got.type is aiohttp.WSMsgType.TEXT:
+                self._note(json.loads(got.data))
+                if is_it("", 0, None):
+                    return "", 0, None
+            elif got.type is aiohttp.WSMsgType.BINARY and got.data[0] == MESSAGE_DATA:
+                subscription, t_ns = struct.unpack_from("<IQ", got.data, 1)
+                topic, message = self._topics[subscription], json.loads(got.data[13:])
+                if is_it(topic, t_ns, message):
+                    return topic, t_ns, message
+            else:
+                assert got.type is aiohttp.WSMsgType.BINARY, got
+
+    async def wait_for_channel(self, topic: str) -> None:
+        if topic not in self.channels:
+            await self.receive(lambda *_: topic in self.channels)
+
+    async def subscribe(self, topic: str) -> None:
+        await self.wait_for_channel(topic)
+        number = len(self._topics) + 100
+        self._topics[number] = topic
+        wanted = [{"id": number, "channelId": self.channels[topic]["id"]}]
+        await self._socket.send_json({"op": "subscribe", "subscriptions": wanted})
+
+    def _note(self, told: dict[str, Any]) -> None:
+        if told["op"] == "advertise":
+            self.channels |= {channel["topic"]: channel for channel in told["channels"]}
+        elif told["op"] == "status":
+            self.statuses.append(told["message"])
+
+
+@asynccontextmanager
+async def connected(url: str) -> AsyncIterator[ProtocolClient]:
+    async with aiohttp.ClientSession() as session, session.ws_connect(url, protocols=(SUBPROTOCOL,)) as socket:
+        assert socket.protocol == SUBPROTOCOL
+        yield ProtocolClient(socket)
+
+
+def serve(notes: list[str]) -> FoxgloveServer:
+    return FoxgloveServer("127.0.0.1", 0, note=notes.append)
+
+
+def test_messages_reach_a_client_that_subscribed() -> None:
+    async def talk(server: FoxgloveServer) -> None:
+        channels = {channel.topic: channel for channel in DIALECT.samples(MessageFrames("bow"))}
+        events = DIALECT.events()
+        for channel in channels.values():
+            server.open(channel)
+        server.open(events)
+        server.open(events)
+        assert not server.is_looked_at
+        async with connected(server.url) as client:
+            await client.subscribe("/bow/attitude")
+            await client.subscribe("/events")
+            imu = client.channels["/bow/imu/data"]
+            assert (imu["encoding"], imu["schemaName"], imu["schemaEncoding"]) == ("json", "imud.Imu", "jsonschema")
+            assert json.loads(imu["schema"])["title"] == "imud.Imu"
+            while not server.is_looked_at:
+                await asyncio.sleep(0)
+            got: dict[str, Any] = {}
+            while len(got) < 2:
+                server.send(channels["/bow/attitude"], FULL, FULL.utc_ns)
+                server.send(channels["/bow/imu/data"], FULL, FULL.utc_ns)
+                server.send(events, StampedEvent(EVENT, UTC_NS), UTC_NS)
+                topic, t_ns, message = await client.receive(lambda *_: True)
+                if message is not None:
+                    assert t_ns == UTC_NS
+                    got[topic] = message
+            assert got["/bow/attitude"]["rotation"] == {"x": 0.5, "y": -0.5, "z": 0.5, "w": 0.5}
+            assert client.channels["/bow/attitude"]["schemaName"] == "foxglove.FrameTransform"
+            assert got["/events"]["message"] == 'loss: lost 3, "damaged"'
+            server.problem("no daemon")
+            await client.receive(lambda *_: client.statuses)
+            assert client.statuses == ["no daemon"]
+
+    notes: list[str] = []
+    with closing(serve(notes)) as server:
+        asyncio.run(talk(server))
+        server.problem("no daemon")
+        server.problem("")
+    assert notes == ["no daemon", "samples come again"]
+
+
+def test_a_port_that_is_taken_is_an_error_that_says_so() -> None:
+    with closing(serve([])) as server:
+        port = int(server.url.rpartition(":")[2])
+        with pytest.raises(ServerError, match=f"cannot listen on 127.0.0.1 port {port}"):
+            FoxgloveServer("127.0.0.1", port, note=print)
+
+
+def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
+    """A module on a line, the daemon, `imud foxglove`, and a client of the protocol."""
+
+    async def look(url: str, send: Callable[[], None]) -> tuple[int, Any]:
+        async with connected(url) as client:
+            await client.subscribe("/bow/imu/data")
+            while True:
+                send()
+                try:
+                    _, t_ns, message = await asyncio.wait_for(client.receive(lambda topic, *_: topic), 0.3)
+                except TimeoutError:
+                    continue
+                return t_ns, message
+
+    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
+        daemon.wait_for("bow", "searching")
+        port.send(1)
+        daemon.wait_for("bow", "running")
+        argv = [sys.executable, "-m", "imud", "foxglove", "--port", "0", "--rate", "0"]
+        argv += ["--socket", str(tmp_path / "imud.sock")]
+        with subprocess.Popen(argv, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stderr is not None
+            found = None
+            while found is None:
+                found = re.search(r"ws://\S+", process.stderr.readline())
+            t_ns, imu = asyncio.run(look(found[0], lambda: port.send(1)))
+            process.send_signal(signal.SIGTERM)
+            rest = process.communicate(timeout=LIMIT_S)[1]
+            assert process.returncode == 0, rest
+    assert imu["linear_acceleration"]["z"] == pytest.approx(9.8, abs=1e-6)
+    assert imu["frame_id"] == "bow"
+    assert t_ns == imu["timestamp"]["sec"] * 10**9 + imu["timestamp"]["nsec"]
+
+
+def test_another_address_is_said_loudly() -> None:
+    assert [command.is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "127.9.9.9")] == 4 * [True]
+    assert [command.is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.2", "gateway")] == 4 * [False]
+
+
+def test_the_warning_stands_before_the_first_sample(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("imud.cli.foxglove.relay.Relay.run", lambda _relay: None)
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        assert main(["foxglove", "--host", "0.0.0.0", "--port", "0"]) == 0
+        assert "WARNING: 0.0.0.0 is not a loopback address" in capsys.readouterr().err
+        assert main(["foxglove", "--port", "0"]) == 0
+        assert "WARNING" not in capsys.readouterr().err
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.mark.parametrize("words", [["--port", "70000"], ["--rate", "-1"], ["--rate", "nan"]])
+def test_arguments_out_of_range(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["foxglove", *words]) == 2
+    assert f"{words[0]}: expected" in capsys.readouterr().err
+
+
+def test_without_the_library_it_says_how_to_get_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    monkeypatch.delitem(sys.modules, "imud.cli.foxglove.server", raising=False)
+    assert main(["foxglove"]) == 2
+    assert "pip install 'imud[foxglove]'" in capsys.readouterr().err
