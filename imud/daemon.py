@@ -14,13 +14,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from time import thread_time_ns
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 from imud import __version__
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.contracts.lines import LineFactory
-from imud.contracts.publisher import Batch, DeviceLedger, Publisher, PublisherContext, PublisherSettings
+from imud.contracts.publisher import Batch, DeviceLedger, Publisher, PublisherContext
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ConfigError, ServerError
 from imud.event import Event, EventKind
@@ -33,6 +33,7 @@ from imud.runtime.device_factory import DeviceFactory
 from imud.runtime.latency.budget import LatencyBudget
 from imud.runtime.recording.tap import DeviceTaps
 from imud.signals.gpio import GPIO_LINES
+from imud.signals.watched_line import watching
 from imud.units import NS_PER_S
 
 log = logging.getLogger(__name__)
@@ -83,7 +84,7 @@ class Daemon:
         self._context = PublisherContext(
             self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns, self.ledgers,
             latencies=self._latencies, recording=DeviceTaps(self._devices, host), utc_offset_ns=host.utc_offset_ns,
-            raise_event=self._send_event,
+            raise_event=self._send_event, watch_line=watching(lines, host.now_ns),
         )  # fmt: skip
         self._extra = dict(extra or {})
         self._until_finished = until_finished
@@ -217,7 +218,7 @@ class Daemon:
 
     def _start_configured(self, name: str) -> None:
         settings = self.config.publishers[name]
-        if cast(PublisherSettings, settings).enabled:
+        if PUBLISHERS[name].wanted(settings):
             self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
 
     def _start_or_put_off(self, name: str) -> None:

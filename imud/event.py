@@ -30,7 +30,7 @@ class EventKind(StrEnum):
     ATTITUDE = "attitude"
     """Gravity contradicts the attitude or the mounting at rest; the message says what is likely wrong."""
     RECORDER = "recorder"
-    """The recorder stopped, for example because the disk is full, went on, or lost records."""
+    """The recorder stopped, for example because the disk is full, went on, lost records, or saved a snapshot."""
     BAD_FRAME = "bad-frame"
     """A damaged or unknown frame was heard. Sent at most once a second and device."""
 

@@ -227,6 +227,23 @@ class InputLine(Protocol):
         ...
 
 
+class WatchedInput(Protocol):
+    """An input that is kept open, and opened again after a failure. Synchronization: the loop's thread only."""
+
+    def tick(self, now_ns: int) -> None:
+        """Open the line if that is due. Call it at 10 Hz."""
+        ...
+
+    def close(self) -> None:
+        """Release the line; may be called twice."""
+        ...
+
+
+WatchLine = Callable[[InputSettings, str, OnEdges, Callable[[str], None]], WatchedInput]
+"""Makes one from its settings, a purpose for people, what gets rising edges, and what gets a message when the line
+fails for a new reason and when it is open again."""
+
+
 class OutputLine(Protocol):
     """An output. Synchronization: one thread at a time."""
 

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Final, Protocol
 
 from imud.contracts.action import Actions
 from imud.contracts.control.calibration import CalibrationResult, Calibrations
 from imud.contracts.control.recording import NothingRecorded, RecordingSource, TakeSnapshot
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
+from imud.contracts.lines import WatchedInput, WatchLine
 from imud.contracts.settings import Settings
 from imud.contracts.status import ClientStatus, DeviceStatus, OutputStatus, RecorderStatus
 from imud.errors import CommandError
@@ -136,6 +138,20 @@ def _no_device(name: str) -> DeviceControl:
     raise CommandError(f"{name}: no such device")
 
 
+class NoLine:
+    """Where there are no lines."""
+
+    def tick(self, now_ns: int) -> None:
+        """Ignore it."""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def _no_line(*_: object) -> WatchedInput:
+    return NoLine()
+
+
 class Latencies(Protocol):
     """Where consumers of samples ask for the latency they need: samples of a device may wait for the strictest."""
 
@@ -185,6 +201,8 @@ class PublisherContext:
     """A flight recorder adds a callable while it is open."""
     utc_offset_ns: Callable[[], int] = lambda: 0
     """CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    watch_line: WatchLine = _no_line
+    """Watches a GPIO line that belongs to no device."""
     raise_event: Callable[[Event], None] = lambda _event: None
     """Sends an event of the daemon itself to all publishers."""
     latencies: Latencies = field(default_factory=NoLatencies)
@@ -205,15 +223,6 @@ class PublisherContext:
         return [client for source in self.client_sources for client in source()]
 
 
-class PublisherSettings(Protocol):
-    """Settings that every publisher has; the daemon leaves out publishers that are not enabled."""
-
-    @property
-    def enabled(self) -> bool:
-        """Whether the publisher runs."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class PublisherType:
     """Row of a publisher."""
@@ -222,5 +231,7 @@ class PublisherType:
     """The top-level key in the configuration."""
     settings: type[Settings]
     make: Callable[[Any, PublisherContext], Publisher]
+    wanted: Callable[[Any], bool] = attrgetter("enabled")
+    """Whether there is anything to do with these settings."""
     required: bool = True
     """Whether the daemon ends when it cannot start at the beginning; otherwise it is tried again and again."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from imud.contracts.lines import Edge, InputLine, OnEdges
+from imud.contracts.lines import Edge, InputLine, InputSettings, LineFactory, OnEdges, WatchedInput, WatchLine
 from imud.errors import LinkError
 from imud.units import NS_PER_S
 
@@ -107,3 +107,12 @@ class WatchedLine:
         if str(error) != self.problem:
             self.problem = str(error)
             self._report(self.problem)
+
+
+def watching(lines: LineFactory, now_ns: Callable[[], int]) -> WatchLine:
+    """Return what keeps lines open that belong to no device."""
+
+    def watch(settings: InputSettings, purpose: str, on_edges: OnEdges, report: Callable[[str], None]) -> WatchedInput:
+        return WatchedLine(lines.make_input(settings, purpose, True), on_edges, lambda _level: None, report, now_ns)
+
+    return watch

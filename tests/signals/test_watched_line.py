@@ -2,10 +2,10 @@
 
 import asyncio
 
-from imud.contracts.lines import Edge
+from imud.contracts.lines import Edge, InputSettings
 from imud.errors import LinkBusy, LinkError, LinkMissing
-from imud.signals.watched_line import RETRY_NS, WatchedLine
-from imud.sim.ports.lines import MemoryInput
+from imud.signals.watched_line import RETRY_NS, WatchedLine, watching
+from imud.sim.ports.lines import MemoryInput, MemoryLines
 from tests.support.event_loops import VirtualClock, in_loop
 
 BUSY = LinkBusy("gpiochip0 line 3 is in use by gpiomon: stop that")
@@ -119,3 +119,22 @@ async def test_closing_is_no_failure_and_the_next_look_opens_again() -> None:
     assert it.reports == []
     it.watched.tick(1)
     assert it.line.is_open
+
+
+@in_loop
+async def test_a_line_of_no_device_is_kept_open_by_its_settings() -> None:
+    clock, edges, reports = VirtualClock(), list[Edge](), list[str]()
+    memory = MemoryLines(clock.now_ns)
+    watch = watching(memory.maker, clock.now_ns)
+    watched = watch(InputSettings(line="GPIO5"), "flight recorder", edges.extend, reports.append)
+    line = memory.inputs["flight recorder"]
+    line.open_error = BUSY
+    watched.tick(0)
+    assert reports == [str(BUSY)]
+    line.open_error = None
+    watched.tick(RETRY_NS)
+    line.pulse(10, 5)
+    await asyncio.sleep(0)
+    assert edges == [Edge(10, True, 1)]  # only rising ones are asked for
+    watched.close()
+    assert not line.is_open

@@ -84,6 +84,9 @@ def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
     yield "The daemon", "", General
     for name, publisher in TABLES.publishers.items():
         yield f"Output `{name}`", f"{name}.", publisher.settings
+        for field in msgspec.structs.fields(publisher.settings):
+            if isinstance(field.default, Settings):
+                yield f"Output `{name}`: `{field.name}`", f"{name}.{field.name}.", type(field.default)
     yield "Each device", "devices.NAME.", DeviceGeneral
     for name, link in TABLES.links.items():
         yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings
@@ -102,6 +105,8 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
         return "needed"
     default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+    if isinstance(default, Settings):
+        return "below"
     octal = field.name == "mode" and isinstance(default, int)
     return f"`{default:#o}`" if octal else f"`{shown(default)}`"
 
@@ -113,7 +118,8 @@ def settings_tables() -> str:
         text += [f"### {title}", "", "| key | expected | default | meaning |", "|---|---|---|---|"]
         docs = docs_of(schema)
         for field in msgspec.structs.fields(schema):
-            words = expected(field.type).replace("|", "\\|")
+            is_part = isinstance(field.default, Settings)
+            words = "keys and values" if is_part else expected(field.type).replace("|", "\\|")
             text.append(f"| `{path}{field.name}` | {words} | {default_of(field)} | {docs[field.name]} |")
         if not msgspec.structs.fields(schema):
             text.append("| (none) | | | |")

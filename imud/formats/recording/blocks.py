@@ -76,6 +76,15 @@ class ByteSource(Protocol):
         ...
 
 
+def renumbered(block: bytes, number: int) -> bytes:
+    """Return a whole block with another number."""
+    magic, method, _, plain, stored, _ = HEAD.unpack_from(block)
+    head = HEAD.pack(magic, method, number, plain, stored, 0)[:-_CRC_BYTES]
+    content = memoryview(block)[HEAD.size :]
+    crc = zlib.crc32(content, zlib.crc32(head))
+    return b"".join((head, crc.to_bytes(_CRC_BYTES, "little"), content))
+
+
 class BlockReader:
     """Reader of all whole blocks of a file, seekable or not. Iterate once.
 

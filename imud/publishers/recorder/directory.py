@@ -12,7 +12,9 @@ from typing import Final, NamedTuple
 from imud.units import NS_PER_S
 
 SUFFIX: Final = ".imudrec"
-NAME: Final = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{6}\.imudrec")
+SNAPSHOT: Final = "-snapshot"
+"""Ends the name of a snapshot, before the suffix."""
+NAME: Final = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{6}(-snapshot)?\.imudrec")
 """Files that the recorder makes, and only such are ever removed."""
 FILES_MAX: Final = 100_000
 """Files looked at in one directory."""
@@ -41,10 +43,13 @@ class RecordingDirectory:
         """Make the directory where it is missing. Raises OSError."""
         self.path.mkdir(mode=0o750, parents=True, exist_ok=True)
 
-    def new_file(self, utc_ns: int, epoch: int, number: int) -> Path:
-        """Return the path of the next file: names sort by time, those of one run of the daemon go together."""
+    def new_file(self, utc_ns: int, epoch: int, number: int, kind: str = "") -> Path:
+        """Return the path of the next file: names sort by time, those of one run of the daemon go together.
+
+        `kind` is SNAPSHOT for one, which are counted by themselves.
+        """
         begun = datetime.fromtimestamp(utc_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
-        return self.path / f"{begun}-{epoch & 0xFFFF_FFFF:08x}-{number:06d}{SUFFIX}"
+        return self.path / f"{begun}-{epoch & 0xFFFF_FFFF:08x}-{number:06d}{kind}{SUFFIX}"
 
     def files(self) -> list[RecordingFile]:
         """Return the recordings in the directory, oldest first. Raises OSError."""

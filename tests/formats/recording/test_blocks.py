@@ -11,7 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.errors import ImudError
-from imud.formats.recording.blocks import HEAD, MAGIC, PLAIN_MAX, BlockEncoder, BlockReader, check_begin, is_recording
+from imud.formats.recording.blocks import (
+    HEAD,
+    MAGIC,
+    PLAIN_MAX,
+    BlockEncoder,
+    BlockReader,
+    check_begin,
+    is_recording,
+    renumbered,
+)
 
 GOLDEN_HEAD = b"\x89imudREC" + b"\0" + b"\0\0\0" + b"\0\0\0\0" + b"\3\0\0\0" + b"\3\0\0\0"
 GOLDEN = GOLDEN_HEAD + zlib.crc32(GOLDEN_HEAD + b"abc").to_bytes(4, "little") + b"abc"
@@ -101,3 +110,11 @@ def test_what_a_recording_begins_with() -> None:
     assert is_recording(GOLDEN)
     with pytest.raises(ImudError, match=r"a\.csv is no recording of imud: expected"):
         check_begin(b"t_ns,accel", "a.csv")
+
+
+def test_a_block_with_another_number_is_whole() -> None:
+    encoder = BlockEncoder()
+    blocks = [encoder.encode(content) for content in (b"a", b"b" * 1000)]
+    found = list(BlockReader(io.BytesIO(renumbered(blocks[1], 0) + renumbered(blocks[0], 1))))
+    assert [(block.number, block.content) for block in found] == [(0, b"b" * 1000), (1, b"a")]
+    assert renumbered(blocks[1], 1) == blocks[1]

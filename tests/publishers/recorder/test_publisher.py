@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+import pytest
+
+from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.formats.recording.records import Kind
 from imud.publishers.recorder.publisher import PUBLISHER
-from imud.publishers.recorder.settings import RecorderSettings
+from imud.publishers.recorder.settings import FlightSettings, RecorderSettings
 from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in
+from tests.support.socket_rig import batch
 
 
 def test_files_are_written(tmp_path: Path) -> None:
@@ -19,3 +23,37 @@ def test_files_are_written(tmp_path: Path) -> None:
     made.close()
     (file,) = (tmp_path / "a").iterdir()
     assert {Kind.SESSION, Kind.DEVICE, Kind.EVENT, Kind.END} <= set(kinds_in(file))
+
+
+def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_path: Path) -> None:
+    bench = RecordingBench()
+    flight = FlightSettings(enabled=True, acceleration_m_s2=1, after_s=0)
+    for enabled in (True, False):
+        settings = RecorderSettings(enabled=enabled, directory=str(tmp_path / str(enabled)), flight=flight)
+        made = PUBLISHER.make(settings, bench.context)
+        made.start()
+        made.add_device("imu0", 0)
+        made.tick(bench.advance(0.1))
+        made.publish(batch("imu0"))
+        made.remove_device("imu0")
+        made.close()
+        made.close()
+    ends = [sorted(file.name.split("-", 2)[2] for file in (tmp_path / str(one)).iterdir()) for one in (True, False)]
+    assert ends == [["000000-snapshot.imudrec", "000000.imudrec"], ["000000-snapshot.imudrec"]]
+
+
+def test_it_is_wanted_for_either() -> None:
+    assert not PUBLISHER.wanted(RecorderSettings())
+    assert PUBLISHER.wanted(RecorderSettings(enabled=True))
+    assert PUBLISHER.wanted(RecorderSettings(flight=FlightSettings(enabled=True)))
+
+
+def test_where_one_cannot_start_nothing_runs(tmp_path: Path) -> None:
+    bench = RecordingBench()
+    (tmp_path / "file").write_bytes(b"")
+    flight = FlightSettings(enabled=True, directory=str(tmp_path / "file" / "no"))
+    made = PUBLISHER.make(RecorderSettings(enabled=True, directory=str(tmp_path / "a"), flight=flight), bench.context)
+    with pytest.raises(ServerError):
+        made.start()
+    assert bench.context.recorder_sources == []
+    assert bench.context.snapshots == []

@@ -1,0 +1,253 @@
+"""The flight recorder: what it keeps, which alerts are saved, and what it says of it."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.contracts.lines import Edge, InputSettings, OnEdges
+from imud.contracts.publisher import Batch, NoLine
+from imud.errors import ServerError
+from imud.event import Event, EventKind
+from imud.formats.recording import records
+from imud.formats.recording.file import RecordingReader
+from imud.formats.recording.records import EndRecord, Kind, SessionRecord, decode_object
+from imud.publishers.recorder.directory import RecordingDirectory
+from imud.publishers.recorder.flight import RETRY_NS, SENDS_MAX, FlightRecorder
+from imud.publishers.recorder.settings import FlightSettings, RecorderSettings
+from imud.publishers.recorder.stream import stream_pair
+from imud.units import NS_PER_S
+from tests.publishers.recorder.recording_bench import RecordingBench, records_in
+from tests.support.socket_rig import sample
+
+
+class FlightBench(RecordingBench):
+    """A flight recorder whose thread, time and line are the test's."""
+
+    def __init__(self, folder: Path, devices: list[str] | None = None, **flight: Any) -> None:
+        super().__init__()
+        self.folder = folder / "recordings"
+        settings = RecorderSettings(
+            directory=str(self.folder), devices=devices,
+            flight=FlightSettings(**{"enabled": True, "minutes": 1, "after_s": 10, **flight}),
+        )  # fmt: skip
+        self.edges: list[OnEdges] = []
+        self.reports: list[Callable[[str], None]] = []
+        object.__setattr__(self.context, "watch_line", self._watch)
+        directory = RecordingDirectory(self.folder, settings.keep_bytes)
+        self.flight = FlightRecorder(settings, self.context, directory, self.start_worker)
+        self.flight.start()
+        self.tick()
+
+    def _watch(
+        self, _settings: InputSettings, purpose: str, on_edges: OnEdges, report: Callable[[str], None]
+    ) -> NoLine:
+        assert purpose == "flight recorder"
+        self.edges.append(on_edges)
+        self.reports.append(report)
+        return NoLine()
+
+    def tick(self, seconds: float = 0.1) -> None:
+        """Time passes in steps of at most a second, each with a tick, a round of the thread, and a record."""
+        while seconds > 0:
+            self.source.deliver()
+            self.flight.tick(self.advance(min(seconds, 1.0)))
+            self.workers[0].work()
+            seconds -= 1.0
+        self.flight.tick(self.clock.now_ns())
+
+    def publish(self, device: str, *accelerations_m_s2: float | None) -> None:
+        samples = [
+            sample(device, seq) if a is None else _with_acceleration(device, seq, a)
+            for seq, a in enumerate(accelerations_m_s2, 1)
+        ]
+        self.flight.publish(Batch(device, 0, samples))
+
+    @property
+    def files(self) -> Sequence[Path]:
+        return sorted(self.folder.iterdir())
+
+    @property
+    def messages(self) -> list[str]:
+        return [event.message for event in self.events]
+
+
+def _with_acceleration(device: str, seq: int, a_m_s2: float) -> Any:
+    from msgspec.structs import replace
+
+    return replace(sample(device, seq), accel_m_s2=(0.0, -a_m_s2 * 0.6, a_m_s2 * 0.8))
+
+
+def span_s(path: Path) -> float:
+    """From the begin of the oldest segment to the end."""
+    found = records_in(path)
+    begun, end = decode_object(found[0], SessionRecord), decode_object(found[-1], EndRecord)
+    return float(end.t_ns - begun.t_ns) / NS_PER_S
+
+
+def test_an_acceleration_over_the_bound_is_saved_with_what_came_before_and_after(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path, acceleration_m_s2=50)
+    bench.tick(150)
+    bench.publish("bow", 49.9, 9.8, float("nan"))
+    bench.tick(20)
+    assert bench.files == []
+    bench.publish("bow", 9.8, 51.5, 60.0)
+    bench.tick(9)
+    assert bench.files == []
+    bench.tick(3)
+    (file,) = bench.files
+    assert file.name.endswith("-000000-snapshot.imudrec")
+    assert 69 <= span_s(file) <= 79  # 60 s before, 10 s after, and up to a segment of 5 s
+    found = records_in(file)
+    assert decode_object(found[-1], EndRecord).reason == "|a| of bow was 51.5 m/s²"
+    kinds = [one.kind for one in found]
+    assert kinds[:4] == [Kind.SESSION, Kind.CALL, Kind.DEVICE, Kind.DEVICE]
+    assert kinds[-3:] == [Kind.CHECK, Kind.CHECK, Kind.END]
+    assert kinds.count(Kind.SESSION) == 1
+    (event,) = bench.events
+    assert (event.kind, event.device) == (EventKind.RECORDER, "bow")
+    assert event.message == f"saved {file}: |a| of bow was 51.5 m/s²"
+    assert event.detail == {"file": str(file), "bytes": file.stat().st_size}
+    bench.flight.close()
+    assert bench.source.listening == []
+    assert bench.context.snapshots == []
+
+
+def test_a_device_that_is_lost_is_an_alert_unless_it_is_not_recorded(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path, devices=["bow"], after_s=0)
+    for device, kind in (("mast", EventKind.DOWN), ("bow", EventKind.UP), ("bow", EventKind.LOSS)):
+        bench.flight.event(Event(1, device, kind, ""))
+    bench.publish("bow", 1e6)  # without a bound
+    bench.tick(2)
+    assert bench.files == []
+    bench.flight.event(Event(1, "bow", EventKind.DOWN, "the adapter was pulled out"))
+    bench.tick(2)
+    (file,) = bench.files
+    assert bench.messages == [f"saved {file}: bow is lost: the adapter was pulled out"]
+    assert Kind.EVENT in [one.kind for one in records_in(file)]
+    bench.flight.close()
+    ignoring = FlightBench(tmp_path / "b", device_lost=False, after_s=0)
+    ignoring.flight.event(Event(1, "bow", EventKind.DOWN, ""))
+    ignoring.tick(2)
+    assert ignoring.files == []
+    ignoring.flight.close()
+
+
+def test_a_line_that_becomes_active_is_an_alert(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path, line=InputSettings(line="GPIO5"), after_s=0)
+    bench.edges[0]([Edge(1, False, 1)])
+    bench.tick(2)
+    assert bench.files == []
+    bench.edges[0]([Edge(1, True, 2), Edge(2, False, 3)])
+    bench.tick(2)
+    (file,) = bench.files
+    bench.reports[0]("no line GPIO5")
+    assert bench.messages == [
+        f"saved {file}: the line of the flight recorder became active", "flight recorder: its line: no line GPIO5"
+    ]  # fmt: skip
+    bench.flight.close()
+
+
+def test_a_storm_of_alerts_does_not_fill_the_disk(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path, acceleration_m_s2=1, after_s=1, per_hour=3)
+    for _ in range(100):
+        bench.publish("bow", 9.8, 9.8)
+        bench.tick(1)
+    assert len(bench.files) == 3
+    assert sum("not saved: |a| of bow was 9.8 m/s²; 3 snapshots were within an hour" in m for m in bench.messages) == 1
+    assert len(bench.messages) == 4
+    bench.flight.close()
+
+
+def test_an_alert_that_waits_is_saved_when_imud_stops_and_the_memory_is_given_back(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path, acceleration_m_s2=50, directory=str(tmp_path / "flight"))
+    bench.tick(12)
+    assert len(list((tmp_path / "flight").iterdir())) >= 2
+    bench.publish("bow", 51.5)
+    bench.flight.close()
+    (file,) = bench.files
+    assert bench.messages == [f"saved {file}: |a| of bow was 51.5 m/s²"]
+    assert 11 <= span_s(file) <= 13
+    assert list((tmp_path / "flight").iterdir()) == []
+    bench.flight.close()
+
+
+def test_what_a_killed_imud_left_is_saved_at_the_next_start(tmp_path: Path) -> None:
+    killed = FlightBench(tmp_path, directory=str(tmp_path / "flight"))
+    killed.tick(12)
+    bench = FlightBench(tmp_path, directory=str(tmp_path / "flight"))
+    (file,) = bench.files
+    assert file.name.endswith("-000000-snapshot.imudrec")
+    with file.open("rb") as opened:
+        reader = RecordingReader(opened, "")
+        found = list(reader)
+    assert not reader.is_damaged
+    assert not reader.ended
+    assert sum(one.kind == Kind.DATA for one in found) >= 10
+    assert bench.messages == [f"saved {file}: an imud that was killed left it"]
+    bench.flight.close()
+    killed.flight.close()
+
+
+def test_a_client_gets_what_there_is(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path)
+    bench.tick(30)
+    ours, theirs = stream_pair()
+    assert 29 < bench.context.snapshots[0](ours) < 31
+    bench.workers[0].work()
+    with theirs, theirs.makefile("rb") as file:
+        reader = RecordingReader(file, "")
+        kinds = [one.kind for one in reader]
+    assert reader.problems == []
+    assert (kinds[0], kinds[-1]) == (Kind.SESSION, Kind.END)
+    assert kinds.count(Kind.DATA) >= 28
+    pairs = [stream_pair() for _ in range(SENDS_MAX + 1)]
+    for ours, _ in pairs[:-1]:
+        bench.flight.snapshot(ours)
+    with pytest.raises(ServerError, match="4 clients get a snapshot at present"):
+        bench.flight.snapshot(pairs[-1][0])
+    bench.flight.close()
+    for pair in pairs:
+        for sock in pair:
+            sock.close()
+
+
+def test_where_nothing_is_kept_that_is_told_once_and_tried_again(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    bench = FlightBench(tmp_path, directory=str(folder))
+    folder.rename(tmp_path / "elsewhere")
+    bench.tick(12)
+    assert bench.messages == ["flight recorder: nothing is kept: No such file or directory"]
+    ours, theirs = stream_pair()
+    with ours, theirs, pytest.raises(ServerError, match="nothing is kept: No such file"):
+        bench.flight.snapshot(ours)
+    folder.mkdir()
+    bench.tick(RETRY_NS / NS_PER_S)
+    assert bench.messages[1:] == [
+        "flight recorder: keeping again; it was not possible before: No such file or directory"
+    ]
+    bench.tick(5)
+    assert len(list(folder.iterdir())) >= 1
+    bench.flight.close()
+
+
+def test_directories_that_cannot_be_made_are_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"")
+    with pytest.raises(ServerError, match="flight recorder"):
+        FlightBench(tmp_path, directory=str(tmp_path / "a" / "b"))
+
+
+def test_a_mistake_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path)
+    bench.workers[0].failed(ZeroDivisionError("a mistake"))
+    with pytest.raises(ZeroDivisionError):
+        bench.flight.tick(0)
+    bench.flight.close()
+
+
+def test_a_budget_without_room_for_a_snapshot_is_refused() -> None:
+    with pytest.raises(ValueError, match="room for a snapshot"):
+        RecorderSettings(keep_gb=0.25, enabled=True, flight=FlightSettings(enabled=True))
+    RecorderSettings(keep_gb=0.25, flight=FlightSettings(enabled=True))
+    assert records.VERSION == 1

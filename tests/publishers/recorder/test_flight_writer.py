@@ -1,0 +1,183 @@
+"""The thread of the flight recorder: snapshots to files and to clients, whatever disk and clients do."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from imud.formats.recording import records
+from imud.formats.recording.records import NO_DEVICE, EndRecord, Kind, SessionRecord
+from imud.publishers.recorder.directory import RecordingDirectory
+from imud.publishers.recorder.flight_writer import FlightWriter, Mark, Rescue, Save, Send
+from imud.publishers.recorder.segments import SegmentBegin, SegmentRing
+from imud.publishers.recorder.stream import LINGER_NS, stream_pair
+from imud.publishers.recorder.writer import RecordQueue
+from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in, records_in
+
+END = records.encode_object(Kind.END, NO_DEVICE, EndRecord(9, 9, "a blow"))
+SESSION = records.encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(1, "", "", "", 7, 0, 1, 1))
+
+
+class FlightWriterBench(RecordingBench):
+    """The thread, whose rounds the test calls."""
+
+    def __init__(self, folder: Path, keep_bytes: int = 1 << 30) -> None:
+        super().__init__()
+        self.folder = folder / "recordings"
+        self.queue = RecordQueue[Mark]()
+        self.ring = SegmentRing(1 << 30)
+        directory = RecordingDirectory(self.folder, keep_bytes)
+        self.writer = FlightWriter(self.queue, self.ring, directory, self.clock.now_ns, self.start_worker)
+
+    def begin(self, path: Path | None = None) -> None:
+        self.queue.mark(SegmentBegin(self.advance(1), SESSION, path, 0))
+
+    def put(self, number: int, size: int = 50) -> None:
+        self.queue.put(records.encode_data(number, os.urandom(size), 1, -1))
+
+    def work(self) -> int:
+        return self.workers[0].work()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[FlightWriterBench]:
+    made = FlightWriterBench(tmp_path)
+    yield made
+    made.writer.close()
+
+
+def test_a_snapshot_has_all_that_came_before_it_and_nothing_after(bench: FlightWriterBench) -> None:
+    path = bench.folder / "a"
+    bench.begin()
+    bench.put(0)
+    bench.begin()
+    bench.put(1)
+    bench.queue.mark(Save(path, END))
+    bench.put(2)
+    bench.work()
+    (saved,) = bench.writer.saved
+    assert (saved.path, saved.bytes, saved.problem) == (path, path.stat().st_size, "")
+    assert [(one.kind, one.device) for one in records_in(path)] == [
+        (Kind.SESSION, NO_DEVICE), (Kind.DATA, 0), (Kind.DATA, 1), (Kind.END, NO_DEVICE)
+    ]  # fmt: skip
+    bench.queue.mark(Save(bench.folder / "b", END))
+    bench.work()
+    assert [one.device for one in records_in(bench.folder / "b") if one.kind == Kind.DATA] == [0, 1, 2]
+
+
+def test_a_client_gets_it_piece_by_piece_and_the_others_do_not_wait(bench: FlightWriterBench, tmp_path: Path) -> None:
+    ours, theirs = stream_pair()
+    bench.begin()
+    for number in range(40):
+        bench.put(number, 200_000)
+    bench.queue.mark(Send(ours, END))
+    assert bench.work() < LINGER_NS
+    assert bench.writer.sends_ended == 0
+    bench.queue.mark(Save(bench.folder / "a", END))
+    bench.begin()
+    got, theirs_file = tmp_path / "got", theirs.makefile("rb")
+    theirs.setblocking(False)
+    with got.open("wb") as out:
+        while not bench.writer.sends_ended:
+            bench.work()
+            while piece := theirs_file.read(1 << 20):
+                out.write(piece)
+        while piece := theirs_file.read(1 << 20):
+            out.write(piece)
+    assert got.read_bytes() == (bench.folder / "a").read_bytes()
+    assert kinds_in(got).count(Kind.DATA) == 40
+    theirs_file.close()
+    theirs.close()
+
+
+def test_clients_that_close_or_take_nothing_are_given_up(bench: FlightWriterBench) -> None:
+    bench.begin()
+    for number in range(40):
+        bench.put(number, 200_000)
+    gone, silent = stream_pair(), stream_pair()
+    gone[1].close()
+    bench.queue.mark(Send(gone[0], END))
+    bench.queue.mark(Send(silent[0], END))
+    bench.work()
+    assert bench.writer.sends_ended == 1
+    bench.advance(LINGER_NS / 1e9)
+    bench.work()
+    assert bench.writer.sends_ended == 2
+    silent[1].close()
+
+
+def test_a_full_disk_leaves_no_part_of_a_snapshot(bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.begin()
+    bench.put(0)
+    bench.work()
+    write = os.write
+
+    def full(descriptor: int, data: bytes) -> int:
+        if "recordings" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            raise OSError(28, "No space left on device")
+        return write(descriptor, data)
+
+    monkeypatch.setattr(os, "write", full)
+    bench.queue.mark(Save(bench.folder / "a", END))
+    bench.work()
+    assert [saved.problem for saved in bench.writer.saved] == ["No space left on device"]
+    assert list(bench.folder.iterdir()) == []
+    assert bench.writer.problem == ""
+    monkeypatch.undo()
+    bench.queue.mark(Save(bench.folder / "b", END))
+    bench.work()
+    assert bench.writer.saved[1].problem == ""
+
+
+def test_where_nothing_can_be_kept_nothing_is_saved_until_a_segment_begins(
+    bench: FlightWriterBench, tmp_path: Path
+) -> None:
+    bench.begin(tmp_path / "no" / "folder")
+    bench.put(0)
+    bench.queue.mark(Save(bench.folder / "a", END))
+    bench.work()
+    assert bench.writer.problem == "No such file or directory"
+    assert [saved.problem for saved in bench.writer.saved] == ["nothing was kept"]
+    assert list(bench.folder.iterdir()) == []
+    bench.begin()
+    bench.put(1)
+    bench.queue.mark(Save(bench.folder / "b", END))
+    bench.work()
+    assert bench.writer.problem == ""
+    assert kinds_in(bench.folder / "b") == [Kind.SESSION, Kind.DATA, Kind.END]
+
+
+def test_snapshots_keep_within_the_budget(tmp_path: Path) -> None:
+    bench = FlightWriterBench(tmp_path, keep_bytes=100_000)
+    for number in range(5):
+        bench.begin()
+        bench.put(number, 30_000)
+        path = bench.folder / f"20251121T09314{number}Z-000000ab-00000{number}-snapshot.imudrec"
+        bench.ring.clear()
+        bench.queue.mark(Save(path, END))
+        bench.work()
+        assert sum(file.stat().st_size for file in bench.folder.iterdir()) <= 100_000
+    assert len(list(bench.folder.iterdir())) == 3 - 1 + 1
+    bench.writer.close()
+
+
+def test_what_was_left_is_saved_and_removed_or_stays(
+    bench: FlightWriterBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [tmp_path / "000", tmp_path / "001"]
+    for number, file in enumerate(files):
+        bench.begin(file)
+        bench.put(number)
+    bench.work()
+    bench.folder.mkdir()
+    (bench.folder / "a").write_bytes(b"taken")
+    bench.queue.mark(Rescue(bench.folder / "a", files))
+    bench.work()
+    assert bench.writer.saved[0].problem == "File exists"
+    assert all(file.exists() for file in files)
+    bench.queue.mark(Rescue(bench.folder / "b", files))
+    bench.work()
+    assert bench.writer.saved[1].problem == ""
+    assert not any(file.exists() for file in files)
+    assert (bench.folder / "b").stat().st_size > 100
