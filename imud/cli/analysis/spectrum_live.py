@@ -14,7 +14,7 @@ from imud.analysis.series import FloatArray
 from imud.analysis.spectrum import Spectrum
 from imud.analysis.spectrum_plots import SensorVibration
 from imud.cli.analysis.spectrum_report import SpectrumSettings, peak_lines, sensor_vibration
-from imud.cli.analysis.taking import SILENCE_S, Collector, status_of
+from imud.cli.analysis.taking import LATENCY_MS, SILENCE_S, Collector, status_of
 from imud.cli.arguments import connect, statuses
 from imud.cli.output import COLUMNS, shortened
 from imud.contracts.sensors.data_sheet import SensorName
@@ -23,7 +23,7 @@ from imud.units import NS_PER_S
 
 REDRAW_S: Final = 1.0
 KEPT_S: Final = 10.0
-"""The spectrum is of so much: a line of 0.1 Hz more or less is seen."""
+"""The spectrum is of so much: a longer past would hide what changes."""
 PAST_ROWS: Final = 8
 """Rows of the spectrogram."""
 HEIGHT: Final = 8
@@ -44,7 +44,7 @@ def live(args: argparse.Namespace, settings: SpectrumSettings) -> int:
         view = LiveView(args.input, name)
         drawn_s = monotonic()
         with suppress(KeyboardInterrupt):
-            for sample in listening.watch([args.input], timeout_s=SILENCE_S):
+            for sample in listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS):
                 collector.add(sample)
                 if monotonic() - drawn_s >= REDRAW_S:
                     drawn_s = monotonic()
@@ -77,7 +77,7 @@ class LiveView:
     def _lines(self, sensor: SensorVibration) -> list[str]:
         columns = in_columns(sensor.spectrum)
         decibels = 10 * np.log10(np.maximum(columns, 1e-300))
-        top = float(np.ceil(decibels.max() / 10) * 10)
+        top = 10 * int(np.ceil(decibels.max() / 10))
         level = np.clip((decibels - top + RANGE_DB) / RANGE_DB, 0, 1)
         self._past.appendleft("".join(SHADES[min(int(one * len(SHADES)), len(SHADES) - 1)] for one in level))
         grid, spectrum = sensor.grid, sensor.spectrum
@@ -87,7 +87,7 @@ class LiveView:
         )
         unit = f"dB of ({SI[self._name]})²/Hz"
         return [
-            head, f"{top:.0f} {unit}", *curve_rows(level), axis_line(spectrum.rate_hz / 2),
+            head, f"{top} {unit}", *curve_rows(level), axis_line(spectrum.rate_hz / 2),
             f"{top - RANGE_DB:.0f} {unit}; the last {len(self._past)} s, newest above:", *self._past,
             f"lines, peak amplitude in {SI[self._name]}",
             *peak_lines(sensor)[: PEAKS_SHOWN + 1],

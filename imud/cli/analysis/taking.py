@@ -38,6 +38,8 @@ SAMPLES_MOST: Final = 20_000_000
 """14 hours at 400 Hz; they take 1.3 GB, and the analysis as much again."""
 SILENCE_S: Final = 5.0
 """A live device that sends nothing for so long is named."""
+LATENCY_MS: Final = 200.0
+"""Samples of a live device may come so late, several at once: an analysis costs the daemon little then."""
 NOTE_S: Final = 1.0
 """Time between two notes of progress."""
 _NONE3: Final = (nan, nan, nan)
@@ -278,7 +280,7 @@ def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lam
     with connect(args) as asking, connect(args) as listening:
         before = status_of(statuses(asking), args.input)
         collector = Collector(args.input, skip_s=args.skip or 0.0, for_s=args.duration)
-        samples = listening.watch([args.input], timeout_s=SILENCE_S)
+        samples = listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS)
         begun = noted = monotonic()
         with suppress(KeyboardInterrupt):
             for sample in samples:
@@ -310,6 +312,6 @@ def taken_of(status: DeviceStatus, socket: str) -> Taken:
 
 
 def progress(passed_s: float, count: int) -> None:
-    """Say on a terminal how far it is."""
+    """Say on a terminal how far it is, in a line that the next one replaces."""
     if sys.stderr.isatty():
-        print(f"\r{passed_s:.0f} s, {count} samples", end="", file=sys.stderr, flush=True)
+        print(f"{passed_s:.0f} s, {count} samples", end="\r", file=sys.stderr, flush=True)
