@@ -13,8 +13,9 @@ from textual.widgets import Footer, Input, Label, OptionList, RichLog, Sparkline
 from textual.widgets.option_list import Option
 
 from imud.cli.status import WELL, block
-from imud.cli.top.history import CURVES, DeviceHistory, Fleet, News
+from imud.cli.top.history import CURVES, DeviceHistory, Fleet
 from imud.cli.top.rows import SORTS, TEXT_MAX, VIEWS, chosen, head, row
+from imud.client.feed import News
 from imud.event import Event
 from imud.log import printable
 from imud.units import NS_PER_S

@@ -1,4 +1,4 @@
-"""What `imud top` gets from the daemon and keeps of each device: its newest status, its samples of the last while."""
+"""What `imud top` keeps of each device: its newest status, its samples of the last while."""
 
 import math
 from collections import deque
@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple
 
 from imud.contracts.status import DeviceStatus
-from imud.event import Event
 from imud.sample import Sample, Vector3
 from imud.units import NS_PER_S, RAD_PER_DEG, T_PER_UT
 
@@ -14,21 +13,6 @@ POINTS_MAX: Final = 1200
 """Samples kept of a device: a minute at 20 Hz."""
 SPAN_NS: Final = 60 * NS_PER_S
 """Older samples are not shown."""
-
-
-class News(NamedTuple):
-    """What happened since the news before."""
-
-    problem: str = ""
-    """Why there is no daemon now; empty while there is one."""
-    statuses: tuple[DeviceStatus, ...] | None = None
-    """None where it was not asked for."""
-    clients: int = 0
-    """Of the daemon, with `statuses`."""
-    now_ns: int = 0
-    """CLOCK_MONOTONIC."""
-    samples: tuple[Sample, ...] = ()
-    events: tuple[Event, ...] = ()
 
 
 class Curve(NamedTuple):

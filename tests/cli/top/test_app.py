@@ -10,8 +10,8 @@ import pytest
 from textual.pilot import Pilot
 
 from imud.cli.top.app import DevicePage, NewsCame, Overview, TopApp, event_line
-from imud.cli.top.command import Feed
-from imud.cli.top.history import News
+from imud.cli.top.command import TopFeed
+from imud.client.feed import News
 from imud.contracts.status import DeviceState
 from imud.event import Event, EventKind
 from tests.support.metrics import device
@@ -181,7 +181,7 @@ def test_without_a_daemon_it_says_so_and_tries_again(tmp_path: Path) -> None:
             await asyncio.sleep(0.05)
         pytest.fail(f"expected the reason, got {lines(app)[0]!r}")
 
-    play(steps, lambda on_news: Feed(str(tmp_path / "nobody"), on_news))
+    play(steps, lambda on_news: TopFeed(str(tmp_path / "nobody"), on_news))
 
 
 def test_what_a_device_sends_cannot_write_to_the_terminal() -> None:

@@ -1,4 +1,4 @@
-"""The thread that reads the daemon for `imud top`, and the command where it cannot run."""
+"""What `imud top` reads of the daemon, and the command where it cannot run."""
 
 import sys
 from collections.abc import Callable
@@ -8,8 +8,8 @@ from queue import Queue
 import pytest
 
 from imud.cli import main
-from imud.cli.top.command import Feed
-from imud.cli.top.history import News
+from imud.cli.top.command import TopFeed
+from imud.client.feed import News
 from imud.event import Event, EventKind
 from tests.support.socket_rig import batch, daemon
 
@@ -32,7 +32,7 @@ class Listener:
 def test_status_samples_and_events_come(tmp_path: Path) -> None:
     heard = Listener()
     with daemon(tmp_path) as served:
-        feed = Feed(str(served.path), heard.on_news)
+        feed = TopFeed(str(served.path), heard.on_news)
         feed.start()
         first = heard.wait_for(lambda news: news.statuses)
         assert first.statuses is not None
@@ -50,14 +50,14 @@ def test_status_samples_and_events_come(tmp_path: Path) -> None:
 def test_the_page_of_a_device_gets_samples_of_it_only_until_the_overview_is_shown_again(tmp_path: Path) -> None:
     heard = Listener()
     with daemon(tmp_path) as served:
-        feed = Feed(str(served.path), heard.on_news)
+        feed = TopFeed(str(served.path), heard.on_news)
         feed.look_at("imu1")
         feed.start()
         heard.wait_for(lambda news: news.statuses)
         served.do(lambda server: server.publish(batch("imu0", 1)))
         served.do(lambda server: server.publish(batch("imu1", 2)))
         assert {one.device for one in heard.wait_for(lambda news: news.samples).samples} == {"imu1"}
-        feed.look_at("gone")  # not in the configuration: all devices
+        feed.look_at(None)
         heard.wait_for(lambda news: news.now_ns)
         heard.wait_for(lambda news: news.now_ns)
         served.do(lambda server: server.publish(batch("imu0", 3)))
@@ -69,7 +69,7 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
     heard = Listener()
     with daemon(tmp_path) as served:
         path = str(served.path)
-        feed = Feed(path, heard.on_news)
+        feed = TopFeed(path, heard.on_news)
         feed.start()
         heard.wait_for(lambda news: news.statuses)
     assert path in heard.wait_for(lambda news: news.problem).problem

@@ -1,0 +1,120 @@
+"""The thread that reads the daemon for views."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Queue
+
+from imud.client.feed import Feed, News, Wish
+from imud.event import Event, EventKind
+from tests.support.socket_rig import Daemon, batch, daemon
+
+LIMIT_S = 10.0
+OVERVIEW = Wish((), news_s=0.02, newest=True, newest_s=0.02)
+
+
+class Listener:
+    """Takes news; the test waits for what it needs."""
+
+    def __init__(self) -> None:
+        self._news: Queue[News] = Queue()
+        self.on_news = self._news.put
+
+    def wait_for(self, is_there: Callable[[News], object]) -> News:
+        while not is_there(news := self._news.get(timeout=LIMIT_S)):
+            pass
+        return news
+
+
+@contextmanager
+def feeding(path: str, wanted: Wish | None) -> Iterator[tuple[Feed, Listener]]:
+    heard = Listener()
+    feed = Feed(path, heard.on_news, wanted)
+    feed.start()
+    try:
+        yield feed, heard
+    finally:
+        feed.close()
+
+
+def clients(served: Daemon) -> int:
+    return served.do(lambda server: len(server.hub.connections))
+
+
+def until(condition: Callable[[], object], heard: Listener) -> None:
+    """Look again with each piece of news until something is so."""
+    while not condition():
+        heard.wait_for(lambda news: True)
+
+
+def test_the_first_news_have_the_greeting_and_every_sample_comes(tmp_path: Path) -> None:
+    with daemon(tmp_path) as served, feeding(str(served.path), Wish(("imu0",), news_s=0.02)) as (_, heard):
+        first = heard.wait_for(lambda news: news.statuses)
+        assert first.hello is not None
+        assert first.hello.epoch == 4886718345
+        served.do(lambda server: server.publish(batch("imu1", 1)))
+        served.do(lambda server: server.publish(batch("imu0", 1, 50)))
+        found: list[int] = []
+        while len(found) < 50:
+            news = heard.wait_for(lambda news: news.samples)
+            assert {sample.device for sample in news.samples} == {"imu0"}
+            assert news.hello is None
+            found += [sample.seq for sample in news.samples]
+        assert found == [*range(1, 51)]
+
+
+def test_there_is_no_connection_while_nothing_is_wanted(tmp_path: Path) -> None:
+    with daemon(tmp_path) as served, feeding(str(served.path), None) as (feed, heard):
+        assert clients(served) == 0
+        feed.want(OVERVIEW)
+        heard.wait_for(lambda news: news.statuses)
+        assert clients(served) == 1
+        feed.want(None)
+        while clients(served):
+            pass
+        feed.want(OVERVIEW)
+        assert heard.wait_for(lambda news: news.hello).hello is not None
+
+
+def test_newest_samples_and_events_come_without_a_watch(tmp_path: Path) -> None:
+    with daemon(tmp_path) as served, feeding(str(served.path), OVERVIEW) as (_, heard):
+        heard.wait_for(lambda news: news.statuses)
+        served.do(lambda server: server.publish(batch("imu1", 7)))
+        news = heard.wait_for(lambda news: news.newest)
+        assert news.newest is not None
+        assert [(one.device, one.seq) for one in news.newest] == [("imu1", 7)]
+        assert not news.samples
+        served.do(lambda server: server.event(Event(5, "imu1", EventKind.UP, "is there")))
+        served.do(lambda server: server.event(Event(6, "imu1", EventKind.DOWN, "is not there")))
+        found: list[str] = []
+        while len(found) < 2:
+            found += [event.message for event in heard.wait_for(lambda news: news.events).events]
+        assert found == ["is there", "is not there"]
+
+
+def test_a_device_that_the_daemon_does_not_have_is_left_out(tmp_path: Path) -> None:
+    with daemon(tmp_path) as served, feeding(str(served.path), Wish(("gone",), news_s=0.02)) as (feed, heard):
+        assert not heard.wait_for(lambda news: news.statuses).problem
+        feed.want(Wish(("gone", "imu1"), news_s=0.03))
+        numbers = iter(range(1, 10_000))
+        served.do(lambda server: server.publish(batch("imu1", next(numbers))))
+
+        def came() -> bool:
+            served.do(lambda server: server.publish(batch("imu1", next(numbers))))
+            return bool(heard.wait_for(lambda news: True).samples)
+
+        until(came, heard)
+
+
+def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> None:
+    with daemon(tmp_path) as served:
+        path = str(served.path)
+        heard = Listener()
+        feed = Feed(path, heard.on_news, OVERVIEW)
+        feed.start()
+        heard.wait_for(lambda news: news.statuses)
+    assert path in heard.wait_for(lambda news: news.problem).problem
+    with daemon(tmp_path):
+        assert heard.wait_for(lambda news: news.hello).statuses
+        feed.close()
+        feed.close()
