@@ -7,7 +7,9 @@
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
+# make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
 # make pictures   the pictures of README.md and docs/, into docs/pictures
+# make web-pictures   the pictures of `imud web`, in a real browser, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
 # make audit  items of both manuals: code and tests of each
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
@@ -103,6 +105,14 @@ deb-try: deb
 
 deb-deps:
 	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap
+
+# a browser for the tests of `imud web`
+.PHONY: web-deps web-pictures
+web-deps:
+	apt-get install --yes --no-install-recommends chromium chromium-driver
+
+web-pictures: $(VENV)/made
+	$(BIN)/python -m tests.web.pictures
 
 monitoring-deps:
 	apt-get install --yes --no-install-recommends prometheus prometheus-alertmanager

@@ -21,6 +21,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud.contracts", "imud.frames.settings"),
     ("imud.devices", "imud.clock", "imud.links", "imud.publishers", "imud.utc"),
     ("imud.sim", "imud.config", "imud.client", "imud.analysis", "imud.bridges"),
+    ("imud.web",),
     ("imud.signals",),
     ("imud.runtime",),
     ("imud.reload",),
@@ -336,6 +337,7 @@ CROSS_CUTTING = {
     "sim/test_main.py": "imud/sim/__main__.py as a process",
     "utc/test_gpsd_daemon.py": "a real gpsd and the daemon",
     "utc/test_gpsd_real.py": "a real gpsd",
+    "web/test_page.py": "imud/web/static in a real browser, with the daemon and a module",
 }
 """Test modules that mirror no module of imud, and what they test."""
 
@@ -410,6 +412,7 @@ TESTED_IN = {
     "imud.sim.ports.in_process_bus": "links/test_spi.py",
     "imud.sim.simulator": "sim/test_sensor.py",
     "imud.utc.source": "utc/test_receivers.py",
+    "imud.web.messages": "web/test_hub.py",
     "imud.worker": "runtime/polled/test_in_daemon.py",
 }
 """Modules without a test module of their own, and the one that tests them with what they serve."""

@@ -53,6 +53,7 @@ COMMANDS = {
     "foxglove": Subcommand(
         "imud.cli.foxglove.command:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
     ),
+    "web": Subcommand("imud.cli.web:WEB", "show all devices in a browser, live"),
     "watch": Subcommand("imud.cli.samples:WATCH", "print samples as they come"),
     "clock": Subcommand(
         "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"

@@ -79,12 +79,25 @@ def paragraph(distribution: Distribution) -> str:
     )
 
 
+def bundled(folder: Path, name: str) -> str:
+    """The paragraph of a library that stands in imud itself. Raises SystemExit where its licence is missing."""
+    try:
+        text = (folder / "LICENSE").read_text()
+    except OSError as error:
+        raise SystemExit(f"copyright.py: expected the licence of {name}: {error}") from error
+    holders = [line.strip() for line in text.splitlines() if line.startswith("Copyright")]
+    files = f"*/site-packages/{folder.relative_to(folder.parents[3])}/*"
+    owners = "\n ".join(holders)
+    return f"Files: {files}\nCopyright: {owners}\nLicense: {name}\n{indented(text)}"
+
+
 def main(folder: str) -> None:
     """Print the whole file."""
     print("Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/")
     print("Upstream-Name: imud")
     print("\nFiles: *\nCopyright: the authors of imud\nLicense: Apache-2.0")
     print(" The text of Apache-2.0 is in /usr/share/common-licenses/Apache-2.0.")
+    print("\n" + bundled(Path(folder) / "imud/web/static/uplot", "uplot"))
     for distribution in sorted(distributions(path=[folder]), key=lambda one: one.metadata["Name"].lower()):
         if distribution.metadata["Name"] != "imud":
             print("\n" + paragraph(distribution))

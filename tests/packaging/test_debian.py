@@ -93,7 +93,7 @@ def test_a_removal_stops_the_service_and_an_upgrade_does_not(tmp_path: Path, mon
     run_script("imud-daemon.prerm", "upgrade", "0.2.0-1", root=tmp_path)
     assert not calls.exists()
     run_script("imud-daemon.prerm", "remove", root=tmp_path)
-    assert calls.read_text() == "stop imud.service\n"
+    assert calls.read_text() == "stop imud-web.service imud.service\n"
 
 
 def test_control_has_what_debian_wants() -> None:
@@ -192,7 +192,8 @@ def library(folder: Path, name: str, **texts: str) -> None:
 
 
 def copyright_of(folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run copyright.py on a folder of installed wheels."""
+    """Run copyright.py on a folder of installed wheels, among them imud with what it bundles."""
+    shutil.copytree(ROOT / "imud/web/static/uplot", folder / "imud/web/static/uplot")
     argv = [sys.executable, str(DEBIAN / "copyright.py"), str(folder)]
     return subprocess.run(argv, capture_output=True, text=True, check=False, timeout=30)
 
@@ -202,6 +203,8 @@ def test_copyright_has_each_library_with_its_text(tmp_path: Path) -> None:
     library(tmp_path, "two", LICENSE="  Apache License\n  Version 2.0, January 2004\n")
     library(tmp_path, "pyserial")
     text = copyright_of(tmp_path).stdout
+    uplot = "*/site-packages/imud/web/static/uplot/*"
+    assert f"Files: {uplot}\nCopyright: Copyright (c) 2022 Leon Sorokin\nLicense: uplot\n" in text
     assert "Files: */site-packages/one-1.dist-info* */site-packages/one.py*\n" in text
     assert "Copyright: Copyright (c) 2020 Someone\nLicense: one\n Copyright (c) 2020 Someone\n .\n Do what" in text
     assert (

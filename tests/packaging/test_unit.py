@@ -10,9 +10,12 @@ from ipaddress import ip_address, ip_network
 
 import pytest
 
+from imud.cli import build_parser
+from imud.web.guard import is_loopback
 from tests.support.files import ROOT
 
 UNIT = ROOT / "systemd" / "imud.service"
+WEB_UNIT = ROOT / "systemd" / "imud-web.service"
 EXPOSURE_MAX = 2.0
 """docs/operate.md says what it is made of; the guest's check has the same limit."""
 OFFLINE_SINCE = 250
@@ -50,6 +53,22 @@ def test_systemd_judges_the_unit_as_little_exposed(tmp_path_factory: pytest.Temp
     text = UNIT.read_text()
     assert exposure(text, folder) <= EXPOSURE_MAX
     assert exposure(text.replace("\nIPAddressDeny=any\n", "\n"), folder) > EXPOSURE_MAX, "the judge sees a setting go"
+
+
+@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
+def test_systemd_judges_the_unit_of_the_page_as_little_exposed(tmp_path_factory: pytest.TempPathFactory) -> None:
+    assert exposure(WEB_UNIT.read_text(), str(tmp_path_factory.mktemp("unit"))) <= EXPOSURE_MAX
+
+
+def test_the_unit_of_the_page_may_read_the_socket_and_listens_on_this_machine_only() -> None:
+    lines = WEB_UNIT.read_text().splitlines()
+    assert "SupplementaryGroups=imud" in lines
+    assert "DynamicUser=yes" in lines
+    (command,) = [line.partition("=")[2] for line in lines if line.startswith("ExecStart=")]
+    assert is_loopback(build_parser(("web",)).parse_args(command.split()[1:]).address)
+    assert re.search(
+        r"^# +ExecStart=.*--token-file \$\{CREDENTIALS_DIRECTORY\}/token$", WEB_UNIT.read_text(), re.MULTILINE
+    )
 
 
 def test_of_the_calls_for_the_clock_only_those_that_read_it_are_allowed() -> None:

@@ -1,0 +1,130 @@
+// The attitude as a block on a compass, from the quaternion body → navigation frame.
+
+import { el } from "./util.js";
+
+const SIZE = 300;
+const BODY = [1.0, 0.7, 0.18]; // half edges along x, y, z of the device
+const CAMERA = { azimuth: -2.3, elevation: 0.5 }; // looked at from the south-west, above
+const FACES = [[0, 1], [0, -1], [1, 1], [1, -1], [2, 1], [2, -1]];
+
+/** Rotate a vector by a quaternion [w, x, y, z]. */
+export function rotate([w, x, y, z], [a, b, c]) {
+  const [u, v, t] = [2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)];
+  return [a + w * u + y * t - z * v, b + w * v + z * u - x * t, c + w * t + x * v - y * u];
+}
+
+export class AttitudeView {
+  constructor() {
+    this.canvas = el("canvas", { width: SIZE, height: SIZE, role: "img", "aria-label": "attitude of the device" });
+    this.isNed = false;
+    this.quaternion = null;
+  }
+
+  /** frame: the navigation frame of the quaternion, as `status` has it. */
+  set(quaternion, frame) {
+    this.isNed = frame.startsWith("NED");
+    this.quaternion = quaternion;
+    this.draw();
+  }
+
+  /** A vector of the device in east, north, up. */
+  toEnu(vector) {
+    const [a, b, c] = rotate(this.quaternion, vector);
+    return this.isNed ? [b, a, -c] : [a, b, c];
+  }
+
+  /** East, north, up on the canvas: x, y, and depth (larger is nearer). */
+  project([e, n, u]) {
+    const { azimuth, elevation } = CAMERA;
+    const right = e * -Math.sin(azimuth) + n * Math.cos(azimuth);
+    const away = e * -Math.cos(azimuth) + n * -Math.sin(azimuth);
+    const up = u * Math.cos(elevation) + away * Math.sin(elevation);
+    const near = u * Math.sin(elevation) - away * Math.cos(elevation);
+    const scale = (SIZE * 0.24) / (1 - near * 0.12);
+    return [SIZE / 2 + right * scale, SIZE * 0.42 - up * scale, near];
+  }
+
+  draw() {
+    const context = this.canvas.getContext("2d");
+    const style = getComputedStyle(this.canvas);
+    context.clearRect(0, 0, SIZE, SIZE);
+    context.font = "13px system-ui, sans-serif";
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    this.drawCompass(context, style);
+    if (!this.quaternion) return;
+    this.drawAxes(context, false); // those that point away stand behind the block
+    this.drawBody(context, style);
+    this.drawAxes(context, true);
+  }
+
+  drawCompass(context, style) {
+    const down = -1.45;
+    context.strokeStyle = style.getPropertyValue("--line");
+    context.fillStyle = style.getPropertyValue("--quiet");
+    context.lineWidth = 1;
+    for (const radius of [0.8, 1.6]) {
+      context.beginPath();
+      for (let step = 0; step <= 60; step += 1) {
+        const angle = (step / 30) * Math.PI;
+        context.lineTo(...this.project([radius * Math.cos(angle), radius * Math.sin(angle), down]).slice(0, 2));
+      }
+      context.stroke();
+    }
+    for (const [name, e, n] of [["E", 1, 0], ["N", 0, 1], ["W", -1, 0], ["S", 0, -1]]) {
+      this.line(context, [0, 0, down], [1.6 * e, 1.6 * n, down]);
+      context.fillText(name, ...this.project([1.85 * e, 1.85 * n, down]).slice(0, 2));
+    }
+  }
+
+  drawBody(context, style) {
+    const faces = FACES.map(([axis, side]) => {
+      const [p, q] = [(axis + 1) % 3, (axis + 2) % 3];
+      const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([a, b]) => {
+        const corner = [0, 0, 0];
+        corner[axis] = side * BODY[axis];
+        corner[p] = a * BODY[p];
+        corner[q] = b * BODY[q];
+        return this.project(this.toEnu(corner));
+      });
+      const middle = [0, 0, 0];
+      middle[axis] = side;
+      const light = this.toEnu(middle)[2];
+      return { corners, light, near: corners.reduce((sum, corner) => sum + corner[2], 0) };
+    });
+    faces.sort((a, b) => a.near - b.near);
+    context.strokeStyle = style.getPropertyValue("--ink");
+    for (const { corners, light } of faces) {
+      context.fillStyle = `hsl(212 38% ${Math.round(52 + 20 * light)}%)`;
+      context.beginPath();
+      corners.forEach(([x, y]) => context.lineTo(x, y));
+      context.closePath();
+      context.fill();
+      context.stroke();
+    }
+  }
+
+  drawAxes(context, isNear) {
+    const axes = ["#d1495b", "#2e8b57", "#3a7bd5"].map((colour, axis) => {
+      const end = [0, 0, 0];
+      end[axis] = 1.5;
+      const start = [0, 0, 0];
+      start[axis] = BODY[axis];
+      return { colour, name: "xyz"[axis], start: this.toEnu(start), end: this.toEnu(end) };
+    });
+    context.lineWidth = 3;
+    for (const { colour, name, start, end } of axes) {
+      if (this.project(end)[2] > 0 !== isNear) continue;
+      context.strokeStyle = context.fillStyle = colour;
+      this.line(context, start, end);
+      context.fillText(name, ...this.project(end.map((one) => one * 1.12)).slice(0, 2));
+    }
+  }
+
+  line(context, from, to) {
+    context.beginPath();
+    context.moveTo(...this.project(from).slice(0, 2));
+    context.lineTo(...this.project(to).slice(0, 2));
+    context.stroke();
+  }
+}

@@ -1,0 +1,171 @@
+// The page of one device.
+
+import { AttitudeView } from "./attitude.js";
+import { ActionsView, CalibrationView } from "./control.js";
+import { LatencyView, LedgerView } from "./ledger.js";
+import { RollingPlot } from "./plots.js";
+import { SettingsView } from "./settings.js";
+import { SpectrumPlot } from "./spectrum-plot.js";
+import { AXES, DEGREE, duration, el, facts, number, panel, setText } from "./util.js";
+
+const RATES_HZ = [10, 20, 50];
+const SPANS_S = [10, 30, 60];
+const EVENTS_KEPT = 200;
+
+const PLOTS = [
+  ["accel_m_s2", "Accelerometer", "m/s²", AXES, { decimals: 2 }],
+  ["gyro_rad_s", "Gyroscope", "°/s", AXES, { scale: 1 / DEGREE, decimals: 2 }],
+  ["mag_t", "Magnetometer", "µT", AXES, { scale: 1e6, decimals: 1 }],
+  ["euler_rad", "Attitude", "°", ["roll", "pitch", "yaw"], { scale: 1 / DEGREE, decimals: 1, isAngle: true }],
+];
+
+export class DevicePage {
+  constructor(main, name, stream, session) {
+    this.name = name;
+    this.stream = stream;
+    this.session = session;
+    this.rate_hz = 20;
+    this.span_s = 30;
+    this.isPaused = false;
+    this.frame = "ENU";
+    this.plots = new Map(PLOTS.map(([member, title, ...more]) => [member, new RollingPlot(member, title, ...more)]));
+    this.stamps = new RollingPlot("stamps", "Time stamps", "ms", ["stated error", "latency"], { scale: 1e3, decimals: 3, isLog: true });
+    for (const plot of this.plots.values()) plot.node.hidden = true;
+    this.attitude = new AttitudeView();
+    this.spectrum = new SpectrumPlot(() => this.look());
+    this.ledger = new LedgerView();
+    this.latency = new LatencyView();
+    this.about = el("div");
+    this.events = el("ol", { class: "events", id: "event-list" });
+    this.state = el("span", { class: "pill" });
+    this.trouble = el("p", { class: "problem", hidden: true });
+    this.control = el("div", { class: "grid" });
+    main.append(this.head(), this.trouble, this.panels(), this.control);
+    this.onSession();
+    this.look();
+  }
+
+  head() {
+    const rate = select("rate", RATES_HZ, this.rate_hz, "Hz", (value) => {
+      this.rate_hz = value;
+      this.clear();
+      this.look();
+    });
+    const span = select("span", SPANS_S, this.span_s, "s", (value) => (this.span_s = value));
+    this.pause = el("button", { type: "button", id: "pause", text: "Pause", onclick: () => this.onPause() });
+    const title = el("div", { class: "title" }, el("h1", { text: this.name }), this.state);
+    return el("div", { class: "device-head" }, title, el("div", { class: "buttons" }, rate, span, this.pause));
+  }
+
+  panels() {
+    this.angles = el("p", { class: "angles" });
+    const block = panel("attitude3d", "Orientation", this.attitude.canvas, this.angles);
+    const plots = [...this.plots.values()].map((plot) => plot.node);
+    return el("div", { class: "grid" }, block, ...plots, panel("spectrum", "Spectrum", this.spectrum.node), this.stamps.node,
+      panel("latency", "Latency", this.latency.node), panel("ledger", "Ledger", this.ledger.node),
+      panel("about", "Status", this.about), panel("events", "Events", this.events));
+  }
+
+  look() {
+    this.stream.look({ look: "device", device: this.name, rate_hz: this.rate_hz, spectrum: this.spectrum.member });
+  }
+
+  /** After logging in or out: panels that show more or less then. */
+  onSession() {
+    this.calibration = new CalibrationView(this.name, this.session);
+    this.control.replaceChildren(
+      panel("settings", "Settings", new SettingsView(this.name, this.session).node),
+      panel("calibration", "Calibration", this.calibration.node),
+      panel("actions", "Actions", new ActionsView(this.name, this.session).node));
+  }
+
+  onRestart() {
+    this.onSession();
+  }
+
+  onPause() {
+    this.isPaused = !this.isPaused;
+    setText(this.pause, this.isPaused ? "Go on" : "Pause");
+  }
+
+  onMessage(message) {
+    if (message.kind === "events") this.addEvents(message.events);
+    if (message.device !== this.name) return;
+    if (message.kind === "status") this.showStatus(message);
+    if (this.isPaused) return;
+    if (message.kind === "samples" && message.rate_hz === this.rate_hz) message.buckets.forEach((bucket) => this.add(bucket));
+    if (message.kind === "raw") this.spectrum.add(message);
+  }
+
+  add(bucket) {
+    const period_s = 1 / this.rate_hz;
+    for (const [member, plot] of this.plots) {
+      if (bucket[member]) plot.node.hidden = false;
+      if (!plot.node.hidden) plot.add(bucket, bucket[member] ?? null, period_s, this.span_s);
+    }
+    const stamp = [bucket.t_err_s, bucket.latency_s];
+    this.stamps.add(bucket, [stamp, stamp], period_s, this.span_s);
+    if (bucket.quat_wxyz) this.attitude.set(bucket.quat_wxyz, this.frame);
+    if (bucket.euler_rad) {
+      const names = ["roll", "pitch", "yaw"];
+      setText(this.angles, bucket.euler_rad[1].map((one, axis) => `${names[axis]} ${number(one / DEGREE, 1)}°`).join("  "));
+    }
+  }
+
+  clear() {
+    for (const plot of [...this.plots.values(), this.stamps]) plot.clear();
+  }
+
+  showStatus(message) {
+    const { status } = message;
+    this.status = message;
+    setText(this.state, status ? status.state : "gone");
+    this.state.className = `pill ${["running", "finished"].includes(status?.state) ? "good" : "bad"}`;
+    const trouble = status ? status.problem : `${this.name} is not in the configuration of the daemon`;
+    setText(this.trouble, trouble);
+    this.trouble.hidden = !trouble;
+    if (!status) return;
+    this.frame = status.navigation_frame || "ENU";
+    if (!this.attitude.quaternion) this.attitude.draw();
+    this.ledger.draw(message);
+    this.latency.draw(message);
+    this.about.replaceChildren(facts(aboutRows(status, message.lost)));
+  }
+
+  addEvents(events) {
+    for (const event of events) {
+      if (event.device !== this.name && event.device !== "") continue;
+      if (event.event === "calibration") this.calibration.onEvent(event);
+      const words = el("span", { text: event.message });
+      const when = el("time", { text: number(event.t_s, 3) });
+      this.events.prepend(el("li", { "data-kind": event.event }, when, el("b", { text: event.event }), words));
+    }
+    while (this.events.childElementCount > EVENTS_KEPT) this.events.lastChild.remove();
+  }
+
+  close() {
+    for (const plot of [...this.plots.values(), this.stamps, this.spectrum]) plot.close();
+  }
+}
+
+function select(id, values, chosen, unit, onChange) {
+  const options = values.map((value) => el("option", { value, text: `${value} ${unit}`, selected: value === chosen }));
+  return el("select", { id, "aria-label": id, onchange: (event) => onChange(Number(event.target.value)) }, ...options);
+}
+
+function aboutRows(status, lost) {
+  const { clock } = status;
+  const rows = [
+    ["link", `${status.link}, driver ${status.driver}, opened ${status.connects === 1 ? "once" : `${number(status.connects)} times`}`],
+    ["identity", Object.entries(status.identity).map(([name, value]) => `${name} ${value}`).join(", ") || "not known"],
+    ["rate", `${number(status.rate_hz, 1)} Hz seen, ${number(status.expected_rate_hz, 1)} Hz by the device's clock`],
+    ["clock", `${clock.sync}, skew ${number(clock.skew_ppm, 2)} ppm, residual ${duration(clock.residual_ns / 1e9)}, ${number(clock.resets)} resets`],
+    ["samples", `${number(status.ledger.samples)}; ${number(lost)} lost, ${number(status.ledger.lost_unknown)} gaps of unknown size`],
+    ["waiting", `${duration(status.hold_ns / 1e9)} to be processed together; ${status.hold_by || "nobody"} decides it`],
+    ["kernel", `${number(status.kernel.overrun)} overruns, ${number(status.kernel.framing)} framing, ${number(status.kernel.parity)} parity`],
+  ];
+  if (status.temperature_c !== null) rows.splice(3, 0, ["temperature", `${number(status.temperature_c, 1)} °C`]);
+  if (status.frame) rows.splice(2, 0, ["axes", `${status.frame.frame}; heading ${status.frame.heading}${status.frame.problem ? ` (${status.frame.problem})` : ""}`]);
+  if (status.status_words?.length) rows.push(["status", status.status_words.join(", ")]);
+  return rows;
+}

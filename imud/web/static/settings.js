@@ -1,0 +1,97 @@
+// Settings of a device: declared, actual, difference; with the token also new values, planned before they are written.
+
+import { call, el, shown } from "./util.js";
+
+export class SettingsView {
+  constructor(device, session) {
+    this.device = device;
+    this.session = session;
+    this.state = el("p", { class: "quiet" });
+    this.table = el("tbody");
+    this.result = el("div", { class: "result" });
+    this.save = el("input", { type: "checkbox", id: "settings-save" });
+    this.tools = el("div", { class: "buttons" },
+      el("button", { type: "button", text: "Plan changes", onclick: () => this.plan(this.given()) }),
+      el("button", { type: "button", text: "Plan declared", onclick: () => this.plan(null) }),
+      el("label", {}, this.save, " save to the device's flash"));
+    const names = ["setting", "declared", "actual", "new value"].map((name) => el("th", { text: name }));
+    this.head = names.at(-1);
+    const table = el("table", {}, el("thead", {}, el("tr", {}, ...names)), this.table);
+    const again = el("button", { type: "button", text: "Read again", onclick: () => this.load(this.session.control) });
+    this.node = el("div", {}, this.state, el("div", { class: "scroll" }, table), el("div", { class: "buttons" }, again), this.tools, this.result);
+    this.load();
+  }
+
+  /** fresh: the device itself is asked, which needs the token. */
+  async load(fresh = false) {
+    try {
+      this.show(await call("settings.get", fresh ? { device: this.device, fresh } : { device: this.device }));
+    } catch (error) {
+      this.state.textContent = String(error.message);
+    }
+  }
+
+  show(report) {
+    const { status, settings } = report;
+    const words = [`declared and actual: ${status.state}`, status.problem, `${status.flash_writes} writes to flash by imud`];
+    this.state.textContent = words.filter(Boolean).join("; ");
+    const control = this.session.control;
+    this.tools.hidden = this.head.hidden = !control;
+    this.inputs = new Map();
+    this.table.replaceChildren(...settings.map((one) => {
+      const unit = one.unit ? ` ${one.unit}` : "";
+      const name = el("td", {}, el("b", { text: one.name }), el("p", { class: "quiet", text: `${one.description} (${one.values}; ${one.effect})` }));
+      const cells = [name, el("td", { text: shown(one.declared) }), el("td", { text: shown(one.actual) + (one.actual === null ? "" : unit) })];
+      if (control) {
+        const input = el("input", { type: "text", "aria-label": `new value of ${one.name}`, size: 10 });
+        if (one.declarable) this.inputs.set(one.name, input);
+        cells.push(el("td", {}, one.declarable ? input : null));
+      }
+      return el("tr", { class: one.differs ? "differs" : null, "data-setting": one.name }, ...cells);
+    }));
+  }
+
+  /** What was written into the fields: numbers, true, false, lists as in JSON, everything else text. */
+  given() {
+    const found = {};
+    for (const [name, input] of this.inputs) {
+      if (!input.value.trim()) continue;
+      try {
+        found[name] = JSON.parse(input.value);
+      } catch {
+        found[name] = input.value.trim();
+      }
+    }
+    return found;
+  }
+
+  async plan(settings) {
+    const asked = { device: this.device, save: this.save.checked };
+    if (settings) asked.settings = settings;
+    try {
+      const plan = await call("settings.plan", asked);
+      const steps = plan.steps.map((step) => el("li", { text: `${step.name}: ${shown(step.before)} → ${shown(step.value)}` }));
+      const left = Object.entries(plan.left_out).map(([name, why]) => el("li", { text: `${name} is left out: ${why}` }));
+      const words = plan.steps.length ? "This would be done:" : "Nothing is to be done.";
+      const apply = el("button", { type: "button", text: "Apply", onclick: () => this.apply(asked) });
+      this.result.replaceChildren(el("p", { text: words }), el("ul", {}, ...steps, ...left),
+        ...(plan.risk ? [el("p", { class: "problem", text: plan.risk })] : []), ...(plan.steps.length ? [apply] : []));
+    } catch (error) {
+      this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
+    }
+  }
+
+  async apply(asked) {
+    this.result.replaceChildren(el("p", { text: "Writing…" }));
+    try {
+      const done = await call("settings.apply", asked);
+      const steps = done.steps.map((step) => el("li", { text: `${step.name} = ${shown(step.value)}: ${step.outcome}${step.message ? ` (${step.message})` : ""}` }));
+      const words = done.problem || `Done${done.saved ? ", and saved" : ""}.`;
+      this.result.replaceChildren(el("p", { class: done.problem ? "problem" : "good", text: words }), el("ul", {}, ...steps),
+        ...(done.advice ? [el("p", { text: done.advice })] : []));
+    } catch (error) {
+      this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
+    }
+    this.load();
+  }
+}

@@ -1,0 +1,83 @@
+// The spectrum as a plot, with the highest peak named.
+
+import { COLOURS, powers } from "./plots.js";
+import { Spectrum } from "./spectrum.js";
+import { AXES, el, number, setText } from "./util.js";
+
+const UNITS = { accel_m_s2: "m/s²/√Hz", gyro_rad_s: "rad/s/√Hz", mag_t: "T/√Hz" };
+const NAMES = { accel_m_s2: "accelerometer", gyro_rad_s: "gyroscope", mag_t: "magnetometer" };
+
+export class SpectrumPlot {
+  /** onChoice(member) when another vector is chosen; "" for none. */
+  constructor(onChoice) {
+    this.spectrum = new Spectrum();
+    const choices = Object.entries(NAMES).map(([member, name]) => el("option", { value: member, text: name }));
+    this.choice = el("select", { id: "spectrum-of", "aria-label": "spectrum of" }, el("option", { value: "", text: "off" }), ...choices);
+    this.choice.addEventListener("change", () => {
+      this.clear();
+      onChoice(this.member);
+    });
+    this.note = el("p", { class: "quiet", text: "Choose a vector. Every sample of it is sent then, and transformed here." });
+    this.box = el("div", { class: "plot" });
+    this.node = el("div", {}, this.choice, this.box, this.note);
+    new ResizeObserver(() => this.plot && this.box.clientWidth && this.plot.setSize(this.size())).observe(this.box);
+  }
+
+  get member() {
+    return this.choice.value;
+  }
+
+  size() {
+    return { width: Math.max(this.box.clientWidth, 120), height: 220 };
+  }
+
+  clear() {
+    this.spectrum = new Spectrum();
+    this.plot?.destroy();
+    this.plot = null;
+    this.data = null;
+  }
+
+  add(raw) {
+    if (raw.member !== this.member) return;
+    if (this.spectrum.add(raw)) this.draw();
+    else if (!this.data) setText(this.note, `collecting samples: ${this.spectrum.times.length}`);
+  }
+
+  draw() {
+    const { frequencies, axes } = this.spectrum.result();
+    // Frequency 0 is left out: it is the mean, which was taken away.
+    this.data = [frequencies.slice(1), ...axes.map((axis) => axis.slice(1).map((value) => value || null))];
+    if (!this.plot) this.begin();
+    this.plot.setData(this.data);
+    const peaks = axes.map((axis) => {
+      const at = axis.reduce((best, value, k) => (k > 1 && value > axis[best] ? k : best), Math.min(2, axis.length - 1));
+      return { frequency: frequencies[at], value: axis[at] };
+    });
+    this.peaks = peaks;
+    const words = peaks.map((one, axis) => `${AXES[axis]} ${number(one.frequency, 2)} Hz`).join(", ");
+    const { points, rate_hz, segments, holes } = this.spectrum;
+    setText(this.note,
+      `Highest peaks: ${words}. From every sample, at ${number(rate_hz, 2)} Hz by the time stamps: Hann window, ${points} points, ` +
+      `mean of ${segments.length} segments, resolution ${number(rate_hz / points, 2)} Hz; begun again at ${holes} holes.`);
+  }
+
+  begin() {
+    const ink = getComputedStyle(this.box).getPropertyValue("--quiet");
+    const line = getComputedStyle(this.box).getPropertyValue("--line");
+    const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 } };
+    this.plot = new uPlot(
+      {
+        ...this.size(), legend: { show: false }, cursor: { drag: { x: true, y: false } },
+        series: [{}, ...COLOURS.map((stroke) => ({ stroke, width: 1.25, points: { show: false } }))],
+        axes: [{ ...axis, label: "Hz", labelSize: 18, labelFont: "12px system-ui" }, { ...axis, size: 62, label: UNITS[this.member], labelSize: 18, labelFont: "12px system-ui", values: powers }],
+        scales: { x: { time: false }, y: { distr: 3 } },
+      },
+      this.data, this.box,
+    );
+  }
+
+  close() {
+    this.plot?.destroy();
+  }
+}

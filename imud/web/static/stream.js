@@ -1,0 +1,59 @@
+// The WebSocket to imud web: connected again when it is lost, quiet while the page is hidden.
+
+const RETRY_FIRST_MS = 500;
+const RETRY_MOST_MS = 5000;
+const ACKNOWLEDGE_MS = 250;
+
+export class Stream {
+  /** onMessage(message) for each message; onLink(connected) when the connection comes and goes; mayRead(): whether it
+   *  would be accepted. */
+  constructor(onMessage, onLink, mayRead) {
+    this.mayRead = mayRead;
+    this.onMessage = onMessage;
+    this.onLink = onLink;
+    this.wish = { look: "nothing" };
+    this.handled = 0;
+    this.retry = RETRY_FIRST_MS;
+    this.closed = false;
+    document.addEventListener("visibilitychange", () => this.send());
+    setInterval(() => this.handled && this.send(), ACKNOWLEDGE_MS);
+  }
+
+  connect() {
+    if (!this.mayRead()) {
+      setTimeout(() => this.connect(), RETRY_FIRST_MS);
+      return;
+    }
+    const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+    const socket = new WebSocket(`${scheme}//${location.host}/api/stream`);
+    this.socket = socket;
+    socket.onopen = () => {
+      this.retry = RETRY_FIRST_MS;
+      this.handled = 0;
+      this.onLink(true);
+      this.send();
+    };
+    socket.onmessage = (event) => {
+      this.handled += 1;
+      this.onMessage(JSON.parse(event.data));
+    };
+    socket.onclose = () => {
+      this.onLink(false);
+      setTimeout(() => this.connect(), this.retry);
+      this.retry = Math.min(2 * this.retry, RETRY_MOST_MS);
+    };
+  }
+
+  /** Show something else: a message `Look` of imud/web/messages.py. */
+  look(wish) {
+    this.wish = wish;
+    this.send();
+  }
+
+  send() {
+    if (this.socket?.readyState !== WebSocket.OPEN) return;
+    const wish = document.hidden ? { ...this.wish, look: "nothing" } : this.wish;
+    this.socket.send(JSON.stringify({ ...wish, acknowledged: this.handled }));
+    this.handled = 0;
+  }
+}

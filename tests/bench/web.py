@@ -1,0 +1,113 @@
+"""CPU time of `imud web` and of the daemon with no browser, 1 and 20, on a module at 1 kHz.
+
+Twenty browsers are twenty WebSockets that look at the page of the device at 20 Hz and acknowledge as the page does;
+they draw nothing. What drawing costs is the browser's. The
+figure of the daemon without browsers is that without any client of its socket.
+"""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic
+
+from aiohttp import ClientSession, ClientWebSocketResponse
+
+from tests.bench.rig import cpu_ns, rss_mb
+from tests.bench.rows import Row, at_most
+from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until
+
+RATE_HZ = 1000
+LOOK_HZ = 20
+BROWSERS = (0, 1, 20)
+ACKNOWLEDGE_S = 0.25
+WARM_S = 3.0
+SECONDS, QUICK_SECONDS = 15.0, 5.0
+
+
+async def browse(socket: ClientWebSocketResponse, end_s: float) -> int:
+    """Take messages as a page does; returns the samples in the buckets that came."""
+    look = {"look": "device", "device": "bow", "rate_hz": LOOK_HZ}
+    samples = handled = 0
+    due_s = monotonic()
+    while monotonic() < end_s:
+        if monotonic() >= due_s:
+            await socket.send_str(json.dumps({**look, "acknowledged": handled}))
+            handled, due_s = 0, monotonic() + ACKNOWLEDGE_S
+        try:
+            message = json.loads(await socket.receive_str(timeout=ACKNOWLEDGE_S))
+        except TimeoutError:
+            continue
+        handled += 1
+        if message["kind"] == "samples":
+            samples += sum(bucket["count"] for bucket in message["buckets"])
+    return samples
+
+
+async def share(url: str, browsers: int, pids: Sequence[int], seconds: float) -> tuple[list[float], list[int]]:
+    """CPU time per time of each process while so many look, after a time to warm up; and the samples each got."""
+    async with ClientSession() as session:
+        sockets = [await session.ws_connect(f"{url}api/stream", headers={"Origin": url[:-1]}) for _ in range(browsers)]
+        await asyncio.gather(asyncio.sleep(WARM_S), *(browse(socket, monotonic() + WARM_S) for socket in sockets))
+        before = [cpu_ns(pid) for pid in pids]
+        begin_s = monotonic()
+        _, *counts = await asyncio.gather(
+            asyncio.sleep(seconds), *(browse(socket, begin_s + seconds) for socket in sockets)
+        )
+        took_ns = (monotonic() - begin_s) * 1e9
+        used = [(cpu_ns(pid) - cpu) / took_ns for pid, cpu in zip(pids, before, strict=True)]
+        for socket in sockets:
+            await socket.close()
+    return used, [count for count in counts if count is not None]
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    """Stop a child, and take what it still prints."""
+    process.terminate()
+    process.communicate()
+
+
+def start(stack: ExitStack, folder: Path) -> tuple[RunningDaemon, str, int]:
+    """Start simulator, daemon and `imud web`; the address and the process of the last."""
+    port = str(folder / "port")
+    simulator = [sys.executable, "-m", "imud.sim", "--path", port, "--rate", str(RATE_HZ)]
+    module = stack.enter_context(subprocess.Popen(simulator, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+    stack.callback(end, module)
+    assert module.stdout is not None
+    module.stdout.readline()
+    devices = {"bow": {"driver": "hipnuc-uart", "uart": {"port": port, "baud": 921600}}}
+    daemon = stack.enter_context(running_daemon(folder, devices, python=(), log_level="warning"))
+    daemon.wait_for("bow", "running")
+    wait_until(lambda: daemon.statuses()["bow"].rate_hz > 0.9 * RATE_HZ, "the module sends at its rate")
+    argv = [sys.executable, "-m", "imud", "web", "--socket", str(daemon.socket), "--port", "0"]
+    web = stack.enter_context(subprocess.Popen(argv, stdout=subprocess.PIPE, text=True))
+    stack.callback(end, web)
+    assert web.stdout is not None
+    return daemon, web.stdout.readline().strip(), web.pid
+
+
+def rows(*, quick: bool) -> Iterator[Row]:
+    """Every figure in its order."""
+    seconds = QUICK_SECONDS if quick else SECONDS
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-bench-")))
+        daemon, url, web = start(stack, folder)
+        of_daemon = {}
+        for browsers in BROWSERS:
+            used, counts = asyncio.run(share(url, browsers, (daemon.process.pid, web), seconds))
+            of_daemon[browsers] = used[0]
+            yield Row(f"daemon, {browsers} browsers at {LOOK_HZ} Hz", 100 * used[0], "% of a core")
+            yield Row(f"imud web, {browsers} browsers at {LOOK_HZ} Hz", 100 * used[1], "% of a core")
+            if counts:
+                yield Row(f"samples a second in each of {browsers} browsers, the least", min(counts) / seconds, "Hz")
+        for browsers in BROWSERS[1:]:
+            more = 100 * (of_daemon[browsers] - of_daemon[0])
+            yield Row(f"daemon, more with {browsers} browsers than without", more, "% of a core")
+        yield at_most("daemon, 20 browsers against 1", of_daemon[20] / of_daemon[1], "times", 1.1)
+        yield Row("memory of imud web", rss_mb(web), "MB")
+        yield Row("load of the machine, one minute", os.getloadavg()[0], "processes")

@@ -1,0 +1,137 @@
+"""A real browser (Debian's chromium, headless) and `imud web` as a process, for tests and pictures of the page."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, Final
+
+from selenium.common.exceptions import JavascriptException
+from selenium.webdriver import Chrome, ChromeOptions, ChromeService
+from selenium.webdriver.support.ui import WebDriverWait
+
+from tests.support.files import hi91
+from tests.test_daemon import Cable
+
+CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+MISSING = "" if CHROMIUM and CHROMEDRIVER else "no chromium and chromedriver on this machine (make web-deps)"
+LIMIT_S: Final = 30.0
+LOOK_S: Final = 0.05
+PHONE: Final = (390, 844)
+PERIOD_MS: Final = 5
+
+
+class Page:
+    """A tab, with questions to it."""
+
+    def __init__(self, driver: Chrome) -> None:
+        self.driver = driver
+
+    def js(self, script: str, *arguments: object) -> Any:
+        """Run a script in the page and return its value."""
+        return self.driver.execute_script(script, *arguments)
+
+    def module(self, script: str, *arguments: object) -> Any:
+        """Run the body of an async function in the page, where `import()` works, and return its value."""
+        body = f"const done = arguments[arguments.length - 1]; (async (...args) => {{ {script} }})(...arguments)"
+        answer = self.driver.execute_async_script(
+            f"{body}.then((value) => done([value]), (error) => done(String(error)));", *arguments
+        )
+        assert isinstance(answer, list), answer
+        return answer[0]
+
+    def until(self, script: str, *arguments: object, what: str = "") -> Any:
+        """Look again until a script returns something that is true; return it. While the page loads it may fail."""
+        wait = WebDriverWait(self.driver, LIMIT_S, LOOK_S, ignored_exceptions=(JavascriptException,))
+        return wait.until(lambda _driver: self.js(script, *arguments), what or script)
+
+    def text(self, selector: str) -> str:
+        """Text of an element as it is shown."""
+        return str(self.js("return document.querySelector(arguments[0])?.innerText ?? ''", selector))
+
+    def until_text(self, selector: str, words: str) -> None:
+        """Wait until an element shows these words."""
+        script = "return (document.querySelector(arguments[0])?.innerText ?? '').includes(arguments[1])"
+        self.until(script, selector, words, what=f"{selector} shows {words!r}")
+
+    def click(self, selector: str) -> None:
+        """Click an element as a script does, wherever it is."""
+        self.js("document.querySelector(arguments[0]).click()", selector)
+
+    def problems(self) -> list[str]:
+        """What the browser's console has of errors: scripts, the policy, files that are not there."""
+        return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def browser(folder: Path, size: tuple[int, int] = (1400, 2600), *, phone: bool = False) -> Iterator[Page]:
+    """A browser with one tab of this size."""
+    options = ChromeOptions()
+    options.binary_location = str(CHROMIUM)
+    arguments = ["--headless=new", "--disable-dev-shm-usage", "--disable-gpu", "--hide-scrollbars", "--no-first-run"]
+    arguments += ["--disable-background-networking", f"--user-data-dir={folder / 'chromium'}"]
+    arguments += [f"--window-size={size[0]},{size[1]}", "--force-color-profile=srgb"]
+    if os.getuid() == 0:
+        arguments.append("--no-sandbox")
+    for argument in arguments:
+        options.add_argument(argument)
+    if phone:
+        metrics = {"width": PHONE[0], "height": PHONE[1], "pixelRatio": 2.0, "touch": True, "mobile": True}
+        options.add_experimental_option("mobileEmulation", {"deviceMetrics": metrics})
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = Chrome(options=options, service=ChromeService(executable_path=str(CHROMEDRIVER)))
+    driver.set_script_timeout(LIMIT_S)
+    try:
+        yield Page(driver)
+    finally:
+        driver.quit()
+
+
+@contextmanager
+def serving_web(socket: Path, *words: str, port: int = 0) -> Iterator[str]:
+    """`imud web` for a daemon; its address."""
+    argv = [sys.executable, "-m", "imud", "web", "--socket", str(socket), "--port", str(port), *words]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().strip()
+            assert url.startswith("http://"), "imud web ended at its start"
+            yield url
+        finally:
+            process.terminate()
+            process.wait(LIMIT_S)
+
+
+class Sender:
+    """A module at the end of a cable that sends chosen values at 200 Hz; what it sent is kept."""
+
+    def __init__(self, cable: Cable, value_of: Callable[[int], float]) -> None:
+        self.sent: list[float] = []
+        """acceleration along z, m/s², of each message since the first."""
+        self._cable = cable
+        self._value_of = value_of
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sender")
+
+    def __enter__(self) -> "Sender":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._stopped.set()
+        self._thread.join(LIMIT_S)
+
+    def _run(self) -> None:
+        begin = monotonic()
+        number = 0
+        while not self._stopped.is_set():
+            value = self._value_of(number)
+            self.sent.append(value)
+            os.write(self._cable.master, hi91(number * PERIOD_MS, value))
+            number += 1
+            sleep(max(0.0, begin + number * PERIOD_MS / 1000 - monotonic()))

@@ -1,0 +1,288 @@
+"""The HTTP server: who may, what is answered, the WebSocket."""
+
+import asyncio
+import hashlib
+import json
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from aiohttp import ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
+from aiohttp.test_utils import TestClient, TestServer
+
+from imud.event import Event, EventKind
+from imud.publishers.socket.publisher import SocketServer
+from imud.web import app as web_app
+from imud.web.app import STATIC, WebServer
+from imud.web.guard import COOKIE, WebGuard
+from tests.support.socket_rig import batch, run, serving, until
+
+TOKEN = "correct-horse-battery-staple"
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+class Site:
+    """The server, a client, and the daemon that it reads."""
+
+    def __init__(self, web: WebServer, client: Any, daemon: SocketServer) -> None:
+        self.web = web
+        self.client = client
+        self.daemon = daemon
+        self.origin = {"Origin": str(client.make_url("")).rstrip("/")}
+
+    async def post(self, path: str, body: object, **headers: str) -> tuple[int, Any]:
+        data = body if isinstance(body, bytes) else json.dumps(body).encode()
+        async with self.client.post(path, data=data, headers={**self.origin, **headers}) as response:
+            return response.status, json.loads(await response.read())
+
+    async def get(self, path: str, **headers: str) -> tuple[int, Any]:
+        async with self.client.get(path, headers=headers) as response:
+            return response.status, json.loads(await response.read())
+
+    async def stream(self, **look: Any) -> ClientWebSocketResponse:
+        socket: ClientWebSocketResponse = await self.client.ws_connect("/api/stream", headers=self.origin)
+        await socket.send_json(look)
+        return socket
+
+
+@asynccontextmanager
+async def running(folder: Path, *, token: str = TOKEN, reading_needs_token: bool = False) -> AsyncIterator[Site]:
+    async with serving(folder) as daemon:
+        web = WebServer(daemon.hub.path, WebGuard(token.encode(), lambda: 1e9, reading_needs_token=reading_needs_token))
+        async with TestClient(TestServer(web.make_app())) as client:
+            yield Site(web, client, daemon)
+        await until(lambda: not daemon.hub.connections)
+
+
+async def message(socket: ClientWebSocketResponse, kind: str) -> dict[str, Any]:
+    """The next message of a kind."""
+    while (found := json.loads((await socket.receive()).data))["kind"] != kind:
+        pass
+    assert isinstance(found, dict)
+    return found
+
+
+def test_the_page_and_its_files_are_served_with_safe_headers(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with running(tmp_path) as site:
+            page = await site.client.get("/")
+            text = await page.text()
+            assert page.headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'")
+            assert page.headers["X-Content-Type-Options"] == "nosniff"
+            for path in re.findall(r'(?:src|href)="(/[^"]+)"', text):
+                answer = await site.client.get(path)
+                assert answer.status == 200, path
+                assert "Content-Security-Policy" in answer.headers
+            assert (await site.client.get("/static/../app.py")).status == 404
+            assert (await site.client.get("/static/")).status in (403, 404)
+            missing = await site.client.get("/none")
+            assert missing.status == 404
+            assert "Content-Security-Policy" in missing.headers, "errors have them too"
+
+    run(body)
+
+
+def test_nothing_is_loaded_from_elsewhere_and_no_script_stands_in_the_page() -> None:
+    page = (STATIC / "index.html").read_text()
+    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|style=|javascript:", page)
+    for file in STATIC.rglob("*"):
+        if file.suffix in (".html", ".js", ".css") and file.parent == STATIC:
+            text = file.read_text()
+            assert "innerHTML" not in text, file
+            assert not re.search(r"(?:src|href|import|url|fetch)\W*https?://", text), file
+
+
+def test_the_bundled_library_is_the_published_one_with_its_licence() -> None:
+    table = (STATIC / "uplot" / "README.md").read_text()
+    rows = re.findall(r"^\| (\S+) \| ([0-9a-f]{64}) \|$", table, re.MULTILINE)
+    assert {name for name, _ in rows} == {"uPlot.iife.min.js", "uPlot.min.css", "LICENSE"}
+    for name, digest in rows:
+        assert hashlib.sha256((STATIC / "uplot" / name).read_bytes()).hexdigest() == digest, name
+    assert "MIT" in (STATIC / "uplot" / "LICENSE").read_text()
+
+
+def test_other_names_and_other_sites_are_refused(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with running(tmp_path) as site:
+            assert (await site.get("/api/session", Host="attacker.example"))[0] == 421
+            call = {"method": "actions", "params": {"device": "imu0"}}
+            assert (await site.post("/api/call", call))[0] == 200
+            assert (await site.post("/api/call", call, Origin="http://attacker.example"))[0] == 403
+            assert (await site.client.post("/api/call", json=call)).status == 403, "a browser always has an Origin"
+            assert (await site.client.post("/api/call", json=call, headers=BEARER)).status == 200
+            for headers in ({"Origin": "http://attacker.example"}, {}, {**BEARER, "Origin": "null"}):
+                with pytest.raises(WSServerHandshakeError, match="403"):
+                    await site.client.ws_connect("/api/stream", headers=headers)
+            answer = await site.client.options("/api/call", headers={"Origin": "http://attacker.example"})
+            assert not [name for name in answer.headers if name.startswith("Access-Control")]
+
+    run(body)
+
+
+def test_control_needs_the_token_and_a_cookie_does_for_it(tmp_path: Path) -> None:
+    orders: tuple[tuple[str, dict[str, object]], ...] = (
+        ("settings.plan", {}), ("settings.apply", {}),
+        ("command", {"name": "output", "arguments": {"message": "HI91", "rate_hz": 5}}),
+        ("calibrate", {"kind": "heading"}), ("stop_calibration", {}), ("settings.get", {"fresh": True}),
+    )  # fmt: skip
+
+    async def body() -> None:
+        async with running(tmp_path) as site:
+            for method, params in orders:
+                call = {"method": method, "params": {"device": "imu0", **params}}
+                assert (await site.post("/api/call", call))[0] == 401, method
+                status, answer = await site.post("/api/call", call, **BEARER)
+                assert (status, "result" in answer) == (200, True), (method, answer)
+            assert (await site.get("/api/session"))[1] | {"version": ""} == {
+                "read": True, "control": False, "has_token": True, "version": "",
+            }  # fmt: skip
+            response = await site.client.post("/api/login", json={"token": TOKEN}, headers=site.origin)
+            cookie = response.headers["Set-Cookie"]
+            assert response.status == 200
+            assert "HttpOnly" in cookie
+            assert "SameSite=Strict" in cookie
+            assert TOKEN not in cookie
+            value = cookie.partition("=")[2].partition(";")[0]
+            as_browser = {"Cookie": f"{COOKIE}={value}"}
+            order = {"method": "calibrate", "params": {"device": "imu0", "kind": "heading"}}
+            status, answer = await site.post("/api/call", order, **as_browser)
+            assert (status, answer["result"]["verified"]) == (200, True)
+            assert (await site.post("/api/call", order, **as_browser, Origin="http://attacker.example"))[0] == 403
+            assert (await site.post("/api/logout", {}))[1] == {"control": False}
+
+    run(body)
+
+
+def test_reading_can_need_the_token_too(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with running(tmp_path, reading_needs_token=True) as site:
+            call = {"method": "actions", "params": {"device": "imu0"}}
+            assert (await site.post("/api/call", call))[0] == 401
+            with pytest.raises(WSServerHandshakeError, match="401"):
+                await site.client.ws_connect("/api/stream", headers=site.origin)
+            assert (await site.post("/api/call", call, **BEARER))[0] == 200
+            socket = await site.client.ws_connect("/api/stream", headers=BEARER)
+            await socket.send_json({"look": "overview"})
+            await message(socket, "overview")
+            await socket.close()
+
+    run(body)
+
+
+def test_wrong_tokens_are_answered_late_and_only_so_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body() -> None:
+        monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
+        async with running(tmp_path) as site:
+            guesses = [
+                asyncio.create_task(site.post("/api/login", {"token": "wrong"}))
+                for _ in range(web_app.FAILURES_MAX + 1)
+            ]
+            done, waiting = await asyncio.wait(guesses, return_when=asyncio.FIRST_COMPLETED)
+            assert [one.result()[0] for one in done] == [429]
+            status, _ = await site.post("/api/login", {"token": TOKEN})
+            assert status == 200, "the right one is not held up"
+            for one in waiting:
+                one.cancel()
+        monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
+        async with running(tmp_path) as site:
+            assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "this is not the token"})
+        async with running(tmp_path, token="") as site:
+            assert (await site.post("/api/login", {"token": ""}))[0] == 403
+
+    run(body)
+
+
+@pytest.mark.parametrize(
+    "bad", [b"", b"{", b"[]", b'{"method": 5}', b'{"method": "actions", "params": []}', b"\xff", b'{"x": 1}']
+)
+def test_bad_bodies_are_refused_in_words(bad: bytes, tmp_path: Path) -> None:
+    async def body() -> None:
+        async with running(tmp_path) as site:
+            for path in ("/api/call", "/api/login"):
+                status, answer = await site.post(path, bad)
+                assert status == 400
+                assert answer["error"].startswith("expected a ")
+            status, answer = await site.post("/api/call", {"method": "watch"})
+            assert status == 404
+            assert "settings.get" in answer["error"]
+            response = await site.client.post("/api/call", data=b" " * 100_000, headers=site.origin)
+            assert response.status == 413
+
+    run(body)
+
+
+def test_errors_of_the_daemon_are_told(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with running(tmp_path) as site:
+            status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "none"}})
+            assert (status, answer["code"]) == (200, -32602)
+            assert "no device named 'none'" in answer["error"]
+            site.daemon.close()
+            status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "imu0"}})
+            assert (status, "no daemon at" in answer["error"]) == (502, True)
+
+    run(body)
+
+
+def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing_is_read_without(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with running(tmp_path) as site:
+            assert not site.daemon.hub.connections
+            socket = await site.stream(look="device", device="imu0", rate_hz=50)
+            status = await message(socket, "status")
+            assert (status["device"], status["status"]["name"]) == ("imu0", "imu0")
+            assert len(site.daemon.hub.connections) == 1
+            site.daemon.publish(batch("imu0", 1, 100))
+            got = await message(socket, "samples")
+            assert sum(one["count"] for one in got["buckets"]) >= 19
+            site.daemon.event(Event(5, "imu0", EventKind.UP, "is there"))
+            assert (await message(socket, "events"))["events"][0]["message"] == "is there"
+            await socket.send_json({"look": "overview", "acknowledged": 3})
+            assert [row["name"] for row in (await message(socket, "overview"))["devices"]] == ["imu0", "imu1"]
+            others = [await site.stream(look="overview") for _ in range(5)]
+            for other in others:
+                await message(other, "overview")
+            assert len(site.daemon.hub.connections) == 1, "one connection for all pages"
+            for one in (socket, *others):
+                await one.close()
+            await until(lambda: not site.daemon.hub.connections)
+
+    run(body)
+
+
+def test_what_a_page_sends_wrong_is_told_to_it(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with running(tmp_path) as site:
+            socket = await site.stream(look="everything")
+            assert "Invalid enum value 'everything'" in (await message(socket, "problem"))["message"]
+            for text in ("{", "[]", '{"look": "overview", "more": 1}', '{"rate_hz": 7}', '{"acknowledged": "x"}'):
+                await socket.send_str(text)
+                assert (await message(socket, "problem"))["message"]
+            await socket.send_json({"look": "overview"})
+            assert await message(socket, "overview")
+            await socket.send_str("x" * 5000)
+            while (last := await socket.receive()).type is WSMsgType.TEXT:
+                pass
+            assert last.type is WSMsgType.CLOSE
+            assert last.data == 1009, "too long a message ends the connection"
+
+    run(body)
+
+
+def test_pages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def body() -> None:
+        monkeypatch.setattr(web_app, "BROWSERS_MAX", 1)
+        async with running(tmp_path) as site:
+            socket = await site.stream(look="overview")
+            with pytest.raises(WSServerHandshakeError, match="503"):
+                await site.client.ws_connect("/api/stream", headers=site.origin)
+            await socket.close()
+            assert site.web.hub is not None
+            hub = site.web.hub
+            await until(lambda: not hub.browsers)
+            await (await site.stream(look="overview")).close()
+
+    run(body)

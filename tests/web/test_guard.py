@@ -1,0 +1,129 @@
+"""Host, Origin, token, cookie."""
+
+from pathlib import Path
+
+import pytest
+
+from imud.errors import BadArgument
+from imud.web.guard import SESSION_S, WebGuard, WebRights, host_name, is_loopback, read_token, safety_headers
+
+TOKEN = "correct-horse-battery-staple"
+
+
+class Clock:
+    """The wall clock of a test."""
+
+    now_s = 1_790_000_000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def make(*, reading_needs_token: bool = False, token: str = TOKEN, clock: Clock | None = None) -> WebGuard:
+    return WebGuard(
+        token.encode(), clock or Clock(), reading_needs_token=reading_needs_token, names=["Gateway.example"]
+    )
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "127.0.0.1:9322",
+        "localhost:8080",
+        "LOCALHOST",
+        "[::1]:9322",
+        "192.168.1.7",
+        "gateway.example:9322",
+        "localhost.",
+    ],
+)
+def test_hosts_that_nobody_else_can_have_are_good(host: str) -> None:
+    assert make().host_problem(host) == ""
+
+
+@pytest.mark.parametrize(
+    "host", ["attacker.example:9322", "127.0.0.1.attacker.example", "", None, "1", "[::1", "0x7f.1"]
+)
+def test_other_hosts_are_refused(host: str | None) -> None:
+    if host == "[::1":  # the address is whole
+        assert make().host_problem(host) == ""
+    else:
+        assert "see imud web --host" in make().host_problem(host)
+
+
+def test_an_origin_is_that_of_the_page_itself() -> None:
+    guard = make()
+    good = guard.origin_problem("http://localhost:9322", "localhost:9322", with_token=False)
+    assert good == ""
+    for origin in (
+        "http://localhost:8080",
+        "http://attacker.example",
+        "null",
+        "",
+        "localhost:9322",
+        "ftp://localhost:9322",
+    ):
+        assert guard.origin_problem(origin, "localhost:9322", with_token=False), origin
+        assert guard.origin_problem(origin, "localhost:9322", with_token=True), origin
+
+
+def test_only_a_program_with_the_token_may_leave_the_origin_out() -> None:
+    assert make().origin_problem(None, "localhost", with_token=True) == ""
+    assert make().origin_problem(None, "localhost", with_token=False)
+
+
+def test_rights_by_header_and_by_cookie() -> None:
+    guard = make(reading_needs_token=True)
+    assert guard.rights(None, None) == WebRights(False, False)
+    assert guard.rights(f"Bearer {TOKEN}", None) == WebRights(True, True)
+    assert guard.rights(f"Bearer {TOKEN}x", None) == WebRights(False, False)
+    assert guard.rights(TOKEN, None) == WebRights(False, False)
+    assert guard.rights(None, guard.new_session()) == WebRights(True, True, by_cookie=True)
+    assert guard.rights(None, TOKEN) == WebRights(False, False)
+    assert make().rights(None, None) == WebRights(True, False), "reading is open"
+
+
+def test_without_a_token_nobody_controls() -> None:
+    guard = make(token="")
+    assert guard.rights("Bearer ", "") == WebRights(True, False)
+    assert guard.rights("Bearer", guard.new_session()) == WebRights(True, False)
+    assert not guard.has_token
+
+
+def test_a_session_ends_and_cannot_be_prolonged_or_forged() -> None:
+    clock = Clock()
+    guard = make(clock=clock)
+    cookie = guard.new_session()
+    end, _, signature = cookie.partition(".")
+    assert guard.is_session(cookie)
+    assert make(clock=clock).is_session(cookie), "a restart keeps it"
+    assert not make(token=TOKEN + "2", clock=clock).is_session(cookie), "another token ends it"
+    assert not guard.is_session(f"{int(end) + 1}.{signature}")
+    for forged in (f"{end}.", end, f".{signature}", f"٣{end[1:]}.{signature}", "9" * 400 + "." + signature, "é.é"):
+        assert not guard.is_session(forged), forged
+    clock.now_s += SESSION_S
+    assert not guard.is_session(cookie)
+
+
+def test_names_of_hosts_and_loopback() -> None:
+    assert host_name("[fe80::1]:80") == "fe80::1"
+    assert [is_loopback(one) for one in ("127.0.0.1", "127.8.8.8", "::1", "localhost")] == [True] * 4
+    assert [is_loopback(one) for one in ("0.0.0.0", "::", "192.168.1.1", "", "gateway")] == [False] * 5
+
+
+def test_a_token_comes_from_the_first_line_of_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    file.write_text(f"  {TOKEN} \nmore\n")
+    assert read_token(str(file)) == TOKEN.encode()
+    file.write_text("short\n")
+    with pytest.raises(BadArgument, match="at least 20 characters, got 5; make one with: openssl rand"):
+        read_token(str(file))
+    with pytest.raises(BadArgument, match="No such file"):
+        read_token(str(tmp_path / "none"))
+
+
+def test_the_page_may_run_its_own_scripts_only() -> None:
+    policy = safety_headers()["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "frame-ancestors 'none'" in policy

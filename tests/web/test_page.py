@@ -1,0 +1,290 @@
+"""The page in a real browser: what is plotted is what a module sent, restarts, telephones, the token."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imud.runtime.calibration.turning import cell_of
+from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon, wait_until
+from tests.test_daemon import Cable, cable, device
+from tests.web.browser import MISSING, PHONE, Page, Sender, browser, serving_web
+
+pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
+
+TOKEN = "correct-horse-battery-staple"
+PEAK_EVERY = 40
+WAVE_HZ = 20.0
+POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
+PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
+    return [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]]"""
+"""Times, least and greatest acceleration along z, as uPlot has them."""
+
+
+CHOOSE = """const node = document.querySelector(arguments[0]);
+    node.value = arguments[1];
+    node.dispatchEvent(new Event('change'))"""
+
+
+TURNING = {
+    "t_s": 5.0, "device": "bow", "event": "calibration", "message": "half of the directions",
+    "detail": {"cells": "0000000000ff", "field_t": 48.5e-6, "residual": 0.025},
+}  # fmt: skip
+"""An event of a calibration, as docs/socket.md has it."""
+
+
+def peaks(number: int) -> float:
+    """9.5 m/s², and now and then one sample with a value that no other has."""
+    return 9.5 if number % PEAK_EVERY else 20.0 + number / PEAK_EVERY / 8
+
+
+def wave(number: int) -> float:
+    """Vibration of 2 m/s² at WAVE_HZ, in messages at 200 Hz."""
+    return 9.8 + 2.0 * math.sin(2 * math.pi * WAVE_HZ * number / 200)
+
+
+@contextmanager
+def sent_by(folder: Path, port: Cable) -> Iterator[RunningDaemon]:
+    with running_daemon(folder, {"bow": device(port.name)}, python=()) as daemon:
+        yield daemon
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """One browser for all tests that do not need another size."""
+    with browser(tmp_path_factory.mktemp("browser")) as one:
+        yield one
+
+
+@pytest.fixture
+def page(window: Page) -> Page:
+    """Its tab, with no page open and nothing in its log."""
+    window.driver.get("about:blank")
+    window.problems()
+    return window
+
+
+def test_what_is_plotted_is_what_was_sent_and_every_peak_of_it(page: Page, tmp_path: Path) -> None:
+    with cable(tmp_path) as port, Sender(port, peaks) as sender, sent_by(tmp_path, port) as daemon:
+        daemon.wait_for("bow", "running")
+        with serving_web(daemon.socket) as url:
+            page.driver.get(f"{url}#/device/bow")
+            page.until(POINTS, 80, what="four seconds are plotted")
+            page.click("#pause")
+            page.until("return !window.imud.view.plots.get('accel_m_s2').isDue")
+            times, least, greatest = page.js(PLOTTED)
+            sent = list(sender.sent)
+            assert page.problems() == []
+    assert len(times) == len(least) == len(greatest) >= 80
+    assert all(np.diff(times) > 0)
+    assert set(np.round(least, 4)) <= {9.5}, "ten samples are in each bucket, and one of forty is a peak"
+    known = np.array(sent)
+    plotted = [value for value in greatest if value > 15]
+    assert len(plotted) >= 10, "a peak each 0.2 s"
+    numbers = [int(np.argmin(np.abs(known - value))) for value in plotted]
+    assert np.allclose(known[numbers], plotted, rtol=1e-6), "each plotted peak was sent with this value"
+    assert np.all(np.diff(numbers) == PEAK_EVERY), "no peak between the first and the last is missing"
+    moments = [time for time, value in zip(times, greatest, strict=True) if value > 15]
+    assert np.allclose(np.diff(moments), 0.2, atol=0.05), "they stand where they belong in time, within a bucket"
+
+
+def test_the_spectrum_has_the_frequency_and_the_size_of_a_vibration(page: Page, tmp_path: Path) -> None:
+    with cable(tmp_path) as port, Sender(port, wave), sent_by(tmp_path, port) as daemon:
+        daemon.wait_for("bow", "running")
+        with serving_web(daemon.socket) as url:
+            page.driver.get(f"{url}#/device/bow")
+            page.until(POINTS, 2)
+            page.js(CHOOSE, "#spectrum-of", "accel_m_s2")
+            page.until("return window.imud.view.spectrum.data", what="a spectrum")
+            frequencies, _, _, density = page.js("return window.imud.view.spectrum.data")
+            rate_hz, points = page.js(
+                "const one = window.imud.view.spectrum.spectrum; return [one.rate_hz, one.points]"
+            )
+            note = page.text("#spectrum .quiet")
+            assert page.problems() == []
+    assert rate_hz == pytest.approx(200, rel=0.02)
+    assert points == 512, "the greatest power of two in four seconds"
+    at = int(np.argmax(np.array(density, dtype=float)))
+    assert frequencies[at] == pytest.approx(WAVE_HZ, abs=200 / 512)
+    power = sum(value**2 for value in density[max(at - 4, 0) : at + 5]) * (frequencies[1] - frequencies[0])
+    assert power == pytest.approx(2.0**2 / 2, rel=0.1), "the mean square of a sine of 2 m/s²"
+    assert "every sample" in note
+
+
+def test_the_transform_is_that_of_numpy(page: Page, tmp_path: Path) -> None:
+    values = np.random.default_rng(5).normal(size=256)
+    with serving_web(tmp_path / "none") as url:
+        page.driver.get(url)
+        found = page.module(
+            "const { density } = await import('/static/spectrum.js'); return [...density(args[0], 128)]",
+            values.tolist(),
+        )
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(256) / 256)
+    expected = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2 / (128 * np.sum(window**2))
+    expected[1:-1] *= 2
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_directions_and_rotations_are_those_of_the_daemon(page: Page, tmp_path: Path) -> None:
+    with serving_web(tmp_path / "none") as url:
+        page.driver.get(url)
+        cells = page.module(
+            """const { cellDirection } = await import('/static/control.js');
+            return Array.from({ length: 48 }, (_, cell) => cellDirection(cell))"""
+        )
+        covered = page.module(
+            """const { coveredCells } = await import('/static/control.js');
+            return coveredCells('800000000005')"""
+        )
+        turned = page.module(
+            """const { rotate } = await import('/static/attitude.js');
+            return rotate([Math.SQRT1_2, 0, 0, Math.SQRT1_2], [1, 0, 0])"""
+        )
+    assert [cell_of(tuple(one)) for one in cells] == [*range(48)]
+    assert [cell for cell, is_covered in enumerate(covered) if is_covered] == [0, 2, 47]
+    assert turned == pytest.approx([0, 1, 0]), "a quarter turn about z takes x to y"
+
+
+def test_the_page_goes_on_after_a_restart_of_the_daemon_and_of_imud_web(page: Page, tmp_path: Path) -> None:
+    with cable(tmp_path) as port, Sender(port, peaks):
+        with sent_by(tmp_path, port) as daemon:
+            daemon.wait_for("bow", "running")
+            socket = daemon.socket
+            with serving_web(socket) as url:
+                page.driver.get(f"{url}#/device/bow")
+                page.until(POINTS, 5)
+                page.until_text("#daemon", "imud 0.")
+            page.until_text("#problem", "no connection to imud web")
+            own_port = int(url.rstrip("/").rpartition(":")[2])
+            with serving_web(socket, port=own_port):
+                page.until_text("#daemon", "imud 0.")
+                assert page.js("return document.querySelector('#problem').hidden")
+        with serving_web(socket, port=own_port):
+            page.until_text("#daemon", "not connected")
+            page.until_text("#problem", "imud.sock")
+            before = page.js("return window.imud.view.plots.get('accel_m_s2').newest")
+            with sent_by(tmp_path, port):
+                page.until_text("#daemon", "imud 0.")
+                page.until("return window.imud.view.plots.get('accel_m_s2').newest > arguments[0] + 1", before)
+                greatest = page.js(PLOTTED)[2]
+                assert None in greatest, "the line is broken while nothing came"
+
+
+def test_ledger_latency_status_and_settings_are_those_of_the_daemon(page: Page, tmp_path: Path) -> None:
+    with daemon_with_module(tmp_path, "--rate", "100") as daemon, serving_web(daemon.socket) as url:
+        page.driver.get(f"{url}#/device/bow")
+        page.until("return document.querySelector('#bar-bytes')?.dataset.total > 0")
+        drawn = page.js(
+            """const status = window.imud.view.status.status;
+            return ['bytes', 'frames', 'samples'].map((id) => {
+                const bar = document.querySelector(`#bar-${id}`);
+                const width = (one) => one.getBoundingClientRect().width;
+                const parts = [...bar.children].map((part) => [Number(part.dataset.count), width(part)]);
+                return [Number(bar.dataset.total), parts, width(bar)];
+            }).concat([status])"""
+        )
+        *bars, status = drawn
+        assert [bar[0] for bar in bars] == [
+            status["ledger"]["bytes_in"], status["ledger"]["frames_good"], status["ledger"]["samples"],
+        ]  # fmt: skip
+        for total, parts, width in bars:
+            assert sum(count for count, _ in parts) == total, "the parts add up"
+            shown = [(count, wide) for count, wide in parts if count]
+            assert sum(wide for _, wide in shown) == pytest.approx(width, abs=1)
+            assert all(wide >= 3 or wide == pytest.approx(width * count / total, abs=1) for count, wide in shown)
+        counts = page.js(
+            "return [...document.querySelectorAll('.histogram li')].map((one) => Number(one.dataset.count))"
+        )
+        assert len(counts) == 11
+        page.until("return document.querySelectorAll('[data-setting]').length > 3")
+        page.until("return document.querySelectorAll('#calibration details').length > 0")
+        page.until("return document.querySelectorAll('#actions details').length > 3")
+        assert "Log in to begin it." in page.js("return document.querySelector('#calibration').textContent")
+        assert (
+            page.js("return getComputedStyle(document.querySelector('#settings .buttons + .buttons')).display")
+            == "none"
+        )
+        page.until("return window.imud.view.attitude.quaternion")
+        assert page.js("return document.querySelector('#attitude3d canvas').toDataURL().length") > 3000
+        page.js("window.imud.view.addEvents([arguments[0]])", TURNING)
+        assert page.js("return document.querySelector('#calibration canvas').dataset.covered") == "8"
+        assert "field 48.5 µT, residual 2.5 %" in page.text("#calibration-progress")
+        assert page.problems() == []
+
+
+def test_with_the_token_settings_are_planned_and_without_the_right_one_not(page: Page, tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    file.write_text(TOKEN)
+    with (
+        daemon_with_module(tmp_path, "--rate", "100") as daemon,
+        serving_web(daemon.socket, "--token-file", str(file), "--reading", "token") as url,
+    ):
+        page.driver.get(f"{url}#/device/bow")
+        page.until("return document.querySelector('#login-dialog').open", what="the token is asked for")
+        enter(page, "wrong")
+        page.until_text("#login-problem", "this is not the token")
+        enter(page, TOKEN)
+        page.until("return !document.querySelector('#login-dialog').open")
+        page.until("return document.querySelector('[data-setting=\"mode\"] input')")
+        page.js("document.querySelector('[data-setting=\"mode\"] input').value = '9-axis'")
+        page.click("#settings .buttons + .buttons button")
+        page.until_text("#settings .result", "mode")
+        assert "9-axis" in page.text("#settings .result")
+        cookies = page.driver.get_cookies()
+        assert [(one["httpOnly"], one["sameSite"]) for one in cookies] == [(True, "Strict")]
+        assert TOKEN not in page.driver.current_url
+        refused = [one for one in page.problems() if "401" not in one]
+        assert refused == []
+
+
+def enter(page: Page, token: str) -> None:
+    """Write a token into the dialog and send it."""
+    page.js("document.querySelector('#token').value = arguments[0]", token)
+    page.click("#login-form button[type=submit]")
+
+
+def test_both_views_fit_a_telephone(tmp_path: Path) -> None:
+    wide = "return [document.documentElement.scrollWidth, window.innerWidth]"
+    with (
+        daemon_with_module(tmp_path, "--rate", "100") as daemon,
+        serving_web(daemon.socket) as url,
+        browser(tmp_path, phone=True) as page,
+    ):
+        page.driver.get(url)
+        page.until("return document.querySelector('.card')")
+        page.until_text(".card", "Hz")
+        assert page.js(wide) == [PHONE[0], PHONE[0]]
+        page.click(".card")
+        page.until(POINTS, 5)
+        page.until("return document.querySelectorAll('[data-setting]').length > 3")
+        assert page.js(wide) == [PHONE[0], PHONE[0]]
+        cut: list[Any] = page.js(
+            """return [...document.querySelectorAll('main *')].filter((one) => {
+                const box = one.getBoundingClientRect();
+                return box.width && box.right > window.innerWidth + 1 && !one.closest('.scroll');
+            }).map((one) => one.outerHTML.slice(0, 80))"""
+        )
+        assert cut == []
+
+
+def test_a_hidden_page_reads_nothing(page: Page, tmp_path: Path) -> None:
+    with daemon_with_module(tmp_path, "--rate", "100") as daemon, serving_web(daemon.socket) as url:
+        page.driver.get(f"{url}#/device/bow")
+        page.until(POINTS, 5)
+
+        def clients() -> int:
+            with daemon.client() as client:
+                return len(client.status()["socket"]["clients"]) - 1
+
+        assert clients() == 1
+        page.js(
+            """Object.defineProperty(document, 'hidden', { value: true, configurable: true });
+            document.dispatchEvent(new Event('visibilitychange'))"""
+        )
+        wait_until(lambda: clients() == 0, "the page reads nothing")
+        page.js("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
+        wait_until(lambda: clients() == 1, "it reads again")
