@@ -15,6 +15,7 @@
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
 # make lab-debian   boots Debian 12 and 13 with systemd and checks the package there (as root; tests/lab_debian/README.md)
+# make lab-arm64    the same short on emulated arm64, and unit tests on its Python
 # make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
 SHELL := /bin/sh
 PYTHON ?= python3
@@ -25,7 +26,7 @@ LAB_OPTIONS ?= --steady
 RIG_OPTIONS ?=
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try monitoring-deps lab-debian lab-debian-deps
+.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try monitoring-deps lab-debian lab-debian-deps lab-arm64 lab-arm64-deps
 
 all: check
 
@@ -132,6 +133,13 @@ lab-debian: $(VENV)/made
 
 lab-debian-deps: deb-deps
 	tests/lab_debian/deps amd64
+
+# As root; ARGS=unit-tests: these only, without a machine.
+lab-arm64: $(VENV)/made
+	tests/lab_debian/run --arm64 $(RIG_OPTIONS) $(ARGS)
+
+lab-arm64-deps: deb-deps
+	tests/lab_debian/deps arm64
 
 clean:
 	rm -rf build $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

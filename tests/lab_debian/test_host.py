@@ -35,6 +35,7 @@ BOOKWORM, TRIXIE = AMD64
     [
         (["--frob"], "lab-debian: unrecognized arguments: --frob (tests/lab/run --help)\n"),
         (["--arm64", "--suite", "bookworm"], "lab-debian: there is no bookworm for arm64, only trixie\n"),
+        (["unit-tests"], "lab-debian: unit-tests are for an architecture that the host has not: --arm64\n"),
     ],
 )
 def test_bad_options_are_one_line(arguments: list[str], line: str) -> None:
@@ -356,6 +357,56 @@ def test_nothing_of_the_hosts_environment_reaches_a_step(tmp_path: Path, monkeyp
     monkeypatch.setenv("PIP_INDEX_URL", "http://elsewhere")
     image.step(["sh", "-c", "env"], tmp_path / "log")
     assert "elsewhere" not in (tmp_path / "log").read_text(encoding="utf-8")
+
+
+STATUS = """\
+Package: libc6
+Status: install ok installed
+Architecture: amd64
+Version: 2.41-12
+
+Package: tzdata
+Status: install ok installed
+Architecture: all
+Version: 2025b-4
+"""
+
+
+def write(root: Path, files: dict[str, str]) -> None:
+    """Files of a root file system."""
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text, encoding="ascii")
+
+
+def test_a_root_of_another_architecture_keeps_what_was_set_up_and_has_the_others_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, records = tmp_path / "root", "var/lib/dpkg"
+    write(root, {
+        f"{records}/status": STATUS, f"{records}/info/libc6:amd64.list": "/usr/lib/x86_64-linux-gnu/libc.so.6\n",
+        f"{records}/info/libc6:amd64.postinst": "#!/bin/sh\n", "usr/lib/x86_64-linux-gnu/libc.so.6": "ours",
+        "usr/lib64/ld.so": "ours", "usr/bin/true": "ours", "etc/passwd": "made by a script", "etc/ld.so.cache": "ours",
+    })  # fmt: skip
+    (root / "lib64").symlink_to("usr/lib64")
+    asked: list[tuple[str, ...]] = []
+
+    def unpacked(_release: Release, folder: Path, _log: Path, variant: str, names: tuple[str, ...]) -> None:
+        asked.append((variant, *names))
+        theirs = {"usr/bin/true": "theirs", "usr/lib/aarch64-linux-gnu/libc.so.6": "theirs", f"{records}/status": ""}
+        write(folder, theirs)
+
+    monkeypatch.setattr(image, "bootstrap", unpacked)
+    image.exchange(ARM64[0], root, tmp_path / "other", tmp_path / "log")
+    assert asked == [("extract", "libc6", "tzdata")]
+    left = {str(path.relative_to(root)): path.read_text() for path in root.rglob("*") if path.is_file()}
+    assert left == {
+        f"{records}/status": STATUS.replace("amd64", "arm64"),
+        f"{records}/info/libc6:arm64.list": "/usr/lib/aarch64-linux-gnu/libc.so.6\n",
+        f"{records}/info/libc6:arm64.postinst": "#!/bin/sh\n",
+        "usr/lib/aarch64-linux-gnu/libc.so.6": "theirs", "usr/bin/true": "theirs", "etc/passwd": "made by a script",
+    }  # fmt: skip
+    assert not (root / "lib64").is_symlink()
 
 
 # --- packages ---------------------------------------------------------------------------------------------------------

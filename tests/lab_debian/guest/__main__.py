@@ -17,7 +17,6 @@ from tests.lab_debian.guest import (
     rights,
     sandbox,
     service,
-    unit_tests,
 )
 from tests.lab_debian.guest.checks import Checks
 from tests.lab_debian.guest.system import SHARE, Host, uptime_s
@@ -35,13 +34,12 @@ GROUPS: dict[str, Group] = {
     "doctor": first_contact.check_doctor,
     "setup": first_contact.check_setup,
     "streaming": service.check_streaming,
-    "unit-tests": unit_tests.check,
     "removal": removal.check,
 }
 """In the order in which they run: the first leaves the package installed and the second the service running."""
 RUNS = {
     "amd64": ("service", "rights", "sandbox", "outputs", "buses", "replug", "doctor", "setup", "removal"),
-    "arm64": ("streaming", "sandbox", "doctor", "unit-tests"),
+    "arm64": ("streaming", "sandbox", "doctor"),
 }
 
 

@@ -1,6 +1,7 @@
 """The unit's confinement: systemd's own score, what the process may not do, and that nodes of all kinds open."""
 
 import json
+import platform
 import re
 from pathlib import Path
 
@@ -18,6 +19,8 @@ SCORE_MAX = 2.0
 """Of the rest 0.4 are for adjtimex, which tells whether the clock is synchronised (docs/operate.md)."""
 PUBLIC, PRIVATE = "192.0.2.1", "10.9.8.7"
 """Addresses that the guest gives itself; the first is of TEST-NET-1 (RFC 5737), outside of every private network."""
+INIT_MODULE = {"x86_64": 175, "aarch64": 105}[platform.machine()]
+"""Number of the system call."""
 FORBIDDEN = {
     "write to /usr": "open('/usr/probe', 'w')",
     "write to /etc": "open('/etc/probe', 'w')",
@@ -34,7 +37,7 @@ FORBIDDEN = {
     "make a namespace": "import ctypes; l = ctypes.CDLL(None, use_errno=True); assert not l.unshare(0x10000000)",
     "map memory that is written and executed": "import mmap; mmap.mmap(-1, 4096, prot=7)",
     "open a packet socket": "import socket; socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)",
-    "load a module": "import ctypes; l = ctypes.CDLL(None, use_errno=True); assert not l.syscall(175, 0, 0, 0)",
+    "load a module": f"import ctypes; assert not ctypes.CDLL(None).syscall({INIT_MODULE}, 0, 0, 0)",
     "make a node": "import os, stat; os.mknod('/var/lib/imud/n', stat.S_IFCHR | 0o600, os.makedev(1, 3))",
     "make a set-uid file": "import os; open('/var/lib/imud/s', 'w'); os.chmod('/var/lib/imud/s', 0o4755)",
 }

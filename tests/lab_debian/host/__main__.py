@@ -18,7 +18,7 @@ from tests.lab.host import guest, results
 from tests.lab.host.__main__ import Parser, run_program
 from tests.lab.host.environment import ROOT
 from tests.lab.host.errors import HungGuest, LabError
-from tests.lab_debian.host import image, packages, requests
+from tests.lab_debian.host import image, packages, requests, unit_tests
 from tests.lab_debian.host.machine import SENSOR, DebianMachine
 from tests.lab_debian.host.release import AMD64, ARM64, Release
 
@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     """The options."""
     options = Parser(prog="tests/lab_debian/run", allow_abbrev=False, description="Checks the package on Debian.")
     options.add_argument("--ci", action="store_true", help="where it cannot run say so and succeed")
-    options.add_argument("--arm64", action="store_true", help="emulated arm64 and unit tests there, instead of amd64")
+    options.add_argument("--arm64", action="store_true", help="arm64, with unit tests, instead of amd64")
     options.add_argument("--suite", choices=[release.suite for release in AMD64], help="only this release")
     options.add_argument("--build-only", action="store_true", help="make images and packages, do not boot")
     options.add_argument("--package", type=Path, metavar="DEB", help="install this package instead of building one")
@@ -55,17 +55,18 @@ def say(line: str) -> None:
 def chosen(options: argparse.Namespace) -> list[Release]:
     """The releases to run. LabError if there is none of that name."""
     found = [release for release in (ARM64 if options.arm64 else AMD64) if options.suite in (None, release.suite)]
+    if unit_tests.NAME in options.only and not options.arm64:
+        raise LabError(f"{unit_tests.NAME} are for an architecture that the host has not: --arm64")
     if not found:
         raise LabError(f"there is no {options.suite} for arm64, only {', '.join(r.suite for r in ARM64)}")
     return found
 
 
-def program(options: argparse.Namespace, release: Release) -> str:
-    """What the guest runs."""
+def program(options: argparse.Namespace, release: Release, groups: list[str]) -> str:
+    """What the guest runs: the command, or the groups of checks, all that are for its architecture if none is named."""
     if options.exec:
         return f"{options.exec}\n"
-    groups = " ".join([release.architecture, *options.only])
-    return f"exec python3 -B -m tests.lab_debian.guest {groups}\n"
+    return f"exec python3 -B -m tests.lab_debian.guest {' '.join([release.architecture, *groups])}\n"
 
 
 @contextlib.contextmanager
@@ -89,26 +90,21 @@ def simulator(python: Path, node: Path) -> Iterator[int]:
             process.stdin.close()
 
 
-def fill(folder: Path, release: Release, package: Path, options: argparse.Namespace) -> None:
+def fill(folder: Path, release: Release, package: Path, script: str) -> None:
     """Put into the run's folder what the guest takes from there."""
     shutil.copytree(GUEST, folder / GUEST.relative_to(ROOT), ignore=shutil.ignore_patterns(BYTECODE))
     shutil.copy(package, folder / "imud.deb")
     packages.next_version(package, folder)
     (folder / "release").write_text(f"{release.suite}\n", encoding="ascii")
-    (folder / "script").write_text(program(options, release), encoding="utf-8")
-    if release.architecture == "arm64":
-        for part in ("tests", "imud", "etc", "docs", "systemd"):
-            shutil.copytree(ROOT / part, folder / "tree" / part, ignore=shutil.ignore_patterns(BYTECODE, "corpus"))
-        for file in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
-            shutil.copy(ROOT / file, folder / "tree" / file)
+    (folder / "script").write_text(script, encoding="utf-8")
 
 
-def boot(options: argparse.Namespace, release: Release, made: image.Image, package: Path) -> int:
+def boot(options: argparse.Namespace, release: Release, groups: list[str], made: image.Image, package: Path) -> int:
     """One run of one guest; its status."""
     output = options.output / release.name
     failed, start_s = True, time.monotonic()
     with results.run_folder(output) as folder, contextlib.ExitStack() as stack:
-        fill(folder, release, package, options)
+        fill(folder, release, package, program(options, release, groups))
         sockets = stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-lab-"))
         machine = DebianMachine(release, made, folder, Path(sockets))
         python = options.venv.absolute() / "bin" / "python"
@@ -150,21 +146,30 @@ def lab(arguments: Sequence[str]) -> int:
                 raise LabError(why)
             say(f"left out: {why}")
             return 0
+    return max(run_release(options, release) for release in releases)
+
+
+def run_release(options: argparse.Namespace, release: Release) -> int:
+    """Everything that is asked for of one release; the worst status."""
+    python = options.venv.absolute() / "bin" / "python"
+    checked = [group for group in options.only if group != unit_tests.NAME]
+    boots = bool(options.exec or checked or not options.only)
+    start_s = time.monotonic()
+    made = image.built(release, say) if boots else None
+    package = options.package or packages.build(release, python)
+    say(f"{release.name}: image and package after {time.monotonic() - start_s:.0f} s")
+    if options.build_only:
+        return 0
     worst = 0
-    for release in releases:
-        start_s = time.monotonic()
-        made = image.built(release, say)
-        package = options.package or packages.build(release, options.venv / "bin" / "python")
-        say(f"{release.name}: image and package after {time.monotonic() - start_s:.0f} s")
-        if options.build_only:
-            continue
-        try:
-            status = boot(options, release, made, package)
-        except HungGuest as error:
-            say(f"{error}; booting once more")
-            status = boot(options, release, made, package)
-        worst = max(worst, status)
-    return worst
+    if release.foreign and not options.exec and (not options.only or unit_tests.NAME in options.only):
+        worst = unit_tests.run(release, package, python, options.output / release.name, say)
+    if made is None:
+        return worst
+    try:
+        return max(worst, boot(options, release, checked, made, package))
+    except HungGuest as error:
+        say(f"{error}; booting once more")
+        return max(worst, boot(options, release, checked, made, package))
 
 
 def main() -> int:

@@ -11,9 +11,6 @@ SYSTEM = (
 )
 """Debian's packages in the guest: the system itself, what sets it up, and the programs that imud works with."""
 
-UNIT_TESTS = ("python3-pytest", "python3-pytest-timeout", "python3-hypothesis", "gcc", "libc6-dev")
-"""What the unit tests need on an architecture that the host has not."""
-
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "crc32c_generic", "ext4", "virtio_console", "9pnet_virtio", "9p", "autofs4")
 """Loaded by the initramfs, in this order; some are built into some kernels."""
 
@@ -39,9 +36,9 @@ class Release:
         return f"{self.suite}-{self.architecture}"
 
     @property
-    def packages(self) -> tuple[str, ...]:
-        """Debian's packages in its root file system."""
-        return SYSTEM if self.architecture == "amd64" else (*SYSTEM, *UNIT_TESTS)
+    def foreign(self) -> bool:
+        """Whether the host has another architecture."""
+        return self.architecture != "amd64"
 
     @property
     def qemu(self) -> str:

@@ -1,0 +1,141 @@
+"""The unit tests of codecs, clock, ring and C header on the Python of an architecture that the host has not.
+
+They need no booted system and run under qemu-user, which emulates neither memory nor devices of a machine, on the
+libraries of imud's package for that architecture.
+"""
+
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+from tests.lab.host import results
+from tests.lab.host.environment import ROOT
+from tests.lab.host.errors import LabError
+from tests.lab_debian.host import user_mode
+from tests.lab_debian.host.release import PYTHONS, Release
+
+NAME = "unit-tests"
+"""As a group of checks."""
+CLOCK = ("arrival_fit", "arrival_time", "device_utc", "edge_pairing", "even_arrivals", "even_run", "intervals",
+         "link_delay", "stamp_time")  # fmt: skip
+"""Tests of the clock but for those that play hours of arrivals: several minutes each where they are emulated."""
+PARTS = {
+    "codecs": (
+        *("tests/formats", "tests/devices/hipnuc/common", "tests/devices/imu61x/common"),
+        *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("tests/devices/**/test_codec.py")),
+        *(f"tests/devices/test_every_{kind}_driver.py" for kind in ("stream", "can", "polled")),
+    ),
+    "clock": tuple(f"tests/clock/test_{name}.py" for name in CLOCK),
+    "ring": ("tests/publishers/shm/test_publisher.py", "tests/client/test_ring.py"),
+    "C header": ("tests/include",),
+}
+"""What is run: folders and files of tests by what they test. Not those of sessions, settings and simulators, which have
+no layout of bytes of their own."""
+TEST_LIMIT_S = 600
+"""Per test: ten times the ordinary limit."""
+LIMIT_S = 3600.0
+REPORT = "unit-tests.xml"
+LINES_SHOWN = 12
+
+
+@dataclass
+class Tally:
+    """The results of one part."""
+
+    passed: int = 0
+    skipped: int = 0
+    seconds: float = 0.0
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def good(self) -> bool:
+        """Whether tests ran, and none failed."""
+        return self.passed > 0 and not self.failures
+
+
+def run(release: Release, package: Path, python: Path, output: Path, say: Callable[[str], None]) -> int:
+    """Run all parts; 0 if all passed, 1 if not. `package` is imud's, `python` has pip. LabError if they cannot run."""
+    made = user_mode.built(release, python, say)
+    start_s = time.monotonic()
+    with results.run_folder(output) as work:
+        result = pytest(made, work, unpack(package, work, release))
+        report = work / REPORT
+        if not report.exists():
+            lines = result.stdout.strip().splitlines() or ["no output"]
+            raise LabError(f"the unit tests on {release.name} ended with {result.returncode}: {lines[-1]}")
+        text = report.read_text(encoding="utf-8")
+        shutil.copy(report, output / REPORT)
+    good = shown(counted(text))
+    say(f"{release.name}: the unit tests ran {time.monotonic() - start_s:.0f} s; report: {output / REPORT}")
+    return 0 if good and result.returncode == 0 else 1
+
+
+def pytest(made: Path, work: Path, site: str) -> subprocess.CompletedProcess[str]:
+    """Run the tests with the libraries at `site`; the report is in `work`. LabError if they do not end."""
+    words = ["/usr/bin/env", "--chdir=/mnt/tree", "/usr/bin/python3", "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    words += [
+        f"--timeout={TEST_LIMIT_S}",
+        f"--junit-xml=/mnt/{REPORT}",
+        *(path for part in PARTS.values() for path in part),
+    ]
+    try:
+        return subprocess.run(
+            user_mode.command(made, work, ROOT, words), env=user_mode.environment(user_mode.SITE, site), text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LIMIT_S, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired as error:
+        raise LabError(f"the unit tests did not end within {LIMIT_S:.0f} s") from error
+
+
+def unpack(package: Path, work: Path, release: Release) -> str:
+    """Unpack imud's package into the run's folder; the path of its libraries as the program sees it."""
+    try:
+        subprocess.run(["dpkg-deb", "--extract", str(package), str(work / "package")], check=True, timeout=600)
+    except (subprocess.SubprocessError, OSError) as error:
+        raise LabError(f"the package {package} cannot be unpacked: {error}") from error
+    site = f"package/usr/lib/imud/lib/python{PYTHONS[release.suite]}/site-packages"
+    if not (work / site).is_dir():
+        raise LabError(f"the package {package} has no {site.removeprefix('package/')}: is it one for {release.name}?")
+    shutil.rmtree(work / site / "imud")  # the tests have that of the repository, which is the same
+    return f"/mnt/{site}"
+
+
+def counted(report: str) -> dict[str, Tally]:
+    """Results by part, of pytest's report (JUnit XML)."""
+    tallies = {name: Tally() for name in PARTS}
+    for case in ElementTree.fromstring(report).iter("testcase"):
+        place = case.get("classname", "").replace(".", "/")
+        part = next((name for name, paths in PARTS.items() if place.startswith(stems(paths))), "")
+        if not part:
+            raise LabError(f"a test outside of what was asked for: {place}")
+        tally = tallies[part]
+        tally.seconds += float(case.get("time", "0"))
+        bad = [element for element in case if element.tag in ("failure", "error")]
+        if bad:
+            tally.failures.append(f"{place}: {case.get('name')}\n{bad[0].text or bad[0].get('message', '')}")
+        elif case.find("skipped") is not None:
+            tally.skipped += 1
+        else:
+            tally.passed += 1
+    return tallies
+
+
+def stems(paths: tuple[str, ...]) -> tuple[str, ...]:
+    """Folders and files as the report's class names begin."""
+    return tuple(path.removesuffix(".py") for path in paths)
+
+
+def shown(tallies: dict[str, Tally]) -> bool:
+    """Print a line for each part, and failures; whether all are good."""
+    for name, tally in tallies.items():
+        word = "PASS" if tally.good else "FAIL"
+        counts = f"{tally.passed} passed, {tally.skipped} skipped, {len(tally.failures)} failed"
+        print(f"{word} {tally.seconds:6.1f} s  {NAME}: {name}: {counts}", flush=True)
+        for failure in tally.failures:
+            for line in failure.splitlines()[:1] + failure.splitlines()[1:][-LINES_SHOWN:]:
+                print(f"       {line}", flush=True)
+    return all(tally.good for tally in tallies.values())

@@ -1,0 +1,108 @@
+"""Programs of an architecture that the host has not: the host's kernel runs them by qemu-user (binfmt_misc).
+
+`built` makes what they run in, once per change of its inputs: the release's Python and compiler, only unpacked, so that
+no maintainer script has to be emulated, and pytest beside them. `command` runs a program there, where it can change
+nothing but its own folder of the run.
+"""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.lab.host import cache
+from tests.lab.host.errors import LabError
+from tests.lab_debian.host.image import CLEAN, bootstrap, enable_emulation
+from tests.lab_debian.host.release import PYTHONS, Release
+
+PACKAGES = ("base-files", "base-passwd", "dash", "coreutils", "python3", "gcc", "g++", "libc6-dev")
+"""Debian's: what the tests' Python and their compiler need."""
+WHEELS = ("pytest>=8.2", "pytest-timeout>=2.3", "hypothesis>=6.100", "canopen>=2.3", "cantools>=39")
+"""Of the Python Package Index: what the tests import beside imud and what its package has."""
+MACHINES = {"arm64": "aarch64"}
+"""Names of architectures in the tags of wheels."""
+TAGS = ("manylinux_2_17", "manylinux2014", "manylinux_2_28")
+ROOT_NAME = "root"
+SITE = "/opt/site"
+"""Where WHEELS are, as programs see it."""
+PYCACHE = "pycache"
+"""Bytecode of later runs: compiling takes longer than the tests."""
+NEEDED_BYTES = 2 << 30
+PIP_LIMIT_S = 600
+
+ENTER = """\
+set -eu
+made=$1 work=$2 tree=$3
+shift 3
+root=$made/root
+mount --bind "$root" "$root"
+mount -o remount,bind,ro "$root"
+mount -t proc proc "$root/proc"
+mount --rbind /dev "$root/dev"
+mount -t tmpfs tmpfs "$root/dev/shm"
+mount -t tmpfs tmpfs "$root/tmp"
+mount --bind "$work" "$root/mnt"
+mkdir -p "$work/tree" "$work/pycache"
+mount --bind "$tree" "$root/mnt/tree"
+mount -o remount,bind,ro "$root/mnt/tree"
+mount --bind "$made/pycache" "$root/mnt/pycache"
+exec chroot "$root" "$@"
+"""
+"""In a mount namespace, so that nothing stays mounted. /mnt is the run's folder, and tree in it the repository."""
+
+
+def built(release: Release, python: Path, say: Callable[[str], None]) -> Path:
+    """The folder of `release`, made if it is not in the cache; `python` has pip. LabError if it cannot be made."""
+
+    def make(folder: Path) -> None:
+        say(f"{release.name}: unpacking Python, compiler and pytest (a minute, once)")
+        make_root(release, python, folder)
+
+    enable_emulation(release.architecture)
+    return cache.get(f"programs-{release.name}-{key(release)}", make, NEEDED_BYTES, say, cache.cache_root("-debian"))
+
+
+def key(release: Release) -> str:
+    """Changes with the recipe and its lists."""
+    return cache.key_of(release.name.encode(), Path(__file__).read_bytes())
+
+
+def make_root(release: Release, python: Path, folder: Path) -> None:
+    """Fill `folder` with the root file system and a place for bytecode."""
+    root = folder / ROOT_NAME
+    bootstrap(release, root, folder / "build.log", "extract", PACKAGES)
+    for name in ("passwd", "group"):
+        shutil.copy(root / f"usr/share/base-passwd/{name}.master", root / "etc" / name)
+    for name, target in (("cc", "gcc"), ("c++", "g++")):  # made by scripts that do not run
+        (root / "usr/bin" / name).symlink_to(target)
+    for name in ("proc", "dev/shm", "tmp", "mnt"):
+        (root / name).mkdir(parents=True, exist_ok=True)
+    (folder / PYCACHE).mkdir()
+    install_wheels(release, python, root / SITE.lstrip("/"))
+
+
+def install_wheels(release: Release, python: Path, site: Path) -> None:
+    """Unpack WHEELS for the release's Python and architecture, by the host's pip. LabError with its last line."""
+    machine = MACHINES[release.architecture]
+    fits = ["--only-binary=:all:", "--implementation", "cp", "--python-version", PYTHONS[release.suite]]
+    fits += [word for tag in TAGS for word in ("--platform", f"{tag}_{machine}")]
+    command = [str(python), "-m", "pip", "install", "--quiet", "--no-compile", "--target", str(site), *fits, *WHEELS]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=PIP_LIMIT_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise LabError(f"pip did not end within {PIP_LIMIT_S} s") from error
+    if result.returncode:
+        lines = [line for line in (result.stdout + result.stderr).splitlines() if line.strip()]
+        raise LabError(f"wheels for {release.name}: {lines[-1] if lines else 'pip failed'}")
+
+
+def command(made: Path, work: Path, tree: Path, words: list[str]) -> list[str]:
+    """The command that runs `words` in `made`, with `work` as its /mnt and `tree` as /mnt/tree, at low priority."""
+    enter = ["unshare", "--mount", "sh", "-c", ENTER, "sh"]
+    return ["nice", "-n", "5", *enter, str(made), str(work), str(tree), *words]
+
+
+def environment(*paths: str) -> dict[str, str]:
+    """The environment of such a program: nothing of the host's, and `paths` for Python."""
+    return {**CLEAN, "LC_ALL": "C.UTF-8", "PYTHONPYCACHEPREFIX": "/mnt/pycache", "PYTHONPATH": os.pathsep.join(paths)}
