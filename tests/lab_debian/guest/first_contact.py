@@ -29,8 +29,8 @@ def check_doctor(checks: Checks, host: Host) -> None:
     wait_streaming("usb")
     wait_streaming("can")
     with checks("imud doctor finds no error while everything runs"):
-        found = findings()
-        expect("errors", [finding for finding in found if finding["severity"] == "error"], [])
+        # on a busy host a simulator stands still for a second, which is an error while it lasts
+        wait_until(lambda: not errors(), "no error of imud doctor")
     with checks("imud doctor tells that the adapter is gone"):
         host.unplug()
         wait_until(lambda: (device("usb") or {}).get("state") == "missing", "the device is missing")
@@ -48,10 +48,13 @@ def check_doctor(checks: Checks, host: Host) -> None:
         wait_streaming("usb")
 
 
-def findings() -> list[dict[str, str]]:
-    """What `imud doctor --json` says."""
+def errors() -> list[dict[str, str]]:
+    """The errors that `imud doctor --json` finds, printed so that a run shows those that pass."""
     examined = json.loads(run("imud", "doctor", "--json").stdout)
-    return [finding for check in examined["checks"] for finding in check["findings"]]
+    found = [one for check in examined["checks"] for one in check["findings"] if one["severity"] == "error"]
+    for one in found:
+        print(f"       {one['seen']}", flush=True)
+    return found
 
 
 def check_setup(checks: Checks, _host: Host) -> None:
