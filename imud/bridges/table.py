@@ -24,6 +24,8 @@ AXES: Final = {
 """Columns of the fields that have more than one."""
 TIMES: Final = frozenset({"t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
 """Fields that a file without times does not have."""
+REALS: Final = frozenset({"temperature_c", "pressure_pa"})
+"""Fields of one number that is none of those that count; a device may send whole degrees all the same."""
 EVENT_COLUMNS: Final = ("utc_ns", "t_ns", "device", "kind", "message", "detail")
 LOSS_COLUMNS: Final = ("utc_ns", "t_ns", "device", *LossCounts._fields[3:])
 
@@ -45,7 +47,7 @@ def sample_row(fields: Sequence[str], without_times: bool = False) -> Callable[[
         for name, width, is_unknown in plan:
             value = None if is_unknown else getattr(sample, name)
             if not width:
-                cells.append(value)
+                cells.append(float(value) if value is not None and name in REALS else value)
             elif value is None:
                 cells += width * (None,)
             else:

@@ -70,12 +70,12 @@ def run(args: argparse.Namespace) -> int:
         out = ExportFile(args.output, source=args.file, force=args.force, binary=args.to == "mcap")
         with closing(progress), out, closing(_sink(args, file, out, is_recording=is_recording)) as sink:
             convention = _convention(args)
-            feed = ExportFeed(sink, file, progress, args.device, convention)
+            feed = ExportFeed(sink, file, progress, convention)
             done = _play(args, file, feed, is_recording=is_recording)
             sink.finish()
     size = f"{out.written_bytes / MEGABYTE:.1f} MB"
-    complain(f"{done.report}\n\n{feed.samples} samples to {out.name}, {size} in {progress.spent_s:.1f} s")
-    return done.status if feed.samples else 1
+    complain(f"{done.report}\n\n{feed.samples_taken} samples to {out.name}, {size} in {progress.spent_s:.1f} s")
+    return done.status if feed.samples_taken else 1
 
 
 def check(args: argparse.Namespace) -> None:

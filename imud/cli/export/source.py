@@ -1,30 +1,28 @@
 """What is exported: a recording or a capture, played into a sink in the axes that are wanted."""
 
-from collections.abc import Collection
-from operator import attrgetter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from imud.bridges.channel import LossCounts, StampedEvent
+from imud.cli.export.playing import LossWatch, play_beside, play_here
 from imud.cli.export.progress import Progress
 from imud.cli.export.sinks import Sink
 from imud.cli.output import paragraph
-from imud.cli.recording.replay import block, play
+from imud.cli.recording.replay import block
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import Driver
 from imud.contracts.publisher import Batch
 from imud.contracts.settings import Settings
 from imud.errors import BadArgument
-from imud.event import Event
 from imud.formats.candump import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.frames.conventions import Convention
-from imud.ledger import Ledger
 from imud.runtime.recording.captures import CapturePlayer, KnownTimes
-from imud.runtime.recording.player import PlayedDevice, Player
+from imud.runtime.recording.player import PlayedDevice
 
-_LOST: Final = attrgetter("samples", *LossCounts._fields[4:])
-"""Counters of a ledger in the order of `LossCounts`."""
+BESIDE_BYTES: Final = 1_000_000
+"""From this size on a recording is played in a process of its own: a start of one takes as long as 20,000 samples."""
 
 
 class Exported(NamedTuple):
@@ -37,50 +35,56 @@ class Exported(NamedTuple):
 
 
 class ExportFeed:
-    """Passes on what a player makes. Synchronization: one thread."""
+    """A sink that turns samples into the axes that are wanted for another one. Synchronization: one thread."""
 
-    def __init__(
-        self, sink: Sink, file: BinaryIO, progress: Progress, devices: Collection[str], convention: Convention | None
-    ) -> None:
-        """`devices` are those that are wanted, none: all; None as `convention` leaves axes as they were published."""
+    def __init__(self, sink: Sink, file: BinaryIO, progress: Progress, convention: Convention | None) -> None:
+        """None as `convention` leaves axes as they were published."""
         self._sink = sink
-        self._position = file.tell
+        self._file = file
+        self._read_bytes: int | None = None
         self._progress = progress
-        self._devices = devices
         self._convention = convention
-        self._lost: dict[str, tuple[int, ...]] = {}
-        self.samples = 0
+        self.samples_taken = 0
         """Samples passed on."""
 
-    def batch(self, batch: Batch, ledger: Ledger) -> None:
-        """Pass on samples, and before them what was lost since those before."""
-        if self._devices and batch.device not in self._devices:
-            return
-        samples, *lost = _LOST(ledger)
-        counts = tuple(lost)
-        if counts != self._lost.get(batch.device):
-            self._lost[batch.device] = counts
-            first = batch.samples[0]
-            before = samples - len(batch.samples)
-            self._sink.losses(LossCounts(first.t_ns, first.utc_ns, batch.device, before, *counts))
+    def at(self, read_bytes: int) -> None:
+        """Note how far the file is read, where another process reads it."""
+        self._read_bytes = read_bytes
+
+    def samples(self, batch: Batch) -> None:
+        """Turn samples, and pass them on."""
         self._sink.samples(batch.converted(self._convention))
-        self.samples += len(batch.samples)
+        self.samples_taken += len(batch.samples)
         self._progress.add(len(batch.samples), self._position)
 
-    def event(self, event: Event, utc_ns: int) -> None:
-        """Pass on an event of a device that is wanted, or of the daemon itself."""
-        if not self._devices or not event.device or event.device in self._devices:
-            self._sink.event(StampedEvent(event, utc_ns))
+    def losses(self, losses: LossCounts) -> None:
+        """Pass them on."""
+        self._sink.losses(losses)
+
+    def event(self, event: StampedEvent) -> None:
+        """Pass it on."""
+        self._sink.event(event)
+
+    def finish(self) -> None:
+        """Write what waits."""
+        self._sink.finish()
+
+    def close(self) -> None:
+        """No-op: the other sink is the caller's."""
+
+    def _position(self) -> int:
+        return self._file.tell() if self._read_bytes is None else self._read_bytes
 
 
-def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Collection[str]) -> Exported:
+def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Sequence[str]) -> Exported:
     """Play a recording. Raises ImudError, BadArgument for a device that it does not have."""
-    player = Player(lambda batch: feed.batch(batch, player.devices[batch.device_id].ledger), on_event=feed.event)
-    report, status = play(file, str(path), player)
-    known = {device.described.name for device in player.devices.values()}
+    if path.stat().st_size < BESIDE_BYTES:
+        report, status, known = play_here(file, str(path), feed, devices)
+    else:
+        report, status, known = play_beside(path, feed, devices, feed.at)
     for name in devices:
         if name not in known:
-            there = ", ".join(sorted(known))
+            there = ", ".join(known)
             raise BadArgument(f"--device {name}: expected a device of the recording, which has {there}")
     return Exported(report, status)
 
@@ -89,7 +93,8 @@ def export_capture(
     file: BinaryIO, path: Path, feed: ExportFeed, driver: Driver, options: Settings, baud: int
 ) -> Exported:
     """Play a capture. Raises ImudError."""
-    player = CapturePlayer(lambda batch: feed.batch(batch, player.device.ledger), driver, options, str(path))
+    watch = LossWatch(feed, ())
+    player = CapturePlayer(lambda batch: watch.batch(batch, player.device.ledger), driver, options, str(path))
     reader: CaptureReader | CandumpReader
     if isinstance(driver, CanDriver):
         reader = CandumpReader(file)

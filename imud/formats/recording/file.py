@@ -47,6 +47,10 @@ class BlockGatherer:
         return self._encoder.encode(content)
 
 
+_LOOKED_AT: Final = frozenset({int(Kind.SESSION)})
+"""Records that the reader itself looks at."""
+
+
 class RecordingReader:
     """Reader of the records of one file, seekable or not. Iterate once.
 
@@ -79,13 +83,14 @@ class RecordingReader:
                 self.records_unreadable += 1
                 continue
             for record in found:
-                self._look_at(record)
+                if record.kind in _LOOKED_AT:
+                    self._look_at(record)
                 yield record
+            self.ended = found[-1].kind == Kind.END if found else self.ended
         if not self.blocks_read:
             raise ImudError(f"{self._name} is no recording of imud, or nothing of it is left: no whole block is in it")
 
     def _look_at(self, record: Record) -> None:
-        self.ended = record.kind == Kind.END
         if record.kind == Kind.SESSION:
             self.session = decode_object(record, SessionRecord)
             if self.session is not None and self.session.version != records.VERSION:

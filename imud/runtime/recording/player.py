@@ -45,6 +45,8 @@ from imud.signals.ready_edges import ReadyEdges
 
 FROM_OUTSIDE: Final = ("lost_queue", "replies_late", "replies_unsolicited")
 """Counters that neither codec nor clock decides: a check sets them."""
+_DATA: Final = int(Kind.DATA)
+"""Of an enumeration each look at a member takes 0.1 µs on Python 3.11."""
 
 
 @dataclass(slots=True)
@@ -126,7 +128,9 @@ class Player:
 
     def _play(self, record: Record) -> None:
         kind, device = record.kind, self.devices.get(record.device)
-        if kind == Kind.CLOCKS:
+        if kind == _DATA and device is not None:  # nearly all
+            self._play_device(device, record)
+        elif kind == Kind.CLOCKS:
             self._read_clocks(records.decode_clocks(record.body))
         elif kind == Kind.CALL:
             self._call(device, records.decode_object(record, CallRecord))
@@ -143,7 +147,7 @@ class Player:
 
     def _play_device(self, device: PlayedDevice, record: Record) -> None:
         kind, path = record.kind, device.path
-        if kind == Kind.DATA and isinstance(path, StreamPath):
+        if kind == _DATA and isinstance(path, StreamPath):
             t_rx_ns, waited_ns, data = records.decode_data(record.body)
             if waited_ns < 0:
                 path.on_data(data, t_rx_ns)

@@ -1,0 +1,99 @@
+"""A recording that is played in a process of its own gives what it gives in this one."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from imud.bridges.channel import LossCounts, StampedEvent
+from imud.cli import main
+from imud.cli.export.playing import play_beside, play_here
+from imud.contracts.publisher import Batch
+from imud.errors import ImudError
+from imud.frames.conventions import Convention
+from imud.sample import Sample
+from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
+
+
+class KeepingSink:
+    """Keeps what it takes."""
+
+    def __init__(self) -> None:
+        self.taken: list[Sample | LossCounts | StampedEvent] = []
+        self.largest = 0
+
+    def samples(self, batch: Batch) -> None:
+        self.taken += batch.converted(Convention.ENU_FLU).samples
+        self.largest = max(self.largest, len(batch.samples))
+
+    def losses(self, losses: LossCounts) -> None:
+        self.taken.append(losses)
+
+    def event(self, event: StampedEvent) -> None:
+        self.taken.append(event)
+
+    def finish(self) -> None: ...
+    def close(self) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    _, _, (made,) = run_recorded(tmp_path_factory.mktemp("recorded"))
+    return made
+
+
+@pytest.mark.parametrize("devices", [[], ["bow"]])
+def test_both_ways_give_the_same_in_the_same_order(file: Path, devices: list[str]) -> None:
+    here, beside, positions = KeepingSink(), KeepingSink(), list[int]()
+    with file.open("rb") as stream:
+        first = play_here(stream, str(file), here, devices)
+    second = play_beside(file, beside, devices, positions.append)
+    assert second == first
+    assert first[2] == ["bow", "mast"]
+    assert beside.taken == here.taken
+    assert len(here.taken) > FRAMES
+    assert 1 < beside.largest < 2000
+    assert positions == sorted(positions)
+    assert 0 < positions[-1] <= file.stat().st_size
+
+
+def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
+    with pytest.raises(ImudError, match="no whole block"):
+        play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
+
+
+def test_a_player_that_ends_early_is_an_error(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/true")
+    with pytest.raises(ImudError, match="ended before its end"):
+        play_beside(file, KeepingSink(), [], lambda _at: None)
+
+
+def test_an_error_of_the_sink_ends_the_player(file: Path) -> None:
+    class Full(KeepingSink):
+        def samples(self, batch: Batch) -> None:
+            raise ImudError("full")
+
+    with pytest.raises(ImudError, match="full"):
+        play_beside(file, Full(), [], lambda _at: None)
+
+
+def test_the_player_ends_quietly_when_nobody_reads(file: Path) -> None:
+    argv = [sys.executable, "-m", "imud.cli.export.playing", str(file)]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+
+
+def test_the_command_writes_the_same_file(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", "--to", "csv", "-o", str(tmp_path / "here"), str(file)]) == 0
+    monkeypatch.setattr("imud.cli.export.source.BESIDE_BYTES", 0)
+    assert main(["export", "--to", "csv", "-o", str(tmp_path / "beside"), str(file)]) == 0
+    assert (tmp_path / "here").read_bytes() == (tmp_path / "beside").read_bytes()
+    assert main(["export", "--to", "csv", "--device", "stern", str(file)]) == 2
+    assert "which has bow, mast" in capsys.readouterr().err
