@@ -1,9 +1,14 @@
-"""Cost of recording: CPU of the daemon with and without, and what a sample takes on the disk.
+"""Cost of recording: CPU of the daemon with and without, and what a sample takes on the disk; and that it is right.
 
-The same load in turns, the best round of each: other programs share the machine. Threads of the recorder are part of
-the daemon's CPU. `size` records simulated modules that move, because a module at rest is compressed better.
+`python -m tests.bench.recording [--quick] [size] [cpu] [replay]`; without a name all of them.
+
+`cpu`: the same load in turns, the best round of each: other programs share the machine, which must be quiet otherwise.
+Threads of the recorder are part of the daemon's CPU. `size` records simulated modules that move, because a module at
+rest is compressed better. `replay` has a daemon play ten minutes of such a module at 1 kHz as fast as it can, and
+record it; a replay of the recording must have every member of every sample equal. With the others it is half a minute.
 """
 
+import hashlib
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -12,16 +17,27 @@ from pathlib import Path
 from random import Random
 from time import thread_time_ns
 
+import msgspec
+
+from imud import config
+from imud.contracts.publisher import Batch
+from imud.daemon import Daemon
+from imud.event import Event
 from imud.formats.recording import records
-from imud.formats.recording.file import BlockGatherer
+from imud.formats.recording.file import BlockGatherer, RecordingReader
+from imud.runtime import event_loop
+from imud.runtime.recording.player import Player
 from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.bench.rig import Load, run
 from tests.bench.rows import Row, at_most
+from tests.support.files import CaptureWriter
 
 RATIO_LIMIT = 1.15
 SIZE_SECONDS = 60
+REPLAY_SECONDS = 600
+REPLAY_QUICK_SECONDS = 30
 BEGIN_NS = 86_400 * NS_PER_S
 
 
@@ -29,6 +45,20 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
     """All figures."""
     yield from size_rows()
     yield from cpu_rows(rounds=1 if quick else 3, seconds=2.0 if quick else 6.0)
+    yield from replay_rows(REPLAY_QUICK_SECONDS)
+
+
+def chosen_rows(words: list[str]) -> Iterator[Row]:
+    """Those that the command line names."""
+    quick = "--quick" in words
+    if not {"size", "cpu", "replay"} & set(words):
+        yield from rows(quick=quick)
+    if "size" in words:
+        yield from size_rows()
+    if "cpu" in words:
+        yield from cpu_rows(rounds=1 if quick else 3, seconds=2.0 if quick else 6.0)
+    if "replay" in words:
+        yield from replay_rows(REPLAY_QUICK_SECONDS if quick else REPLAY_SECONDS)
 
 
 def size_rows() -> Iterator[Row]:
@@ -71,6 +101,70 @@ def cpu_rows(rounds: int, seconds: float) -> Iterator[Row]:
     yield at_most("1 kHz, 1 client: samples lost, recorded", float(max(b.lost for _, b in pairs)), "samples", 0)
 
 
+class Digest:
+    """A publisher that keeps the number of samples and a digest of all their members."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.sha256 = hashlib.sha256()
+
+    def publish(self, batch: Batch) -> None:
+        """Count and hash."""
+        self.count += len(batch.samples)
+        for sample in batch.samples:
+            self.sha256.update(msgspec.msgpack.encode(sample))
+
+    def start(self) -> None: ...
+    def add_device(self, name: str, device_id: int) -> None: ...
+    def remove_device(self, name: str) -> None: ...
+    def event(self, event: Event) -> None: ...
+    def tick(self, now_ns: int) -> None: ...
+    def close(self) -> None: ...
+
+
+def moving_capture(file: Path, seconds: int) -> None:
+    """A module at 1 kHz that moves, behind a port that hands its bytes over up to 0.25 ms late."""
+    random = Random(1)
+    module = HipnucModule(BEGIN_NS, ModuleSettings(baud=921_600, hi91=Output(period_ms=1)), HipnucHardware())
+    with file.open("wb") as out:
+        writer = CaptureWriter(out, driver="hipnuc-uart", baud=921600)
+        for second in range(seconds):
+            for burst in module.advance(BEGIN_NS + (second + 1) * NS_PER_S):
+                if burst.data:
+                    writer.write(burst.data, burst.due_ns + random.randrange(NS_PER_MS // 4))
+
+
+def replay_rows(seconds: int) -> Iterator[Row]:
+    """Run a daemon that records, replay what it wrote, and compare."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        moving_capture(folder / "capture", seconds)
+        text = f"""
+recorder: {{enabled: true, directory: {folder / "recordings"}, file_mb: 1000}}
+socket: {{enabled: false}}
+shm: {{enabled: false}}
+metrics: {{enabled: false}}
+devices:
+  bow: {{driver: hipnuc-uart, replay: {{path: {folder / "capture"}, speed: maximum}}}}
+"""
+        live, again = Digest(), Digest()
+        daemon = Daemon(config.parse(text, "imud.yaml"), extra={"live": live}, until_finished=True)
+        event_loop.run(daemon.run())
+        (file,) = (folder / "recordings").iterdir()
+        player = Player(again.publish)
+        with file.open("rb") as opened:
+            reader = RecordingReader(opened, file.name)
+            player.play(reader)
+        (device,) = player.devices.values()
+        same = live.count == again.count and live.sha256.digest() == again.sha256.digest()
+        yield Row(f"{seconds} s at 1 kHz: samples", float(live.count), "samples")
+        yield at_most(f"{seconds} s at 1 kHz: records dropped", float(player.lost), "records", 0)
+        yield Row(f"{seconds} s at 1 kHz: checks", float(device.checks), "checks")
+        yield at_most(f"{seconds} s at 1 kHz: checks that differ", float(len(device.differences)), "checks", 0)
+        yield at_most(f"{seconds} s at 1 kHz: 0 if every member of every sample is equal", float(not same), "", 0)
+        yield Row(f"{seconds} s at 1 kHz: bytes on the disk per sample", file.stat().st_size / live.count, "bytes")
+
+
 if __name__ == "__main__":
-    for row in rows(quick="--quick" in sys.argv):
+    for row in chosen_rows(sys.argv[1:]):
         print(f"{row.name:64} {row.value:12.3f} {row.unit:6} {row.reach} {row.reached}")
