@@ -1,7 +1,8 @@
 """Contract: events of a device other than samples, delivered to subscribers and to the log."""
 
+import logging
 from enum import StrEnum
-from typing import Protocol, cast
+from typing import Final, Protocol, cast
 
 import msgspec
 
@@ -38,6 +39,15 @@ class EventKind(StrEnum):
 def kind_of(name: str) -> EventKind:
     """Return the kind of this name; one that this imud does not know stays a plain string."""
     return EventKind(name) if name in EventKind.__members__.values() else cast("EventKind", name)
+
+
+LEVELS: Final = {
+    EventKind.UP: logging.INFO,
+    EventKind.SYNC: logging.INFO,
+    EventKind.MARK: logging.DEBUG,
+    EventKind.CALIBRATION: logging.DEBUG,
+}
+"""Kinds below a warning; marks are as frequent as camera triggers, progress of a calibration comes twice a second."""
 
 
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -54,14 +54,15 @@ COMMANDS = {
         "imud.cli.foxglove.command:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
     ),
     "web": Subcommand("imud.cli.web:WEB", "show all devices in a browser, live"),
-    "watch": Subcommand("imud.cli.samples:WATCH", "print samples as they come"),
+    "watch": Subcommand("imud.cli.live.watch:WATCH", "print samples as they come"),
+    "events": Subcommand("imud.cli.live.events:EVENTS", "print events as they come"),
     "clock": Subcommand(
         "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"
     ),
     "command": Subcommand("imud.cli.devices:COMMAND", "list the actions of a device, or carry one out"),
     "settings": Subcommand("imud.cli.settings:SETTINGS", "show, set, save or restore a device's own settings"),
     "calibrate": Subcommand("imud.cli.calibrate:CALIBRATE", "calibrate a device, guided step by step"),
-    "schema": Subcommand("imud.cli.samples:SCHEMA", "list the fields of a sample with units and frames"),
+    "schema": Subcommand("imud.cli.schema:SCHEMA", "list the fields of a sample with units and frames"),
 }
 
 

@@ -1,11 +1,13 @@
 """Plain text for people: tables and histograms."""
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime, timedelta
 from math import floor, log10
 from typing import Final
 
 from imud.log import MESSAGE_CHARACTERS_MAX, printable
+from imud.units import NS_PER_US
 
 COLUMNS: Final = 80
 """Width of a terminal that texts fit."""
@@ -13,6 +15,7 @@ WIDTH: Final = 40
 """Characters of the longest bar."""
 BARS: Final = 12
 """Most lines of a histogram."""
+EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 NO_VALUE: Final = ("", "-")
 """Cells of a column of numbers that are none."""
 STEPS: Final = (1, 2, 5, 10, 20)
@@ -35,6 +38,20 @@ def shortened(text: str, width: int) -> str:
         return text
     end = (width - 1) // 2
     return f"{text[: width - 1 - end]}…{text[len(text) - end :]}"
+
+
+def fitted(value: float, width: int, show: Callable[[float], str]) -> str:
+    """Format a number in `width` characters: as `show` does, without decimals, or by a power of ten."""
+    for text in (show(value), f"{value:.1f}", f"{value:.0f}", f"{value:.1e}", f"{value:.0e}"):
+        short = text.replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+        if len(short) <= width:
+            return short
+    return "#" * width
+
+
+def local_time(utc_ns: int) -> datetime:
+    """Return a time given in ns since 1970-01-01 UTC in the local time zone, cut off to µs."""
+    return (EPOCH + timedelta(microseconds=utc_ns // NS_PER_US)).astimezone()
 
 
 def paragraph(label: str, text: str) -> list[str]:

@@ -4,6 +4,7 @@ A command may be started with a descriptor closed, with its output on a full dis
 a locale that has only ASCII. None of that may end in a traceback, or in an exit status that says the opposite.
 """
 
+import errno
 import io
 import os
 import select
@@ -39,6 +40,18 @@ def open_standard_streams() -> None:
 def discard_output() -> None:
     """Throw away what is buffered for standard output, and all that follows: it cannot be written."""
     _discard(sys.stdout)
+
+
+def raise_if_unread() -> None:
+    """Raise BrokenPipeError where standard output is a pipe or socket whose reader has gone, without writing to it."""
+    try:
+        descriptor = sys.stdout.fileno()
+    except OSError:  # a stream without a descriptor, in memory
+        return
+    poll = select.poll()
+    poll.register(descriptor, 0)  # errors are reported unasked
+    if any(events & select.POLLERR for _, events in poll.poll(0)):
+        raise BrokenPipeError(errno.EPIPE, "nobody reads the output any more")
 
 
 def complain(text: str) -> None:

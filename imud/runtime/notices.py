@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 
 from imud.contracts.codec import BadFrame
-from imud.event import Event, EventKind
+from imud.event import LEVELS, Event, EventKind
 from imud.ledger import Ledger
 from imud.log import MESSAGE_CHARACTERS_MAX, printable, same_as
 from imud.sample import Sync
@@ -15,8 +15,6 @@ log = logging.getLogger(__name__)
 INTERVAL_NS = NS_PER_S
 """At most one loss and one bad-frame event a second and device."""
 RAW_SHOWN_BYTES = 32
-LEVELS = {EventKind.UP: logging.INFO, EventKind.MARK: logging.DEBUG, EventKind.CALIBRATION: logging.DEBUG}
-"""Events below a warning; marks are as frequent as camera triggers, progress of a calibration comes twice a second."""
 
 
 class Notices:

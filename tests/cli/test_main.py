@@ -45,7 +45,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"imud {__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["devices", "status", "watch"])
+@pytest.mark.parametrize("command", ["devices", "status", "watch", "events"])
 def test_no_daemon_is_one_line(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--socket", str(tmp_path / "none")]) == 2
     error = capsys.readouterr().err

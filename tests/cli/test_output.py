@@ -1,8 +1,10 @@
 """A histogram in plain characters: its bars, their edges and their lengths."""
 
+import time
+
 import pytest
 
-from imud.cli.output import BARS, WIDTH, bar_width, histogram, table
+from imud.cli.output import BARS, WIDTH, bar_width, fitted, histogram, local_time, table
 
 
 def test_nothing_for_no_values() -> None:
@@ -53,3 +55,31 @@ def test_numbers_stand_to_the_right_in_columns_that_have_nothing_else() -> None:
         "baud     115200          11",
         "node     -               -",
     ]
+
+
+@pytest.mark.parametrize(
+    ("value", "width", "text"),
+    [
+        (12.34, 5, "12.34"),
+        (12345.6, 5, "12346"),
+        (123456.0, 5, "1.2e5"),
+        (1234567.0, 4, "1e6"),
+        (-1e300, 3, "###"),
+        (-12.34, 5, "-12.3"),
+    ],
+)
+def test_numbers_lose_digits_rather_than_the_column_its_width(value: float, width: int, text: str) -> None:
+    assert fitted(value, width, lambda number: f"{number:.2f}") == text
+
+
+def test_local_time_has_its_offset_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Summer and winter in a time zone with both: the offset is that of the moment, not that of today."""
+    monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+    time.tzset()
+    try:
+        assert local_time(1_790_000_000_123_456_789).isoformat() == "2026-09-21T16:13:20.123456+02:00"
+        assert local_time(1_800_000_000_000_000_000).isoformat() == "2027-01-15T09:00:00+01:00"
+        assert local_time(-1_000).isoformat() == "1970-01-01T00:59:59.999999+01:00"
+    finally:
+        monkeypatch.undo()
+        time.tzset()

@@ -1,5 +1,6 @@
 """No command ends in a traceback for what its standard streams are: a full disk, closed, ASCII, or not read."""
 
+import io
 import os
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from time import monotonic
 
 import pytest
 
+from imud.cli.streams import raise_if_unread
 from tests.support.daemon_process import running_daemon
 from tests.support.files import hi91
 from tests.support.surroundings import pipe
@@ -70,6 +72,23 @@ def test_reader_that_has_gone(tmp_path: Path) -> None:
         assert done.returncode == 0, words
         assert b"Traceback" not in done.stderr
         assert b"Broken pipe" not in done.stderr
+
+
+def test_a_reader_that_has_gone_is_seen_without_writing(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pipe() as (reader, writer), open(writer, "w", closefd=False) as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        raise_if_unread()
+        os.close(reader)
+        with pytest.raises(BrokenPipeError):
+            raise_if_unread()
+
+
+def test_files_and_streams_in_memory_are_always_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (tmp_path / "file").open("w") as file:
+        for stream in (file, io.StringIO()):
+            monkeypatch.setattr(sys, "stdout", stream)
+            raise_if_unread()
+    assert (tmp_path / "file").read_bytes() == b""
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from math import inf
 from typing import Final, NamedTuple
 
-from imud.cli.output import shortened
+from imud.cli.output import fitted, shortened
 from imud.cli.top.history import DeviceHistory, norm
 from imud.contracts.status import DeviceState
 from imud.ledger import lost
@@ -47,15 +47,6 @@ def _number(
         return -inf if found is None else found
 
     return Column(title, width, text, key)
-
-
-def fitted(value: float, width: int, show: Callable[[float], str]) -> str:
-    """Format a number in `width` characters: as `show` does, without decimals, or by a power of ten."""
-    for text in (show(value), f"{value:.0f}", f"{value:.1e}", f"{value:.0e}"):
-        short = text.replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
-        if len(short) <= width:
-            return short
-    return "#" * width
 
 
 def age_s(device: DeviceHistory, now_ns: int) -> float | None:

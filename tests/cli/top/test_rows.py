@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from imud.cli.top.history import DeviceHistory
-from imud.cli.top.rows import AGE, LOST, NAME, RATE, STATE, VIEWS, WIDTH, chosen, duration, fitted, head, row
+from imud.cli.top.rows import AGE, LOST, NAME, RATE, STATE, VIEWS, WIDTH, chosen, duration, head, row
 from imud.contracts.status import DeviceState
 from imud.sample import Sync
 from imud.units import NS_PER_S
@@ -61,14 +61,6 @@ def test_every_row_is_as_wide_as_its_titles_and_fits_80_columns(view: str, value
 )  # fmt: skip
 def test_ages_have_five_characters_at_most(seconds: float, text: str) -> None:
     assert duration(seconds) == text
-
-
-@pytest.mark.parametrize(
-    ("value", "width", "text"),
-    [(12.34, 5, "12.3"), (12345.6, 5, "12346"), (123456.0, 5, "1.2e5"), (1234567.0, 4, "1e6"), (-1e300, 3, "###")],
-)
-def test_numbers_lose_digits_rather_than_the_column_its_width(value: float, width: int, text: str) -> None:
-    assert fitted(value, width, lambda number: f"{number:.1f}") == text
 
 
 def names(devices: list[DeviceHistory]) -> list[str]:

@@ -1,0 +1,8 @@
+"""`imud watch` and `imud events`: what the running daemon sends, as it comes.
+
+following   one connection to the daemon, or one after another through its restarts; what is said about silent devices
+  ├──▶ watch      samples: as a table, as JSON or as CSV
+  │      ├──▶ fields    members of a sample by name, and as columns of CSV
+  │      └──▶ table     the layout for people, in the width of the terminal
+  └──▶ events     events: a line each
+"""

@@ -1,0 +1,120 @@
+"""`imud events`: print events as they come, each with its local time and priority.
+
+    2026-11-23T14:05:09.123+01:00 warning bow: down: the adapter was pulled out
+
+The priority is that with which the daemon logs events of this kind (`imud.event.LEVELS`), by its name in syslog(3).
+What happened before the command began is not sent: `imud status` shows what it led to, and the journal has all of it.
+"""
+
+import argparse
+import logging
+import sys
+import time
+from typing import Final
+
+import msgspec
+
+from imud.cli.arguments import CliCommand, add_socket
+from imud.cli.live.following import LOOK_S, keep_connected
+from imud.cli.output import local_time
+from imud.cli.streams import raise_if_unread
+from imud.client import Client
+from imud.event import LEVELS, Event
+from imud.log import MESSAGE_CHARACTERS_MAX, printable
+
+PRIORITIES: Final = {"warning": logging.WARNING, "info": logging.INFO, "debug": logging.DEBUG}
+"""Priorities by name, the most important first."""
+DAEMON: Final = "imud"
+"""Shown as the device of events of the daemon itself."""
+
+
+class PrintedEvent(msgspec.Struct, frozen=True, omit_defaults=True):
+    """An event as `--json` prints it: as the socket sends it, with its time and its priority."""
+
+    time: str
+    """Local time with its offset from UTC, ISO 8601."""
+    priority: str
+    t_ns: int
+    """CLOCK_MONOTONIC when it was noticed."""
+    device: str
+    """Empty for the daemon itself."""
+    kind: str
+    message: str
+    detail: dict[str, str | int | float | bool | None] = {}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `imud events`."""
+    add_socket(parser)
+    parser.add_argument(
+        "--device", action="append", default=[], metavar="DEVICE",
+        help="events of this device and of the daemon itself; may be given several times (default: of all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--priority", choices=list(PRIORITIES), default="debug",
+        help="events of this priority and of more important ones (default: %(default)s, which are all)",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    parser.add_argument("--count", type=int, default=None, metavar="N", help="stop after N events")
+    parser.add_argument(
+        "--follow", action="store_true", help="wait for the daemon where it does not run, and go on after its restarts"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print until interrupted, until N events came, or until the daemon ends; with `--follow` also after that."""
+    keep_connected("imud events", args.socket, _Printer(args).work, follow=args.follow)
+    return 0
+
+
+class _Printer:
+    """What goes on from one connection to the next."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self._args = args
+        self._left: int | None = args.count
+        self._least = PRIORITIES[args.priority]
+
+    def work(self, client: Client) -> None:
+        """Print the events of one connection."""
+        events = client.events(self._args.device or None, timeout_s=LOOK_S)
+        show = as_json if self._args.json else as_text
+        while self._left is None or self._left > 0:
+            try:
+                event = next(events)
+            except TimeoutError:  # nothing happens
+                raise_if_unread()
+                continue
+            if level_of(event) < self._least:
+                continue
+            sys.stdout.write(show(printed(event, time.time_ns() - time.monotonic_ns())) + "\n")
+            sys.stdout.flush()
+            if self._left is not None:
+                self._left -= 1
+
+
+def level_of(event: Event) -> int:
+    """Return the level with which the daemon logs events of this kind; that of a warning for a kind that is unknown."""
+    return LEVELS.get(event.kind, logging.WARNING)
+
+
+def printed(event: Event, utc_offset_ns: int) -> PrintedEvent:
+    """Add time and priority to an event; `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    level = level_of(event)
+    priority = next(name for name, least in PRIORITIES.items() if level >= least)
+    when = local_time(event.t_ns + utc_offset_ns).isoformat(timespec="milliseconds")
+    return PrintedEvent(when, priority, event.t_ns, event.device, str(event.kind), event.message, event.detail)
+
+
+def as_text(event: PrintedEvent) -> str:
+    """Format an event as one line of printable characters."""
+    line = f"{event.time} {event.priority:7} {event.device or DAEMON}: {event.kind}: {event.message}"
+    return printable(line, MESSAGE_CHARACTERS_MAX)
+
+
+def as_json(event: PrintedEvent) -> str:
+    """Format an event as one JSON object."""
+    return msgspec.json.encode(event).decode()
+
+
+EVENTS = CliCommand(add_arguments, run)
