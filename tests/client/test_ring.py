@@ -405,3 +405,5 @@ def test_close_twice(board: Board) -> None:
     ring = Ring(board.path)
     ring.close()
     ring.close()
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    assert [line.split()[1] for line in maps if line.endswith(str(board.path))] == ["rw-s"]  # the writer's only

@@ -464,8 +464,9 @@ def test_a_rate_or_an_address_that_the_device_does_not_have_is_refused(device: s
 
 
 def test_rates_and_addresses_that_the_device_has_are_accepted() -> None:
-    config.parse("devices:\n  a: {driver: imu61x-uart, uart: {port: x, baud: 1500000}}\n", "x.yaml")
-    config.parse("devices:\n  a: {driver: imu61x-i2c, i2c: {address: 0x1B}}\n", "x.yaml")
+    on_uart = config.parse("devices:\n  a: {driver: imu61x-uart, uart: {port: x, baud: 1500000}}\n", "x.yaml")
+    on_i2c = config.parse("devices:\n  a: {driver: imu61x-i2c, i2c: {address: 0x1B}}\n", "x.yaml")
+    assert (on_uart.devices[0].driver, on_i2c.devices[0].driver) == ("imu61x-uart", "imu61x-i2c")
 
 
 # I2C at 400 kHz: address, register, address, 32 bytes, nine bits each, and start, start, stop: 318 bits = 795 µs
@@ -495,7 +496,8 @@ def test_rates_that_a_bus_carries_are_accepted() -> None:
             "{driver: imu61x-spi, spi: {port: /dev/spidev1.0, rate_hz: 3900}}",
         ],
     ):
-        config.parse("devices:\n" + "".join(f"  {n}: {d}\n" for n, d in zip("ab", devices, strict=True)), "x.yaml")
+        text = "devices:\n" + "".join(f"  {n}: {d}\n" for n, d in zip("ab", devices, strict=True))
+        assert [device.name for device in config.parse(text, "x.yaml").devices] == ["a", "b"]
 
 
 def test_a_link_on_which_nothing_is_searched_needs_a_driver() -> None:

@@ -168,7 +168,9 @@ def test_command_mode_and_stream(variant: str) -> None:
 def test_modes_are_seen_at_any_rate(rate_hz: int) -> None:
     far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=rate_hz))
     far.run(session.stop_streaming())
+    assert far.samples(1500) == []
     far.run(session.start_streaming())
+    assert far.samples(2500)
 
 
 def test_a_mode_that_is_acknowledged_and_not_changed_is_an_error() -> None:
