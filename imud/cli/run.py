@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             return EXIT_OUTPUT
         except ImudError:
             raise
-        except Exception:
+        except Exception:  # the top level of the daemon: the log has it, and the exit status says it
             log.critical("imud ends because of a mistake of its own", exc_info=True)
             return EXIT_MISTAKE
     return 0

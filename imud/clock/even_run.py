@@ -67,8 +67,7 @@ def add_even_run(
         arrival_ns = t_rx_ns - (m.size_bytes * byte_ns + trailing_ns + offset_ns)
         if step != period_ticks or not step or arrival_ns < even_from_ns:
             break
-        step_ns = step * tick_ns
-        next_ns = device_ns + step_ns
+        next_ns = device_ns + (step_ns := step * tick_ns)
         fit_ns = ref_arrival_ns + slope * (next_ns - ref_device_ns)
         above_ns = arrival_ns - fit_ns
         is_new = not waited_ns or above_ns <= 0.0

@@ -51,7 +51,7 @@ class RingDirectory:
         self._fd = _open(path)
         try:
             self._identity = _identity(_checked(self._fd, path))
-        except BaseException:
+        except BaseException:  # whatever ended it, the descriptor does not stay open
             os.close(self._fd)
             raise
         self._remove_leftovers()

@@ -37,6 +37,7 @@ from imud.frames.conventions import Convention
 from imud.frames.settings import FrameSettings, published_frame
 from imud.host_clock import HostClock
 from imud.ledger import LEDGER_FIELDS, Ledger
+from imud.log import printable
 from imud.runtime.path import CanPath, PathContext, SamplePath, StreamPath, make_clock
 from imud.runtime.polled.path import PolledPath, PollTiming
 from imud.runtime.recording.state import StateError, StateReader
@@ -123,8 +124,9 @@ class Player:
                 self._play(record)
             except (ImudError, OSError):  # codecs and clocks do no I/O: the samples could not be written
                 raise
-            except Exception as error:  # a codec with a forged state may fail anyhow
-                raise ImudError(f"a record of kind {record.kind} cannot be replayed: {error!r}") from error
+            except Exception as error:  # a codec or clock whose recorded state was forged may raise anything
+                words = f"{type(error).__name__}: {printable(str(error))}"
+                raise ImudError(f"a record of kind {record.kind} cannot be replayed: {words}") from error
 
     def _play(self, record: Record) -> None:
         kind, device = record.kind, self.devices.get(record.device)
