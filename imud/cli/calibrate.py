@@ -137,7 +137,7 @@ def _account(result: CalibrationResult, *, asked_to_save: bool) -> str:
 def _value(value: float | None, unit: str) -> str:
     """Format a value in the units that people use."""
     if value is None:
-        return "not told"
+        return "not reported"
     match unit:
         case "rad":
             return f"{value / RAD_PER_DEG:.3g}°"

@@ -24,7 +24,7 @@ from imud.runtime import event_loop
 SPEEDS = ("recorded", "real", "maximum")
 DRIVER, SPEED, BAUD = "hipnuc-uart", "maximum", 115200
 NO_TIMES = (
-    "not known: the capture has bytes and no time of any read. Rate, skew, residual, error and latency cannot be told, "
+    "not known: the capture has bytes and no time of any read. Rate, skew, residual, error and latency are unknown, "
     "and the host times of the samples are made of the baud rate"
 )
 

@@ -66,7 +66,7 @@ def settings(args: argparse.Namespace) -> int:
 
 
 def _report(client: Client, device: str, *, needed: bool) -> SettingsReport:
-    """Ask for the settings: of the device itself where this user may, else what it told last.
+    """Ask for the settings: of the device itself where this user may, else what it reported last.
 
     Raises ImudError where they are `needed` and the device does not tell them now.
     """
@@ -76,11 +76,12 @@ def _report(client: Client, device: str, *, needed: bool) -> SettingsReport:
     except RpcError as error:
         if needed or not fresh or error.code is not Code.FAILED:
             raise
-        print(f"{error}; what it told last:", file=sys.stderr)
+        print(f"{error}; what it reported last:", file=sys.stderr)
         found = client.call("settings.get", device=device)
     report = msgspec.convert(found, SettingsReport)
     if needed and report.status.read_ns is None:
-        raise BadArgument(f"{device} has not told its settings yet, and only members of the control group may ask it")
+        who = "only members of the control group may ask for them"
+        raise BadArgument(f"{device} has not reported its settings yet, and {who}")
     return report
 
 
@@ -90,7 +91,7 @@ def _shown(report: SettingsReport, *, verbose: bool) -> str:
     status, count = report.status, len(report.status.differences)
     words = {
         SettingsState.UNDECLARED: "nothing is declared; `--yaml` prints what to paste into the configuration",
-        SettingsState.UNKNOWN: "the device has not told its settings",
+        SettingsState.UNKNOWN: "the device has not reported its settings",
         SettingsState.AGREE: "all that can be read is as declared",
         SettingsState.DIFFER: f"{count} of {len(report.settings)} differ; `--apply` sets them, with `--save` for good",
     }[status.state]
@@ -103,7 +104,7 @@ def _shown(report: SettingsReport, *, verbose: bool) -> str:
 
 def _row(one: SettingInfo, *, verbose: bool) -> Sequence[str]:
     """Format one setting."""
-    actual = _value(one.actual) if one.readable or one.actual is not None else "(not told)"
+    actual = _value(one.actual) if one.readable or one.actual is not None else "(not reported)"
     mark = "differs" if one.differs else "" if one.declarable else "only read"
     row = (one.name, _value(one.declared), actual, mark)
     return (*row, one.unit, one.section, str(one.effect), one.values) if verbose else row

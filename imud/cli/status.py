@@ -53,7 +53,7 @@ def page(devices: Sequence[DeviceStatus]) -> str:
 
 
 def block(status: DeviceStatus, without_times: str = "") -> str:
-    """Format the block of one device, in 80 columns; `without_times` is why nothing can be told that has to do with
+    """Format the block of one device, in 80 columns; `without_times` is why nothing is known that has to do with
     time."""
     clock, ledger = status.clock, status.ledger
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
@@ -133,11 +133,11 @@ def declared(settings: SettingsStatus) -> str:
     words = str(settings.state)
     if settings.differences:
         words += ": " + ", ".join(
-            f"{name} is {'not told' if one.actual is None else shown(one.actual)}, declared {shown(one.declared)}"
+            f"{name} is {'not reported' if one.actual is None else shown(one.actual)}, declared {shown(one.declared)}"
             for name, one in settings.differences.items()
         )
     if settings.unverified:
-        words += f"; not told by the device: {', '.join(settings.unverified)}"
+        words += f"; not reported by the device: {', '.join(settings.unverified)}"
     return words + (f" ({settings.problem})" if settings.problem else "")
 
 

@@ -1,7 +1,7 @@
 """Reading of `settings:` of a device: the values that the device's own settings should have, by its driver's table.
 
 They are declared for a named driver only, whose table has their names and types. What the table refuses together, and
-what contradicts the place where imud is told to find the device, is refused here, before any port is opened.
+what contradicts the place where imud is configured to find the device, is refused here, before any port is opened.
 """
 
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ class DeclaredReader:
         for name, value in values.items():
             place = _fixed(name, options, link) if table.table[name].connection else None
             if place not in (None, value):
-                message = f"expected {shown(place)}, where imud is told to find the device, got {shown(value)}; "
+                message = f"expected {shown(place)}, where imud is configured to find the device, got {shown(value)}; "
                 hint = f"`imud command {path[-1]} {name} …` changes it, or let imud search for it where it can (auto)"
                 self._keys.problem((*key, name), message + hint)
         baud = getattr(link, "baud", 0)

@@ -130,7 +130,7 @@ class SettingsState(StrEnum):
     UNDECLARED = "undeclared"
     """Nothing is declared for the device."""
     UNKNOWN = "unknown"
-    """The device has not told its settings since its link was opened."""
+    """The device has not reported its settings since its link was opened."""
     AGREE = "agree"
     """All that can be read is as declared."""
     DIFFER = "differ"

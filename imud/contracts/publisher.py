@@ -122,7 +122,7 @@ class DeviceControl(Protocol):
         ...
 
     async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """Return its own settings: asked for now if `fresh`, otherwise as told last. Raises ImudError."""
+        """Return its own settings: asked for now if `fresh`, otherwise as reported last. Raises ImudError."""
         ...
 
     async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:

@@ -348,7 +348,7 @@ class Device:
     # --- settings -----------------------------------------------------------------------------------------------------
 
     async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """Return the device's settings: asked for now if `fresh`, otherwise as told last.
+        """Return the device's settings: asked for now if `fresh`, otherwise as reported last.
 
         Raises CommandError, TransferError, DeviceRefused, LinkError.
         """

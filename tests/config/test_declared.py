@@ -79,7 +79,7 @@ def test_nothing_is_declared(lines: list[str]) -> None:
         ({"lines": ["settings: {mode: 9-axis}"], "driver": "fake-uart"}, "5:5: devices.bow.settings: expected settings only of a driver that knows those of its device, got them with fake-uart; drivers with settings: fake-module"),
         ({"lines": ["settings: {mode: 9-axis}", "identify: false"]}, "5:5: devices.bow.settings: expected identify: true, without which imud does not read settings, got false"),
         ({"lines": ["settings: {output: {a: 1000, b: 500}}"]}, "5:15: devices.bow.settings: output: expected at most 1152 Hz in all at 115200 baud, got 1500 Hz"),
-        ({"lines": ["settings: {baud: 921600}"]}, "5:22: devices.bow.settings.baud: expected 115200, where imud is told to find the device, got 921600; `imud command bow baud …` changes it, or let imud search for it where it can (auto)"),
+        ({"lines": ["settings: {baud: 921600}"]}, "5:22: devices.bow.settings.baud: expected 115200, where imud is configured to find the device, got 921600; `imud command bow baud …` changes it, or let imud search for it where it can (auto)"),
         ({"lines": ["on_difference: repair"]}, '5:20: devices.bow.on_difference: expected one of "report", "apply", "apply_and_save", got "repair"'),
     ],
 )  # fmt: skip

@@ -41,7 +41,7 @@ def rights(at: Surroundings) -> Findings:
         try:
             seen = node.stat()
         except FileNotFoundError:
-            continue  # told by the checks of ports and buses
+            continue  # reported by the checks of ports and buses
         if person is None:
             yield not_checked(f"{path}: the user of the daemon is not in /etc/passwd", "look at `ls -lL` of the node")
         elif _may_open(person, seen.st_mode, seen.st_uid, seen.st_gid):

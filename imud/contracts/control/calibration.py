@@ -1,4 +1,4 @@
-"""Contract of a guided calibration: what a person does, what the device is told, and how its result is judged.
+"""Contract of a guided calibration: what a person does, what is sent to the device, and how its result is judged.
 
 A script here is what the driver's transport runs, as for actions. The guide (`imud.runtime.calibration`) watches the
 samples meanwhile: it refuses motion where the device must rest, shows how far turning has come, and afterwards compares

@@ -86,7 +86,7 @@ def _declared(device: DeviceStatus) -> SettingsStatus | None:
 
 
 def _compared(device: DeviceStatus) -> SettingsStatus | None:
-    """The same once the device has told them."""
+    """The same once the device has reported them."""
     found = _declared(device)
     return found if found is not None and found.state is not SettingsState.UNKNOWN else None
 

@@ -342,7 +342,7 @@ def _stop_calibration(hub: Hub, _connection: Connection, params: DeviceParams) -
 
 
 def _settings(hub: Hub, connection: Connection, params: SettingsParams) -> Later:
-    """The device's own settings, as told last or asked for now."""
+    """The device's own settings, as reported last or asked for now."""
     _known_devices(hub, [params.device])
     if params.fresh:
         if Rights.CONTROL not in connection.rights:

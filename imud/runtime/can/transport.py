@@ -199,7 +199,7 @@ class CanTransport:
 
     async def read_back(self) -> None:
         """Ask for identity and settings again."""
-        with suppress(LinkError):  # whoever waits for the link's end is told by it
+        with suppress(LinkError):  # whoever waits for the link's end learns of it
             await self._identify(1)
 
     async def _identify(self, tries: int) -> None:

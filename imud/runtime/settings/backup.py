@@ -23,7 +23,7 @@ def backup_text(device: str, driver: str, identity: Mapping[str, str], settings:
     """Format a backup; `settings` has JSON values of all settings that can be set again."""
     time = _time(utc_ns).isoformat(timespec="seconds").replace("+00:00", "Z")
     content = {"device": device, "driver": driver, "time": time, "identity": identity, "settings": settings}
-    head = f"Settings of {device} as the device told them. `imud settings {device} --restore FILE` sets them again."
+    head = f"Settings of {device} as the device reported them. `imud settings {device} --restore FILE` sets them again."
     return f"{yaml_comment(head)}\n{yaml_block(content)}\n"
 
 

@@ -17,7 +17,7 @@ Values = Mapping[str, Any]
 
 
 def has(table: DeviceSettings, name: str, wanted: Values, actual: Values, told: Values) -> bool:
-    """Whether a device has a wanted value: as it says, or as it was told where it does not say."""
+    """Whether a device has a wanted value: as it reports, or as was written to it where it does not."""
     setting = table.table[name]
     known = actual if name in actual else told
     return name in known and setting.agrees(wanted[name], known[name])
@@ -43,7 +43,7 @@ def unverified(table: DeviceSettings, wanted: Values, actual: Values) -> tuple[s
 def words(found: Mapping[str, SettingDifference]) -> str:
     """Describe differences, for example `mode is "9-axis", declared "6-axis"`."""
     return ", ".join(
-        f"{name} is {'not told' if one.actual is None else shown(one.actual)}, declared {shown(one.declared)}"
+        f"{name} is {'not reported' if one.actual is None else shown(one.actual)}, declared {shown(one.declared)}"
         for name, one in found.items()
     )
 

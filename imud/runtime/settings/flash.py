@@ -1,6 +1,6 @@
 """Store of the writes to the flash of each module, which are counted over all runs of imud and limited per day.
 
-Flash of the controllers in such modules endures some ten thousand erasures. A device that forgets what it was told, or
+Flash of the controllers in such modules endures some ten thousand erasures. A device that forgets its settings, or
 a configuration that contradicts it, must not use them up: imud by itself writes a module LIMIT_ITSELF times within 24
 hours, which is a life of some seven years even so; people and programs may write it LIMIT_ASKED times.
 """

@@ -4,7 +4,7 @@
                                                                                           │ on_difference
                                                                                           └─▶ plan ─▶ apply ─▶ event
 
-A device that does not keep what it is told is told again after growing pauses (PAUSES_S), and its flash is written a
+A device that does not keep its settings gets them again after growing pauses (PAUSES_S), and its flash is written a
 limited number of times per day (`flash.py`).
 """
 
@@ -236,7 +236,7 @@ class SettingsKeeper:
         )
 
     async def report(self, *, fresh: bool) -> SettingsReport:
-        """Return all settings: asked for now if `fresh`, otherwise as told last.
+        """Return all settings: asked for now if `fresh`, otherwise as reported last.
 
         Raises CommandError, TransferError, DeviceRefused, LinkError.
         """
@@ -396,7 +396,7 @@ class SettingsKeeper:
         return make_plan(table, self._target, wanted, actual, self._all_told(table), save=save, unsaved=unsaved)
 
     def _all_told(self, table: DeviceSettings) -> dict[str, Any]:
-        """Values of settings that the device does not tell, as it was told them since its restart or before a save."""
+        """Values of settings that the device does not report, as written to it since its restart or before a save."""
         found: dict[str, Any] = {}
         for name, value in self._writes.told(self._module).items():
             try:
@@ -405,7 +405,7 @@ class SettingsKeeper:
                 log.debug("%s: %s of an earlier version is not used", self._config.name, name)
         return found | self._told
 
-    # --- what is told -------------------------------------------------------------------------------------------------
+    # --- what is reported ---------------------------------------------------------------------------------------------
 
     def _tell(self, found: Mapping[str, SettingDifference], *, quiet: bool = False) -> None:
         """Raise an event for differences that are news; `quiet` for those that an answer or another event tells."""

@@ -174,7 +174,7 @@ class StreamTransport:
 
     async def read_back(self) -> None:
         """Ask for identity and settings again."""
-        with suppress(LinkError):  # whoever waits for the link's end is told by it
+        with suppress(LinkError):  # whoever waits for the link's end learns of it
             await self._identify(1)
 
     async def _still_answers(self) -> bool:

@@ -1,7 +1,7 @@
 """The calibration of its magnetometer that a simulated module does by itself. Manual V1.5.9, sections 8.1.3 and 8.2.
 
 The manual says that the module needs to be turned through many attitudes, and not when it has enough. The simulated one
-has enough after one turn about each axis. What it finds it keeps without being told to save.
+has enough after one turn about each axis. What it finds it keeps without a command to save.
 
     field of the earth + field of what turns with it − what it knows of that = what it sends
 """

@@ -69,7 +69,7 @@ VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
         baud_acts_at_start=True, reset_acts_at_start=True,
     ),
 }  # fmt: skip
-"""The simulated variants by name, each of which carries out what it is told."""
+"""The simulated variants by name, each of which carries out its commands."""
 REFUSING: Final = Imu61xBehaviour(refuses=ORDERS)
 """A device that answers questions and refuses every order."""
 

@@ -20,7 +20,7 @@ def test_a_backup_has_identity_time_and_settings() -> None:
         "identity": {"product": "HI14", "serial_number": "04"},
         "settings": {"mode": "6-axis"},
     }
-    assert text.startswith("# Settings of bow as the device told them. `imud settings bow --restore FILE`")
+    assert text.startswith("# Settings of bow as the device reported them. `imud settings bow --restore FILE`")
 
 
 def test_the_newest_of_each_device_are_kept(tmp_path: Path) -> None:

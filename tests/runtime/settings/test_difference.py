@@ -32,7 +32,7 @@ def test_the_table_says_what_agrees() -> None:
 def test_what_the_device_does_not_tell_differs_unless_it_was_told() -> None:
     found = differences(FAKE_SETTINGS, {"mode": "6-axis"}, {}, {})
     assert found == {"mode": SettingDifference("6-axis", None)}
-    assert words(found) == 'mode is not told, declared "6-axis"'
+    assert words(found) == 'mode is not reported, declared "6-axis"'
     assert differing({"mode": "6-axis"}, {}, {"mode": "6-axis"}) == []
     assert differing({"mode": "6-axis"}, {"mode": "9-axis"}, {"mode": "6-axis"}) == ["mode"]  # what it says counts
 

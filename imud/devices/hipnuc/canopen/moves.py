@@ -8,7 +8,7 @@ with too:
               write; who confirms the same write again: the old number (pending) or the new one (followed)?
     restart   whose boot-up message comes? else: which of the numbers that it can have is heard?
 
-A node is followed by `Request.settings`. One that is heard nowhere is told to go back, and that is an error.
+A node is followed by `Request.settings`. One that is heard nowhere is commanded to go back, and that is an error.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,7 +54,7 @@ def change_node(settings: HipnucCanopenSettings, new: int) -> RequestScript[Writ
     """Give a node another number, 1 … 127, and follow it where that is in force at once.
 
     Raises BadArgument for a number that is heard on the bus, DeviceRefused, Aborted, and NoReply for a node that is
-    heard at neither number afterwards; it is told to go back then.
+    heard at neither number afterwards; it is commanded to go back then.
     """
     node = settings.node
     if new == node:
@@ -72,7 +72,7 @@ def change_node(settings: HipnucCanopenSettings, new: int) -> RequestScript[Writ
         _number_frame(new, node), f"node {new}, back to number {node}", never, never, never, silent=True
     )  # in case it is there and could not answer
     confirmed = "confirmed the write and " if first else ""
-    raise NoReply(f"the node {confirmed}answers neither as node {new} nor as node {node}: it was told to go back")
+    raise NoReply(f"the node {confirmed}answers neither as node {new} nor as node {node}: it was commanded to go back")
 
 
 def restart(settings: HipnucCanopenSettings, bus_bit_s: int) -> RequestScript[str]:

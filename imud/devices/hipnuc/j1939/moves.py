@@ -3,8 +3,8 @@
 The manual (section 6.2.2) says of the bit rate that it needs saving and restarting, and of the address nothing. So both
 are dealt with: after a write the same write is sent again, to the old and then to the new address, and who confirms
 it is where the module is. After a restart a module claims its address (J1939-81); one that does not is looked for by
-whatever it sends. A module is followed by `Request.settings`. One that is heard nowhere is told to go back, and that is
-an error.
+whatever it sends. A module is followed by `Request.settings`. One that is heard nowhere is commanded to go back, and
+that is an error.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ def change_address(settings: HipnucJ1939Settings, new: int) -> RequestScript[Wri
     """Give a module another address, 1 … 128, and follow it where that is in force at once.
 
     Raises BadArgument for an address that is heard on the bus, Rejected, and NoReply for a module that is heard at
-    neither address afterwards; it is told to go back then.
+    neither address afterwards; it is commanded to go back then.
     """
     peer = settings.peer
     if new == peer.address:
@@ -52,7 +52,7 @@ def change_address(settings: HipnucJ1939Settings, new: int) -> RequestScript[Wri
     yield Request(back.payload, back.name, never, never, never, silent=True)
     confirmed = "confirmed the write and " if first else ""
     raise NoReply(
-        f"the module {confirmed}answers neither at address {new} nor at {peer.address}: it was told to go back"
+        f"the module {confirmed}answers neither at address {new} nor at {peer.address}: it was commanded to go back"
     )
 
 

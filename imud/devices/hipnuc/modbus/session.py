@@ -145,7 +145,7 @@ def change_address(at: int, new: int) -> TransferScript[Written]:
     """Give the module at address `at` another one, 1 … 128, and follow it there.
 
     Raises BadArgument for an address that another module of the line has, DeviceRefused, and NoReply for a module that
-    is heard neither there nor at its former address; it is told to go back then.
+    is heard neither there nor at its former address; it is commanded to go back then.
     """
     if new not in BY_NAME["MD_ID"].values:
         raise BadArgument(f"address: expected 1 … {ID_MAX}, got {new!r}; higher ones go by serial number")
@@ -163,7 +163,7 @@ def change_address(at: int, new: int) -> TransferScript[Written]:
             return Written.VERIFIED if new == at else Written.PENDING
     with suppress(TransferError):
         yield replace(write_register(BY_NAME["MD_ID"].address, at), at=new)
-    raise NoReply(f"the module answers neither at address {new} nor at {at}: it was told to go back to {at}")
+    raise NoReply(f"the module answers neither at address {new} nor at {at}: it was commanded to go back to {at}")
 
 
 def set_baud(baud: BaudRate) -> TransferScript[Written]:

@@ -1,8 +1,8 @@
 """Settings that a HiPNUC module on a UART keeps itself: manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
 
 They are read from LOG USRCONFIG, COMCONFIG and MAGCONFIG (`replies.py`). The manual shows one line of each report, so
-a value in a form that is not known counts as not told. `values_of` returns what is known by name, `shown` the same in
-words.
+a value in a form that is not known counts as not reported. `values_of` returns what is known by name, `shown` the same
+in words.
 """
 
 from collections.abc import Iterator, Mapping
@@ -58,7 +58,7 @@ class AngleAlarm(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
-    """Return the settings by name from the module's own words (`session.read_settings`); what is not told is absent."""
+    """Return the settings by name from the module's own words (`session.read_settings`); absent where not reported."""
     lines = lines_of(raw)
     user, com, mag = parse_usrconfig(lines), parse_comconfig(lines), parse_magconfig(lines)
     rates = {name.lower(): _whole_rate(period_s) for name, period_s in com.periods_s.items()}

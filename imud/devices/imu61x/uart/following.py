@@ -95,7 +95,7 @@ def restart(*, done: int = RESULT_DONE) -> RequestScript[Identity]:
 
 
 def _old_timer() -> RequestScript[int]:
-    """The timer, µs, once it can be told from one that has just begun, and does not turn over soon."""
+    """The timer, µs, once it can be distinguished from one that has just begun, and does not turn over soon."""
     while True:
         timer_us = (yield from in_contact(sample)).dev_ticks
         assert timer_us is not None  # every AHRS frame has it
