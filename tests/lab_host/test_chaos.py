@@ -104,6 +104,12 @@ def test_a_rate_is_learned_from_four_equal_steps() -> None:
     assert not booked(numbers, 1, learns=True).balanced
 
 
+def test_the_step_over_a_restart_is_none_of_the_four() -> None:
+    numbers, restart = [1, 2, 3, 4, 5, 7, 8], away(3.1, 3.2, restarts=True)
+    assert booked(numbers, 0, restart, unknown=3, learns=True).balanced  # two steps before, and one after, are no rate
+    assert booked(numbers, 1, restart, unknown=2, learns=True).balanced
+
+
 @pytest.mark.parametrize(("unknown_most", "known"), [(0, [True, False, False]), (1, [True, True, False])])
 def test_a_hole_with_a_sample_on_one_side_may_be_in_the_losses(unknown_most: int, known: list[bool]) -> None:
     """It is a gap of unknown size only where a sample has ended it."""

@@ -127,7 +127,7 @@ def find_holes(
         found.append(Hole(missing, not is_uncertain, UNKNOWN_MOST if unlearned else 1))
         heard = 1 if restarts else heard + 1
         if unlearned:
-            even = (even + 1) * (not missing)
+            even = 0 if restarts else (even + 1) * (not missing)
     return found
 
 
