@@ -5,10 +5,12 @@ allocated but the frames. Python's own `recvmsg` costs two system calls per fram
 time) and one more, with an exception, to find the queue empty.
 
 Kernel stamps are CLOCK_REALTIME. They are carried over to CLOCK_MONOTONIC with the offset of the two at the read. A
-stamp that is then not between the last time the queue was seen empty and now is of before a step of the wall clock: it
-is carried over with the offset of that last time. Nothing moves a stamp out of these bounds. Both clocks are slewed
-together: their difference is the same at arrival and read. The kernel begins to stamp some ms after the first socket of
-the machine asks for it; until then it fills in the time of the read.
+stamp that is then not between the last time the queue was seen empty and now is of before a step of the wall clock:
+it is carried over with the offset of that last time. One that neither offset brings there is of a time between two
+steps: its frame is dated by the read, because a frame may have waited, but cannot have come before it was sent.
+Nothing moves a stamp out of these bounds. Both clocks are slewed together: their difference is the same at arrival
+and read. The kernel begins to stamp some ms after the first socket of the machine asks for it; until then it fills in
+the time of the read.
 """
 
 import ctypes
@@ -30,7 +32,7 @@ from imud.formats.can import (
     REMOTE_FLAG,
     CanFrame,
 )
-from imud.units import NS_PER_S, NS_PER_US
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 BATCH_FRAMES: Final = 64
 """Frames per read: 8 ms of a full bus at 1 Mbit/s. What is left is read at the next turn of the loop."""
@@ -97,6 +99,8 @@ _new_frame: Final[Callable[[tuple[int, bool, bytes, int, bool]], CanFrame]] = pa
 
 STEP_NS: Final = 100 * NS_PER_US
 """A smaller change of the offset may be the error of its two readings."""
+BACKLOG_NS: Final = 5 * NS_PER_MS
+"""A frame is stamped so long at most before it is in the queue of the socket: the kernel's own queue is before it."""
 
 
 class FrameReader:
@@ -176,6 +180,8 @@ class FrameReader:
             t_ns = seconds * NS_PER_S + ns - offset_ns if kind == SO_TIMESTAMPNS_NEW else now_ns
             if stepped_ns and not newest_ns < t_ns <= now_ns and newest_ns < t_ns + stepped_ns <= now_ns:
                 t_ns += stepped_ns
+            elif t_ns < newest_ns - BACKLOG_NS:
+                t_ns = now_ns
             if t_ns > newest_ns:  # noqa: PLR1730 - a call costs a twentieth of a frame
                 newest_ns = t_ns
             if newest_ns > now_ns:  # noqa: PLR1730

@@ -12,6 +12,7 @@ from imud.formats.can import RAW_FRAME, pack_frame
 from imud.links.can.frame_reader import BATCH_FRAMES, FrameReader
 
 HOUR_NS = 3600 * 10**9
+QUARTER_NS = 10**9 // 4
 LIMIT_S = 5.0
 APART_S = 0.005
 """Between frames, much more than the error of one reading of both clocks."""
@@ -134,6 +135,21 @@ def test_frames_of_before_and_after_a_step_of_the_wall_clock_keep_their_order_an
     wire.send(2)
     (second,) = wire.reader.read()
     assert begin_ns - CLOCKS_NS <= first.t_rx_ns < second.t_rx_ns <= time.monotonic_ns()
+
+
+@pytest.mark.parametrize("step_ns", [QUARTER_NS, -QUARTER_NS])
+def test_a_frame_of_a_time_between_two_steps_of_the_wall_clock_is_not_dated_before_it_came(
+    wire: Wire, step_ns: int
+) -> None:
+    """The wall clock is set and set back between two reads, as a host under SIGSTOP sees it."""
+    wire.wall_ahead_ns += step_ns  # of both reads; the kernel stamps by the clock without it
+    wire.send(1)
+    wire.reader.read()
+    time.sleep(APART_S)
+    sent_ns = time.monotonic_ns()
+    wire.send(2, 3)
+    for frame in wire.reader.read():
+        assert sent_ns - CLOCKS_NS <= frame.t_rx_ns <= time.monotonic_ns()
 
 
 def test_error_frames_go_their_own_way(wire: Wire) -> None:
