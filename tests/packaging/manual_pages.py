@@ -43,6 +43,11 @@ FILES: Final = (
     ("/var/lib/imud", "What the daemon remembers."),
 )
 
+RAGGED: Final = ".ad l"
+"""From here on lines end where they end: some words of a synopsis are longer than half a line."""
+EVEN: Final = ".ad b"
+"""From here on both margins are even again."""
+
 # --- roff -------------------------------------------------------------------------------------------------------------
 
 
@@ -165,7 +170,7 @@ def options(parser: argparse.ArgumentParser) -> Iterator[str]:
 def main_page(parser: argparse.ArgumentParser) -> Iterator[str]:
     """The lines of imud(1)."""
     yield from header("imud", 1, "daemon that owns inertial sensors and gives programs their samples")
-    yield from (".SH SYNOPSIS", synopsis(parser), ".SH DESCRIPTION")
+    yield from (".SH SYNOPSIS", RAGGED, synopsis(parser), EVEN, ".SH DESCRIPTION")
     yield escaped(
         "imud owns inertial sensors on serial ports, RS-485, CAN, I2C and SPI, gives each sample the time at which it "
         "was measured, and hands it to any number of programs over a UNIX socket and shared memory. As a service it is "
@@ -183,11 +188,11 @@ def main_page(parser: argparse.ArgumentParser) -> Iterator[str]:
 def command_page(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
     """The lines of imud-NAME(1)."""
     yield from header(f"imud-{name}", 1, COMMANDS[name].help)
-    yield ".SH SYNOPSIS"
+    yield from (".SH SYNOPSIS", RAGGED)
     below = commands_of(parser)
     for number, one in enumerate(below.values() if below else [parser]):
         yield from (*([".br"] if number else []), synopsis(one))
-    yield from (".SH DESCRIPTION", escaped(parser.description or COMMANDS[name].help))
+    yield from (EVEN, ".SH DESCRIPTION", escaped(parser.description or COMMANDS[name].help))
     yield from (".SH OPTIONS", *options(parser))
     for word, one in below.items():
         yield from (f".SS {escaped(one.prog)}", escaped(sentence(helps_of(parser)[word])), *options(one))

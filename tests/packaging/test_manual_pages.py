@@ -14,7 +14,7 @@ from tests.packaging.manual_pages import escaped, help_of, marked, pages, senten
 from tests.support import references
 from tests.support.files import ROOT
 
-REQUESTS = ("TH", "SH", "SS", "TP", "PP", "EX", "EE")
+REQUESTS = ("ad", "TH", "SH", "SS", "TP", "PP", "EX", "EE")
 
 PAGES = pages()
 
