@@ -4,6 +4,7 @@ A value in SI times the factor is the value in the unit. Gyroscopes: 1 rad/√s 
 1 m/s/√s = 1 (m/s²)/√Hz = 60 m/s/√h = 10⁶/g µg/√Hz, with g = 9.80665 m/s².
 """
 
+import re
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -97,4 +98,9 @@ def figure_text(value: float) -> str:
     if value == 0 or 1e-4 <= abs(value) < 1e6:
         digits = f"{value:.3g}"
         return f"{value:.0f}" if "e" in digits else digits
-    return f"{value:.2e}"
+    return short_exponent(f"{value:.2e}")
+
+
+def short_exponent(text: str) -> str:
+    """A number with its exponent as short as it can be, 1.61e6 for 1.61e+06, so that it fits into a column."""
+    return re.sub(r"e([+-])0*(?=\d)", lambda sign: "e" + sign[1].strip("+"), text)

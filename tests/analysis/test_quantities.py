@@ -37,7 +37,7 @@ def test_both_sensors_have_the_same_figures() -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0"), (0.34321, "0.343"), (12345.6, "12346"), (1e-5, "1.00e-05"), (-9.81, "-9.81"), (2e7, "2.00e+07")],
+    [(0.0, "0"), (0.34321, "0.343"), (12345.6, "12346"), (1e-5, "1.00e-5"), (-9.81, "-9.81"), (2e7, "2.00e7")],
 )
 def test_figures_have_three_digits(value: float, text: str) -> None:
     assert figure_text(value) == text

@@ -11,7 +11,7 @@ from imud import __version__
 from imud.analysis.allan import NoiseType
 from imud.analysis.noise import AXES, KNOWN_PARTS, AxisNoise, SensorNoise, sensor_noise
 from imud.analysis.noise_terms import Coefficient, NoiseTerms
-from imud.analysis.quantities import QUANTITIES, SI, TITLES, Quantity, ShownUnit, figure_text
+from imud.analysis.quantities import QUANTITIES, SI, TITLES, Quantity, ShownUnit, figure_text, short_exponent
 from imud.analysis.series import Readings
 from imud.cli.analysis.taking import Taken
 from imud.cli.output import COLUMNS, paragraph, shortened
@@ -153,7 +153,7 @@ def cell(figure: Coefficient | None, unit: ShownUnit) -> str:
     if figure.value is None:
         return f"< {figure_text(figure.below * unit.factor)}"
     words = figure_text(figure.value * unit.factor)
-    return f"{words} ±{figure.sigma * unit.factor:.1g}" if figure.sigma else words
+    return f"{words} ±{short_exponent(f'{figure.sigma * unit.factor:.1g}')}" if figure.sigma else words
 
 
 def rows(name: SensorName, sensor: SensorNoise) -> Iterator[tuple[str, str, str, list[str]]]:

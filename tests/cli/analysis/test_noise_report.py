@@ -34,6 +34,7 @@ def noise_of_three(n: float = 1e-3) -> FloatArray:
         (Coefficient(0.00123456, 0.0, 0.0), "1.23"),
         (Coefficient(0.00123456, 0.0000412, 0.0), "1.23 ±0.04"),
         (Coefficient(None, 0.0, 0.005), "< 5"),
+        (Coefficient(3.26e3, 3e2, 0.0), "3.26e6 ±3e5"),
     ],
 )
 def test_cells(figure: Coefficient | None, words: str) -> None:
