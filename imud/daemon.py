@@ -242,7 +242,8 @@ class Daemon:
         outputs = ", ".join(self._publishers) or "none"
         missing = f" (not yet: {', '.join(self._put_off)})" if self._put_off else ""
         file = f"configuration {self._file}; " if self._file is not None else ""
-        return f"{file}{len(self._devices)} devices; outputs: {outputs}{missing}"
+        devices = f"{len(self._devices)} device{'s' * (len(self._devices) != 1)}"
+        return f"{file}{devices}; outputs: {outputs}{missing}"
 
     def _start_publisher(self, name: str, publisher: Publisher) -> None:
         for device_name, device in self._devices.items():
