@@ -102,7 +102,8 @@ def test_while_nobody_looks_no_samples_are_asked_for_and_events_still_come(tmp_p
             assert said.topic != "/imu0/stamp" or said.message["seq"] != 2
         viewer.wait_for("open /imu0/imu/data")  # from the newest sample, so that one can look
         viewer.is_looked_at = True
-        viewer.wait_for("/imu0/status")
+        while not served.do(lambda server: any(client.encoding for client in server.hub.clients())):
+            viewer.said.get(timeout=LIMIT_S)  # until the relay watches, with one of the next statuses
         served.do(lambda server: server.publish(batch("imu0", 2)))
         viewer.wait_for("/imu0/stamp", lambda said: said.message["seq"] == 2)
 
