@@ -4,19 +4,18 @@ A dialect makes the channels of a device; whoever writes a file or serves a view
 needs to know nothing of their messages. Axes and frames are those of REP-103, and of REP-145 for names of topics.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
-from imud.event import Event, EventKind
+from imud.event import LEVELS, Event
 from imud.frames.conventions import Convention
 from imud.sample import Sample
 
 T_contra = TypeVar("T_contra", contravariant=True)
 T = TypeVar("T")
 
-INFORMATION: Final = frozenset({EventKind.UP, EventKind.SYNC, EventKind.MARK, EventKind.CALIBRATION})
-"""Events that are no warnings."""
 STEADY_NS: Final = 1_000_000_000
 """A value that changes rarely (temperature) is said again after this time, so that a reader who comes later has it."""
 
@@ -74,7 +73,7 @@ class StampedEvent(NamedTuple):
     @property
     def is_warning(self) -> bool:
         """Whether a viewer shows it as a warning, as the log does."""
-        return self.event.kind not in INFORMATION
+        return LEVELS.get(self.event.kind, logging.WARNING) >= logging.WARNING
 
 
 class Deviations(NamedTuple):

@@ -14,6 +14,7 @@ from imud.contracts.driver import Driver
 from imud.contracts.settings import Settings, unknown_name, value_problem, wrong_values
 from imud.contracts.status import DeviceStatus
 from imud.errors import BadArgument
+from imud.sample import SAMPLE_FIELDS
 
 SECONDS_OF: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 DURATION: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
@@ -122,3 +123,17 @@ def driver_settings(driver: Driver, options: Mapping[str, object]) -> Settings:
     for wrong in wrong_values(driver.settings, options, "option"):
         raise BadArgument(f"--option {wrong}")
     return msgspec.convert(options, driver.settings)
+
+
+# --- samples ----------------------------------------------------------------------------------------------------------
+
+
+def chosen_fields(text: str) -> tuple[str, ...]:
+    """Return the names in a list separated by commas, in its order. Raises BadArgument for one that is not known."""
+    names = tuple(name.strip() for name in text.split(","))
+    for number, name in enumerate(names):
+        if name not in SAMPLE_FIELDS:
+            raise BadArgument(f"--fields: {unknown_name('a field', name, SAMPLE_FIELDS)} (`imud schema` explains them)")
+        if name in names[:number]:
+            raise BadArgument(f"--fields: expected each field once, got {name} twice")
+    return names

@@ -2,7 +2,7 @@
 
 from imud.bridges import table
 from imud.bridges.channel import LossCounts, StampedEvent
-from imud.sample import SAMPLE_FIELDS
+from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 
 
@@ -46,3 +46,8 @@ def test_events_and_losses() -> None:
     losses = LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5)
     row = dict(zip(table.LOSS_COLUMNS, table.loss_row(losses), strict=True))
     assert (row["samples"], row["lost_crc"], row["lost_unknown"]) == (100, 2, 5)
+
+
+def test_every_array_has_a_column_for_each_of_its_numbers() -> None:
+    lengths = {field.name: int(field.type[7:-1]) for field in SAMPLE_SCHEMA if field.type.startswith("number[")}
+    assert {name: len(columns) for name, columns in table.AXES.items()} == lengths

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
+from imud.cli.arguments import chosen_fields
+from imud.errors import BadArgument
 from tests.cli.test_decode import MANUAL_FRAME
 from tests.support.files import imu61x_log
 
@@ -62,3 +64,22 @@ def test_bad_option_is_one_clear_line(
 ) -> None:
     assert main([command, "--driver", "imu61x-can", "--option", option, str(moved)]) == 2
     assert capsys.readouterr().err == f"imud {command}: {said}\n"
+
+
+def test_fields_come_in_the_order_in_which_they_are_named() -> None:
+    assert chosen_fields("t_ns, accel_m_s2,device") == ("t_ns", "accel_m_s2", "device")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t_ns,accel", ['got "accel"; did you mean accel_m_s2? known: accel_m_s2, device, ']),
+        ("", ['got ""', "known: accel_m_s2"]),
+        ("t_ns,,seq", ['got ""']),
+        ("seq,t_ns,seq", ["expected each field once, got seq twice"]),
+    ],
+)
+def test_wrong_names_are_an_error_that_lists_the_known_ones(text: str, words: list[str]) -> None:
+    with pytest.raises(BadArgument) as caught:
+        chosen_fields(text)
+    assert all(word in str(caught.value) for word in ["--fields: ", *words])

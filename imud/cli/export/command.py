@@ -8,21 +8,19 @@ from typing import BinaryIO, Final
 from imud import __version__
 from imud.bridges.json_channels import JsonDialect
 from imud.bridges.ros2_channels import Ros2Dialect
-from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
+from imud.cli.arguments import CliCommand, add_option, chosen_fields, driver_settings, given_options
 from imud.cli.export.output import ExportFile
 from imud.cli.export.progress import Progress
 from imud.cli.export.sinks import TABLES, CsvSink, Sink
 from imud.cli.export.source import Exported, ExportFeed, export_capture, export_recording, times_of
 from imud.cli.recording.replay import begins_as_recording
 from imud.cli.streams import complain
-from imud.contracts.settings import unknown_name
 from imud.devices import DRIVERS
 from imud.errors import BadArgument, ImudError, reason_of
 from imud.files import open_regular
 from imud.frames.conventions import Convention
 from imud.log import STDERR, log_to
 from imud.runtime.recording.captures import KnownTimes
-from imud.sample import SAMPLE_FIELDS
 
 FORMATS: Final = ("csv", "mcap")
 SCHEMAS: Final = ("json", "ros2")
@@ -85,17 +83,6 @@ def check(args: argparse.Namespace) -> None:
             raise BadArgument(f"--{option}: expected with --to {to} only, got --to {args.to}")
     if args.fields is not None and args.table not in (None, "samples"):
         raise BadArgument(f"--fields: expected with samples only, got --table {args.table}")
-
-
-def chosen_fields(text: str) -> tuple[str, ...]:
-    """Return the names in a list separated by commas, in its order. Raises BadArgument for one that is not known."""
-    names = tuple(name.strip() for name in text.split(","))
-    for number, name in enumerate(names):
-        if name not in SAMPLE_FIELDS:
-            raise BadArgument(f"--fields: {unknown_name('a field', name, SAMPLE_FIELDS)} (`imud schema` explains them)")
-        if name in names[:number]:
-            raise BadArgument(f"--fields: expected each field once, got {name} twice")
-    return names
 
 
 def _is_recording(args: argparse.Namespace) -> bool:

@@ -2,7 +2,7 @@
 
 following   one connection to the daemon, or one after another through its restarts; what is said about silent devices
   ├──▶ watch      samples: as a table, as JSON or as CSV
-  │      ├──▶ fields    members of a sample by name, and as columns of CSV
+  │      ├──▶ formats   the table, JSON lines and CSV, by name
   │      └──▶ table     the layout for people, in the width of the terminal
   └──▶ events     events: a line each
 """

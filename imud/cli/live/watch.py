@@ -2,18 +2,15 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
 from time import monotonic
-from typing import Final, Protocol
+from typing import Final
 
-from imud.cli.arguments import CliCommand, add_socket
-from imud.cli.live.fields import as_csv, as_json, chosen_fields, csv_head
+from imud.cli.arguments import CliCommand, add_socket, chosen_fields
 from imud.cli.live.following import LOOK_S, DeviceNotes, keep_connected
-from imud.cli.live.table import SampleTable
+from imud.cli.live.formats import OUTPUTS, SampleOutput
 from imud.cli.streams import raise_if_unread
 from imud.client import Client
 from imud.frames.conventions import Convention
-from imud.sample import SAMPLE_FIELDS, Sample
 
 TABLE_HZ: Final = 10.0
 """Rate of the table without `--rate`: more cannot be read."""
@@ -58,62 +55,6 @@ def run(args: argparse.Namespace) -> int:
     watching = _Watching(args, OUTPUTS[args.format](fields))
     keep_connected("imud watch", args.socket, watching.work, follow=args.follow)
     return 0
-
-
-class SampleOutput(Protocol):
-    """A format of samples."""
-
-    def begin(self, devices: Iterable[str]) -> str:
-        """Return what precedes the samples of these devices; called with every connection."""
-        ...
-
-    def text(self, sample: Sample) -> str:
-        """Format a sample, with its line end."""
-        ...
-
-
-class _Table:
-    def __init__(self, fields: tuple[str, ...] | None) -> None:
-        self._table = SampleTable(fields)
-
-    def begin(self, devices: Iterable[str]) -> str:
-        self._table.add_devices(devices)
-        return ""
-
-    def text(self, sample: Sample) -> str:
-        return self._table.text(sample)
-
-
-class _JsonLines:
-    def __init__(self, fields: tuple[str, ...] | None) -> None:
-        self._fields = fields
-
-    def begin(self, _devices: Iterable[str]) -> str:
-        return ""
-
-    def text(self, sample: Sample) -> str:
-        return as_json(sample, self._fields) + "\n"
-
-
-class _Csv:
-    def __init__(self, fields: tuple[str, ...] | None) -> None:
-        self._fields = SAMPLE_FIELDS if fields is None else fields
-        self._begun = False
-
-    def begin(self, _devices: Iterable[str]) -> str:
-        begun, self._begun = self._begun, True
-        return "" if begun else csv_head(self._fields)
-
-    def text(self, sample: Sample) -> str:
-        return as_csv(sample, self._fields)
-
-
-OUTPUTS: Final[dict[str, Callable[[tuple[str, ...] | None], SampleOutput]]] = {
-    "table": _Table,
-    "json": _JsonLines,
-    "csv": _Csv,
-}
-"""What makes each format, of these fields or of all."""
 
 
 class _Watching:
