@@ -115,8 +115,8 @@ class WebServer:
     async def _login(self, request: web.Request) -> web.StreamResponse:
         try:
             token = msgspec.json.decode(await request.read(), type=LoginRequest).token
-        except msgspec.DecodeError as error:
-            return _refusal(400, f"expected a token: {error}")
+        except msgspec.DecodeError:
+            return _refusal(400, 'expected a token, as {"token": "…"}')
         if not self._guard.has_token:
             return _refusal(403, "this server was started without a token: nothing can be controlled")
         if not self._guard.is_token(token):
@@ -171,14 +171,15 @@ class WebServer:
         assert self.hub is not None
         try:
             self.hub.look(browser, messages.decode_look(text))
-        except msgspec.DecodeError as error:
-            browser.mailbox.put_newest("problem", messages.encode(messages.ProblemMessage(str(error))).decode())
+        except msgspec.DecodeError:
+            problem = messages.ProblemMessage("the page asked for something that imud web does not know: reload it")
+            browser.mailbox.put_newest("problem", messages.encode(problem).decode())
 
     async def _call(self, request: web.Request) -> web.StreamResponse:
         try:
             asked = msgspec.json.decode(await request.read(), type=CallRequest)
-        except msgspec.DecodeError as error:
-            return _refusal(400, f"expected a method and its parameters: {error}")
+        except msgspec.DecodeError:
+            return _refusal(400, 'expected a method and its parameters, as {"method": "status", "params": {}}')
         rights = self._rights_of(request)
         if asked.method not in READING | CONTROLLING:
             return _refusal(404, f"no method {asked.method!r}; there are: {', '.join(sorted(READING | CONTROLLING))}")
