@@ -161,6 +161,12 @@ def test_after_a_trouble_the_deadlines_begin_anew() -> None:
     assert [hole.is_certain for hole in find_holes(samples, numbers, troubles)] == [True, False, True]
 
 
+def test_a_value_that_is_read_again_where_the_deadlines_begin_is_no_deadline() -> None:
+    log = polled((0, GOOD), (1, DAMAGED), (2, DAMAGED), (3, DAMAGED), (3.02, GOOD, 3.01), (3.03, GOOD, 3.01))
+    samples = read_at(0, 3.03)
+    assert log.numbers_of(samples, log.troubles(0, 5 * PERIOD_NS)) == [0, 3]
+
+
 def test_a_sample_without_a_good_answer_is_strange() -> None:
     log = polled((0, GOOD), (1, DAMAGED))
     assert log.strange(read_at(0, 1, 2)) == [2, 3]

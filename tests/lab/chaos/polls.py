@@ -21,6 +21,8 @@ from imud.sim.simulator import Burst
 from tests.lab.chaos.account import Interval
 from tests.lab.wire import Refuse
 
+SEARCH_PART: Final = 2
+"""A device that is found again is read at once, and again at the first deadline: less than half a period later."""
 BLOCK_REPLY_BYTES: Final = READ_OVERHEAD_BYTES + 2 * BLOCK_REGISTERS
 
 
@@ -96,16 +98,17 @@ class PollLog:
         numbers, begin = [0], 0
         for n, (before, after) in enumerate(pairwise(samples), 1):
             if any(trouble.touches(before, after) for trouble in troubles):
-                numbers.append(numbers[-1] + self._steps(before, after))
+                numbers.append(numbers[-1] + self._steps(before, after, self.period_ns // SEARCH_PART))
                 begin = n
             else:
                 numbers.append(numbers[begin] + self._steps(samples[begin], after))
         return numbers[: len(samples)]
 
-    def _steps(self, before: Sample, after: Sample) -> int:
+    def _steps(self, before: Sample, after: Sample, apart_ns: int = 0) -> int:
+        """Return how many deadlines after one sample the other is; reads less than `apart_ns` apart share one."""
         asked = self.between(before.t_ns - 1, after.t_rx_ns)
         good = [a for a in asked if a.is_sample and a.answer is Answer.GOOD]
-        stale = sum(a.measured_ns == b.measured_ns for a, b in pairwise(good))
+        stale = sum(a.measured_ns == b.measured_ns and b.t_ns - a.t_ns >= apart_ns for a, b in pairwise(good))
         return round((after.t_ns - before.t_ns) / self.period_ns) - stale
 
 
