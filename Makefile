@@ -6,6 +6,7 @@
 #                                                                   (14 minutes; ARGS=--short: at most 5)
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
+# make mqtt-deps   installs mosquitto, for the tests of the output mqtt
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
 # make pictures   the pictures of README.md and docs/, into docs/pictures
@@ -117,6 +118,10 @@ web-pictures: $(VENV)/made
 
 monitoring-deps:
 	apt-get install --yes --no-install-recommends prometheus prometheus-alertmanager
+
+.PHONY: mqtt-deps
+mqtt-deps:
+	apt-get install --yes --no-install-recommends mosquitto openssl
 
 lab-deps:
 	tests/lab/deps

@@ -32,6 +32,8 @@ class EventKind(StrEnum):
     """Gravity contradicts the attitude or the mounting at rest; the message says what is likely wrong."""
     RECORDER = "recorder"
     """The recorder stopped, for example because the disk is full, went on, lost records, or saved a snapshot."""
+    MQTT = "mqtt"
+    """The output `mqtt` stopped spooling, for example because the disk is full, or went on."""
     BAD_FRAME = "bad-frame"
     """A damaged or unknown frame was heard. Sent at most once a second and device."""
 

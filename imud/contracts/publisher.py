@@ -11,7 +11,7 @@ from imud.contracts.control.recording import NothingRecorded, RecordingSource, T
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.lines import WatchedInput, WatchLine
 from imud.contracts.settings import Settings
-from imud.contracts.status import ClientStatus, DeviceStatus, OutputStatus, RecorderStatus
+from imud.contracts.status import ClientStatus, DeviceStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.errors import CommandError
 from imud.event import Event
 from imud.formats.slot import encode_slots
@@ -195,6 +195,8 @@ class PublisherContext:
     """The same of a recorder."""
     output_sources: list[Callable[[], Sequence[OutputStatus]]] = field(default_factory=list)
     """The same of outputs that send sentences."""
+    mqtt_sources: list[Callable[[], MqttStatus]] = field(default_factory=list)
+    """The same of the output `mqtt`."""
     recording: RecordingSource = field(default_factory=NothingRecorded)
     """What there is to record."""
     snapshots: list[TakeSnapshot] = field(default_factory=list)

@@ -120,6 +120,11 @@ def disagreements(schema: type[msgspec.Struct], given: Mapping[str, Any]) -> lis
 
 def value_problem(value: object, field_type: Any) -> str:
     """Return what is wrong with a value of a field, empty if it fits: what was expected, and what came."""
+    info = inspect.type_info(field_type)
+    if isinstance(info, inspect.DictType) and isinstance(info.value_type, inspect.StructType):
+        for key, given in value.items() if isinstance(value, Mapping) else ():
+            if isinstance(given, Mapping) and (found := wrong_values(info.value_type.cls, given)):
+                return f"{shown(key)}: {found[0]}"
     try:
         msgspec.convert(value, field_type)
     except msgspec.ValidationError as error:

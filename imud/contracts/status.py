@@ -286,6 +286,35 @@ class OutputStatus(msgspec.Struct, frozen=True):
     """Why nothing is sent, one sentence; empty while it is."""
 
 
+class MqttStatus(msgspec.Struct, frozen=True):
+    """State of the output `mqtt`."""
+
+    broker: str
+    """The broker that is connected; empty while there is none."""
+    problem: str
+    """Why nothing is sent, one sentence; empty while it is."""
+    spool_problem: str
+    """Why nothing is spooled, one sentence; empty while it is."""
+    queued: int
+    """Samples and events that were given to the output since the start."""
+    spooled: int
+    """Messages written to the spool."""
+    sent: int
+    """Messages sent, those sent again included."""
+    acknowledged: int
+    """Messages that the broker has taken."""
+    waiting: int
+    """Messages in the spool now, those that earlier runs left included."""
+    spool_bytes: int
+    """Room that the spool uses."""
+    thinned: int
+    """Samples of which only statistics are left, for want of room."""
+    dropped: dict[str, int]
+    """Samples and events that were dropped, by cause."""
+    reconnects: int
+    """Connections after the first."""
+
+
 class ClientStatus(msgspec.Struct, frozen=True):
     """One client of the UNIX socket."""
 

@@ -11,5 +11,6 @@ PUBLISHERS: Table[PublisherType] = Table(
         "metrics": "imud.publishers.metrics.publisher:PUBLISHER",
         "recorder": "imud.publishers.recorder.publisher:PUBLISHER",
         "nmea0183": "imud.publishers.nmea0183.publisher:PUBLISHER",
+        "mqtt": "imud.publishers.mqtt.publisher:PUBLISHER",
     },
 )

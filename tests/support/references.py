@@ -41,6 +41,7 @@ from imud.formats.ring import (
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES, SlotField
 from imud.frames.settings import FrameSettings, MountingAngles, MountingAxes
 from imud.ledger import LEDGER_FIELDS
+from imud.publishers.mqtt.settings import DeviceSending
 from imud.publishers.socket.encoding import ALWAYS_FIELDS
 from imud.publishers.socket.messages import NOTIFICATIONS
 from imud.publishers.socket.rpc import METHODS
@@ -87,6 +88,7 @@ def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
         for field in msgspec.structs.fields(publisher.settings):
             if isinstance(field.default, Settings):
                 yield f"Output `{name}`: `{field.name}`", f"{name}.{field.name}.", type(field.default)
+    yield "What the output `mqtt` sends of a device (`docs/fleet.md`)", "mqtt.devices.NAME.", DeviceSending
     yield "Each device", "devices.NAME.", DeviceGeneral
     for name, link in TABLES.links.items():
         yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings

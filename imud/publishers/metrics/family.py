@@ -17,7 +17,7 @@ from prometheus_client.core import (
     Metric,
 )
 
-from imud.contracts.status import ClientStatus, DeviceStatus, OutputStatus, RecorderStatus
+from imud.contracts.status import ClientStatus, DeviceStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.publishers.metrics.rings import RingView
 from imud.units import NS_PER_S, PPM_PER_ONE
 
@@ -48,6 +48,8 @@ class Snapshot:
     """One while there is a recorder."""
     outputs: Sequence[OutputStatus] = ()
     """Ways out of outputs that send sentences."""
+    mqtts: Sequence[MqttStatus] = ()
+    """One while there is the output `mqtt`."""
 
 
 @dataclass(frozen=True, slots=True)

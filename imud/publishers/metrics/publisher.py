@@ -32,6 +32,7 @@ from imud.event import Event
 from imud.log import messages_dropped
 from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
+from imud.publishers.metrics.mqtt import MQTT_FAMILIES
 from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
 from imud.publishers.metrics.recorder import RECORDER_FAMILIES
 from imud.publishers.metrics.rings import RingReader
@@ -124,7 +125,8 @@ class DaemonCollector(Collector):
         """Yield all metrics of the snapshot, with pauses while they are rendered."""
         recorder = RECORDER_FAMILIES if self._snapshot.recorders else ()
         outputs = OUTPUT_FAMILIES if self._snapshot.outputs else ()
-        for family in (*FAMILIES, *recorder, *outputs):
+        mqtt = MQTT_FAMILIES if self._snapshot.mqtts else ()
+        for family in (*FAMILIES, *recorder, *outputs, *mqtt):
             metric = family.metric(self._snapshot)
             metric.samples = _PausingList(metric.samples, self._pause)
             yield metric
@@ -268,6 +270,7 @@ class MetricsPublisher:
                     messages_dropped(),
                     rings=dict.fromkeys(context.without_ring, "") | context.rings,
                     recorders=tuple(status() for status in context.recorder_sources),
+                    mqtts=tuple(status() for status in context.mqtt_sources),
                     outputs=tuple(output for source in context.output_sources for output in source()),
                 )
             )

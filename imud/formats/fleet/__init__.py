@@ -1,0 +1,1 @@
+"""Messages of gateways over MQTT: topics, the ledger in every message, payloads. No I/O."""

@@ -1,0 +1,191 @@
+"""Payloads of gateways: every one of a stream begins with a header by which a reader keeps the ledger.
+
+    JSON      {"v": 1, "gateway": …, "boot": …, "device": …, "kind": …, "first": 1, "last": 200, …}
+    slots     "IMUB" | version, u8 | 0 | header bytes, u16 | header, JSON | Zstandard frame of slots, 256 bytes each
+
+Little-endian. Numbers `first` to `last` of a stream are covered by exactly one message, whatever its kind: whole
+samples, what is left of them when the spool had no room (`intervals` in the stream `samples`), or that they were
+dropped and why (`dropped`). What no message covers was lost on the way, and what two cover came twice.
+"""
+
+import math
+import struct
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Final
+
+import msgspec
+import zstandard
+
+from imud.event import Event
+from imud.formats.slot import SLOT_BYTES, decode_slot
+from imud.sample import Sample, Sync
+
+VERSION: Final = 1
+MAGIC: Final = b"IMUB"
+SLOTS_MAX: Final = 500
+"""Slots in one message: 128 kB before compression, which is the smallest limit of the large brokers' services."""
+SAMPLES_MAX: Final = 200
+"""Samples in one JSON message: about 100 kB."""
+HEADER_MAX: Final = 4096
+LEVEL: Final = 3
+"""Of Zstandard, its own default."""
+_PREFIX: Final = struct.Struct("<4sBBH")
+JSON_TYPE: Final = "application/json"
+SLOTS_TYPE: Final = "application/vnd.imud.slots+zstd"
+
+
+class MessageKind(StrEnum):
+    """Kinds of messages of a stream."""
+
+    SAMPLES = "samples"
+    """Whole samples as JSON."""
+    SLOTS = "slots"
+    """Whole samples as compressed slots."""
+    INTERVALS = "intervals"
+    """Statistics of intervals."""
+    EVENTS = "events"
+    DROPPED = "dropped"
+    """Nothing but the numbers of what was dropped by the gateway, and why."""
+
+
+class DropCause(StrEnum):
+    """Reasons for which a gateway drops what it was to send."""
+
+    QUEUE = "queue"
+    """The writer of the spool was too slow."""
+    SPACE = "space"
+    """The spool was full of what cannot be thinned any more."""
+    AGE = "age"
+    """It waited for longer than the spool keeps anything."""
+    DISK = "disk"
+    """The disk was full, or failed."""
+    OFF = "off"
+    """The output did not run, for example while its settings were changed."""
+    DAMAGED = "damaged"
+    """The spool gave back what it was not given."""
+
+
+class Measures(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Statistics of one quantity over an interval, a value for each of its components; left out are those not asked."""
+
+    mean: tuple[float, ...] | None = None
+    min: tuple[float, ...] | None = None
+    max: tuple[float, ...] | None = None
+    rms: tuple[float, ...] | None = None
+
+
+class Interval(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Samples of one interval of time, summed up."""
+
+    first: int
+    """`seq` of its first sample."""
+    last: int
+    count: int
+    """Samples in it."""
+    begin_t_ns: int
+    """`t_ns` of the first sample."""
+    end_t_ns: int
+    begin_utc_ns: int
+    end_utc_ns: int
+    t_err_ns: int
+    """The largest of all samples."""
+    sync: Sync
+    """The worst of all samples."""
+    values: dict[str, Measures]
+    """By the names that samples have."""
+    status: int | None = None
+    """Status bits that any of the samples had."""
+
+
+class FleetMessage(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True):
+    """A message of a stream."""
+
+    v: int
+    """VERSION."""
+    gateway: str
+    boot: str
+    """Number of the daemon's start, 16 hexadecimal digits: `epoch` on the socket and in shared memory."""
+    device: str
+    """Empty for the gateway itself."""
+    kind: MessageKind
+    begin: int
+    """Number with which the stream began in this boot."""
+    first: int
+    """The first number that this message covers."""
+    last: int
+    count: int
+    """Samples, or events, that the numbers stand for."""
+    utc_ns: int
+    """CLOCK_REALTIME of the newest of it."""
+    cause: DropCause | None = None
+    """Why it was dropped."""
+    samples: list[Sample] = []  # msgspec copies a mutable default
+    intervals: list[Interval] = []
+    events: list[Event] = []
+
+
+_ENCODER: Final = msgspec.json.Encoder()
+_DECODER: Final = msgspec.json.Decoder(FleetMessage)
+
+
+def boot_text(epoch: int) -> str:
+    """The number of a start as text: JSON of other languages has no integers above 2⁵³."""
+    return f"{epoch & 0xFFFF_FFFF_FFFF_FFFF:016x}"
+
+
+def encode_message(message: FleetMessage) -> bytes:
+    """The payload as JSON. Values that JSON does not have (not a number, infinity) are left out of samples."""
+    payload = _ENCODER.encode(message)
+    if message.samples and b"null" in payload:
+        payload = _ENCODER.encode(msgspec.structs.replace(message, samples=[finite(one) for one in message.samples]))
+    return payload
+
+
+def encode_slots_message(message: FleetMessage, slots: Sequence[bytes]) -> bytes:
+    """The payload with slots, 1 to SLOTS_MAX of them."""
+    header = _ENCODER.encode(message)
+    compressed = zstandard.ZstdCompressor(level=LEVEL).compress(b"".join(slots))
+    return _PREFIX.pack(MAGIC, VERSION, 0, len(header)) + header + compressed
+
+
+def decode_message(payload: bytes) -> FleetMessage:
+    """The message in a payload, slots as samples. Raises ValueError for anything else."""
+    try:
+        message = _decode_slots(payload) if payload.startswith(MAGIC) else _DECODER.decode(payload)
+    except (msgspec.DecodeError, zstandard.ZstdError, struct.error) as error:
+        raise ValueError(f"expected a message of a gateway, got {len(payload)} bytes: {error}") from error
+    if message.v != VERSION:
+        raise ValueError(f"expected a message of version {VERSION}, got {message.v}: the gateway has a newer imud")
+    if not 0 < message.begin <= message.first <= message.last:
+        raise ValueError(f"expected numbers in order, got {message.begin}, {message.first} and {message.last}")
+    return message
+
+
+def _decode_slots(payload: bytes) -> FleetMessage:
+    _, version, _, size = _PREFIX.unpack_from(payload)
+    if version != VERSION or size > HEADER_MAX:
+        raise ValueError(f"expected slots of version {VERSION}, got {version} and a header of {size} bytes")
+    begin = _PREFIX.size
+    message = _DECODER.decode(payload[begin : begin + size])
+    frame = payload[begin + size :]
+    if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * SLOT_BYTES:  # it decides how much is allocated
+        raise ValueError(f"expected 1 to {SLOTS_MAX} slots, got {zstandard.frame_content_size(frame)} bytes")
+    slots = zstandard.ZstdDecompressor().decompress(frame)
+    if len(slots) % SLOT_BYTES:
+        raise ValueError(f"expected slots of {SLOT_BYTES} bytes, got {len(slots)}")
+    samples = [
+        decode_slot(slots[at : at + SLOT_BYTES], message.device) for at in range(0, len(slots), SLOT_BYTES)
+    ]  # fmt: skip
+    return msgspec.structs.replace(message, samples=samples)
+
+
+def finite(sample: Sample) -> Sample:
+    """The sample without vectors and values that have a component which is not finite."""
+    bad: dict[str, None] = {}
+    for name in sample.__struct_fields__:
+        value = getattr(sample, name)
+        parts = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
+            bad[name] = None
+    return msgspec.structs.replace(sample, **bad) if bad else sample

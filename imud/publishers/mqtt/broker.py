@@ -1,0 +1,256 @@
+"""One connection to a broker, by paho-mqtt, without a thread of its own: the sender's thread waits on its socket.
+
+A connection is used once: after a loss a new one is made, which begins without any state of the old one. What the old
+one had sent without an answer is in the spool and is sent again.
+"""
+
+import importlib
+import os
+import select
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol
+
+from imud.errors import ServerError, reason_of
+from imud.files import read_regular
+from imud.publishers.mqtt.settings import Broker, MqttSettings
+
+CONNECT_S: Final = 4.0
+"""TCP, TLS and the broker's answer take so long each at most; satellite links take 2 s."""
+IN_FLIGHT_MAX: Final = 20
+"""Messages without an acknowledgement, unless the broker allows fewer: what brokers usually allow."""
+REFUSED: Final = 0x80
+"""Reason codes of MQTT 5 from here on are refusals (section 2.4)."""
+PASSWORD_BYTES: Final = 65_535
+"""Of a password (MQTT 5.0, section 3.1.3.6)."""
+EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
+
+
+class BrokerError(Exception):
+    """A broker cannot be reached, or ended the connection. Example: connection refused."""
+
+
+class Will(NamedTuple):
+    """What the broker publishes, retained, when the connection ends without a farewell."""
+
+    topic: str
+    payload: bytes
+
+
+class BrokerConnection(Protocol):
+    """A connection to one broker. Synchronization: one thread; `ring` from any."""
+
+    acknowledged: list[int]
+    """Numbers of messages that the broker has taken; whoever reads them clears them."""
+    in_flight_max: int
+    """Messages that may be without an acknowledgement."""
+
+    def publish(self, topic: str, payload: bytes, content_type: str, *, retain: bool) -> int:
+        """Send a message with QoS 1; return its number. Raises BrokerError."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Read and write what is there; return after so much time, after something came, or on `ring`.
+
+        Raises BrokerError when the connection is lost, or a message was refused.
+        """
+        ...
+
+    def ring(self) -> None:
+        """End the present wait, or the next."""
+        ...
+
+    def close(self) -> None:
+        """End the connection with a farewell; may be called twice."""
+        ...
+
+
+class Connect(Protocol):
+    """Function that connects to a broker."""
+
+    def __call__(self, broker: Broker, settings: MqttSettings, client_id: str, will: Will, /) -> BrokerConnection:
+        """Return a connection that the broker has accepted. Raises BrokerError."""
+        ...
+
+
+def check_extra() -> None:
+    """Raise ServerError where paho-mqtt is missing."""
+    try:
+        importlib.import_module("paho.mqtt.client")
+    except ImportError as error:
+        raise ServerError(EXTRA_MISSING) from error
+
+
+class PahoConnection:
+    """A connection by paho-mqtt. Synchronization: as `BrokerConnection`."""
+
+    def __init__(self, broker: Broker, settings: MqttSettings, client_id: str, will: Will) -> None:
+        """Connect and wait for the answer. Raises BrokerError."""
+        self.acknowledged: list[int] = []
+        self.in_flight_max = IN_FLIGHT_MAX
+        self._broker = broker
+        self._is_v5 = settings.version == "5"
+        self._answered = self._closed = self._woke = False
+        self._problem = ""
+        self._topics: dict[int, str] = {}
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        try:
+            self._client = self._made(settings, client_id, will)
+            self._client.connect(broker.host, broker.port, keepalive=settings.keep_alive_s)
+            for _ in range(1000):
+                if self._answered or self._problem:
+                    break
+                self._turn(CONNECT_S)
+                if not self._answered and not self._problem and not self._woke:
+                    self._problem = f"no answer within {CONNECT_S:g} s"
+            if self._problem:
+                raise BrokerError(self._problem)
+        except (OSError, ValueError, BrokerError) as error:
+            self.close()
+            reason = str(error) if isinstance(error, BrokerError) else _reason_of(error)
+            raise BrokerError(f"{broker.name}: {reason}") from error
+
+    def _made(self, settings: MqttSettings, client_id: str, will: Will) -> Any:
+        """A client of paho-mqtt with everything but a connection. Raises OSError for files, ValueError."""
+        from paho.mqtt import client as paho
+        from paho.mqtt.enums import CallbackAPIVersion
+
+        version = paho.MQTTv5 if self._is_v5 else paho.MQTTv311
+        clean: dict[str, Any] = {} if self._is_v5 else {"clean_session": True}
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2,
+            client_id,
+            protocol=version,
+            transport="websockets" if self._broker.websockets else "tcp",
+            reconnect_on_failure=False,
+            **clean,
+        )
+        client.connect_timeout = CONNECT_S
+        if self._broker.websockets:
+            client.ws_set_options(path=self._broker.path)
+        if self._broker.tls:
+            client.tls_set(ca_certs=settings.ca_file, certfile=settings.cert_file, keyfile=settings.key_file)
+        if settings.user:
+            client.username_pw_set(settings.user, _password(settings.password_file))
+        client.will_set(will.topic, will.payload, qos=1, retain=True)
+        client.on_connect = self._on_connect
+        client.on_publish = self._on_publish
+        client.on_disconnect = self._on_disconnect
+        return client
+
+    # --- as a connection ---------------------------------------------------------------------------------------------
+
+    def publish(self, topic: str, payload: bytes, content_type: str, *, retain: bool) -> int:
+        """Send a message. Raises BrokerError."""
+        properties = None
+        if self._is_v5 and content_type:
+            from paho.mqtt.packettypes import PacketTypes
+            from paho.mqtt.properties import Properties
+
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # the library has no types here
+            properties.ContentType = content_type
+        try:
+            info = self._client.publish(topic, payload, qos=1, retain=retain, properties=properties)
+        except (OSError, ValueError) as error:
+            raise BrokerError(f"{self._broker.name}: {_reason_of(error)}") from error
+        if info.rc:
+            self._fail("the connection was lost")
+        self._topics[info.mid] = topic
+        return int(info.mid)
+
+    def wait(self, seconds: float) -> None:
+        """Read and write what is there. Raises BrokerError."""
+        self._turn(seconds)
+        if self._problem:
+            raise BrokerError(f"{self._broker.name}: {self._problem}")
+
+    def ring(self) -> None:
+        """End the present wait, or the next."""
+        if not self._closed:
+            os.eventfd_write(self._bell, 1)
+
+    def close(self) -> None:
+        """End the connection; may be called twice."""
+        if self._closed:
+            return
+        self._closed = True
+        client = getattr(self, "_client", None)
+        if client is not None:
+            with suppress(OSError, ValueError):  # it is gone already
+                client.disconnect()
+                sock = client.socket()
+                if sock is not None:  # what the farewell would follow was not sent: nothing is read at the other end
+                    sock.close()
+        os.close(self._bell)
+
+    # --- the socket --------------------------------------------------------------------------------------------------
+
+    def _turn(self, seconds: float) -> None:
+        """Wait for the socket once and do what paho-mqtt has to do."""
+        client, sock = self._client, self._client.socket()
+        if sock is None:
+            self._problem = self._problem or "the connection was lost"
+            return
+        poll = select.poll()
+        poll.register(sock.fileno(), select.POLLIN | (select.POLLOUT if client.want_write() else 0))
+        poll.register(self._bell, select.POLLIN)
+        pending = getattr(sock, "pending", lambda: 0)()
+        ready = dict(poll.poll(0 if pending else seconds * 1000))
+        self._woke = bool(ready) or bool(pending)
+        if self._bell in ready:
+            os.eventfd_read(self._bell)
+        events = ready.get(sock.fileno(), 0)
+        try:
+            if pending or events & ~select.POLLOUT:
+                client.loop_read()
+            if events & select.POLLOUT and client.socket() is not None:
+                client.loop_write()
+            client.loop_misc()
+        except (OSError, ValueError) as error:
+            self._problem = self._problem or _reason_of(error)
+        if client.socket() is None:
+            self._problem = self._problem or "the connection was lost"
+
+    def _fail(self, problem: str) -> None:
+        self._problem = self._problem or problem
+        raise BrokerError(f"{self._broker.name}: {self._problem}")
+
+    # --- what paho-mqtt calls, in `_turn` ----------------------------------------------------------------------------
+
+    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, properties: Any) -> None:
+        if reason.is_failure:
+            self._problem = f"the broker refuses the connection: {reason}"
+            return
+        allowed = getattr(properties, "ReceiveMaximum", IN_FLIGHT_MAX)
+        self.in_flight_max = max(1, min(IN_FLIGHT_MAX, allowed))
+        self._answered = True
+
+    def _on_publish(self, _client: Any, _data: Any, mid: int, reason: Any, _properties: Any) -> None:
+        topic = self._topics.pop(mid, "")
+        if reason is not None and reason.value >= REFUSED:
+            self._problem = self._problem or f"the broker refuses messages of {topic}: {reason}"
+            return
+        self.acknowledged.append(mid)
+
+    def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
+        if flags.is_disconnect_packet_from_server:
+            self._problem = self._problem or f"the broker ended the connection: {reason}"
+
+
+def _password(path: str | None) -> str | None:
+    """The first line of the file. Raises OSError, and ValueError for what is no text."""
+    if path is None:
+        return None
+    text = read_regular(Path(path), PASSWORD_BYTES).decode("utf-8")
+    return text.partition("\n")[0].rstrip("\r")
+
+
+def _reason_of(error: BaseException) -> str:
+    """Describe an error; those of TLS in the words of the TLS library, which say what is wrong with a certificate."""
+    import ssl
+
+    if isinstance(error, ssl.SSLError):
+        return getattr(error, "verify_message", "") or error.reason or str(error)
+    if isinstance(error, FileNotFoundError) and error.filename:
+        return f"{error.filename}: {reason_of(error)}"
+    return reason_of(error)

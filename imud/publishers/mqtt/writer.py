@@ -1,0 +1,273 @@
+"""The thread of the spool: what the event loop put into a queue becomes messages on disk, and these go to the sender.
+
+    loop ──put──▶ queue ──▶ streams ──messages──▶ spool (a transaction a second) ──▶ sender
+                                                    ▲────────acknowledged──────────────┘
+
+The loop never waits: samples that have no room in the queue are counted, and show as a gap that a message explains. A
+disk that is full or fails ends the spooling; for a while messages wait in memory, then only their numbers do.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Final, NamedTuple
+
+import msgspec
+
+from imud.contracts.publisher import Batch
+from imud.contracts.status import DeviceStatus
+from imud.event import Event
+from imud.formats.fleet.messages import DropCause
+from imud.formats.fleet.topics import Stream
+from imud.publishers.mqtt.sender import MqttSender
+from imud.publishers.mqtt.settings import DeviceSending, MqttSettings
+from imud.publishers.mqtt.spool import Position, Spool, Spooled, SpoolError
+from imud.publishers.mqtt.streams import DeviceStreams, Gateway, notes_of
+from imud.units import NS_PER_S
+from imud.worker import StartWorker
+
+QUEUE_SAMPLES: Final = 20_000
+"""Samples that wait for the writer: 20 s of a device at 1 kHz, about 20 MB. A flash card that erases stalls for a
+second, a checkpoint of the log for less."""
+QUEUE_EVENTS: Final = 2_000
+COMMIT_NS: Final = NS_PER_S
+"""Between two transactions: what is newer is lost when the process is killed."""
+DISK_RETRY_NS: Final = 10 * NS_PER_S
+"""A disk that was full or failed is tried again after so long."""
+PENDING_BYTES: Final = 8 << 20
+"""Messages that wait in memory while the disk fails; of those that are more only the numbers are kept."""
+
+
+class SentState(NamedTuple):
+    """State of devices that is to be published, retained, by topic."""
+
+    statuses: Mapping[str, DeviceStatus]
+    other: Mapping[str, object]
+    """Further messages by topic; None removes what is there."""
+
+
+Item = Batch | Event | SentState
+
+
+class WriterQueue:
+    """Queue from the event loop to the writer. Synchronization: one thread puts, one takes."""
+
+    def __init__(self, samples_max: int = QUEUE_SAMPLES, events_max: int = QUEUE_EVENTS) -> None:
+        self.queued = 0
+        """Samples and events that were put since the start."""
+        self.dropped = 0
+        """Samples and events that had no room."""
+        self._samples_max, self._events_max = samples_max, events_max
+        self._items: deque[Item] = deque()
+        self._put = self._taken = 0
+        self._events_put = self._events_taken = 0
+
+    @property
+    def waiting(self) -> int:
+        """Samples that wait."""
+        return self._put - self._taken
+
+    def put_batch(self, batch: Batch) -> None:
+        """Add samples, or drop and count them."""
+        count = len(batch.samples)
+        self.queued += count
+        if self._put - self._taken + count > self._samples_max:
+            self.dropped += count
+            return
+        self._items.append(batch)
+        self._put += count
+
+    def put_event(self, item: Event | SentState) -> None:
+        """Add an event or a state, or drop and count it."""
+        self.queued += isinstance(item, Event)
+        if self._events_put - self._events_taken >= self._events_max:
+            self.dropped += 1
+            return
+        self._items.append(item)
+        self._events_put += 1
+
+    def take(self) -> Item | None:
+        """Return the oldest item; None for none."""
+        try:
+            item = self._items.popleft()
+        except IndexError:
+            return None
+        if isinstance(item, Batch):
+            self._taken += len(item.samples)
+        else:
+            self._events_taken += 1
+        return item
+
+
+class SpoolWriter:
+    """The thread and what it owns. Synchronization: counters are read by any thread, the rest is the thread's own."""
+
+    def __init__(
+        self, settings: MqttSettings, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
+        now_ns: Callable[[], int], utc_offset_ns: Callable[[], int], start_worker: StartWorker,
+    ) -> None:  # fmt: skip
+        self.problem = ""
+        """Why nothing is spooled, one sentence; empty while it is."""
+        self.lost_on_disk = 0
+        """Samples and events of which only the numbers are left because the disk failed."""
+        self.failure: BaseException | None = None
+        """The exception that ended the thread, which is a defect of imud."""
+        self.positions: list[Position] = []
+        """How far the streams have come, as of the last transaction."""
+        self._settings, self._gateway = settings, gateway
+        self._queue, self._spool, self._sender = queue, spool, sender
+        self._now_ns, self._utc_offset_ns = now_ns, utc_offset_ns
+        self._streams: dict[str, DeviceStreams] = {}
+        self._resumable: dict[str, list[Position]] = {}
+        self._boots: dict[str, int] = {}
+        self._rows: list[Spooled] = []
+        self._acknowledged: set[int] = set()
+        self._session = 0
+        self._due_ns = 0
+        self._resume()
+        self._worker = start_worker("mqtt spool", self.work, self._failed)
+        sender.wanting = self._worker.ring
+
+    def close(self) -> None:
+        """Store all that waits and end the thread; may be called twice."""
+        self._sender.wanting = lambda: None
+        self._worker.end()
+        self._take_answers()
+        self._take_all()
+        for streams in self._streams.values():
+            self._rows += streams.flush()
+        self._due_ns = 0
+        self._store(self._now_ns())
+        self._spool.close()
+
+    # --- the thread's side -------------------------------------------------------------------------------------------
+
+    def work(self) -> int:
+        """Do what is due; return the time until the next round, ns."""
+        self._take_answers()
+        self._take_all()
+        now_ns = self._now_ns()
+        if now_ns >= self._due_ns:
+            for streams in self._streams.values():
+                self._rows += streams.look(now_ns)
+            self._store(now_ns)
+        self._give()
+        return max(1, min(COMMIT_NS, self._due_ns - self._now_ns()))
+
+    def _take_answers(self) -> None:
+        """Note what was acknowledged, and begin anew with the oldest after a new connection."""
+        session = self._sender.session
+        for of_session, number in self._sender.take_acknowledged():
+            if of_session == self._session:
+                self._acknowledged.add(number)
+        if session != self._session:
+            self._session = session
+            self._spool.rewind()
+
+    def _take_all(self) -> None:
+        """Make messages of what waits in the queue."""
+        while (item := self._queue.take()) is not None:
+            if isinstance(item, Batch):
+                self._take_batch(item)
+            elif isinstance(item, Event):
+                streams = self._streams_of(item.device, 0)
+                if streams is not None:
+                    self._rows += streams.event(item, item.t_ns + self._utc_offset_ns())
+            else:
+                made = {topic: msgspec.json.encode(status) for topic, status in item.statuses.items()}
+                made |= {
+                    topic: b"" if value is None else msgspec.json.encode(value) for topic, value in item.other.items()
+                }
+                self._sender.retain(made)
+
+    def _take_batch(self, batch: Batch) -> None:
+        streams = self._streams_of(batch.device, batch.device_id)
+        if streams is None:
+            return
+        if batch.samples[0].seq < streams.next_seq:  # the device was made anew, and counts from 1 again
+            self._rows += streams.flush()
+            del self._streams[batch.device]
+            self._resumable.pop(batch.device, None)
+            self._boots[batch.device] = self._boots.get(batch.device, 1) + 1
+            streams = self._streams_of(batch.device, batch.device_id)
+            assert streams is not None
+        self._rows += streams.add(batch.samples)
+
+    def _streams_of(self, device: str, device_id: int) -> DeviceStreams | None:
+        found = self._streams.get(device)
+        if found is None:
+            sending = self._settings.sending(device) if device else DeviceSending(rate_hz=None)
+            if sending is None:
+                return None
+            number = self._boots.get(device, 1)
+            gateway = self._gateway if number == 1 else self._gateway._replace(boot=f"{self._gateway.boot}-{number}")
+            found = self._streams[device] = DeviceStreams(gateway, device, device_id, sending)
+            for position in self._resumable.pop(device, []):
+                found.resume(position.stream, position)
+        return found
+
+    def _resume(self) -> None:
+        """Find out where an earlier run of the output in the same boot ended."""
+        try:
+            self._spool.open()
+            self.positions = self._spool.positions()
+        except SpoolError as error:
+            self.problem = str(error)
+            return
+        for position in self.positions:
+            boot, _, number = position.boot.partition("-")
+            if boot == self._gateway.boot and position.stream in Stream.__members__.values():
+                known = self._boots.get(position.device, 1)
+                if int(number or "1") > known:
+                    self._boots[position.device] = known = int(number)
+                    self._resumable.pop(position.device, None)
+                if int(number or "1") == known:
+                    self._resumable.setdefault(position.device, []).append(position)
+
+    # --- the spool ---------------------------------------------------------------------------------------------------
+
+    def _store(self, now_ns: int) -> None:
+        """Write one transaction of all that is new, if there is anything."""
+        self._due_ns = now_ns + COMMIT_NS
+        if not self._rows and not self._acknowledged and not self.problem:
+            return
+        if self.problem and sum([len(row.payload) for row in self._rows]) > PENDING_BYTES:
+            lost = sum([row.items for row in self._rows if row.kind != "dropped"])
+            self._rows = notes_of(self._rows, DropCause.DISK, self._gateway.gateway)
+            self.lost_on_disk += lost
+        acknowledged = frozenset(self._acknowledged)
+        try:
+            self._spool.commit(self._rows, acknowledged, now_ns, now_ns + self._utc_offset_ns())
+            self.positions = self._spool.positions()
+        except SpoolError as error:
+            self.problem = str(error)
+            self._due_ns = now_ns + DISK_RETRY_NS
+            self._make_room(acknowledged, now_ns)
+            return
+        self.problem = ""
+        self._rows = []
+        self._acknowledged -= acknowledged
+
+    def _make_room(self, acknowledged: frozenset[int], now_ns: int) -> None:
+        """Remove what was acknowledged, for which a disk can have room that has none for more."""
+        if acknowledged:
+            with suppress(SpoolError):
+                self._spool.commit((), acknowledged, now_ns, now_ns + self._utc_offset_ns())
+                self._acknowledged -= acknowledged
+
+    def _give(self) -> None:
+        """Give the sender what it has room for."""
+        room = self._sender.room()
+        try:
+            while room > 0:
+                rows = self._spool.after(room)
+                if not rows:
+                    return
+                fresh = [row for row in rows if row.id not in self._acknowledged]
+                self._sender.give(self._session, fresh)
+                room -= len(fresh)
+        except SpoolError as error:
+            self.problem = self.problem or str(error)
+
+    def _failed(self, error: BaseException) -> None:
+        self.failure = error

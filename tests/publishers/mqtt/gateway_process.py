@@ -1,0 +1,54 @@
+"""A gateway as a process of its own, to be killed: `python -m tests.publishers.mqtt.gateway_process PORT SPOOL EPOCH`.
+
+It makes samples of one device at 1 kHz in the real time of the machine, sends them by the real output, and prints after
+each transaction how far each stream has come into the spool.
+"""
+
+import sys
+import time
+
+import msgspec
+
+from imud.contracts.publisher import Batch, PublisherContext
+from imud.publishers.mqtt.publisher import MqttPublisher
+from imud.publishers.mqtt.settings import MqttSettings
+from imud.sample import Sample, Sync
+from imud.units import NS_PER_MS
+
+TICK_S = 0.05
+EVERY = {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.2}}
+
+
+def main(port: str, spool: str, epoch: str, megabytes: str = "256") -> None:
+    """Run until killed."""
+    settings = msgspec.convert(
+        {
+            "brokers": [f"mqtt://127.0.0.1:{port}"], "gateway": "gw", "spool_directory": spool, "retry_max_s": 1,
+            "devices": EVERY, "spool_mb": float(megabytes),
+        },
+        MqttSettings,
+    )  # fmt: skip
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    context = PublisherContext(list, int(epoch), time.monotonic_ns, utc_offset_ns=lambda: offset_ns)
+    output = MqttPublisher(settings, context)
+    output.add_device("bow", 0)
+    output.start()
+    begin_ns, seq, told = time.monotonic_ns(), 0, 0
+    while True:
+        samples = []
+        while begin_ns + seq * NS_PER_MS < time.monotonic_ns():
+            seq += 1
+            t_ns = begin_ns + seq * NS_PER_MS
+            values = (seq * 0.37, seq / 7, 9.8)
+            samples.append(Sample("bow", seq, t_ns, 0, Sync.EDGE, t_ns, t_ns + offset_ns, accel_m_s2=values))
+        output.publish(Batch("bow", 0, samples))
+        output.tick(time.monotonic_ns())
+        status = output.status()
+        if status.spooled != told:
+            told = status.spooled
+            print(f"{status.waiting} {seq}", flush=True)
+        time.sleep(TICK_S)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

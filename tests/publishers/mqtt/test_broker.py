@@ -1,0 +1,187 @@
+"""Connections to a real mosquitto: both versions, TLS with certificates, passwords, websockets, refusals."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from imud.publishers.mqtt.broker import BrokerError, PahoConnection, Will
+from imud.publishers.mqtt.settings import MqttSettings, broker_of
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, free_port, running_broker
+
+pytestmark = pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
+WILL = Will("imud/s/g/state", b'{"online":false}')
+
+
+def connect(url: str, **settings: object) -> PahoConnection:
+    broker = broker_of(url)
+    assert broker is not None
+    return PahoConnection(broker, msgspec.convert(settings, MqttSettings), "gateway", WILL)
+
+
+def send(connection: PahoConnection, payload: bytes = b"{}", topic: str = "imud/s/g/state") -> None:
+    """Send a message and wait until the broker has it."""
+    number = connection.publish(topic, payload, "application/json", retain=False)
+    for _ in range(1000):
+        if number in connection.acknowledged:
+            return
+        connection.wait(1.0)
+    raise AssertionError(connection.acknowledged)
+
+
+def wait_for_the_end(connection: PahoConnection) -> None:
+    """Wait until the connection is lost."""
+    for _ in range(10):
+        connection.wait(1.0)
+
+
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_a_message_is_acknowledged(tmp_path: Path, version: str) -> None:
+    with running_broker(tmp_path / "broker") as broker:
+        collector = Collector(broker.port)
+        connection = connect(f"mqtt://127.0.0.1:{broker.port}", version=version)
+        send(connection, b'{"a":1}')
+        collector.wait_for(lambda: bool(collector.messages))
+        assert collector.messages == [("imud/s/g/state", b'{"a":1}')]
+        connection.close()
+        connection.close()
+        collector.close()
+
+
+def test_the_will_is_published_when_the_gateway_is_gone(tmp_path: Path) -> None:
+    with running_broker(tmp_path / "broker") as broker:
+        collector = Collector(broker.port)
+        connection = connect(f"mqtt://127.0.0.1:{broker.port}")
+        taken = connect(f"mqtt://127.0.0.1:{broker.port}")  # the same name: the broker ends the first connection
+        collector.wait_for(lambda: bool(collector.messages))
+        assert collector.messages == [(WILL.topic, WILL.payload)]
+        with pytest.raises(BrokerError, match=r"taken over|lost"):
+            wait_for_the_end(connection)
+        connection.close()
+        taken.close()
+        collector.close()
+
+
+def test_a_broker_that_is_not_there_is_named() -> None:
+    port = free_port()
+    with pytest.raises(BrokerError, match=rf"mqtt://127.0.0.1:{port}: Connection refused"):
+        connect(f"mqtt://127.0.0.1:{port}")
+
+
+def test_a_broker_that_ends_is_noticed(tmp_path: Path) -> None:
+    with running_broker(tmp_path / "broker") as broker:
+        connection = connect(f"mqtt://127.0.0.1:{broker.port}")
+        broker.stop()
+        with pytest.raises(BrokerError, match=r"lost|ended|reset"):
+            wait_for_the_end(connection)
+        connection.close()
+
+
+def test_user_and_password(tmp_path: Path) -> None:
+    program = shutil.which("mosquitto_passwd")
+    if program is None:
+        pytest.skip("mosquitto_passwd is not installed")
+    subprocess.run([program, "-b", "-c", tmp_path / "users", "gate", "secret"], check=True)
+    with running_broker(tmp_path / "broker", "allow_anonymous false", f"password_file {tmp_path}/users") as broker:
+        url = f"mqtt://127.0.0.1:{broker.port}"
+        (tmp_path / "good").write_text("secret\n")
+        (tmp_path / "bad").write_text("guess\n")
+        connection = connect(url, user="gate", password_file=str(tmp_path / "good"))
+        send(connection)
+        connection.close()
+        with pytest.raises(BrokerError, match=r"refuses the connection: Not authorized"):
+            connect(url, user="gate", password_file=str(tmp_path / "bad"))
+        with pytest.raises(BrokerError, match=r"refuses the connection"):
+            connect(url, version="3.1.1")
+        with pytest.raises(BrokerError, match=r"none: No such file or directory"):
+            connect(url, user="gate", password_file=str(tmp_path / "none"))
+
+
+def test_a_message_that_is_refused_ends_the_connection_with_the_topic(tmp_path: Path) -> None:
+    rights = tmp_path / "rights"
+    rights.write_text("topic write imud/s/g/state\n")
+    with running_broker(tmp_path / "broker", "allow_anonymous true", f"acl_file {rights}") as broker:
+        connection = connect(f"mqtt://127.0.0.1:{broker.port}")
+        send(connection)
+        with pytest.raises(BrokerError, match=r"refuses messages of imud/s/g/events: Not authorized"):
+            send(connection, topic="imud/s/g/events")
+        connection.close()
+
+
+def test_websockets(tmp_path: Path) -> None:
+    port = free_port()
+    listener = (f"listener {port} 127.0.0.1", "protocol websockets", "allow_anonymous true")
+    try:
+        with running_broker(tmp_path / "broker", *listener):
+            connection = connect(f"ws://127.0.0.1:{port}")
+            send(connection)
+            connection.close()
+    except AssertionError as error:
+        if "Websockets support not available" in str(error):
+            pytest.skip("this mosquitto has no websockets")
+        raise
+
+
+# --- TLS --------------------------------------------------------------------------------------------------------------
+
+
+class Authority:
+    """Certificates made by openssl for one test."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._run("req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "ca.key", "-out", "ca.pem", "-days", "2",
+                  "-subj", "/CN=imud test authority")  # fmt: skip
+        for name, more in (("broker", "subjectAltName=IP:127.0.0.1"), ("gateway", "extendedKeyUsage=clientAuth")):
+            self._run("req", "-newkey", "rsa:2048", "-nodes", "-keyout", f"{name}.key", "-out", f"{name}.csr",
+                      "-subj", f"/CN={name}")  # fmt: skip
+            (folder / "extension").write_text(more)
+            self._run("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial",
+                      "-out", f"{name}.pem", "-days", "2", "-extfile", "extension")  # fmt: skip
+
+    def _run(self, *words: str) -> None:
+        subprocess.run(["openssl", *words], cwd=self.folder, check=True, capture_output=True)
+
+    def __getitem__(self, name: str) -> str:
+        return str(self.folder / name)
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    return Authority(tmp_path_factory.mktemp("authority"))
+
+
+LEFT_OPEN = "ignore::pytest.PytestUnraisableExceptionWarning"
+"""paho-mqtt 2.2 leaves the socket of a handshake that failed to the garbage collector."""
+
+
+@pytest.mark.filterwarnings(LEFT_OPEN)
+def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authority) -> None:
+    port = free_port()
+    lines = (
+        f"listener {port} 127.0.0.1", f"cafile {authority['ca.pem']}", f"certfile {authority['broker.pem']}",
+        f"keyfile {authority['broker.key']}", "require_certificate true", "allow_anonymous true",
+    )  # fmt: skip
+    with running_broker(tmp_path / "broker", *lines):
+        own = {"cert_file": authority["gateway.pem"], "key_file": authority["gateway.key"]}
+        connection = connect(f"mqtts://127.0.0.1:{port}", ca_file=authority["ca.pem"], **own)
+        send(connection, b"x" * 200_000)
+        connection.close()
+        with pytest.raises(BrokerError, match=r"(?i)self[- ]signed certificate"):
+            connect(f"mqtts://127.0.0.1:{port}", **own)
+        with pytest.raises(BrokerError):
+            connect(f"mqtts://127.0.0.1:{port}", ca_file=authority["ca.pem"])
+        with pytest.raises(BrokerError, match=r"(?i)hostname mismatch|not valid for"):
+            connect(f"mqtts://localhost:{port}", ca_file=authority["ca.pem"], **own)
+        with pytest.raises(BrokerError, match=r"No such file or directory"):
+            connect(f"mqtts://127.0.0.1:{port}", ca_file=str(tmp_path / "none"))
+
+
+@pytest.mark.filterwarnings(LEFT_OPEN)
+def test_a_broker_that_does_not_speak_tls_is_an_error(tmp_path: Path) -> None:
+    with running_broker(tmp_path / "broker") as broker, pytest.raises(BrokerError, match=r"mqtts://127.0.0.1"):
+        connect(f"mqtts://127.0.0.1:{broker.port}")

@@ -1,0 +1,252 @@
+"""The output as a whole with a broker in memory: births and states, what is put into the queue, what goes wrong."""
+
+import builtins
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.settings import wrong_values
+from imud.contracts.status import DeviceState, DeviceStatus
+from imud.errors import ServerError
+from imud.event import Event, EventKind
+from imud.publishers.mqtt.broker import EXTRA_MISSING
+from imud.publishers.mqtt.publisher import MqttPublisher
+from imud.publishers.mqtt.settings import Broker, MqttSettings, broker_of
+from imud.units import NS_PER_S
+from tests.publishers.mqtt.fake_broker import FakeBroker
+from tests.support.event_loops import VirtualClock
+from tests.support.signal_bench import HandWorker
+from tests.support.socket_rig import device_status, sample
+
+
+class PublisherBench:
+    """The output with the threads' work done by hand, but for the sender's, which runs."""
+
+    def __init__(self, path: Path, **settings: object) -> None:
+        self.clock, self.broker = VirtualClock(), FakeBroker(blocks=True)
+        self.events: list[Event] = []
+        self.statuses: list[DeviceStatus] = [device_status("imu0", 0)]
+        self.asked = 0
+        self.workers: list[HandWorker] = []
+        self.context = PublisherContext(self._status, 77, self.clock.now_ns, raise_event=self.events.append)
+        made = msgspec.convert({"spool_directory": str(path), "gateway": "gw", **settings}, MqttSettings)
+        self.output = MqttPublisher(
+            made, self.context, connect=self.broker.connect, start_worker=self._start, host_name=lambda: "host.example"
+        )
+
+    def _status(self) -> list[DeviceStatus]:
+        self.asked += 1
+        return self.statuses
+
+    def _start(self, *args: object) -> HandWorker:
+        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # as StartWorker
+        return self.workers[-1]
+
+    def tick(self, seconds: float = 1.0) -> None:
+        self.clock.advance(round(seconds * NS_PER_S))
+        self.output.tick(self.clock.now_ns())
+        self.workers[0].work()
+
+    def close(self) -> list[tuple[str, bytes, bool]]:
+        """Close it; return all that was sent."""
+        self.output.close()
+        self.output.close()
+        return [one for connection in self.broker.connections for one in connection.sent]
+
+
+def test_birth_states_and_farewell(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.output.add_device("imu0", 0)
+    bench.output.start()
+    bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/schema")
+    sent = bench.close()
+    topics = {topic: json.loads(payload) for topic, payload, retain in sent if retain}
+    assert {"imud/default/gw/state", "imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"} == set(topics)
+    assert json.loads(sent[0][1])["online"] is True
+    assert json.loads(sent[0][1])["boot"] == "000000000000004d"
+    assert topics["imud/default/gw/state"] == {
+        "v": 1, "online": False, "boot": "000000000000004d", "reason": "imud stopped",
+    }  # fmt: skip
+    assert topics["imud/default/gw/imu0/schema"]["slot"]["bytes"] == 256
+    assert topics["imud/default/gw/imu0/status"]["state"] == "running"
+    assert bench.broker.will is not None
+    assert json.loads(bench.broker.will.payload)["reason"] == "connection lost"
+
+
+def test_states_are_looked_at_after_events_and_now_and_then(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, status_s=60)
+    bench.output.add_device("imu0", 0)
+    bench.output.start()
+    bench.tick()
+    assert bench.asked == 1
+    for _ in range(50):
+        bench.tick()
+        bench.output.event(Event(0, "imu0", EventKind.MARK, "pulse"))
+    assert bench.asked == 1
+    bench.output.event(Event(0, "imu0", EventKind.DOWN, "gone"))
+    bench.statuses = [msgspec.structs.replace(bench.statuses[0], state=DeviceState.MISSING)]
+    bench.tick()
+    assert bench.asked == 2
+    for _ in range(30):
+        bench.tick()
+    assert bench.asked == 3
+    bench.close()
+
+
+def test_a_device_that_is_removed_leaves_no_state(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.output.add_device("imu0", 0)
+    bench.output.start()
+    bench.tick()
+    bench.output.remove_device("imu0")
+    bench.statuses = []
+    bench.tick()
+    bench.tick(100)
+    sent = [topic for topic, payload, _ in bench.close() if not payload]
+    assert set(sent) <= {"imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"}
+    assert bench.output.status().broker == ""
+
+
+def test_only_declared_devices_are_queued(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, devices={"imu0": {}})
+    for name in ("imu0", "imu1"):
+        bench.output.add_device(name, 0)
+    bench.output.start()
+    for name in ("imu0", "imu1"):
+        bench.output.publish(Batch(name, 0, [sample(name, 1), sample(name, 2)]))
+        bench.output.event(Event(0, name, EventKind.LOSS, "x"))
+    assert bench.output.status().queued == 3
+    bench.output.event(Event(0, "", EventKind.CONFIGURATION, "x"))
+    assert bench.output.status().queued == 4
+    assert bench.context.mqtt_sources == [bench.output.status]
+    bench.close()
+    assert bench.context.mqtt_sources == []
+
+
+def test_a_spool_that_fails_is_an_event_and_no_end(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path / "spool")
+    bench.output.add_device("imu0", 0)
+    bench.output.start()
+    database = tmp_path / "spool" / "spool.db"
+    bench.output.publish(Batch("imu0", 0, [sample("imu0", 1)]))
+    bench.tick()
+    for path in tmp_path.glob("spool/spool.db*"):
+        path.write_bytes(b"\xff" * 10_000)
+    for _ in range(20):
+        bench.output.event(Event(0, "imu0", EventKind.LOSS, "x"))
+        bench.tick(20)
+    messages = [event.message for event in bench.events]
+    assert any("nothing is spooled" in one for one in messages), messages
+    assert any("spooling again" in one for one in messages), messages
+    assert all(event.kind is EventKind.MQTT and not event.device for event in bench.events)
+    assert database.exists()
+    bench.close()
+
+
+def test_a_thread_that_ends_by_a_defect_ends_the_daemon(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.output.start()
+    bench.workers[0].failed(ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        bench.output.tick(0)
+    bench.close()
+
+
+def test_two_outputs_do_not_share_a_spool(tmp_path: Path) -> None:
+    first, second = PublisherBench(tmp_path), PublisherBench(tmp_path)
+    first.output.start()
+    with pytest.raises(ServerError, match="another running imud"):
+        second.output.start()
+    first.close()
+    second.output.start()
+    second.close()
+
+
+def test_the_name_of_the_host_is_the_gateway(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, gateway="")
+    bench.output.start()
+    bench.close()
+    assert bench.broker.will is not None
+    assert bench.broker.will.topic == "imud/default/host/state"
+    odd = MqttPublisher(
+        MqttSettings(spool_directory=str(tmp_path)), bench.context, connect=bench.broker.connect,
+        host_name=lambda: "Gerät",
+    )  # fmt: skip
+    with pytest.raises(ServerError, match=r"mqtt.gateway: expected a name .* 'Gerät'"):
+        odd.start()
+
+
+def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real: Callable[..., Any] = builtins.__import__
+
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.partition(".")[0] == "paho":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    import importlib
+
+    def import_module(name: str) -> Any:
+        return without(name)
+
+    monkeypatch.setattr(importlib, "import_module", import_module)
+    output = MqttPublisher(MqttSettings(spool_directory=str(tmp_path)), PublisherBench(tmp_path).context)
+    with pytest.raises(ServerError) as found:
+        output.start()
+    assert str(found.value) == EXTRA_MISSING == "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"brokers": []}, "brokers: expected a list of 1 to 16"),
+        ({"brokers": ["http://a"]}, "expected a URL such as mqtts://"),
+        ({"brokers": ["mqtt://user:secret@a"]}, "no user"),
+        ({"brokers": ["mqtt://a:99999"]}, "expected a URL"),
+        ({"brokers": ["mqtt://a/path"]}, "expected a URL"),
+        ({"site": "a/b"}, "site: expected letters, digits"),
+        ({"key_file": "/k"}, "key_file: expected cert_file as well"),
+        ({"password_file": "/p"}, "password_file: expected user as well"),
+        ({"devices": {"a b": {}}}, "devices: expected names of devices"),
+        (
+            {"devices": {"*": {"rate_hz": 0.001}}},
+            'devices: "*": rate_hz: expected a number from 0.01 to 100, or null, got 0.001',
+        ),
+        ({"devices": {"*": {"whole": "xml"}}}, 'whole: expected one of "none", "json", "slots", got "xml"'),
+        ({"devices": {"*": {"wole": "json"}}}, "wole"),
+        ({"version": "3.1"}, "version: expected"),
+    ],
+)
+def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
+    (wrong,) = wrong_values(MqttSettings, given)
+    assert words in str(wrong)
+
+
+@pytest.mark.parametrize(
+    ("url", "broker"),
+    [
+        ("mqtt://a", Broker("a", 1883, False, False, "/mqtt")),
+        ("mqtts://a.example", Broker("a.example", 8883, True, False, "/mqtt")),
+        ("ws://10.0.0.1:8080/x", Broker("10.0.0.1", 8080, False, True, "/x")),
+        ("wss://[::1]", Broker("::1", 443, True, True, "/mqtt")),
+    ],
+)
+def test_urls(url: str, broker: Broker) -> None:
+    assert broker_of(url) == broker
+    assert broker_of(broker.name) == broker
+
+
+def test_what_is_not_named_is_as_the_star_says() -> None:
+    settings = msgspec.convert({"devices": {"bow": {"rate_hz": 5}, "*": {"rate_hz": 2}}}, MqttSettings)
+    assert [getattr(settings.sending(name), "rate_hz", None) for name in ("bow", "mast")] == [5, 2]
+    alone = msgspec.convert({"devices": {"bow": {}}}, MqttSettings)
+    assert alone.sending("mast") is None

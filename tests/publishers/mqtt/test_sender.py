@@ -1,0 +1,119 @@
+"""The sender: a window of messages, retained ones first, everything again after a loss, in order."""
+
+import pytest
+
+from imud.formats.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
+from imud.publishers.mqtt.backoff import BrokerTurn
+from imud.publishers.mqtt.broker import Will
+from imud.publishers.mqtt.sender import OUTBOX_MAX, MqttSender
+from imud.publishers.mqtt.settings import Broker, MqttSettings
+from imud.publishers.mqtt.spool import Spooled
+from tests.publishers.mqtt.fake_broker import FakeBroker
+from tests.support.event_loops import VirtualClock
+
+
+def row(number: int, payload: bytes = b"{}") -> Spooled:
+    return Spooled(number, "1", "bow", "samples", "samples", "topic", number, number, 1, 0, payload)
+
+
+class SenderBench:
+    """A sender whose rounds the test calls."""
+
+    def __init__(self, *hosts: str) -> None:
+        self.broker, self.clock = FakeBroker(), VirtualClock()
+        turn = BrokerTurn([Broker(host, 1, False, False, "") for host in hosts or ("a",)], 60.0, lambda: 0.5)
+        will = Will("state", b"gone")
+        self.sender = MqttSender(MqttSettings(), "me", will, turn, self.broker.connect, self.clock.now_ns)
+        self.wanted = 0
+        self.sender.wanting = self._want
+
+    def _want(self) -> None:
+        self.wanted += 1
+
+    def sent(self) -> list[bytes]:
+        return [payload for _, payload, _ in self.broker.connections[-1].sent]
+
+
+def test_messages_go_in_their_order_within_the_window() -> None:
+    bench = SenderBench()
+    bench.broker.answers = 0
+    assert bench.sender.room() == 0
+    assert bench.sender.work() == 0
+    assert bench.sender.room() == OUTBOX_MAX
+    bench.sender.give(bench.sender.session, [row(n, b"%d" % n) for n in range(1, 7)])
+    bench.sender.work()
+    assert bench.sent() == [b"1", b"2", b"3", b"4"]
+    assert bench.sender.room() == OUTBOX_MAX - 6
+    bench.broker.answers = 2
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"1", b"2", b"3", b"4", b"5", b"6"]
+    assert bench.sender.take_acknowledged() == [(1, 1), (1, 2)]
+    assert bench.sender.take_acknowledged() == []
+    assert (bench.sender.sent, bench.sender.acknowledged) == (6, 2)
+
+
+def test_after_a_loss_nothing_is_held_and_the_session_is_another() -> None:
+    bench = SenderBench("a", "b")
+    bench.broker.answers = 1
+    bench.sender.work()
+    bench.sender.give(1, [row(1), row(2)])
+    bench.sender.work()
+    bench.broker.problem = "the cable was pulled"
+    assert bench.sender.work() == 2.0
+    assert bench.broker.connections[0].closed
+    assert (bench.sender.connected, bench.sender.problem, bench.sender.session) == (False, "the cable was pulled", 2)
+    assert bench.sender.take_acknowledged() == [(1, 1)]
+    bench.sender.give(1, [row(3)])
+    assert bench.sender.work() > 0
+    bench.broker.problem = ""
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == []
+    assert (bench.sender.problem, bench.sender.reconnects) == ("", 1)
+    assert bench.broker.asked == ["a", "a", "b"]
+
+
+def test_retained_messages_go_first_and_again_at_each_connection() -> None:
+    bench = SenderBench()
+    bench.sender.retain({"state": b"born", "status": b"1"})
+    bench.sender.work()
+    bench.sender.give(1, [row(1, b"data")])
+    bench.sender.work()
+    assert bench.broker.connections[0].sent == [
+        ("state", b"born", True),
+        ("status", b"1", True),
+        ("topic", b"data", False),
+    ]
+    bench.sender.retain({"status": b"1"})
+    bench.sender.work()
+    assert len(bench.sent()) == 3, "what is the same is not sent again"
+    bench.sender.retain({"status": b""})
+    bench.sender.work()
+    assert bench.sent()[3:] == [b""]
+    bench.broker.problem = "gone"
+    bench.sender.work()
+    bench.broker.problem = ""
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"born"], "what was removed is not sent again"
+
+
+def test_the_type_of_a_message_is_told() -> None:
+    bench = SenderBench()
+    bench.sender.work()
+    bench.sender.give(1, [row(1, MAGIC + b"x"), row(2)])
+    bench.sender.work()
+    assert bench.broker.connections[0].types == [SLOTS_TYPE, JSON_TYPE]
+
+
+@pytest.mark.timeout(20)
+def test_it_ends_with_a_farewell() -> None:
+    bench = SenderBench()
+    bench.sender.start()
+    bench.sender.close(b"bye")
+    bench.sender.close(b"bye")
+    if bench.broker.connections:
+        assert bench.broker.connections[-1].sent[-1] == ("state", b"bye", True)
+        assert bench.broker.connections[-1].closed
+    assert bench.sender.failure is None

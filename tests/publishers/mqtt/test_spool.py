@@ -1,0 +1,241 @@
+"""The spool: order, room, age, a full disk, a damaged file; every number is covered by exactly one message, always."""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from imud.formats.fleet.ledger import FleetLedger, StreamCounts
+from imud.formats.fleet.messages import (
+    VERSION,
+    FleetMessage,
+    MessageKind,
+    decode_message,
+    encode_message,
+    encode_slots_message,
+)
+from imud.formats.fleet.topics import Stream, topic_of
+from imud.formats.slot import encode_slots
+from imud.publishers.mqtt.spool import CLOCK_SET_NS, FILE, STEP, Spool, Spooled, SpoolError, row_of
+from imud.sample import Sample, Sync
+from imud.units import NS_PER_S
+
+HOUR_NS = 3600 * NS_PER_S
+UTC_NS = CLOCK_SET_NS + 10_000 * HOUR_NS
+
+
+def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> Spooled:
+    """A message of whole samples, or of an event."""
+    stream = Stream.SAMPLES if whole else Stream.EVENTS
+    last = first + count - 1
+    samples = [
+        Sample(device, seq, seq, 0, Sync.EDGE, seq, seq, accel_m_s2=(seq * 0.37, seq / 7, 9.8))
+        for seq in range(first, last + 1)
+    ]
+    message = FleetMessage(
+        v=VERSION, gateway="gw", boot="1", device=device, begin=1,
+        kind=MessageKind.SLOTS if whole else MessageKind.EVENTS, first=first, last=last, count=count, utc_ns=last,
+    )  # fmt: skip
+    payload = encode_slots_message(message, encode_slots(samples, 0)) if whole else encode_message(message)
+    return row_of(topic_of("site", "gw", device, stream), stream, message, payload, 0)
+
+
+class SpoolBench:
+    """A spool and its clocks."""
+
+    def __init__(self, path: Path, kilobytes: int = 100_000, hours: float = 100.0) -> None:
+        self.spool = Spool(path, kilobytes * 1000, round(hours * HOUR_NS))
+        self.spool.open()
+        self.now_ns = 0
+
+    def commit(self, *rows: Spooled, done: tuple[int, ...] = (), utc_ns: int = UTC_NS) -> None:
+        self.now_ns += NS_PER_S
+        self.spool.commit(rows, done, self.now_ns, utc_ns)
+
+    def all(self) -> list[Spooled]:
+        self.spool.rewind()
+        found = self.spool.after(1_000_000)
+        self.spool.rewind()
+        return found
+
+    def counts(self) -> StreamCounts:
+        """What a reader would get, of the stream `samples`."""
+        ledger = FleetLedger(from_begin=True)
+        for row in self.all():
+            ledger.take(decode_message(row.payload), Stream(row.stream))
+        (found,) = [one for key, one in ledger.counts.items() if key.stream == "samples"]
+        assert found.balance == 0
+        return found
+
+
+def test_messages_come_in_their_order_until_they_are_acknowledged(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(batch(1), batch(101), batch(201))
+    first = bench.spool.after(2)
+    assert [row.first for row in first] == [1, 101]
+    assert [row.first for row in bench.spool.after(5)] == [201]
+    assert bench.spool.after(5) == []
+    bench.commit(done=(first[0].id,))
+    assert [row.first for row in bench.all()] == [101, 201]
+    assert bench.spool.messages == 2
+
+
+def test_what_was_committed_is_there_after_the_end_without_a_farewell(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from pathlib import Path; from tests.publishers.mqtt.test_spool import SpoolBench, batch\n"
+        "bench = SpoolBench(Path(sys.argv[1]))\n"
+        "for n in range(5): bench.commit(batch(100 * n + 1))\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    import sys
+
+    ended = subprocess.run([sys.executable, "-c", code, tmp_path], check=False, timeout=30)
+    assert ended.returncode == -9
+    bench = SpoolBench(tmp_path)
+    assert bench.counts() == StreamCounts(1, 500, whole=500)
+    assert bench.spool.positions()[0].last == 500
+    bench.commit(batch(501))
+    assert [row.id for row in bench.all()] == [1, 2, 3, 4, 5, 6]
+
+
+def test_the_oldest_samples_become_statistics_before_anything_is_dropped(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=300)
+    for number in range(200):
+        bench.commit(batch(100 * number + 1))
+        assert bench.spool.used_bytes <= 300_000
+    counts = bench.counts()
+    assert counts.dropped == {}
+    assert counts.thinned >= 8_000
+    assert counts.whole >= 1000
+    assert counts.whole + counts.thinned == 20_000
+    assert bench.spool.thinned == counts.thinned
+    kinds = [row.kind for row in bench.all()]
+    assert kinds == sorted(kinds), "intervals are the oldest, slots the newest"
+
+
+def test_when_nothing_can_be_thinned_the_oldest_are_dropped_and_it_is_said(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=100)
+    for number in range(400):
+        bench.commit(batch(100 * number + 1), batch(number + 1, 1, whole=False))
+        assert bench.spool.used_bytes <= 100_000
+    counts = bench.counts()
+    assert counts.missing == 0
+    assert counts.newest == 40_000
+    assert counts.dropped["space"] > 20_000
+    rows = bench.all()
+    events = sum(row.items for row in rows if row.stream == "events" and row.kind == "dropped")
+    assert bench.spool.dropped["space"] == counts.dropped["space"] + events
+    assert sum(row.kind == "dropped" for row in rows) == 2, "neighbours share one note for each stream"
+
+
+def test_what_was_given_to_the_sender_is_left_alone(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=150)
+    bench.commit(batch(1), batch(101))
+    given = bench.spool.after(2)
+    for number in range(2, 100):
+        bench.commit(batch(100 * number + 1))
+    assert bench.spool.thinned > 0
+    assert bench.all()[:2] == given
+
+
+def test_what_waited_too_long_is_dropped(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, hours=1)
+    bench.commit(batch(1), batch(101))
+    bench.commit(batch(201), utc_ns=UTC_NS + HOUR_NS // 2)
+    bench.commit(utc_ns=UTC_NS + HOUR_NS + 1)
+    assert bench.counts() == StreamCounts(1, 300, whole=100, dropped={"age": 200})
+    assert bench.spool.dropped == {"age": 200}
+
+
+def test_a_clock_that_was_not_set_says_nothing_of_ages(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, hours=1)
+    bench.commit(batch(1), utc_ns=5 * NS_PER_S)
+    bench.commit(batch(101), utc_ns=UTC_NS)
+    bench.commit(utc_ns=UTC_NS + 1)
+    assert bench.counts() == StreamCounts(1, 200, whole=200)
+
+
+def test_a_note_that_was_delivered_is_not_widened(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, hours=1)
+    bench.commit(batch(1))
+    bench.commit(batch(101), utc_ns=UTC_NS + HOUR_NS)
+    bench.commit(utc_ns=UTC_NS + HOUR_NS + 1)
+    (note,) = bench.spool.after(1)
+    assert note.kind == "dropped"
+    bench.commit(utc_ns=UTC_NS + 2 * HOUR_NS + 2)
+    bench.commit(done=(note.id,), utc_ns=UTC_NS + 2 * HOUR_NS + 2)
+    (left,) = bench.all()
+    assert (left.first, left.last, left.kind) == (101, 200, "dropped")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 512 kB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "x", disk], check=False).returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        yield disk
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_full_disk_leaves_the_spool_as_it_was(small_disk: Path) -> None:
+    bench = SpoolBench(small_disk)
+    number = 0
+    with pytest.raises(SpoolError, match="full"):  # noqa: PT012
+        while True:
+            bench.commit(batch(100 * number + 1))
+            number += 1
+    assert number > 5
+    messages, thinned = bench.spool.messages, bench.spool.thinned
+    assert messages == number
+    assert thinned == 0
+    assert bench.counts() == StreamCounts(1, 100 * number, whole=100 * number)
+    bench.spool.close()
+    again = SpoolBench(small_disk)
+    assert again.counts() == StreamCounts(1, 100 * number, whole=100 * number)
+
+
+def test_a_damaged_file_is_set_aside(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_bytes(b"This is no database at all, and it is long enough to be seen as none." * 100)
+    bench = SpoolBench(tmp_path)
+    assert bench.spool.set_aside == str(tmp_path / "spool.db.damaged")
+    bench.commit(batch(1))
+    assert bench.counts() == StreamCounts(1, 100, whole=100)
+
+
+def test_a_file_that_is_damaged_later_is_set_aside_at_the_next_attempt(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    for number in range(STEP):
+        bench.commit(batch(100 * number + 1))
+    bench.spool.close()
+    path = tmp_path / FILE
+    content = bytearray(path.read_bytes())
+    content[1024:] = b"\xa5" * (len(content) - 1024)
+    path.write_bytes(content)
+    bench = SpoolBench(tmp_path)
+    for _ in range(2):
+        try:
+            bench.commit(batch(1))
+        except SpoolError:
+            continue
+    assert bench.spool.set_aside
+    assert bench.counts().whole == 100
+
+
+def test_a_directory_that_cannot_be_made_is_an_error_with_its_name(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SpoolError, match="file"):
+        Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
+
+
+def test_a_payload_that_cannot_be_read_is_dropped_as_damaged(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=60)
+    bench.commit(batch(1)._replace(payload=b"IMUB" + bytes(30_000)))
+    for number in range(1, 20):
+        bench.commit(batch(100 * number + 1))
+    assert bench.spool.dropped["damaged"] == 100
+    assert bench.counts().dropped["damaged"] == 100

@@ -1,0 +1,258 @@
+"""The queue and the thread of the spool: bounded, nothing twice, a disk that fails costs only what it must."""
+
+from pathlib import Path
+
+import msgspec
+
+from imud.contracts.publisher import Batch
+from imud.event import Event, EventKind
+from imud.formats.fleet.ledger import FleetLedger, StreamCounts
+from imud.formats.fleet.messages import decode_message
+from imud.formats.fleet.topics import Stream
+from imud.publishers.mqtt.backoff import BrokerTurn
+from imud.publishers.mqtt.broker import Will
+from imud.publishers.mqtt.sender import MqttSender
+from imud.publishers.mqtt.settings import Broker, MqttSettings
+from imud.publishers.mqtt.spool import Spool, SpoolError
+from imud.publishers.mqtt.streams import Gateway
+from imud.publishers.mqtt.writer import COMMIT_NS, DISK_RETRY_NS, PENDING_BYTES, SpoolWriter, WriterQueue
+from imud.sample import Sample, Sync
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.publishers.mqtt.fake_broker import FakeBroker
+from tests.support.event_loops import VirtualClock
+from tests.support.signal_bench import HandWorker
+
+HOUR_NS = 3600 * NS_PER_S
+
+
+class FailingSpool(Spool):
+    """A spool whose disk fails when the test says so."""
+
+    fails = False
+
+    def commit(self, new: object, acknowledged: object, now_ns: int, utc_ns: int) -> None:
+        if self.fails:
+            raise SpoolError("No space left on device")
+        super().commit(new, acknowledged, now_ns, utc_ns)  # type: ignore[arg-type]
+
+
+class WriterBench:
+    """Writer and sender by hand; one sample each millisecond."""
+
+    def __init__(self, path: Path, boot: str = "1", **settings: object) -> None:
+        self.clock, self.broker = VirtualClock(), FakeBroker()
+        made = msgspec.convert({"devices": {"bow": {"rate_hz": None, "whole": "slots", **settings}}}, MqttSettings)
+        self.queue = WriterQueue()
+        self.spool = FailingSpool(path, 100_000_000, HOUR_NS)
+        turn = BrokerTurn([Broker("a", 1, False, False, "")], 60.0, lambda: 0.5)
+        self.sender = MqttSender(made, "me", Will("t", b""), turn, self.broker.connect, self.clock.now_ns)
+        self.workers: list[HandWorker] = []
+        self.writer = SpoolWriter(
+            made, Gateway("site", "gw", boot), self.queue, self.spool, self.sender, self.clock.now_ns, lambda: 0,
+            self._start,
+        )  # fmt: skip
+        self.seq = 0
+
+    def _start(self, *args: object) -> HandWorker:
+        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # as StartWorker
+        return self.workers[-1]
+
+    def put(self, count: int) -> None:
+        """Samples of `count` milliseconds."""
+        base_ns = self.clock.now_ns()
+        made = []
+        for n in range(count):
+            self.seq += 1
+            made.append(
+                Sample("bow", self.seq, base_ns + n * NS_PER_MS, 0, Sync.EDGE, 0, 0, accel_m_s2=(self.seq / 3, 0, 1))
+            )
+        self.queue.put_batch(Batch("bow", 0, made))
+        self.clock.advance(count * NS_PER_MS)
+
+    def work(self, seconds: int = 1) -> None:
+        """Both threads for so many seconds."""
+        for _ in range(seconds):
+            self.workers[0].work()
+            self.sender.work()
+            self.workers[0].work()
+            self.sender.work()
+            self.clock.advance(COMMIT_NS)
+
+    def arrived(self) -> list[bytes]:
+        """What was sent in all connections."""
+        rows = []
+        for connection in self.broker.connections:
+            rows += [payload for topic, payload, retain in connection.sent if not retain]
+        return rows
+
+    def counts(self) -> StreamCounts:
+        """The ledger of a reader, of what was sent and what is in the spool."""
+        ledger = FleetLedger(from_begin=True)
+        self.spool.rewind()
+        for payload in [*self.arrived(), *[row.payload for row in self.spool.after(1_000_000)]]:
+            ledger.take(decode_message(payload), Stream.SAMPLES)
+        (counts,) = ledger.counts.values()
+        assert counts.balance == 0
+        return counts
+
+
+def test_everything_is_spooled_sent_and_removed(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    for _ in range(5):
+        bench.put(1000)
+        bench.work()
+    bench.work(4)
+    counts = bench.counts()
+    assert (counts.whole, counts.duplicates, counts.missing) == (5000, 0, 0)
+    assert bench.spool.messages == 0
+    assert bench.sender.acknowledged == bench.spool.spooled == 10
+    bench.writer.close()
+
+
+def test_nothing_is_sent_before_it_is_stored(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.work()
+    bench.spool.fails = True
+    bench.put(2000)
+    bench.work(3)
+    assert bench.arrived() == []
+    assert bench.writer.problem == "No space left on device"
+
+
+def test_there_is_one_transaction_a_second(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path, batch_s=0.1)
+    commits = []
+    bench.spool.commit = lambda new, *_: commits.append(len(new))  # type: ignore[method-assign]
+    for _ in range(100):
+        bench.put(100)
+        bench.workers[0].work()
+    assert len(commits) in (9, 10)
+
+
+def test_after_a_loss_everything_unacknowledged_goes_again_in_order(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.broker.answers = 1
+    bench.put(3000)
+    bench.work(3)
+    assert len(bench.arrived()) == 5
+    bench.broker.problem = "gone"
+    bench.work(2)
+    bench.broker.problem, bench.broker.answers = "", 1000
+    bench.work(5)
+    firsts = [decode_message(payload).first for payload in bench.arrived()]
+    assert firsts == [1, 501, 1001, 1501, 2001, 501, 1001, 1501, 2001, 2501]
+    counts = bench.counts()
+    assert (counts.whole, counts.duplicates) == (3000, 2000)
+    assert bench.spool.messages == 0
+
+
+def test_an_acknowledgement_of_an_earlier_connection_does_not_count(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.put(1000)
+    bench.work(2)
+    bench.broker.problem = "gone"
+    bench.sender.work()
+    bench.broker.problem = ""
+    bench.sender.work()
+    bench.work(3)
+    assert bench.spool.messages == 0
+    assert bench.counts().whole >= 1000
+
+
+def test_samples_that_have_no_room_are_counted_and_noted(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    for _ in range(25):
+        bench.put(1000)
+    assert bench.queue.waiting == 20_000
+    bench.work()
+    bench.put(1000)
+    bench.work(12)
+    assert bench.queue.dropped == 5000
+    assert bench.counts() == StreamCounts(1, 26_000, whole=21_000, dropped={"queue": 5000})
+
+
+def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.put(1000)
+    bench.work()
+    bench.spool.fails = True
+    bench.put(1000)
+    bench.work(2)
+    bench.spool.fails = False
+    bench.work(DISK_RETRY_NS // NS_PER_S + 1)
+    assert bench.writer.problem == ""
+    bench.work(3)
+    assert bench.counts() == StreamCounts(1, 2000, whole=2000)
+
+
+def test_a_disk_that_fails_for_long_leaves_the_numbers(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.spool.fails = True
+    rounds = 0
+    while not bench.writer.lost_on_disk:
+        bench.put(10_000)
+        bench.work(DISK_RETRY_NS // NS_PER_S)
+        rounds += 1
+        assert rounds * 10_000 < PENDING_BYTES
+    bench.spool.fails = False
+    bench.work(DISK_RETRY_NS // NS_PER_S + 5)
+    counts = bench.counts()
+    assert counts.missing == 0
+    assert counts.dropped["disk"] == bench.writer.lost_on_disk
+    assert counts.whole + counts.dropped["disk"] == bench.seq
+
+
+def test_a_device_that_counts_from_one_again_is_a_boot_of_its_own(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.put(1000)
+    bench.seq = 0
+    bench.put(500)
+    bench.work(4)
+    bench.writer.close()
+    boots = {position.boot: position.last for position in bench.writer.positions}
+    assert boots == {"1": 1000, "1-2": 500}
+    again = WriterBench(tmp_path)
+    again.seq = 600
+    again.put(10)
+    again.work(4)
+    again.writer.close()
+    assert {one.boot: one.last for one in again.writer.positions} == {"1": 1000, "1-2": 610}
+
+
+def test_the_next_run_sends_what_the_last_one_left(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path, boot="1")
+    bench.broker.problem = "no network"
+    bench.put(2000)
+    bench.work(3)
+    bench.writer.close()
+    again = WriterBench(tmp_path, boot="2")
+    again.work(3)
+    assert sum(decode_message(payload).count for payload in again.arrived()) == 2000
+
+
+def test_events_of_the_gateway_and_of_devices(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    for device in ("", "bow", "unknown"):
+        bench.queue.put_event(Event(1, device, EventKind.LINK, "x"))
+    bench.work(4)
+    topics = [topic for connection in bench.broker.connections for topic, _, _ in connection.sent]
+    assert topics == ["imud/site/gw/events", "imud/site/gw/bow/events"]
+
+
+def test_the_queue_of_events_is_bounded() -> None:
+    queue = WriterQueue(samples_max=10, events_max=2)
+    for _ in range(3):
+        queue.put_event(Event(1, "", EventKind.LINK, "x"))
+    assert (queue.queued, queue.dropped) == (3, 1)
+    queue.take()
+    queue.put_event(Event(1, "", EventKind.LINK, "x"))
+    assert queue.dropped == 1
+
+
+def test_closing_stores_what_waits(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.put(123)
+    bench.writer.close()
+    spool = Spool(tmp_path, 1_000_000, HOUR_NS)
+    spool.open()
+    assert [row.items for row in spool.after(9)] == [123]
