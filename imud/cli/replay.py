@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"of a capture (default: {DRIVER})")
     parser.add_argument("--speed", choices=SPEEDS, help=f"of a capture (default: {SPEED})")
-    parser.add_argument("--baud", type=int, help=f"rate of a raw capture (default: {BAUD})")
+    parser.add_argument("--baud", type=int, help=f"rate of a capture that names none (default: {BAUD})")
     parser.add_argument(
         "--socket", type=Path, metavar="PATH", help="serve the samples on this socket, as the daemon does"
     )
@@ -57,10 +57,11 @@ def run(args: argparse.Namespace) -> int:
     with log_to(STDERR, "warning"):
         if begins_as_recording(str(args.file)):
             return play_recording(args)
-        args.driver, args.speed, args.baud = args.driver or DRIVER, args.speed or SPEED, args.baud or BAUD
+        args.driver, args.speed = args.driver or DRIVER, args.speed or SPEED
+        args.baud = args.baud or (0 if names_rate(args) else BAUD)
         without_times = "" if has_times(args) else NO_TIMES
         status = play(args)
-    print(block(status, without_times), file=sys.stderr)
+    print(block(status, without_times, virtual=args.speed == "maximum"), file=sys.stderr)
     return 0 if status.ledger["samples"] else 1
 
 
@@ -82,6 +83,14 @@ def has_times(args: argparse.Namespace) -> bool:
         return True
     with open_regular(args.file) as file:
         return CaptureReader(file).stamped
+
+
+def names_rate(args: argparse.Namespace) -> bool:
+    """Whether the file says at which rate its bytes came: the first line of a stamped capture."""
+    if isinstance(DRIVERS[args.driver], CanDriver):
+        return False
+    with open_regular(args.file) as file:
+        return CaptureReader(file).baud > 0
 
 
 def check(device: config.DeviceConfig) -> None:

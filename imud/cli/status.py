@@ -52,9 +52,12 @@ def page(devices: Sequence[DeviceStatus]) -> str:
     return "\n\n".join(parts)
 
 
-def block(status: DeviceStatus, without_times: str = "") -> str:
-    """Format the block of one device, in 80 columns; `without_times` is why nothing is known that has to do with
-    time."""
+def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = False) -> str:
+    """Format the block of one device, in 80 columns.
+
+    `without_times` is why nothing is known that has to do with time. `virtual`: samples came as fast as they could be
+    read, with the times of a capture: how often they came and how late they were published says nothing.
+    """
     clock, ledger = status.clock, status.ledger
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
     rows = [
@@ -84,6 +87,9 @@ def block(status: DeviceStatus, without_times: str = "") -> str:
             f"{status.kernel.overrun} overruns, {status.kernel.framing} framing, {status.kernel.parity} parity",
         ),
     ]
+    if virtual:
+        rows[2] = ("rate", f"{status.expected_rate_hz:.1f} Hz by the device's clock")
+        rows = [row for row in rows if row[0] != "latency"]
     if without_times:
         rows = [("times", without_times), *(row for row in rows if row[0] not in ("rate", "clock", "latency"))]
     if status.frame is not None:

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
+from imud.formats.capture import RECORD
+from imud.units import NS_PER_MS
 from tests.support.files import hi91
 
 
@@ -26,6 +28,23 @@ def test_every_sample_is_printed_and_the_account_is_given(tmp_path: Path, capsys
     assert times == sorted(set(times))
     assert "samples   50; lost 0" in printed.err
     assert "closed" in printed.err
+
+
+def test_a_stamped_capture_has_its_own_rate_and_no_figures_of_how_fast_it_was_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "stamped"
+    frames = capture(tmp_path / "raw", 100).read_bytes()
+    size = len(frames) // 100
+    records = [RECORD.pack(n * 10 * NS_PER_MS, size) + frames[n * size : (n + 1) * size] for n in range(100)]
+    for header, words in ((b"baud=921600", "at 921600 baud"), (b"", "at 115200 baud")):
+        file.write_bytes(b"#imud-capture 1 driver=hipnuc-uart " + header + b"\n" + b"".join(records))
+        assert main(["replay", str(file)]) == 0
+        said = capsys.readouterr().err
+        assert words in said
+        assert "Hz by the device's clock" in said
+        assert "Hz seen" not in said
+        assert "latency" not in said
 
 
 def test_capture_without_samples_is_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
