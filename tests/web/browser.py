@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, Final
@@ -119,6 +119,7 @@ class Sender:
         self._thread = threading.Thread(target=self._run, name="sender")
 
     def __enter__(self) -> "Sender":
+        os.set_blocking(self._cable.master, False)
         self._thread.start()
         return self
 
@@ -132,6 +133,7 @@ class Sender:
         while not self._stopped.is_set():
             value = self._value_of(number)
             self.sent.append(value)
-            os.write(self._cable.master, hi91(number * PERIOD_MS, value))
+            with suppress(BlockingIOError):  # nobody reads any more: the daemon ends before this thread
+                os.write(self._cable.master, hi91(number * PERIOD_MS, value))
             number += 1
             sleep(max(0.0, begin + number * PERIOD_MS / 1000 - monotonic()))
