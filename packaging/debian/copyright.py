@@ -58,7 +58,7 @@ def licence_texts(distribution: Distribution) -> list[str]:
     return [
         Path(str(file.locate())).read_text(errors="replace")
         for file in distribution.files or []
-        if ".dist-info/" in str(file) and re.search(r"LICEN[CS]E|COPYING|NOTICE", file.name, re.IGNORECASE)
+        if ".dist-info/" in str(file) and re.search(r"LICEN[CS]E|COPYING|NOTICE|e[pd]l-v", file.name, re.IGNORECASE)
     ]
 
 

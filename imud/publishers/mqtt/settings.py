@@ -119,7 +119,7 @@ class MqttSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     keep_alive_s: Annotated[int, msgspec.Meta(ge=5, le=3600)] = 30
     """A connection that is dead is noticed within twice this time, s."""
     retry_max_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
-    """Longest pause between two attempts to connect, s; pauses grow from 1 s and are drawn at random."""
+    """Longest pause between two attempts to connect, s; pauses grow from 4 s and are drawn at random."""
     spool_directory: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud/mqtt"
     """Where the spool is; imud makes it where it is missing."""
     spool_mb: Annotated[float, msgspec.Meta(ge=1, le=1_000_000)] = 256.0
