@@ -174,6 +174,15 @@ def test_a_test_that_failed_is_shown_with_its_end(capsys: pytest.CaptureFixture[
     assert "no compiler" in out
 
 
+def test_a_file_that_cannot_be_read_is_shown_with_its_error(capsys: pytest.CaptureFixture[str]) -> None:
+    unread = (
+        """<testcase classname="" name="tests.formats.test_rmc" time="0"><error>ImportError: x</error></testcase>"""
+    )
+    tallies = unit_tests.counted(report(unread))
+    assert not unit_tests.shown(tallies)
+    assert "ImportError: x" in capsys.readouterr().out
+
+
 def test_a_part_of_which_no_test_ran_is_a_failure() -> None:
     skipped = f"<testsuite>{case('tests.clock.test_intervals', '<skipped/>')}</testsuite>"
     assert not any(tally.good for tally in unit_tests.counted(skipped).values())

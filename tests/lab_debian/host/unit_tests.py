@@ -108,7 +108,8 @@ def counted(report: str) -> dict[str, Tally]:
     """Results by part, of pytest's report (JUnit XML)."""
     tallies = {name: Tally() for name in PARTS}
     for case in ElementTree.fromstring(report).iter("testcase"):
-        place = case.get("classname", "").replace(".", "/")
+        # the error of a file that cannot be read has no class, and its name is that of the file
+        place = (case.get("classname") or str(case.get("name"))).replace(".", "/")
         part = next((name for name, paths in PARTS.items() if place.startswith(stems(paths))), "")
         if not part:
             raise LabError(f"a test outside of what was asked for: {place}")
