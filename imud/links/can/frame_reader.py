@@ -180,10 +180,10 @@ class FrameReader:
             t_ns = seconds * NS_PER_S + ns - offset_ns if kind == SO_TIMESTAMPNS_NEW else now_ns
             if stepped_ns and not newest_ns < t_ns <= now_ns and newest_ns < t_ns + stepped_ns <= now_ns:
                 t_ns += stepped_ns
-            elif t_ns < newest_ns - BACKLOG_NS:
-                t_ns = now_ns
-            if t_ns > newest_ns:  # noqa: PLR1730 - a call costs a twentieth of a frame
+            if t_ns > newest_ns:
                 newest_ns = t_ns
+            elif t_ns < newest_ns - BACKLOG_NS:
+                newest_ns = now_ns
             if newest_ns > now_ns:  # noqa: PLR1730
                 newest_ns = now_ns
             whole = data if size == DATA_BYTES_MAX else data[:size]
