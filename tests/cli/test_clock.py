@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Event, Thread
 
 import msgspec
 import pytest
@@ -13,36 +12,16 @@ from imud.cli.clock import EDGES_ENOUGH, ENOUGH, aids, block, verdict
 from imud.contracts.status import ClockStatus
 from imud.sample import Sync
 from imud.units import NS_PER_MS
-from tests.support.daemon_process import RunningDaemon, running_daemon
+from tests.support.daemon_process import RunningDaemon, running_daemon, sending_daemon
 from tests.support.files import hi91
 from tests.support.metrics import LINES, device, equipped
-from tests.support.pty_port import PtyPort
 
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[RunningDaemon]:
     """A daemon with one device that sends 100 frames a second, or nearly."""
-    port = PtyPort()
-    ended = Event()
-
-    def send() -> None:
-        ms = 0
-        while not ended.wait(0.01):
-            ms += 10
-            port.send(hi91(ms))
-
-    sender = Thread(target=send)
-    uart = {"port": port.path, "baud": 115200}
-    device = {"driver": "hipnuc-uart", "identify": False, "uart": uart}
-    with running_daemon(tmp_path, {"bow": device}) as daemon:
-        sender.start()
-        try:
-            daemon.wait_for("bow", "running")
-            yield daemon
-        finally:
-            ended.set()
-            sender.join()
-            port.unplug()
+    with sending_daemon(tmp_path, lambda number: hi91(10 * number)) as made:
+        yield made
 
 
 def test_a_page_for_people(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,27 +3,14 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from queue import Queue
 
-from imud.client.feed import Feed, News, Wish
+from imud.client.feed import Feed, Wish
 from imud.event import Event, EventKind
+from tests.client.news import Listener
 from tests.support.socket_rig import Daemon, batch, daemon
 
 LIMIT_S = 10.0
 OVERVIEW = Wish((), news_s=0.02, newest=True, newest_s=0.02)
-
-
-class Listener:
-    """Takes news; the test waits for what it needs."""
-
-    def __init__(self) -> None:
-        self._news: Queue[News] = Queue()
-        self.on_news = self._news.put
-
-    def wait_for(self, is_there: Callable[[News], object]) -> News:
-        while not is_there(news := self._news.get(timeout=LIMIT_S)):
-            pass
-        return news
 
 
 @contextmanager

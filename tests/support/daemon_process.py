@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event, Thread
 from time import monotonic, sleep
 from typing import Any
 
@@ -13,6 +14,7 @@ import msgspec
 
 from imud.client import Client
 from imud.contracts.status import DeviceStatus
+from tests.support.pty_port import PtyPort
 
 LIMIT_S = 10.0
 """Recordings and manuals that are not in the repository."""
@@ -136,3 +138,27 @@ def daemon_with_module(
         finally:
             simulator.terminate()
             simulator.communicate()
+
+
+@contextmanager
+def sending_daemon(folder: Path, frame: Callable[[int], bytes], every_s: float = 0.01) -> Iterator[RunningDaemon]:
+    """A daemon with one HiPNUC module, `bow`, that sends `frame(n)`, n from 1 on, 100 times a second or nearly."""
+    port, ended = PtyPort(), Event()
+
+    def send() -> None:
+        number = 0
+        while not ended.wait(every_s):
+            number += 1
+            port.send(frame(number))
+
+    sender = Thread(target=send)
+    device = {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port.path, "baud": 115200}}
+    with running_daemon(folder, {"bow": device}) as daemon:
+        sender.start()
+        try:
+            daemon.wait_for("bow", "running")
+            yield daemon
+        finally:
+            ended.set()
+            sender.join()
+            port.unplug()

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Event, Thread
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from imud.cli.analysis.commands import bands_hz
 from imud.cli.output import COLUMNS
 from tests.cli.analysis.captures import frame, resting, shaken, write_capture
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
-from tests.support.daemon_process import RunningDaemon, running_daemon
-from tests.support.pty_port import PtyPort
+from tests.support.daemon_process import RunningDaemon, sending_daemon
 
 SET_HZ, TRUE_HZ, SHAKEN_HZ = 400.0, 408.0, 63.7
 SHEET = "source: a sheet\ngyro: {random_walk_deg_sqrt_h: 0.5}\naccel: {random_walk_m_s_sqrt_h: 0.001}\n"
@@ -193,27 +191,10 @@ def test_bands(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[RunningDaemon]:
-    """A daemon with one module that sends 100 messages a second, or nearly."""
-    port, ended = PtyPort(), Event()
+    """A daemon with one module that is shaken."""
     accel, gyro = shaken(1000, 100.0, 12.0)
-
-    def send() -> None:
-        number = 0
-        while not ended.wait(0.01):
-            number += 1
-            port.send(frame(10 * number, accel[number % 1000], gyro[number % 1000]))
-
-    sender = Thread(target=send)
-    device = {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port.path, "baud": 115200}}
-    with running_daemon(tmp_path, {"bow": device}) as daemon:
-        sender.start()
-        try:
-            daemon.wait_for("bow", "running")
-            yield daemon
-        finally:
-            ended.set()
-            sender.join()
-            port.unplug()
+    with sending_daemon(tmp_path, lambda n: frame(10 * n, accel[n % 1000], gyro[n % 1000])) as made:
+        yield made
 
 
 def test_a_live_device(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,32 +1,17 @@
 """What `imud top` reads of the daemon, and the command where it cannot run."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from queue import Queue
 
 import pytest
 
 from imud.cli import main
 from imud.cli.top.command import TopFeed
-from imud.client.feed import News
 from imud.event import Event, EventKind
+from tests.client.news import Listener
 from tests.support.socket_rig import batch, daemon
 
 LIMIT_S = 10.0
-
-
-class Listener:
-    """Takes news; the test waits for what it needs."""
-
-    def __init__(self) -> None:
-        self._news: Queue[News] = Queue()
-        self.on_news = self._news.put
-
-    def wait_for(self, is_there: Callable[[News], object]) -> News:
-        while not is_there(news := self._news.get(timeout=LIMIT_S)):
-            pass
-        return news
 
 
 def test_status_samples_and_events_come(tmp_path: Path) -> None:
