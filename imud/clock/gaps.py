@@ -126,7 +126,7 @@ class ArrivalPace:
         self._off_windows = 0
         """Windows in a row that were late or early: each lost samples or had a wrong phase, or the rate is another."""
         self._off_ns = 0.0
-        """By how much the last of them was late; 0.0 where samples were missing in it, or it was early."""
+        """By how much the last of them in which no sample was missing was late; 0.0 where it was early."""
         self.begin(0)
 
     @property
@@ -217,15 +217,17 @@ class ArrivalPace:
         if self.is_known and (2 * late_ns >= turn_ns or abs(off) > PACE_KNOWN):
             self._off_windows += 1
             turns, before_ns = max(round(late_ns / turn_ns), 0), self._off_ns
-            self._off_ns = 0.0 if turns or late_ns < 0 else late_ns
-            if before_ns and self._off_ns and abs(late_ns - before_ns) <= PACE_KNOWN * self._unjudged * self.period_ns:
+            rest_ns, sure = late_ns - turns * turn_ns, (turns + self._unjudged) * self._error < UNCERTAIN
+            if not turns:
+                self._off_ns = max(late_ns, 0.0)
+            if before_ns and abs(rest_ns - before_ns) <= PACE_KNOWN * self._unjudged * self.period_ns:
                 self._off_windows, self._off_ns = 0, 0.0
                 self._due_ns += late_ns  # the same again: it is not the rate that changed, but the phase
-                return 0, True
+                return turns * self._turn, not turns or sure or self._turn > 1
             if self._off_windows < OFF_WINDOWS:
                 self._due_ns += turns * turn_ns if turns else min(late_ns, 0)  # late ones waited
                 if turns:
-                    return turns * self._turn, (turns + self._unjudged) * self._error < UNCERTAIN or self._turn > 1
+                    return turns * self._turn, sure or self._turn > 1
                 return 0, not has_phase or late_ns * -2 < turn_ns
         self._off_windows, self._off_ns = 0, 0.0
         if abs(off) > PACE_KNOWN and (self.is_known or abs(off) > PACE_NEAR or 2 * late_ns >= turn_ns):
