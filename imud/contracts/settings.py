@@ -124,7 +124,8 @@ def value_problem(value: object, field_type: Any) -> str:
     if isinstance(info, inspect.DictType) and isinstance(info.value_type, inspect.StructType):
         for key, given in value.items() if isinstance(value, Mapping) else ():
             if isinstance(given, Mapping) and (found := wrong_values(info.value_type.cls, given)):
-                return f"{shown(key)}: {found[0]}"
+                place = f"{key}.{found[0].name}" if found[0].name else str(key)
+                return f"{found[0].message}, at {shown(place)}"
     try:
         msgspec.convert(value, field_type)
     except msgspec.ValidationError as error:

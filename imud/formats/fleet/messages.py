@@ -154,7 +154,7 @@ def decode_message(payload: bytes) -> FleetMessage:
     try:
         message = _decode_slots(payload) if payload.startswith(MAGIC) else _DECODER.decode(payload)
     except (msgspec.DecodeError, zstandard.ZstdError, struct.error) as error:
-        raise ValueError(f"expected a message of a gateway, got {len(payload)} bytes: {error}") from error
+        raise ValueError(f"expected a message of a gateway, got {len(payload)} other bytes") from error
     if message.v != VERSION:
         raise ValueError(f"expected a message of version {VERSION}, got {message.v}: the gateway has a newer imud")
     if not 0 < message.begin <= message.first <= message.last:

@@ -105,10 +105,12 @@ class PahoConnection:
                     self._problem = f"no answer within {CONNECT_S:g} s"
             if self._problem:
                 raise BrokerError(self._problem)
-        except (OSError, ValueError, BrokerError) as error:
+        except BrokerError as error:
             self.close()
-            reason = str(error) if isinstance(error, BrokerError) else _reason_of(error)
-            raise BrokerError(f"{broker.name}: {reason}") from error
+            raise BrokerError(f"{broker.name}: {error}") from error
+        except (OSError, ValueError) as error:
+            self.close()
+            raise BrokerError(f"{broker.name}: {_reason_of(error)}") from error
 
     def _made(self, settings: MqttSettings, client_id: str, will: Will) -> Any:
         """A client of paho-mqtt with everything but a connection. Raises OSError for files, ValueError."""

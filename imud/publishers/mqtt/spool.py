@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from imud.errors import reason_of
 from imud.formats.fleet.messages import VERSION, DropCause, FleetMessage, MessageKind, decode_message, encode_message
 from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.statistics import summed_up
@@ -147,7 +148,7 @@ class Spool:
                 self._open()
         except (OSError, sqlite3.Error) as error:
             self._drop_connection()
-            raise SpoolError(f"{self._path}: {error}") from error
+            raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
     def close(self) -> None:
         """Close the file; may be called twice."""
@@ -207,7 +208,7 @@ class Spool:
                 base.execute("ROLLBACK")
             self.messages, self.thinned, self.dropped, self._next_id, self._thin_from, self._markers = before
             self._look_at(error)
-            raise SpoolError(f"{self._path}: {error}") from error
+            raise SpoolError(f"{self._path}: {reason_of(error)}") from error
         self.spooled += len(new)
 
     def after(self, limit: int) -> list[Spooled]:
@@ -219,7 +220,7 @@ class Spool:
             found = [Spooled(*row) for row in rows]
         except sqlite3.Error as error:
             self._look_at(error)
-            raise SpoolError(f"{self._path}: {error}") from error
+            raise SpoolError(f"{self._path}: {reason_of(error)}") from error
         if found:
             self._given = found[-1].id
         return found
@@ -234,7 +235,7 @@ class Spool:
             rows = self._connection().execute("SELECT boot, device, stream, begin, last FROM position")
             return [Position(*row) for row in rows]
         except sqlite3.Error as error:
-            raise SpoolError(f"{self._path}: {error}") from error
+            raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
     def _connection(self) -> sqlite3.Connection:
         if self._base is None:

@@ -219,9 +219,9 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
         ({"devices": {"a b": {}}}, "devices: expected names of devices"),
         (
             {"devices": {"*": {"rate_hz": 0.001}}},
-            'devices: "*": rate_hz: expected a number from 0.01 to 100, or null, got 0.001',
+            'devices: expected a number from 0.01 to 100, or null, got 0.001, at "*.rate_hz"',
         ),
-        ({"devices": {"*": {"whole": "xml"}}}, 'whole: expected one of "none", "json", "slots", got "xml"'),
+        ({"devices": {"*": {"whole": "xml"}}}, 'expected one of "none", "json", "slots", got "xml", at "*.whole"'),
         ({"devices": {"*": {"wole": "json"}}}, "wole"),
         ({"version": "3.1"}, "version: expected"),
     ],
