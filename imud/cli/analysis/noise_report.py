@@ -12,7 +12,7 @@ from imud.analysis.allan import NoiseType
 from imud.analysis.noise import AXES, KNOWN_PARTS, AxisNoise, SensorNoise, sensor_noise
 from imud.analysis.noise_terms import Coefficient, NoiseTerms
 from imud.analysis.quantities import QUANTITIES, SI, TITLES, Quantity, ShownUnit, figure_text, short_exponent
-from imud.analysis.series import Readings
+from imud.analysis.series import Grid, Readings
 from imud.cli.analysis.taking import Taken
 from imud.cli.output import COLUMNS, paragraph, shortened
 from imud.contracts.sensors.data_sheet import ModelFigures, SensorName
@@ -289,8 +289,8 @@ def measurement_object(taken: Taken) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _sensor_object(report: NoiseReport, name: SensorName, sensor: SensorNoise) -> dict[str, Any]:
-    curve, grid = sensor.curve, sensor.grid
+def grid_object(name: SensorName, grid: Grid) -> dict[str, Any]:
+    """Unit of a sensor and the even grid of its samples, for programs."""
     return {
         "unit": SI[name],
         "rate_hz": grid.rate_hz,
@@ -298,6 +298,13 @@ def _sensor_object(report: NoiseReport, name: SensorName, sensor: SensorNoise) -
         "filled": grid.filled,
         "runs": len(grid.runs),
         "stamp_scatter_s": grid.scatter_s,
+    }
+
+
+def _sensor_object(report: NoiseReport, name: SensorName, sensor: SensorNoise) -> dict[str, Any]:
+    curve = sensor.curve
+    return {
+        **grid_object(name, sensor.grid),
         "corner_hz": sensor.corner_hz,
         "fitted_from_s": sensor.tau_least_s,
         "disturbed_s": sensor.disturbed_s,

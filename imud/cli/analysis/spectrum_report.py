@@ -10,7 +10,7 @@ from imud.analysis.series import FloatArray, Readings, even_runs, grid_of, with_
 from imud.analysis.spectrum import WINDOW_LEAST, power_spectrum, spectrogram, window_size
 from imud.analysis.spectrum_plots import AXES, SensorVibration, spectrum_figure
 from imud.cli.analysis.noise_page import picture
-from imud.cli.analysis.noise_report import circumstances, measurement_object, readings_of
+from imud.cli.analysis.noise_report import circumstances, grid_object, measurement_object, readings_of
 from imud.cli.analysis.taking import Taken
 from imud.cli.output import paragraph
 from imud.contracts.sensors.data_sheet import SensorName
@@ -153,14 +153,9 @@ def as_object(report: SpectrumReport) -> dict[str, Any]:
 
 
 def _sensor_object(taken: Taken, name: SensorName, sensor: SensorVibration) -> dict[str, Any]:
-    spectrum, grid = sensor.spectrum, sensor.grid
+    spectrum = sensor.spectrum
     return {
-        "unit": SI[name],
-        "rate_hz": grid.rate_hz,
-        "missing": grid.missing,
-        "filled": grid.filled,
-        "runs": len(grid.runs),
-        "stamp_scatter_s": grid.scatter_s,
+        **grid_object(name, sensor.grid),
         "window": spectrum.window,
         "window_samples": spectrum.size,
         "bin_hz": spectrum.bin_hz,

@@ -8,13 +8,12 @@ A disk that is full, or fails, ends the recording with an event and is tried aga
 import logging
 import os
 from pathlib import Path
-from typing import Final
 
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import RecorderStatus
 from imud.errors import ServerError, reason_of
 from imud.event import Event, EventKind
-from imud.publishers.recorder.directory import RecordingDirectory
+from imud.publishers.recorder.directory import RETRY_NS, RecordingDirectory
 from imud.publishers.recorder.feed import RecordFeed
 from imud.publishers.recorder.settings import MEGABYTE, RecorderSettings
 from imud.publishers.recorder.writer import RecordingWriter, RecordQueue
@@ -22,9 +21,6 @@ from imud.units import NS_PER_S
 from imud.worker import BusThread, StartWorker
 
 log = logging.getLogger(__name__)
-
-RETRY_NS: Final = 60 * NS_PER_S
-"""A disk that was full or failed is tried again after so long."""
 
 
 class Recorder:

@@ -18,6 +18,8 @@ NAME: Final = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{6}(-snapshot)?\.imudrec")
 """Files that the recorder makes, and only such are ever removed."""
 FILES_MAX: Final = 100_000
 """Files looked at in one directory."""
+RETRY_NS: Final = 60 * NS_PER_S
+"""A directory that was full or failed is tried again after so long."""
 
 
 class RecordingFile(NamedTuple):

@@ -17,7 +17,7 @@ from imud.contracts.publisher import Batch, PublisherContext
 from imud.errors import ServerError, reason_of
 from imud.event import Event, EventKind
 from imud.publishers.recorder.alerts import Alert, AlertGate
-from imud.publishers.recorder.directory import SNAPSHOT, SUFFIX, RecordingDirectory
+from imud.publishers.recorder.directory import RETRY_NS, SNAPSHOT, SUFFIX, RecordingDirectory
 from imud.publishers.recorder.feed import RecordFeed
 from imud.publishers.recorder.flight_writer import FlightWriter, Mark, Rescue, Save, Saved, Send
 from imud.publishers.recorder.segments import SEGMENTS_MAX, SegmentBegin, SegmentRing
@@ -32,8 +32,6 @@ SEGMENT_NS_MIN: Final = 5 * NS_PER_S
 """A segment begins with the state of every device, which is 17 kB of one at 1 kHz: a twentieth of 5 s of its data."""
 SEGMENTS_OF_BYTES: Final = 16
 """A new segment begins at such a part of the room, so that little more than that is dropped at once."""
-RETRY_NS: Final = 60 * NS_PER_S
-"""A directory that was full or failed is tried again after so long."""
 SENDS_MAX: Final = 4
 """Clients that get a snapshot at the same time; each keeps the room of segments that were dropped meanwhile."""
 

@@ -11,8 +11,8 @@ from imud.formats.recording import records
 from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import Kind, LostRecord
 from imud.publishers.recorder import continuous as module
-from imud.publishers.recorder.continuous import RETRY_NS, Recorder
-from imud.publishers.recorder.directory import RecordingDirectory
+from imud.publishers.recorder.continuous import Recorder
+from imud.publishers.recorder.directory import RETRY_NS, RecordingDirectory
 from imud.publishers.recorder.feed import CHECK_NS
 from imud.publishers.recorder.settings import RecorderSettings
 from imud.publishers.recorder.writer import RecordQueue

@@ -13,8 +13,8 @@ from imud.event import Event, EventKind
 from imud.formats.recording import records
 from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import EndRecord, Kind, SessionRecord, decode_object
-from imud.publishers.recorder.directory import RecordingDirectory
-from imud.publishers.recorder.flight import RETRY_NS, SENDS_MAX, FlightRecorder
+from imud.publishers.recorder.directory import RETRY_NS, RecordingDirectory
+from imud.publishers.recorder.flight import SENDS_MAX, FlightRecorder
 from imud.publishers.recorder.settings import FlightSettings, RecorderSettings
 from imud.publishers.recorder.stream import stream_pair
 from imud.units import NS_PER_S
