@@ -1,8 +1,6 @@
 """`imud events`: a line or an object per event, with its local time and priority."""
 
 import json
-import time
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from threading import Event as Flag
@@ -21,14 +19,7 @@ DOWN = Event(5 * NS_PER_S, "bow", EventKind.DOWN, "the adapter was pulled out", 
 OFFSET_NS = 1_790_000_000 * NS_PER_S + 123_999_999  # 2026-09-21 14:13:20 UTC
 
 
-@pytest.fixture(autouse=True)
-def _in_kolkata(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A time zone that is not that of the machine."""
-    monkeypatch.setenv("TZ", "IST-5:30")
-    time.tzset()
-    yield
-    monkeypatch.undo()
-    time.tzset()
+pytestmark = pytest.mark.usefixtures("in_kolkata")
 
 
 def test_a_line_has_local_time_with_its_offset_and_the_priority() -> None:

@@ -2,8 +2,6 @@
 
 import os
 import sys
-import time
-from collections.abc import Iterator
 
 import msgspec
 import pytest
@@ -24,14 +22,7 @@ LARGEST = Sample(
 )  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def _in_kolkata(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A time zone that is not that of the machine."""
-    monkeypatch.setenv("TZ", "IST-5:30")
-    time.tzset()
-    yield
-    monkeypatch.undo()
-    time.tzset()
+pytestmark = pytest.mark.usefixtures("in_kolkata")
 
 
 class Terminal:
