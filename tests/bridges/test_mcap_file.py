@@ -1,6 +1,7 @@
 """Files of MCAP, read by the readers of the library `mcap`, which check CRCs and indexes."""
 
 import struct
+import threading
 from io import BytesIO
 from typing import Any
 
@@ -139,7 +140,10 @@ def test_an_error_of_the_disk_comes_out() -> None:
 
 
 def test_closing_before_the_end_ends_the_thread() -> None:
+    before = threading.enumerate()
     file = McapFile(BytesIO(), "", "imud", {})
-    file.add_channel(FIRST).add(1, b"x")
+    file.add_channel(FIRST).add(1, bytes(CHUNK_BYTES + 1))
+    assert threading.active_count() > len(before)
     file.close()
     file.close()
+    assert threading.enumerate() == before
