@@ -109,8 +109,8 @@ class DeviceTime:
 
     def begin(self, ticks: int) -> None:
         """Set the first stamp of a device, or the first after its clock started anew."""
+        self.period.restart(was_added=ticks == self.ticks)
         self.ticks = ticks
-        self.period.restart()
         self._phase_ns = self._shift_ns = self.doubt_ns = 0.0
         self.missed = self._gap = self.watched = self._even_for = 0
         self.uneven = self.rephased = False

@@ -23,6 +23,8 @@ WHOLE_AFTER: Final = 64
 """Number of equal steps after which the period is a whole number of ticks: a different step before was a loss."""
 WHOLE_OFF: Final = 0.5
 """A whole number of ticks that is further from the mean is another rate."""
+UNJUDGED_MOST: Final = 64
+"""Steps from before there is a period that are kept until there is one; a device of an even rate has a few."""
 EVERY_TICK: Final = 1.5
 """With a shorter period two samples can be in one tick; with a longer one it is the same sample."""
 MEMORY: Final = 4096
@@ -38,7 +40,7 @@ class PeriodLearner:
 
     __slots__ = (
         "_before", "_candidate", "_count", "_even", "_odd_at", "_on_unknown_gap", "_run", "_run_sum", "_steady", "_sum",
-        "_uneven", "_uneven_sum", "changes", "is_gap", "is_new", "period_ticks",
+        "_uneven", "_uneven_sum", "_unjudged", "changes", "is_gap", "is_new", "period_ticks",
     )  # fmt: skip
 
     def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
@@ -56,6 +58,8 @@ class PeriodLearner:
         self._run_sum = 0
         self._uneven = self._uneven_sum = 0
         """Steps in a row that are not the period exactly, and their sum."""
+        self._unjudged: list[int] = []
+        """Steps from before there was a period that were not noted as gaps."""
         self._odd_at = 0.0
         """Number of the last step that was no period."""
         self._steady = False
@@ -84,8 +88,13 @@ class PeriodLearner:
             return 0
         return self.steps_in(ticks) - 1
 
-    def restart(self) -> None:
-        """Forget the newest step: the counter began anew, or was not read for a while."""
+    def restart(self, *, was_added: bool = False) -> None:
+        """Forget the newest step: the counter began anew, or was not read for a while.
+
+        `was_added`: what was added last was no step of one counter; whoever calls notes the gap.
+        """
+        if was_added and self._unjudged and not self.is_gap:
+            self._unjudged.pop()
         self._run, self.is_gap = 0, False
 
     def add_even_steps(self, count: int = 1) -> None:
@@ -139,22 +148,36 @@ class PeriodLearner:
     def _learn(self, ticks: int) -> bool:
         """Adopt another period when the last steps agree on it; return whether they do."""
         self._uneven, self._uneven_sum, self.is_gap = 0, 0, False
+        is_first = not self.period_ticks
+        if is_first and len(self._unjudged) < UNJUDGED_MOST:
+            self._unjudged.append(ticks)
         if self._run and abs(ticks - self._candidate) <= 1:
             self._run += 1
             self._run_sum += ticks
         else:
-            if self._run and not self.period_ticks:
+            if self._run and is_first:
                 shorter, longer = sorted((ticks, self._candidate))
                 if longer > GAP_FACTOR * shorter + 1:
                     self.is_gap = True
                     self._on_unknown_gap()
+                    if longer in self._unjudged:
+                        self._unjudged.remove(longer)
             self._candidate, self._run, self._run_sum = ticks, 1, ticks
             self._note_odd()
         longer = 0 < self.period_ticks < self._candidate
         if self._run < (CONSISTENT_LONGER if longer or self._steady else CONSISTENT):
             return False
         self._adopt(self._run_sum, self._run, is_new=self._steady)
+        if is_first:
+            self._judge()
         return True
+
+    def _judge(self) -> None:
+        """Note the gaps among the steps from before the first period: two beside each other can be of a like length."""
+        for ticks in self._unjudged:
+            if int(ticks / self.period_ticks + 0.5) > 1 and ticks - self.period_ticks >= 1:
+                self._on_unknown_gap()
+        self._unjudged.clear()
 
     def _note_odd(self) -> None:
         """Note a step that is no period, and whether there were many before."""

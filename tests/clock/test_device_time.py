@@ -9,7 +9,7 @@ import pytest
 from imud.clock import SampleClock
 from imud.clock.arrival_fit import ArrivalFit
 from imud.clock.device_time import DeviceTime
-from imud.clock.period_learner import PeriodLearner
+from imud.clock.period_learner import UNJUDGED_MOST, PeriodLearner
 from imud.contracts.timing import UtcReference
 from imud.sample import Measurement, Sample, Sync
 from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
@@ -103,6 +103,48 @@ def test_nothing_is_missing_before_a_period_is_known() -> None:
 )
 def test_a_longer_step_is_a_loss(step: int, lost: int, expected: int) -> None:
     assert missing([step] * 10 + [lost] + [step] * 3)[10:] == [expected, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("steps", "gaps"),
+    [
+        ([400, 300, 100, 100, 100, 100], 2),  # of a like length: neither stands out beside the other
+        ([300, 300, 100, 100, 100, 100], 2),
+        ([400, 100, 300, 100, 100, 100, 100], 3),  # 300 stands out beside the period before and the one after
+        ([100, 101, 99, 100], 0),
+        ([2, 3, 2, 3, 2, 3], 0),
+        ([1, 1, 2, 1], 0),  # 750 Hz in milliseconds, or a loss: within one
+    ],
+)
+def test_gaps_from_before_a_period_is_known_are_noted_when_it_is(steps: list[int], gaps: int) -> None:
+    noted: list[int] = []
+    learner = PeriodLearner(lambda: noted.append(1))
+    for step in steps:
+        assert learner.add_step(step) == 0
+    assert learner.period_ticks
+    assert len(noted) == gaps
+    learner.add_even_steps(1000)
+    assert len(noted) == gaps
+
+
+def test_a_step_to_another_counter_is_noted_by_whoever_restarts() -> None:
+    noted: list[int] = []
+    learner = PeriodLearner(lambda: noted.append(1))
+    learner.add_step(1 << 31)
+    learner.restart(was_added=True)
+    for _ in range(10):
+        learner.add_step(100)
+    assert learner.period_ticks == 100
+    assert not noted
+
+
+def test_steps_that_never_agree_are_kept_in_bounds() -> None:
+    learner = PeriodLearner()
+    random = Random(7)
+    for _ in range(10_000):
+        learner.add_step(random.randrange(1, 1 << 30))
+    assert not learner.period_ticks
+    assert len(learner._unjudged) <= UNJUDGED_MOST
 
 
 def test_uneven_ticks_are_no_loss() -> None:
