@@ -16,6 +16,7 @@ GROUPS: Final = {
     "shm": "tests.fuzz.shm",
     "utc": "tests.fuzz.utc",
     "http": "tests.fuzz.scrape",
+    "mqtt": "tests.fuzz.broker",
 }
 """Module of each group; imported when one of its targets is used, so that only its code is instrumented."""
 

@@ -51,7 +51,7 @@ class Atheris(Protocol):
 def fuzz_with_atheris(name: str, seconds: float, seed: int, folder: Path, grown: Path, inputs: Sequence[str]) -> None:
     """Fuzz, guided by the coverage of the package `imud`."""
     atheris = cast(Atheris, importlib.import_module("atheris"))
-    with atheris.instrument_imports(include=["imud", "prometheus_client"]):
+    with atheris.instrument_imports(include=["imud", "prometheus_client", "paho"]):
         target = load(name)
 
     def mutated(data: bytes, size: int, seed: int) -> bytes:

@@ -1,0 +1,90 @@
+"""What an MQTT broker sends: whatever it is, the connection goes on or ends with a BrokerError."""
+
+import socket
+from collections.abc import Sequence
+from contextlib import closing, suppress
+from threading import Thread
+from typing import Final
+
+from imud.publishers.mqtt.broker import BrokerError, PahoConnection, Will, check_extra
+from imud.publishers.mqtt.settings import MqttSettings, broker_of
+from tests.fuzz.target import Target, check_printable
+
+WAITS: Final = 8
+"""More than the packets that fit into an input of `BYTES_MAX` need."""
+BYTES_MAX: Final = 256
+LIMIT_S: Final = 10.0
+SETTINGS: Final = (MqttSettings(site="site", version="3.1.1"), MqttSettings(site="site", version="5"))
+
+
+def names() -> Sequence[str]:
+    """The one target."""
+    return ["broker"]
+
+
+def make(_name: str) -> Target:
+    """A connection to a broker that sends the input. The library is imported here, to be instrumented too."""
+    check_extra()
+    return Target(HostileBroker().run, seeds, bytes_max=BYTES_MAX)
+
+
+class HostileBroker:
+    """A broker on loopback that answers the first packet with the input and hangs up."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._data = b""
+        Thread(target=self._serve, name="hostile broker", daemon=True).start()
+
+    def run(self, data: bytes) -> None:
+        """The lowest bit of the first byte says which version of MQTT is spoken; the broker sends the others."""
+        self._data = data[1:]
+        broker = broker_of(f"mqtt://127.0.0.1:{self._listener.getsockname()[1]}")
+        assert broker is not None
+        settings = SETTINGS[data[0] & 1 if data else 0]
+        try:
+            connection = PahoConnection(broker, settings, "gateway", Will("state", b"{}"))
+            with closing(connection):
+                connection.publish("topic", b"{}", "application/json", retain=False)
+                for _ in range(WAITS):
+                    connection.wait(LIMIT_S)
+                    assert all(1 <= number <= 0xFFFF for number in connection.acknowledged)
+        except BrokerError as error:
+            check_printable(str(error))
+
+    def _serve(self) -> None:
+        while True:
+            connection, _ = self._listener.accept()
+            with connection, suppress(OSError):
+                connection.settimeout(LIMIT_S)
+                if connection.recv(4096):
+                    connection.sendall(self._data)
+                connection.shutdown(socket.SHUT_WR)
+                while connection.recv(4096):
+                    pass
+
+
+def seeds() -> list[bytes]:
+    """An accepted connection and one packet of each type after it, in both versions; refusals; nothing."""
+    accepted = {0: bytes.fromhex("20020000"), 1: bytes.fromhex("2003000000")}
+    packets = [
+        bytes.fromhex("40020001"),  # PUBACK
+        bytes.fromhex("40040001 8700"),  # PUBACK: not authorized
+        bytes.fromhex("40040001 0000 40020001"),  # twice
+        bytes.fromhex("3005 0001 74 00 62"),  # PUBLISH, QoS 0
+        bytes.fromhex("3208 0001 74 0001 00 6263"),  # PUBLISH, QoS 1
+        bytes.fromhex("3408 0001 74 0001 00 6263"),  # PUBLISH, QoS 2
+        bytes.fromhex("50020001"),  # PUBREC
+        bytes.fromhex("62020001"),  # PUBREL
+        bytes.fromhex("70020001"),  # PUBCOMP
+        bytes.fromhex("90040001 0000"),  # SUBACK
+        bytes.fromhex("b0040001 0000"),  # UNSUBACK
+        bytes.fromhex("d000"),  # PINGRESP
+        bytes.fromhex("e0028b00"),  # DISCONNECT: server shutting down
+        bytes.fromhex("f0020000"),  # AUTH
+        bytes.fromhex("10020000"),  # CONNECT, which only clients send
+        bytes.fromhex("ffffffff7f00"),  # the longest length there can be
+    ]
+    tails = [b"".join((bytes([version]), answer, packet)) for version, answer in accepted.items() for packet in packets]
+    limits = bytes.fromhex("01 200b 0000 08 21 0005 27 00000100")  # receive maximum, maximum packet size
+    return [*tails, limits, bytes.fromhex("00 20020005"), bytes.fromhex("01 2003008700"), b"\x00", b"\x01"]
