@@ -17,6 +17,7 @@ GROUPS: Final = {
     "utc": "tests.fuzz.utc",
     "http": "tests.fuzz.scrape",
     "mqtt": "tests.fuzz.broker",
+    "fleet": "tests.fuzz.fleet",
 }
 """Module of each group; imported when one of its targets is used, so that only its code is instrumented."""
 
