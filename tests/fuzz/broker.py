@@ -25,24 +25,18 @@ def names() -> Sequence[str]:
 def make(_name: str) -> Target:
     """A connection to a broker that sends the input. The library is imported here, to be instrumented too."""
     check_extra()
-    return Target(HostileBroker().run, seeds, bytes_max=BYTES_MAX)
+    return Target(run, seeds, bytes_max=BYTES_MAX)
 
 
-class HostileBroker:
-    """A broker on loopback that answers the first packet with the input and hangs up."""
-
-    def __init__(self) -> None:
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._data = b""
-        Thread(target=self._serve, name="hostile broker", daemon=True).start()
-
-    def run(self, data: bytes) -> None:
-        """The lowest bit of the first byte says which version of MQTT is spoken; the broker sends the others."""
-        self._data = data[1:]
-        broker = broker_of(f"mqtt://127.0.0.1:{self._listener.getsockname()[1]}")
-        assert broker is not None
-        settings = SETTINGS[data[0] & 1 if data else 0]
+def run(data: bytes) -> None:
+    """The lowest bit of the first byte says which version of MQTT is spoken; the broker sends the others."""
+    settings = SETTINGS[data[0] & 1 if data else 0]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = Thread(target=_serve, args=(listener, data[1:]), name="hostile broker")
+        thread.start()
         try:
+            broker = broker_of(f"mqtt://127.0.0.1:{listener.getsockname()[1]}")
+            assert broker is not None
             connection = PahoConnection(broker, settings, "gateway", Will("state", b"{}"))
             with closing(connection):
                 connection.publish("topic", b"{}", "application/json", retain=False)
@@ -51,17 +45,20 @@ class HostileBroker:
                     assert all(1 <= number <= 0xFFFF for number in connection.acknowledged)
         except BrokerError as error:
             check_printable(str(error))
+        finally:
+            thread.join(LIMIT_S)
 
-    def _serve(self) -> None:
-        while True:
-            connection, _ = self._listener.accept()
-            with connection, suppress(OSError):
-                connection.settimeout(LIMIT_S)
-                if connection.recv(4096):
-                    connection.sendall(self._data)
-                connection.shutdown(socket.SHUT_WR)
-                while connection.recv(4096):
-                    pass
+
+def _serve(listener: socket.socket, data: bytes) -> None:
+    """Answer the first packet with the input, and hang up."""
+    listener.settimeout(LIMIT_S)
+    with suppress(OSError), listener.accept()[0] as connection:
+        connection.settimeout(LIMIT_S)
+        if connection.recv(4096):
+            connection.sendall(data)
+        connection.shutdown(socket.SHUT_WR)
+        while connection.recv(4096):
+            pass
 
 
 def seeds() -> list[bytes]:
