@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, monotonic_ns, sleep
@@ -124,13 +124,19 @@ class Chaos:
         self._outages = {name: [i for i in times if i.end_ns == NEVER_NS] for name, times in self._outages.items()}
 
     def _audit_sender(self, name: str, samples: list[Sample], before: Snapshot, now: Snapshot, what: str) -> None:
+        is_learning = name in self.far.noise
+        was = before.devices[name].ledger
+        if is_learning:  # a gap from before the rate is known is counted when it is: all are held from the first sample
+            before_them = self.life.recorder.before[name]
+            samples = [*before_them, *(sample for sample in samples if sample.seq > len(before_them))]
+            was = dict.fromkeys(was, 0)
         found = self.far.truth[name].numbers_of(samples)
         true = [(sample, number) for sample, number in zip(samples, found, strict=True) if number is not None]
         self._refuse_strange(name, [s.seq for s, number in zip(samples, found, strict=True) if number is None], what)
         outages = self._outages[name]
         numbers = [number for _, number in true]
-        holes = accounts.find_holes([s for s, _ in true], numbers, outages, learns=name in self.far.noise)
-        self._book(name, holes, before, now, what)
+        holes = accounts.find_holes([s for s, _ in true], numbers, outages, learns=is_learning)
+        self._book(name, samples, holes, was, now, what)
 
     def _audit_polled(self, name: str, samples: list[Sample], before: Snapshot, now: Snapshot, what: str) -> None:
         """Hold the deadlines of a device that is polled against its samples, and its answers against the causes."""
@@ -145,7 +151,7 @@ class Chaos:
         if samples and any(trouble.end_ns > samples[-1].t_rx_ns for trouble in troubles):
             missing = round((now.at_ns - samples[-1].t_ns) / log.period_ns)
             holes.append(accounts.Hole(missing, is_certain=False, unknown_most=0, is_open=True))
-        self._book(name, holes, before, now, what)
+        self._book(name, samples, holes, was.ledger, now, what)
         assert was.polling is not None
         assert is_now.polling is not None
         gone = is_now.polling.vanished - was.polling.vanished + 1
@@ -159,22 +165,23 @@ class Chaos:
         if seqs:
             self._violated(what, f"{name}: {len(seqs)} samples that the device never took, the first is {seqs[0]}")
 
-    def _book(self, name: str, holes: list[Hole], before: Snapshot, now: Snapshot, what: str) -> None:
-        was, is_now = before.devices[name].ledger, now.devices[name].ledger
+    def _book(
+        self, name: str, samples: list[Sample], holes: list[Hole], was: Mapping[str, int], now: Snapshot, what: str
+    ) -> None:
+        is_now = now.devices[name].ledger
         count, outages = is_now["samples"] - was["samples"], len(self._outages[name])
         unknown = is_now["lost_unknown"] - was["lost_unknown"]
         result = accounts.account(count, holes, lost(is_now) - lost(was), unknown, outages)
         self.accounts[name] += result
         if not result.balanced:
-            self._show_holes(name, holes)
+            self._show_holes(name, samples, holes)
             uncertain = [hole.missing for hole in holes if not hole.is_certain]
             causes = {cause: is_now[cause] - was[cause] for cause in is_now if is_now[cause] > was[cause]}
             causes = {cause: count for cause, count in causes.items() if cause.startswith("lost_")}
             self._violated(what, f"{name}: {result}, uncertain holes {uncertain}, {causes}")
 
-    def _show_holes(self, name: str, holes: list[Hole]) -> None:
+    def _show_holes(self, name: str, samples: list[Sample], holes: list[Hole]) -> None:
         """Print what is between samples, by the time since the first of them."""
-        samples = self.life.recorder.samples()[name]
         for sample, after, hole in zip(samples, [*samples[1:], None], holes, strict=False):
             if hole.missing or not hole.is_certain:
                 t_ns, t_dev = sample.t_ns - samples[0].t_ns, (sample.t_dev_ns, after and after.t_dev_ns)

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from imud.client import Client
+from imud.client import Client, Ring
 from imud.client.watch import Watch
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.errors import ImudError
@@ -45,13 +45,15 @@ class Recorder:
     Synchronization: the thread appends to a list, which others only read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, rings: Path) -> None:
         self._client = Client(path, timeout_s=ANSWER_LIMIT_S)
         self._watch = self._client.watch(encoding="binary")
         self._newest = self._client.poll()
         """The sample before the first that is received, of each device that had one."""
         self.begin = _snapshot(self._client)
         """The state at a moment from which on every sample is received."""
+        self.before: Final = {name: _first_samples(rings, name, d.newest_seq) for name, d in self.begin.devices.items()}
+        """The samples of each device up to then."""
         self._slots: list[bytes] = []
         self._others: list[object] = []
         self._thread = threading.Thread(target=self._run, name="recorder")
@@ -94,6 +96,15 @@ class Recorder:
                     self._others.append(message)
 
 
+def _first_samples(rings: Path, name: str, newest_seq: int) -> list[Sample]:
+    """Samples 1 to `newest_seq` of a daemon that has just started, out of its ring."""
+    with Ring(name, directory=str(rings)) as ring:
+        ring._next = 1
+        found = [sample for sample in ring.read().samples if sample.seq <= newest_seq]
+    assert [sample.seq for sample in found] == list(range(1, newest_seq + 1)), f"{name}: its ring has not {newest_seq}"
+    return found
+
+
 class Life:
     """One process of the daemon from its start to its end."""
 
@@ -108,7 +119,7 @@ class Life:
         self.process = subprocess.Popen(argv, stderr=self._log, stdin=subprocess.DEVNULL)
         wait_until(lambda: self.socket.exists() or self.process.poll() is not None, "the socket", START_LIMIT_S)
         assert self.process.poll() is None, "the daemon ended at its start"
-        self.recorder = Recorder(self.socket)
+        self.recorder = Recorder(self.socket, folder)
         self.descriptors = self.threads = 0
         """When all devices ran for the first time; 0 before."""
 
