@@ -45,12 +45,12 @@ def name(example: Example) -> str:
 
 
 def imud_lines() -> Iterator[list[str]]:
-    """Every `imud …` command line of the shell examples, without comments."""
+    """Every `imud …` command line of the shell examples, without comments and without where its output goes."""
     for example in examples("sh"):
         for line in example.text.splitlines():
             words = shlex.split(line, comments=True)
             if words[:1] == ["imud"]:
-                yield words[1:]
+                yield words[1 : words.index(">")] if ">" in words else words[1:]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

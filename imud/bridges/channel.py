@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
+from imud.contracts.sensors.deviations import Deviations
 from imud.event import LEVELS, Event
 from imud.frames.conventions import Convention
 from imud.sample import Sample
@@ -74,17 +75,6 @@ class StampedEvent(NamedTuple):
     def is_warning(self) -> bool:
         """Whether a viewer shows it as a warning, as the log does."""
         return LEVELS.get(self.event.kind, logging.WARNING) >= logging.WARNING
-
-
-class Deviations(NamedTuple):
-    """One-sigma noise of the values of a device, in SI units; None: not known."""
-
-    accel_m_s2: float | None = None
-    gyro_rad_s: float | None = None
-    mag_t: float | None = None
-    attitude_rad: float | None = None
-    temperature_c: float | None = None
-    pressure_pa: float | None = None
 
 
 class MessageFrames(NamedTuple):

@@ -21,7 +21,6 @@ from typing import Any, Final
 import msgspec
 
 from imud.bridges.channel import (
-    Deviations,
     LossCounts,
     MessageChannel,
     MessageFrames,
@@ -31,6 +30,7 @@ from imud.bridges.channel import (
     covariance,
     topic,
 )
+from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.status import DeviceStatus
 from imud.log import printable
 from imud.sample import SAMPLE_SCHEMA, Sample

@@ -4,13 +4,16 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import msgspec
 
+from imud.bridges.noise_file import read_noise
 from imud.client import Client
 from imud.client.connection import default_path
 from imud.contracts.driver import Driver
+from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.settings import Settings, unknown_name, value_problem, wrong_values
 from imud.contracts.status import DeviceStatus
 from imud.errors import BadArgument
@@ -123,6 +126,22 @@ def driver_settings(driver: Driver, options: Mapping[str, object]) -> Settings:
     for wrong in wrong_values(driver.settings, options, "option"):
         raise BadArgument(f"--option {wrong}")
     return msgspec.convert(options, driver.settings)
+
+
+# --- noise ------------------------------------------------------------------------------------------------------------
+
+
+def add_noise(parser: argparse.ArgumentParser) -> None:
+    """Add the option --noise."""
+    parser.add_argument(
+        "--noise", action="append", type=Path, default=[], metavar="REPORT",
+        help="report of `imud noise --json`: its standard deviations become covariances; may be given several times",
+    )  # fmt: skip
+
+
+def noise_by_device(reports: Sequence[Path]) -> dict[str, Deviations]:
+    """Return what reports say, by the name of the device; of two of one device the later wins. Raises ImudError."""
+    return dict(map(read_noise, reports))
 
 
 # --- samples ----------------------------------------------------------------------------------------------------------

@@ -69,9 +69,12 @@ class Ring:
     """An open ring. Synchronization: one thread; every thread or process may open its own."""
 
     def __init__(
-        self, device_or_path: str | Path, *, directory: str | None = None, now_ns: Callable[[], int] = time.monotonic_ns
-    ) -> None:
+        self, device_or_path: str | Path, *, directory: str | None = None, from_oldest: bool = False,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:  # fmt: skip
         """Open by device name, or by path if there is a '/' in it; `read` gives the samples that come from now on.
+
+        `from_oldest`: it begins with the oldest sample that is still in the ring.
 
         A name is looked up in `directory`, by default as `default_directory` says.
         Raises ServerError: no such ring, not permitted, or of another layout.
@@ -82,7 +85,8 @@ class Ring:
         """Samples missed since opening."""
         self._now_ns = now_ns
         self._change_to(_RingFile.open(self.path))
-        self._next = self.newest_seq + 1
+        newest = self.newest_seq
+        self._next = self._oldest(newest) if from_oldest and newest else newest + 1
 
     @property
     def header(self) -> RingHeader:

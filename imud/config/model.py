@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 
 from imud.contracts.device_settings import OnDifference
 from imud.contracts.lines import DeviceLines
+from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.settings import Settings
 from imud.frames.conventions import Convention
 from imud.frames.settings import FrameSettings
@@ -40,6 +41,8 @@ class DeviceConfig:
     """Convention of what is published; None for the device's own, and for enu-flu beside `frame`."""
     declination_deg: float | None = None
     """True heading minus magnetic heading; None to leave the heading as it is."""
+    noise: Deviations | None = None
+    """What is known of the noise of its samples; None for nothing."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from enum import StrEnum
 import msgspec
 
 from imud.contracts.device_settings import SettingsStatus
+from imud.contracts.sensors.deviations import Deviations
 from imud.frames.conventions import Heading
 from imud.frames.published import FrameWords
 from imud.sample import Sync
@@ -250,6 +251,8 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     declared: SettingsStatus | None = None
     """How its own settings compare with those that the configuration declares; None for a driver that does not know
     them, or is not known."""
+    noise: Deviations | None = None
+    """Noise of its samples as the configuration has it; None where it has none."""
 
 
 class RecorderStatus(msgspec.Struct, frozen=True):

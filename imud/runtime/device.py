@@ -445,5 +445,6 @@ class Device:
             lines=self._lines_status(),
             utc=self._attachments.utc_status(),
             declared=self._settings.status(),
+            noise=self.config.noise,
         )
         return transport.add_status(status)

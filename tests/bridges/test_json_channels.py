@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from imud.bridges.channel import Deviations, LossCounts, MessageChannel, MessageFrames, StampedEvent
+from imud.bridges.channel import LossCounts, MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.json_channels import JsonDialect
+from imud.contracts.sensors.deviations import Deviations
 from imud.sample import Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 from tests.support.socket_rig import device_status

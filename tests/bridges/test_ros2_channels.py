@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imud.bridges.channel import Deviations, LossCounts, MessageChannel, MessageFrames, StampedEvent
+from imud.bridges.channel import LossCounts, MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.ros2_channels import Ros2Dialect, time_of
 from imud.bridges.ros2_types import FIELDS, schema
+from imud.contracts.sensors.deviations import Deviations
 from imud.sample import Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 

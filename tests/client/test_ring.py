@@ -126,6 +126,15 @@ def test_read_gives_what_comes_after_opening(board: Board) -> None:
         assert numbers(ring) == ([], 0)
 
 
+@pytest.mark.parametrize(("count", "expected"), [(0, []), (3, [1, 2, 3]), (SLOTS + 2, [*range(3, SLOTS + 3)])])
+def test_read_can_begin_with_the_oldest_that_is_left(board: Board, count: int, expected: list[int]) -> None:
+    board.publish(range(1, count + 1))
+    with Ring(board.path, from_oldest=True, now_ns=lambda: board.now_ns) as ring:
+        assert numbers(ring) == (expected, 0)
+        board.publish([count + 1])
+        assert numbers(ring) == ([count + 1], 0)
+
+
 @pytest.mark.parametrize("count", [1, SLOTS - 1, SLOTS, SLOTS + 1, 3 * SLOTS + 5])
 def test_slow_reader_learns_exactly_what_it_missed(board: Board, ring: Ring, count: int) -> None:
     board.publish(range(1, count + 1))

@@ -1,9 +1,10 @@
-"""The keys frame, convention and declination_deg: every way to give a rotation, and every mistake with its place."""
+"""The keys frame, convention, declination_deg and noise: all ways to give a rotation, and mistakes with their place."""
 
 import pytest
 
 from imud import config
 from imud.config import DeviceConfig
+from imud.contracts.sensors.deviations import Deviations
 from imud.errors import ConfigError
 from imud.frames.conventions import Convention, EulerOrder
 from imud.frames.settings import FrameSettings, MountingAngles, MountingAxes
@@ -33,6 +34,23 @@ def problem(keys: str, driver: str = "hipnuc-uart") -> str:
 def test_without_the_keys_nothing_is_turned() -> None:
     plain = device("")
     assert (plain.frame, plain.convention, plain.declination_deg) == (None, None, None)
+
+
+def test_the_noise_of_samples() -> None:
+    assert device("").noise is None
+    assert device("    noise: {gyro_rad_s: 0.001, mag_t: 2.0e-7}\n").noise == Deviations(gyro_rad_s=0.001, mag_t=2e-7)
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ("    noise: {gyro_rad_s: 0}\n", "devices.bow.noise.gyro_rad_s"),
+        ("    noise: {gyro: 1}\n", "gyro"),
+        ("    noise: 3\n", "devices.bow.noise"),
+    ],
+)
+def test_noise_that_cannot_be(keys: str, expected: str) -> None:
+    assert expected in problem(keys)
 
 
 def test_every_way() -> None:

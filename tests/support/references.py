@@ -25,6 +25,7 @@ from imud.contracts.action import Action, Actions, parameters_of
 from imud.contracts.control.calibration import Handling
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
+from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.settings import Settings, expected, shown
 from imud.devices import DRIVERS
 from imud.formats.jsonrpc import Code, is_big
@@ -99,6 +100,7 @@ def settings_parts() -> Iterator[tuple[str, str, type[Settings]]]:
     yield "How the sensor lies in its body (`docs/frames.md`)", "devices.NAME.frame.", FrameSettings
     yield "Axes of the sensor in the body", "devices.NAME.frame.axes.", MountingAxes
     yield "Angles of the sensor in the body", "devices.NAME.frame.euler.", MountingAngles
+    yield "Noise of the device's samples, for covariances (`docs/export.md`)", "devices.NAME.noise.", Deviations
     yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcSettings
 
 

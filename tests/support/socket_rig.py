@@ -31,6 +31,7 @@ from imud.contracts.device_settings import (
     StepOutcome,
 )
 from imud.contracts.publisher import AS_SENT, Batch, Latencies, NoLatencies, PublisherContext
+from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, FrameStatus, KernelCounters
 from imud.errors import Rejected
 from imud.frames.conventions import Convention, Heading
@@ -107,6 +108,7 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
             declination_deg=None,
             conventions={str(one): AS_SENT.words_of(one) for one in Convention},
         ),
+        noise=Deviations(accel_m_s2=0.01),
     )
 
 

@@ -8,19 +8,28 @@ from typing import BinaryIO, Final
 from imud import __version__
 from imud.bridges.json_channels import JsonDialect
 from imud.bridges.ros2_channels import Ros2Dialect
-from imud.cli.arguments import CliCommand, add_option, chosen_fields, driver_settings, given_options
+from imud.cli.arguments import (
+    CliCommand,
+    add_noise,
+    add_option,
+    chosen_fields,
+    driver_settings,
+    given_options,
+    noise_by_device,
+)
 from imud.cli.export.output import ExportFile
 from imud.cli.export.progress import Progress
 from imud.cli.export.sinks import TABLES, CsvSink, Sink
-from imud.cli.export.source import Exported, ExportFeed, export_capture, export_recording, times_of
+from imud.cli.export.source import Exported, ExportFeed, export_capture, export_recording, recorded_noise, times_of
 from imud.cli.recording.replay import begins_as_recording
 from imud.cli.streams import complain
+from imud.contracts.sensors.deviations import Deviations
 from imud.devices import DRIVERS
 from imud.errors import BadArgument, ImudError, reason_of
 from imud.files import open_regular
 from imud.frames.conventions import Convention
 from imud.log import STDERR, log_to
-from imud.runtime.recording.captures import KnownTimes
+from imud.runtime.recording.captures import NAME, KnownTimes
 
 FORMATS: Final = ("csv", "mcap")
 SCHEMAS: Final = ("json", "ros2")
@@ -53,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--convention", choices=[str(one) for one in Convention],
         help="axes and angles (default: of CSV as they were published, of MCAP enu-flu as of REP-103)",
     )  # fmt: skip
+    add_noise(parser)
     parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"of a capture (default: {DRIVER})")
     parser.add_argument("--baud", type=int, help=f"rate of a raw capture (default: {BAUD})")
     add_option(parser)
@@ -81,6 +91,8 @@ def check(args: argparse.Namespace) -> None:
     for option, to in (("table", "csv"), ("schema", "mcap")):
         if getattr(args, option) is not None and args.to != to:
             raise BadArgument(f"--{option}: expected with --to {to} only, got --to {args.to}")
+    if args.noise and args.to != "mcap":
+        raise BadArgument(f"--noise: expected with --to mcap only, got --to {args.to}")
     if args.fields is not None and args.table not in (None, "samples"):
         raise BadArgument(f"--fields: expected with samples only, got --table {args.table}")
 
@@ -120,7 +132,12 @@ def _sink(args: argparse.Namespace, file: BinaryIO, out: ExportFile, *, is_recor
     words = {"imud": __version__, "source": args.file.name, "convention": str(convention)}
     if not is_recording:
         words["times"] = (times_of(file, DRIVERS[args.driver or DRIVER]) or KnownTimes.HOST).value
-    return McapSink(McapFile(out, dialect.profile, f"imud {__version__}", words), dialect, convention, args.fields)
+    noise = recorded_noise(file, str(args.file)) if is_recording else {}
+    for device, given in noise_by_device(args.noise).items():
+        name = device if is_recording else NAME  # whatever it was called where the report was made
+        noise[name] = noise.get(name, Deviations()).updated(given)
+    made = McapFile(out, dialect.profile, f"imud {__version__}", words)
+    return McapSink(made, dialect, convention, args.fields, noise)
 
 
 def _play(args: argparse.Namespace, file: BinaryIO, feed: ExportFeed, *, is_recording: bool) -> Exported:

@@ -1,10 +1,11 @@
 """An export as MCAP: messages of a dialect, a channel for each kind. It needs the extra `export`."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 
 from imud.bridges.channel import Dialect, LossCounts, MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.mcap_file import McapChannel, McapFile
 from imud.contracts.publisher import Batch
+from imud.contracts.sensors.deviations import Deviations
 from imud.frames.conventions import Convention
 from imud.sample import Sample
 
@@ -18,12 +19,14 @@ class McapSink:
         dialect: Dialect,
         convention: Convention,
         fields: Collection[str] | None,
+        noise: Mapping[str, Deviations],
     ) -> None:
-        """`fields` chooses the channels of samples that say something of one of them; None: all."""
+        """`fields` chooses the channels of samples that say something of one of them; None: all. `noise`: by device."""
         self._file = file
         self._dialect = dialect
         self._convention = convention
         self._fields = fields
+        self._noise = noise
         self._devices: dict[str, list[_SampleChannel]] = {}
         self._losses: dict[str, tuple[MessageChannel[LossCounts], McapChannel]] = {}
         self._events: tuple[MessageChannel[StampedEvent], McapChannel] | None = None
@@ -69,7 +72,8 @@ class McapSink:
         self._file.close()
 
     def _channels_of(self, batch: Batch) -> "list[_SampleChannel]":
-        frames = MessageFrames(batch.device, self._convention, batch.frame.device.has_north)
+        noise = self._noise.get(batch.device, Deviations())
+        frames = MessageFrames(batch.device, self._convention, batch.frame.device.has_north, noise)
         wanted = self._fields
         return [
             _SampleChannel(described, self._open)

@@ -4,23 +4,31 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
+import msgspec
+
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.cli.export.playing import LossWatch, play_beside, play_here
 from imud.cli.export.progress import Progress
 from imud.cli.export.sinks import Sink
 from imud.cli.output import paragraph
+from imud.cli.recording.info import INPUTS
 from imud.cli.recording.replay import block
 from imud.contracts.can import CanDriver
 from imud.contracts.driver import Driver
 from imud.contracts.publisher import Batch
+from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.settings import Settings
-from imud.errors import BadArgument
+from imud.errors import BadArgument, ImudError, reason_of
 from imud.formats.candump import CandumpReader
 from imud.formats.capture import CaptureReader
+from imud.formats.recording.file import RecordingReader
+from imud.formats.recording.records import DeviceRecord, Kind, decode_object
 from imud.frames.conventions import Convention
 from imud.runtime.recording.captures import CapturePlayer, KnownTimes
 from imud.runtime.recording.player import PlayedDevice
 
+NOISE: Final = "noise"
+"""Key of the recorded configuration."""
 BESIDE_BYTES: Final = 1_000_000
 """From this size on a recording is played in a process of its own: a start of one takes as long as 20,000 samples."""
 
@@ -87,6 +95,23 @@ def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Sequ
             there = ", ".join(known)
             raise BadArgument(f"--device {name}: expected a device of the recording, which has {there}")
     return Exported(report, status)
+
+
+def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
+    """Return what the configuration at the begin of a recording has of the noise of devices. Raises ImudError."""
+    found: dict[str, Deviations] = {}
+    for record in RecordingReader(file, name):
+        if record.kind == Kind.DEVICE:
+            device = decode_object(record, DeviceRecord)
+            if device is not None and NOISE in device.configuration:
+                try:
+                    found[device.name] = msgspec.convert(device.configuration[NOISE], Deviations)
+                except msgspec.ValidationError as error:
+                    raise ImudError(f"{name}: the noise of {device.name} cannot be read: {reason_of(error)}") from None
+        elif record.kind in INPUTS:
+            break
+    file.seek(0)
+    return found
 
 
 def export_capture(

@@ -6,7 +6,7 @@ from contextlib import closing
 from ipaddress import ip_address
 from typing import Final
 
-from imud.cli.arguments import CliCommand, add_socket
+from imud.cli.arguments import CliCommand, add_noise, add_socket, noise_by_device
 from imud.cli.foxglove.relay import Relay
 from imud.cli.streams import complain
 from imud.errors import BadArgument
@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate", type=float, default=RATE_HZ, metavar="HZ",
         help="at most this many samples a second of each device; 0: all (default: %(default)g)",
     )  # fmt: skip
+    add_noise(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
         raise BadArgument(f"--port: expected 0 to {PORT_MAX}, got {args.port}")
     if not args.rate >= 0:
         raise BadArgument(f"--rate: expected samples a second, 0 for all, got {args.rate}")
+    noise = noise_by_device(args.noise)
     try:
         from imud.cli.foxglove.server import FoxgloveServer
     except ModuleNotFoundError as error:
@@ -51,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         if not is_loopback(args.host):
             complain(OPEN.format(host=args.host, port=args.port))
         complain(f"imud foxglove: open {server.url} in Foxglove, Lichtblick or PlotJuggler; Ctrl-C ends")
-        relay = Relay(args.socket, server, devices=args.device, rate_hz=args.rate or None)
+        relay = Relay(args.socket, server, devices=args.device, rate_hz=args.rate or None, noise=noise)
         signal.signal(signal.SIGTERM, lambda *_: relay.stop())
         relay.run()
     return 0

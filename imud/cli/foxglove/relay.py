@@ -1,6 +1,6 @@
 """Relay of the daemon's samples, events and status to a viewer, as messages in JSON (`imud.bridges.json_channels`)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from threading import Event as Flag
 from time import monotonic, monotonic_ns, time_ns
@@ -12,6 +12,7 @@ from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.json_channels import JsonDialect
 from imud.client import Client
 from imud.client.watch import EventStream, Watch, event_of
+from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.status import DeviceStatus
 from imud.errors import ImudError
 from imud.event import Event
@@ -62,13 +63,18 @@ class Relay:
         *,
         devices: Sequence[str] = (),
         rate_hz: float | None = None,
+        noise: Mapping[str, Deviations] | None = None,
         utc_offset_ns: Callable[[], int] = lambda: time_ns() - monotonic_ns(),
     ) -> None:
-        """`devices` are those that are shown, none: all; each at most `rate_hz`, None: every sample."""
+        """`devices` are those that are shown, none: all; each at most `rate_hz`, None: every sample.
+
+        `noise`, by device, is taken in place of what the daemon's configuration has.
+        """
         self._path = path
         self._viewer = viewer
         self._wanted = list(devices)
         self._rate_hz = rate_hz
+        self._noise = noise or {}
         self._utc_offset_ns = utc_offset_ns
         self._dialect = JsonDialect()
         self._events = self._dialect.events()
@@ -138,8 +144,10 @@ class Relay:
             self._devices.pop(name).close()
         for name, status in there.items():
             known = self._devices.get(name)
-            if known is None or known.has_north != _has_north(status):
-                known = self._devices[name] = _ShownDevice(self._viewer, self._dialect, status)
+            noise = (status.noise or Deviations()).updated(self._noise.get(name, Deviations()))
+            frames = MessageFrames(name, has_north=_has_north(status), deviations=noise)
+            if known is None or known.frames != frames:
+                known = self._devices[name] = _ShownDevice(self._viewer, self._dialect, frames)
             known.show_status(status, utc_ns)
         unknown = [name for name, device in self._devices.items() if not device.is_offered]
         for sample in client.poll(unknown, convention=Convention.ENU_FLU) if unknown else ():
@@ -149,11 +157,11 @@ class Relay:
 class _ShownDevice:
     """The channels of one device."""
 
-    def __init__(self, viewer: Viewer, dialect: JsonDialect, status: DeviceStatus) -> None:
-        self.has_north = _has_north(status)
+    def __init__(self, viewer: Viewer, dialect: JsonDialect, frames: MessageFrames) -> None:
+        self.frames = frames
         self._viewer = viewer
-        self._status = dialect.status(status.name)
-        self._channels = dialect.samples(MessageFrames(status.name, has_north=self.has_north))
+        self._status = dialect.status(frames.device)
+        self._channels = dialect.samples(frames)
         self._open: set[str] = set()
         viewer.open(self._status)
 

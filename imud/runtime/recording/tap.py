@@ -380,6 +380,7 @@ def _configuration(config: DeviceConfig) -> dict[str, Any]:
         "frame": config.frame,
         "convention": config.convention,
         "declination_deg": config.declination_deg,
+        "noise": config.noise,
     }
     tree: dict[str, Any] = msgspec.to_builtins({key: one for key, one in made.items() if one is not None})
     return tree

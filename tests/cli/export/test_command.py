@@ -24,6 +24,7 @@ from imud.frames.conventions import FLU_LEVEL, RFU_ENU, Convention
 from imud.frames.published import as_sent
 from imud.sample import Sample
 from imud.units import NS_PER_MS, NS_PER_S
+from tests.cli.analysis.captures import resting, write_capture
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded, stamped_capture
 from tests.support.files import hi91, imu61x_log
 
@@ -185,6 +186,33 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
     assert found["/bow/losses"][0][1].lost_crc == 0
 
 
+def test_covariances_come_from_the_configuration_and_from_reports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("scipy", reason="the analysis needs the extra imud[analysis]")
+    accel, gyro = resting(12_000, 100.0)
+    resting_file = write_capture(tmp_path / "rest.capture", accel, gyro, rate_hz=100.0)
+    _, _, (file,) = run_recorded(tmp_path, more="noise: {gyro_rad_s: 0.5, attitude_rad: 0.25}")
+    assert main(["noise", "--json", str(resting_file)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    report["measurement"]["device"] = "mast"
+    (tmp_path / "mast.json").write_text(json.dumps(report))
+    sigma = sum(axis["spread"]["value"] ** 2 for axis in report["sensors"]["gyro"]["axes"].values()) / 3
+    for words, variance in (([], 0.25), (["--noise", str(tmp_path / "mast.json")], sigma)):
+        out = tmp_path / "a.mcap"
+        assert main(["export", "--to", "mcap", "--schema", "ros2", "--force", *words, "-o", str(out), str(file)]) == 0
+        with AnyReader([out]) as reader:
+            imu: dict[str, Any] = {
+                connection.topic: reader.deserialize(data, connection.msgtype)
+                for connection, _, data in reader.messages()
+                if connection.topic.endswith("/imu/data")
+            }
+        mast = imu["/mast/imu/data"]
+        assert list(mast.angular_velocity_covariance) == pytest.approx([variance, 0, 0, 0, variance, 0, 0, 0, variance])
+        assert mast.orientation_covariance[8] == 0.0625
+        assert not any(imu["/bow/imu/data"].angular_velocity_covariance)
+
+
 def test_fields_choose_channels(recorded: Recorded, tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     words = ["--to", "mcap", "--fields", "mag_t,temperature_c", "--device", "bow", "-o", str(out)]
@@ -282,6 +310,7 @@ def test_what_is_no_recording_is_a_capture_without_samples(tmp_path: Path, capsy
     ("words", "expected"),
     [
         (["--to", "csv", "--schema", "ros2"], "--schema: expected with --to mcap only"),
+        (["--to", "csv", "--noise", "a.json"], "--noise: expected with --to mcap only"),
         (["--to", "mcap", "--table", "events"], "--table: expected with --to csv only"),
         (["--to", "csv", "--fields", "acel_m_s2"], "acel_m_s2"),
         (["--to", "csv", "--table", "events", "--fields", "t_ns"], "--fields: expected with samples only"),

@@ -11,6 +11,7 @@ import msgspec
 
 from imud.bridges.channel import MessageChannel
 from imud.cli.foxglove.relay import Relay
+from imud.contracts.sensors.deviations import Deviations
 from imud.event import Event, EventKind
 from tests.support.socket_rig import batch, daemon
 
@@ -78,6 +79,17 @@ def test_samples_come_in_the_axes_of_rep_103(tmp_path: Path) -> None:
         assert imu.utc_ns == 1_790_000_000_007_000_000
         stamp = viewer.wait_for("/imu0/stamp")
         assert (stamp.message["seq"], stamp.message["t_err_ns"]) == (7, 12_000)
+
+
+def test_covariances_are_those_that_were_given(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    noise = {"imu0": Deviations(gyro_rad_s=0.5)}
+    with daemon(tmp_path) as served, relaying(served.path, viewer, noise=noise):
+        viewer.wait_for("/imu1/status")
+        served.do(lambda server: server.publish(batch("imu0", 7)))
+        imu = viewer.wait_for("/imu0/imu/data")
+        assert imu.message["angular_velocity_covariance"] == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
+        assert imu.message["linear_acceleration_covariance"] == [1e-4, 0, 0, 0, 1e-4, 0, 0, 0, 1e-4]  # of the status
 
 
 def test_events_and_status_come(tmp_path: Path) -> None:

@@ -98,8 +98,7 @@ class Recorder:
 
 def _first_samples(rings: Path, name: str, newest_seq: int) -> list[Sample]:
     """Samples 1 to `newest_seq` of a daemon that has just started, out of its ring."""
-    with Ring(name, directory=str(rings)) as ring:
-        ring._next = 1
+    with Ring(name, directory=str(rings), from_oldest=True) as ring:
         found = [sample for sample in ring.read().samples if sample.seq <= newest_seq]
     assert [sample.seq for sample in found] == list(range(1, newest_seq + 1)), f"{name}: its ring has not {newest_seq}"
     return found
