@@ -11,7 +11,14 @@ from imud.contracts.control.recording import NothingRecorded, RecordingSource, T
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.lines import WatchedInput, WatchLine
 from imud.contracts.settings import Settings
-from imud.contracts.status import ClientStatus, DeviceStatus, MqttStatus, OutputStatus, RecorderStatus
+from imud.contracts.status import (
+    ClientStatus,
+    DeviceStatus,
+    FlightStatus,
+    MqttStatus,
+    OutputStatus,
+    RecorderStatus,
+)
 from imud.errors import CommandError
 from imud.event import Event
 from imud.formats.slot import encode_slots
@@ -193,6 +200,8 @@ class PublisherContext:
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
     recorder_sources: list[Callable[[], RecorderStatus]] = field(default_factory=list)
     """The same of a recorder."""
+    flight_sources: list[Callable[[], FlightStatus]] = field(default_factory=list)
+    """The same of a flight recorder."""
     output_sources: list[Callable[[], Sequence[OutputStatus]]] = field(default_factory=list)
     """The same of outputs that send sentences."""
     mqtt_sources: list[Callable[[], MqttStatus]] = field(default_factory=list)

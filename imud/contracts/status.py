@@ -274,6 +274,26 @@ class RecorderStatus(msgspec.Struct, frozen=True):
     """Files removed to keep within the budget."""
 
 
+class FlightStatus(msgspec.Struct, frozen=True):
+    """State of the flight recorder."""
+
+    problem: str
+    """Why nothing is kept, one sentence; empty while it is."""
+    kept_ns: int
+    """Length of what is kept now."""
+    kept_bytes: int
+    records_dropped: int
+    """Records that had no room because this machine was too slow."""
+    saved: int
+    """Snapshots saved to files since the start."""
+    failed: int
+    """Snapshots that could not be saved."""
+    left_out: int
+    """Alerts that were not saved because there were too many within an hour."""
+    sent: int
+    """Snapshots that clients asked for."""
+
+
 class OutputStatus(msgspec.Struct, frozen=True):
     """One way out of an output that sends sentences."""
 

@@ -17,7 +17,14 @@ from prometheus_client.core import (
     Metric,
 )
 
-from imud.contracts.status import ClientStatus, DeviceStatus, MqttStatus, OutputStatus, RecorderStatus
+from imud.contracts.status import (
+    ClientStatus,
+    DeviceStatus,
+    FlightStatus,
+    MqttStatus,
+    OutputStatus,
+    RecorderStatus,
+)
 from imud.publishers.metrics.rings import RingView
 from imud.units import NS_PER_S, PPM_PER_ONE
 
@@ -46,6 +53,8 @@ class Snapshot:
     """What was found in these rings."""
     recorders: Sequence[RecorderStatus] = ()
     """One while there is a recorder."""
+    flights: Sequence[FlightStatus] = ()
+    """One while there is a flight recorder."""
     outputs: Sequence[OutputStatus] = ()
     """Ways out of outputs that send sentences."""
     mqtts: Sequence[MqttStatus] = ()

@@ -34,7 +34,7 @@ from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
 from imud.publishers.metrics.mqtt import MQTT_FAMILIES
 from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
-from imud.publishers.metrics.recorder import RECORDER_FAMILIES
+from imud.publishers.metrics.recorder import FLIGHT_FAMILIES, RECORDER_FAMILIES
 from imud.publishers.metrics.rings import RingReader
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.units import NS_PER_S
@@ -124,9 +124,10 @@ class DaemonCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics of the snapshot, with pauses while they are rendered."""
         recorder = RECORDER_FAMILIES if self._snapshot.recorders else ()
+        flight = FLIGHT_FAMILIES if self._snapshot.flights else ()
         outputs = OUTPUT_FAMILIES if self._snapshot.outputs else ()
         mqtt = MQTT_FAMILIES if self._snapshot.mqtts else ()
-        for family in (*FAMILIES, *recorder, *outputs, *mqtt):
+        for family in (*FAMILIES, *recorder, *flight, *outputs, *mqtt):
             metric = family.metric(self._snapshot)
             metric.samples = _PausingList(metric.samples, self._pause)
             yield metric
@@ -270,6 +271,7 @@ class MetricsPublisher:
                     messages_dropped(),
                     rings=dict.fromkeys(context.without_ring, "") | context.rings,
                     recorders=tuple(status() for status in context.recorder_sources),
+                    flights=tuple(status() for status in context.flight_sources),
                     mqtts=tuple(status() for status in context.mqtt_sources),
                     outputs=tuple(output for source in context.output_sources for output in source()),
                 )

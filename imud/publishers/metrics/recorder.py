@@ -1,10 +1,10 @@
-"""Table of the recorder's metrics; there are none where nothing is to be recorded."""
+"""Tables of the metrics of the recorder and of the flight recorder; there are none where there is no such thing."""
 
 from collections.abc import Callable
 from typing import Final
 
-from imud.contracts.status import RecorderStatus
-from imud.publishers.metrics.family import BYTES, NO_UNIT, Family, Lines, MetricType, Reader, Snapshot
+from imud.contracts.status import FlightStatus, RecorderStatus
+from imud.publishers.metrics.family import BYTES, NO_UNIT, SECONDS, Family, Lines, MetricType, Reader, Snapshot
 
 
 def _recorder(read: Callable[[RecorderStatus], float]) -> Reader:
@@ -14,6 +14,24 @@ def _recorder(read: Callable[[RecorderStatus], float]) -> Reader:
         return [((), read(status)) for status in snapshot.recorders]
 
     return Reader((), lines)
+
+
+def _flight(read: Callable[[FlightStatus], float]) -> Reader:
+    """A value of the flight recorder."""
+
+    def lines(snapshot: Snapshot) -> Lines:
+        return [((), read(status)) for status in snapshot.flights]
+
+    return Reader((), lines)
+
+
+def _snapshots(snapshot: Snapshot) -> Lines:
+    """Snapshots by what became of them."""
+    return [
+        ((result,), getattr(status, result))
+        for status in snapshot.flights
+        for result in ("saved", "failed", "left_out")
+    ]
 
 
 RECORDER_FAMILIES: Final = (
@@ -42,5 +60,35 @@ RECORDER_FAMILIES: Final = (
         "imud_recorder_files_removed_total", MetricType.COUNTER, NO_UNIT,
         "Recordings that were removed to keep within the budget.",
         _recorder(lambda status: status.files_removed),
+    ),
+)  # fmt: skip
+
+FLIGHT_FAMILIES: Final = (
+    Family(
+        "imud_flight_recorder_active", MetricType.GAUGE, NO_UNIT,
+        "1 while the flight recorder keeps what devices deliver, 0 while there is no room for it.",
+        _flight(lambda status: not status.problem),
+    ),
+    Family(
+        "imud_flight_recorder_kept_seconds", MetricType.GAUGE, SECONDS, "Length of what the flight recorder has.",
+        _flight(lambda status: status.kept_ns),
+    ),
+    Family(
+        "imud_flight_recorder_kept_bytes", MetricType.GAUGE, BYTES, "Size of what the flight recorder has.",
+        _flight(lambda status: status.kept_bytes),
+    ),
+    Family(
+        "imud_flight_recorder_records_dropped_total", MetricType.COUNTER, NO_UNIT,
+        "Records that the flight recorder does not have because this machine was too slow.",
+        _flight(lambda status: status.records_dropped),
+    ),
+    Family(
+        "imud_flight_recorder_snapshots_total", MetricType.COUNTER, NO_UNIT,
+        "Alerts whose snapshot was saved, could not be saved, or was one too many within an hour.",
+        Reader(("result",), _snapshots),
+    ),
+    Family(
+        "imud_flight_recorder_snapshots_sent_total", MetricType.COUNTER, NO_UNIT, "Snapshots that clients asked for.",
+        _flight(lambda status: status.sent),
     ),
 )  # fmt: skip

@@ -31,6 +31,8 @@ class AlertGate:
         """The alert whose snapshot is to be saved."""
         self.left_out = 0
         """Alerts that were not saved since the last that was, because there were too many."""
+        self.left_out_total = 0
+        """The same since the start."""
         self._after_ns = after_ns
         self._per_hour = per_hour
         self._accepted: deque[int] = deque()
@@ -45,6 +47,7 @@ class AlertGate:
             accepted.popleft()
         if len(accepted) >= self._per_hour:
             self.left_out += 1
+            self.left_out_total += 1
             return self.left_out > 1
         accepted.append(alert.t_ns)
         self.pending = alert

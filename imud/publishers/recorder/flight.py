@@ -14,6 +14,7 @@ from typing import Final
 
 from imud.contracts.lines import Edge, WatchedInput
 from imud.contracts.publisher import Batch, PublisherContext
+from imud.contracts.status import FlightStatus
 from imud.errors import ServerError, reason_of
 from imud.event import Event, EventKind
 from imud.publishers.recorder.alerts import Alert, AlertGate
@@ -70,6 +71,8 @@ class FlightRecorder:
         self._begun_ns = 0
         self._segments = self._snapshots = self._sends = 0
         """Counts since the start."""
+        self._saved = self._failed = 0
+        """Snapshots, by what became of them."""
         self._problem = ""
 
     # --- the publisher -----------------------------------------------------------------------------------------------
@@ -92,6 +95,7 @@ class FlightRecorder:
         if self._settings.line is not None:
             self._line = context.watch_line(self._settings.line, "flight recorder", self._on_edges, self._on_line)
         context.snapshots.append(self.snapshot)
+        context.flight_sources.append(self.status)
         where = f"in {self._settings.directory}" if self._own is not None else "in memory"
         log.info("flight recorder: the last %g minutes are kept %s", self._settings.minutes, where)
 
@@ -149,6 +153,7 @@ class FlightRecorder:
         if writer is None:
             return
         self._context.snapshots.remove(self.snapshot)
+        self._context.flight_sources.remove(self.status)
         if self._line is not None:
             self._line.close()
         now_ns = self._context.now_ns()
@@ -169,6 +174,15 @@ class FlightRecorder:
         self._feed.check()
         self._queue.mark(Send(sock, self._feed.ending("a snapshot for a client")))
         return (self._context.now_ns() - oldest_ns) / NS_PER_S
+
+    def status(self) -> FlightStatus:
+        """Return the state of the flight recorder."""
+        oldest_ns = self._ring.oldest_ns
+        kept_ns = self._context.now_ns() - oldest_ns if oldest_ns and not self._problem else 0
+        return FlightStatus(
+            self._problem, kept_ns, self._ring.bytes, self._queue.dropped, self._saved, self._failed,
+            self._gate.left_out_total, self._sends,
+        )  # fmt: skip
 
     # --- segments and snapshots --------------------------------------------------------------------------------------
 
@@ -215,6 +229,8 @@ class FlightRecorder:
     def _tell(self, saved: Saved, now_ns: int) -> None:
         alert = self._saving.pop(saved.path, None)
         device, reason = ("", "an imud that was killed left it") if alert is None else (alert.device, alert.reason)
+        self._failed += bool(saved.problem)
+        self._saved += not saved.problem
         if saved.problem:
             self._raise(now_ns, f"a snapshot was not saved: {saved.path}: {saved.problem}: {reason}", device)
         else:

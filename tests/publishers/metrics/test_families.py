@@ -15,6 +15,7 @@ from imud.contracts.status import (
     ClientStatus,
     ClockStatus,
     DeviceState,
+    FlightStatus,
     MqttStatus,
     OutputStatus,
     RecorderStatus,
@@ -395,10 +396,18 @@ def test_rendering_pauses_often() -> None:
 def shown_names() -> set[str]:
     """Names of all families as they stand after `# HELP`."""
     recorder = RecorderStatus("a", "", 1, 2, 3, 4, 5)
+    flight = FlightStatus("", 1, 2, 3, 4, 5, 6, 7)
     output = OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")
     mqtt = MqttStatus("mqtt://127.0.0.1:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8}, 9)
     snapshot = Snapshot(
-        DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,), outputs=(output,), mqtts=(mqtt,)
+        DEVICES,
+        (client(1),),
+        ((("front", "up"), 1),),
+        1,
+        recorders=(recorder,),
+        flights=(flight,),
+        outputs=(output,),
+        mqtts=(mqtt,),
     )
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))

@@ -105,13 +105,17 @@ def test_an_acceleration_over_the_bound_is_saved_with_what_came_before_and_after
     assert kinds[:4] == [Kind.SESSION, Kind.CALL, Kind.DEVICE, Kind.DEVICE]
     assert kinds[-3:] == [Kind.CHECK, Kind.CHECK, Kind.END]
     assert kinds.count(Kind.SESSION) == 1
+    (status,) = [source() for source in bench.context.flight_sources]
+    assert 60 <= status.kept_ns / NS_PER_S <= 79
+    assert status.kept_bytes >= file.stat().st_size // 2
     (event,) = bench.events
     assert (event.kind, event.device) == (EventKind.RECORDER, "bow")
     assert event.message == f"saved {file}: |a| of bow was 51.5 m/s²"
     assert event.detail == {"file": str(file), "bytes": file.stat().st_size}
     bench.flight.close()
     assert bench.source.listening == []
-    assert bench.context.snapshots == []
+    assert not bench.context.snapshots
+    assert not bench.context.flight_sources
 
 
 def test_a_device_that_is_lost_is_an_alert_unless_it_is_not_recorded(tmp_path: Path) -> None:
@@ -157,6 +161,9 @@ def test_a_storm_of_alerts_does_not_fill_the_disk(tmp_path: Path) -> None:
     assert len(bench.files) == 3
     assert sum("not saved: |a| of bow was 9.8 m/s²; 3 snapshots were within an hour" in m for m in bench.messages) == 1
     assert len(bench.messages) == 4
+    status = bench.flight.status()
+    assert (status.saved, status.failed, status.sent) == (3, 0, 0)
+    assert status.left_out >= 90
     bench.flight.close()
 
 
