@@ -162,6 +162,7 @@ def configured_chronyd() -> Iterator[None]:
         yield
     finally:
         run("systemctl", "stop", "chrony.service")
+        Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd 4.3 leaves it
         for name in CHRONY_FILES:
             Path(name).unlink()
         must("systemctl", "daemon-reload")
