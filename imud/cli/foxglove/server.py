@@ -24,7 +24,7 @@ class FoxgloveServer:
         self._channels: dict[str, foxglove.Channel] = {}
         try:
             self._server = foxglove.start_server(name="imud", host=host, port=port, context=self._context)
-        except Exception as error:
+        except RuntimeError as error:  # the library's only one
             raise ServerError(
                 f"cannot listen on {host} port {port}: {error}; is another `imud foxglove` running? (ss -ltnp)"
             ) from error
