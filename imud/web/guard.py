@@ -54,8 +54,7 @@ class WebGuard:
 
     def host_problem(self, host: str | None) -> str:
         """Return why the header Host is not accepted; empty where it is."""
-        name = host_name(host or "")
-        if name in self._names or is_address(name):
+        if is_own_host(host or "", self._names):
             return ""
         return f"expected an IP address or one of {', '.join(sorted(self._names))} as the host; see imud web --host"
 
@@ -104,6 +103,12 @@ def host_name(host: str) -> str:
         return host[1:].partition("]")[0]
     name, _, _port = host.partition(":")
     return name.removesuffix(".")
+
+
+def is_own_host(host: str, names: Collection[str]) -> bool:
+    """Decide whether a header Host is an IP address or a known name: no page of another site is served under it."""
+    name = host_name(host)
+    return name in names or is_address(name)
 
 
 def is_address(name: str) -> bool:

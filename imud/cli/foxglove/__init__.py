@@ -2,5 +2,7 @@
 
 command   arguments, signals
   ├──▶ relay    reads the daemon, connected again after its restart; asks for samples only while somebody looks
+  ├──▶ origins  whose pages may read
   └──▶ server   the WebSocket server (foxglove-sdk), which the relay gives messages to
+         └──▶ gate   listens, refuses other sites, and joins viewers with that server
 """

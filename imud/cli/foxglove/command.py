@@ -3,31 +3,50 @@
 import argparse
 import signal
 from contextlib import closing
-from ipaddress import ip_address
 from typing import Final
 
 from imud.cli.arguments import CliCommand, add_noise, add_socket, noise_by_device
+from imud.cli.foxglove.origins import ViewerOrigins
 from imud.cli.foxglove.relay import Relay
 from imud.cli.streams import complain
 from imud.errors import BadArgument
+from imud.web.guard import is_loopback
 
-HOST: Final = "127.0.0.1"
+ADDRESS: Final = "127.0.0.1"
 PORT: Final = 8765
 """Where viewers look first."""
 PORT_MAX: Final = 65535
 RATE_HZ: Final = 100.0
 """Samples a second of each device: smooth on any screen; a viewer draws 60 pictures a second."""
 OPEN: Final = (
-    "WARNING: {host} is not a loopback address: everybody who reaches port {port} can read all samples, events and "
-    "states; there is no password and no encryption. To read from another machine: ssh -L {port}:127.0.0.1:{port}"
+    "WARNING: {address} is not a loopback address: everybody who reaches port {port} can read all samples, events and "
+    "states; there is no password and no encryption"
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud foxglove`."""
     add_socket(parser)
-    parser.add_argument("--host", default=HOST, help="address to listen on (default: %(default)s, this machine only)")
-    parser.add_argument("--port", type=int, default=PORT, help="port of it (default: %(default)s; 0: a free one)")
+    parser.add_argument(
+        "--address", default=ADDRESS, metavar="ADDRESS",
+        help="listen here (default: %(default)s, which only this machine reaches); another one needs --open",
+    )  # fmt: skip
+    parser.add_argument(
+        "--port", type=int, default=PORT, metavar="N", help="listen there (default: %(default)s; 0: any)"
+    )
+    parser.add_argument(
+        "--open", action="store_true",
+        help="let everybody who reaches --address read, without a password and without encryption",
+    )  # fmt: skip
+    parser.add_argument(
+        "--host", action="append", default=[], metavar="NAME",
+        help="a further name under which viewers may ask for this host; IP addresses and localhost are known",
+    )  # fmt: skip
+    parser.add_argument(
+        "--allow-origin", action="append", default=[], metavar="SITE",
+        help="pages of this site in a browser may read too, as https://viewer.example; those of app.foxglove.dev "
+        "and of this machine may, and the viewers that are programs",
+    )  # fmt: skip
     parser.add_argument(
         "--device", action="append", default=[], metavar="NAME", help="only this one; may be given several times"
     )
@@ -45,26 +64,25 @@ def run(args: argparse.Namespace) -> int:
     if not args.rate >= 0:
         raise BadArgument(f"--rate: expected samples a second, 0 for all, got {args.rate}")
     noise = noise_by_device(args.noise)
+    if not (args.open or is_loopback(args.address)):
+        raise BadArgument(
+            f"--address {args.address} can be reached from other machines, and there is no password: expected "
+            f"--open as well, or no --address, and a tunnel: ssh -L {PORT}:127.0.0.1:{PORT} GATEWAY"
+        )
+    origins = ViewerOrigins(names=args.host, origins=args.allow_origin)
     try:
         from imud.cli.foxglove.server import FoxgloveServer
     except ModuleNotFoundError as error:
         raise BadArgument(f"imud foxglove: it needs {error.name}: pip install 'imud[foxglove]'") from None
-    with closing(FoxgloveServer(args.host, args.port, note=lambda text: complain(f"imud foxglove: {text}"))) as server:
-        if not is_loopback(args.host):
-            complain(OPEN.format(host=args.host, port=args.port))
+    server = FoxgloveServer(args.address, args.port, origins, note=lambda text: complain(f"imud foxglove: {text}"))
+    with closing(server):
+        if not is_loopback(args.address):
+            complain(OPEN.format(address=args.address, port=server.url.rpartition(":")[2]))
         complain(f"imud foxglove: open {server.url} in Foxglove, Lichtblick or PlotJuggler; Ctrl-C ends")
         relay = Relay(args.socket, server, devices=args.device, rate_hz=args.rate or None, noise=noise)
         signal.signal(signal.SIGTERM, lambda *_: relay.stop())
         relay.run()
     return 0
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only programs of this machine reach the address."""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 FOXGLOVE = CliCommand(add_arguments, run)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, closing
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,8 @@ import pytest
 from imud.bridges.channel import MessageFrames, StampedEvent
 from imud.bridges.json_channels import JsonDialect
 from imud.cli import main
-from imud.cli.foxglove import command
-from imud.cli.foxglove.server import FoxgloveServer
+from imud.cli.foxglove.origins import ViewerOrigins
+from imud.cli.foxglove.server import FoxgloveServer, hidden_address
 from imud.errors import ServerError
 from tests.bridges.samples import EVENT, FULL, UTC_NS
 from tests.support.daemon_process import running_daemon
@@ -82,7 +83,7 @@ async def connected(url: str) -> AsyncIterator[ProtocolClient]:
 
 
 def serve(notes: list[str]) -> FoxgloveServer:
-    return FoxgloveServer("127.0.0.1", 0, note=notes.append)
+    return FoxgloveServer("127.0.0.1", 0, ViewerOrigins(), note=notes.append)
 
 
 def test_messages_reach_a_client_that_subscribed() -> None:
@@ -130,7 +131,32 @@ def test_a_port_that_is_taken_is_an_error_that_says_so() -> None:
     with closing(serve([])) as server:
         port = int(server.url.rpartition(":")[2])
         with pytest.raises(ServerError, match=f"cannot listen on 127.0.0.1 port {port}"):
-            FoxgloveServer("127.0.0.1", port, note=print)
+            FoxgloveServer("127.0.0.1", port, ViewerOrigins(), note=print)
+
+
+def test_a_page_of_another_site_does_not_connect_and_that_of_foxglove_does() -> None:
+    async def status_for(url: str, origin: str) -> int:
+        async with aiohttp.ClientSession() as session:
+            try:
+                socket = await session.ws_connect(url, protocols=(SUBPROTOCOL,), headers={"Origin": origin})
+            except aiohttp.WSServerHandshakeError as error:
+                return error.status
+            await socket.close()
+            return 101
+
+    notes: list[str] = []
+    with closing(serve(notes)) as server:
+        assert asyncio.run(status_for(server.url, "https://attacker.example")) == 403
+        assert asyncio.run(status_for(server.url, "https://app.foxglove.dev")) == 101
+    assert len(notes) == 1
+    assert "--allow-origin https://attacker.example" in notes[0]
+
+
+def test_the_server_behind_the_gate_is_not_found_by_trying() -> None:
+    addresses = {hidden_address() for _ in range(100)}
+    assert len(addresses) >= 99, "of 16 million"
+    assert all(ip_address(one).is_loopback for one in addresses)
+    assert not addresses & {"127.0.0.0", "127.255.255.255"}
 
 
 def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
@@ -167,9 +193,10 @@ def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
     assert t_ns == imu["timestamp"]["sec"] * 10**9 + imu["timestamp"]["nsec"]
 
 
-def test_another_address_is_said_loudly() -> None:
-    assert [command.is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "127.9.9.9")] == 4 * [True]
-    assert [command.is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.2", "gateway")] == 4 * [False]
+@pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.168.1.2", "gateway"])
+def test_another_address_needs_to_be_opened(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["foxglove", "--address", address, "--port", "0"]) == 2
+    assert "expected --open as well, or no --address, and a tunnel: ssh -L 8765:" in capsys.readouterr().err
 
 
 def test_the_warning_stands_before_the_first_sample(
@@ -178,7 +205,7 @@ def test_the_warning_stands_before_the_first_sample(
     monkeypatch.setattr("imud.cli.foxglove.relay.Relay.run", lambda _relay: None)
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        assert main(["foxglove", "--host", "0.0.0.0", "--port", "0"]) == 0
+        assert main(["foxglove", "--address", "0.0.0.0", "--open", "--port", "0"]) == 0
         assert "WARNING: 0.0.0.0 is not a loopback address" in capsys.readouterr().err
         assert main(["foxglove", "--port", "0"]) == 0
         assert "WARNING" not in capsys.readouterr().err
@@ -186,7 +213,9 @@ def test_the_warning_stands_before_the_first_sample(
         signal.signal(signal.SIGTERM, handler)
 
 
-@pytest.mark.parametrize("words", [["--port", "70000"], ["--rate", "-1"], ["--rate", "nan"]])
+@pytest.mark.parametrize(
+    "words", [["--port", "70000"], ["--rate", "-1"], ["--rate", "nan"], ["--allow-origin", "viewer.example"]]
+)
 def test_arguments_out_of_range(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["foxglove", *words]) == 2
     assert f"{words[0]}: expected" in capsys.readouterr().err
