@@ -6,6 +6,7 @@
     imud/<site>/<gateway>/<device>/statistics    intervals: mean, or minimum, maximum, mean and RMS
     imud/<site>/<gateway>/<device>/events
     imud/<site>/<gateway>/<device>/status        retained
+    imud/<site>/<gateway>/<device>/settings      retained: the device's own settings, and where they are not as declared
     imud/<site>/<gateway>/<device>/schema        retained: what the samples mean and how slots are laid out
 
 A name is one level of a topic: without `/`, without the wildcards `+` and `#`, and without `$` at its beginning, which
@@ -36,7 +37,8 @@ class Stream(StrEnum):
 STATE: Final = "state"
 STATUS: Final = "status"
 SCHEMA: Final = "schema"
-_DEVICE_TOPICS: Final = frozenset((*Stream, STATUS, SCHEMA))
+SETTINGS: Final = "settings"
+_DEVICE_TOPICS: Final = frozenset((*Stream, STATUS, SETTINGS, SCHEMA))
 _GATEWAY_TOPICS: Final = frozenset((STATE, Stream.EVENTS))
 
 
@@ -48,7 +50,7 @@ class TopicParts(NamedTuple):
     device: str
     """Empty for what is of the gateway itself."""
     leaf: str
-    """`state`, `status`, `schema`, or the name of a `Stream`."""
+    """`state`, `status`, `settings`, `schema`, or the name of a `Stream`."""
 
 
 def is_name(text: str) -> bool:

@@ -21,10 +21,11 @@ from imud.contracts.status import DeviceStatus, MqttStatus
 from imud.errors import ServerError, reason_of
 from imud.event import Event, EventKind
 from imud.formats.fleet.messages import VERSION, boot_text
-from imud.formats.fleet.topics import SCHEMA, STATE, STATUS, is_name, topic_of
+from imud.formats.fleet.topics import SCHEMA, SETTINGS, STATE, STATUS, is_name, topic_of
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
 from imud.publishers.mqtt.backoff import BrokerTurn
 from imud.publishers.mqtt.broker import Connect, PahoConnection, Will, check_extra
+from imud.publishers.mqtt.home_assistant import discovery_of, discovery_topic
 from imud.publishers.mqtt.sender import MqttSender
 from imud.publishers.mqtt.settings import MqttSettings, broker_of
 from imud.publishers.mqtt.spool import Spool
@@ -65,6 +66,8 @@ class MqttPublisher:
         """Devices of which something is sent."""
         self._known: dict[str, tuple[str, str, str]] = {}
         """What was published of a device: its state, problem and frame."""
+        self._settings_known: dict[str, dict[str, object]] = {}
+        """The settings of devices as they were published."""
         self._state_ns = self._all_ns = 0
         self._is_changed = True
         """Whether states are to be looked at before the next time."""
@@ -113,8 +116,15 @@ class MqttPublisher:
         """Forget a device that left the configuration, and take its state off the broker."""
         self._names.discard(name)
         self._sent.discard(name)
+        topics = []
         if self._known.pop(name, None) is not None:
-            self._queue.put_event(SentState({}, {self._topic(name, STATUS): None, self._topic(name, SCHEMA): None}))
+            topics += [self._topic(name, STATUS), self._topic(name, SCHEMA)]
+            if self._settings.home_assistant:
+                topics.append(discovery_topic(self._gateway, name))
+        if self._settings_known.pop(name, None) is not None:
+            topics.append(self._topic(name, SETTINGS))
+        if topics:
+            self._queue.put_event(SentState({}, dict.fromkeys(topics)))
 
     def publish(self, batch: Batch) -> None:
         """Put samples into the queue."""
@@ -179,13 +189,19 @@ class MqttPublisher:
         other: dict[str, object] = {}
         for status in self._context.status():
             sending = self._settings.sending(status.name)
-            if status.name not in self._sent or sending is None or not sending.status:
+            if status.name not in self._sent or sending is None:
+                continue
+            if sending.settings:
+                other |= self._changed_settings(status)
+            if not sending.status:
                 continue
             frame = status.frame
             known = (status.state.value, status.problem, repr(frame))
             if is_due or self._known.get(status.name) != known:
                 statuses[self._topic(status.name, STATUS)] = status
                 other[self._topic(status.name, SCHEMA)] = schema_of(status)
+                if self._settings.home_assistant:
+                    other[discovery_topic(self._gateway, status.name)] = discovery_of(self._gateway, status, sending)
                 self._known[status.name] = known
         if is_due:
             self._all_ns = now_ns
@@ -193,6 +209,14 @@ class MqttPublisher:
             other[self._topic("", STATE)] = state | {"mqtt": self.status(), "positions": self._positions()}
         if statuses or other:
             self._queue.put_event(SentState(statuses, other))
+
+    def _changed_settings(self, status: DeviceStatus) -> dict[str, object]:
+        """The message about the settings of a device, where they are not what was published."""
+        found = settings_of(status)
+        if found is None or self._settings_known.get(status.name) == found:
+            return {}
+        self._settings_known[status.name] = found
+        return {self._topic(status.name, SETTINGS): found}
 
     def _positions(self) -> list[object]:
         return list(self._writer.positions) if self._writer is not None else []
@@ -270,6 +294,23 @@ def schema_of(status: DeviceStatus) -> Mapping[str, object]:
             "sync_codes": {sync.value: code for sync, code in SYNC_CODES.items()},
         },
     }
+
+
+def settings_of(status: DeviceStatus) -> dict[str, object] | None:
+    """A device's own settings and how they differ from what is declared; None while nothing is known of them."""
+    declared = status.declared
+    if declared is None and not status.settings:
+        return None
+    found: dict[str, object] = {"v": VERSION, "device": status.name, "actual": dict(status.settings)}
+    if declared is not None:
+        found |= {
+            "state": declared.state,
+            "on_difference": declared.on_difference,
+            "differences": dict(declared.differences),
+            "unverified": list(declared.unverified),
+            "problem": declared.problem,
+        }
+    return found
 
 
 PUBLISHER = PublisherType("mqtt", MqttSettings, MqttPublisher, required=False)

@@ -44,6 +44,8 @@ class DeviceSending(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Whether its events are sent."""
     status: bool = True
     """Whether its state is sent, retained, when it changes and every `status_s`."""
+    settings: bool = True
+    """Whether its own settings are sent, retained, when they change: what it reports, and what is not as declared."""
 
     @property
     def batch_ns(self) -> int:
@@ -129,6 +131,9 @@ class MqttSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """What waited for longer is dropped, hours."""
     status_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
     """How often the state of devices and of the gateway is sent, s."""
+    home_assistant: bool = False
+    """Whether devices whose `status` is sent are announced to Home Assistant, in retained messages below
+    `homeassistant/device/`, which the broker must let this gateway write."""
     devices: dict[str, DeviceSending] = msgspec.field(default_factory=lambda: {EVERY: DeviceSending()})
     """What is sent, by the names of devices; `*` stands for all that are not named. The keys of each are under
     `mqtt.devices.NAME`."""

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from imud.contracts.device_settings import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.settings import wrong_values
 from imud.contracts.status import DeviceState, DeviceStatus
@@ -111,6 +112,34 @@ def test_a_device_that_is_removed_leaves_no_state(tmp_path: Path) -> None:
     sent = [topic for topic, payload, _ in bench.close() if not payload]
     assert set(sent) <= {"imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"}
     assert bench.output.status().broker == ""
+
+
+def test_settings_that_are_not_as_declared_are_published_when_they_change(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.output.add_device("imu0", 0)
+    topic = "imud/default/gw/imu0/settings"
+
+    def declare(state: SettingsState, read_ns: int, **differences: SettingDifference) -> None:
+        declared = SettingsStatus(state, OnDifference.REPORT, differences=differences, read_ns=read_ns)
+        bench.statuses = [
+            msgspec.structs.replace(device_status("imu0", 0), settings={"rate_hz": "50"}, declared=declared)
+        ]
+        bench.output.event(Event(0, "imu0", EventKind.CONFIGURATION, "x"))
+        bench.tick()
+
+    bench.output.start()
+    declare(SettingsState.AGREE, 1)
+    bench.broker.wait_for(topic)
+    declare(SettingsState.AGREE, 2)  # read again, and nothing is different
+    declare(SettingsState.DIFFER, 3, rate_hz=SettingDifference(100, 50))
+    with bench.broker.changed:
+        assert bench.broker.changed.wait_for(
+            lambda: any(b'"differ"' in sent[1] for sent in bench.broker.connections[0].sent if sent[0] == topic), 10
+        )
+    sent = [json.loads(payload) for one, payload, retain in bench.close() if one == topic and retain]
+    assert [one["state"] for one in sent] == ["agree", "differ"]
+    assert sent[1]["differences"] == {"rate_hz": {"declared": 100, "actual": 50}}
+    assert sent[1]["actual"] == {"rate_hz": "50"}
 
 
 def test_only_declared_devices_are_queued(tmp_path: Path) -> None:
