@@ -364,6 +364,7 @@ TESTED_IN = {
     "imud.cli.export.source": "cli/export/test_command.py",
     "imud.client.watch": "client/test_connection.py",
     "imud.clock.period_learner": "clock/test_device_time.py",
+    "imud.formats.fleet.commands": "publishers/mqtt/test_commands.py",
     "imud.publishers.mqtt.settings": "publishers/mqtt/test_publisher.py",
     "imud.publishers.recorder.settings": "publishers/recorder/test_continuous.py",
     "imud.config.devices": "config/test_reading.py",

@@ -336,6 +336,10 @@ class MqttStatus(msgspec.Struct, frozen=True):
     """Samples and events that were dropped, by cause."""
     reconnects: int
     """Connections after the first."""
+    commands: int = 0
+    """Requests for actions that were carried out, or tried."""
+    commands_refused: int = 0
+    """Requests that were refused."""
 
 
 class ClientStatus(msgspec.Struct, frozen=True):

@@ -7,6 +7,8 @@
     imud/<site>/<gateway>/<device>/events
     imud/<site>/<gateway>/<device>/status        retained
     imud/<site>/<gateway>/<device>/settings      retained: the device's own settings, and where they are not as declared
+    imud/<site>/<gateway>/<device>/command       requests to the gateway, where it takes any
+    imud/<site>/<gateway>/<device>/answer        answers to them; also answer/<name>
     imud/<site>/<gateway>/<device>/schema        retained: what the samples mean and how slots are laid out
 
 A name is one level of a topic: without `/`, without the wildcards `+` and `#`, and without `$` at its beginning, which
@@ -38,7 +40,9 @@ STATE: Final = "state"
 STATUS: Final = "status"
 SCHEMA: Final = "schema"
 SETTINGS: Final = "settings"
-_DEVICE_TOPICS: Final = frozenset((*Stream, STATUS, SETTINGS, SCHEMA))
+COMMAND: Final = "command"
+ANSWER: Final = "answer"
+_DEVICE_TOPICS: Final = frozenset((*Stream, STATUS, SETTINGS, SCHEMA, COMMAND, ANSWER))
 _GATEWAY_TOPICS: Final = frozenset((STATE, Stream.EVENTS))
 
 
@@ -50,7 +54,7 @@ class TopicParts(NamedTuple):
     device: str
     """Empty for what is of the gateway itself."""
     leaf: str
-    """`state`, `status`, `settings`, `schema`, or the name of a `Stream`."""
+    """`state`, `status`, `settings`, `schema`, `command`, `answer`, or the name of a `Stream`."""
 
 
 def is_name(text: str) -> bool:

@@ -49,4 +49,6 @@ MQTT_FAMILIES: Final = (
         Reader(("cause",), _dropped),
     ),
     _counter("reconnects", "Connections to a broker after the first.", lambda status: status.reconnects),
+    _counter("commands", "Requests for actions that were carried out, or tried.", lambda status: status.commands),
+    _counter("commands_refused", "Requests for actions that were refused.", lambda status: status.commands_refused),
 )  # fmt: skip

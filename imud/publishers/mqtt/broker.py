@@ -5,6 +5,7 @@ one had sent without an answer is in the spool and is sent again.
 """
 
 import importlib
+import logging
 import os
 import select
 from contextlib import suppress
@@ -15,12 +16,16 @@ from imud.errors import ServerError, reason_of
 from imud.files import read_regular
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 
+log = logging.getLogger(__name__)
+
 CONNECT_S: Final = 4.0
 """TCP, TLS and the broker's answer take so long each at most; satellite links take 2 s."""
 IN_FLIGHT_MAX: Final = 20
 """Messages without an acknowledgement, unless the broker allows fewer: what brokers usually allow."""
 REFUSED: Final = 0x80
 """Reason codes of MQTT 5 from here on are refusals (section 2.4)."""
+PACKET_BYTES: Final = 16_384
+"""The broker may send so much at once: four times the longest request."""
 PASSWORD_BYTES: Final = 65_535
 """Of a password (MQTT 5.0, section 3.1.3.6)."""
 EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
@@ -37,6 +42,19 @@ class Will(NamedTuple):
     payload: bytes
 
 
+class Received(NamedTuple):
+    """A message from the broker."""
+
+    topic: str
+    payload: bytes
+    retain: bool
+    """Whether the broker had kept it."""
+    response_topic: str
+    """Where the answer is to go; empty where the message says nothing, and with MQTT 3.1.1."""
+    correlation: bytes | None
+    """To be sent back with the answer; with MQTT 5 only."""
+
+
 class BrokerConnection(Protocol):
     """A connection to one broker. Synchronization: one thread; `ring` from any."""
 
@@ -44,8 +62,16 @@ class BrokerConnection(Protocol):
     """Numbers of messages that the broker has taken; whoever reads them clears them."""
     in_flight_max: int
     """Messages that may be without an acknowledgement."""
+    received: list[Received]
+    """Messages of subscriptions; whoever reads them clears them."""
 
-    def publish(self, topic: str, payload: bytes, content_type: str, *, retain: bool) -> int:
+    def subscribe(self, topic: str) -> None:
+        """Ask for messages of a topic. Raises BrokerError."""
+        ...
+
+    def publish(
+        self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
+    ) -> int:
         """Send a message with QoS 1; return its number. Raises BrokerError."""
         ...
 
@@ -88,6 +114,7 @@ class PahoConnection:
         """Connect and wait for the answer. Raises BrokerError."""
         self.acknowledged: list[int] = []
         self.in_flight_max = IN_FLIGHT_MAX
+        self.received: list[Received] = []
         self._broker = broker
         self._is_v5 = settings.version == "5"
         self._answered = self._closed = self._woke = False
@@ -96,7 +123,9 @@ class PahoConnection:
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         try:
             self._client = self._made(settings, client_id, will)
-            self._client.connect(broker.host, broker.port, keepalive=settings.keep_alive_s)
+            self._client.connect(
+                broker.host, broker.port, keepalive=settings.keep_alive_s, properties=self._connect_properties()
+            )
             for _ in range(1000):
                 if self._answered or self._problem:
                     break
@@ -138,19 +167,35 @@ class PahoConnection:
         client.on_connect = self._on_connect
         client.on_publish = self._on_publish
         client.on_disconnect = self._on_disconnect
+        client.on_message = self._on_message
+        client.on_subscribe = self._on_subscribe
         return client
+
+    def _connect_properties(self) -> Any:
+        """How much the broker may send at once; None with MQTT 3.1.1."""
+        return (
+            _properties("CONNECT", MaximumPacketSize=PACKET_BYTES, ReceiveMaximum=IN_FLIGHT_MAX)
+            if self._is_v5
+            else None
+        )
 
     # --- as a connection ---------------------------------------------------------------------------------------------
 
-    def publish(self, topic: str, payload: bytes, content_type: str, *, retain: bool) -> int:
+    def subscribe(self, topic: str) -> None:
+        """Ask for messages of a topic. Raises BrokerError."""
+        try:
+            self._client.subscribe(topic, qos=1)
+        except (OSError, ValueError) as error:
+            raise BrokerError(f"{self._broker.name}: {_reason_of(error)}") from error
+
+    def publish(
+        self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
+    ) -> int:
         """Send a message. Raises BrokerError."""
         properties = None
-        if self._is_v5 and content_type:
-            from paho.mqtt.packettypes import PacketTypes
-            from paho.mqtt.properties import Properties
-
-            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]  # the library has no types here
-            properties.ContentType = content_type
+        if self._is_v5:
+            given = {"ContentType": content_type or None, "CorrelationData": correlation}
+            properties = _properties("PUBLISH", **{name: one for name, one in given.items() if one is not None})
         try:
             info = self._client.publish(topic, payload, qos=1, retain=retain, properties=properties)
         except (OSError, ValueError) as error:
@@ -234,9 +279,37 @@ class PahoConnection:
             return
         self.acknowledged.append(mid)
 
+    def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
+        properties = message.properties
+        self.received.append(
+            Received(
+                message.topic,
+                message.payload,
+                bool(message.retain),
+                getattr(properties, "ResponseTopic", ""),
+                getattr(properties, "CorrelationData", None),
+            )
+        )
+
+    def _on_subscribe(self, _client: Any, _data: Any, _mid: int, reasons: Any, _properties: Any) -> None:
+        for reason in reasons:
+            if reason.value >= REFUSED:
+                log.warning("mqtt: %s: the broker refuses to send requests: %s", self._broker.name, reason)
+
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:
             self._problem = self._problem or f"the broker ended the connection: {reason}"
+
+
+def _properties(packet: str, **values: object) -> Any:
+    """Properties of a packet of MQTT 5."""
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
+
+    made = Properties(getattr(PacketTypes, packet))  # type: ignore[no-untyped-call]  # the library has no types here
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made
 
 
 def _password(path: str | None) -> str | None:

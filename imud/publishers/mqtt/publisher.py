@@ -25,6 +25,7 @@ from imud.formats.fleet.topics import SCHEMA, SETTINGS, STATE, STATUS, is_name, 
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
 from imud.publishers.mqtt.backoff import BrokerTurn
 from imud.publishers.mqtt.broker import Connect, PahoConnection, Will, check_extra
+from imud.publishers.mqtt.commands import CommandChannel
 from imud.publishers.mqtt.home_assistant import discovery_of, discovery_topic
 from imud.publishers.mqtt.sender import MqttSender
 from imud.publishers.mqtt.settings import MqttSettings, broker_of
@@ -61,6 +62,7 @@ class MqttPublisher:
         self._spool: Spool | None = None
         self._sender: MqttSender | None = None
         self._writer: SpoolWriter | None = None
+        self._commands: CommandChannel | None = None
         self._names: set[str] = set()
         self._sent: set[str] = set()
         """Devices of which something is sent."""
@@ -94,9 +96,15 @@ class MqttPublisher:
         brokers = [found for url in settings.brokers if (found := broker_of(url)) is not None]
         turn = BrokerTurn(brokers, settings.retry_max_s)
         self._spool = Spool(directory, settings.spool_bytes, settings.spool_age_ns)
+        if settings.commands.enabled:
+            self._commands = CommandChannel(
+                settings.commands, self._gateway, context.control, context.now_ns, context.utc_offset_ns
+            )
         self._sender = MqttSender(
-            settings, f"imud-{settings.site}-{gateway}", will, turn, self._connect, context.now_ns
+            settings, f"imud-{settings.site}-{gateway}", will, turn, self._connect, context.now_ns, self._commands
         )  # fmt: skip
+        if self._commands is not None:
+            self._commands.answer = self._sender.reply
         self._writer = SpoolWriter(
             settings, self._gateway, self._queue, self._spool, self._sender, context.now_ns, context.utc_offset_ns,
             self._start_worker,
@@ -146,6 +154,8 @@ class MqttPublisher:
         if failure is not None:
             raise failure
         self._look_at_problems(now_ns, writer, sender)
+        if self._commands is not None:
+            self._commands.run_next()
         if now_ns - self._state_ns >= STATE_NS:
             self._state_ns = now_ns
             self._send_states(now_ns)
@@ -156,6 +166,8 @@ class MqttPublisher:
         writer, self._writer = self._writer, None
         if self.status in self._context.mqtt_sources:
             self._context.mqtt_sources.remove(self.status)
+        if self._commands is not None:
+            self._commands.close()
         if sender is not None:
             sender.close(self._state(online=False, reason="imud stopped"))
         if writer is not None:
@@ -170,11 +182,13 @@ class MqttPublisher:
         if writer is None or sender is None or spool is None:
             return MqttStatus("", "", "", self._queue.queued, 0, 0, 0, 0, 0, 0, {}, 0)
         dropped = dict(spool.dropped)
+        commands = self._commands
         for cause, count in (("queue", self._queue.dropped), ("disk", writer.lost_on_disk)):
             dropped[cause] = dropped.get(cause, 0) + count
         return MqttStatus(
             sender.broker, sender.problem, writer.problem, self._queue.queued, spool.spooled, sender.sent,
             sender.acknowledged, spool.messages, spool.used_bytes, spool.thinned, dropped, sender.reconnects,
+            commands.run if commands is not None else 0, commands.refused if commands is not None else 0,
         )  # fmt: skip
 
     # --- states ------------------------------------------------------------------------------------------------------

@@ -15,11 +15,14 @@ from typing import Final
 from imud.formats.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.publishers.mqtt.backoff import BrokerTurn
 from imud.publishers.mqtt.broker import BrokerConnection, BrokerError, Connect, Will
+from imud.publishers.mqtt.commands import CommandChannel, CommandReply
 from imud.publishers.mqtt.settings import MqttSettings
 from imud.publishers.mqtt.spool import Spooled
 from imud.units import NS_PER_S
 from imud.worker import WakeEvent
 
+REPLIES_MAX: Final = 32
+"""Answers that wait for a connection; the oldest go first."""
 OUTBOX_MAX: Final = 60
 """Messages that are held in memory: three windows of those without an acknowledgement, 6 MB at most."""
 WAIT_S: Final = 1.0
@@ -35,7 +38,7 @@ class MqttSender:
 
     def __init__(
         self, settings: MqttSettings, client_id: str, will: Will, turn: BrokerTurn, connect: Connect,
-        now_ns: Callable[[], int],
+        now_ns: Callable[[], int], commands: CommandChannel | None = None,
     ) -> None:  # fmt: skip
         self.session = 0
         """Number of the connection; changes when it is made and when it is lost."""
@@ -56,6 +59,8 @@ class MqttSender:
         """Called in the thread when there is room for messages, or acknowledgements wait; set by the writer."""
         self._settings, self._client_id, self._will = settings, client_id, will
         self._turn, self._connect, self._now_ns = turn, connect, now_ns
+        self._commands = commands
+        self._replies: deque[CommandReply] = deque(maxlen=REPLIES_MAX)
         self._lock = threading.Lock()
         self._outbox: deque[Spooled] = deque()
         self._in_flight: dict[int, int] = {}
@@ -106,6 +111,11 @@ class MqttSender:
                     self._due[topic] = None
         self._ring()
 
+    def reply(self, reply: CommandReply) -> None:
+        """Send an answer to a request, before all else. From any thread."""
+        self._replies.append(reply)
+        self._ring()
+
     def take_acknowledged(self) -> list[tuple[int, int]]:
         """Return session and id of what was acknowledged since the last call."""
         with self._lock:
@@ -146,6 +156,7 @@ class MqttSender:
                 self._send(connection)
                 connection.wait(WAIT_S)
                 self._pass_on(connection)
+                self._take_requests(connection)
         except BrokerError as error:
             self._lose(str(error))
             return self._turn.failed(self._now_ns())
@@ -154,6 +165,8 @@ class MqttSender:
     def _open(self) -> None:
         broker = self._turn.broker
         connection = self._connect(broker, self._settings, self._client_id, self._will)
+        if self._commands is not None:
+            connection.subscribe(self._commands.subscription)
         self._turn.connected(self._now_ns())
         self.reconnects += self._was_connected
         self._was_connected = True
@@ -167,6 +180,13 @@ class MqttSender:
     def _send(self, connection: BrokerConnection) -> None:
         """Send what the window has room for, what is retained first."""
         while len(self._in_flight) < connection.in_flight_max:
+            if self._replies:
+                reply = self._replies.popleft()
+                number = connection.publish(
+                    reply.topic, reply.payload, JSON_TYPE, retain=False, correlation=reply.correlation
+                )
+                self._in_flight[number] = 0
+                continue
             with self._lock:
                 topic = next(iter(self._due), None)
                 if topic is not None:
@@ -197,6 +217,13 @@ class MqttSender:
             is_low = 2 * (len(self._outbox) + len(self._in_flight)) <= OUTBOX_MAX
         if is_low:
             self.wanting()
+
+    def _take_requests(self, connection: BrokerConnection) -> None:
+        """Check what came; the event loop carries it out."""
+        received, connection.received = connection.received, []
+        for one in received:
+            if self._commands is not None:
+                self._commands.take(one)
 
     def _lose(self, problem: str) -> None:
         connection = self._connection

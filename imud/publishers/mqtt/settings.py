@@ -53,6 +53,37 @@ class DeviceSending(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
         return round(self.batch_s * NS_PER_S)
 
 
+class CommandSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the command channel."""
+
+    enabled: bool = False
+    """Whether actions of devices may be asked for over the broker, by whoever its rights let write to
+    `imud/SITE/GATEWAY/DEVICE/command`."""
+    actions: Annotated[list[str], msgspec.Meta(max_length=256)] = msgspec.field(default_factory=list[str])
+    """What may be asked for: names of actions, as `imud command DEVICE` lists them, for all devices, or `DEVICE/ACTION`
+    for one. All others are refused."""
+    max_age_s: Annotated[float, msgspec.Meta(ge=1, le=600)] = 30.0
+    """A request that is older by its `issued_utc_ns`, or so far ahead of the gateway's clock, is refused, s."""
+    per_minute: Annotated[int, msgspec.Meta(ge=1, le=600)] = 30
+    """Requests within a minute; more are refused."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is no name of an action."""
+        for entry in self.actions:
+            device, slash, action = entry.rpartition("/")
+            if not is_name(action) or (slash and not is_name(device)):
+                raise ValueError(f"actions: expected names of actions, or DEVICE/ACTION, got {shown(entry)}")
+
+    def allows(self, device: str, action: str) -> bool:
+        """Whether a request for it is carried out."""
+        return action in self.actions or f"{device}/{action}" in self.actions
+
+    @property
+    def max_age_ns(self) -> int:
+        """`max_age_s` in nanoseconds."""
+        return round(self.max_age_s * NS_PER_S)
+
+
 class Broker(NamedTuple):
     """A broker, taken from its URL."""
 
@@ -131,6 +162,8 @@ class MqttSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """What waited for longer is dropped, hours."""
     status_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
     """How often the state of devices and of the gateway is sent, s."""
+    commands: CommandSettings = CommandSettings()
+    """The command channel."""
     home_assistant: bool = False
     """Whether devices whose `status` is sent are announced to Home Assistant, in retained messages below
     `homeassistant/device/`, which the broker must let this gateway write."""

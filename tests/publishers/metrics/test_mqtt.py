@@ -20,11 +20,12 @@ def shown(*statuses: MqttStatus) -> dict[str, float]:
 
 
 def test_each_value_is_that_of_the_output() -> None:
-    status = MqttStatus("mqtt://a:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8, "space": 9}, 10)
+    status = MqttStatus("mqtt://a:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8, "space": 9}, 10, 11, 12)
     assert shown(status) == {
         "connected": 1, "spooling": 1, "queued_total": 1, "spooled_messages_total": 2, "sent_messages_total": 3,
         "acknowledged_messages_total": 4, "waiting_messages": 5, "spool_bytes": 6, "thinned_total": 7,
         "dropped_totalage": 8, "dropped_totalspace": 9, "reconnects_total": 10,
+        "commands_total": 11, "commands_refused_total": 12,
     }  # fmt: skip
     assert shown() == {}
 

@@ -3,7 +3,7 @@
 import threading
 from typing import Final
 
-from imud.publishers.mqtt.broker import BrokerError, Will
+from imud.publishers.mqtt.broker import BrokerError, Received, Will
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 
 LIMIT_S: Final = 10.0
@@ -15,6 +15,9 @@ class FakeConnection:
     def __init__(self, broker: "FakeBroker") -> None:
         self.acknowledged: list[int] = []
         self.in_flight_max = broker.window
+        self.received: list[Received] = []
+        self.subscribed: list[str] = []
+        self.correlations: list[bytes | None] = []
         self.sent: list[tuple[str, bytes, bool]] = []
         self.types: list[str] = []
         self.closed = False
@@ -22,8 +25,15 @@ class FakeConnection:
         self._broker = broker
         self._answered = 0
 
-    def publish(self, topic: str, payload: bytes, content_type: str, *, retain: bool) -> int:
+    def subscribe(self, topic: str) -> None:
         """Note it."""
+        self.subscribed.append(topic)
+
+    def publish(
+        self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
+    ) -> int:
+        """Note it."""
+        self.correlations.append(correlation)
         self.sent.append((topic, payload, retain))
         self.types.append(content_type)
         with self._broker.changed:
