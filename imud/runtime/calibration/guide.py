@@ -23,7 +23,7 @@ from imud.contracts.control.calibration import (
     RestMeans,
     Verdict,
 )
-from imud.errors import CommandError
+from imud.errors import CommandError, ImudError
 from imud.event import EventKind
 from imud.runtime.calibration.rest import RestWindow
 from imud.runtime.calibration.turning import (
@@ -113,6 +113,15 @@ class Guide:
         if calibration.unready is not None and (words := await self._run_script(calibration.unready)):
             raise CommandError(f"{kind}: {words}")
         self._report(kind, "begin", calibration.help)
+        try:
+            return await self._begun(kind, calibration, save)
+        except (ImudError, asyncio.CancelledError) as error:
+            words = str(error).removeprefix(f"{kind}: ") or "it was cancelled"
+            self._report(kind, "end", words, verified=False, saved=False)
+            raise
+
+    async def _begun(self, kind: str, calibration: Calibration, save: bool) -> CalibrationResult:
+        """Run a calibration whose begin was reported, and report its end; errors are left to the caller."""
         if calibration.handling is Handling.REST:
             device, checks, problem = await self._at_rest(kind, calibration)
         else:

@@ -174,7 +174,9 @@ def test_motion_refuses_before_anything_is_sent(rig: GuideRig) -> None:
 
     rig.play(story)
     assert rig.ran == []
-    assert "rest" in rig.phases()
+    assert rig.phases()[-2:] == ["rest", "end"]
+    assert rig.events[-1].message.startswith("calibration gyro: expected the device at rest, got: it turns at")
+    assert rig.events[-1].detail["verified"] is False
 
 
 @pytest.mark.parametrize("until_s", [19.7, 20.05])
@@ -251,6 +253,12 @@ def test_it_can_be_ended(rig: GuideRig, end: str) -> None:
         getattr(rig.guide, end)()
         with pytest.raises(CommandError, match="link ended" if end == "stop" else "was cancelled"):
             await running
+        assert rig.phases() == ["begin", "end"], "who looks on is told, too"
+        assert rig.events[-1].message == (
+            "calibration gyro: the device's link ended during the calibration"
+            if end == "stop"
+            else "calibration gyro: it was cancelled"
+        )
         assert not rig.guide.cancel()
         assert (await rig.guide.run("gyro", gyro(rig), save=False)).verified  # and begun anew
 
