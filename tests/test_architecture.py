@@ -338,6 +338,7 @@ CROSS_CUTTING = {
     "sim/test_main.py": "imud/sim/__main__.py as a process",
     "utc/test_gpsd_daemon.py": "a real gpsd and the daemon",
     "utc/test_gpsd_real.py": "a real gpsd",
+    "web/test_calibration_page.py": "the calibrations of imud/web/static in a real browser",
     "web/test_page.py": "imud/web/static in a real browser, with the daemon and a module",
 }
 """Test modules that mirror no module of imud, and what they test."""

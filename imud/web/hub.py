@@ -15,7 +15,7 @@ import msgspec
 from imud.client.feed import News, Wish
 from imud.contracts.device_settings import SettingsState
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
-from imud.event import Event
+from imud.event import Event, EventKind
 from imud.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
 from imud.sample import Sample
 from imud.units import NS_PER_S
@@ -181,7 +181,7 @@ class BrowserHub:
             messages.NewEvent(one.t_ns / NS_PER_S, one.device, str(one.kind), one.message, dict(one.detail))
             for one in events
         )
-        self._events.extend(fresh)
+        self._events.extend(one for one in fresh if not _is_progress(one))
         self._to(lambda look: look.look != "nothing", messages.EventsMessage(fresh))
 
     def _spread_samples(self, news: News) -> None:
@@ -258,6 +258,11 @@ def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages
         accel_m_s2=None if newest is None else newest.accel_m_s2,
         gyro_rad_s=None if newest is None else newest.gyro_rad_s,
     )
+
+
+def _is_progress(event: messages.NewEvent) -> bool:
+    """Decide whether an event is one of many within a calibration, of which a page that opens needs the next only."""
+    return event.event == EventKind.CALIBRATION and event.detail.get("phase") not in ("begin", "end")
 
 
 def _counts(status: DeviceStatus) -> dict[str, int]:

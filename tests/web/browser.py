@@ -92,6 +92,25 @@ def browser(folder: Path, size: tuple[int, int] = (1400, 2600), *, phone: bool =
         driver.quit()
 
 
+def open_page(page: Page, url: str, device: str) -> None:
+    """Open the page of a device, and wait until its script runs."""
+    page.driver.get(f"{url}#/device/{device}")
+    page.until("return Boolean(window.imud?.view?.plots)")
+
+
+def log_in(page: Page, token: str) -> None:
+    """Give the token, and wait until the page may control."""
+    page.click("#login")
+    enter(page, token)
+    page.until("return window.imud.session.control")
+
+
+def enter(page: Page, token: str) -> None:
+    """Write a token into the dialog and send it."""
+    page.js("document.querySelector('#token').value = arguments[0]", token)
+    page.click("#login-form button[type=submit]")
+
+
 @contextmanager
 def serving_web(socket: Path, *words: str, port: int = 0) -> Iterator[str]:
     """`imud web` for a daemon; its address."""

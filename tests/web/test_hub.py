@@ -195,6 +195,22 @@ def test_events_come_and_new_pages_get_those_that_are_remembered() -> None:
     run(body)
 
 
+def test_the_progress_of_a_calibration_is_not_remembered_and_its_begin_and_end_are() -> None:
+    def turning(phase: str) -> Event:
+        return Event(1, "bow", EventKind.CALIBRATION, phase, {"kind": "magnetometer", "phase": phase})
+
+    async def body() -> None:
+        hub, _ = make()
+        browser = opened(hub, look="device", device="bow")
+        for phase in ("begin", "turn", "rest", "turn", "end"):
+            hub.spread(News(events=(turning(phase),)))
+        assert len(await heard(browser, "events")) == 5
+        (late,) = await heard(opened(hub, look="device", device="bow"), "events")
+        assert [event["message"] for event in late["events"]] == ["begin", "end"]
+
+    run(body)
+
+
 def test_a_browser_that_reads_nothing_holds_up_no_other_and_is_told_what_it_missed() -> None:
     async def body() -> None:
         hub, _ = make()

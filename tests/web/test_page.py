@@ -12,7 +12,7 @@ import pytest
 from imud.runtime.calibration.turning import cell_of
 from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon, wait_until
 from tests.test_daemon import Cable, cable, device
-from tests.web.browser import MISSING, PHONE, Page, Sender, browser, serving_web
+from tests.web.browser import MISSING, PHONE, Page, Sender, browser, enter, serving_web
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
 
@@ -29,6 +29,8 @@ CHOOSE = """const node = document.querySelector(arguments[0]);
     node.value = arguments[1];
     node.dispatchEvent(new Event('change'))"""
 
+
+DIRECTIONS = [(x, y, z) for x in (-0.9, 0.1, 0.5) for y in (-0.2, 0.3) for z in (-0.6, 0.4, 1.0)]
 
 TURNING = {
     "t_s": 5.0, "device": "bow", "event": "calibration", "message": "half of the directions",
@@ -133,11 +135,16 @@ def test_directions_and_rotations_are_those_of_the_daemon(page: Page, tmp_path: 
     with serving_web(tmp_path / "none") as url:
         page.driver.get(url)
         cells = page.module(
-            """const { cellDirection } = await import('/static/control.js');
+            """const { cellDirection } = await import('/static/sphere.js');
             return Array.from({ length: 48 }, (_, cell) => cellDirection(cell))"""
         )
+        cells_of = page.module(
+            """const { cellOf } = await import('/static/sphere.js');
+            return args[0].map(cellOf)""",
+            DIRECTIONS,
+        )
         covered = page.module(
-            """const { coveredCells } = await import('/static/control.js');
+            """const { coveredCells } = await import('/static/sphere.js');
             return coveredCells('800000000005')"""
         )
         turned = page.module(
@@ -145,6 +152,7 @@ def test_directions_and_rotations_are_those_of_the_daemon(page: Page, tmp_path: 
             return rotate([Math.SQRT1_2, 0, 0, Math.SQRT1_2], [1, 0, 0])"""
         )
     assert [cell_of(tuple(one)) for one in cells] == [*range(48)]
+    assert cells_of == [cell_of(one) for one in DIRECTIONS]
     assert [cell for cell, is_covered in enumerate(covered) if is_covered] == [0, 2, 47]
     assert turned == pytest.approx([0, 1, 0]), "a quarter turn about z takes x to y"
 
@@ -212,7 +220,8 @@ def test_ledger_latency_status_and_settings_are_those_of_the_daemon(page: Page, 
         assert page.js("return document.querySelector('#attitude3d canvas').toDataURL().length") > 3000
         page.js("window.imud.view.addEvents([arguments[0]])", TURNING)
         assert page.js("return document.querySelector('#calibration canvas').dataset.covered") == "8"
-        assert "field 48.5 µT, residual 2.5 %" in page.text("#calibration-progress")
+        assert page.text("#calibration-progress") == "half of the directions"
+        assert "field\n48.5 µT\nresidual\n2.5 %" in page.text("#calibration .facts")
         assert page.problems() == []
 
 
@@ -239,12 +248,6 @@ def test_with_the_token_settings_are_planned_and_without_the_right_one_not(page:
         assert TOKEN not in page.driver.current_url
         refused = [one for one in page.problems() if "401" not in one]
         assert refused == []
-
-
-def enter(page: Page, token: str) -> None:
-    """Write a token into the dialog and send it."""
-    page.js("document.querySelector('#token').value = arguments[0]", token)
-    page.click("#login-form button[type=submit]")
 
 
 def test_both_views_fit_a_telephone(tmp_path: Path) -> None:

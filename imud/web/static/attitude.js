@@ -1,6 +1,6 @@
 // The attitude as a block on a compass, from the quaternion body → navigation frame.
 
-import { el } from "./util.js";
+import { cleared, el } from "./util.js";
 
 const SIZE = 300;
 const BODY = [1.0, 0.7, 0.18]; // half edges along x, y, z of the device
@@ -15,7 +15,7 @@ export function rotate([w, x, y, z], [a, b, c]) {
 
 export class AttitudeView {
   constructor() {
-    this.canvas = el("canvas", { width: SIZE, height: SIZE, role: "img", "aria-label": "attitude of the device" });
+    this.canvas = el("canvas", { role: "img", "aria-label": "attitude of the device" });
     this.isNed = false;
     this.quaternion = null;
   }
@@ -45,9 +45,8 @@ export class AttitudeView {
   }
 
   draw() {
-    const context = this.canvas.getContext("2d");
+    const context = cleared(this.canvas, SIZE);
     const style = getComputedStyle(this.canvas);
-    context.clearRect(0, 0, SIZE, SIZE);
     context.font = "13px system-ui, sans-serif";
     context.textAlign = "center";
     context.textBaseline = "middle";

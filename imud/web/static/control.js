@@ -1,77 +1,32 @@
 // Guided calibrations with the sphere of directions that were covered, and the actions of a device.
 
-import { call, el, number, shown } from "./util.js";
-import { rotate } from "./attitude.js";
+import { CoverageSphere } from "./sphere.js";
+import { call, DEGREE, el, facts, marked, number, quantity, shown } from "./util.js";
 
-const SIZE = 220;
-const TILT = [0.88, -0.36, 0.12, 0.28]; // how the sphere is looked at: a quaternion
-const ORDERS = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
-const SIZES = [0.85, 0.48, 0.2];
-
-/** The middle of cell 0 … 47: an octant by signs (bit 0: x < 0), then the order of the absolute values. */
-export function cellDirection(cell) {
-  const order = ORDERS[cell % ORDERS.length];
-  const octant = Math.floor(cell / ORDERS.length);
-  const direction = [0, 0, 0];
-  order.forEach((axis, rank) => (direction[axis] = (octant >> axis) & 1 ? -SIZES[rank] : SIZES[rank]));
-  return direction;
-}
-
-/** Which cells a mask of 48 bits in hexadecimal has. */
-export function coveredCells(mask) {
-  const bits = BigInt(`0x${mask || "0"}`);
-  return Array.from({ length: 48 }, (_, cell) => Boolean((bits >> BigInt(cell)) & 1n));
-}
-
-export class CoverageSphere {
-  constructor() {
-    this.canvas = el("canvas", { width: SIZE, height: SIZE, role: "img", "aria-label": "directions that were covered" });
-  }
-
-  draw(mask) {
-    const covered = coveredCells(mask);
-    this.canvas.dataset.covered = covered.filter(Boolean).length;
-    const context = this.canvas.getContext("2d");
-    const style = getComputedStyle(this.canvas);
-    context.clearRect(0, 0, SIZE, SIZE);
-    context.strokeStyle = style.getPropertyValue("--line");
-    context.beginPath();
-    context.arc(SIZE / 2, SIZE / 2, SIZE * 0.42, 0, 2 * Math.PI);
-    context.stroke();
-    const points = covered.map((is, cell) => ({ is, at: rotate(TILT, cellDirection(cell)) }));
-    points.sort((a, b) => a.at[1] - b.at[1]);
-    for (const { is, at: [x, depth, z] } of points) {
-      context.globalAlpha = 0.35 + 0.325 * (depth + 1);
-      context.fillStyle = style.getPropertyValue(is ? "--good" : "--line");
-      context.beginPath();
-      context.arc(SIZE / 2 + x * SIZE * 0.42, SIZE / 2 - z * SIZE * 0.42, is ? 8 : 5, 0, 2 * Math.PI);
-      context.fill();
-    }
-    context.globalAlpha = 1;
-  }
-}
+const SAVED_ON_REQUEST = "until power-off, unless it is saved";
 
 export class CalibrationView {
   constructor(device, session) {
     this.device = device;
     this.session = session;
     this.list = el("div");
+    this.begins = [];
     this.progress = el("p", { id: "calibration-progress", role: "status" });
+    this.bar = el("progress", { max: 1, value: 0, "aria-label": "progress of the calibration" });
     this.sphere = new CoverageSphere();
-    this.result = el("div", { class: "result" });
-    this.save = el("input", { type: "checkbox" });
-    this.stop = el("button", { type: "button", text: "Stop", hidden: true, onclick: () => this.end() });
-    this.node = el("div", {}, this.list, this.progress, this.sphere.canvas, el("div", { class: "buttons" }, this.stop), this.result);
-    this.sphere.canvas.hidden = true;
+    this.details = el("div", { class: "grow" });
+    this.turning = el("div", { class: "turning", hidden: true }, this.sphere.canvas, this.details);
+    this.stop = el("button", { type: "button", id: "calibration-stop", text: "Stop", onclick: () => this.end() });
+    this.running = el("div", { class: "running", hidden: true }, this.progress, this.bar);
+    this.result = el("div", { class: "result", id: "calibration-result" });
+    this.node = el("div", {}, this.running, this.turning, this.result, this.list);
     this.load();
   }
 
   async load() {
     try {
       const found = await call("calibrations", { device: this.device });
-      const entries = found.map((one) => this.entry(one));
-      const save = this.session.control && found.length ? [el("label", {}, this.save, " save a verified result")] : [];
-      this.list.replaceChildren(...entries, ...save, ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has none." })]));
+      this.list.replaceChildren(...found.map((one) => this.entry(one)), ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has none." })]));
     } catch (error) {
       this.list.replaceChildren(el("p", { class: "quiet", text: error.message }));
     }
@@ -79,26 +34,48 @@ export class CalibrationView {
 
   entry(one) {
     const steps = el("ol", {}, ...one.instructions.map((words) => el("li", { text: words })));
-    const begin = el("button", { type: "button", text: `Begin ${one.kind}`, onclick: () => this.begin(one.kind) });
-    const words = this.session.control ? begin : el("p", { class: "quiet", text: "Log in to begin it." });
-    return el("details", {}, el("summary", { text: `${one.kind}: ${one.help}` }), steps,
-      el("p", { class: "quiet", text: `The result lasts ${one.kept}. Manual, section ${one.section}.` }), words);
+    const save = one.kept === SAVED_ON_REQUEST ? el("input", { type: "checkbox" }) : null;
+    const begin = el("button", { type: "button", text: `Begin ${one.kind}`, onclick: () => this.begin(one.kind, save?.checked ?? false) });
+    begin.disabled = !this.running.hidden;
+    this.begins.push(begin);
+    const control = el("div", { class: "buttons" }, begin, save && el("label", {}, save, " save a verified result"));
+    const words = this.session.control ? control : el("p", { class: "quiet", text: "Log in to begin it." });
+    return el("details", { "data-kind": one.kind }, el("summary", {}, el("b", { text: one.kind }), ": ", ...marked(one.help)), steps,
+      el("p", { class: "quiet", text: `The result lasts: ${one.kept}. Manual, section ${one.section}.` }), words);
   }
 
-  async begin(kind) {
-    this.result.replaceChildren();
-    this.progress.textContent = `calibration ${kind} begins`;
-    this.stop.hidden = false;
+  /** Whether a calibration goes on, whoever began it. */
+  setRunning(is) {
+    this.running.hidden = !is;
+    for (const button of this.begins) button.disabled = is;
+    if (is && this.session.control && !this.stop.isConnected) this.running.append(this.stop);
+  }
+
+  async begin(kind, save) {
+    this.prepare(`calibration ${kind} begins`);
+    this.isOwn = true;
     try {
-      const done = await call("calibrate", { device: this.device, kind, save: this.save.checked });
-      const words = done.verified ? `${kind} is verified${done.saved ? " and saved" : ""}` : done.problem;
-      const checks = done.checks.map((one) => el("li", { text: `${one.name} ${number(one.value, 4)} ${one.unit}, at most ${number(one.limit, 4)}: ${one.passed ? "passed" : "not passed"}` }));
-      this.result.replaceChildren(el("p", { class: done.verified ? "good" : "problem", text: words }), el("ul", {}, ...checks));
+      const done = await call("calibrate", { device: this.device, kind, save });
+      const checks = done.checks.map((one) => {
+        const words = `${one.name} ${quantity(one.value, one.unit)}, at most ${quantity(one.limit, one.unit)}: `;
+        return el("li", { text: words }, el("b", { class: one.passed ? "good" : "problem", text: one.passed ? "passed" : "not passed" }));
+      });
+      const words = done.verified ? `${kind} is verified${done.saved ? " and saved" : ""}` : `${kind}: ${done.problem}`;
+      const device = done.device ? [el("p", { class: "quiet", text: `The device says: ${done.device}` })] : [];
+      this.result.replaceChildren(el("p", { class: done.verified ? "good" : "problem", text: words }), el("ul", {}, ...checks), ...device);
     } catch (error) {
       this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
     }
-    this.stop.hidden = true;
-    this.progress.textContent = "";
+    this.setRunning(false);
+  }
+
+  prepare(words) {
+    this.isOwn = false; // the answer of the own call says more than the event of its end, which may come after it
+    this.result.replaceChildren();
+    this.turning.hidden = true;
+    this.bar.removeAttribute("value"); // no share is known yet
+    this.progress.textContent = words;
+    this.setRunning(true);
   }
 
   async end() {
@@ -110,24 +87,40 @@ export class CalibrationView {
   }
 
   /** Show an event of the kind `calibration`, whoever began it. */
-  onEvent(event) {
-    const { detail } = event;
-    this.progress.textContent = event.message;
-    if (detail.cells !== undefined) {
-      this.sphere.canvas.hidden = false;
-      this.sphere.draw(detail.cells);
+  onEvent({ message, detail }) {
+    if (detail.phase === "begin" && this.running.hidden) this.prepare(message);
+    this.progress.textContent = message;
+    if (detail.phase === "end") {
+      this.setRunning(false);
+      if (!this.isOwn) this.result.replaceChildren(el("p", { class: detail.verified ? "good" : "problem", text: message + (detail.saved ? " and saved" : "") }));
+    } else {
+      this.setRunning(true);
     }
-    if (detail.field_t) this.progress.textContent += `; field ${number(detail.field_t * 1e6, 1)} µT, residual ${number(detail.residual * 100, 1)} %`;
+    if (detail.cells === undefined) return;
+    this.turning.hidden = false;
+    this.sphere.draw(detail.cells);
+    this.bar.value = detail.progress ?? 0;
+    this.details.replaceChildren(facts(turningRows(detail)));
   }
+}
+
+function turningRows(detail) {
+  const turned = ["x", "y", "z"].map((axis) => [`turned about ${axis}`, `${number((detail[`turned_${axis}_rad`] ?? 0) / DEGREE)}° of 360°`]);
+  return [
+    ["directions", `${quantity(detail.coverage, "")} of the sphere`], ...turned,
+    ["field", detail.field_t ? quantity(detail.field_t, "T") : "not known yet"],
+    ["residual", detail.field_t ? quantity(detail.residual, "") : "not known yet"],
+    ["the device says", detail.device || "–"],
+  ];
 }
 
 export class ActionsView {
   constructor(device, session) {
     this.device = device;
     this.session = session;
-    this.list = el("div");
+    this.list = el("div", { class: "list" });
     this.result = el("div", { class: "result" });
-    this.node = el("div", {}, this.list, this.result);
+    this.node = el("div", {}, this.result, this.list);
     this.load();
   }
 
@@ -149,7 +142,7 @@ export class ActionsView {
     const run = el("button", { type: "button", text: `Run ${action.name}`, onclick: () => this.run(action, inputs) });
     const risk = action.risk ? [el("p", { class: "problem", text: action.risk })] : [];
     const words = this.session.control ? run : el("p", { class: "quiet", text: "Log in to run it." });
-    return el("details", {}, el("summary", { text: `${action.name}: ${action.help}` }), ...risk, ...inputs.map((one) => one.node), words);
+    return el("details", {}, el("summary", {}, el("b", { text: action.name }), ": ", ...marked(action.help)), ...risk, ...inputs.map((one) => one.node), words);
   }
 
   async run(action, inputs) {

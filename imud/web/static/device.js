@@ -14,7 +14,7 @@ const EVENTS_KEPT = 200;
 
 const PLOTS = [
   ["accel_m_s2", "Accelerometer", "m/s²", AXES, { decimals: 2 }],
-  ["gyro_rad_s", "Gyroscope", "°/s", AXES, { scale: 1 / DEGREE, decimals: 2 }],
+  ["gyro_rad_s", "Gyroscope", "°/s", AXES, { scale: 1 / DEGREE, decimals: 1 }],
   ["mag_t", "Magnetometer", "µT", AXES, { scale: 1e6, decimals: 1 }],
   ["euler_rad", "Attitude", "°", ["roll", "pitch", "yaw"], { scale: 1 / DEGREE, decimals: 1, isAngle: true }],
 ];
@@ -28,6 +28,7 @@ export class DevicePage {
     this.span_s = 30;
     this.isPaused = false;
     this.frame = "ENU";
+    this.offset_s = null; // from the daemon's clock to wall-clock time
     this.plots = new Map(PLOTS.map(([member, title, ...more]) => [member, new RollingPlot(member, title, ...more)]));
     this.stamps = new RollingPlot("stamps", "Time stamps", "ms", ["stated error", "latency"], { scale: 1e3, decimals: 3, isLog: true });
     for (const plot of this.plots.values()) plot.node.hidden = true;
@@ -39,7 +40,7 @@ export class DevicePage {
     this.events = el("ol", { class: "events", id: "event-list" });
     this.state = el("span", { class: "pill" });
     this.trouble = el("p", { class: "problem", hidden: true });
-    this.control = el("div", { class: "grid" });
+    this.control = el("div", { class: "control" });
     main.append(this.head(), this.trouble, this.panels(), this.control);
     this.onSession();
     this.look();
@@ -53,7 +54,8 @@ export class DevicePage {
     });
     const span = select("span", SPANS_S, this.span_s, "s", (value) => (this.span_s = value));
     this.pause = el("button", { type: "button", id: "pause", text: "Pause", onclick: () => this.onPause() });
-    const title = el("div", { class: "title" }, el("h1", { text: this.name }), this.state);
+    const back = el("a", { href: "#/", class: "back", text: "← Devices" });
+    const title = el("div", { class: "title" }, back, el("h1", { text: this.name }), this.state);
     return el("div", { class: "device-head" }, title, el("div", { class: "buttons" }, rate, span, this.pause));
   }
 
@@ -99,6 +101,7 @@ export class DevicePage {
 
   add(bucket) {
     const period_s = 1 / this.rate_hz;
+    this.setOffset(bucket.utc_s - bucket.last_s);
     for (const [member, plot] of this.plots) {
       if (bucket[member]) plot.node.hidden = false;
       if (!plot.node.hidden) plot.add(bucket, bucket[member] ?? null, period_s, this.span_s);
@@ -124,6 +127,7 @@ export class DevicePage {
     const trouble = status ? status.problem : `${this.name} is not in the configuration of the daemon`;
     setText(this.trouble, trouble);
     this.trouble.hidden = !trouble;
+    this.setOffset(Date.now() / 1000 - message.now_s);
     if (!status) return;
     this.frame = status.navigation_frame || "ENU";
     if (!this.attitude.quaternion) this.attitude.draw();
@@ -136,11 +140,26 @@ export class DevicePage {
     for (const event of events) {
       if (event.device !== this.name && event.device !== "") continue;
       if (event.event === "calibration") this.calibration.onEvent(event);
+      if (event.event === "calibration" && !["begin", "end"].includes(event.detail.phase)) continue; // twice a second
       const words = el("span", { text: event.message });
-      const when = el("time", { text: number(event.t_s, 3) });
+      const when = el("time", { "data-t": event.t_s, text: this.clockTime(event.t_s) });
       this.events.prepend(el("li", { "data-kind": event.event }, when, el("b", { text: event.event }), words));
     }
     while (this.events.childElementCount > EVENTS_KEPT) this.events.lastChild.remove();
+  }
+
+  /** By the device's first samples, or by the first status of a device that sends none. */
+  setOffset(offset_s) {
+    if (this.offset_s !== null) return;
+    this.offset_s = offset_s;
+    for (const when of this.events.querySelectorAll("time")) when.textContent = this.clockTime(Number(when.dataset.t));
+  }
+
+  /** Local time of day of a time of the daemon's clock. */
+  clockTime(t_s) {
+    if (this.offset_s === null) return "";
+    const at = new Date((t_s + this.offset_s) * 1000);
+    return `${at.toTimeString().slice(0, 8)}.${String(at.getMilliseconds()).padStart(3, "0")}`;
   }
 
   close() {

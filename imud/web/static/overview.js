@@ -17,7 +17,8 @@ export class Overview {
   constructor(main, stream) {
     this.summary = el("p", { id: "summary", class: "quiet" });
     this.grid = el("div", { class: "cards" });
-    main.append(el("h1", { text: "Devices" }), this.summary, this.grid);
+    this.none = el("p", { class: "quiet", hidden: true, text: "The configuration of the daemon has no devices: see imud setup." });
+    main.append(el("h1", { text: "Devices" }), this.summary, this.none, this.grid);
     this.cards = new Map();
     stream.look({ look: "overview" });
   }
@@ -26,6 +27,7 @@ export class Overview {
     if (message.kind !== "overview") return;
     const well = message.devices.filter((row) => row.is_well).length;
     setText(this.summary, `${well} of ${message.devices.length} devices well, ${message.clients} ${message.clients === 1 ? "client" : "clients"} of the daemon`);
+    this.none.hidden = message.devices.length > 0;
     const names = message.devices.map((row) => row.name);
     if (names.join("\n") !== [...this.cards.keys()].join("\n")) {
       this.cards = new Map(message.devices.map((row) => [row.name, makeCard(row.name)]));

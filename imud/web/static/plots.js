@@ -9,8 +9,13 @@ const DRAW_MS = 66;
 const HOLE_BUCKETS = 3; // without buckets for that many periods the line is broken
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
-const ink = () => (dark.matches ? "#a9b4c4" : "#5b6675");
-const grid = () => (dark.matches ? "#2b3443" : "#e4e8ee");
+export const ink = () => (dark.matches ? "#a9b4c4" : "#5b6675");
+export const grid = () => (dark.matches ? "#2b3443" : "#e4e8ee");
+
+/** Labels of a linear axis. */
+export function labels(_, splits) {
+  return splits.map((at) => at.toLocaleString("en", { maximumFractionDigits: 6, useGrouping: false }).replace("-", "−"));
+}
 
 /** Labels of a logarithmic axis: powers of ten only. */
 export function powers(_, splits) {
@@ -48,7 +53,7 @@ export class RollingPlot {
   }
 
   size() {
-    return { width: Math.max(this.box.clientWidth, 120), height: 220 };
+    return { width: Math.max(this.box.clientWidth, 120), height: Math.max(this.box.clientHeight, 220) };
   }
 
   begin() {
@@ -63,7 +68,7 @@ export class RollingPlot {
       {
         ...this.size(), series: [{}, ...series], bands, legend: { show: false },
         cursor: { sync: { key: "time" }, drag: { x: false, y: false }, points: { show: false } },
-        axes: [axis({ values: seconds, space: 80, size: 30 }), axis({ size: 52, ...(this.isLog && { values: powers }) })],
+        axes: [axis({ values: seconds, space: 80, size: 30 }), axis({ size: 52, values: this.isLog ? powers : labels })],
         scales: { y: this.isLog ? { distr: 3 } : {}, x: { time: true, range: () => [this.newest - this.span_s, this.newest] } },
         hooks: { setCursor: [() => this.showValues()] },
       },

@@ -1,11 +1,13 @@
 // The spectrum as a plot, with the highest peak named.
 
-import { COLOURS, powers } from "./plots.js";
+import { COLOURS, grid, ink, powers } from "./plots.js";
 import { Spectrum } from "./spectrum.js";
 import { AXES, el, number, setText } from "./util.js";
 
 const UNITS = { accel_m_s2: "m/s²/√Hz", gyro_rad_s: "rad/s/√Hz", mag_t: "T/√Hz" };
 const NAMES = { accel_m_s2: "accelerometer", gyro_rad_s: "gyroscope", mag_t: "magnetometer" };
+
+const OFF = "Choose a vector. Every sample of it is sent then, and transformed here.";
 
 export class SpectrumPlot {
   /** onChoice(member) when another vector is chosen; "" for none. */
@@ -15,11 +17,14 @@ export class SpectrumPlot {
     this.choice = el("select", { id: "spectrum-of", "aria-label": "spectrum of" }, el("option", { value: "", text: "off" }), ...choices);
     this.choice.addEventListener("change", () => {
       this.clear();
+      this.box.hidden = !this.member;
+      setText(this.note, this.member ? "collecting samples" : OFF);
       onChoice(this.member);
     });
-    this.note = el("p", { class: "quiet", text: "Choose a vector. Every sample of it is sent then, and transformed here." });
+    this.note = el("p", { class: "quiet", text: OFF });
     this.box = el("div", { class: "plot" });
-    this.node = el("div", {}, this.choice, this.box, this.note);
+    this.node = el("div", { class: "fill" }, el("div", { class: "buttons" }, this.choice), this.box, this.note);
+    this.box.hidden = true;
     new ResizeObserver(() => this.plot && this.box.clientWidth && this.plot.setSize(this.size())).observe(this.box);
   }
 
@@ -28,7 +33,7 @@ export class SpectrumPlot {
   }
 
   size() {
-    return { width: Math.max(this.box.clientWidth, 120), height: 220 };
+    return { width: Math.max(this.box.clientWidth, 120), height: Math.max(this.box.clientHeight, 220) };
   }
 
   clear() {
@@ -63,9 +68,7 @@ export class SpectrumPlot {
   }
 
   begin() {
-    const ink = getComputedStyle(this.box).getPropertyValue("--quiet");
-    const line = getComputedStyle(this.box).getPropertyValue("--line");
-    const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 } };
+    const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 } };
     this.plot = new uPlot(
       {
         ...this.size(), legend: { show: false }, cursor: { drag: { x: true, y: false } },

@@ -15,6 +15,17 @@ export function el(tag, attributes = {}, ...children) {
 export const DEGREE = Math.PI / 180;
 export const AXES = ["x", "y", "z"];
 
+/** The context of a square canvas of `size` CSS pixels, cleared, as sharp as the screen. */
+export function cleared(canvas, size) {
+  const scale = Math.max(devicePixelRatio || 1, 1);
+  const pixels = Math.round(size * scale);
+  if (canvas.width !== pixels || canvas.height !== pixels) canvas.width = canvas.height = pixels;
+  const context = canvas.getContext("2d");
+  context.setTransform(scale, 0, 0, scale, 0, 0);
+  context.clearRect(0, 0, size, size);
+  return context;
+}
+
 /** A number with so many decimals and a true minus sign; "–" for none. */
 export function number(value, decimals = 0) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
@@ -38,13 +49,30 @@ export function duration(seconds) {
   return size < 172800 ? `${number(seconds / 3600, 0)} h` : `${number(seconds / 86400, 0)} d`;
 }
 
+const SHOWN_UNITS = { rad: [1 / DEGREE, "°"], "rad/s": [1 / DEGREE, "°/s"], T: [1e6, "µT"], "": [100, "%"] };
+
+/** A value in SI with three digits and the unit that people read; a value without a unit is a share. */
+export function quantity(value, unit) {
+  if (value === null || value === undefined) return "–";
+  const [factor, name] = SHOWN_UNITS[unit] ?? [1, unit];
+  const shownValue = value * factor;
+  const isTiny = shownValue !== 0 && Math.abs(shownValue) < 0.01;
+  const text = isTiny ? "< 0.01" : shownValue.toLocaleString("en", { maximumSignificantDigits: 3 }).replace("-", "−");
+  return name === "°" ? text + name : `${text} ${name}`;
+}
+
 /** A value of a setting or an identity as text. */
 export function shown(value) {
   if (value === null || value === undefined) return "–";
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
 
-/** A panel with its title; `more` stands beside the title. */
+/** A text whose words between backticks are those of a command line. */
+export function marked(text) {
+  return text.split("`").map((part, index) => (index % 2 ? el("code", { text: part }) : part));
+}
+
+/** A panel with its title. */
 export function panel(id, title, ...children) {
   return el("section", { id, class: "panel" }, el("h2", { text: title }), ...children);
 }

@@ -1,0 +1,148 @@
+"""Calibrations through the page in a real browser: a module that is turned, its sphere, its result."""
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imud.client import Client
+from imud.formats.jsonrpc import RpcError
+from imud.runtime.calibration.turning import COVERAGE_WANTED
+from tests.support.daemon_process import RunningDaemon, daemon_with_module
+from tests.web.browser import LIMIT_S, MISSING, Page, browser, log_in, open_page, serving_web
+from tests.web.turned import BIAS, turned_module
+
+pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
+
+TOKEN = "correct-horse-battery-staple"
+COVERED = "return Number(document.querySelector('#calibration canvas').dataset.covered)"
+BEGIN = "#calibration [data-kind={}] button"
+PIXEL = """const { onSphere, coveredCells, cellDirection } = await import('/static/sphere.js');
+    const canvas = document.querySelector('#calibration canvas');
+    const scale = canvas.width / 240;
+    const colour = (cell) => {
+        const [x, y] = onSphere(cellDirection(cell));
+        return [...canvas.getContext('2d').getImageData(x * scale, y * scale, 1, 1).data].join();
+    };
+    const { sphere } = window.imud.view.calibration;
+    sphere.draw(args[0]);
+    return coveredCells(args[0]).map((is, cell) => [is, onSphere(cellDirection(cell))[2] > 0.3, colour(cell)]);"""
+"""Of each cell of a mask: whether it is covered, whether it is in front, and the colour in its middle."""
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """One browser for all tests."""
+    with browser(tmp_path_factory.mktemp("browser")) as one:
+        yield one
+
+
+@pytest.fixture
+def page(window: Page) -> Page:
+    """Its tab, with no page open, without a cookie, and with nothing in its log."""
+    window.driver.delete_all_cookies()
+    window.driver.get("about:blank")
+    window.problems()
+    return window
+
+
+@pytest.fixture
+def token(tmp_path: Path) -> str:
+    file = tmp_path / "token"
+    file.write_text(TOKEN)
+    return str(file)
+
+
+def calibrate(daemon: RunningDaemon, kind: str) -> Any:
+    with Client(daemon.socket, timeout_s=LIMIT_S) as client:
+        return client.call("calibrate", device="bow", kind=kind)
+
+
+def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path, token: str) -> None:
+    with turned_module(tmp_path) as daemon, serving_web(daemon.socket, "--token-file", token) as url:
+        open_page(page, url, "bow")
+        page.until("return document.querySelectorAll('#calibration details').length >= 5")
+        log_in(page, TOKEN)
+        page.until("return document.querySelector(arguments[0])", BEGIN.format("magnetometer"))
+        page.click(BEGIN.format("magnetometer"))
+        page.until("return document.querySelector('#calibration-stop')?.getClientRects().length")
+        assert page.js("return document.querySelector(arguments[0]).disabled", BEGIN.format("level"))
+        first = page.until(COVERED)
+        page.until(f"{COVERED} > arguments[0]", first)
+        page.until_text("#calibration .facts", "turned about x")
+        page.until_text("#calibration-result", "magnetometer is verified and saved")
+        result = page.text("#calibration-result")
+        assert "field strength 45.1 µT, at most 67 µT: passed" in result
+        assert "residual of the field" in result
+        assert f"The device says: {BIAS}" in result
+        assert page.js(COVERED) >= COVERAGE_WANTED * 48, "those of the field that the device has corrected"
+        assert "field\n45.1 µT" in page.text("#calibration .facts")
+        assert not page.js("return document.querySelector('#calibration-stop').getClientRects().length")
+        assert not page.js("return document.querySelector(arguments[0]).disabled", BEGIN.format("level"))
+        kinds = page.js("return [...document.querySelectorAll('#event-list li')].map((one) => one.dataset.kind)")
+        assert kinds.count("calibration") == 2, "its begin and its end; what is between is the sphere"
+        assert page.problems() == []
+
+
+def test_without_the_token_a_calibration_is_seen_and_not_controlled(page: Page, tmp_path: Path, token: str) -> None:
+    with (
+        turned_module(tmp_path) as daemon,
+        serving_web(daemon.socket, "--token-file", token) as url,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        open_page(page, url, "bow")
+        page.until("return document.querySelector('#calibration').textContent.includes('Log in to begin it.')")
+        assert not page.js("return document.querySelector('#calibration button')")
+        ask = """const { call } = await import('/static/util.js');
+            return call(args[0], { device: 'bow', kind: 'level' }).catch((error) => error.message)"""
+        for method in ("calibrate", "stop_calibration"):
+            assert page.module(ask, method) == "expected the token: log in first"
+        running: Future[Any] = pool.submit(calibrate, daemon, "magnetometer")
+        page.until(COVERED)
+        page.until_text("#calibration-progress", "of the directions and turns")
+        assert not page.js("return document.querySelector('#calibration-stop')")
+        with daemon.client() as client:
+            client.call("stop_calibration", device="bow")
+        with pytest.raises(RpcError, match="was cancelled"):
+            running.result(LIMIT_S)
+        page.until_text("#calibration-result", "calibration magnetometer: it was cancelled")
+        assert page.js("return document.querySelector('#calibration .running').hidden")
+        assert [one for one in page.problems() if "401" not in one] == []
+
+
+def test_it_is_stopped_and_says_what_is_missing(page: Page, tmp_path: Path, token: str) -> None:
+    with turned_module(tmp_path) as daemon, serving_web(daemon.socket, "--token-file", token) as url:
+        open_page(page, url, "bow")
+        log_in(page, TOKEN)
+        page.until("return document.querySelector(arguments[0])", BEGIN.format("level"))
+        page.click(BEGIN.format("level"))
+        page.until_text("#calibration-progress", "waiting for rest: ")
+        page.click("#calibration-stop")
+        page.until_text("#calibration-result", "the calibration was cancelled")
+        page.until("return !document.querySelector(arguments[0]).disabled", BEGIN.format("level"))
+
+
+def test_an_error_of_the_daemon_is_shown(page: Page, tmp_path: Path, token: str) -> None:
+    with daemon_with_module(tmp_path) as daemon, serving_web(daemon.socket, "--token-file", token) as url:
+        open_page(page, url, "bow")
+        log_in(page, TOKEN)
+        page.until("return document.querySelector(arguments[0])", BEGIN.format("magnetometer"))
+        page.click(BEGIN.format("magnetometer"))
+        page.until_text("#calibration-result", "magnetometer: expected 9-axis mode")
+        page.until("return document.querySelector('#calibration .running').hidden")
+
+
+def test_the_sphere_has_the_colour_of_what_is_covered(page: Page, tmp_path: Path) -> None:
+    mask = "0f0f0f0f0f0f"
+    with daemon_with_module(tmp_path) as daemon, serving_web(daemon.socket) as url:
+        open_page(page, url, "bow")
+        page.js("window.imud.view.calibration.turning.hidden = false")
+        cells = [tuple(one) for one in page.module(PIXEL, mask)]
+    front = {(is_covered, colour) for is_covered, is_near, colour in cells if is_near}
+    covered = {colour for is_covered, colour in front if is_covered}
+    open_ = {colour for is_covered, colour in front if not is_covered}
+    assert covered
+    assert open_
+    assert not covered & open_
