@@ -1,6 +1,7 @@
 """Takes the screenshots of `imud web` for README.md and docs/views.md: `make web-pictures`.
 
-Three simulated modules, one of them with faults on its line, in a real browser: docs/pictures/web-*.png.
+Three simulated modules, one of them with faults on its line, in a real browser; and one that is turned: web-*.png in
+docs/pictures.
 """
 
 import subprocess
@@ -12,7 +13,8 @@ from pathlib import Path
 
 from tests.support.daemon_process import running_daemon
 from tests.support.files import ROOT
-from tests.web.browser import MISSING, Page, browser, serving_web
+from tests.web.browser import MISSING, Page, browser, log_in, open_page, serving_web
+from tests.web.turned import turned_module
 
 FOLDER = ROOT / "docs/pictures"
 MODULES = {
@@ -67,10 +69,7 @@ def desktop(folder: Path, url: str) -> None:
         page.until("return [...document.querySelectorAll('.card .pill')].every((one) => one.innerText === 'running')")
         page.until_text(".card", "regression")
         shot(page, "overview")
-        page.js("document.querySelector('#login').click()")
-        page.js("document.querySelector('#token').value = arguments[0]", TOKEN)
-        page.click("#login-form button[type=submit]")
-        page.until("return window.imud.session.control")
+        log_in(page, TOKEN)
         page.driver.get(f"{url}#/device/bow")
         page.driver.set_window_size(1320, 2400)
         page.until("return Boolean(window.imud?.view?.plots)")
@@ -90,6 +89,24 @@ def phone(folder: Path, url: str) -> None:
         shot(page, "phone")
 
 
+def calibration(folder: Path) -> None:
+    """The panel of a calibration while the module is turned."""
+    token = folder / "token"
+    token.write_text(TOKEN)
+    with (
+        turned_module(folder) as daemon,
+        serving_web(daemon.socket, "--token-file", str(token)) as url,
+        browser(folder / "calibration", (1320, 900)) as page,
+    ):
+        open_page(page, url, "bow")
+        log_in(page, TOKEN)
+        page.until("return document.querySelector('#calibration [data-kind=magnetometer] button')")
+        page.click("#calibration [data-kind=magnetometer] button")
+        page.until("return Number(document.querySelector('#calibration canvas').dataset.covered) > 18")
+        (panel,) = page.driver.find_elements("css selector", "#calibration")
+        assert panel.screenshot(str(FOLDER / "web-calibration.png"))
+
+
 def main() -> None:
     """Take all of them."""
     if MISSING:
@@ -105,6 +122,8 @@ def main() -> None:
         url = stack.enter_context(serving_web(daemon.socket, "--token-file", str(token)))
         desktop(folder, url)
         phone(folder, url)
+    with tempfile.TemporaryDirectory(prefix="imud-web-") as name:
+        calibration(Path(name))
 
 
 if __name__ == "__main__":
