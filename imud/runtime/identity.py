@@ -4,8 +4,8 @@ A device that was unplugged and connected again may be another one, or have othe
 """
 
 import logging
-from collections.abc import Callable, Mapping
-from itertools import islice
+from collections.abc import Callable, Iterator, Mapping
+from itertools import chain, islice, repeat
 
 from imud.contracts.driver import Identity
 from imud.contracts.session import RequestScript
@@ -18,10 +18,17 @@ from imud.runtime.notices import Notices
 log = logging.getLogger(__name__)
 
 IDENTIFY_TRIES = 3
-IDENTIFY_AGAIN_S = (5, 30, 120)
-"""Pauses before a device that streams is asked again; then it is taken for one that cannot be asked (RX not wired)."""
+IDENTIFY_AGAIN_S = (5, 30, 120, 300)
+"""Pauses before a device that has not answered is asked again, the last of them for ever: right after a plug requests
+and replies can be lost, and a line that is wired later, or a host that is busy for minutes, must not cost the identity
+until the next plug. One whose RX is not wired gets one request in five minutes for nothing."""
 WORDS_MAX = 200
 """Settings or details of one device; the HI14 has the most, some 60."""
+
+
+def pauses_s() -> Iterator[int]:
+    """Return the pauses before the further requests to a device that has not answered, without an end."""
+    return chain(IDENTIFY_AGAIN_S, repeat(IDENTIFY_AGAIN_S[-1]))
 
 
 def ignore_settings(_settings: Mapping[str, str]) -> None:
@@ -44,6 +51,8 @@ class KnownIdentity:
         """By the device's own names."""
         self.shown_settings: Mapping[str, str] = {}
         """The same for people."""
+        self.answered = False
+        """Whether the device told all of it when it was asked last."""
         self._notices = notices
         self._now_ns = now_ns
         self._on_settings = on_settings
@@ -57,15 +66,18 @@ class KnownIdentity:
         apply: Callable[[Identity], None],
         tries: int = IDENTIFY_TRIES,
     ) -> bool:
-        """Ask for identity and settings; `apply` gets the identity. Return whether the device answered.
+        """Ask for identity and settings; `apply` gets the identity. Return whether the device answered both.
 
-        What is known of a device that does not answer is left as it is.
+        What is known of a device that does not answer is left as it is; one that tells its identity only has that.
         """
+        self.answered = False
         for attempt in range(1, tries + 1):
             try:
                 identity = await exchange.run(identify())
                 apply(identity)
-                self.update(identity, await exchange.run(read_settings()))
+                self._keep_identity(identity)
+                self._keep_settings(await exchange.run(read_settings()))
+                self.answered = True
                 return True
             except CommandError as error:
                 log.info("%s: %s (try %d of %d)", self._notices.device, error, attempt, tries)
@@ -73,20 +85,28 @@ class KnownIdentity:
 
     def update(self, identity: Identity, settings: Mapping[str, str]) -> None:
         """Keep what the device said; raise an event for what differs from before."""
-        identity, settings = printable_identity(identity), printable_words(settings)
-        shown = printable_words(self._describe(settings))
-        now_ns, before, known = self._now_ns(), self.identity, self.shown_settings
-        identity = completed(identity, before)
+        self._keep_identity(identity)
+        self._keep_settings(settings)
+
+    def _keep_identity(self, identity: Identity) -> None:
+        """Keep who the device says it is; raise an event when it is another one than before."""
+        before = self.identity
+        self.identity = identity = completed(printable_identity(identity), before)
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
             serial_number = identity.serial_number
-            self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, serial_number=serial_number)
+            self._notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message, serial_number=serial_number)
+
+    def _keep_settings(self, settings: Mapping[str, str]) -> None:
+        """Keep the settings that the device said; raise an event for those that differ from before."""
+        settings, known = printable_words(settings), self.shown_settings
+        shown = printable_words(self._describe(settings))
         changed = {name: value for name, value in shown.items() if known.get(name, value) != value}
         if changed:
             words = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
             message = f"settings of the device changed: {words}"
-            self._notices.raise_event(now_ns, EventKind.CONFIGURATION, message, **changed)
-        self.identity, self.settings, self.shown_settings = identity, settings, shown
+            self._notices.raise_event(self._now_ns(), EventKind.CONFIGURATION, message, **changed)
+        self.settings, self.shown_settings = settings, shown
         self._on_settings(settings)
 
 

@@ -5,7 +5,8 @@
       └────────────────┴──────────────────────────────────────┘
 
 Where driver and rate are configured there is no round: `begin` has set up the device at once. A device that sends
-nothing and answers is not searched again: `answers` asks it where it is, before its rate is left.
+nothing and answers is not searched again: `answers` asks it where it is, before its rate is left. A device that has not
+answered is asked again while the loop waits, whatever else is requested meanwhile, until it answers.
 """
 
 import asyncio
@@ -17,6 +18,8 @@ from imud.errors import NothingHeard
 from imud.host_clock import HostClock
 from imud.runtime.attachments import Attachments
 from imud.runtime.health import Health
+from imud.runtime.identity import pauses_s
+from imud.units import NS_PER_S
 
 
 class BegunRound(Protocol):
@@ -46,10 +49,13 @@ class SearchLoop:
         host: HostClock,
         begin: Callable[[], BegunRound | None],
         ask: Callable[[], Awaitable[None]],
+        ask_again: Callable[[], Awaitable[None]],
+        unanswered: Callable[[], bool],
         answers: Callable[[], Awaitable[bool]] = never_answers,
     ) -> None:
         """`begin` starts a round, or sets up the configured device and returns None; `ask` is called after each.
 
+        `ask_again` is called after ever longer pauses for as long as `unanswered`.
         `answers` is called when another search was requested, and returns whether none is needed.
         """
         self._health = health
@@ -57,6 +63,8 @@ class SearchLoop:
         self._host = host
         self._begin = begin
         self._ask = ask
+        self._ask_again = ask_again
+        self._unanswered = unanswered
         self._answers = answers
         self._round: BegunRound | None = None
         self._again = asyncio.Event()
@@ -64,13 +72,6 @@ class SearchLoop:
     @property
     def requested(self) -> bool:
         """Whether another search was requested and has not begun."""
-        return self._again.is_set()
-
-    async def requested_within(self, limit_s: float) -> bool:
-        """Wait `limit_s`, or until another search is requested; return whether it is."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(limit_s):
-                await self._again.wait()
         return self._again.is_set()
 
     def start(self) -> None:
@@ -103,12 +104,20 @@ class SearchLoop:
             self.start()
 
     async def _needed(self) -> None:
-        """Return when another search is needed."""
+        """Return when another search is needed; until then ask a device again that has not answered."""
+        now_ns, pauses = self._host.now_ns, pauses_s()
+        due_ns = now_ns() + next(pauses) * NS_PER_S
         while True:
-            await self._again.wait()
-            self._again.clear()
-            if not await self._answers():
-                return
+            with suppress(TimeoutError):
+                async with asyncio.timeout((due_ns - now_ns()) / NS_PER_S if self._unanswered() else None):
+                    await self._again.wait()
+            if self._again.is_set():
+                self._again.clear()
+                if not await self._answers():
+                    return
+            else:
+                await self._ask_again()
+                due_ns = now_ns() + next(pauses) * NS_PER_S
 
     async def _finish_search(self) -> None:
         while self._round is not None:

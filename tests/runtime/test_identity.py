@@ -11,7 +11,7 @@ from imud.runtime.notices import Notices
 
 def test_only_differences_are_reported() -> None:
     events: list[Event] = []
-    times_ns = iter((1, 2, 3, 4))
+    times_ns = iter((3, 4))  # one for each event
     known = KnownIdentity(Notices("bow", Ledger(), events.append), lambda: next(times_ns))
     known.update(Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200"})
     known.update(Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200", "NEW": "1"})

@@ -49,7 +49,13 @@ class CanTransport:
         self._latency_ns = 0
         self._also: Sequence[CanFilter] = ()
         """Frames that can answer the outstanding request although they are none of the device's replies."""
-        self._search = SearchLoop(context.health, context.attachments, context.host, self._begin_search, self._ask)
+        self._search = SearchLoop(
+            *(context.health, context.attachments, context.host),
+            begin=self._begin_search,
+            ask=self._ask,
+            ask_again=self._ask_once,
+            unanswered=lambda: self._may_ask and not context.identity.answered,
+        )
         self._round: CanRound | None = None
         """The search that frames go to; None while they go to the path."""
         self._options: Settings | None = None
@@ -197,6 +203,9 @@ class CanTransport:
             self.link.send_cyclic(frames)
         await self._identify(IDENTIFY_TRIES)
 
+    async def _ask_once(self) -> None:
+        await self._identify(1)
+
     async def read_back(self) -> None:
         """Ask for identity and settings again."""
         with suppress(LinkError):  # whoever waits for the link's end learns of it
@@ -204,7 +213,7 @@ class CanTransport:
 
     async def _identify(self, tries: int) -> None:
         driver, options = self.driver, self._options
-        if driver is not None and self.link.writable and self._config.identify:
+        if driver is not None and self._may_ask:
             await self._context.identity.ask(
                 self._exchange,
                 lambda: driver.identify(options),
@@ -330,6 +339,10 @@ class CanTransport:
     @property
     def _searchable(self) -> bool:
         return self._config.driver == "auto"
+
+    @property
+    def _may_ask(self) -> bool:
+        return self._config.identify and self.link.writable
 
 
 def _changed(before: Settings | None, after: Settings) -> str:

@@ -19,7 +19,7 @@ from imud.runtime.detection import StreamFound
 from imud.runtime.detection.remembered import Remembered, RememberedDevice
 from imud.runtime.detection.rounds import StreamRound
 from imud.runtime.exchange import Exchange
-from imud.runtime.identity import IDENTIFY_AGAIN_S, IDENTIFY_TRIES
+from imud.runtime.identity import IDENTIFY_TRIES
 from imud.runtime.latency.stream_hold import StreamHold
 from imud.runtime.path import SamplePath, StreamPath
 from imud.runtime.recording.tap import PathParts
@@ -55,7 +55,12 @@ class StreamTransport:
             context.ledger, self._send, self._now_ns, self._change_rate, on_busy=lambda _busy: self._release()
         )
         self._search = SearchLoop(
-            context.health, context.attachments, context.host, self._begin_search, self._ask, self._still_answers
+            *(context.health, context.attachments, context.host),
+            begin=self._begin_search,
+            ask=self._ask,
+            ask_again=self._ask_once,
+            unanswered=lambda: self._may_ask and not context.identity.answered,
+            answers=self._still_answers,
         )
         self._discard = _Discard(context.ledger)
         self._receiver: DataReceiver = self._discard
@@ -151,10 +156,11 @@ class StreamTransport:
         """Ask for identity and settings, and start the streaming of a silent device, where asking is allowed."""
         driver = self.driver
         if self._may_ask and driver is not None:
-            answered = await self._identify(IDENTIFY_TRIES)
+            await self._identify(IDENTIFY_TRIES)
             await self._wake(driver)
-            if not answered:
-                await self._identify_later()
+
+    async def _ask_once(self) -> None:
+        await self._identify(1)
 
     async def _identify(self, tries: int) -> bool:
         """Ask for identity and settings; return whether the device answered."""
@@ -165,12 +171,6 @@ class StreamTransport:
         return await self._context.identity.ask(
             self._exchange, driver.identify, driver.read_settings, self._apply, tries
         )
-
-    async def _identify_later(self) -> None:
-        """Ask a device again that streams and has not answered: right after a plug its replies can be lost or late."""
-        for pause_s in IDENTIFY_AGAIN_S:
-            if await self._search.requested_within(pause_s) or await self._identify(1):
-                return
 
     async def read_back(self) -> None:
         """Ask for identity and settings again."""

@@ -1,6 +1,7 @@
 """The life of a device on a CAN bus inside the process: streams, loses frames by cause, bus down and up."""
 
 from collections.abc import Callable, Coroutine, Sequence
+from itertools import pairwise
 from random import Random
 from time import monotonic_ns
 from typing import Any
@@ -20,6 +21,7 @@ from imud.formats.can import CanFrame
 from imud.links.memory import MemorySettings
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.device_rig import play as play_rigs
+from tests.support.event_loops import VirtualClock
 
 MS = 1_000_000
 
@@ -163,6 +165,26 @@ def test_frames_from_before_a_loss_are_not_mixed_with_those_after() -> None:
 
     rig = play(story)
     assert rig.samples == []
+
+
+def test_a_device_that_has_not_answered_is_asked_on() -> None:
+    """Nobody answers: after the first minutes one try in five, as on a serial line."""
+    clock = VirtualClock()
+    rigs = DeviceRigs(clock.host)
+    rig = rigs.add(configured("hipnuc-canopen", HipnucCanopenSettings(node=8)))
+
+    async def story(_made: list[DeviceRig]) -> None:
+        await rig.until(lambda: rig.can_link.listening)
+        counts = []
+        for pass_s in (1.0, 180.0, 310.0, 310.0, 310.0):
+            end_ns = clock.now_ns() + int(pass_s * 1e9)
+            await rig.until(lambda end_ns=end_ns: clock.now_ns() > end_ns, limit_s=pass_s + 1, step_s=0.1)  # type: ignore[misc]
+            counts.append(len(rig.can_link.written))
+        tries = [after - before for before, after in pairwise(counts)]
+        assert tries[1] == tries[2] == tries[3] > 0
+        assert tries[0] > tries[1]
+
+    play_rigs(rigs, story, clock)
 
 
 def test_bus_down_and_up() -> None:

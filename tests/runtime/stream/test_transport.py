@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from time import monotonic_ns
 from typing import Any
 
@@ -280,33 +281,113 @@ def test_a_device_that_has_just_been_opened_is_given_time() -> None:
     play(story)
 
 
-@pytest.mark.parametrize("deaf_to", [3, 5, 6])
-def test_a_device_that_streams_and_did_not_answer_is_asked_again(deaf_to: int) -> None:
-    """Three tries, then one after 5, 30 and 120 s; a device that answers none of them is left alone."""
-    clock = VirtualClock()
-    rigs = DeviceRigs(clock.host)
-    rig = rigs.add(configured(identify=True))
-    ms = seen = asked = 0
+class DeafModule:
+    """A module that streams, and answers from a request for its version on; in virtual time."""
 
-    def send() -> None:
-        nonlocal ms, seen, asked
-        ms += 250
-        assert rig.link.feed(hi91(ms), clock.now_ns())
-        for request in rig.link.written[seen:]:
-            seen += 1
-            asked += b"VERSION" in request
-            if asked > deaf_to:
+    def __init__(self, deaf_to: int, deaf_to_settings: int = 0) -> None:
+        self.clock = VirtualClock()
+        self.rigs = DeviceRigs(self.clock.host)
+        self.rig = self.rigs.add(configured(identify=True))
+        self.asked_ns: list[int] = []
+        """When it was asked for its version."""
+        self.paused = False
+        """It sends nothing, and hears."""
+        self._deaf_to, self._deaf_to_settings = deaf_to, deaf_to_settings
+        self._ms = self._seen = 0
+
+    def step(self) -> None:
+        """A frame every 0.25 s, and the replies."""
+        self._ms += 250
+        if not self.paused:
+            assert self.rig.link.feed(hi91(self._ms), self.clock.now_ns())
+        for request in self.rig.link.written[self._seen :]:
+            self._seen += 1
+            if b"VERSION" in request:
+                self.asked_ns.append(self.clock.now_ns())
+            if len(self.asked_ns) > self._deaf_to + self._deaf_to_settings * (b"VERSION" not in request):
                 reply = VERSION % b"043995698D6E1708" if b"VERSION" in request else b"COM1=115200\r\nOK\r\n"
-                assert rig.link.feed(reply, clock.now_ns())
+                assert self.rig.link.feed(reply, self.clock.now_ns())
 
-    async def story(_made: list[DeviceRig]) -> None:
-        await rig.until(lambda: rig.link.listening)
-        end_ns = clock.now_ns() + 300_000 * MS
-        await rig.until(lambda: clock.now_ns() > end_ns, limit_s=400.0, step=send, step_s=0.25)
-        assert asked == min(deaf_to + 1, 6)
-        assert rig.device.status().identity.get("product") == ("HI14R3" if deaf_to < 6 else None)
+    async def pass_s(self, duration_s: float) -> None:
+        """Let time pass."""
+        end_ns = self.clock.now_ns() + int(duration_s * 1e9)
+        await self.rig.until(lambda: self.clock.now_ns() > end_ns, limit_s=duration_s + 1, step=self.step, step_s=0.25)
 
-    play_rigs(rigs, story, clock)
+    @property
+    def product(self) -> str | None:
+        """What is known of it."""
+        return self.rig.device.status().identity.get("product")
+
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Run the device while the story is told."""
+
+        async def told(_made: list[DeviceRig]) -> None:
+            await self.rig.until(lambda: self.rig.link.listening)
+            await story()
+
+        play_rigs(self.rigs, told, self.clock)
+
+
+@pytest.mark.parametrize("deaf_to", [3, 5, 6, 9])
+def test_a_device_that_streams_and_did_not_answer_is_asked_until_it_does(deaf_to: int) -> None:
+    """Three tries, then one after 5, 30 and 120 s, then every five minutes."""
+    module = DeafModule(deaf_to)
+
+    async def story() -> None:
+        await module.pass_s(2000)
+        assert len(module.asked_ns) == deaf_to + 1
+        assert module.product == "HI14R3"
+
+    module.play(story)
+
+
+def test_a_device_that_never_answers_gets_a_request_in_five_minutes() -> None:
+    module = DeafModule(1_000_000)
+
+    async def story() -> None:
+        await module.pass_s(3600)
+        pauses_s = [(after - before) / 1e9 for before, after in pairwise(module.asked_ns)]
+        for pause_s, wanted_s in zip(pauses_s[2:5], (5, 30, 120), strict=True):
+            assert wanted_s <= pause_s < wanted_s + 3  # a request waits for its reply before the pause
+        assert len(pauses_s[5:]) == 11
+        assert all(300 <= pause_s < 303 for pause_s in pauses_s[5:])
+        assert module.product is None
+
+    module.play(story)
+
+
+def test_a_device_that_is_silent_for_a_moment_before_it_has_answered_is_asked_on() -> None:
+    """The request at its silence is lost, too, and its samples come back meanwhile: no search, and no last request."""
+    module = DeafModule(5)
+
+    async def story() -> None:
+        await module.pass_s(12)
+        assert len(module.asked_ns) == 4  # the next pause is of 30 s
+        module.paused = True
+        await module.rig.until(lambda: len(module.asked_ns) == 5, step=module.step, step_s=0.25)
+        assert module.rig.is_in(DeviceState.SILENT)
+        module.paused = False
+        module.step()  # within the time of that request
+        await module.pass_s(2)
+        assert module.rig.is_in(DeviceState.RUNNING)
+        assert module.product is None
+        await module.pass_s(200)
+        assert module.product == "HI14R3"
+
+    module.play(story)
+
+
+def test_a_device_whose_settings_are_lost_has_told_its_product_already() -> None:
+    module = DeafModule(0, deaf_to_settings=4)
+
+    async def story() -> None:
+        await module.pass_s(4)
+        assert module.product == "HI14R3"
+        assert not module.rig.device.status().settings
+        await module.pass_s(60)
+        assert module.rig.device.status().settings
+
+    module.play(story)
 
 
 @pytest.mark.parametrize("baud", [115200, "auto"])
