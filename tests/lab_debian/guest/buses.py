@@ -165,6 +165,7 @@ def configured_chronyd() -> Iterator[None]:
         Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd 4.3 leaves it
         for name in CHRONY_FILES:
             Path(name).unlink()
+        Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd is no longer root when it ends
         must("systemctl", "daemon-reload")
 
 
