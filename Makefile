@@ -6,7 +6,9 @@
 #                                                                   (14 minutes; ARGS=--short: at most 5)
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
-# make mqtt-deps   installs mosquitto, for the tests of the output mqtt
+# make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
+# make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
+# make fleet-load    1,000 simulated gateways, one broker, one collector   make fleet-cluster  three NATS servers, one is killed
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
 # make pictures   the pictures of README.md and docs/, into docs/pictures
@@ -79,6 +81,16 @@ audit: $(VENV)/made
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)
 
+.PHONY: fleet-faults fleet-load fleet-cluster
+fleet-faults: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_faults $(ARGS)
+
+fleet-load: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_load $(ARGS)
+
+fleet-cluster: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_cluster $(ARGS)
+
 soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)
 
@@ -121,7 +133,7 @@ monitoring-deps:
 
 .PHONY: mqtt-deps
 mqtt-deps:
-	apt-get install --yes --no-install-recommends mosquitto openssl
+	apt-get install --yes --no-install-recommends mosquitto openssl nats-server
 
 lab-deps:
 	tests/lab/deps

@@ -72,12 +72,12 @@ def gpsd_us(program: str, load: Load) -> float:
         arguments = ["--gpsd", str(port), "--clients", str(load.clients)]
         readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *arguments))
         readers.line()
-        used_ns, elapsed, refused = measure_cpu(load, writer, pid)
+        used = measure_cpu(load, writer, pid)
         readers.say("end")
         got = json.loads(readers.line())["samples"]
-    if refused or got < load.frames * (1 - LOST_MOST):
-        raise RuntimeError(f"gpsd: {got} of {load.frames} samples came, {refused} were not sent")
-    return used_ns / 1e3 / (elapsed * load.rate_hz)
+    if used.refused or got < load.frames * (1 - LOST_MOST):
+        raise RuntimeError(f"gpsd: {got} of {load.frames} samples came, {used.refused} were not sent")
+    return used.cpu_ns / 1e3 / (used.elapsed_s * load.rate_hz)
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:

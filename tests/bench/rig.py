@@ -5,11 +5,12 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic, sleep
+from typing import NamedTuple
 
 import msgspec
 
@@ -50,6 +51,8 @@ class Load:
     """Whether the first device's SOUT is on a line."""
     record_to: str = ""
     """Directory that the daemon records to; empty for no recording."""
+    mqtt: Mapping[str, object] = field(default_factory=dict)
+    """Settings of the output `mqtt`; empty for none."""
 
     @property
     def frames(self) -> int:
@@ -62,6 +65,10 @@ class Outcome:
     """What came of it."""
 
     cpu_us_per_sample: float
+    loop_us_per_sample: float
+    """Of that, the thread of the event loop."""
+    written_bytes_s: float
+    """What the process gave the disk, bytes a second."""
     cpu_share: float
     p50_us: float
     p99_us: float
@@ -125,6 +132,17 @@ def cpu_ns(pid: int) -> int:
     return total
 
 
+def loop_ns(pid: int) -> int:
+    """CPU time of the main thread of a process so far."""
+    return int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text().split()[0])
+
+
+def written_bytes(pid: int) -> int:
+    """Bytes that a process gave the disk so far (proc(5), /proc/PID/io)."""
+    lines = Path(f"/proc/{pid}/io").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("write_bytes:"))
+
+
 def rss_mb(pid: int) -> float:
     """Resident memory of a process in MB (10⁶ bytes)."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
@@ -150,6 +168,7 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         | ({} if load.latency_ms is None else {"latency_ms": load.latency_ms}),
         "metrics": {"port": 0},
         "recorder": {"enabled": bool(load.record_to), "directory": load.record_to or str(folder)},
+        **({"mqtt": load.mqtt} if load.mqtt else {}),
         "devices": devices,
     }
     file = folder / "imud.yaml"
@@ -201,16 +220,28 @@ def start_readers(stack: ExitStack, folder: Path, load: Load) -> Process:
     return readers
 
 
-def measure_cpu(load: Load, writer: Process, pid: int) -> tuple[int, float, int]:
-    """Let the writer go; return the CPU time of process `pid`, ns, over how many seconds, and the refused frames."""
+class Used(NamedTuple):
+    """What a process used within a time."""
+
+    cpu_ns: int
+    loop_ns: int
+    written_bytes: int
+    elapsed_s: float
+    refused: int
+    """Frames that the writer could not write."""
+
+
+def measure_cpu(load: Load, writer: Process, pid: int) -> Used:
+    """Let the writer go; return what process `pid` used while it was measured."""
     writer.say("go")
     sleep(load.warm_s)
-    before_ns, begun = cpu_ns(pid), monotonic()
+    before_ns, before_loop_ns, before_bytes, begun = cpu_ns(pid), loop_ns(pid), written_bytes(pid), monotonic()
     sleep(load.seconds - END_S)
-    used_ns, elapsed = cpu_ns(pid) - before_ns, monotonic() - begun
+    used_ns, used_loop_ns, elapsed = cpu_ns(pid) - before_ns, loop_ns(pid) - before_loop_ns, monotonic() - begun
+    used_bytes = written_bytes(pid) - before_bytes
     refused = int(writer.line())
     sleep(0.05)  # what is on its way arrives
-    return used_ns, elapsed, refused
+    return Used(used_ns, used_loop_ns, used_bytes, elapsed, refused)
 
 
 def run(load: Load) -> Outcome:
@@ -231,21 +262,24 @@ def run(load: Load) -> Outcome:
         server = start_server(stack, folder, ports, load)
         readers = start_readers(stack, folder, load)
         pid = server.popen.pid
-        used_ns, elapsed, refused = measure_cpu(load, writer, pid)
+        used = measure_cpu(load, writer, pid)
         memory_mb = rss_mb(pid)
         statuses = () if load.bare else tuple(ask(folder / "s"))
         readers.say("end")
         figures = json.loads(readers.line())
     total = load.frames * load.devices
+    counted = used.elapsed_s * load.rate_hz * load.devices
     return Outcome(
-        cpu_us_per_sample=used_ns / 1e3 / (elapsed * load.rate_hz * load.devices),
-        cpu_share=used_ns / 1e9 / elapsed,
+        cpu_us_per_sample=used.cpu_ns / 1e3 / counted,
+        loop_us_per_sample=used.loop_ns / 1e3 / counted,
+        written_bytes_s=used.written_bytes / used.elapsed_s,
+        cpu_share=used.cpu_ns / 1e9 / used.elapsed_s,
         p50_us=figures["p50_us"],
         p99_us=figures["p99_us"],
         max_us=figures["max_us"],
         received=figures["samples"],
         gaps=figures["gaps"] + total - figures["samples"] if load.clients and load.client_hz is None else 0,
-        refused=refused,
+        refused=used.refused,
         rss_mb=memory_mb,
         statuses=statuses,
     )

@@ -46,7 +46,7 @@ def main(port: str, spool: str, epoch: str, megabytes: str = "256") -> None:
         status = output.status()
         if status.spooled != told:
             told = status.spooled
-            print(f"{status.waiting} {seq}", flush=True)
+            print(f"{status.waiting} {seq} {status.spool_bytes}", flush=True)
         time.sleep(TICK_S)
 
 

@@ -71,6 +71,12 @@ class Mosquitto:
         assert running.wait(LIMIT_S), "\n".join(self.log)
         assert self._process.poll() is None, "\n".join(self.log)
 
+    @property
+    def pid(self) -> int:
+        """Of the process that runs."""
+        assert self._process is not None
+        return self._process.pid
+
     def _read(self, process: "subprocess.Popen[str]", running: threading.Event) -> None:
         assert process.stdout is not None
         for line in process.stdout:

@@ -1,0 +1,123 @@
+"""`make fleet-cluster`: three NATS servers with JetStream and MQTT, of which one is killed while gateways send.
+
+`python -m tests.bench.fleet_cluster [--gateways 200] [--seconds 30]`. The servers are Debian's nats-server, which
+speaks MQTT 3.1.1; sessions and messages are on three of them. A third of the way through the server that the
+collector is connected to is killed with SIGKILL. Gateways and collector go to the next server of their lists, and
+gateways send again what was not acknowledged. It ends with 1 where a number is missing at the end.
+"""
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from tests.bench.fleet_load import CollectorProcess, Fleet, acknowledged_by
+from tests.publishers.mqtt.mosquitto import free_port
+
+PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
+SERVERS: Final = 3
+LIMIT_S: Final = 60.0
+ACCOUNT_WORDS: Final = ("p50_ms", "p99_ms", "max_ms", "duplicates", "missing", "open")
+
+
+class Cluster:
+    """The servers."""
+
+    def __init__(self, folder: Path) -> None:
+        self.ports = [free_port() for _ in range(SERVERS)]
+        self.monitors = [free_port() for _ in range(SERVERS)]
+        routes = [free_port() for _ in range(SERVERS)]
+        self.processes: list[subprocess.Popen[bytes]] = []
+        for at in range(SERVERS):
+            config = folder / f"nats-{at}.conf"
+            config.write_text(configuration(at, folder, self.ports[at], self.monitors[at], routes))
+            assert PROGRAM is not None
+            log = folder / f"nats-{at}.log"
+            self.processes.append(subprocess.Popen([PROGRAM, "-c", str(config), "-l", str(log)]))
+        end_s = time.monotonic() + LIMIT_S
+        while not all(map(is_healthy, self.monitors)):
+            if time.monotonic() > end_s:
+                raise TimeoutError(f"no cluster within {LIMIT_S:g} s; see {folder}")
+            time.sleep(0.2)
+
+    def kill(self, at: int) -> None:
+        """With SIGKILL."""
+        self.processes[at].send_signal(signal.SIGKILL)
+        self.processes[at].wait(10)
+
+    def close(self) -> None:
+        """End all."""
+        for process in self.processes:
+            if process.poll() is None:
+                process.kill()
+                process.wait(10)
+
+
+def configuration(at: int, folder: Path, port: int, monitor: int, routes: Sequence[int]) -> str:
+    """The configuration of one server."""
+    others = ", ".join(f'"nats://127.0.0.1:{route}"' for route in routes)
+    return f"""server_name: n{at}
+listen: "127.0.0.1:{free_port()}"
+http: "127.0.0.1:{monitor}"
+jetstream {{ store_dir: "{folder}/store-{at}" }}
+cluster {{ name: fleet, listen: "127.0.0.1:{routes[at]}", routes: [{others}] }}
+mqtt {{ listen: "127.0.0.1:{port}" }}
+"""
+
+
+def is_healthy(monitor: int) -> bool:
+    """Whether a server has joined, with JetStream."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{monitor}/healthz", timeout=2) as answer:
+            return bool(answer.status == 200)
+    except OSError:
+        return False
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(prog="make fleet-cluster")
+    parser.add_argument("--gateways", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    args = parser.parse_args()
+    if PROGRAM is None:
+        print("nats-server is not installed (apt-get install nats-server)")
+        return 1
+    print(f"{args.gateways} gateways, {args.seconds:g} s, load {os.getloadavg()[0]:.1f} before", flush=True)
+    with tempfile.TemporaryDirectory(prefix="imud-cluster-") as folder:
+        cluster = Cluster(Path(folder))
+        try:
+            collector = CollectorProcess(cluster.ports)
+            fleet = Fleet(args.gateways, cluster.ports)
+            fleet.run(8.0)
+            killed = False
+
+            def tick(at_s: float) -> None:
+                nonlocal killed
+                if not killed and at_s > args.seconds / 3:
+                    killed = True
+                    cluster.kill(0)
+
+            acknowledged = acknowledged_by(fleet)
+            fleet.run(args.seconds, tick)
+            print(f"  acknowledged {(acknowledged_by(fleet) - acknowledged) / args.seconds:.0f} messages/s")
+            print(f"  waiting when gateways stop: {fleet.waiting} messages; acknowledged after {fleet.drain():.1f} s")
+            account = collector.end(fleet.numbered)
+            fleet.clients.close()
+        finally:
+            cluster.close()
+    print(f"  numbered {fleet.numbered}, came {account['came']}, connections of the collector {account['connects']}")
+    print("  " + ", ".join(f"{word} {account[word]:.0f}" for word in ACCOUNT_WORDS))
+    return int(fleet.numbered != account["came"] or bool(account["open"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

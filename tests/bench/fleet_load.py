@@ -1,0 +1,249 @@
+"""`make fleet-load`: gateways that are simulated, one broker and one collector: how many are held, and what it takes.
+
+`python -m tests.bench.fleet_load [--gateways 1000] [--seconds 30]`. Every gateway sends what the output `mqtt` sends
+of two devices with `rate_hz: 10` and `batch_s: 1`: a message a second and device, with ten intervals of acceleration,
+rate of turn and angles. The collector, a process of its own, decodes every message and keeps the ledger. At the end
+the gateways stop, everything they have numbered has to arrive, and the program ends with 1 where anything is missing.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from time import monotonic, time_ns
+from typing import Any, Final
+
+from imud.formats.fleet.ledger import FleetLedger
+from imud.formats.fleet.messages import FleetMessage, Interval, Measures, MessageKind, decode_message, encode_message
+from imud.formats.fleet.topics import Stream, parse_topic, topic_of
+from imud.sample import Sync
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.mqtt_clients import Clients, MqttClient
+from tests.bench.rig import cpu_ns, rss_mb
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
+
+DEVICES: Final = ("bow", "mast")
+SAMPLES: Final = 100
+"""Of a device in a second."""
+INTERVALS: Final = 10
+END_S: Final = 180.0
+"""How long the rest may take to arrive."""
+FLEET: Final = "imud/#"
+
+
+class SimulatedGateway:
+    """A gateway: what it sends, and its connection."""
+
+    def __init__(self, number: int, ports: Sequence[int], due_s: float) -> None:
+        self.name = f"gw-{number}"
+        self.client = MqttClient(self.name, ports, first=number)
+        self.due_s = due_s
+        self.seq = 0
+
+    def second(self) -> None:
+        """Number and give what one second of both devices makes."""
+        first, last = self.seq + 1, self.seq + SAMPLES
+        self.seq = last
+        for device in DEVICES:
+            message = FleetMessage(
+                v=1, gateway=self.name, boot="1", device=device, kind=MessageKind.INTERVALS, begin=1, first=first,
+                last=last, count=SAMPLES, utc_ns=time_ns(), intervals=intervals_of(first),
+            )  # fmt: skip
+            self.client.give(topic_of("load", self.name, device, Stream.STATISTICS), encode_message(message))
+
+
+_MADE: dict[int, list[Interval]] = {}
+
+
+def intervals_of(first: int) -> list[Interval]:
+    """Ten intervals from a number on; those of gateways that are equally far are the same."""
+    found = _MADE.get(first)
+    if found is None:
+        size = SAMPLES // INTERVALS
+        found = [_interval(begin, begin + size - 1) for begin in range(first, first + SAMPLES, size)]
+        _MADE[first] = found
+        _MADE.pop(first - 100 * SAMPLES, None)
+    return found
+
+
+def _interval(first: int, last: int) -> Interval:
+    def vector(scale: float) -> Measures:
+        value = (scale * first * 0.1234567, scale * 0.7654321, scale * 9.8066512)
+        return Measures(value, value, value, value)
+
+    t_ns = first * 10 * NS_PER_MS
+    return Interval(
+        first, last, last - first + 1, t_ns, t_ns + 90 * NS_PER_MS, t_ns, t_ns + 90 * NS_PER_MS, 1000, Sync.REGRESSION,
+        {"accel_m_s2": vector(1.0), "gyro_rad_s": vector(0.01), "euler_rad": vector(0.1)},
+    )  # fmt: skip
+
+
+class Fleet:
+    """All gateways, in this process."""
+
+    def __init__(self, number: int, ports: Sequence[int]) -> None:
+        begin_s = monotonic() + 5.0
+        self.gateways = [SimulatedGateway(one, ports, begin_s + one / number) for one in range(number)]
+        self.clients = Clients([one.client for one in self.gateways])
+        self.late_s = 0.0
+        """How late the latest second was given."""
+
+    def run(self, seconds: float, tick: Callable[[float], None] = lambda _at_s: None) -> None:
+        """Send for so long; `tick` is called with the time since the begin."""
+        begin_s = monotonic()
+        while (at_s := monotonic() - begin_s) < seconds:
+            tick(at_s)
+            self.clients.round(0.005)
+            now_s = monotonic()
+            for gateway in self.gateways:
+                if now_s >= gateway.due_s:
+                    self.late_s = max(self.late_s, now_s - gateway.due_s)
+                    gateway.due_s += 1.0
+                    gateway.second()
+                    if gateway.client.is_ready:
+                        self.clients.write(gateway.client)
+
+    def drain(self) -> float:
+        """Wait until everything is acknowledged; return how long that took, s."""
+        begin_s = monotonic()
+        while self.waiting and monotonic() - begin_s < END_S:
+            self.clients.round(0.02)
+        return monotonic() - begin_s
+
+    @property
+    def waiting(self) -> int:
+        """Messages without an acknowledgement."""
+        return sum(len(one.client.waiting) for one in self.gateways)
+
+    @property
+    def numbered(self) -> int:
+        """Samples that have a number, of both devices."""
+        return len(DEVICES) * sum(one.seq for one in self.gateways)
+
+
+class CollectorProcess:
+    """The collector in a process of its own."""
+
+    def __init__(self, ports: Sequence[int]) -> None:
+        words = ["-m", "tests.bench.fleet_load", "--collector", *map(str, ports)]
+        self.popen = subprocess.Popen(
+            [sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert self.popen.stdout is not None
+        assert self.popen.stdout.readline().strip() == "ready"
+
+    def end(self, numbered: int) -> dict[str, Any]:
+        """Have it wait for all numbers; return its account."""
+        said, _ = self.popen.communicate(f"{numbered}\n", timeout=2 * END_S)
+        found: dict[str, Any] = json.loads(said)
+        return found
+
+
+def collect(ports: Sequence[int]) -> None:
+    """The collector: take everything until standard input says how many numbers there are, and all have come."""
+    ledger, delays_ms, came = FleetLedger(from_begin=True), [], 0
+    client = MqttClient("collector", ports, subscribe=FLEET)
+
+    def take(topic: str, payload: bytes) -> None:
+        nonlocal came
+        parts = parse_topic(topic)
+        if parts is None or parts.leaf not in Stream.__members__.values():
+            return
+        message = decode_message(payload)
+        delays_ms.append((time_ns() - message.utc_ns) / NS_PER_MS)
+        if ledger.take(message, Stream(parts.leaf)) is not None:
+            came += message.count
+
+    client.on_message = take
+    clients = Clients([client])
+    os.set_blocking(0, False)
+    while not client.is_ready:
+        clients.round(0.05)
+    end_s = monotonic() + 1.0
+    while monotonic() < end_s:
+        clients.round(0.05)
+    print("ready", flush=True)
+    due = -1
+    while due < 0 or (came < due and monotonic() < end_s):
+        clients.round(0.02)
+        if due < 0 and (line := sys.stdin.readline()):
+            due, end_s = int(line), monotonic() + END_S
+    counts = ledger.counts.values()
+    delays_ms.sort()
+    print(
+        json.dumps(
+            {
+                "came": came, "missing": sum(one.missing for one in counts), "connects": client.connects,
+                "duplicates": sum(one.duplicates for one in counts), "streams": len(ledger.counts),
+                "open": sum(one.balance != 0 for one in counts),
+                "p50_ms": delays_ms[len(delays_ms) // 2], "p99_ms": delays_ms[len(delays_ms) * 99 // 100],
+                "max_ms": delays_ms[-1],
+            }
+        )
+    )  # fmt: skip
+
+
+def measure(number: int, seconds: float) -> Iterator[tuple[str, float, str]]:
+    """Figures of a fleet on one mosquitto."""
+    with tempfile.TemporaryDirectory(prefix="imud-load-") as folder, running_broker(
+        Path(folder) / "broker", "allow_anonymous true", "log_type error", "log_type information"
+    ) as broker:  # fmt: skip
+        collector = CollectorProcess([broker.port])
+        fleet = Fleet(number, [broker.port])
+        fleet.run(6.0)
+        pids = {"broker": broker.pid, "collector": collector.popen.pid, "gateways": os.getpid()}
+        before, acknowledged = {name: cpu_ns(pid) for name, pid in pids.items()}, acknowledged_by(fleet)
+        begin_s, fleet.late_s = monotonic(), 0.0
+        fleet.run(seconds)
+        elapsed_s = monotonic() - begin_s
+        used = {name: (cpu_ns(pid) - before[name]) / NS_PER_S / elapsed_s for name, pid in pids.items()}
+        memory = {name: rss_mb(pid) for name, pid in pids.items()}
+        yield "messages acknowledged", (acknowledged_by(fleet) - acknowledged) / elapsed_s, "1/s"
+        yield "messages waiting at the end", float(fleet.waiting), ""
+        yield "gateways late at most", fleet.late_s, "s"
+        yield "everything acknowledged after", fleet.drain(), "s"
+        account = collector.end(fleet.numbered)
+        fleet.clients.close()
+    for name in pids:
+        yield f"CPU of the {name}", used[name], "cores"
+        yield f"memory of the {name}", memory[name], "MB"
+    for name in ("p50_ms", "p99_ms", "max_ms"):
+        yield f"delay {name[:-3]}", account[name], "ms"
+    yield "streams", float(account["streams"]), ""
+    yield "duplicates", float(account["duplicates"]), "samples"
+    yield "lost", float(fleet.numbered - account["came"]), "samples"
+
+
+def acknowledged_by(fleet: Fleet) -> int:
+    """Messages that the broker has taken."""
+    return sum(one.client.acknowledged for one in fleet.gateways)
+
+
+def main() -> int:
+    """Run one load, or the collector of one."""
+    parser = argparse.ArgumentParser(prog="make fleet-load")
+    parser.add_argument("--gateways", type=int, default=1000)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--collector", nargs="+", type=int, default=[], help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.collector:
+        collect(args.collector)
+        return 0
+    if NO_MOSQUITTO:
+        print(NO_MOSQUITTO)
+        return 1
+    load = f"load {os.getloadavg()[0]:.1f} before"
+    print(f"{args.gateways} gateways of {len(DEVICES)} devices, {args.seconds:g} s, {os.cpu_count()} cores, {load}")
+    lost = 1.0
+    for name, value, unit in measure(args.gateways, args.seconds):
+        print(f"  {name:32} {value:12.2f} {unit}", flush=True)
+        lost = value if name == "lost" else lost
+    return int(lost != 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

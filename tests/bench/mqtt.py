@@ -1,0 +1,141 @@
+"""Cost of the output `mqtt`: CPU of the daemon at 1 kHz with and without it, whatever the broker does, and its wear.
+
+`python -m tests.bench.mqtt [--quick]`. Brokers: Debian's mosquitto; nobody at the port; mosquitto that refuses the
+user; a peer that accepts, and reads 1 kB a second; mosquitto that is stopped with SIGSTOP. The same load runs in turns,
+and the best round of each counts. All samples are sent as slots, and statistics of 1 Hz.
+
+The event loop's thread is what samples wait for; the whole daemon has the two threads of the output as well, which run
+beside it where there is a second core. Bytes written are `write_bytes` of /proc/PID/io, on the file system of the
+working directory.
+"""
+
+import socket
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from tests.bench.rig import Load, Outcome, run
+from tests.bench.rows import Row, at_most
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, free_port, running_broker
+
+LOOP_RATIO_LIMIT: Final = 1.05
+"""Of the event loop's thread: with the output it puts each batch into a queue."""
+SAMPLES: Final[Mapping[str, object]] = {"whole": "slots", "rate_hz": 1}
+READ_BYTES: Final = 1000
+HOUR_S: Final = 3600
+Place = Callable[[Path], AbstractContextManager[int]]
+
+
+def rows(*, quick: bool = False) -> Iterator[Row]:
+    """All figures."""
+    if NO_MOSQUITTO:
+        print(f"skipped: {NO_MOSQUITTO}")
+        return
+    rounds, seconds = (1, 2.0) if quick else (3, 6.0)
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in ("without", *BROKERS)}
+    for _ in range(rounds):
+        outcomes["without"].append(run(Load(seconds=seconds)))
+        for name, place in BROKERS.items():
+            outcomes[name].append(run_with(place, Load(seconds=seconds), SAMPLES))
+    best = {name: min(found, key=lambda one: one.loop_us_per_sample) for name, found in outcomes.items()}
+    plain = best.pop("without")
+    yield Row("1 kHz, no output mqtt: CPU of the event loop per sample", plain.loop_us_per_sample, "us")
+    for name, outcome in best.items():
+        ratio = outcome.loop_us_per_sample / plain.loop_us_per_sample
+        yield at_most(f"1 kHz, broker {name}: CPU ratio of the event loop", ratio, "x", LOOP_RATIO_LIMIT)
+        yield Row(
+            f"1 kHz, broker {name}: CPU ratio of the daemon", outcome.cpu_us_per_sample / plain.cpu_us_per_sample, "x"
+        )
+        lost = max(one.lost for one in outcomes[name])
+        yield at_most(f"1 kHz, broker {name}: samples lost", float(lost), "samples", 0)
+    yield from wear_rows(10.0 if quick else 60.0)
+
+
+def wear_rows(seconds: float) -> Iterator[Row]:
+    """Bytes written in an hour, from a shorter time at a steady load."""
+    for words, sending, rate_hz in (
+        ("statistics of 1 Hz of 100 Hz", {"rate_hz": 1}, 100.0),
+        ("statistics of 10 Hz of 1 kHz", {"rate_hz": 10}, 1000.0),
+        ("all samples of 1 kHz as slots", {"whole": "slots", "rate_hz": None}, 1000.0),
+    ):
+        for name in ("present", "gone"):
+            outcome = run_with(BROKERS[name], Load(seconds=seconds, rate_hz=rate_hz), sending)
+            yield Row(f"{words}, broker {name}: written in an hour", outcome.written_bytes_s * HOUR_S / 1e6, "MB")
+
+
+def run_with(place: Place, load: Load, sending: Mapping[str, object]) -> Outcome:
+    """One measurement with the output, whose spool is on a disk."""
+    with tempfile.TemporaryDirectory(dir=".", prefix=".imud-bench-") as name, place(Path(name) / "broker") as port:
+        settings = {
+            "enabled": True, "brokers": [f"mqtt://127.0.0.1:{port}"], "gateway": "bench", "retry_max_s": 1,
+            "spool_directory": str(Path(name).absolute() / "spool"), "devices": {"*": sending},
+        }  # fmt: skip
+        return run(replace(load, mqtt=settings))
+
+
+@contextmanager
+def present(folder: Path) -> Iterator[int]:
+    """A broker that takes everything."""
+    with running_broker(folder) as broker:
+        yield broker.port
+
+
+@contextmanager
+def gone(_folder: Path) -> Iterator[int]:
+    """Nobody listens."""
+    yield free_port()
+
+
+@contextmanager
+def refusing(folder: Path) -> Iterator[int]:
+    """A broker that does not know the user."""
+    with running_broker(folder, "allow_anonymous false") as broker:
+        yield broker.port
+
+
+@contextmanager
+def stopped(folder: Path) -> Iterator[int]:
+    """A broker that answers nothing; the kernel still accepts connections for it."""
+    with running_broker(folder) as broker:
+        broker.freeze()
+        yield broker.port
+
+
+@contextmanager
+def slow(_folder: Path) -> Iterator[int]:
+    """A peer that accepts every connection, and reads READ_BYTES a second of it."""
+    ended = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(0.2)
+        thread = threading.Thread(target=_serve_slowly, args=(listener, ended))
+        thread.start()
+        try:
+            yield int(listener.getsockname()[1])
+        finally:
+            ended.set()
+            thread.join(10)
+
+
+def _serve_slowly(listener: socket.socket, ended: threading.Event) -> None:
+    while not ended.is_set():
+        with suppress(TimeoutError), listener.accept()[0] as peer:
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            peer.recv(4096)
+            peer.sendall(bytes.fromhex("2003000000"))  # CONNACK: accepted, no properties
+            with suppress(OSError):
+                while not ended.wait(1.0) and peer.recv(READ_BYTES):
+                    pass
+
+
+BROKERS: Final[Mapping[str, Place]] = {
+    "present": present, "gone": gone, "refusing": refusing, "slow": slow, "stopped": stopped,
+}  # fmt: skip
+
+if __name__ == "__main__":
+    for row in rows(quick="--quick" in sys.argv):
+        print(f"{row.name:70} {row.value:12.3f} {row.unit:8} {row.reach} {row.reached}", flush=True)

@@ -1,0 +1,209 @@
+"""Many clients of MQTT 3.1.1 in one thread, cheap enough that a broker and a collector are what a measurement loads.
+
+Packets are those of the standard (OASIS MQTT 3.1.1, sections 2 and 3): CONNECT, PUBLISH with QoS 1, SUBSCRIBE,
+PINGREQ and their answers. What is to be sent waits, as in the spool, until the broker has acknowledged it; after a
+loss a client goes to the next broker of its list and sends everything again, oldest first.
+"""
+
+import selectors
+import socket
+import struct
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from random import Random
+from time import monotonic
+from typing import Final
+
+CONNACK, PUBLISH, PUBACK, SUBACK = 2, 3, 4, 9
+WINDOW: Final = 20
+KEEP_ALIVE_S: Final = 30
+ANSWER_S: Final = 15.0
+"""A broker that answers nothing for so long while it owes something is left."""
+RETRY_S: Final = 2.0
+READ_BYTES: Final = 262_144
+
+
+class MqttClient:
+    """One client. Synchronization: the thread of its `Clients`."""
+
+    def __init__(self, name: str, ports: Sequence[int], *, subscribe: str = "", first: int = 0) -> None:
+        self.name, self.ports, self.subscribe = name, tuple(ports), subscribe
+        self.at = first % len(ports)
+        self.socket: socket.socket | None = None
+        self.is_ready = False
+        self.waiting: deque[tuple[str, bytes]] = deque()
+        """Messages that the broker has not acknowledged, those that were sent first."""
+        self.sent = 0
+        """How many of them were sent on this connection."""
+        self.acknowledged = self.connects = 0
+        self.retry_s = 0.0
+        self.heard_s = self.wrote_s = 0.0
+        self.out = bytearray()
+        self.read = bytearray()
+        self.number = 0
+        """Packet identifier of the newest message; those of a connection follow on each other."""
+        self.on_message: Callable[[str, bytes], None] = lambda _topic, _payload: None
+
+    def give(self, topic: str, payload: bytes) -> None:
+        """Have a message sent."""
+        self.waiting.append((topic, payload))
+
+
+class Clients:
+    """All clients of a process. Synchronization: one thread."""
+
+    def __init__(self, clients: Sequence[MqttClient]) -> None:
+        self.clients = list(clients)
+        self._selector = selectors.DefaultSelector()
+        self._random = Random(1)
+        self._looked_s = 0.0
+        for client in self.clients:
+            client.retry_s = monotonic() + self._random.random() * RETRY_S
+
+    def round(self, seconds: float) -> None:
+        """Read and write what is there, for so long at most, and connect what is to be connected."""
+        for key, mask in self._selector.select(seconds):
+            client: MqttClient = key.data
+            try:
+                if mask & selectors.EVENT_READ:
+                    self._read(client)
+                self._write(client)
+            except OSError:
+                self._lose(client)
+        now_s = monotonic()
+        if now_s - self._looked_s > 0.1:
+            self._looked_s = now_s
+            for client in self.clients:
+                self._look_after(client, now_s)
+
+    def write(self, client: MqttClient) -> None:
+        """Write what the window has room for."""
+        try:
+            self._write(client)
+        except OSError:
+            self._lose(client)
+
+    def _write(self, client: MqttClient) -> None:
+        if client.socket is None:
+            return
+        while client.is_ready and client.sent < min(WINDOW, len(client.waiting)):
+            topic, payload = client.waiting[client.sent]
+            client.number = client.number % 0xFFFF + 1
+            client.out += packet(0x32, text(topic) + struct.pack(">H", client.number) + payload)
+            client.sent += 1
+        if client.out:
+            with suppress(BlockingIOError):
+                del client.out[: client.socket.send(client.out)]
+            client.wrote_s = monotonic()
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.out else 0)
+        if self._selector.get_key(client.socket).events != events:
+            self._selector.modify(client.socket, events, client)
+
+    def close(self) -> None:
+        """Disconnect all."""
+        for client in self.clients:
+            if client.socket is not None:
+                with suppress(OSError):
+                    client.socket.send(b"\xe0\x00")
+                self._lose(client)
+        self._selector.close()
+
+    def _look_after(self, client: MqttClient, now_s: float) -> None:
+        if client.socket is None:
+            if now_s >= client.retry_s:
+                self._connect(client, now_s)
+            return
+        owes = client.sent or not client.is_ready or client.wrote_s > client.heard_s + KEEP_ALIVE_S / 2
+        if owes and now_s - max(client.heard_s, min(client.wrote_s, now_s - ANSWER_S)) > 2 * ANSWER_S:
+            self._lose(client)
+        elif client.is_ready:
+            if now_s - client.wrote_s > KEEP_ALIVE_S / 2:
+                client.out += b"\xc0\x00"
+            self.write(client)
+
+    def _connect(self, client: MqttClient, now_s: float) -> None:
+        made = socket.socket()
+        made.setblocking(False)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        made.connect_ex(("127.0.0.1", client.ports[client.at]))
+        client.socket, client.is_ready, client.sent = made, False, 0
+        client.heard_s = client.wrote_s = now_s
+        client.read.clear()
+        flags = 0 if client.subscribe else 2  # a clean session for those who only send
+        head = text("MQTT") + bytes((4, flags)) + struct.pack(">H", KEEP_ALIVE_S)
+        client.out[:] = packet(0x10, head + text(client.name))
+        self._selector.register(made, selectors.EVENT_READ | selectors.EVENT_WRITE, client)
+
+    def _lose(self, client: MqttClient) -> None:
+        made, client.socket = client.socket, None
+        client.is_ready, client.sent = False, 0
+        client.out.clear()
+        client.at = (client.at + 1) % len(client.ports)
+        client.retry_s = monotonic() + self._random.random() * RETRY_S
+        if made is not None:
+            self._selector.unregister(made)
+            made.close()
+
+    def _read(self, client: MqttClient) -> None:
+        assert client.socket is not None
+        try:
+            data = client.socket.recv(READ_BYTES)
+        except BlockingIOError:
+            return
+        if not data:
+            raise ConnectionResetError
+        client.heard_s = monotonic()
+        client.read += data
+        while (found := split(client.read)) is not None:
+            first, begin, end = found
+            self._take(client, first, bytes(client.read[begin:end]))
+            del client.read[:end]
+
+    def _take(self, client: MqttClient, first: int, body: bytes) -> None:
+        kind = first >> 4
+        if kind == CONNACK:
+            if body[1]:
+                raise ConnectionRefusedError
+            client.connects += 1
+            client.is_ready, client.number = True, 0
+            if client.subscribe:
+                client.out += packet(0x82, b"\x00\x01" + text(client.subscribe) + b"\x01")
+        elif kind == PUBACK:  # brokers acknowledge in the order of the messages (section 4.6)
+            client.waiting.popleft()
+            client.sent -= 1
+            client.acknowledged += 1
+        elif kind == PUBLISH:
+            size = struct.unpack_from(">H", body)[0]
+            at = 2 + size
+            if first & 0x06:
+                client.out += b"\x40\x02" + body[at : at + 2]
+                at += 2
+            client.on_message(body[2 : 2 + size].decode(), body[at:])
+
+
+def text(value: str) -> bytes:
+    """A string with its length (section 1.5.3)."""
+    data = value.encode()
+    return struct.pack(">H", len(data)) + data
+
+
+def packet(first: int, body: bytes) -> bytes:
+    """A packet with its length (section 2.2.3)."""
+    size, head = len(body), bytearray((first,))
+    while True:
+        size, low = divmod(size, 128)
+        head.append(low | (128 if size else 0))
+        if not size:
+            return bytes(head) + body
+
+
+def split(data: bytearray) -> tuple[int, int, int] | None:
+    """First byte, begin and end of the body of the first packet; None while it is not whole."""
+    size = 0
+    for at in range(1, min(5, len(data))):
+        size |= (data[at] & 127) << 7 * (at - 1)
+        if data[at] < 128:
+            end = at + 1 + size
+            return (data[0], at + 1, end) if len(data) >= end else None
+    return None

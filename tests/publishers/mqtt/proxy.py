@@ -1,0 +1,116 @@
+"""A TCP proxy in front of a broker: passes everything on, stops passing it on, breaks connections, or is slow.
+
+One thread for all connections. What it has read and not yet passed on is bounded, so that a slow end is felt by the
+other one.
+"""
+
+import selectors
+import socket
+import threading
+from contextlib import suppress
+from typing import Final
+
+PIECE_BYTES: Final = 16_384
+ROUND_S: Final = 0.02
+
+
+class Proxy:
+    """The proxy. Synchronization: methods from any thread."""
+
+    def __init__(self, port: int) -> None:
+        """`port` is the broker's, on loopback."""
+        self.bytes_s: float | None = None
+        """What passes from gateway to broker in a second; None: as much as there is."""
+        self.connections = 0
+        """Connections that were accepted."""
+        self._to = port
+        self._stalled = self._cut = self._ended = False
+        self._pairs: dict[socket.socket, socket.socket] = {}
+        self._from_gateway: set[socket.socket] = set()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.setblocking(False)
+        self.port = int(self._listener.getsockname()[1])
+        self._thread = threading.Thread(target=self._run, name="proxy")
+        self._thread.start()
+
+    def stall(self) -> None:
+        """Pass nothing on, as a cable that is pulled behind a switch: no end learns anything."""
+        self._stalled = True
+
+    def cut(self) -> None:
+        """Break all connections, and refuse new ones."""
+        self._cut = True
+
+    def restore(self) -> None:
+        """Pass everything on."""
+        self._stalled = self._cut = False
+
+    def close(self) -> None:
+        """End it."""
+        self._ended = True
+        self._thread.join(10)
+        self._drop_all()
+        self._listener.close()
+
+    def _run(self) -> None:
+        pause = threading.Event()
+        while not self._ended:
+            if self._cut:
+                self._drop_all()
+                with suppress(OSError):
+                    self._listener.accept()[0].close()
+                pause.wait(ROUND_S)
+            elif self._stalled:
+                pause.wait(ROUND_S)
+            else:
+                self._round()
+                if self.bytes_s is not None:
+                    pause.wait(ROUND_S)
+
+    def _round(self) -> None:
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._listener, selectors.EVENT_READ)
+            for one in self._pairs:
+                selector.register(one, selectors.EVENT_READ)
+            for key, _ in selector.select(ROUND_S):
+                if key.fileobj is self._listener:
+                    self._accept()
+                else:
+                    self._pass_on(key.fileobj)  # type: ignore[arg-type]  # only sockets are registered
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            near, _ = self._listener.accept()
+            self.connections += 1
+            try:
+                far = socket.create_connection(("127.0.0.1", self._to), timeout=5)
+            except OSError:
+                near.close()
+                return
+            self._pairs |= {near: far, far: near}
+            self._from_gateway.add(near)
+
+    def _pass_on(self, source: socket.socket) -> None:
+        target = self._pairs.get(source)
+        if target is None:
+            return
+        is_limited = self.bytes_s is not None and source in self._from_gateway
+        most = max(1, round(self.bytes_s * ROUND_S)) if is_limited and self.bytes_s is not None else PIECE_BYTES
+        try:
+            data = source.recv(most)
+            target.settimeout(5)
+            if data:
+                target.sendall(data)
+                return
+        except OSError:
+            pass
+        self._drop(source, target)
+
+    def _drop(self, *both: socket.socket) -> None:
+        for one in both:
+            self._pairs.pop(one, None)
+            self._from_gateway.discard(one)
+            one.close()
+
+    def _drop_all(self) -> None:
+        self._drop(*list(self._pairs))
