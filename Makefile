@@ -8,6 +8,7 @@
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
+# make fleet-day     a spool with what 24 hours without a network make, replayed
 # make fleet-load    1,000 simulated gateways, one broker, one collector   make fleet-cluster  three NATS servers, one is killed
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
@@ -81,7 +82,7 @@ audit: $(VENV)/made
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)
 
-.PHONY: fleet-faults fleet-load fleet-cluster
+.PHONY: fleet-faults fleet-load fleet-cluster fleet-day
 fleet-faults: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_faults $(ARGS)
 
@@ -90,6 +91,9 @@ fleet-load: $(VENV)/made
 
 fleet-cluster: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_cluster $(ARGS)
+
+fleet-day: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_day $(ARGS)
 
 soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)
