@@ -96,13 +96,14 @@ def calibration(folder: Path) -> None:
     with (
         turned_module(folder) as daemon,
         serving_web(daemon.socket, "--token-file", str(token)) as url,
-        browser(folder / "calibration", (1320, 900)) as page,
+        browser(folder / "calibration", (1320, 1100)) as page,
     ):
         open_page(page, url, "bow")
         log_in(page, TOKEN)
         page.until("return document.querySelector('#calibration [data-kind=magnetometer] button')")
+        page.js("document.querySelector('header').hidden = true")  # it would stand over the panel
         page.click("#calibration [data-kind=magnetometer] button")
-        page.until("return Number(document.querySelector('#calibration canvas').dataset.covered) > 18")
+        page.until("return Number(document.querySelector('#calibration canvas').dataset.covered) > 12")
         (panel,) = page.driver.find_elements("css selector", "#calibration")
         assert panel.screenshot(str(FOLDER / "web-calibration.png"))
 
