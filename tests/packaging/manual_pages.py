@@ -83,6 +83,11 @@ def header(name: str, section: int, summary: str) -> Iterator[str]:
     yield from (".SH NAME", f"{escaped(name)} \\- {escaped(summary)}")
 
 
+def breakable(text: str) -> str:
+    """Text with a space after each comma of its JSON: troff warns of a line with one long word, and lintian of that."""
+    return re.sub(r",(?=\S)", ", ", text)
+
+
 def listed(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
     """Paragraphs with a term, which is bold, and its meaning."""
     for term, meaning in rows:
@@ -222,7 +227,7 @@ def configuration_page() -> Iterator[str]:
             default = references.default_of(field).strip("`")
             value = "needed" if default == "needed" else f"default {default}"
             yield from (".TP", bold(path + field.name), marked(f"{docs[field.name]} Expected: {expected(field.type)};"))
-            yield escaped(f"{value}.")
+            yield escaped(breakable(f"{value}."))
     yield from see_also([("imud", 1), ("imud-check", 1), ("imud-run", 1)])
 
 
