@@ -38,7 +38,8 @@ class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=T
     enabled: bool = True
     """Whether imud uses the device; if not, its keys are checked all the same."""
     identify: bool = True
-    """Whether imud may send queries (nothing that changes the device) to learn product, serial number and firmware."""
+    """Whether imud may send queries (nothing that changes the device) to learn product, serial number and firmware. A
+    device that does not answer is asked again after 5, 30 and 120 s, then every five minutes."""
     on_difference: OnDifference = OnDifference.REPORT
     """What imud does where the device is not as `settings` declare: report it, apply them, or apply and save to the
     device's flash."""
