@@ -9,30 +9,19 @@ import logging
 import os
 import select
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
-from imud.errors import ServerError, reason_of
-from imud.files import read_regular
+from imud.errors import ServerError
+from imud.publishers.mqtt.access import CONNECT_S, REFUSED, BrokerError, connection_problem, paho_client, properties_of
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 
 log = logging.getLogger(__name__)
 
-CONNECT_S: Final = 4.0
-"""TCP, TLS and the broker's answer take so long each at most; satellite links take 2 s."""
 IN_FLIGHT_MAX: Final = 20
 """Messages without an acknowledgement, unless the broker allows fewer: what brokers usually allow."""
-REFUSED: Final = 0x80
-"""Reason codes of MQTT 5 from here on are refusals (section 2.4)."""
 PACKET_BYTES: Final = 16_384
 """The broker may send so much at once: four times the longest request."""
-PASSWORD_BYTES: Final = 65_535
-"""Of a password (MQTT 5.0, section 3.1.3.6)."""
 EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
-
-
-class BrokerError(Exception):
-    """A broker cannot be reached, or ended the connection. Example: connection refused."""
 
 
 class Will(NamedTuple):
@@ -139,30 +128,11 @@ class PahoConnection:
             raise BrokerError(f"{broker.name}: {error}") from error
         except (OSError, ValueError) as error:
             self.close()
-            raise BrokerError(f"{broker.name}: {_reason_of(error)}") from error
+            raise BrokerError(f"{broker.name}: {connection_problem(error)}") from error
 
     def _made(self, settings: MqttSettings, client_id: str, will: Will) -> Any:
         """A client of paho-mqtt with everything but a connection. Raises OSError for files, ValueError."""
-        from paho.mqtt import client as paho
-        from paho.mqtt.enums import CallbackAPIVersion
-
-        version = paho.MQTTv5 if self._is_v5 else paho.MQTTv311
-        clean: dict[str, Any] = {} if self._is_v5 else {"clean_session": True}
-        client = paho.Client(
-            CallbackAPIVersion.VERSION2,
-            client_id,
-            protocol=version,
-            transport="websockets" if self._broker.websockets else "tcp",
-            reconnect_on_failure=False,
-            **clean,
-        )
-        client.connect_timeout = CONNECT_S
-        if self._broker.websockets:
-            client.ws_set_options(path=self._broker.path)
-        if self._broker.tls:
-            client.tls_set(ca_certs=settings.ca_file, certfile=settings.cert_file, keyfile=settings.key_file)
-        if settings.user:
-            client.username_pw_set(settings.user, _password(settings.password_file))
+        client = paho_client(self._broker, settings, client_id, is_v5=self._is_v5)
         client.will_set(will.topic, will.payload, qos=1, retain=True)
         client.on_connect = self._on_connect
         client.on_publish = self._on_publish
@@ -174,7 +144,7 @@ class PahoConnection:
     def _connect_properties(self) -> Any:
         """How much the broker may send at once; None with MQTT 3.1.1."""
         return (
-            _properties("CONNECT", MaximumPacketSize=PACKET_BYTES, ReceiveMaximum=IN_FLIGHT_MAX)
+            properties_of("CONNECT", MaximumPacketSize=PACKET_BYTES, ReceiveMaximum=IN_FLIGHT_MAX)
             if self._is_v5
             else None
         )
@@ -186,7 +156,7 @@ class PahoConnection:
         try:
             self._client.subscribe(topic, qos=1)
         except (OSError, ValueError) as error:
-            raise BrokerError(f"{self._broker.name}: {_reason_of(error)}") from error
+            raise BrokerError(f"{self._broker.name}: {connection_problem(error)}") from error
 
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
@@ -195,11 +165,11 @@ class PahoConnection:
         properties = None
         if self._is_v5:
             given = {"ContentType": content_type or None, "CorrelationData": correlation}
-            properties = _properties("PUBLISH", **{name: one for name, one in given.items() if one is not None})
+            properties = properties_of("PUBLISH", **{name: one for name, one in given.items() if one is not None})
         try:
             info = self._client.publish(topic, payload, qos=1, retain=retain, properties=properties)
         except (OSError, ValueError) as error:
-            raise BrokerError(f"{self._broker.name}: {_reason_of(error)}") from error
+            raise BrokerError(f"{self._broker.name}: {connection_problem(error)}") from error
         if info.rc:
             self._fail("the connection was lost")
         self._topics[info.mid] = topic
@@ -254,7 +224,7 @@ class PahoConnection:
                 client.loop_write()
             client.loop_misc()
         except (OSError, ValueError) as error:
-            self._problem = self._problem or _reason_of(error)
+            self._problem = self._problem or connection_problem(error)
         if client.socket() is None:
             self._problem = self._problem or "the connection was lost"
 
@@ -299,33 +269,3 @@ class PahoConnection:
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:
             self._problem = self._problem or f"the broker ended the connection: {reason}"
-
-
-def _properties(packet: str, **values: object) -> Any:
-    """Properties of a packet of MQTT 5."""
-    from paho.mqtt.packettypes import PacketTypes
-    from paho.mqtt.properties import Properties
-
-    made = Properties(getattr(PacketTypes, packet))  # type: ignore[no-untyped-call]  # the library has no types here
-    for name, value in values.items():
-        setattr(made, name, value)
-    return made
-
-
-def _password(path: str | None) -> str | None:
-    """The first line of the file. Raises OSError, and ValueError for what is no text."""
-    if path is None:
-        return None
-    text = read_regular(Path(path), PASSWORD_BYTES).decode("utf-8")
-    return text.partition("\n")[0].rstrip("\r")
-
-
-def _reason_of(error: BaseException) -> str:
-    """Describe an error; those of TLS in the words of the TLS library, which say what is wrong with a certificate."""
-    import ssl
-
-    if isinstance(error, ssl.SSLError):
-        return getattr(error, "verify_message", "") or error.reason or str(error)
-    if isinstance(error, FileNotFoundError) and error.filename:
-        return f"{error.filename}: {reason_of(error)}"
-    return reason_of(error)

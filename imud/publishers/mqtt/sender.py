@@ -13,8 +13,9 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from imud.formats.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
+from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.backoff import BrokerTurn
-from imud.publishers.mqtt.broker import BrokerConnection, BrokerError, Connect, Will
+from imud.publishers.mqtt.broker import BrokerConnection, Connect, Will
 from imud.publishers.mqtt.commands import CommandChannel, CommandReply
 from imud.publishers.mqtt.settings import MqttSettings
 from imud.publishers.mqtt.spool import Spooled

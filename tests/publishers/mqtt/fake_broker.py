@@ -3,7 +3,8 @@
 import threading
 from typing import Final
 
-from imud.publishers.mqtt.broker import BrokerError, Received, Will
+from imud.publishers.mqtt.access import BrokerError
+from imud.publishers.mqtt.broker import Received, Will
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 
 LIMIT_S: Final = 10.0

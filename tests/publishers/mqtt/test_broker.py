@@ -7,7 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.publishers.mqtt.broker import BrokerError, PahoConnection, Will
+from imud.publishers.mqtt.access import BrokerError
+from imud.publishers.mqtt.broker import PahoConnection, Will
 from imud.publishers.mqtt.settings import MqttSettings, broker_of
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, free_port, running_broker
 
