@@ -13,7 +13,7 @@ from textual.widgets import Footer, Input, Label, OptionList, RichLog, Sparkline
 from textual.widgets.option_list import Option
 
 from imud.cli.status import WELL, block
-from imud.cli.top.history import CURVES, DeviceHistory, Fleet
+from imud.cli.top.history import CURVES, DeviceHistories, DeviceHistory
 from imud.cli.top.rows import SORTS, TEXT_MAX, VIEWS, chosen, head, row
 from imud.client.feed import News
 from imud.event import Event
@@ -78,7 +78,7 @@ class TopApp(App[None]):
     def __init__(self, make_feed: Callable[[Callable[[News], None]], NewsSource]) -> None:
         """`make_feed` gets what takes news; from any thread."""
         super().__init__()
-        self.fleet = Fleet()
+        self.fleet = DeviceHistories()
         self.problem = "connecting"
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.paused = False

@@ -79,7 +79,7 @@ class DeviceHistory:
         return found
 
 
-class Fleet:
+class DeviceHistories:
     """All devices of a daemon, by name, in the order of its configuration."""
 
     def __init__(self) -> None:

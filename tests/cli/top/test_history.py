@@ -5,7 +5,7 @@ import math
 import msgspec
 import pytest
 
-from imud.cli.top.history import CURVES, POINTS_MAX, SPAN_NS, DeviceHistory, Fleet, norm
+from imud.cli.top.history import CURVES, POINTS_MAX, SPAN_NS, DeviceHistories, DeviceHistory, norm
 from tests.support.metrics import device
 from tests.support.socket_rig import sample
 
@@ -50,7 +50,7 @@ def test_a_daemon_that_was_restarted_begins_the_curves_anew() -> None:
 
 
 def test_devices_come_and_go_with_the_configuration() -> None:
-    fleet = Fleet()
+    fleet = DeviceHistories()
     fleet.add(sample("bow"))  # no status had it yet
     fleet.update([device("stern"), device("bow")], 3)
     assert list(fleet.devices) == ["stern", "bow"]
