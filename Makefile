@@ -6,6 +6,7 @@
 #                                                                   (14 minutes; ARGS=--short: at most 5)
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
+# make fleet-deps  installs PostgreSQL, for the tests of the collector, and what make mqtt-deps installs
 # make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
 # make fleet-day     a spool with what 24 hours without a network make, replayed
@@ -135,9 +136,12 @@ web-pictures: $(VENV)/made
 monitoring-deps:
 	apt-get install --yes --no-install-recommends prometheus prometheus-alertmanager
 
-.PHONY: mqtt-deps
+.PHONY: mqtt-deps fleet-deps
 mqtt-deps:
 	apt-get install --yes --no-install-recommends mosquitto openssl nats-server
+
+fleet-deps: mqtt-deps
+	apt-get install --yes --no-install-recommends postgresql
 
 lab-deps:
 	tests/lab/deps

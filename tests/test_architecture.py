@@ -20,7 +20,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud.formats",),
     ("imud.contracts", "imud.frames.settings"),
     ("imud.devices", "imud.clock", "imud.links", "imud.publishers", "imud.utc"),
-    ("imud.sim", "imud.config", "imud.client", "imud.analysis", "imud.bridges"),
+    ("imud.sim", "imud.config", "imud.client", "imud.analysis", "imud.bridges", "imud.fleet"),
     ("imud.web",),
     ("imud.signals",),
     ("imud.runtime",),
@@ -201,6 +201,7 @@ MAY_READ_CLOCKS = (
     "imud.host_clock",
     "imud.cli",  # programs of their own, as are the client and the simulator's process
     "imud.client",
+    "imud.fleet.reader",
     "imud.sim.__main__",
     "imud.links",  # in the callback that reads, and in waits for the wire
 )

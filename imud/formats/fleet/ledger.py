@@ -6,7 +6,7 @@ Numbers of a stream come in order. A message may come again, as a whole or with 
 cover numbers whose message had come though its acknowledgement was lost): what is known already is a duplicate.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import msgspec
@@ -53,13 +53,24 @@ class StreamCounts(msgspec.Struct):
         return self.newest - self.begin + 1 - covered
 
 
+class StoredAccount(msgspec.Struct, frozen=True):
+    """The account of one stream as it is kept: a reader that was restarted goes on with it."""
+
+    counts: StreamCounts
+    gaps: list[tuple[int, int]]
+    """First and last of each range that is missing and may still come."""
+
+
 class _Account:
     """The account of one stream, with the ranges that are missing."""
 
-    def __init__(self, message: FleetMessage, *, from_begin: bool) -> None:
-        begin = message.begin if from_begin else message.first
-        self.counts = StreamCounts(begin, begin - 1)
-        self._gaps: list[tuple[int, int]] = []
+    def __init__(self, counts: StreamCounts, gaps: Sequence[tuple[int, int]] = ()) -> None:
+        self.counts = counts
+        self._gaps = list(gaps)
+
+    def stored(self) -> StoredAccount:
+        """A copy that does not change any more."""
+        return StoredAccount(msgspec.structs.replace(self.counts, dropped=dict(self.counts.dropped)), list(self._gaps))
 
     def take(self, message: FleetMessage, stream: Stream) -> list[tuple[int, int]]:
         """Enter a message; return the ranges of numbers that are new."""
@@ -112,6 +123,16 @@ class FleetLedger:
         """The account of each stream."""
         return {key: account.counts for key, account in self._accounts.items()}
 
+    def stored(self, key: StreamKey) -> StoredAccount:
+        """The account of a stream, to be kept. Raises KeyError for one of which nothing came."""
+        return self._accounts[key].stored()
+
+    def restore(self, key: StreamKey, account: StoredAccount) -> None:
+        """Go on with an account that was kept. Raises OverflowError beyond STREAMS_MAX streams."""
+        if key not in self._accounts and len(self._accounts) >= STREAMS_MAX:
+            raise OverflowError(f"expected at most {STREAMS_MAX} streams, got one more: {key}")
+        self._accounts[key] = _Account(account.counts, account.gaps)
+
     def take(self, message: FleetMessage, stream: Stream) -> FleetMessage | None:
         """Enter a message; return what of it is new, None for nothing. Raises OverflowError beyond STREAMS_MAX streams.
 
@@ -122,7 +143,8 @@ class FleetLedger:
         if account is None:
             if len(self._accounts) >= STREAMS_MAX:
                 raise OverflowError(f"expected at most {STREAMS_MAX} streams, got one more: {key}")
-            account = self._accounts[key] = _Account(message, from_begin=self._from_begin)
+            begin = message.begin if self._from_begin else message.first
+            account = self._accounts[key] = _Account(StreamCounts(begin, begin - 1))
         fresh = account.take(message, stream)
         if not fresh:
             return None

@@ -1,0 +1,1 @@
+"""`imud fleet`: what gateways send over MQTT, collected or shown."""

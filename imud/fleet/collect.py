@@ -1,0 +1,94 @@
+"""The collector: batches of all gateways into a store, acknowledged when the store has them.
+
+    session ──delivery──▶ ledger ──batch──▶ store.write (one transaction) ──▶ acknowledge
+
+A transaction has what came within COMMIT_S, at most BATCHES_MAX messages. A store that keeps the ledger beside the rows
+gives it back after a restart, so that what comes again is known. A collector whose store fails ends: what it had not
+acknowledged is sent to the next one.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from typing import Final, NamedTuple, Protocol
+
+from imud.fleet.connection import RECEIVE_MAX, FleetDelivery
+from imud.fleet.reader import Fleet, FleetBatch, FleetSession
+from imud.formats.fleet.ledger import FleetLedger, StreamKey
+from imud.units import NS_PER_S
+
+COMMIT_S: Final = 0.5
+BATCHES_MAX: Final = RECEIVE_MAX // 2
+"""Messages of one transaction: while it runs, the broker can send as many again."""
+
+
+class FleetStore(Protocol):
+    """Where batches go. Synchronization: one thread at a time."""
+
+    def restore(self, ledger: FleetLedger) -> None:
+        """Enter the accounts that are kept into a ledger. Raises ServerError."""
+        ...
+
+    def write(self, batches: Sequence[FleetBatch], ledger: FleetLedger, changed: frozenset[StreamKey]) -> None:
+        """Keep batches and the accounts that changed, all or nothing. Raises ServerError, OSError."""
+        ...
+
+    def close(self) -> None:
+        """End; may be called twice."""
+        ...
+
+
+class Selection(NamedTuple):
+    """What is collected; None stands for all."""
+
+    site: str | None = None
+    gateway: str | None = None
+    device: str | None = None
+
+
+EVERYTHING: Final = Selection()
+
+
+class FleetCollector:
+    """One run of the collector. Synchronization: one event loop; `stop` from it too."""
+
+    def __init__(
+        self, fleet: Fleet, store: FleetStore, selection: Selection = EVERYTHING,
+    ) -> None:  # fmt: skip
+        self.written = 0
+        """Messages that the store has."""
+        self._fleet, self._store, self._selection, self._now_ns = fleet, store, selection, fleet.now_ns
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End after the present message; what has come is written."""
+        self._stopped = True
+
+    async def run(self, *, stop_after_s: float | None = None) -> None:
+        """Collect until `stop`, or for so long. Raises ServerError and OSError when the store fails."""
+        self._store.restore(self._fleet.ledger)
+        end_ns = None if stop_after_s is None else self._now_ns() + round(stop_after_s * NS_PER_S)
+        site, gateway, device = self._selection
+        async with FleetSession(self._fleet, site=site, gateway=gateway, device=device) as session:
+            while not self._stopped and (end_ns is None or self._now_ns() < end_ns):
+                await self._turn(session)
+
+    async def _turn(self, session: FleetSession) -> None:
+        """Take what comes within COMMIT_S, write it, acknowledge it."""
+        deliveries: list[FleetDelivery] = []
+        batches: list[FleetBatch] = []
+        changed: set[StreamKey] = set()
+        due_ns = self._now_ns() + round(COMMIT_S * NS_PER_S)
+        while len(deliveries) < BATCHES_MAX and (left_ns := due_ns - self._now_ns()) > 0 and not self._stopped:
+            delivery = await session.next(left_ns / NS_PER_S)
+            if delivery is None:
+                continue
+            deliveries.append(delivery)
+            batch = self._fleet.take(delivery, changed)
+            if batch is not None:
+                batches.append(batch)
+        if batches or changed:
+            ledger, frozen = self._fleet.ledger, frozenset(changed)
+            await asyncio.shield(asyncio.to_thread(self._store.write, batches, ledger, frozen))
+            self.written += len(batches)
+        for delivery in deliveries:
+            session.acknowledge(delivery)

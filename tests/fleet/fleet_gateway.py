@@ -1,0 +1,72 @@
+"""A gateway of the tests that sends given messages with QoS 1 and waits until the broker has taken them."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+
+from imud.formats.fleet.messages import VERSION, DropCause, FleetMessage, MessageKind, encode_message
+from imud.formats.fleet.state import GatewayState
+from imud.formats.fleet.topics import STATE, Stream, topic_of
+from imud.sample import Sample, Sync
+from imud.units import NS_PER_MS
+
+LIMIT_S = 20.0
+UTC_NS = 1_790_000_000_000_000_000
+
+
+def samples_message(
+    first: int, last: int, *, gateway: str = "gw", boot: str = "1", device: str = "bow", utc_ns: int = UTC_NS
+) -> FleetMessage:
+    """Whole samples with these numbers, a millisecond apart; `utc_ns` is that of number 0."""
+    samples = [
+        Sample(
+            device, seq, seq * NS_PER_MS, 500, Sync.EDGE, seq * NS_PER_MS + 10, utc_ns + seq * NS_PER_MS,
+            accel_m_s2=(seq / 8, 0.0, 9.75), temperature_c=21.5,
+        )
+        for seq in range(first, last + 1)
+    ]  # fmt: skip
+    return FleetMessage(
+        v=VERSION, gateway=gateway, boot=boot, device=device, kind=MessageKind.SAMPLES, begin=1, first=first, last=last,
+        count=len(samples), utc_ns=samples[-1].utc_ns, samples=samples,
+    )  # fmt: skip
+
+
+def dropped_message(first: int, last: int, *, gateway: str = "gw", boot: str = "1") -> FleetMessage:
+    """What the gateway says of numbers that it dropped."""
+    return msgspec.structs.replace(
+        samples_message(first, last, gateway=gateway, boot=boot), kind=MessageKind.DROPPED, cause=DropCause.SPACE,
+        samples=[],
+    )  # fmt: skip
+
+
+class SendingGateway:
+    """A client of the broker. Synchronization: one thread."""
+
+    def __init__(self, port: int) -> None:
+        from paho.mqtt.client import Client, MQTTv5
+        from paho.mqtt.enums import CallbackAPIVersion
+
+        self._client: Any = Client(CallbackAPIVersion.VERSION2, "sending", protocol=MQTTv5)
+        self._client.max_inflight_messages_set(500)
+        self._client.connect("127.0.0.1", port)
+        self._client.loop_start()
+
+    def send(self, *messages: FleetMessage, stream: Stream = Stream.SAMPLES) -> None:
+        """Send messages of a stream."""
+        self.publish((topic_of("mill", one.gateway, one.device, stream), encode_message(one)) for one in messages)
+
+    def send_state(self, state: GatewayState, gateway: str = "gw") -> None:
+        """Send a state, retained."""
+        self.publish([(topic_of("mill", gateway, "", STATE), msgspec.json.encode(state))], retain=True)
+
+    def publish(self, messages: Iterable[tuple[str, bytes]], *, retain: bool = False) -> None:
+        """Send payloads, and wait until the broker has acknowledged them."""
+        for info in [self._client.publish(topic, payload, qos=1, retain=retain) for topic, payload in messages]:
+            info.wait_for_publish(LIMIT_S)
+            assert info.is_published()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._client.disconnect()
+        self._client.loop_stop()

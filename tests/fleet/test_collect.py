@@ -1,0 +1,85 @@
+"""The collector with a real broker: what the store has is acknowledged, and its ledger goes on."""
+
+import asyncio
+from collections.abc import Sequence
+
+import pytest
+
+from imud.errors import ServerError
+from imud.fleet import Fleet, FleetBatch
+from imud.fleet.collect import FleetCollector
+from imud.formats.fleet.ledger import FleetLedger, StoredAccount, StreamKey
+from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, samples_message
+from tests.publishers.mqtt.mosquitto import Mosquitto
+
+
+class MemoryStore:
+    """A store that keeps what it is given, and fails when it is told to."""
+
+    def __init__(self) -> None:
+        self.rows: list[int] = []
+        self.accounts: dict[StreamKey, StoredAccount] = {}
+        self.fails = False
+        self.collector: FleetCollector | None = None
+        self.most = 1 << 30
+
+    def restore(self, ledger: FleetLedger) -> None:
+        for key, account in self.accounts.items():
+            ledger.restore(key, account)
+
+    def write(self, batches: Sequence[FleetBatch], ledger: FleetLedger, changed: frozenset[StreamKey]) -> None:
+        if self.fails:
+            raise ServerError("the store is full")
+        self.rows += [sample.seq for batch in batches for sample in batch.message.samples]
+        self.accounts |= {key: ledger.stored(key) for key in changed}
+        if len(self.rows) >= self.most and self.collector is not None:
+            self.collector.stop()
+
+    def close(self) -> None:
+        pass
+
+
+def collect(broker: Mosquitto, store: MemoryStore, most: int) -> Fleet:
+    """Run the collector until the store has so many rows."""
+    fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
+    store.most = most
+    store.collector = FleetCollector(fleet, store)
+
+    async def run() -> None:
+        assert store.collector is not None
+        async with asyncio.timeout(LIMIT_S):
+            await store.collector.run()
+
+    asyncio.run(run())
+    return fleet
+
+
+def begin_session(broker: Mosquitto) -> None:
+    fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
+    asyncio.run(FleetCollector(fleet, MemoryStore()).run(stop_after_s=1.0))
+    assert not fleet.problem
+
+
+def test_what_a_store_refused_comes_again_to_the_next_collector(broker: Mosquitto, gateway: SendingGateway) -> None:
+    begin_session(broker)
+    gateway.send(samples_message(1, 5), samples_message(6, 9))
+    store = MemoryStore()
+    store.fails = True
+    with pytest.raises(ServerError, match="the store is full"):
+        collect(broker, store, 9)
+    store.fails = False
+    collect(broker, store, 9)
+    assert store.rows == list(range(1, 10))
+
+
+def test_a_restarted_collector_knows_what_it_had(broker: Mosquitto, gateway: SendingGateway) -> None:
+    begin_session(broker)
+    gateway.send(samples_message(1, 5))
+    store = MemoryStore()
+    collect(broker, store, 5)
+    gateway.send(samples_message(1, 5), samples_message(6, 9))
+    fleet = collect(broker, store, 9)
+    assert store.rows == list(range(1, 10))
+    (account,) = fleet.accounts.values()
+    assert (account.received, account.counts.duplicates, account.balance) == (9, 5, 0)
+    assert store.accounts == {StreamKey("gw", "1", "bow", "samples"): StoredAccount(account.counts, [])}

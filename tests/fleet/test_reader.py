@@ -1,0 +1,192 @@
+"""The reader against a real broker: what is not taken comes again, what is taken does not, and connections return."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from imud.errors import BadArgument
+from imud.fleet import Fleet, FleetBatch
+from imud.fleet.connection import RECEIVE_MAX
+from imud.formats.fleet.ledger import StreamKey
+from imud.formats.fleet.state import GatewayState, StreamPosition
+from imud.formats.fleet.topics import topic_of
+from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+
+KEY = StreamKey("gw", "1", "bow", "samples")
+
+
+def fleet_at(broker: Mosquitto, name: str = "") -> Fleet:
+    return Fleet(f"mqtt://127.0.0.1:{broker.port}", name=name, retry_max_s=1.0)
+
+
+async def taken(fleet: Fleet, number: int, **wanted: str) -> list[FleetBatch]:
+    """So many batches; the last of them is not acknowledged."""
+    found = []
+    async with asyncio.timeout(LIMIT_S):
+        batches = fleet.watch(**wanted)
+        async for batch in batches:
+            found.append(batch)
+            if len(found) == number:
+                break
+        await batches.aclose()
+    return found
+
+
+async def session_begun(fleet: Fleet) -> None:
+    """Connect once and leave, so that the broker keeps the session."""
+    batches = fleet.watch()
+    waiting = asyncio.ensure_future(anext(batches))
+    await until(lambda: not waiting.done() and bool(fleet.states))
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+
+
+async def until(true: Callable[[], bool]) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while not true():
+            await asyncio.sleep(0.02)
+
+
+STATE = GatewayState(v=1, online=True, boot="1", positions=[StreamPosition("1", "bow", "samples", 1, 50)])
+
+
+def test_batches_come_as_samples_of_the_client_and_the_account_closes(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
+    gateway.send_state(STATE)
+    fleet = fleet_at(broker, "archive")
+
+    async def play() -> list[FleetBatch]:
+        await session_begun(fleet)
+        gateway.send(samples_message(1, 10), samples_message(1, 10), dropped_message(11, 15), samples_message(19, 20))
+        return await taken(fleet, 3)
+
+    batches = asyncio.run(play())
+    assert [one.site for one in batches] == ["mill"] * 3
+    assert batches[0].message == samples_message(1, 10)
+    assert fleet.states["mill", "gw"] == STATE
+    account = fleet.accounts[KEY]
+    assert (account.sent, account.received, account.in_spool, account.balance) == (50, 12, 30, 0)
+    assert (account.counts.dropped, account.counts.missing, account.counts.duplicates) == ({"space": 5}, 3, 10)
+
+
+def test_what_a_reader_had_not_taken_comes_again_and_nothing_else(broker: Mosquitto, gateway: SendingGateway) -> None:
+    gateway.send_state(STATE)
+
+    async def play() -> list[FleetBatch]:
+        await session_begun(fleet_at(broker, "archive"))
+        gateway.send(*(samples_message(10 * n + 1, 10 * n + 10) for n in range(5)))
+        assert len(await taken(fleet_at(broker, "archive"), 3)) == 3  # two acknowledged
+        return await taken(fleet_at(broker, "archive"), 3)
+
+    assert [one.message.first for one in asyncio.run(play())] == [21, 31, 41]
+
+
+def test_the_broker_sends_no_more_than_the_reader_has_room_for(broker: Mosquitto, gateway: SendingGateway) -> None:
+    gateway.send_state(STATE)
+    fleet = fleet_at(broker, "slow")
+
+    async def play() -> tuple[int, int]:
+        await session_begun(fleet)
+        await asyncio.to_thread(gateway.send, *(samples_message(n, n) for n in range(1, 2 * RECEIVE_MAX + 1)))
+        before = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log)
+        batches = fleet.watch()
+        await anext(batches)
+        gateway.send_state(STATE)  # the broker has handled all before it
+        sent = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log) - before
+        count = 1
+        async for _ in batches:
+            count += 1
+            if count == 2 * RECEIVE_MAX:
+                break
+        await batches.aclose()
+        return sent, count
+
+    sent, count = asyncio.run(play())
+    assert sent <= RECEIVE_MAX + 1
+    assert count == 2 * RECEIVE_MAX
+    assert fleet.accounts[KEY].counts.missing == 0
+
+
+def test_a_broker_that_restarts_loses_nothing(broker: Mosquitto, gateway: SendingGateway) -> None:
+    gateway.send_state(STATE)
+    fleet = fleet_at(broker, "archive")
+
+    async def play() -> list[int]:
+        await session_begun(fleet)
+        batches, found = fleet.watch(), []
+        gateway.send(samples_message(1, 10))
+        found.append((await anext(batches)).message.first)
+        waiting = asyncio.ensure_future(anext(batches))
+        await asyncio.to_thread(broker.stop)
+        await asyncio.to_thread(broker.start)
+        other = SendingGateway(broker.port)
+        await asyncio.to_thread(other.send, samples_message(11, 20))
+        async with asyncio.timeout(LIMIT_S):
+            found.append((await waiting).message.first)
+        other.close()
+        await batches.aclose()
+        return found
+
+    assert asyncio.run(play()) == [1, 11]
+
+
+def test_only_what_is_wanted_comes_even_where_the_session_had_more(broker: Mosquitto, gateway: SendingGateway) -> None:
+    gateway.send_state(STATE)
+
+    async def play() -> list[FleetBatch]:
+        await session_begun(fleet_at(broker, "archive"))
+        gateway.send(samples_message(1, 1, gateway="other"), samples_message(1, 1, device="stern"))
+        gateway.send(samples_message(1, 2))
+        return await taken(fleet_at(broker, "archive"), 1, gateway="gw", device="bow")
+
+    assert [one.message.last for one in asyncio.run(play())] == [2]
+
+
+def test_what_no_gateway_sends_is_counted_and_acknowledged(broker: Mosquitto, gateway: SendingGateway) -> None:
+    gateway.send_state(STATE)
+    fleet = fleet_at(broker, "archive")
+
+    async def play() -> None:
+        await session_begun(fleet)
+        wrong = topic_of("mill", "other", "bow", "samples")
+        gateway.publish([(wrong, b"{}"), (wrong, b"IMUB\xff"), (topic_of("mill", "gw", "", "state"), b"[]")])
+        gateway.publish([(wrong, b'{"v":1,"gateway":"gw","boot":"1","device":"bow","kind":"samples",'
+                                 b'"begin":1,"first":1,"last":1,"count":1,"utc_ns":0}')])  # fmt: skip
+        gateway.send(samples_message(1, 1))
+        await taken(fleet, 1)
+
+    asyncio.run(play())
+    assert fleet.ignored == 4
+
+
+@pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
+def test_a_refusal_is_said_and_tried_again(tmp_path: Path) -> None:
+    with running_broker(tmp_path / "closed", "allow_anonymous false") as closed:
+        fleet = fleet_at(closed)
+
+        async def play() -> None:
+            batches = fleet.watch()
+            waiting = asyncio.ensure_future(anext(batches))
+            await until(lambda: bool(fleet.problem))
+            waiting.cancel()
+            await asyncio.gather(waiting, return_exceptions=True)
+
+        asyncio.run(play())
+        assert "refuses the connection: Not authorized" in fleet.problem
+
+
+@pytest.mark.parametrize("url", ["http://host", "mqtt://user:secret@host", "mqtt://", "host:1883"])
+def test_what_is_no_broker_is_refused(url: str) -> None:
+    with pytest.raises(BadArgument, match="expected a URL"):
+        Fleet(url)
+
+
+def test_names_are_checked() -> None:
+    with pytest.raises(BadArgument, match="a name"):
+        Fleet("mqtt://host", name="a/b")
+    with pytest.raises(BadArgument, match="gateway: expected"):
+        asyncio.run(taken(Fleet("mqtt://host"), 1, gateway="#"))

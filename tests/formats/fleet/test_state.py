@@ -1,0 +1,112 @@
+"""Accounts across the network: what gateways say they have spooled against what came, through any order and restart."""
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.formats.fleet.ledger import FleetLedger, StoredAccount, StreamCounts, StreamKey
+from imud.formats.fleet.messages import MessageKind
+from imud.formats.fleet.state import GatewayState, SpoolPositions, StreamPosition, decode_state
+from imud.formats.fleet.topics import Stream
+from tests.formats.fleet.test_ledger import message
+
+KEY = StreamKey("gw", "1", "bow", "samples")
+
+
+def state(last: int, boot: str = "1") -> GatewayState:
+    return GatewayState(v=1, online=True, boot=boot, positions=[StreamPosition(boot, "bow", "samples", 1, last)])
+
+
+def test_a_stream_of_which_nothing_came_is_in_the_spool() -> None:
+    positions = SpoolPositions()
+    positions.take("gw", state(40))
+    account = positions.accounts(FleetLedger())[KEY]
+    assert (account.sent, account.received, account.in_spool, account.balance) == (40, 0, 40, 0)
+
+
+def test_a_state_that_is_older_than_what_came_takes_nothing_back() -> None:
+    positions, ledger = SpoolPositions(), FleetLedger()
+    ledger.take(message(1, 30), Stream.SAMPLES)
+    positions.take("gw", state(50))
+    positions.take("gw", state(20))
+    account = positions.accounts(ledger)[KEY]
+    assert (account.sent, account.received, account.in_spool, account.balance) == (50, 30, 20, 0)
+
+
+def test_a_reboot_has_its_own_account() -> None:
+    positions, ledger = SpoolPositions(), FleetLedger()
+    ledger.take(message(1, 30), Stream.SAMPLES)
+    positions.take("gw", state(30))
+    positions.take("gw", state(7, "2"))
+    accounts = positions.accounts(ledger)
+    assert [(accounts[KEY._replace(boot=boot)].sent, accounts[KEY._replace(boot=boot)].in_spool) for boot in "12"] == [
+        (30, 0), (7, 7)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("payload", [b"", b"[]", b'{"v":1}', b'{"v":1,"online":1,"boot":"1"}', b"\xff"])
+def test_other_payloads_are_refused(payload: bytes) -> None:
+    with pytest.raises(ValueError, match="expected the state of a gateway"):
+        decode_state(payload)
+
+
+def test_a_will_is_a_state() -> None:
+    assert decode_state(b'{"v":1,"online":false,"boot":"ab","reason":"connection lost"}').reason == "connection lost"
+
+
+RANGES = st.tuples(st.integers(1, 40), st.integers(0, 12)).map(lambda pair: (pair[0], pair[0] + pair[1]))
+KINDS = st.sampled_from([MessageKind.SAMPLES, MessageKind.DROPPED, MessageKind.INTERVALS])
+MESSAGES = st.tuples(st.sampled_from(["1", "2"]), RANGES, KINDS)
+STATES = st.tuples(st.sampled_from(["1", "2"]), st.integers(1, 60))
+
+
+@given(st.lists(st.one_of(MESSAGES, STATES, st.just("restart"), st.just("killed"))))
+def test_it_closes_whatever_comes_and_however_often_the_collector_starts_anew(steps: list[object]) -> None:
+    """A killed collector has what it had stored, and the last message, which was not acknowledged, comes again."""
+    ledger, positions = FleetLedger(from_begin=True), SpoolPositions()
+    seen: dict[str, set[int]] = {"1": set(), "2": set()}
+    given_out: dict[str, list[int]] = {"1": [], "2": []}
+    stored: dict[StreamKey, bytes] = {}
+    newest: dict[str, int] = {}
+    last: tuple[str, tuple[int, int], MessageKind] | None = None
+
+    def take(boot: str, span: tuple[int, int], kind: MessageKind) -> None:
+        fresh = ledger.take(message(*span, kind, boot=boot), Stream.SAMPLES)
+        if fresh is not None and kind is MessageKind.SAMPLES:
+            given_out[boot] += [one.seq for one in fresh.samples]
+        seen[boot] |= set(range(span[0], span[1] + 1))
+        stored[KEY._replace(boot=boot)] = msgspec.json.encode(ledger.stored(KEY._replace(boot=boot)))
+
+    for step in steps:
+        if step in ("restart", "killed"):
+            ledger, positions = FleetLedger(from_begin=True), SpoolPositions()
+            newest.clear()
+            for key, account in stored.items():
+                ledger.restore(key, msgspec.json.decode(account, type=StoredAccount))
+            if step == "killed" and last is not None:
+                take(*last)
+        elif isinstance(step, tuple) and len(step) == 3:
+            last = step
+            take(*step)
+        else:
+            assert isinstance(step, tuple)
+            boot, position = step
+            positions.take("gw", state(position, boot))
+            newest[boot] = max(position, newest.get(boot, 0))
+        for key, told in positions.accounts(ledger).items():
+            numbers = seen[key.boot]
+            assert told.balance == 0
+            assert told.sent == max(numbers | {newest.get(key.boot, 0)})
+            assert told.counts.missing == max(numbers, default=0) - len(numbers)
+            assert told.in_spool == max(0, newest.get(key.boot, 0) - max(numbers, default=0))
+    for seqs in given_out.values():
+        assert len(seqs) == len(set(seqs))
+
+
+def test_what_was_stored_does_not_change_afterwards() -> None:
+    ledger = FleetLedger()
+    ledger.take(message(1, 4, MessageKind.DROPPED), Stream.SAMPLES)
+    stored = ledger.stored(KEY)
+    ledger.take(message(5, 9, MessageKind.DROPPED), Stream.SAMPLES)
+    assert stored == StoredAccount(StreamCounts(1, 4, dropped={"space": 4}), [])
