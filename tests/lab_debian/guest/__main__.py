@@ -17,6 +17,7 @@ from tests.lab_debian.guest import (
     rights,
     sandbox,
     service,
+    views,
 )
 from tests.lab_debian.guest.checks import Checks
 from tests.lab_debian.guest.system import SHARE, Host, uptime_s
@@ -29,6 +30,7 @@ GROUPS: dict[str, Group] = {
     "rights": rights.check,
     "sandbox": sandbox.check,
     "outputs": outputs.check,
+    "views": views.check,
     "buses": buses.check,
     "replug": replug.check,
     "doctor": first_contact.check_doctor,
@@ -38,7 +40,7 @@ GROUPS: dict[str, Group] = {
 }
 """In the order in which they run: the first leaves the package installed and the second the service running."""
 RUNS = {
-    "amd64": ("service", "rights", "sandbox", "outputs", "buses", "replug", "doctor", "setup", "removal"),
+    "amd64": ("service", "rights", "sandbox", "outputs", "views", "buses", "replug", "doctor", "setup", "removal"),
     "arm64": ("streaming", "sandbox", "doctor"),
 }
 

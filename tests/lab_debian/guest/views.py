@@ -1,0 +1,168 @@
+"""The page in the browser as a service of its own, and a daemon whose MQTT broker is not there."""
+
+import json
+import re
+from pathlib import Path
+
+from tests.lab_debian.guest.checks import Checks, Failed, expect, expect_in, wait_until
+from tests.lab_debian.guest.rights import RATE_HZ
+from tests.lab_debian.guest.sandbox import PRIVATE, SCORE_MAX
+from tests.lab_debian.guest.service import CAN, USB
+from tests.lab_debian.guest.system import (
+    Host,
+    configure,
+    device,
+    journal,
+    mark,
+    must,
+    pid,
+    run,
+    shown,
+    start_service,
+    wait_streaming,
+)
+
+UNIT = "imud-web.service"
+PORT = 9322
+TOKEN = "0123456789abcdef0123456789abcdef"
+TOKEN_FILE = Path("/etc/imud-web.token")
+DROP_IN = Path(f"/etc/systemd/system/{UNIT}.d/lab.conf")
+OPEN = f"""\
+[Service]
+LoadCredential=token:{TOKEN_FILE}
+ExecStart=
+ExecStart=/usr/bin/imud web --address 0.0.0.0 --token-file ${{CREDENTIALS_DIRECTORY}}/token
+SupplementaryGroups=imud-control
+"""
+"""As the unit's own comment has it, on all addresses."""
+FETCH = """
+import sys, urllib.error, urllib.request
+url, token, body = sys.argv[1:]
+request = urllib.request.Request(url, body.encode() or None)
+request.add_header("Origin", url[:url.index("/", 7)])
+if token:
+    request.add_header("Authorization", "Bearer " + token)
+try:
+    with urllib.request.urlopen(request, timeout=20) as answer:
+        print(answer.status, answer.read().decode())
+except urllib.error.HTTPError as error:
+    print(error.code, error.read().decode())
+except OSError as error:
+    print(0, error)
+"""
+"""Asks as the page of this server does. Prints the status of an answer and its text; 0 for none."""
+LOOK = json.dumps({"method": "actions", "params": {"device": "usb"}})
+CHANGE = json.dumps(
+    {
+        "method": "command",
+        "params": {"device": "usb", "name": "output", "arguments": {"message": "HI91", "rate_hz": RATE_HZ}},
+    }
+)
+NO_BROKER = "mqtt: {enabled: true, brokers: ['mqtt://127.0.0.1:1']}\n"
+"""Nobody listens there."""
+STAYS_S = 30.0
+
+
+def fetch(path: str, address: str = "127.0.0.1", token: str = "", body: str = "") -> tuple[int, str]:
+    """Status and text of an answer of the page's server; a status of 0 where there is none."""
+    said = run("/usr/bin/python3", "-c", FETCH, f"http://{address}:{PORT}{path}", token, body).stdout
+    status, _, text = said.partition(" ")
+    return int(status), text
+
+
+def check(checks: Checks, _host: Host) -> None:
+    """Both."""
+    configure(USB + CAN)
+    start_service()
+    wait_streaming("usb")
+    check_page(checks)
+    check_confinement(checks)
+    check_token(checks)
+    check_no_broker(checks)
+    configure(USB + CAN)
+    start_service()
+    wait_streaming("usb")
+
+
+def check_page(checks: Checks) -> None:
+    """It starts as the package has it: this machine only, and nothing can be changed."""
+    with checks("imud-web starts, and its page answers on this machine"):
+        must("systemctl", "start", UNIT)
+        wait_until(lambda: fetch("/")[0] == 200, "the page")
+        expect_in("<!doctype html>", fetch("/")[1].lower(), "page")
+    with checks("imud-web listens on this machine only, as a user of its own"):
+        listening = must("ss", "--listening", "--tcp", "--numeric", "--no-header", f"sport = :{PORT}")
+        expect("addresses", [line.split()[3] for line in listening.splitlines()], [f"127.0.0.1:{PORT}"])
+        must("ip", "address", "replace", f"{PRIVATE}/32", "dev", "lo")
+        expect("status on another address", fetch("/", PRIVATE)[0], 0)
+        process = Path(f"/proc/{shown('MainPID', UNIT)}/status").read_text()
+        assert not re.search(r"^Uid:\t0\t", process, re.MULTILINE), "it runs as root"
+        expect_in("CapEff:\t0000000000000000", process, "status")
+        expect_in("Seccomp:\t2", process, "status")
+    with checks("without a token nobody changes anything by imud-web"):
+        expect("who looks", fetch("/api/call", body=LOOK)[0], 200)
+        expect("who changes", fetch("/api/call", body=CHANGE)[0], 401)
+
+
+def check_confinement(checks: Checks) -> None:
+    """Exposure; a restart of the daemon beside it; stop."""
+    with checks(f"systemd-analyze security gives imud-web at most {SCORE_MAX}"):
+        said = must("systemd-analyze", "security", "--no-pager", UNIT)
+        found = re.search(r"Overall exposure level for imud-web\.service: ([\d.]+)", said)
+        if found is None:
+            raise Failed(said)
+        checks.figure("exposure of imud-web (systemd-analyze security)", float(found[1]), "of 10")
+        assert float(found[1]) <= SCORE_MAX, f"score {found[1]}"
+    with checks("imud-web stays when the daemon is restarted"):
+        before = shown("MainPID", UNIT)
+        start_service()
+        wait_streaming("usb")
+        expect("process", shown("MainPID", UNIT), before)
+        expect("page", fetch("/")[0], 200)
+    with checks("imud-web stops cleanly"):
+        must("systemctl", "stop", UNIT)
+        expect("result", shown("Result", UNIT), "success")
+        expect("status", fetch("/")[0], 0)
+
+
+def check_token(checks: Checks) -> None:
+    """With a token on all addresses."""
+    with checks("on all addresses imud-web needs its token, and with it a module is asked"):
+        TOKEN_FILE.write_text(f"{TOKEN}\n")
+        TOKEN_FILE.chmod(0o600)
+        DROP_IN.parent.mkdir(exist_ok=True)
+        DROP_IN.write_text(OPEN)
+        must("systemctl", "daemon-reload")
+        try:
+            must("systemctl", "start", UNIT)
+            wait_until(lambda: fetch("/", PRIVATE)[0], "an answer on another address")
+            for token in ("", TOKEN[:-1] + "x"):
+                expect("a stranger who looks", fetch("/api/call", PRIVATE, token, LOOK)[0], 401)
+                expect("a stranger who changes", fetch("/api/call", PRIVATE, token, CHANGE)[0], 401)
+            expect_in("output", fetch("/api/call", PRIVATE, TOKEN, LOOK)[1], "actions")
+            expect_in('"result"', fetch("/api/call", PRIVATE, TOKEN, CHANGE)[1], "answer to a change")
+        finally:
+            run("systemctl", "stop", UNIT)
+            DROP_IN.unlink()
+            DROP_IN.parent.rmdir()
+            TOKEN_FILE.unlink()
+            must("systemctl", "daemon-reload")
+
+
+def check_no_broker(checks: Checks) -> None:
+    """The output is on, and nobody is there to take it."""
+    with checks("a daemon whose MQTT broker is not there streams on, keeps its messages, and is not restarted"):
+        since = mark()
+        configure(NO_BROKER + USB + CAN)
+        start_service()
+        before = pid()
+        wait_streaming("usb")
+        wait_until(lambda: "127.0.0.1:1" in journal(since), "what is wrong, in the log")
+        wait_until(lambda: any(Path("/var/lib/imud/mqtt").rglob("*")), "the spool")
+        began = (device("usb") or {})["newest_seq"]
+        wait_until(
+            lambda: (device("usb") or {})["newest_seq"] > began + STAYS_S * RATE_HZ, f"samples of {STAYS_S} s more"
+        )
+        expect("process", pid(), before)
+        expect("restarts", shown("NRestarts"), "0")
+        expect("active", shown("ActiveState"), "active")
