@@ -8,6 +8,7 @@
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make fleet-deps  installs PostgreSQL, for the tests of the collector, and what make mqtt-deps installs
 # make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
+# make fleet-demo    a broker, three gateways with a simulated sensor each, and `imud fleet top` on them
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
 # make fleet-day     a spool with what 24 hours without a network make, replayed
 # make fleet-load    1,000 simulated gateways, one broker, one collector   make fleet-cluster  three NATS servers, one is killed
@@ -83,7 +84,10 @@ audit: $(VENV)/made
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)
 
-.PHONY: fleet-faults fleet-load fleet-cluster fleet-day
+.PHONY: fleet-demo fleet-faults fleet-load fleet-cluster fleet-day
+fleet-demo: $(VENV)/made
+	$(BIN)/python -m tests.fleet.demo $(ARGS)
+
 fleet-faults: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_faults $(ARGS)
 

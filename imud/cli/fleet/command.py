@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from imud.cli.arguments import CliCommand, duration_s
+from imud.cli.fleet.top import add_top, run_top
 from imud.cli.output import table
 from imud.errors import BadArgument
 from imud.fleet import Fleet, ReaderAccess
@@ -45,6 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--name", default=NAME,
         help="of the session that the broker keeps for this one collector while it is away (default: %(default)s)",
     )  # fmt: skip
+    showing = actions.add_parser("top", help="show all gateways, redrawn in place")
+    _broker(showing)
+    add_top(showing)
     collecting.add_argument("--site", help="of this site only")
     collecting.add_argument("--gateway", help="of this gateway only")
     collecting.add_argument("--device", help="of this device only")
@@ -71,6 +75,8 @@ def _broker(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out one of the actions. Raises ImudError."""
+    if args.action == "top":
+        return asyncio.run(run_top(args, fleet_of(args, "", from_begin=False)))
     return asyncio.run(_collect(args))
 
 
