@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,17 +13,9 @@ import pytest
 from imud.cli import main
 from imud.formats.fleet.state import GatewayState, StreamPosition
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.publishers.mqtt.mosquitto import Mosquitto
 
 URL = "mqtt://127.0.0.1:{}"
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Mosquitto]:
-    if NO_MOSQUITTO:
-        pytest.skip(NO_MOSQUITTO)
-    with running_broker(tmp_path / "broker") as one:
-        yield one
 
 
 @contextmanager

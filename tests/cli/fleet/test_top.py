@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -15,21 +14,18 @@ from imud.formats.fleet.state import GatewayState
 from tests.fleet.demo import GATEWAYS
 from tests.fleet.demo import main as demonstrate
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, samples_message
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto
 
 URL = "mqtt://127.0.0.1:{}"
 TOP = (sys.executable, "-m", "imud", "fleet", "top")
 
 
 @pytest.fixture
-def gateway(tmp_path: Path) -> Iterator[tuple[Mosquitto, SendingGateway]]:
-    if NO_MOSQUITTO:
-        pytest.skip(NO_MOSQUITTO)
-    with running_broker(tmp_path / "broker") as broker:
-        made = SendingGateway(broker.port)
-        made.send_state(GatewayState(v=1, online=True, boot="1", devices=["bow"]))
-        yield broker, made
-        made.close()
+def gateway(broker: Mosquitto) -> Iterator[tuple[Mosquitto, SendingGateway]]:
+    made = SendingGateway(broker.port)
+    made.send_state(GatewayState(v=1, online=True, boot="1", devices=["bow"]))
+    yield broker, made
+    made.close()
 
 
 def test_tables_come_until_it_is_told_to_end(gateway: tuple[Mosquitto, SendingGateway]) -> None:
