@@ -124,6 +124,8 @@ class SpoolWriter:
         self._acknowledged: set[int] = set()
         self._session = 0
         self._due_ns = 0
+        self._allowed, self._allowed_ns = 1.0, now_ns()
+        """Messages that may be given, as of a time, where `messages_per_s` bounds them."""
         self._resume()
         self._worker = start_worker("mqtt spool", self.work, self._failed)
         sender.wanting = self._worker.ring
@@ -151,8 +153,8 @@ class SpoolWriter:
             for streams in self._streams.values():
                 self._rows += streams.look(now_ns)
             self._store(now_ns)
-        self._give()
-        return max(1, min(COMMIT_NS, self._due_ns - self._now_ns()))
+        pause_ns = self._give(now_ns)
+        return max(1, min(COMMIT_NS, self._due_ns - self._now_ns(), pause_ns))
 
     def _take_answers(self) -> None:
         """Note what was acknowledged, and begin anew with the oldest after a new connection."""
@@ -255,19 +257,25 @@ class SpoolWriter:
                 self._spool.commit((), acknowledged, now_ns, now_ns + self._utc_offset_ns())
                 self._acknowledged -= acknowledged
 
-    def _give(self) -> None:
-        """Give the sender what it has room for."""
-        room = self._sender.room()
+    def _give(self, now_ns: int) -> int:
+        """Give the sender what it has room for; return after what time more may be given, ns."""
+        room, rate_hz = self._sender.room(), self._settings.messages_per_s
+        if rate_hz is not None:
+            self._allowed += (now_ns - self._allowed_ns) * rate_hz / NS_PER_S
+            self._allowed, self._allowed_ns = min(self._allowed, max(rate_hz, 1.0)), now_ns
+            room = min(room, int(self._allowed))
         try:
             while room > 0:
                 rows = self._spool.after(room)
                 if not rows:
-                    return
+                    return COMMIT_NS
                 fresh = [row for row in rows if row.id not in self._acknowledged]
                 self._sender.give(self._session, fresh)
                 room -= len(fresh)
+                self._allowed -= len(fresh) if rate_hz is not None else 0
         except SpoolError as error:
             self.problem = self.problem or str(error)
+        return COMMIT_NS if rate_hz is None else round(max(1.0 - self._allowed, 0.0) * NS_PER_S / rate_hz) or COMMIT_NS
 
     def _failed(self, error: BaseException) -> None:
         self.failure = error

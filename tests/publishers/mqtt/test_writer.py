@@ -1,5 +1,6 @@
 """The queue and the thread of the spool: bounded, nothing twice, a disk that fails costs only what it must."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -39,9 +40,10 @@ class FailingSpool(Spool):
 class WriterBench:
     """Writer and sender by hand; one sample each millisecond."""
 
-    def __init__(self, path: Path, boot: str = "1", **settings: object) -> None:
+    def __init__(self, path: Path, boot: str = "1", messages_per_s: float | None = None, **settings: object) -> None:
         self.clock, self.broker = VirtualClock(), FakeBroker()
-        made = msgspec.convert({"devices": {"bow": {"rate_hz": None, "whole": "slots", **settings}}}, MqttSettings)
+        devices = {"bow": {"rate_hz": None, "whole": "slots", **settings}}
+        made = msgspec.convert({"devices": devices, "messages_per_s": messages_per_s}, MqttSettings)
         self.queue = WriterQueue()
         self.spool = FailingSpool(path, 100_000_000, HOUR_NS)
         turn = BrokerTurn([Broker("a", 1, False, False, "")], 60.0, lambda: 0.5)
@@ -117,6 +119,33 @@ def test_nothing_is_sent_before_it_is_stored(tmp_path: Path) -> None:
     bench.work(3)
     assert bench.arrived() == []
     assert bench.writer.problem == "No space left on device"
+
+
+def test_what_waited_is_sent_in_order_and_no_faster_than_is_allowed(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path, messages_per_s=3)
+    bench.broker.problem = "no route"
+    for _ in range(10):
+        bench.put(1000)
+        bench.work()
+    bench.broker.problem = ""
+    sent = []
+    for _ in range(30):
+        bench.work()
+        sent.append(len(bench.arrived()))
+    assert sent[-1] == 20
+    assert max(b - a for a, b in pairwise([0, *sent])) <= 6  # what a second allows, and what it had saved
+    begun = next(number for number, count in enumerate(sent) if count)
+    assert 3 * 5 <= sent[begun + 5] <= 3 * 7
+    firsts = [decode_message(payload).first for payload in bench.arrived()]
+    assert firsts == list(range(1, 10_000, 500))
+    assert bench.counts().missing == 0
+
+
+def test_a_rate_below_one_message_a_second_sends_one_now_and_then(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path, messages_per_s=0.25)
+    bench.put(5000)
+    bench.work(21)
+    assert len(bench.arrived()) in (5, 6)
 
 
 def test_there_is_one_transaction_a_second(tmp_path: Path) -> None:
