@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.fleet_gateway import SendingGateway
+from tests.publishers.mqtt.conftest import authority
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+
+__all__ = ["authority", "broker", "gateway"]
 
 
 @pytest.fixture

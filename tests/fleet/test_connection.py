@@ -1,6 +1,7 @@
 """One connection of a reader with a real broker: deliveries, acknowledgements, its end."""
 
 import asyncio
+from pathlib import Path
 
 import pytest
 
@@ -9,15 +10,18 @@ from imud.fleet.connection import ReaderConnection
 from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.settings import broker_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway
-from tests.publishers.mqtt.mosquitto import Mosquitto, free_port
+from tests.publishers.mqtt.authority import Authority
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
 
 ACCESS = ReaderAccess()
 
 
-async def opened(port: int, session_s: int = 0) -> ReaderConnection:
-    broker = broker_of(f"mqtt://127.0.0.1:{port}")
+async def opened(
+    port: int, session_s: int = 0, *, scheme: str = "mqtt", access: ReaderAccess = ACCESS
+) -> ReaderConnection:
+    broker = broker_of(f"{scheme}://127.0.0.1:{port}")
     assert broker is not None
-    return await ReaderConnection.open(broker, ACCESS, "reader", ["imud/#"], session_s)
+    return await ReaderConnection.open(broker, access, "reader", ["imud/#"], session_s)
 
 
 def test_a_retained_message_says_so_and_none_comes_in_no_time(broker: Mosquitto, gateway: SendingGateway) -> None:
@@ -74,3 +78,30 @@ def test_a_broker_that_ends_is_noticed(broker: Mosquitto) -> None:
         connection.close()
 
     asyncio.run(play())
+
+
+@pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
+def test_tls_with_certificates_of_both_sides_and_more_than_one_record_at_once(
+    tmp_path: Path, authority: Authority
+) -> None:
+    port, plain = free_port(), free_port()
+    lines = [*authority.listener(port), f"listener {plain} 127.0.0.1", "allow_anonymous true"]
+    access = ReaderAccess(
+        ca_file=authority["ca.pem"], cert_file=authority["gateway.pem"], key_file=authority["gateway.key"]
+    )
+
+    async def play() -> list[tuple[str, int]]:
+        connection = await opened(port, scheme="mqtts", access=access)
+        payloads = [(f"imud/{number}", bytes(number * 10_000)) for number in range(20)]
+        await asyncio.to_thread(SendingGateway(plain).publish, payloads)
+        found = []
+        for _ in payloads:
+            delivery = await connection.next(LIMIT_S)
+            assert delivery is not None
+            connection.acknowledge(delivery.number)
+            found.append((delivery.topic, len(delivery.payload)))
+        connection.close()
+        return found
+
+    with running_broker(tmp_path / "broker", "per_listener_settings true", *lines):
+        assert asyncio.run(play()) == [(f"imud/{number}", number * 10_000) for number in range(20)]

@@ -10,6 +10,7 @@ import pytest
 from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.broker import PahoConnection, Will
 from imud.publishers.mqtt.settings import MqttSettings, broker_of
+from tests.publishers.mqtt.authority import Authority
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, free_port, running_broker
 
 pytestmark = pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
@@ -128,34 +129,6 @@ def test_websockets(tmp_path: Path) -> None:
 # --- TLS --------------------------------------------------------------------------------------------------------------
 
 
-class Authority:
-    """Certificates made by openssl for one test."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._run("req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "ca.key", "-out", "ca.pem", "-days", "2",
-                  "-subj", "/CN=imud test authority")  # fmt: skip
-        for name, more in (("broker", "subjectAltName=IP:127.0.0.1"), ("gateway", "extendedKeyUsage=clientAuth")):
-            self._run("req", "-newkey", "rsa:2048", "-nodes", "-keyout", f"{name}.key", "-out", f"{name}.csr",
-                      "-subj", f"/CN={name}")  # fmt: skip
-            (folder / "extension").write_text(more)
-            self._run("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial",
-                      "-out", f"{name}.pem", "-days", "2", "-extfile", "extension")  # fmt: skip
-
-    def _run(self, *words: str) -> None:
-        subprocess.run(["openssl", *words], cwd=self.folder, check=True, capture_output=True)
-
-    def __getitem__(self, name: str) -> str:
-        return str(self.folder / name)
-
-
-@pytest.fixture(scope="module")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is not installed")
-    return Authority(tmp_path_factory.mktemp("authority"))
-
-
 LEFT_OPEN = "ignore::pytest.PytestUnraisableExceptionWarning"
 """paho-mqtt 2.2 leaves the socket of a handshake that failed to the garbage collector."""
 
@@ -163,11 +136,7 @@ LEFT_OPEN = "ignore::pytest.PytestUnraisableExceptionWarning"
 @pytest.mark.filterwarnings(LEFT_OPEN)
 def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authority) -> None:
     port = free_port()
-    lines = (
-        f"listener {port} 127.0.0.1", f"cafile {authority['ca.pem']}", f"certfile {authority['broker.pem']}",
-        f"keyfile {authority['broker.key']}", "require_certificate true", "allow_anonymous true",
-    )  # fmt: skip
-    with running_broker(tmp_path / "broker", *lines):
+    with running_broker(tmp_path / "broker", *authority.listener(port)):
         own = {"cert_file": authority["gateway.pem"], "key_file": authority["gateway.key"]}
         connection = connect(f"mqtts://127.0.0.1:{port}", ca_file=authority["ca.pem"], **own)
         send(connection, b"x" * 200_000)
