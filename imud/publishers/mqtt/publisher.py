@@ -95,7 +95,9 @@ class MqttPublisher:
         will = Will(topic_of(settings.site, gateway, "", STATE), self._state(online=False, reason="connection lost"))
         brokers = [found for url in settings.brokers if (found := broker_of(url)) is not None]
         turn = BrokerTurn(brokers, settings.retry_max_s)
-        self._spool = Spool(directory, settings.spool_bytes, settings.spool_age_ns)
+        self._spool = Spool(
+            directory, settings.spool_bytes, settings.spool_age_ns, newest_first=settings.newest_first
+        )  # fmt: skip
         if settings.commands.enabled:
             self._commands = CommandChannel(
                 settings.commands, self._gateway, context.control, context.now_ns, context.utc_offset_ns

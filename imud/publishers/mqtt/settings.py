@@ -156,6 +156,8 @@ class MqttSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     messages_per_s: Annotated[float, msgspec.Meta(ge=0.1, le=100_000)] | None = None
     """Most messages of streams that are sent in a second, so that a gateway that was away for long does not take the
     whole link when it is back; more than it makes. null for as many as broker and link take."""
+    newest_first: bool = False
+    """Whether what is new is sent before what waited while there was no connection; streams are not in order then."""
     spool_directory: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud/mqtt"
     """Where the spool is; imud makes it where it is missing."""
     spool_mb: Annotated[float, msgspec.Meta(ge=1, le=1_000_000)] = 256.0

@@ -7,7 +7,8 @@
 - Room: the pages that are in use, within a number of bytes. Where they do not suffice, the oldest whole samples become
   statistics of their batch; when there are none left, the oldest messages are dropped. What is older than the age
   allows is dropped too. In the place of what was dropped there is a message that says so, and neighbours share it.
-- Messages that were given to the sender are left alone until `rewind`.
+- Messages that were given to the sender are left alone until `rewind`. They are given in their order; with
+  `newest_first` those that are new since `rewind` go before those that waited then.
 - A full disk (SpoolError) leaves the spool as it was before the transaction.
 - A file that is damaged is set aside, and a new one begun.
 """
@@ -57,6 +58,9 @@ CREATE TABLE IF NOT EXISTS position (
 ) WITHOUT ROWID;
 """
 _COLUMNS: Final = "id, boot, device, stream, kind, topic, first, last, items, stored_utc_ns, payload"
+_FREE: Final = "id > ? AND NOT (id > ? AND id <= ?)"
+"""Messages that were not given: what may become statistics or be dropped."""
+_ID_MAX: Final = (1 << 63) - 1
 _THICK: Final = (MessageKind.SAMPLES.value, MessageKind.SLOTS.value)
 
 
@@ -109,7 +113,7 @@ def row_of(topic: str, stream: Stream, message: FleetMessage, payload: bytes, st
 class Spool:
     """The file. Synchronization: one thread; the counters may be read by any."""
 
-    def __init__(self, directory: Path, bytes_max: int, age_ns: int) -> None:
+    def __init__(self, directory: Path, bytes_max: int, age_ns: int, *, newest_first: bool = False) -> None:
         self.messages = 0
         """Messages in the file."""
         self.used_bytes = 0
@@ -127,6 +131,10 @@ class Spool:
         self._base: sqlite3.Connection | None = None
         self._next_id = 1
         self._given = 0
+        """Messages up to this id were given."""
+        self._newest_first = newest_first
+        self._ahead_from = self._ahead = 0
+        """Those after the first id up to the second were given ahead of what waited; 0 while nothing waits behind."""
         self._thin_from = 0
         """Messages up to this id need not be looked at for thinning."""
         self._synced_ns = 0
@@ -213,21 +221,37 @@ class Spool:
 
     def after(self, limit: int) -> list[Spooled]:
         """The next messages, oldest first, which count as given from now on. Raises SpoolError."""
+        found: list[Spooled] = []
+        if self._ahead_from:
+            found = self._between(self._ahead, _ID_MAX, limit)
+            self._ahead = found[-1].id if found else self._ahead
+            waited = self._between(self._given, self._ahead_from, limit - len(found))
+            self._given = waited[-1].id if waited else self._given
+            if not waited and len(found) < limit:  # all that waited is given
+                self._given, self._ahead_from, self._ahead = self._ahead, 0, 0
+            return found + waited
+        found = self._between(self._given, _ID_MAX, limit)
+        self._given = found[-1].id if found else self._given
+        return found
+
+    def _between(self, after_id: int, last_id: int, limit: int) -> list[Spooled]:
+        """Messages after an id up to another, oldest first. Raises SpoolError."""
+        if limit <= 0:
+            return []
         try:
             rows = self._connection().execute(
-                f"SELECT {_COLUMNS} FROM message WHERE id > ? ORDER BY id LIMIT ?", (self._given, limit)
-            )  # fmt: skip
-            found = [Spooled(*row) for row in rows]
+                f"SELECT {_COLUMNS} FROM message WHERE id > ? AND id <= ? ORDER BY id LIMIT ?",
+                (after_id, last_id, limit),
+            )
+            return [Spooled(*row) for row in rows]
         except sqlite3.Error as error:
             self._look_at(error)
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
-        if found:
-            self._given = found[-1].id
-        return found
 
     def rewind(self) -> None:
         """Nothing was given: the connection that it was given to is gone."""
         self._given = 0
+        self._ahead_from = self._ahead = self._next_id - 1 if self._newest_first else 0
 
     def positions(self) -> list[Position]:
         """How far streams have come, those of earlier boots included. Raises SpoolError."""
@@ -275,13 +299,18 @@ class Spool:
             done = base.executemany("DELETE FROM message WHERE id = ?", [(one,) for one in acknowledged])
             self.messages -= done.rowcount
 
+    @property
+    def _taken(self) -> tuple[int, int, int]:
+        """What `_FREE` leaves out: all up to the first id, and all after the second up to the third."""
+        return self._given, self._ahead_from, self._ahead
+
     def _keep_age(self, base: sqlite3.Connection, utc_ns: int) -> None:
         if utc_ns < CLOCK_SET_NS:
             return
         old_ns = utc_ns - self._age_ns
         oldest = base.execute(
-            "SELECT id, stored_utc_ns FROM message WHERE id > ? AND kind != 'dropped' ORDER BY id LIMIT ?",
-            (self._given, STEP),
+            f"SELECT id, stored_utc_ns FROM message WHERE {_FREE} AND kind != 'dropped' ORDER BY id LIMIT ?",
+            (*self._taken, STEP),
         ).fetchall()
         for number, stored_utc_ns in oldest:
             if not CLOCK_SET_NS <= stored_utc_ns < old_ns:
@@ -307,8 +336,8 @@ class Spool:
     def _thin_some(self, base: sqlite3.Connection) -> bool:
         """Make statistics of the oldest whole samples; return whether there were any."""
         rows = base.execute(
-            f"SELECT {_COLUMNS} FROM message WHERE id > ? AND kind IN (?, ?) ORDER BY id LIMIT ?",
-            (max(self._given, self._thin_from), *_THICK, STEP),
+            f"SELECT {_COLUMNS} FROM message WHERE {_FREE} AND id > ? AND kind IN (?, ?) ORDER BY id LIMIT ?",
+            (*self._taken, self._thin_from, *_THICK, STEP),
         )  # fmt: skip
         found = [Spooled(*row) for row in rows]
         for row in found:
@@ -335,8 +364,8 @@ class Spool:
     def _drop_some(self, base: sqlite3.Connection) -> bool:
         """Drop the oldest messages; return whether there were any."""
         rows = base.execute(
-            f"SELECT {_COLUMNS} FROM message WHERE id > ? AND kind != 'dropped' ORDER BY id LIMIT ?",
-            (self._given, STEP),
+            f"SELECT {_COLUMNS} FROM message WHERE {_FREE} AND kind != 'dropped' ORDER BY id LIMIT ?",
+            (*self._taken, STEP),
         )  # fmt: skip
         found = [Spooled(*row) for row in rows]
         for row in found:
@@ -348,7 +377,7 @@ class Spool:
         self.dropped[cause.value] = self.dropped.get(cause.value, 0) + row.items
         before = None
         marker_id = self._markers.get(row.key, 0)
-        if marker_id > self._given:
+        if marker_id > self._given and not self._ahead_from < marker_id <= self._ahead:
             before = base.execute(f"SELECT {_COLUMNS} FROM message WHERE id = ?", (marker_id,)).fetchone()
         if before is not None:
             old = Spooled(*before)

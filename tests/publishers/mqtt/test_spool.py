@@ -3,6 +3,7 @@
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -44,8 +45,10 @@ def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = Tr
 class SpoolBench:
     """A spool and its clocks."""
 
-    def __init__(self, path: Path, kilobytes: int = 100_000, hours: float = 100.0) -> None:
-        self.spool = Spool(path, kilobytes * 1000, round(hours * HOUR_NS))
+    def __init__(
+        self, path: Path, kilobytes: int = 100_000, hours: float = 100.0, *, newest_first: bool = False
+    ) -> None:
+        self.spool = Spool(path, kilobytes * 1000, round(hours * HOUR_NS), newest_first=newest_first)
         self.spool.open()
         self.now_ns = 0
 
@@ -127,6 +130,72 @@ def test_when_nothing_can_be_thinned_the_oldest_are_dropped_and_it_is_said(tmp_p
     events = sum(row.items for row in rows if row.stream == "events" and row.kind == "dropped")
     assert bench.spool.dropped["space"] == counts.dropped["space"] + events
     assert sum(row.kind == "dropped" for row in rows) == 2, "neighbours share one note for each stream"
+
+
+def test_what_is_new_goes_before_what_waited_where_asked(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, newest_first=True)
+    bench.commit(batch(1), batch(101), batch(201), batch(301))
+    bench.spool.rewind()
+    assert [row.first for row in bench.spool.after(1)] == [1]
+    bench.commit(batch(401), batch(501))
+    assert [row.first for row in bench.spool.after(3)] == [401, 501, 101]
+    bench.commit(batch(601))
+    assert [row.first for row in bench.spool.after(9)] == [601, 201, 301]
+    assert bench.spool.after(9) == []
+    bench.commit(batch(701), batch(801))
+    assert [row.first for row in bench.spool.after(1)] == [701]
+    assert [row.first for row in bench.spool.after(9)] == [801]
+    bench.spool.rewind()
+    assert [row.first for row in bench.spool.after(9)] == list(range(1, 900, 100))
+
+
+def test_what_was_given_ahead_is_left_alone_too(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, kilobytes=150, newest_first=True)
+    bench.commit(batch(1), batch(101))
+    bench.spool.rewind()
+    bench.commit(batch(201), batch(301))
+    given = bench.spool.after(2)
+    assert [row.first for row in given] == [201, 301]
+    for number in range(4, 400):
+        bench.commit(batch(100 * number + 1))
+    assert bench.spool.thinned > 0
+    assert bench.spool.dropped["space"] > 0
+    kept = {row.id: row for row in bench.all()}
+    assert [kept[row.id] for row in given] == given
+    assert bench.counts().missing == 0
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+@pytest.mark.parametrize("seed", range(12))
+def test_everything_is_given_once_and_never_changed_afterwards(tmp_path: Path, seed: int, newest_first: bool) -> None:
+    random = Random(seed)
+    bench = SpoolBench(tmp_path, kilobytes=random.choice([120, 250, 100_000]), newest_first=newest_first)
+    ledger, first, given = FleetLedger(from_begin=True), 1, dict[int, Spooled]()
+    for _ in range(150):
+        match random.randrange(8):
+            case 0:
+                bench.spool.rewind()
+                given.clear()
+            case 1 | 2 if given:
+                done = tuple(random.sample(sorted(given), random.randint(1, len(given))))
+                for number in done:
+                    ledger.take(decode_message(given.pop(number).payload), Stream.SAMPLES)
+                bench.commit(done=done)
+            case 3 | 4:
+                for row in bench.spool.after(random.randint(1, 6)):
+                    assert row.id not in given
+                    given[row.id] = row
+            case _:
+                bench.commit(*(batch(first + 100 * number) for number in range(2)))
+                first += 200
+    kept = {row.id: row for row in bench.all()}
+    assert {number: row.payload for number, row in kept.items() if number in given} == {
+        number: row.payload for number, row in given.items()
+    }
+    for row in kept.values():
+        ledger.take(decode_message(row.payload), Stream.SAMPLES)
+    (counts,) = ledger.counts.values()
+    assert (counts.newest, counts.missing, counts.balance) == (first - 1, 0, 0)
 
 
 def test_what_was_given_to_the_sender_is_left_alone(tmp_path: Path) -> None:
