@@ -1,6 +1,11 @@
 """The unit tests on a foreign architecture: when they run, what they are given, what is made of their report."""
 
+import ast
+import re
 import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 
 import pytest
@@ -28,6 +33,49 @@ def report(*more: str) -> str:
     places = ("tests.formats.test_can", "tests.clock.test_intervals", "tests.publishers.shm.test_publisher")
     passed = [case(place) for place in (*places, "tests.include.test_c_header")]
     return f"<testsuites><testsuite>{''.join([*passed, *more])}</testsuite></testsuites>"
+
+
+# --- what they import -------------------------------------------------------------------------------------------------
+
+
+def imported(path: Path, seen: set[Path]) -> Iterator[str]:
+    """Names of the modules that a test file imports when it is read, and so its helpers in `tests`, and theirs."""
+    if path in seen:
+        return
+    seen.add(path)
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Import):
+            names = [one.name for one in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{one.name}" for one in node.names)]
+        else:
+            continue
+        for name in names:
+            yield name.partition(".")[0]
+            helper = ROOT / f"{name.replace('.', '/')}.py"
+            if name.startswith("tests.") and helper.exists():
+                yield from imported(helper, seen)
+
+
+def distribution(requirement: str) -> str:
+    """Name of what a requirement asks for, as it is compared."""
+    found = re.match(r"[\w.-]+", requirement)
+    assert found, requirement
+    return found[0].lower().replace("_", "-")
+
+
+def test_what_the_tests_import_is_there() -> None:
+    """In WHEELS, or among the libraries of imud itself, which its package has."""
+    paths = [ROOT / name for part in unit_tests.PARTS.values() for name in part]
+    files = [one for path in paths for one in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
+    seen: set[Path] = set()
+    names = {name for file in files for name in imported(file, seen)}
+    assert {"pytest", "imud"} <= names
+    owners = packages_distributions()
+    foreign = names - set(sys.stdlib_module_names) - {"imud", "tests"}
+    wanted = {name: {distribution(one) for one in owners.get(name, [name])} for name in foreign}
+    given = {distribution(one) for one in (*user_mode.WHEELS, *(requires("imud") or ())) if "extra ==" not in one}
+    assert {name: who for name, who in wanted.items() if not who & given} == {}
 
 
 # --- what is run when -------------------------------------------------------------------------------------------------
