@@ -1,8 +1,16 @@
 """Rows of CSV: columns with units in their names, empty cells for what is missing, all digits."""
 
+import struct
+from collections.abc import Iterator, Sequence
+from math import inf, isfinite, nan
+from random import Random
+
+import msgspec
+import pytest
+
 from imud.bridges import table
 from imud.bridges.channel import LossCounts, StampedEvent
-from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA
+from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 
 
@@ -51,3 +59,88 @@ def test_events_and_losses() -> None:
 def test_every_array_has_a_column_for_each_of_its_numbers() -> None:
     lengths = {field.name: int(field.type[7:-1]) for field in SAMPLE_SCHEMA if field.type.startswith("number[")}
     assert {name: len(columns) for name, columns in table.AXES.items()} == lengths
+
+
+# --- many rows at once ------------------------------------------------------------------------------------------------
+
+
+def by_rows(samples: Sequence[Sample], fields: Sequence[str] = SAMPLE_FIELDS) -> bytes:
+    """The text that Python's own writer makes of the rows."""
+    return table.csv_text(map(table.sample_row(fields), samples))
+
+
+def finite(random: Random, count: int) -> Iterator[float]:
+    """Numbers of every size: any bits, round ones, and those where the form of the exponent changes."""
+    while count:
+        value = random.choice(
+            (
+                struct.unpack("<d", random.randbytes(8))[0],
+                random.uniform(-1, 1) * 10.0 ** random.randint(-9, 20),
+                random.choice((1, -1, 2.5, -12.5)) * 10.0 ** random.randint(-8, 23),
+            )
+        )
+        if isfinite(value):
+            count -= 1
+            yield value
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1e-5, b"1e-05"), (-2.5e-5, b"-2.5e-05"), (0.0001, b"0.0001"), (10.00001, b"10.00001"), (3e-7, b"3e-07"),
+        (-1.5e-10, b"-1.5e-10"), (1e15, b"1000000000000000.0"), (1e16, b"1e+16"), (1.5e100, b"1.5e+100"),
+        (-0.0, b"-0.0"), (0.1, b"0.1"), (100.00002, b"100.00002"), (5e-324, b"5e-324"), (nan, b"nan"), (-inf, b"-inf"),
+    ],
+)  # fmt: skip
+def test_numbers_are_written_as_python_writes_them(value: float, text: bytes) -> None:
+    sample = msgspec.structs.replace(FULL, gyro_rad_s=(value, 0.5, value))
+    assert table.SampleText(("gyro_rad_s", "seq")).of([sample, FULL]) == text + b",0.5," + text + b",7\r\n" + (
+        b"0.25,0.5,-0.75,7\r\n"
+    )
+
+
+def test_numbers_of_every_size_are_written_as_python_writes_them() -> None:
+    numbers = finite(Random(1), 9 * 20 * 100)
+    for _ in range(100):
+        samples = [
+            msgspec.structs.replace(FULL, **{name: (next(numbers), next(numbers), next(numbers)) for name in VECTORS})
+            for _ in range(20)
+        ]
+        assert table.SampleText(SAMPLE_FIELDS).of(samples) == by_rows(samples)
+    assert next(numbers, None) is None
+
+
+VECTORS = ("accel_m_s2", "gyro_rad_s", "mag_t")
+
+
+def test_samples_that_have_different_fields_stand_in_one_text() -> None:
+    whole = msgspec.structs.replace(BARE, temperature_c=21)
+    samples = [FULL, BARE, msgspec.structs.replace(FULL, mag_t=(nan, 0.0, 0.0)), whole, BARE]
+    for chosen in (samples, samples[:2], samples[3:], samples[1:2]):
+        assert table.SampleText(SAMPLE_FIELDS).of(chosen) == by_rows(chosen)
+    assert table.SampleText(("seq", "temperature_c")).of([whole]) == b"%d,21.0\r\n" % whole.seq
+
+
+def test_a_missing_value_is_not_taken_for_one_that_is_no_number() -> None:
+    """Both are null in JSON: as many of the one kind as of the other must not be confused."""
+    samples = [msgspec.structs.replace(FULL, pressure_pa=None), msgspec.structs.replace(FULL, pressure_pa=nan)]
+    assert table.SampleText(("seq", "pressure_pa")).of(samples) == b"7,\r\n7,nan\r\n"
+
+
+@pytest.mark.parametrize(
+    "name", ["bow", 'b,"o"w', "home-5", "0.00001", "1e16", "@", "null", "[a]", "a\r\nb", "é\udc80"]
+)
+def test_the_name_of_a_device_stays_as_it_is(name: str) -> None:
+    samples = [msgspec.structs.replace(one, device=name) for one in (FULL, BARE)]
+    assert table.SampleText(SAMPLE_FIELDS).of(samples) == by_rows(samples)
+    assert table.SampleText(("seq", "device")).of(samples) == by_rows(samples, ("seq", "device"))
+
+
+@pytest.mark.parametrize("field", ["status", "temperature_c", "device", "sync", "t_dev_ns", "incli_rad"])
+def test_a_field_alone(field: str) -> None:
+    assert table.SampleText((field,)).of([BARE, FULL]) == by_rows([BARE, FULL], (field,))
+
+
+def test_text_without_times_has_empty_cells_for_them() -> None:
+    names = ("seq", "t_ns", "utc_ns", "t_err_ns", "sync", "t_rx_ns", "t_dev_ns")
+    assert table.SampleText(names, without_times=True).of([FULL]) == b"7,,,,,,5000000\r\n"

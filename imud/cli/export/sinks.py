@@ -1,8 +1,6 @@
 """What takes an export: the contract, and the table of samples, events or losses as CSV."""
 
-import csv
 from collections.abc import Collection
-from io import StringIO
 from typing import Final, Protocol
 
 from imud.bridges import table
@@ -46,35 +44,32 @@ class CsvSink:
         """`what` is one of TABLES; `fields` are those of samples, None for all."""
         self._out = out
         self._what = what
-        self._text = StringIO()
-        self._rows = csv.writer(self._text)  # by RFC 4180: CRLF, quotes only where they are needed
         names = SAMPLE_FIELDS if fields is None else tuple(fields)
-        self._row = table.sample_row(names, without_times)
+        self._rows = table.SampleText(names, without_times)
         heads = {"samples": table.sample_columns(names), "events": table.EVENT_COLUMNS, "losses": table.LOSS_COLUMNS}
-        self._rows.writerow(heads[what])
+        self._text = bytearray(table.csv_text([heads[what]]))
 
     def samples(self, batch: Batch) -> None:
         """Write a row each."""
         if self._what == "samples":
-            self._rows.writerows(map(self._row, batch.samples))
-            if self._text.tell() >= CSV_BYTES:
+            self._text += self._rows.of(batch.samples)
+            if len(self._text) >= CSV_BYTES:
                 self.finish()
 
     def losses(self, losses: LossCounts) -> None:
         """Write a row."""
         if self._what == "losses":
-            self._rows.writerow(table.loss_row(losses))
+            self._text += table.csv_text([table.loss_row(losses)])
 
     def event(self, event: StampedEvent) -> None:
         """Write a row."""
         if self._what == "events":
-            self._rows.writerow(table.event_row(event))
+            self._text += table.csv_text([table.event_row(event)])
 
     def finish(self) -> None:
         """Write what waits."""
-        self._out.write(self._text.getvalue().encode(errors="backslashreplace"))
-        self._text.seek(0)
-        self._text.truncate()
+        self._out.write(bytes(self._text))
+        self._text.clear()
 
     def close(self) -> None:
         """No-op: nothing is held."""
