@@ -1,6 +1,7 @@
 """One connection of a reader with a real broker: deliveries, acknowledgements, its end."""
 
 import asyncio
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -93,7 +94,8 @@ def test_tls_with_certificates_of_both_sides_and_more_than_one_record_at_once(
     async def play() -> list[tuple[str, int]]:
         connection = await opened(port, scheme="mqtts", access=access)
         payloads = [(f"imud/{number}", bytes(number * 10_000)) for number in range(20)]
-        await asyncio.to_thread(SendingGateway(plain).publish, payloads)
+        with closing(SendingGateway(plain)) as gateway:
+            await asyncio.to_thread(gateway.publish, payloads)
         found = []
         for _ in payloads:
             delivery = await connection.next(LIMIT_S)
