@@ -48,7 +48,7 @@ class ViewerGate:
         self._origins = origins
         self._note = note
         self._noted: set[str] = set()
-        self._count = 0
+        self._connections: set[asyncio.Task[None]] = set()
         self._socket = _listening(host, port)
         self.port: Final = int(self._socket.getsockname()[1])
         self._loop = asyncio.new_event_loop()
@@ -69,14 +69,20 @@ class ViewerGate:
             runner.run(self._serve())  # the runner cancels the connections that are left
 
     async def _serve(self) -> None:
-        listening = await asyncio.start_server(self._take, sock=self._socket, limit=HEAD_BYTES_MAX)
+        listening = await asyncio.start_server(self._accept, sock=self._socket, limit=HEAD_BYTES_MAX)
         self._ready.set()
         await self._stopped.wait()
         listening.close()
 
+    def _accept(self, reader: StreamReader, writer: StreamWriter) -> None:
+        """Serve a connection; its writer is closed even where the gate ends before the task has begun."""
+        task = self._loop.create_task(self._take(reader, writer))
+        self._connections.add(task)
+        task.add_done_callback(self._connections.discard)
+        task.add_done_callback(lambda _: writer.close())
+
     async def _take(self, reader: StreamReader, writer: StreamWriter) -> None:
         """Serve a connection to its end."""
-        self._count += 1
         try:
             async with asyncio.timeout(HEAD_S):
                 head = await reader.readuntil(b"\r\n\r\n")
@@ -88,13 +94,10 @@ class ViewerGate:
                 await self._join(head, reader, writer)
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # it went away, or it is no viewer
-        finally:
-            self._count -= 1
-            writer.close()
 
     def _judge(self, head: bytes) -> tuple[str, str]:
         """Return the HTTP status and the words of a refusal; empty words where the request may pass."""
-        if self._count > CONNECTIONS_MAX:
+        if len(self._connections) > CONNECTIONS_MAX:
             return "503 Service Unavailable", f"{CONNECTIONS_MAX} viewers are connected, which is the most"
         request, _, rest = head.partition(b"\r\n")
         try:
@@ -123,10 +126,10 @@ class ViewerGate:
         try:
             await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
         finally:
+            server_writer.close()  # before the wait: the end of the gate may cancel that
             for way in ways:
                 way.cancel()
             await asyncio.gather(*ways, return_exceptions=True)
-            server_writer.close()
 
 
 async def _pass_on(reader: StreamReader, writer: StreamWriter, pause_s: float) -> None:

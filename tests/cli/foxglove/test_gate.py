@@ -1,5 +1,6 @@
 """The gate before a server that repeats what it gets: who comes through, who is refused, and what ends with what."""
 
+import gc
 import socket
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -186,6 +187,21 @@ def test_closing_ends_connections_and_may_be_repeated(echo: Echo) -> None:
         gate.close()
         assert connection.recv(1) == b""
         connection.close()
+
+
+def test_the_gate_ends_beside_its_viewers_and_leaves_nothing_open(echo: Echo) -> None:
+    """A leftover is seen twice: its thread of the server goes on, and asyncio warns when it is collected."""
+    rounds, viewers_at_a_time = 5, 20
+    for _ in range(rounds):
+        with gated(echo) as gate:
+            viewers = [connect(gate) for _ in range(viewers_at_a_time)]
+            for viewer in viewers:
+                viewer.sendall(head())
+                assert received(viewer, len(head())) == head()
+            for viewer in viewers:
+                viewer.close()
+    gc.collect()
+    wait_until(lambda: echo.ended == rounds * viewers_at_a_time, "every connection behind ends")
 
 
 def test_a_server_that_is_gone_closes_the_connection(echo: Echo) -> None:
