@@ -192,3 +192,8 @@ def status_part(find: Callable[[DeviceStatus], T | None]) -> DevicePart[T]:
 def daemon(read: Callable[[Snapshot], float]) -> Reader:
     """Reads one value of the daemon, without labels."""
     return Reader((), lambda snapshot: (((), read(snapshot)),))
+
+
+def each(find: Callable[[Snapshot], Sequence[T]], read: Callable[[T], float]) -> Reader:
+    """Reads one value, without labels, of an output of which there is one or none."""
+    return Reader((), lambda snapshot: [((), read(status)) for status in find(snapshot)])

@@ -4,16 +4,12 @@ from collections.abc import Callable
 from typing import Final
 
 from imud.contracts.status import MqttStatus
-from imud.publishers.metrics.family import BYTES, NO_UNIT, Family, Lines, MetricType, Reader, Snapshot, Unit
+from imud.publishers.metrics.family import BYTES, NO_UNIT, Family, Lines, MetricType, Reader, Snapshot, Unit, each
 
 
 def _mqtt(read: Callable[[MqttStatus], float]) -> Reader:
     """A value of the output."""
-
-    def lines(snapshot: Snapshot) -> Lines:
-        return [((), read(status)) for status in snapshot.mqtts]
-
-    return Reader((), lines)
+    return each(lambda snapshot: snapshot.mqtts, read)
 
 
 def _dropped(snapshot: Snapshot) -> Lines:

@@ -4,25 +4,17 @@ from collections.abc import Callable
 from typing import Final
 
 from imud.contracts.status import FlightStatus, RecorderStatus
-from imud.publishers.metrics.family import BYTES, NO_UNIT, SECONDS, Family, Lines, MetricType, Reader, Snapshot
+from imud.publishers.metrics.family import BYTES, NO_UNIT, SECONDS, Family, Lines, MetricType, Reader, Snapshot, each
 
 
 def _recorder(read: Callable[[RecorderStatus], float]) -> Reader:
     """A value of the recorder."""
-
-    def lines(snapshot: Snapshot) -> Lines:
-        return [((), read(status)) for status in snapshot.recorders]
-
-    return Reader((), lines)
+    return each(lambda snapshot: snapshot.recorders, read)
 
 
 def _flight(read: Callable[[FlightStatus], float]) -> Reader:
     """A value of the flight recorder."""
-
-    def lines(snapshot: Snapshot) -> Lines:
-        return [((), read(status)) for status in snapshot.flights]
-
-    return Reader((), lines)
+    return each(lambda snapshot: snapshot.flights, read)
 
 
 def _snapshots(snapshot: Snapshot) -> Lines:
