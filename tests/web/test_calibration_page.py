@@ -1,6 +1,5 @@
 """Calibrations through the page in a real browser: a module that is turned, its sphere, its result."""
 
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from imud.client import Client
 from imud.formats.jsonrpc import RpcError
 from imud.runtime.calibration.turning import COVERAGE_WANTED
 from tests.support.daemon_process import RunningDaemon, daemon_with_module
-from tests.web.browser import LIMIT_S, MISSING, Page, browser, log_in, open_page, serving_web
+from tests.web.browser import LIMIT_S, MISSING, Page, log_in, open_page, serving_web
 from tests.web.turned import BIAS, turned_module
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
@@ -30,22 +29,6 @@ PIXEL = """const { onSphere, coveredCells, cellDirection } = await import('/stat
     sphere.draw(args[0]);
     return coveredCells(args[0]).map((is, cell) => [is, onSphere(cellDirection(cell))[2] > 0.3, colour(cell)]);"""
 """Of each cell of a mask: whether it is covered, whether it is in front, and the colour in its middle."""
-
-
-@pytest.fixture(scope="module")
-def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """One browser for all tests."""
-    with browser(tmp_path_factory.mktemp("browser")) as one:
-        yield one
-
-
-@pytest.fixture
-def page(window: Page) -> Page:
-    """Its tab, with no page open, without a cookie, and with nothing in its log."""
-    window.driver.delete_all_cookies()
-    window.driver.get("about:blank")
-    window.problems()
-    return window
 
 
 @pytest.fixture

@@ -55,21 +55,6 @@ def sent_by(folder: Path, port: Cable) -> Iterator[RunningDaemon]:
         yield daemon
 
 
-@pytest.fixture(scope="module")
-def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """One browser for all tests that do not need another size."""
-    with browser(tmp_path_factory.mktemp("browser")) as one:
-        yield one
-
-
-@pytest.fixture
-def page(window: Page) -> Page:
-    """Its tab, with no page open and nothing in its log."""
-    window.driver.get("about:blank")
-    window.problems()
-    return window
-
-
 def test_what_is_plotted_is_what_was_sent_and_every_peak_of_it(page: Page, tmp_path: Path) -> None:
     with cable(tmp_path) as port, Sender(port, peaks) as sender, sent_by(tmp_path, port) as daemon:
         daemon.wait_for("bow", "running")
