@@ -54,7 +54,7 @@ COMMANDS = {
         "imud.cli.foxglove.command:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
     ),
     "web": Subcommand("imud.cli.web:WEB", "show all devices in a browser, live"),
-    "fleet": Subcommand("imud.cli.fleet.command:FLEET", "collect what gateways send to an MQTT broker"),
+    "fleet": Subcommand("imud.cli.fleet.command:FLEET", "collect or show what gateways send to an MQTT broker"),
     "watch": Subcommand("imud.cli.live.watch:WATCH", "print samples as they come"),
     "events": Subcommand("imud.cli.live.events:EVENTS", "print events as they come"),
     "clock": Subcommand(

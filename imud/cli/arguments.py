@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from imud.bridges.noise_file import read_noise
 from imud.client import Client
 from imud.client.connection import default_path
 from imud.contracts.driver import Driver
@@ -141,6 +140,8 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
 
 def noise_by_device(reports: Sequence[Path]) -> dict[str, Deviations]:
     """Return what reports say, by the name of the device; of two of one device the later wins. Raises ImudError."""
+    from imud.bridges.noise_file import read_noise  # not part of every command's start
+
     return dict(map(read_noise, reports))
 
 

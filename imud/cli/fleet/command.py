@@ -46,20 +46,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--name", default=NAME,
         help="of the session that the broker keeps for this one collector while it is away (default: %(default)s)",
     )  # fmt: skip
-    showing = actions.add_parser("top", help="show all gateways, redrawn in place")
-    _broker(showing)
-    add_top(showing)
-    collecting.add_argument("--site", help="of this site only")
-    collecting.add_argument("--gateway", help="of this gateway only")
-    collecting.add_argument("--device", help="of this device only")
     collecting.add_argument(
         "--from-begin", action="store_true",
         help="count as missing what a gateway had sent of its present boot before the collector first heard of it",
     )  # fmt: skip
+    showing = actions.add_parser("top", help="show all gateways, redrawn in place")
+    _broker(showing)
+    add_top(showing)
 
 
 def _broker(parser: argparse.ArgumentParser) -> None:
-    """Arguments for the connection."""
+    """Arguments for the connection, and for what is read."""
     parser.add_argument("url", metavar="URL", help="broker: mqtt, mqtts, ws or wss, for example mqtts://HOST:8883")
     parser.add_argument("--user", default="", help="name for the broker")
     parser.add_argument("--password-file", metavar="FILE", help="file that has the password in its first line")
@@ -70,6 +67,8 @@ def _broker(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--cert-file", metavar="FILE", help="certificate (PEM) of this client")
     parser.add_argument("--key-file", metavar="FILE", help="its key (PEM), where the certificate's file has none")
+    for name, words in (("site", "this site"), ("gateway", "this gateway"), ("device", "this device")):
+        parser.add_argument(f"--{name}", help=f"of {words} only")
     parser.add_argument("--duration", type=duration_s, metavar="TIME", help="end after so long, as 90s, 10min or 2h")
 
 

@@ -60,8 +60,6 @@ def add_top(parser: argparse.ArgumentParser) -> None:
         "--interval", type=float, default=INTERVAL_S, metavar="S", help="time between pictures (default: %(default)g)"
     )
     parser.add_argument("--plain", action="store_true", help="one table after another, as where it is no terminal")
-    for name, words in (("site", "this site"), ("gateway", "this gateway"), ("device", "this device")):
-        parser.add_argument(f"--{name}", help=f"of {words} only")
 
 
 async def run_top(args: argparse.Namespace, fleet: Fleet) -> int:
