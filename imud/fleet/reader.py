@@ -19,7 +19,7 @@ import msgspec
 
 from imud.errors import BadArgument, ServerError
 from imud.fleet.connection import FleetDelivery, ReaderConnection
-from imud.formats.fleet.ledger import FleetLedger, StreamKey
+from imud.formats.fleet.ledger import FleetLedger, StreamKey, key_of
 from imud.formats.fleet.messages import FleetMessage, decode_message
 from imud.formats.fleet.state import GatewayState, SpoolPositions, StreamAccount, decode_state
 from imud.formats.fleet.topics import ROOT, STATE, Stream, TopicParts, is_name, parse_topic
@@ -27,6 +27,7 @@ from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.backoff import BrokerTurn
 from imud.publishers.mqtt.broker import check_extra
 from imud.publishers.mqtt.settings import Broker, broker_of
+from imud.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
@@ -130,7 +131,7 @@ class Fleet:
                 raise ValueError(f"expected a message of {parts.gateway}/{parts.device}, got one of another")
             fresh = self.ledger.take(message, stream)
             if changed is not None:
-                changed.add(StreamKey(message.gateway, message.boot, message.device, stream.value))
+                changed.add(key_of(message, stream))
             return FleetBatch(parts.site, stream, fresh) if fresh is not None else None
         except ValueError as error:
             self.ignored += 1
@@ -196,7 +197,7 @@ class FleetSession:
     async def _connected(self, timeout_s: float | None) -> bool:
         """Connect, when it is time for it. Raises BrokerError."""
         fleet = self._fleet
-        pause_s = (self._again_ns - fleet.now_ns()) / 1e9
+        pause_s = (self._again_ns - fleet.now_ns()) / NS_PER_S
         if pause_s > 0:
             await asyncio.sleep(pause_s if timeout_s is None else min(pause_s, timeout_s))
         if fleet.now_ns() < self._again_ns:
@@ -214,7 +215,7 @@ class FleetSession:
         fleet = self._fleet
         now_ns = fleet.now_ns()
         pause_s = self._turn.failed(now_ns)
-        self._again_ns = now_ns + round(pause_s * 1e9)
+        self._again_ns = now_ns + round(pause_s * NS_PER_S)
         if fleet.problem != str(error):
             fleet.problem = str(error)
             log.warning("%s; trying again", error)

@@ -29,6 +29,11 @@ class StreamKey(NamedTuple):
     stream: str
 
 
+def key_of(message: FleetMessage, stream: Stream) -> StreamKey:
+    """What the numbers of a message count in."""
+    return StreamKey(message.gateway, message.boot, message.device, stream.value)
+
+
 class StreamCounts(msgspec.Struct):
     """The account of one stream, in numbers: samples by `seq`, or events."""
 
@@ -138,7 +143,7 @@ class FleetLedger:
 
         Statistics that are partly new are returned as they are.
         """
-        key = StreamKey(message.gateway, message.boot, message.device, stream.value)
+        key = key_of(message, stream)
         account = self._accounts.get(key)
         if account is None:
             if len(self._accounts) >= STREAMS_MAX:

@@ -24,6 +24,7 @@ import msgspec
 
 from imud.errors import reason_of
 from imud.formats.fleet.messages import VERSION, DropCause, FleetMessage, MessageKind, decode_message, encode_message
+from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.statistics import summed_up
 from imud.units import NS_PER_S
@@ -90,16 +91,6 @@ class Spooled(NamedTuple):
     def key(self) -> tuple[str, str, str]:
         """What its numbers count in."""
         return self.boot, self.device, self.stream
-
-
-class Position(msgspec.Struct, frozen=True):
-    """How far a stream of a boot has come into the spool."""
-
-    boot: str
-    device: str
-    stream: str
-    begin: int
-    last: int
 
 
 def row_of(topic: str, stream: Stream, message: FleetMessage, payload: bytes, stored_utc_ns: int) -> Spooled:
@@ -253,11 +244,11 @@ class Spool:
         self._given = 0
         self._ahead_from = self._ahead = self._next_id - 1 if self._newest_first else 0
 
-    def positions(self) -> list[Position]:
+    def positions(self) -> list[StreamPosition]:
         """How far streams have come, those of earlier boots included. Raises SpoolError."""
         try:
             rows = self._connection().execute("SELECT boot, device, stream, begin, last FROM position")
-            return [Position(*row) for row in rows]
+            return [StreamPosition(*row) for row in rows]
         except sqlite3.Error as error:
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 

@@ -23,10 +23,11 @@ from imud.formats.fleet.messages import (
     encode_message,
     encode_slots_message,
 )
+from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream, topic_of
 from imud.formats.slot import encode_slots
 from imud.publishers.mqtt.settings import DeviceSending, Whole
-from imud.publishers.mqtt.spool import Position, Spooled, row_of
+from imud.publishers.mqtt.spool import Spooled, row_of
 from imud.publishers.mqtt.statistics import IntervalMaker, by_interval
 from imud.sample import Sample
 from imud.units import NS_PER_S
@@ -73,7 +74,7 @@ class _Numbered:
         """The message as it is stored."""
         return row_of(self._topic, self._stream, message, payload or encode_message(message), stored_utc_ns)
 
-    def resume(self, position: Position) -> None:
+    def resume(self, position: StreamPosition) -> None:
         """Go on where the spool says that the stream came to."""
         self._begin, self.next = position.begin, position.last + 1
 
@@ -105,7 +106,7 @@ class DeviceStreams:
         """The `seq` that comes next; 0 while there was none."""
         self._gap_cause = DropCause.QUEUE
 
-    def resume(self, stream: str, position: Position) -> None:
+    def resume(self, stream: str, position: StreamPosition) -> None:
         """Go on where an earlier run of the output in the same boot ended."""
         numbered = {Stream.SAMPLES: self._whole, Stream.STATISTICS: self._statistics, Stream.EVENTS: self._events}
         found = numbered.get(Stream(stream))

@@ -18,10 +18,11 @@ from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
 from imud.event import Event
 from imud.formats.fleet.messages import DropCause
+from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.sender import MqttSender
 from imud.publishers.mqtt.settings import DeviceSending, MqttSettings
-from imud.publishers.mqtt.spool import Position, Spool, Spooled, SpoolError
+from imud.publishers.mqtt.spool import Spool, Spooled, SpoolError
 from imud.publishers.mqtt.streams import DeviceStreams, Gateway, notes_of
 from imud.units import NS_PER_S
 from imud.worker import StartWorker
@@ -112,13 +113,13 @@ class SpoolWriter:
         """Samples and events of which only the numbers are left because the disk failed."""
         self.failure: BaseException | None = None
         """The exception that ended the thread, which is a defect of imud."""
-        self.positions: list[Position] = []
+        self.positions: list[StreamPosition] = []
         """How far the streams have come, as of the last transaction."""
         self._settings, self._gateway = settings, gateway
         self._queue, self._spool, self._sender = queue, spool, sender
         self._now_ns, self._utc_offset_ns = now_ns, utc_offset_ns
         self._streams: dict[str, DeviceStreams] = {}
-        self._resumable: dict[str, list[Position]] = {}
+        self._resumable: dict[str, list[StreamPosition]] = {}
         self._boots: dict[str, int] = {}
         self._rows: list[Spooled] = []
         self._acknowledged: set[int] = set()

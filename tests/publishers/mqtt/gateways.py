@@ -15,11 +15,12 @@ import msgspec
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.formats.fleet.ledger import FleetLedger, StreamCounts
 from imud.formats.fleet.messages import decode_message
+from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream
 from imud.host_clock import HostClock
 from imud.publishers.mqtt.publisher import MqttPublisher
 from imud.publishers.mqtt.settings import MqttSettings
-from imud.publishers.mqtt.spool import Position, Spool, Spooled
+from imud.publishers.mqtt.spool import Spool, Spooled
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.publishers.mqtt.mosquitto import LIMIT_S, Collector
@@ -60,7 +61,7 @@ class LiveGateway:
             pause.wait(0.02)
 
 
-def in_spool(folder: Path) -> tuple[list[Spooled], list[Position]]:
+def in_spool(folder: Path) -> tuple[list[Spooled], list[StreamPosition]]:
     """What is in the spool of a gateway that has ended, and how far its streams came."""
     spool = Spool(folder, 1 << 40, 1 << 62)
     spool.open()

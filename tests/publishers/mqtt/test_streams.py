@@ -6,9 +6,10 @@ import pytest
 from imud.event import Event, EventKind
 from imud.formats.fleet.ledger import FleetLedger, StreamCounts
 from imud.formats.fleet.messages import SAMPLES_MAX, SLOTS_MAX, DropCause, FleetMessage, MessageKind, decode_message
+from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.settings import DeviceSending, Whole
-from imud.publishers.mqtt.spool import Position, Spooled
+from imud.publishers.mqtt.spool import Spooled
 from imud.publishers.mqtt.streams import LATE_NS, DeviceStreams, Gateway, notes_of
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
@@ -96,8 +97,8 @@ def test_events_count_from_one() -> None:
 
 def test_a_later_run_in_the_same_boot_goes_on() -> None:
     one = streams(rate_hz=None, whole="json")
-    one.resume("samples", Position(GATEWAY.boot, "bow", "samples", 1, 100))
-    one.resume("events", Position(GATEWAY.boot, "bow", "events", 1, 7))
+    one.resume("samples", StreamPosition(GATEWAY.boot, "bow", "samples", 1, 100))
+    one.resume("events", StreamPosition(GATEWAY.boot, "bow", "events", 1, 7))
     made = one.add(samples(151, 160)) + one.flush()
     assert ranges(made, Stream.SAMPLES) == [("dropped", 101, 150), ("samples", 151, 160)]
     assert messages(made)[0].cause is DropCause.OFF
