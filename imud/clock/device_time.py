@@ -71,8 +71,8 @@ class DeviceTime:
     """
 
     __slots__ = (
-        "_even_for", "_gap", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "doubt_ns", "even_ns", "missed",
-        "modulus", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
+        "_even_for", "_gap", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "_unsure_ns", "doubt_ns", "even_ns",
+        "missed", "modulus", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
     )  # fmt: skip
 
     def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
@@ -84,6 +84,8 @@ class DeviceTime:
         self._phase_ns = 0.0
         self._shift_ns = 0.0
         """Part of the corrections of the counter that is still in `even_ns`."""
+        self._unsure_ns = 0.0
+        """Part of `_shift_ns` that no arrival has confirmed: the first step of another rate looks like a correction."""
         self._even_for = 0
         self._step_ns = 0
         """The newest step of the counter; negative where that is shorter than half a turn forward."""
@@ -111,7 +113,7 @@ class DeviceTime:
         """Set the first stamp of a device, or the first after its clock started anew."""
         self.period.restart(was_added=ticks == self.ticks)
         self.ticks = ticks
-        self._phase_ns = self._shift_ns = self.doubt_ns = 0.0
+        self._phase_ns = self._shift_ns = self._unsure_ns = self.doubt_ns = 0.0
         self.missed = self._gap = self.watched = self._even_for = 0
         self.uneven = self.rephased = False
         self.raw_ns = self.even_ns = ticks % self.modulus * self.tick_ns
@@ -182,7 +184,8 @@ class DeviceTime:
         """Note that device time before the newest sample does not show when the samples after it are."""
         self.rephased, self.uneven = True, False
         self.watched = self._gap = 0
-        self.doubt_ns = 0.0
+        self._shift_ns -= self._unsure_ns
+        self._unsure_ns = self.doubt_ns = 0.0
 
     def _leave_tick(self, step: int, off_ns: float, over_ns: float) -> None:
         """Handle a sample that is even with those before only if it is `over_ns` outside of its tick."""
@@ -192,6 +195,7 @@ class DeviceTime:
             self._note_uneven(step)
         elif settled and over > FOLLOWED_NS:
             self._shift_ns += over_ns
+            self._unsure_ns += over_ns
             self.doubt_ns = max(self.doubt_ns, over)
             self.watched = WATCHED
         if over > UNEVEN_SHARE * tick_ns:
@@ -231,7 +235,7 @@ class DeviceTime:
                 self._shorten_gap(periods)
                 return True
         if -early_ns <= above_ns <= self.doubt_ns / 2:
-            self.doubt_ns = 0.0
+            self._unsure_ns = self.doubt_ns = 0.0
         return False
 
     def _absorb_step(self, before_ns: int, elapsed_ns: float, above_ns: float, early_ns: float, hold_ns: int) -> bool:
@@ -256,7 +260,9 @@ class DeviceTime:
         if self._step_ns < 0:
             self.raw_ns -= self.modulus * self.tick_ns
         self.even_ns = before_ns + round(periods * period_ns)
-        self._shift_ns = self.even_ns - self.raw_ns - self._phase_ns
+        shift_ns = self.even_ns - self.raw_ns - self._phase_ns
+        self._unsure_ns += shift_ns - self._shift_ns
+        self._shift_ns = shift_ns
         self.missed, self._gap = periods - 1, 0
         self.doubt_ns = min(abs(self._step_ns - periods * period_ns), period_ns)
         self.uneven = False

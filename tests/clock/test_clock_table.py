@@ -43,6 +43,16 @@ def test_the_stated_error_is_neither_too_small_nor_too_large(cell: Cell) -> None
     assert RATIO_LEAST <= figures_of(cell, range(6), 45).ratio <= RATIO_MOST
 
 
+@pytest.mark.parametrize("seed", [1, 13, 21])
+def test_the_first_step_of_another_rate_is_no_correction_of_the_counter(seed: int) -> None:
+    """Taken for one, it stayed in all stamps after: 7.9 ms off with 0.5 ms stated."""
+    cell = Cell("100 Hz to 400", FAST, Device(rates_hz=((0.0, 100.0), (12.0, 400.0))))
+    later = list(dated(cell, seed, 6, 20))[600:]
+    far = [one for one in later if abs(one.off_ns) > NS_PER_MS]
+    assert len(far) <= 12, "those in which the change is found out"
+    assert all(abs(one.off_ns) <= 2 * one.t_err_ns for one in far)
+
+
 def test_a_timer_longer_than_the_driver_says_is_measured() -> None:
     clock = clock_of(Cell("wrong timer", UNTOLD))
     for message in messages(Cell("wrong timer", UNTOLD), 1, 6, 5):
