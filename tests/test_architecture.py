@@ -359,6 +359,7 @@ TESTED_IN = {
     "imud.cli.setup.plan": "cli/setup/test_steps.py",
     "imud.cli.probe.command": "cli/probe/test_can.py",
     "imud.cli.probe.report": "cli/probe/test_can.py",
+    "imud.bridges.json_types": "bridges/test_json_channels.py",
     "imud.bridges.ros2_types": "bridges/test_ros2_channels.py",
     "imud.cli.foxglove.command": "cli/foxglove/test_server.py",
     "imud.cli.export.sinks": "cli/export/test_command.py",

@@ -16,6 +16,7 @@ a sample does not have is left out; NaN is null. Covariances are there where the
 
 from collections.abc import Callable, Sequence
 from math import isfinite
+from operator import attrgetter
 from typing import Any, Final
 
 import msgspec
@@ -30,17 +31,27 @@ from imud.bridges.channel import (
     covariance,
     topic,
 )
-from imud.contracts.sensors.deviations import Deviations
+from imud.bridges.json_types import (
+    STAMP_FIELDS,
+    ImuMessage,
+    MagneticMessage,
+    Matrix,
+    RotationMember,
+    StampMessage,
+    TransformMessage,
+    VectorMember,
+    timestamp,
+)
 from imud.contracts.status import DeviceStatus
 from imud.log import printable
-from imud.sample import SAMPLE_SCHEMA, Sample
-from imud.units import NS_PER_S
+from imud.sample import SAMPLE_SCHEMA, Quaternion, Sample
 
 LEVEL_INFO: Final = 2
 LEVEL_WARNING: Final = 3
 TEXT_MAX: Final = 4096
 """Characters of a line in the log: of an event more than that has never been seen."""
 _encode: Final = msgspec.json.Encoder().encode
+_stamp_values: Final = attrgetter(*STAMP_FIELDS)
 
 Encoder = Callable[[Sample], bytes | None]
 Properties = dict[str, Any]
@@ -72,11 +83,6 @@ _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}
 _INTEGER: Final = {"type": "integer"}
 _FIELD_TYPES: Final = {"string": _TEXT, "integer": _INTEGER, "number": _NUMBER}
-_STAMP: Final = (
-    "seq", "t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns", "t_dev_ns", "euler_rad", "incli_rad", "status",
-    "pps_age_ms", "edge_seq",
-)  # fmt: skip
-"""Fields of a sample that its stamp has."""
 
 
 def _field(name: str) -> Properties:
@@ -101,7 +107,7 @@ MAGNETIC_SCHEMA: Final = _schema(
     "imud.MagneticField",
     {"frame_id": _TEXT, "magnetic_field": _numbers("xyz", "T"), "magnetic_field_covariance": _matrix("T²")},
 )
-STAMP_SCHEMA: Final = _schema("imud.SampleStamp", {name: _field(name) for name in _STAMP})
+STAMP_SCHEMA: Final = _schema("imud.SampleStamp", {name: _field(name) for name in STAMP_FIELDS})
 LOSSES_SCHEMA: Final = _schema("imud.Losses", dict.fromkeys(LossCounts._fields[3:], _INTEGER))
 STATUS_SCHEMA: Final = _schema(
     "imud.DeviceStatus",
@@ -140,7 +146,7 @@ class JsonDialect:
             ("temperature", *_scalar(frames, "temperature_c", "imud.Temperature", noise.temperature_c)),
             ("pressure", *_scalar(frames, "pressure_pa", "imud.FluidPressure", noise.pressure_pa)),
             ("attitude", FRAME_TRANSFORM_SCHEMA, _transform(frames), ("quat_wxyz",)),
-            ("stamp", STAMP_SCHEMA, _stamp, _STAMP),
+            ("stamp", STAMP_SCHEMA, _stamp, STAMP_FIELDS),
         )
         return [
             MessageChannel(topic(name, place), schema, "json", encode, frozenset(fields))
@@ -160,55 +166,45 @@ class JsonDialect:
         return MessageChannel(topic(device, "status"), STATUS_SCHEMA, "json", _status)
 
 
-def timestamp(utc_ns: int) -> dict[str, int]:
-    """Return a stamp as the schemas of Foxglove have it."""
-    sec, nsec = divmod(utc_ns, NS_PER_S)
-    return {"sec": sec, "nsec": nsec}
-
-
-def _axes(values: Sequence[float]) -> dict[str, float]:
-    return dict(zip("xyz", values, strict=True))
-
-
 def _imu(frames: MessageFrames) -> Encoder:
-    body, known = frames.body, _known_covariances(frames.deviations)
+    body, noise = frames.body, frames.deviations
+    known = [_known(sigma) for sigma in (noise.attitude_rad, noise.gyro_rad_s, noise.accel_m_s2)]
 
     def encode(sample: Sample) -> bytes | None:
         gyro, accel, quat = sample.gyro_rad_s, sample.accel_m_s2, sample.quat_wxyz
         if gyro is None and accel is None:
             return None
-        message: dict[str, Any] = {"timestamp": timestamp(sample.utc_ns), "frame_id": body}
-        if quat is not None:
-            w, x, y, z = quat
-            message["orientation"] = {"x": x, "y": y, "z": z, "w": w}
-        if gyro is not None:
-            message["angular_velocity"] = _axes(gyro)
-        if accel is not None:
-            message["linear_acceleration"] = _axes(accel)
-        return _encode(message | known if known else message)
+        return _encode(
+            ImuMessage(
+                timestamp(sample.utc_ns),
+                body,
+                None if quat is None else _rotation(quat),
+                None if gyro is None else VectorMember(*gyro),
+                None if accel is None else VectorMember(*accel),
+                *known,
+            )
+        )
 
     return encode
 
 
-def _known_covariances(noise: Deviations) -> dict[str, tuple[float, ...]]:
-    sigmas = {
-        "orientation_covariance": noise.attitude_rad,
-        "angular_velocity_covariance": noise.gyro_rad_s,
-        "linear_acceleration_covariance": noise.accel_m_s2,
-    }
-    return {name: covariance(sigma) for name, sigma in sigmas.items() if sigma is not None}
+def _known(sigma: float | None) -> Matrix | None:
+    return None if sigma is None else covariance(sigma)
+
+
+def _rotation(quat: Quaternion) -> RotationMember:
+    w, x, y, z = quat
+    return RotationMember(x, y, z, w)
 
 
 def _mag(frames: MessageFrames) -> Encoder:
-    body, sigma = frames.body, frames.deviations.mag_t
-    known = {} if sigma is None else {"magnetic_field_covariance": covariance(sigma)}
+    body, known = frames.body, _known(frames.deviations.mag_t)
 
     def encode(sample: Sample) -> bytes | None:
         mag = sample.mag_t
         if mag is None:
             return None
-        message = {"timestamp": timestamp(sample.utc_ns), "frame_id": body, "magnetic_field": _axes(mag)}
-        return _encode(message | known)
+        return _encode(MagneticMessage(timestamp(sample.utc_ns), body, VectorMember(*mag), known))
 
     return encode
 
@@ -231,30 +227,19 @@ def _scalar(
 
 
 def _transform(frames: MessageFrames) -> Encoder:
-    navigation, body, nowhere = frames.navigation, frames.body, {"x": 0.0, "y": 0.0, "z": 0.0}
+    navigation, body, nowhere = frames.navigation, frames.body, VectorMember(0.0, 0.0, 0.0)
 
     def encode(sample: Sample) -> bytes | None:
         quat = sample.quat_wxyz
         if quat is None or not isfinite(sum(quat)):
             return None
-        w, x, y, z = quat
-        return _encode(
-            {
-                "timestamp": timestamp(sample.utc_ns), "parent_frame_id": navigation, "child_frame_id": body,
-                "translation": nowhere, "rotation": {"x": x, "y": y, "z": z, "w": w},
-            }
-        )  # fmt: skip
+        return _encode(TransformMessage(timestamp(sample.utc_ns), navigation, body, nowhere, _rotation(quat)))
 
     return encode
 
 
 def _stamp(sample: Sample) -> bytes:
-    message: dict[str, Any] = {"timestamp": timestamp(sample.utc_ns)}
-    for name in _STAMP:
-        value = getattr(sample, name)
-        if value is not None:
-            message[name] = value
-    return _encode(message)
+    return _encode(StampMessage(timestamp(sample.utc_ns), *_stamp_values(sample)))
 
 
 def _losses(losses: LossCounts) -> bytes:

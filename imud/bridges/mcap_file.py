@@ -10,8 +10,9 @@ as `mcap recover` reads them.
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import accumulate, chain, count, repeat
 from typing import Any, Final
 
 import zstandard
@@ -70,6 +71,24 @@ class McapChannel:
         self.count += 1
         self._file.append(self.index, t_ns, head, data)
 
+    def add_run(self, times_ns: Sequence[int], messages: Sequence[bytes]) -> None:
+        """Append messages, one of each time, as `add` one after the other. Raises OSError.
+
+        Most runs fit the present chunk, and are packed without a call of Python's for each message.
+        """
+        sizes = list(map(len, messages))
+        fits = self._file.has_room(sum(sizes) + len(sizes) * _MESSAGE.size)
+        if not (fits and min(times_ns) >= 0 and max(times_ns) <= TIME_MAX and self.count + len(sizes) < _SEQUENCE_MASK):
+            for t_ns, data in zip(times_ns, messages, strict=True):
+                self.add(t_ns, data)
+            return
+        lengths = map(_MESSAGE_REST.__add__, sizes)
+        heads = map(
+            _MESSAGE.pack, repeat(Opcode.MESSAGE), lengths, repeat(self.id), count(self.count), times_ns, times_ns
+        )
+        self.count += len(sizes)
+        self._file.append_run(self.index, times_ns, list(heads), messages, sizes)
+
 
 class McapFile:
     """Writer of one file. Synchronization: one thread; it has another to compress."""
@@ -116,6 +135,23 @@ class McapFile:
         self._size += len(head) + len(data)
         if self._size >= CHUNK_BYTES:
             self._end_chunk()
+
+    def has_room(self, size: int) -> bool:
+        """Whether the present chunk goes on after so many bytes more."""
+        return self._size + size < CHUNK_BYTES
+
+    def append_run(
+        self,
+        index: list[int],
+        times_ns: Sequence[int],
+        heads: Sequence[bytes],
+        messages: Sequence[bytes],
+        sizes: Sequence[int],
+    ) -> None:
+        """Append messages that the present chunk has room for, with their places to `index`; for `McapChannel`."""
+        *places, self._size = accumulate(map(_MESSAGE.size.__add__, sizes), initial=self._size)
+        index += chain.from_iterable(zip(times_ns, places, strict=True))
+        self._parts += chain.from_iterable(zip(heads, messages, strict=True))
 
     def finish(self) -> None:
         """Write what waits, and the summary; the file itself stays open. Raises OSError."""

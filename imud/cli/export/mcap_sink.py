@@ -1,6 +1,6 @@
 """An export as MCAP: messages of a dialect, a channel for each kind. It needs the extra `export`."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from imud.bridges.channel import Dialect, LossCounts, MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.mcap_file import McapChannel, McapFile
@@ -39,8 +39,9 @@ class McapSink:
         if channels is None:
             channels = self._devices[batch.device] = self._channels_of(batch)
         samples = batch.samples
+        times_ns = [sample.utc_ns for sample in samples]
         for channel in channels:
-            channel.add(samples)
+            channel.add(samples, times_ns)
 
     def losses(self, losses: LossCounts) -> None:
         """Write the message."""
@@ -99,12 +100,14 @@ class _SampleChannel:
         self._open = open_
         self._channel: McapChannel | None = None
 
-    def add(self, samples: Collection[Sample]) -> None:
-        """Write a message of each that has one."""
-        encode, channel = self._encode, self._channel
-        for sample in samples:
-            data = encode(sample)
-            if data is not None:
-                if channel is None:
-                    channel = self._channel = self._open(self._described)
-                channel.add(sample.utc_ns, data)
+    def add(self, samples: Sequence[Sample], times_ns: Sequence[int]) -> None:
+        """Write a message of each that has one, of these times."""
+        made = list(map(self._encode, samples))
+        messages = [data for data in made if data is not None]
+        if not messages:
+            return
+        if len(messages) < len(made):
+            times_ns = [t_ns for t_ns, data in zip(times_ns, made, strict=True) if data is not None]
+        if self._channel is None:
+            self._channel = self._open(self._described)
+        self._channel.add_run(times_ns, messages)
