@@ -1,4 +1,4 @@
-"""Contract of the JSON messages of samples: their members in order. msgspec writes these faster than dictionaries.
+"""JSON messages of samples: their members in order. msgspec writes these faster than dictionaries.
 
 What is None by default is left out. What the members mean is in the schemas of `json_channels`.
 """

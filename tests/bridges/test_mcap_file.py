@@ -2,7 +2,9 @@
 
 import struct
 import threading
+from collections.abc import Sequence
 from io import BytesIO
+from random import Random
 from typing import Any
 
 import pytest
@@ -147,3 +149,45 @@ def test_closing_before_the_end_ends_the_thread() -> None:
     file.close()
     file.close()
     assert threading.enumerate() == before
+
+
+def in_runs(sizes: Sequence[int], times_ns: Sequence[int], length: int) -> tuple[bytes, bytes]:
+    """The same messages in two channels, added one by one and in runs."""
+    files = []
+    for one_by_one in (True, False):
+        out = BytesIO()
+        file = McapFile(out, "", "imud test", {})
+        channels = [file.add_channel(FIRST), file.add_channel(SECOND)]
+        for at in range(0, len(sizes), length):
+            times = times_ns[at : at + length]
+            messages = [bytes([size & 0xFF]) * size for size in sizes[at : at + length]]
+            for channel in channels:
+                if one_by_one:
+                    for t_ns, data in zip(times, messages, strict=True):
+                        channel.add(t_ns, data)
+                else:
+                    channel.add_run(times, messages)
+        file.finish()
+        files.append(out.getvalue())
+    return files[0], files[1]
+
+
+@pytest.mark.parametrize("length", [1, 7, 64])
+def test_runs_are_written_as_one_message_after_the_other(length: int) -> None:
+    """Over several chunks, whose ends are in the middle of runs, and where a message fills a chunk exactly."""
+    random = Random(length)
+    sizes = [random.choice((0, 17, 300, 5000)) for _ in range(1500)]
+    sizes[500] = CHUNK_BYTES - 31
+    one_by_one, runs = in_runs(sizes, [10**18 + number for number in range(len(sizes))], length)
+    assert runs == one_by_one
+    summary = SeekingReader(BytesIO(runs)).get_summary()
+    assert summary is not None
+    assert len(summary.chunk_indexes) >= 4
+
+
+def test_times_that_cannot_be_said_are_clipped_in_runs_too() -> None:
+    times_ns = [5, -1, 4, 1 << 64, 7, 8]
+    one_by_one, runs = in_runs([3] * 6, times_ns, 3)
+    assert runs == one_by_one
+    found = [t_ns for _, t_ns, _ in read(SeekingReader(BytesIO(runs)))]
+    assert sorted(set(found)) == [0, 4, 5, 7, 8, (1 << 64) - 1]
