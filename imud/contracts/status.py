@@ -272,6 +272,8 @@ class RecorderStatus(msgspec.Struct, frozen=True):
     """Records that wait to be written."""
     files_removed: int
     """Files removed to keep within the budget."""
+    disk_bytes: int
+    """Size of all recordings in the directory, snapshots and the present file included."""
 
 
 class FlightStatus(msgspec.Struct, frozen=True):
@@ -292,6 +294,8 @@ class FlightStatus(msgspec.Struct, frozen=True):
     """Alerts that were not saved because there were too many within an hour."""
     sent: int
     """Snapshots that clients asked for."""
+    disk_bytes: int
+    """Size of all recordings in the directory except the one that is written at present."""
 
 
 class OutputStatus(msgspec.Struct, frozen=True):

@@ -34,7 +34,7 @@ from imud.publishers.metrics.families import FAMILIES
 from imud.publishers.metrics.family import Snapshot
 from imud.publishers.metrics.mqtt import MQTT_FAMILIES
 from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
-from imud.publishers.metrics.recorder import FLIGHT_FAMILIES, RECORDER_FAMILIES
+from imud.publishers.metrics.recorder import FLIGHT_FAMILIES, RECORDER_FAMILIES, RECORDINGS_FAMILIES
 from imud.publishers.metrics.rings import RingReader
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.units import NS_PER_S
@@ -127,7 +127,8 @@ class DaemonCollector(Collector):
         flight = FLIGHT_FAMILIES if self._snapshot.flights else ()
         outputs = OUTPUT_FAMILIES if self._snapshot.outputs else ()
         mqtt = MQTT_FAMILIES if self._snapshot.mqtts else ()
-        for family in (*FAMILIES, *recorder, *flight, *outputs, *mqtt):
+        recordings = RECORDINGS_FAMILIES if recorder or flight else ()
+        for family in (*FAMILIES, *recorder, *flight, *recordings, *outputs, *mqtt):
             metric = family.metric(self._snapshot)
             metric.samples = _PausingList(metric.samples, self._pause)
             yield metric

@@ -26,6 +26,19 @@ def _snapshots(snapshot: Snapshot) -> Lines:
     ]
 
 
+def _disk(snapshot: Snapshot) -> Lines:
+    """Both recorders write to one directory; the one that always writes knows its present file, too."""
+    always = [status.disk_bytes for status in snapshot.recorders]
+    return [((), size) for size in always or [status.disk_bytes for status in snapshot.flights]]
+
+
+RECORDINGS_FAMILIES: Final = (
+    Family(
+        "imud_recordings_bytes", MetricType.GAUGE, BYTES,
+        "Size of all recordings in the directory of the recorder, snapshots included.", Reader((), _disk),
+    ),
+)  # fmt: skip
+
 RECORDER_FAMILIES: Final = (
     Family(
         "imud_recorder_active", MetricType.GAUGE, NO_UNIT, "1 while imud records, 0 while the disk does not let it.",

@@ -124,6 +124,7 @@ class Recorder:
             records_dropped=queue.dropped,
             waiting_bytes=queue.waiting_bytes,
             files_removed=self._directory.removed,
+            disk_bytes=self._directory.kept_bytes + (writer.file_bytes if writer is not None else 0),
         )
 
     # --- files -------------------------------------------------------------------------------------------------------

@@ -38,12 +38,24 @@ class RecordingDirectory:
         """Files removed for the budget since the start."""
         self.in_use: set[str] = set()
         """Names of files that are written at present, which are not removed."""
+        self.kept_bytes = 0
+        """Size of the files that are not in use, as of the last look, and of those that were added since."""
         self._keep_bytes = keep_bytes
         self._lock = Lock()
 
     def make(self) -> None:
         """Make the directory where it is missing. Raises OSError."""
         self.path.mkdir(mode=0o750, parents=True, exist_ok=True)
+
+    def measure(self) -> None:
+        """Look how much the files take. Raises OSError."""
+        with self._lock:
+            self._note(self.files())
+
+    def add(self, size: int) -> None:
+        """Count a file that was written."""
+        with self._lock:
+            self.kept_bytes += size
 
     def new_file(self, utc_ns: int, epoch: int, number: int, kind: str = "") -> Path:
         """Return the path of the next file: names sort by time, those of one run of the daemon go together.
@@ -73,12 +85,17 @@ class RecordingDirectory:
         with self._lock:
             files = self.files()
             total, removed = sum(file.size for file in files), list[str]()
+            self._note(files)
             for file in files:
                 if total + reserve_bytes <= self._keep_bytes:
                     break
                 if file.name not in self.in_use:
                     (self.path / file.name).unlink(missing_ok=True)
                     total -= file.size
+                    self.kept_bytes -= file.size
                     removed.append(file.name)
             self.removed += len(removed)
         return removed
+
+    def _note(self, files: Sequence[RecordingFile]) -> None:
+        self.kept_bytes = sum(file.size for file in files if file.name not in self.in_use)

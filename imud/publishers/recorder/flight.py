@@ -81,6 +81,7 @@ class FlightRecorder:
         """Begin to keep what devices deliver. Raises ServerError."""
         try:
             self._directory.make()
+            self._directory.measure()
             if self._own is not None:
                 self._own.make()
                 self._own.make_room(0)
@@ -181,7 +182,7 @@ class FlightRecorder:
         kept_ns = self._context.now_ns() - oldest_ns if oldest_ns and not self._problem else 0
         return FlightStatus(
             self._problem, kept_ns, self._ring.bytes, self._queue.dropped, self._saved, self._failed,
-            self._gate.left_out_total, self._sends,
+            self._gate.left_out_total, self._sends, self._directory.kept_bytes,
         )  # fmt: skip
 
     # --- segments and snapshots --------------------------------------------------------------------------------------

@@ -167,6 +167,7 @@ class FlightWriter:
                 self._directory.make()
                 self._directory.make_room(reader.bytes)
                 size = _write(reader, path)
+                self._directory.add(size)
                 return Saved(path, size, "" if size else "nothing was kept")
             finally:
                 reader.close()

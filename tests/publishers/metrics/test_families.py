@@ -395,8 +395,8 @@ def test_rendering_pauses_often() -> None:
 
 def shown_names() -> set[str]:
     """Names of all families as they stand after `# HELP`."""
-    recorder = RecorderStatus("a", "", 1, 2, 3, 4, 5)
-    flight = FlightStatus("", 1, 2, 3, 4, 5, 6, 7)
+    recorder = RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
+    flight = FlightStatus("", 1, 2, 3, 4, 5, 6, 7, 8)
     output = OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")
     mqtt = MqttStatus("mqtt://127.0.0.1:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8}, 9)
     snapshot = Snapshot(

@@ -43,3 +43,15 @@ def test_the_present_file_and_files_of_others_stay(tmp_path: Path) -> None:
     directory.make_room(0)
     assert [file.name for file in directory.files()] == [newest]
     assert all(path.exists() for path in foreign)
+
+
+def test_what_files_take_is_known_without_those_that_are_written(tmp_path: Path) -> None:
+    directory = filled(tmp_path, 100, 40, 30, 20)
+    assert directory.kept_bytes == 0
+    directory.measure()
+    assert directory.kept_bytes == 90
+    directory.in_use.add(directory.files()[-1].name)
+    directory.make_room(20)
+    assert directory.kept_bytes == 30  # the oldest was removed, the newest is written
+    directory.add(7)
+    assert directory.kept_bytes == 37

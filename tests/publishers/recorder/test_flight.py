@@ -163,6 +163,7 @@ def test_a_storm_of_alerts_does_not_fill_the_disk(tmp_path: Path) -> None:
     assert len(bench.messages) == 4
     status = bench.flight.status()
     assert (status.saved, status.failed, status.sent) == (3, 0, 0)
+    assert status.disk_bytes == sum(file.stat().st_size for file in bench.files)
     assert status.left_out >= 90
     bench.flight.close()
 
