@@ -1,8 +1,9 @@
-"""One connection of a reader to a broker, by paho-mqtt in the event loop of asyncio, with MQTT 5.
+"""One connection of a reader to a broker, by paho-mqtt in the event loop of asyncio, with MQTT 5 or 3.1.1.
 
-The broker keeps what is not acknowledged and sends it again in the next connection of the same session. It sends no
-more than RECEIVE_MAX messages ahead of the acknowledgements ("receive maximum", MQTT 5.0, section 3.1.2.11.3), which
-bounds the queue here: a reader that is slow is not sent more, and the broker queues it.
+The broker keeps what is not acknowledged and sends it again in the next connection of the same session. With MQTT 5 it
+sends no more than RECEIVE_MAX messages ahead of the acknowledgements ("receive maximum", MQTT 5.0, section
+3.1.2.11.3): a reader that is slow is not sent more, and the broker queues it. MQTT 3.1.1 has no such bound; there the
+socket is not read while so many messages wait here.
 """
 
 import asyncio
@@ -58,21 +59,30 @@ class ReaderConnection:
         """Topics whose subscription the broker has not answered."""
         self._client: Any = None
         self._socket: Any = None
+        self._is_paused = False
+        """Whether the socket is not read because enough messages wait."""
         self._number = -1
         """Of the socket: paho-mqtt may close it before the event loop has forgotten it."""
         self._timer: asyncio.TimerHandle | None = None
 
     @classmethod
     async def open(
-        cls, broker: Broker, access: BrokerAccess, client_id: str, topics: Sequence[str], session_s: int
+        cls,
+        broker: Broker,
+        access: BrokerAccess,
+        client_id: str,
+        topics: Sequence[str],
+        session_s: int,
+        *,
+        is_v5: bool = True,
     ) -> "ReaderConnection":
         """Connect and subscribe. `session_s`: how long the broker keeps the session without a connection, s; 0: none.
 
-        Raises BrokerError.
+        With MQTT 3.1.1 the broker's own settings say how long. Raises BrokerError.
         """
         self = cls(broker)
         try:
-            await self._connect(access, client_id, session_s)
+            await self._connect(access, client_id, session_s, is_v5=is_v5)
             await self._until(lambda: self._answered, "no answer")
             self._awaited = len(topics)
             self._client.subscribe([(topic, 1) for topic in topics])
@@ -86,25 +96,26 @@ class ReaderConnection:
             raise
         return self
 
-    async def _connect(self, access: BrokerAccess, client_id: str, session_s: int) -> None:
-        client = paho_client(self._broker, access, client_id, is_v5=True, manual_ack=True)
+    async def _connect(self, access: BrokerAccess, client_id: str, session_s: int, *, is_v5: bool) -> None:
+        client = paho_client(self._broker, access, client_id, is_v5=is_v5, keeps_session=session_s > 0, manual_ack=True)
         client.max_inflight_messages_set(RECEIVE_MAX)
         client.on_connect, client.on_subscribe = self._on_connect, self._on_subscribe
         client.on_message, client.on_disconnect = self._on_message, self._on_disconnect
-        properties = properties_of(
-            "CONNECT", SessionExpiryInterval=session_s, ReceiveMaximum=RECEIVE_MAX, MaximumPacketSize=PACKET_BYTES
-        )
         self._client = client
         await asyncio.to_thread(
-            client.connect, self._broker.host, self._broker.port, KEEP_ALIVE_S,
-            clean_start=session_s == 0, properties=properties,
-        )  # fmt: skip
+            client.connect, self._broker.host, self._broker.port, KEEP_ALIVE_S, **(_of_v5(session_s) if is_v5 else {})
+        )
         self._socket = client.socket()
         if self._socket is None:
             raise BrokerError(f"{self._broker.name}: the connection was lost")
         self._number = self._socket.fileno()
         asyncio.get_running_loop().add_reader(self._number, self._read)
         self._look_after()
+
+    @property
+    def waiting(self) -> int:
+        """Messages that came and that nobody has taken."""
+        return len(self._queue)
 
     # --- as a connection ---------------------------------------------------------------------------------------------
 
@@ -113,7 +124,9 @@ class ReaderConnection:
         if not self._queue:
             with suppress(TimeoutError):
                 await self._until(lambda: bool(self._queue), "", timeout_s)
-        return self._queue.popleft() if self._queue else None
+        found = self._queue.popleft() if self._queue else None
+        self._look_at_reading()
+        return found
 
     def acknowledge(self, number: int) -> None:
         """Tell the broker that a message is done with; no-op when the connection is lost."""
@@ -157,13 +170,27 @@ class ReaderConnection:
         client = self._client
         while client is not None:
             self._guarded(client.loop_read)
-            if self._problem or not getattr(self._socket, "pending", lambda: 0)():
+            self._look_at_reading()
+            if self._problem or self._is_paused or not getattr(self._socket, "pending", lambda: 0)():
                 break
         self._look_at_writing()
 
     def _write(self) -> None:
         self._guarded(self._client.loop_write)
         self._look_at_writing()
+
+    def _look_at_reading(self) -> None:
+        """Leave the socket alone while enough messages wait; go on when half of them are taken."""
+        if self._socket is None:
+            return
+        loop = asyncio.get_running_loop()
+        if not self._is_paused and len(self._queue) > RECEIVE_MAX:
+            self._is_paused = True
+            loop.remove_reader(self._number)
+        elif self._is_paused and len(self._queue) <= RECEIVE_MAX // 2:
+            self._is_paused = False
+            loop.add_reader(self._number, self._read)
+            loop.call_soon(self._read)  # with TLS the rest may be in the library, of which the kernel knows nothing
 
     def _look_at_writing(self) -> None:
         """Wait for room in the socket while paho-mqtt has something to write."""
@@ -178,7 +205,8 @@ class ReaderConnection:
     def _look_after(self) -> None:
         """Send and expect keep-alives."""
         self._timer = asyncio.get_running_loop().call_later(MISC_S, self._look_after)
-        self._guarded(self._client.loop_misc)
+        if not self._is_paused:  # what it would miss may be in what is not read
+            self._guarded(self._client.loop_misc)
         self._look_at_writing()
 
     def _guarded(self, work: Any) -> None:
@@ -226,3 +254,11 @@ class ReaderConnection:
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:
             self._problem = self._problem or f"the broker ended the connection: {reason}"
+
+
+def _of_v5(session_s: int) -> dict[str, Any]:
+    """What a connection says of its session and its room with MQTT 5."""
+    properties = properties_of(
+        "CONNECT", SessionExpiryInterval=session_s, ReceiveMaximum=RECEIVE_MAX, MaximumPacketSize=PACKET_BYTES
+    )
+    return {"clean_start": session_s == 0, "properties": properties}

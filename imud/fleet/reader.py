@@ -10,7 +10,7 @@ acknowledged, and what comes while the reader is away, is sent when it is back. 
 import asyncio
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from secrets import token_hex
 from types import TracebackType
 from typing import Final, NamedTuple, Self
@@ -34,6 +34,8 @@ log = logging.getLogger(__name__)
 SESSION_S: Final = 7 * 24 * 3600
 """A session with a name outlives so long an absence of its reader, unless the broker allows less."""
 RETRY_MAX_S: Final = 60.0
+VERSIONS: Final = ("5", "3.1.1")
+"""Of MQTT; the first is taken without asking."""
 
 
 class ReaderAccess(msgspec.Struct, frozen=True):
@@ -55,29 +57,43 @@ class FleetBatch(NamedTuple):
     """Its samples are those that `imud.client` gives."""
 
 
-class Fleet:
-    """The gateways of a broker. Synchronization: one event loop."""
-
-    def __init__(
-        self, url: str, *, access: ReaderAccess | None = None, name: str = "", from_begin: bool = False,
-        retry_max_s: float = RETRY_MAX_S, now_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:  # fmt: skip
-        """`url`: mqtt, mqtts, ws or wss, without user and password. `name`: of the session that the broker keeps.
-
-        `from_begin`: numbers that the first message of a stream leaves out count as missing. `retry_max_s`: longest
-        pause between two attempts, s. Raises BadArgument, and ServerError without the extra `mqtt`.
-        """
+def brokers_of(urls: Sequence[str]) -> list[Broker]:
+    """The brokers that URLs name. Raises BadArgument for one that names none, and for no URL."""
+    found = []
+    for url in urls:
         broker = broker_of(url)
         if broker is None:
             raise BadArgument(
                 f"expected a URL such as mqtts://broker.example:8883 (mqtt, mqtts, ws or wss; no user, no password), "
                 f"got {url!r}"
             )
+        found.append(broker)
+    if not found:
+        raise BadArgument("expected the URL of at least one broker, got none")
+    return found
+
+
+class Fleet:
+    """The gateways of a broker, or of a cluster of them. Synchronization: one event loop."""
+
+    def __init__(
+        self, *urls: str, access: ReaderAccess | None = None, name: str = "", version: str = VERSIONS[0],
+        from_begin: bool = False, retry_max_s: float = RETRY_MAX_S, now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:  # fmt: skip
+        """`urls`: mqtt, mqtts, ws or wss, without user and password; several are of one cluster, tried in turn.
+
+        `name`: of the session that the broker keeps. `version`: of MQTT, 5 or 3.1.1. `from_begin`: numbers that the
+        first message of a stream leaves out count as missing. `retry_max_s`: longest pause between two attempts, s.
+        Raises BadArgument, and ServerError without the extra `mqtt`.
+        """
+        if version not in VERSIONS:
+            raise BadArgument(f"expected MQTT {' or '.join(VERSIONS)}, got {version!r}")
         if name and not is_name(name):
             raise BadArgument(f"expected a name of 1 to 64 letters, digits, '_' or '-', got {name!r}")
         check_extra()
-        self.broker: Broker = broker
+        self.brokers: list[Broker] = brokers_of(urls)
         self.access = access or ReaderAccess()
+        self.is_v5 = version == VERSIONS[0]
         self.session_s = SESSION_S if name else 0
         self.client_id = f"imud-reader-{name or token_hex(8)}"
         self.retry_max_s, self.now_ns = retry_max_s, now_ns
@@ -151,7 +167,7 @@ class FleetSession:
                 raise BadArgument(f"{what}: expected 1 to 64 letters, digits, '_' or '-', got {given!r}")
         self._fleet = fleet
         self._wanted = (site, gateway, device)
-        self._turn = BrokerTurn([fleet.broker], fleet.retry_max_s)
+        self._turn = BrokerTurn(fleet.brokers, fleet.retry_max_s)
         self._connection: ReaderConnection | None = None
         self._again_ns = 0
 
@@ -202,12 +218,13 @@ class FleetSession:
             await asyncio.sleep(pause_s if timeout_s is None else min(pause_s, timeout_s))
         if fleet.now_ns() < self._again_ns:
             return False
+        broker = self._turn.broker
         self._connection = await ReaderConnection.open(
-            fleet.broker, fleet.access, fleet.client_id, self._topics(), fleet.session_s
+            broker, fleet.access, fleet.client_id, self._topics(), fleet.session_s, is_v5=fleet.is_v5
         )
         self._turn.connected(fleet.now_ns())
         fleet.problem = ""
-        log.info("connected to %s", fleet.broker.name)
+        log.info("connected to %s", broker.name)
         return True
 
     def _lost(self, error: BrokerError) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from imud.fleet import ReaderAccess
-from imud.fleet.connection import ReaderConnection
+from imud.fleet.connection import RECEIVE_MAX, ReaderConnection
 from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.settings import broker_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway
@@ -18,18 +18,24 @@ ACCESS = ReaderAccess()
 
 
 async def opened(
-    port: int, session_s: int = 0, *, scheme: str = "mqtt", access: ReaderAccess = ACCESS
+    port: int, session_s: int = 0, *, scheme: str = "mqtt", access: ReaderAccess = ACCESS, is_v5: bool = True
 ) -> ReaderConnection:
     broker = broker_of(f"{scheme}://127.0.0.1:{port}")
     assert broker is not None
-    return await ReaderConnection.open(broker, access, "reader", ["imud/#"], session_s)
+    return await ReaderConnection.open(broker, access, "reader", ["imud/#"], session_s, is_v5=is_v5)
 
 
-def test_a_retained_message_says_so_and_none_comes_in_no_time(broker: Mosquitto, gateway: SendingGateway) -> None:
+BOTH = pytest.mark.parametrize("is_v5", [True, False], ids=["5", "3.1.1"])
+
+
+@BOTH
+def test_a_retained_message_says_so_and_none_comes_in_no_time(
+    broker: Mosquitto, gateway: SendingGateway, is_v5: bool
+) -> None:
     gateway.publish([("imud/kept", b"x" * 200_000)], retain=True)
 
     async def play() -> None:
-        connection = await opened(broker.port)
+        connection = await opened(broker.port, is_v5=is_v5)
         found = await connection.next(LIMIT_S)
         assert found is not None
         assert (found.topic, len(found.payload), found.retain) == ("imud/kept", 200_000, True)
@@ -42,17 +48,18 @@ def test_a_retained_message_says_so_and_none_comes_in_no_time(broker: Mosquitto,
     asyncio.run(play())
 
 
-def test_only_what_was_acknowledged_is_done_with(broker: Mosquitto, gateway: SendingGateway) -> None:
+@BOTH
+def test_only_what_was_acknowledged_is_done_with(broker: Mosquitto, gateway: SendingGateway, is_v5: bool) -> None:
     async def play() -> list[str]:
-        (await opened(broker.port, 60)).close()
+        (await opened(broker.port, 60, is_v5=is_v5)).close()
         await asyncio.to_thread(gateway.publish, [(f"imud/{n}", b"") for n in range(4)])
-        first = await opened(broker.port, 60)
+        first = await opened(broker.port, 60, is_v5=is_v5)
         for _ in range(2):
             found = await first.next(LIMIT_S)
             assert found is not None
             first.acknowledge(found.number)
         first.close()
-        second = await opened(broker.port, 60)
+        second = await opened(broker.port, 60, is_v5=is_v5)
         topics = []
         for _ in range(2):
             found = await second.next(LIMIT_S)
@@ -62,6 +69,45 @@ def test_only_what_was_acknowledged_is_done_with(broker: Mosquitto, gateway: Sen
         return topics
 
     assert asyncio.run(play()) == ["imud/2", "imud/3"]
+
+
+@pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
+@pytest.mark.parametrize("scheme", ["mqtt", "mqtts"])
+def test_a_broker_that_sends_without_bound_waits_for_the_reader(
+    tmp_path: Path, authority: Authority, scheme: str
+) -> None:
+    """MQTT 3.1.1 lets a reader set no bound, and this broker has none of its own."""
+    port, plain, count = free_port(), free_port(), 4 * RECEIVE_MAX
+    listener = authority.listener(port) if scheme == "mqtts" else [f"listener {port} 127.0.0.1", "allow_anonymous true"]
+    lines = [*listener, "max_inflight_messages 0", f"listener {plain} 127.0.0.1", "allow_anonymous true"]
+    access = ReaderAccess(
+        ca_file=authority["ca.pem"], cert_file=authority["gateway.pem"], key_file=authority["gateway.key"]
+    )
+
+    async def play() -> tuple[int, list[int]]:
+        connection = await opened(port, scheme=scheme, access=access, is_v5=False)
+        with closing(SendingGateway(plain)) as gateway:
+            sent = [(f"imud/{number}", bytes(100)) for number in range(count)]
+            sending = asyncio.ensure_future(asyncio.to_thread(gateway.publish, sent))
+            async with asyncio.timeout(LIMIT_S):
+                while connection.waiting <= RECEIVE_MAX:
+                    await asyncio.sleep(0)
+                await sending
+            for _ in range(100):  # what could come comes now
+                await asyncio.sleep(0.001)
+        most, found = connection.waiting, []
+        for _ in range(count):
+            delivery = await connection.next(LIMIT_S)
+            assert delivery is not None
+            connection.acknowledge(delivery.number)
+            found.append(int(delivery.topic.removeprefix("imud/")))
+        connection.close()
+        return most, found
+
+    with running_broker(tmp_path / "broker", "per_listener_settings true", *lines):
+        most, found = asyncio.run(play())
+    assert RECEIVE_MAX < most <= RECEIVE_MAX + 2, "a read takes two messages at most beyond the bound"
+    assert found == list(range(count))
 
 
 def test_a_port_without_a_broker_is_named() -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,12 @@ import pytest
 from imud.errors import BadArgument
 from imud.fleet import Fleet, FleetBatch
 from imud.fleet.connection import RECEIVE_MAX
+from imud.fleet.reader import VERSIONS
 from imud.formats.fleet.ledger import StreamKey
 from imud.formats.fleet.state import GatewayState, StreamPosition
 from imud.formats.fleet.topics import topic_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
 
 KEY = StreamKey("gw", "1", "bow", "samples")
 
@@ -175,6 +177,44 @@ def test_what_no_gateway_sends_is_counted_and_acknowledged(broker: Mosquitto, ga
     assert fleet.ignored == 4
 
 
+def test_the_next_broker_of_the_cluster_is_tried(broker: Mosquitto, gateway: SendingGateway) -> None:
+    fleet = Fleet(
+        f"mqtt://127.0.0.1:{free_port()}", f"mqtt://127.0.0.1:{broker.port}", version="3.1.1", retry_max_s=0.1
+    )
+
+    async def play() -> list[FleetBatch]:
+        reading = asyncio.ensure_future(taken(fleet, 1))
+        await until(lambda: any("Received SUBSCRIBE" in line for line in broker.log))
+        await asyncio.to_thread(gateway.send, samples_message(1, 10))
+        return await reading
+
+    assert asyncio.run(play())[0].message == samples_message(1, 10)
+    assert fleet.problem == ""
+
+
+@pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
+@pytest.mark.parametrize("version", VERSIONS)
+def test_over_websockets(tmp_path: Path, version: str) -> None:
+    port, plain = free_port(), free_port()
+    lines = (f"listener {port} 127.0.0.1", "protocol websockets", "allow_anonymous true",
+             f"listener {plain} 127.0.0.1", "allow_anonymous true")  # fmt: skip
+
+    async def play() -> list[FleetBatch]:
+        fleet = Fleet(f"ws://127.0.0.1:{port}", name="archive", version=version)
+        await session_begun(fleet)
+        with closing(SendingGateway(plain)) as other:
+            await asyncio.to_thread(other.send, *(samples_message(n, n) for n in range(1, 101)))
+        return await taken(fleet, 100)
+
+    with running_broker(tmp_path / "broker", "per_listener_settings true", *lines) as broker:
+        if any("Websockets support not available" in line for line in broker.log):
+            pytest.skip("this mosquitto has no websockets")
+        with closing(SendingGateway(plain)) as gateway:
+            gateway.send_state(STATE)
+        found = asyncio.run(play())
+    assert [one.message for one in found] == [samples_message(n, n) for n in range(1, 101)]
+
+
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
 def test_a_refusal_is_said_and_tried_again(tmp_path: Path) -> None:
     with running_broker(tmp_path / "closed", "allow_anonymous false") as closed:
@@ -194,10 +234,14 @@ def test_a_refusal_is_said_and_tried_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("url", ["http://host", "mqtt://user:secret@host", "mqtt://", "host:1883"])
 def test_what_is_no_broker_is_refused(url: str) -> None:
     with pytest.raises(BadArgument, match="expected a URL"):
-        Fleet(url)
+        Fleet("mqtt://host", url)
 
 
 def test_names_are_checked() -> None:
+    with pytest.raises(BadArgument, match="at least one broker"):
+        Fleet()
+    with pytest.raises(BadArgument, match=r"expected MQTT 5 or 3\.1\.1, got '3'"):
+        Fleet("mqtt://host", version="3")
     with pytest.raises(BadArgument, match="a name"):
         Fleet("mqtt://host", name="a/b")
     with pytest.raises(BadArgument, match="gateway: expected"):

@@ -15,6 +15,7 @@ from imud.fleet import Fleet, ReaderAccess
 from imud.fleet.collect import FleetCollector, FleetStore, Selection
 from imud.fleet.json_lines import JsonLines
 from imud.fleet.postgres import PostgresStore
+from imud.fleet.reader import VERSIONS
 from imud.formats.fleet.ledger import StreamKey
 from imud.formats.fleet.state import StreamAccount
 
@@ -57,7 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _broker(parser: argparse.ArgumentParser) -> None:
     """Arguments for the connection, and for what is read."""
-    parser.add_argument("url", metavar="URL", help="broker: mqtt, mqtts, ws or wss, for example mqtts://HOST:8883")
+    parser.add_argument(
+        "urls", nargs="+", metavar="URL",
+        help="broker: mqtt, mqtts, ws or wss, for example mqtts://HOST:8883; several of one cluster are tried in turn",
+    )  # fmt: skip
+    parser.add_argument(
+        "--mqtt-version", choices=VERSIONS, default=VERSIONS[0], help="version of MQTT (default: %(default)s)"
+    )
     parser.add_argument("--user", default="", help="name for the broker")
     parser.add_argument("--password-file", metavar="FILE", help="file that has the password in its first line")
     parser.add_argument(
@@ -86,7 +93,7 @@ def fleet_of(args: argparse.Namespace, name: str, *, from_begin: bool) -> Fleet:
     if args.key_file is not None and args.cert_file is None:
         raise BadArgument("--key-file: expected --cert-file as well")
     access = ReaderAccess(args.user, args.password_file, args.ca_file, args.cert_file, args.key_file)
-    return Fleet(args.url, access=access, name=name, from_begin=from_begin)
+    return Fleet(*args.urls, access=access, name=name, version=args.mqtt_version, from_begin=from_begin)
 
 
 async def _collect(args: argparse.Namespace) -> int:

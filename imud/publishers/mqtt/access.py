@@ -48,15 +48,21 @@ class BrokerAccess(Protocol):
         ...
 
 
-def paho_client(broker: Broker, access: BrokerAccess, client_id: str, *, is_v5: bool, manual_ack: bool = False) -> Any:
-    """A client of paho-mqtt that has not connected yet. Raises OSError for files, ValueError for what they contain."""
+def paho_client(
+    broker: Broker, access: BrokerAccess, client_id: str, *, is_v5: bool, keeps_session: bool = False,
+    manual_ack: bool = False,
+) -> Any:  # fmt: skip
+    """A client of paho-mqtt that has not connected yet. Raises OSError for files, ValueError for what they contain.
+
+    `keeps_session` is for MQTT 3.1.1; with 5 the connection says it.
+    """
     from paho.mqtt import client as paho
     from paho.mqtt.enums import CallbackAPIVersion
 
     client = paho.Client(
         CallbackAPIVersion.VERSION2,
         client_id,
-        clean_session=None if is_v5 else True,
+        clean_session=None if is_v5 else not keeps_session,
         protocol=paho.MQTTv5 if is_v5 else paho.MQTTv311,
         transport="websockets" if broker.websockets else "tcp",
         reconnect_on_failure=False,
