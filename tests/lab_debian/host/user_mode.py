@@ -105,4 +105,10 @@ def command(made: Path, work: Path, tree: Path, words: list[str]) -> list[str]:
 
 def environment(*paths: str) -> dict[str, str]:
     """The environment of such a program: nothing of the host's, and `paths` for Python."""
-    return {**CLEAN, "LC_ALL": "C.UTF-8", "PYTHONPYCACHEPREFIX": "/mnt/pycache", "PYTHONPATH": os.pathsep.join(paths)}
+    return {
+        **CLEAN,
+        "LC_ALL": "C.UTF-8",
+        "PYTHONPYCACHEPREFIX": "/mnt/pycache",
+        "HYPOTHESIS_STORAGE_DIRECTORY": "/mnt/hypothesis",
+        "PYTHONPATH": os.pathsep.join(paths),
+    }
