@@ -1,8 +1,9 @@
 """The collector: batches of all gateways into a store, acknowledged when the store has them.
 
-    session ──delivery──▶ ledger ──batch──▶ store.write (one transaction) ──▶ acknowledge
+    session ──delivery──▶ ledger ──batch──▶ store.write (one transaction, in a thread) ──▶ acknowledge
 
-A transaction has what came within COMMIT_S, at most BATCHES_MAX messages. A store that keeps the ledger beside the rows
+A transaction has what came within COMMIT_S, at most BATCHES_MAX messages; the next one is taken while it is written. A
+store that keeps the ledger beside the rows
 gives it back after a restart, so that what comes again is known. A collector whose store fails ends: what it had not
 acknowledged is sent to the next one.
 """
@@ -13,7 +14,7 @@ from typing import Final, NamedTuple, Protocol
 
 from imud.fleet.connection import RECEIVE_MAX, FleetDelivery
 from imud.fleet.reader import Fleet, FleetBatch, FleetSession
-from imud.formats.fleet.ledger import FleetLedger, StreamKey
+from imud.formats.fleet.ledger import Accounts, FleetLedger, StreamKey
 from imud.units import NS_PER_S
 
 COMMIT_S: Final = 0.5
@@ -28,13 +29,21 @@ class FleetStore(Protocol):
         """Enter the accounts that are kept into a ledger. Raises ServerError."""
         ...
 
-    def write(self, batches: Sequence[FleetBatch], ledger: FleetLedger, changed: frozenset[StreamKey]) -> None:
-        """Keep batches and the accounts that changed, all or nothing. Raises ServerError, OSError."""
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
+        """Keep batches and the accounts that they changed, all or nothing. Raises ServerError, OSError."""
         ...
 
     def close(self) -> None:
         """End; may be called twice."""
         ...
+
+
+class _Turn(NamedTuple):
+    """What is written in one transaction."""
+
+    deliveries: list[FleetDelivery]
+    batches: list[FleetBatch]
+    accounts: Accounts
 
 
 class Selection(NamedTuple):
@@ -69,26 +78,36 @@ class FleetCollector:
         end_ns = None if stop_after_s is None else self._now_ns() + round(stop_after_s * NS_PER_S)
         site, gateway, device = self._selection
         async with FleetSession(self._fleet, site=site, gateway=gateway, device=device) as session:
-            while not self._stopped and (end_ns is None or self._now_ns() < end_ns):
-                await self._turn(session)
+            writing: asyncio.Future[None] | None = None
+            try:
+                while not self._stopped and (end_ns is None or self._now_ns() < end_ns):
+                    turn = await self._take(session)
+                    if writing is not None:
+                        await asyncio.shield(writing)
+                    writing = asyncio.ensure_future(self._write(session, turn))
+            finally:
+                if writing is not None:
+                    await writing
 
-    async def _turn(self, session: FleetSession) -> None:
-        """Take what comes within COMMIT_S, write it, acknowledge it."""
-        deliveries: list[FleetDelivery] = []
-        batches: list[FleetBatch] = []
+    async def _take(self, session: FleetSession) -> _Turn:
+        """Take what comes within COMMIT_S."""
+        turn = _Turn([], [], {})
         changed: set[StreamKey] = set()
         due_ns = self._now_ns() + round(COMMIT_S * NS_PER_S)
-        while len(deliveries) < BATCHES_MAX and (left_ns := due_ns - self._now_ns()) > 0 and not self._stopped:
+        while len(turn.deliveries) < BATCHES_MAX and (left_ns := due_ns - self._now_ns()) > 0 and not self._stopped:
             delivery = await session.next(left_ns / NS_PER_S)
             if delivery is None:
                 continue
-            deliveries.append(delivery)
+            turn.deliveries.append(delivery)
             batch = self._fleet.take(delivery, changed)
             if batch is not None:
-                batches.append(batch)
-        if batches or changed:
-            ledger, frozen = self._fleet.ledger, frozenset(changed)
-            await asyncio.shield(asyncio.to_thread(self._store.write, batches, ledger, frozen))
-            self.written += len(batches)
-        for delivery in deliveries:
+                turn.batches.append(batch)
+        return turn._replace(accounts={key: self._fleet.ledger.stored(key) for key in sorted(changed)})
+
+    async def _write(self, session: FleetSession, turn: _Turn) -> None:
+        """Write what was taken, and acknowledge it."""
+        if turn.batches or turn.accounts:
+            await asyncio.to_thread(self._store.write, turn.batches, turn.accounts)
+            self.written += len(turn.batches)
+        for delivery in turn.deliveries:
             session.acknowledge(delivery)

@@ -10,7 +10,7 @@ from typing import Final, TextIO
 import msgspec
 
 from imud.fleet.reader import FleetBatch
-from imud.formats.fleet.ledger import FleetLedger, StreamKey
+from imud.formats.fleet.ledger import Accounts, FleetLedger
 from imud.formats.fleet.messages import MessageKind
 
 _ENCODER: Final = msgspec.json.Encoder()
@@ -25,7 +25,7 @@ class JsonLines:
     def restore(self, ledger: FleetLedger) -> None:
         """Nothing: a stream of lines keeps no accounts."""
 
-    def write(self, batches: Sequence[FleetBatch], _ledger: FleetLedger, _changed: frozenset[StreamKey]) -> None:
+    def write(self, batches: Sequence[FleetBatch], _accounts: Accounts) -> None:
         """Print everything in the batches. Raises OSError."""
         for batch in batches:
             for line in lines_of(batch):

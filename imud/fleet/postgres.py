@@ -19,7 +19,7 @@ import msgspec
 
 from imud.errors import ServerError
 from imud.fleet.reader import FleetBatch
-from imud.formats.fleet.ledger import FleetLedger, StoredAccount, StreamKey
+from imud.formats.fleet.ledger import Accounts, FleetLedger, StoredAccount, StreamKey
 from imud.publishers.mqtt.spool import CLOCK_SET_NS
 from imud.sample import Sample
 
@@ -97,6 +97,8 @@ class PostgresStore:
         self._error: type[Exception] = psycopg.Error
         self._offsets: set[tuple[str, str]] = set()
         """Gateways and boots whose clock is known."""
+        self._unplaced: set[tuple[str, str]] = set()
+        """Those of which samples wait for it."""
         try:
             self._connection: Any = psycopg.connect(url, connect_timeout=10, application_name="imud fleet collect")
             with self._connection.transaction(), self._connection.cursor() as cursor:
@@ -104,11 +106,8 @@ class PostgresStore:
                 cursor.execute("SELECT pg_advisory_lock(%s)", (LOCK,))
                 cursor.execute(schema())
                 for one in (SAMPLES, UNPLACED, RECORDS):
-                    columns = ", ".join(one.names)
-                    cursor.execute(
-                        f"CREATE TEMPORARY TABLE new_{one.name} ON COMMIT DELETE ROWS AS "
-                        f"SELECT {columns} FROM {one.name} WITH NO DATA"
-                    )
+                    _make_new(cursor, one.name, ", ".join(one.names))
+                _make_new(cursor, "imud_ledger", "*")
         except psycopg.Error as error:
             self.close()
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
@@ -122,11 +121,13 @@ class PostgresStore:
                     ledger.restore(StreamKey(*key), msgspec.json.decode(account, type=StoredAccount))
                 cursor.execute("SELECT gateway, boot FROM imud_boots")
                 self._offsets = {(gateway, boot) for gateway, boot in cursor}
+                cursor.execute("SELECT DISTINCT gateway, split_part(boot, '-', 1) FROM imud_unplaced")
+                self._unplaced = {(gateway, boot) for gateway, boot in cursor}
         except (self._error, OverflowError, msgspec.DecodeError) as error:
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
 
-    def write(self, batches: Sequence[FleetBatch], ledger: FleetLedger, changed: frozenset[StreamKey]) -> None:
-        """Keep batches and the accounts that changed, all or nothing. Raises ServerError."""
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
+        """Keep batches and the accounts that they changed, all or nothing. Raises ServerError."""
         try:
             with self._connection.transaction(), self._connection.cursor() as cursor:
                 known = self._write_offsets(cursor, batches)
@@ -136,15 +137,20 @@ class PostgresStore:
                 self._insert(cursor, SAMPLES, placed)
                 self._insert(cursor, UNPLACED, waiting)
                 self._insert(cursor, RECORDS, [row for batch in batches for row in _record_rows(batch)])
-                self._place(cursor, batches)
-                cursor.executemany(
-                    "INSERT INTO imud_ledger VALUES (%s, %s, %s, %s, %s::jsonb) "
-                    "ON CONFLICT (gateway, boot, device, stream) DO UPDATE SET account = EXCLUDED.account",
-                    [(*key, msgspec.json.encode(ledger.stored(key)).decode()) for key in sorted(changed)],
+                unplaced = self._unplaced | {_boot_of(batch) for batch, one in samples if one.utc_ns < CLOCK_SET_NS}
+                placeable = unplaced & (self._offsets | known)
+                self._place(cursor, placeable)
+                with cursor.copy("COPY new_imud_ledger FROM STDIN") as copy:
+                    for key, account in accounts.items():
+                        copy.write_row((*key, _json(account)))
+                cursor.execute(
+                    "INSERT INTO imud_ledger SELECT * FROM new_imud_ledger "
+                    "ON CONFLICT (gateway, boot, device, stream) DO UPDATE SET account = EXCLUDED.account"
                 )
         except self._error as error:
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
         self._offsets |= known
+        self._unplaced = unplaced - placeable
 
     def close(self) -> None:
         """End the connection; may be called twice."""
@@ -173,7 +179,7 @@ class PostgresStore:
         """Note the clock of each boot that is known from here on; return these boots."""
         found: dict[tuple[str, str], int] = {}
         for batch in batches:
-            boot = batch.message.gateway, batch.message.boot.partition("-")[0]
+            boot = _boot_of(batch)
             for one in batch.message.samples:
                 if one.utc_ns >= CLOCK_SET_NS and boot not in self._offsets:
                     found.setdefault(boot, one.utc_ns - one.t_ns)
@@ -184,9 +190,8 @@ class PostgresStore:
             )
         return set(found)
 
-    def _place(self, cursor: Any, batches: Iterable[FleetBatch]) -> None:
-        """Move samples that wait for the clock of a boot to the others, once it is known."""
-        boots = sorted({(batch.message.gateway, batch.message.boot.partition("-")[0]) for batch in batches})
+    def _place(self, cursor: Any, boots: Iterable[tuple[str, str]]) -> None:
+        """Move samples that wait for the clock of a boot to the others."""
         others = ", ".join(name for name in SAMPLES.names if name != "utc_ns")
         placed = "t_ns + utc_offset_ns"
         cursor.executemany(
@@ -195,8 +200,20 @@ class PostgresStore:
             "RETURNING w.*, b.utc_offset_ns) "
             f"INSERT INTO imud_samples (time, utc_ns, {others}) SELECT {US.format(f'({placed})')}, {placed}, {others} "
             "FROM gone ON CONFLICT DO NOTHING",
-            boots,
+            sorted(boots),
         )
+
+
+def _make_new(cursor: Any, name: str, columns: str) -> None:
+    """Make the temporary table whose rows go into a table."""
+    cursor.execute(
+        f"CREATE TEMPORARY TABLE new_{name} ON COMMIT DELETE ROWS AS SELECT {columns} FROM {name} WITH NO DATA"
+    )
+
+
+def _boot_of(batch: FleetBatch) -> tuple[str, str]:
+    """Gateway and boot, without the number of a device that was made anew."""
+    return batch.message.gateway, batch.message.boot.partition("-")[0]
 
 
 def _sample_row(batch: FleetBatch, sample: Sample) -> tuple[object, ...]:

@@ -102,6 +102,8 @@ class Fleet:
         """The last state of each gateway, by site and gateway."""
         self.ignored = 0
         """Messages of these topics that no gateway of a version known here has sent."""
+        self.connections = 0
+        """Connections that a broker has accepted, with their subscriptions."""
         self.problem = ""
         """Why nothing comes now, one sentence; empty while the connection is there."""
         self._positions = SpoolPositions()
@@ -223,6 +225,7 @@ class FleetSession:
             broker, fleet.access, fleet.client_id, self._topics(), fleet.session_s, is_v5=fleet.is_v5
         )
         self._turn.connected(fleet.now_ns())
+        fleet.connections += 1
         fleet.problem = ""
         log.info("connected to %s", broker.name)
         return True

@@ -1,9 +1,10 @@
 """`make fleet-cluster`: three NATS servers with JetStream and MQTT, of which one is killed while gateways send.
 
 `python -m tests.bench.fleet_cluster [--gateways 200] [--seconds 30]`. The servers are Debian's nats-server, which
-speaks MQTT 3.1.1; sessions and messages are on three of them. A third of the way through the server that the
-collector is connected to is killed with SIGKILL. Gateways and collector go to the next server of their lists, and
-gateways send again what was not acknowledged. It ends with 1 where a number is missing at the end.
+speaks MQTT 3.1.1; sessions and messages are on three of them. The collector is that of the package; with --postgres it
+writes rows. A third of the way through the server that it is connected to is killed with SIGKILL. Gateways and
+collector go to the next server of their lists, and gateways send again what was not acknowledged. It ends with 1 where
+a number is missing at the end.
 """
 
 import argparse
@@ -16,10 +17,13 @@ import tempfile
 import time
 import urllib.request
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
 
-from tests.bench.fleet_load import CollectorProcess, Fleet, acknowledged_by
+from tests.bench.fleet_collector import CollectorProcess
+from tests.bench.fleet_load import GatewayFleet, acknowledged_by
+from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 from tests.publishers.mqtt.mosquitto import free_port
 
 PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
@@ -87,33 +91,40 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-cluster")
     parser.add_argument("--gateways", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--postgres", action="store_true", help="the collector writes into a PostgreSQL")
     args = parser.parse_args()
-    if PROGRAM is None:
-        print("nats-server is not installed (apt-get install nats-server)")
+    missing = "" if PROGRAM else "nats-server is not installed (apt-get install nats-server)"
+    if missing := missing or (NO_POSTGRES if args.postgres else ""):
+        print(missing)
         return 1
     print(f"{args.gateways} gateways, {args.seconds:g} s, load {os.getloadavg()[0]:.1f} before", flush=True)
-    with tempfile.TemporaryDirectory(prefix="imud-cluster-") as folder:
-        cluster = Cluster(Path(folder))
-        try:
-            collector = CollectorProcess(cluster.ports)
-            fleet = Fleet(args.gateways, cluster.ports)
-            fleet.run(8.0)
-            killed = False
+    with tempfile.TemporaryDirectory(prefix="imud-cluster-") as folder, ExitStack() as stack:
+        cluster = stack.enter_context(closing(Cluster(Path(folder))))
+        to = stack.enter_context(running_postgres()) if args.postgres else ""
+        return play(cluster, to, args.gateways, args.seconds)
 
-            def tick(at_s: float) -> None:
-                nonlocal killed
-                if not killed and at_s > args.seconds / 3:
-                    killed = True
-                    cluster.kill(0)
 
-            acknowledged = acknowledged_by(fleet)
-            fleet.run(args.seconds, tick)
-            print(f"  acknowledged {(acknowledged_by(fleet) - acknowledged) / args.seconds:.0f} messages/s")
-            print(f"  waiting when gateways stop: {fleet.waiting} messages; acknowledged after {fleet.drain():.1f} s")
-            account = collector.end(fleet.numbered)
-            fleet.clients.close()
-        finally:
-            cluster.close()
+def play(cluster: Cluster, to: str, gateways: int, seconds: float) -> int:
+    """Send for so long, kill a server meanwhile, and print the account; 1 where it does not close."""
+    collector = CollectorProcess(cluster.ports, version="3.1.1", to=to)
+    fleet = GatewayFleet(gateways, cluster.ports)
+    fleet.run(8.0)
+    killed = False
+
+    def tick(at_s: float) -> None:
+        nonlocal killed
+        if not killed and at_s > seconds / 3:
+            killed = True
+            cluster.kill(0)
+
+    acknowledged = acknowledged_by(fleet)
+    fleet.run(seconds, tick)
+    print(f"  acknowledged {(acknowledged_by(fleet) - acknowledged) / seconds:.0f} messages/s")
+    print(
+        f"  waiting when gateways stop: {fleet.waiting} messages; acknowledged after {fleet.drain():.1f} s", flush=True
+    )
+    account = collector.end(fleet.numbered)
+    fleet.clients.close()
     print(f"  numbered {fleet.numbered}, came {account['came']}, connections of the collector {account['connects']}")
     print("  " + ", ".join(f"{word} {account[word]:.0f}" for word in ACCOUNT_WORDS))
     return int(fleet.numbered != account["came"] or bool(account["open"]))

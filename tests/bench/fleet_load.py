@@ -1,38 +1,36 @@
 """`make fleet-load`: gateways that are simulated, one broker and one collector: how many are held, and what it takes.
 
-`python -m tests.bench.fleet_load [--gateways 1000] [--seconds 30]`. Every gateway sends what the output `mqtt` sends
-of two devices with `rate_hz: 10` and `batch_s: 1`: a message a second and device, with ten intervals of acceleration,
-rate of turn and angles. The collector, a process of its own, decodes every message and keeps the ledger. At the end
-the gateways stop, everything they have numbered has to arrive, and the program ends with 1 where anything is missing.
+`python -m tests.bench.fleet_load [--gateways 1000] [--seconds 30] [--postgres]`. Every gateway sends what the output
+`mqtt` sends of two devices with `rate_hz: 10` and `batch_s: 1`: a message a second and device, with ten intervals of
+acceleration, rate of turn and angles. The collector is that of the package in a process of its own; with --postgres it
+writes rows. At the end the gateways stop, everything they have numbered has to arrive, and the program ends with 1
+where anything is missing.
 """
 
 import argparse
-import json
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from time import monotonic, time_ns
-from typing import Any, Final
+from typing import Final
 
-from imud.formats.fleet.ledger import FleetLedger
-from imud.formats.fleet.messages import FleetMessage, Interval, Measures, MessageKind, decode_message, encode_message
-from imud.formats.fleet.topics import Stream, parse_topic, topic_of
+from imud.formats.fleet.messages import FleetMessage, Interval, Measures, MessageKind, encode_message
+from imud.formats.fleet.topics import Stream, topic_of
 from imud.sample import Sync
 from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.fleet_collector import END_S, CollectorProcess
 from tests.bench.mqtt_clients import Clients, MqttClient
 from tests.bench.rig import cpu_ns, rss_mb
+from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
 
 DEVICES: Final = ("bow", "mast")
 SAMPLES: Final = 100
 """Of a device in a second."""
 INTERVALS: Final = 10
-END_S: Final = 180.0
-"""How long the rest may take to arrive."""
-FLEET: Final = "imud/#"
 
 
 class SimulatedGateway:
@@ -82,7 +80,7 @@ def _interval(first: int, last: int) -> Interval:
     )  # fmt: skip
 
 
-class Fleet:
+class GatewayFleet:
     """All gateways, in this process."""
 
     def __init__(self, number: int, ports: Sequence[int]) -> None:
@@ -125,75 +123,13 @@ class Fleet:
         return len(DEVICES) * sum(one.seq for one in self.gateways)
 
 
-class CollectorProcess:
-    """The collector in a process of its own."""
-
-    def __init__(self, ports: Sequence[int]) -> None:
-        words = ["-m", "tests.bench.fleet_load", "--collector", *map(str, ports)]
-        self.popen = subprocess.Popen(
-            [sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-        assert self.popen.stdout is not None
-        assert self.popen.stdout.readline().strip() == "ready"
-
-    def end(self, numbered: int) -> dict[str, Any]:
-        """Have it wait for all numbers; return its account."""
-        said, _ = self.popen.communicate(f"{numbered}\n", timeout=2 * END_S)
-        found: dict[str, Any] = json.loads(said)
-        return found
-
-
-def collect(ports: Sequence[int]) -> None:
-    """The collector: take everything until standard input says how many numbers there are, and all have come."""
-    ledger, delays_ms, came = FleetLedger(from_begin=True), [], 0
-    client = MqttClient("collector", ports, subscribe=FLEET)
-
-    def take(topic: str, payload: bytes) -> None:
-        nonlocal came
-        parts = parse_topic(topic)
-        if parts is None or parts.leaf not in Stream.__members__.values():
-            return
-        message = decode_message(payload)
-        delays_ms.append((time_ns() - message.utc_ns) / NS_PER_MS)
-        if ledger.take(message, Stream(parts.leaf)) is not None:
-            came += message.count
-
-    client.on_message = take
-    clients = Clients([client])
-    os.set_blocking(0, False)
-    while not client.is_ready:
-        clients.round(0.05)
-    end_s = monotonic() + 1.0
-    while monotonic() < end_s:
-        clients.round(0.05)
-    print("ready", flush=True)
-    due = -1
-    while due < 0 or (came < due and monotonic() < end_s):
-        clients.round(0.02)
-        if due < 0 and (line := sys.stdin.readline()):
-            due, end_s = int(line), monotonic() + END_S
-    counts = ledger.counts.values()
-    delays_ms.sort()
-    print(
-        json.dumps(
-            {
-                "came": came, "missing": sum(one.missing for one in counts), "connects": client.connects,
-                "duplicates": sum(one.duplicates for one in counts), "streams": len(ledger.counts),
-                "open": sum(one.balance != 0 for one in counts),
-                "p50_ms": delays_ms[len(delays_ms) // 2], "p99_ms": delays_ms[len(delays_ms) * 99 // 100],
-                "max_ms": delays_ms[-1],
-            }
-        )
-    )  # fmt: skip
-
-
-def measure(number: int, seconds: float) -> Iterator[tuple[str, float, str]]:
+def measure(number: int, seconds: float, *, to: str = "") -> Iterator[tuple[str, float, str]]:
     """Figures of a fleet on one mosquitto."""
     with tempfile.TemporaryDirectory(prefix="imud-load-") as folder, running_broker(
         Path(folder) / "broker", "allow_anonymous true", "log_type error", "log_type information"
     ) as broker:  # fmt: skip
-        collector = CollectorProcess([broker.port])
-        fleet = Fleet(number, [broker.port])
+        collector = CollectorProcess([broker.port], version="5", to=to)
+        fleet = GatewayFleet(number, [broker.port])
         fleet.run(6.0)
         pids = {"broker": broker.pid, "collector": collector.popen.pid, "gateways": os.getpid()}
         before, acknowledged = {name: cpu_ns(pid) for name, pid in pids.items()}, acknowledged_by(fleet)
@@ -218,7 +154,7 @@ def measure(number: int, seconds: float) -> Iterator[tuple[str, float, str]]:
     yield "lost", float(fleet.numbered - account["came"]), "samples"
 
 
-def acknowledged_by(fleet: Fleet) -> int:
+def acknowledged_by(fleet: GatewayFleet) -> int:
     """Messages that the broker has taken."""
     return sum(one.client.acknowledged for one in fleet.gateways)
 
@@ -228,20 +164,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-load")
     parser.add_argument("--gateways", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--collector", nargs="+", type=int, default=[], help=argparse.SUPPRESS)
+    parser.add_argument("--postgres", action="store_true", help="the collector writes into a PostgreSQL")
     args = parser.parse_args()
-    if args.collector:
-        collect(args.collector)
-        return 0
-    if NO_MOSQUITTO:
-        print(NO_MOSQUITTO)
+    if missing := NO_MOSQUITTO or (NO_POSTGRES if args.postgres else ""):
+        print(missing)
         return 1
     load = f"load {os.getloadavg()[0]:.1f} before"
     print(f"{args.gateways} gateways of {len(DEVICES)} devices, {args.seconds:g} s, {os.cpu_count()} cores, {load}")
     lost = 1.0
-    for name, value, unit in measure(args.gateways, args.seconds):
-        print(f"  {name:32} {value:12.2f} {unit}", flush=True)
-        lost = value if name == "lost" else lost
+    with running_postgres() if args.postgres else nullcontext("") as to:
+        for name, value, unit in measure(args.gateways, args.seconds, to=to):
+            print(f"  {name:32} {value:12.2f} {unit}", flush=True)
+            lost = value if name == "lost" else lost
     return int(lost != 0)
 
 

@@ -1,7 +1,7 @@
-"""Many clients of MQTT 3.1.1 in one thread, cheap enough that a broker and a collector are what a measurement loads.
+"""Many clients of MQTT 3.1.1 that send, in one thread, cheap enough that broker and collector are what is loaded.
 
-Packets are those of the standard (OASIS MQTT 3.1.1, sections 2 and 3): CONNECT, PUBLISH with QoS 1, SUBSCRIBE,
-PINGREQ and their answers. What is to be sent waits, as in the spool, until the broker has acknowledged it; after a
+Packets are those of the standard (OASIS MQTT 3.1.1, sections 2 and 3): CONNECT, PUBLISH with QoS 1, PINGREQ and their
+answers. What is to be sent waits, as in the spool, until the broker has acknowledged it; after a
 loss a client goes to the next broker of its list and sends everything again, oldest first.
 """
 
@@ -9,13 +9,13 @@ import selectors
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from random import Random
 from time import monotonic
 from typing import Final
 
-CONNACK, PUBLISH, PUBACK, SUBACK = 2, 3, 4, 9
+CONNACK, PUBACK = 2, 4
 WINDOW: Final = 20
 KEEP_ALIVE_S: Final = 30
 ANSWER_S: Final = 15.0
@@ -27,8 +27,8 @@ READ_BYTES: Final = 262_144
 class MqttClient:
     """One client. Synchronization: the thread of its `Clients`."""
 
-    def __init__(self, name: str, ports: Sequence[int], *, subscribe: str = "", first: int = 0) -> None:
-        self.name, self.ports, self.subscribe = name, tuple(ports), subscribe
+    def __init__(self, name: str, ports: Sequence[int], *, first: int = 0) -> None:
+        self.name, self.ports = name, tuple(ports)
         self.at = first % len(ports)
         self.socket: socket.socket | None = None
         self.is_ready = False
@@ -43,7 +43,6 @@ class MqttClient:
         self.read = bytearray()
         self.number = 0
         """Packet identifier of the newest message; those of a connection follow on each other."""
-        self.on_message: Callable[[str, bytes], None] = lambda _topic, _payload: None
 
     def give(self, topic: str, payload: bytes) -> None:
         """Have a message sent."""
@@ -130,8 +129,7 @@ class Clients:
         client.socket, client.is_ready, client.sent = made, False, 0
         client.heard_s = client.wrote_s = now_s
         client.read.clear()
-        flags = 0 if client.subscribe else 2  # a clean session for those who only send
-        head = text("MQTT") + bytes((4, flags)) + struct.pack(">H", KEEP_ALIVE_S)
+        head = text("MQTT") + bytes((4, 2)) + struct.pack(">H", KEEP_ALIVE_S)  # a clean session
         client.out[:] = packet(0x10, head + text(client.name))
         self._selector.register(made, selectors.EVENT_READ | selectors.EVENT_WRITE, client)
 
@@ -167,19 +165,10 @@ class Clients:
                 raise ConnectionRefusedError
             client.connects += 1
             client.is_ready, client.number = True, 0
-            if client.subscribe:
-                client.out += packet(0x82, b"\x00\x01" + text(client.subscribe) + b"\x01")
         elif kind == PUBACK:  # brokers acknowledge in the order of the messages (section 4.6)
             client.waiting.popleft()
             client.sent -= 1
             client.acknowledged += 1
-        elif kind == PUBLISH:
-            size = struct.unpack_from(">H", body)[0]
-            at = 2 + size
-            if first & 0x06:
-                client.out += b"\x40\x02" + body[at : at + 2]
-                at += 2
-            client.on_message(body[2 : 2 + size].decode(), body[at:])
 
 
 def text(value: str) -> bytes:

@@ -8,7 +8,7 @@ import pytest
 from imud.errors import ServerError
 from imud.fleet import Fleet, FleetBatch
 from imud.fleet.collect import FleetCollector
-from imud.formats.fleet.ledger import FleetLedger, StoredAccount, StreamKey
+from imud.formats.fleet.ledger import Accounts, FleetLedger, StoredAccount, StreamKey
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, samples_message
 from tests.publishers.mqtt.mosquitto import Mosquitto
 
@@ -27,11 +27,11 @@ class MemoryStore:
         for key, account in self.accounts.items():
             ledger.restore(key, account)
 
-    def write(self, batches: Sequence[FleetBatch], ledger: FleetLedger, changed: frozenset[StreamKey]) -> None:
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
         if self.fails:
             raise ServerError("the store is full")
         self.rows += [sample.seq for batch in batches for sample in batch.message.samples]
-        self.accounts |= {key: ledger.stored(key) for key in changed}
+        self.accounts |= accounts
         if len(self.rows) >= self.most and self.collector is not None:
             self.collector.stop()
 

@@ -9,7 +9,6 @@ import msgspec
 from imud.event import Event, EventKind
 from imud.fleet import FleetBatch
 from imud.fleet.json_lines import JsonLines, lines_of
-from imud.formats.fleet.ledger import FleetLedger
 from imud.formats.fleet.messages import Interval, Measures, MessageKind
 from imud.formats.fleet.topics import Stream
 from imud.sample import Sync
@@ -47,7 +46,7 @@ def test_dropped_intervals_and_events_have_their_kinds() -> None:
         FleetBatch("mill", Stream.SAMPLES, thinned),
         FleetBatch("mill", Stream.EVENTS, event),
     ]
-    JsonLines(out).write(batches, FleetLedger(), frozenset())
+    JsonLines(out).write(batches, {})
     dropped, found, up = map(json.loads, out.getvalue().splitlines())
     assert dropped == HEAD | {"kind": "dropped", "first": 1, "last": 4, "cause": "space"}
     assert (found["kind"], found["values"]["accel_m_s2"]["mean"]) == ("interval", [1.0, 2.0, 3.0])

@@ -56,7 +56,7 @@ def write(url: str, *messages: FleetMessage) -> FleetLedger:
         if fresh is not None:
             batches.append(FleetBatch("mill", Stream.SAMPLES, fresh))
     try:
-        store.write(batches, ledger, frozenset(changed))
+        store.write(batches, {key: ledger.stored(key) for key in changed})
     finally:
         store.close()
     return ledger

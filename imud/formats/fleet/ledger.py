@@ -66,6 +66,10 @@ class StoredAccount(msgspec.Struct, frozen=True):
     """First and last of each range that is missing and may still come."""
 
 
+Accounts = Mapping[StreamKey, StoredAccount]
+"""Accounts as they are kept, by stream."""
+
+
 class _Account:
     """The account of one stream, with the ranges that are missing."""
 
