@@ -1,6 +1,9 @@
 """The reader against a real broker: what is not taken comes again, what is taken does not, and connections return."""
 
 import asyncio
+import re
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -16,6 +19,7 @@ from imud.formats.fleet.state import GatewayState, StreamPosition
 from imud.formats.fleet.topics import topic_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
+from tests.support.files import ROOT
 
 KEY = StreamKey("gw", "1", "bow", "samples")
 
@@ -213,6 +217,20 @@ def test_over_websockets(tmp_path: Path, version: str) -> None:
             gateway.send_state(STATE)
         found = asyncio.run(play())
     assert [one.message for one in found] == [samples_message(n, n) for n in range(1, 101)]
+
+
+def test_the_example_of_the_document(broker: Mosquitto, gateway: SendingGateway) -> None:
+    document = (ROOT / "docs" / "fleet.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", document, re.DOTALL)
+    code = code.replace("127.0.0.1:1883", f"127.0.0.1:{broker.port}")
+    with subprocess.Popen([sys.executable, "-u", "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        while not any("Received SUBSCRIBE" in line for line in broker.log):
+            assert process.poll() is None
+        gateway.send(samples_message(7, 9, gateway="other"), samples_message(1, 3, gateway="gw-17"))
+        line = process.stdout.readline()
+        process.kill()
+    assert line == "samples 1 3 3\n"
 
 
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)

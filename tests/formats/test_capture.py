@@ -1,7 +1,11 @@
 """Raw and stamped captures."""
 
 import io
+import re
 import struct
+import subprocess
+import sys
+from pathlib import Path
 from typing import BinaryIO, cast
 
 import pytest
@@ -10,7 +14,7 @@ from hypothesis import strategies as st
 
 from imud.errors import ImudError
 from imud.formats.capture import MAGIC, RAW_CHUNK_BYTES, RECORD_BYTES_MAX, CaptureReader
-from tests.support.files import CaptureWriter
+from tests.support.files import ROOT, CaptureWriter
 
 GOLDEN = (
     b"#imud-capture 1 driver=hipnuc-uart baud=115200\n"
@@ -143,3 +147,12 @@ def test_the_bound_is_kept_and_the_rest_counted() -> None:
 def test_a_first_line_that_could_not_be_read_back_is_refused() -> None:
     with pytest.raises(ValueError, match="can be read back"):
         CaptureWriter(io.BytesIO(), details={"note": "x" * 5000})
+
+
+def test_the_example_of_the_document(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(GOLDEN)
+    document = (ROOT / "docs" / "captures.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", document, re.DOTALL)
+    argv = [sys.executable, "-c", f"{code}        print(t_ns, data)\n"]
+    done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=20, cwd=tmp_path)
+    assert done.stdout.splitlines()[1:] == ["258 b'abc'", "259 b'd'"], done.stderr

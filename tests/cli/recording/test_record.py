@@ -138,6 +138,20 @@ def test_the_example_of_the_document(daemon: RunningDaemon) -> None:
     assert done.stdout == "b'\\x89imudREC'\n", done.stderr
 
 
+def test_raw_bytes_are_read_as_the_document_does(daemon: RunningDaemon, tmp_path: Path) -> None:
+    """The frames of HI91 that a program without imud finds, in the order of their time."""
+    done = record(daemon, "--for", "1s", "--device", "bow", str(tmp_path / "file"))
+    assert done.returncode == 0, done.stderr
+    document = (ROOT / "docs" / "recording.md").read_text()
+    (code,) = (one for one in re.findall(r"```python\n(.*?)```", document, re.DOTALL) if "zstandard" in one)
+    argv = [sys.executable, "-c", code]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=tmp_path)
+    reads = [line.split() for line in done.stdout.splitlines()]
+    assert len(reads) >= 20, done.stderr
+    assert [int(t_ns) for _, t_ns, _ in reads] == sorted(int(t_ns) for _, t_ns, _ in reads)
+    assert b"\x5a\xa5\x4c\x00" in bytes.fromhex("".join(data for *_, data in reads)), "HI91 has 76 bytes"
+
+
 @pytest.mark.parametrize(
     ("text", "seconds"), [("90", 90), ("90s", 90), ("10min", 600), ("1.5h", 5400), ("2 d", 172_800), (".5s", 0.5)]
 )
