@@ -1,22 +1,30 @@
 """`make fleet-faults`: a gateway, a broker and everything that can happen between them, as a table.
 
-`python -m tests.bench.fleet_faults [--seconds 20] [FAULT …]`. A gateway is the output `mqtt` in a process of its own,
-with one device at 1 kHz, every sample as a slot and statistics of 10 Hz. Each fault begins once samples arrive, and
-lasts `--seconds`; catching up is from its end until nothing waits that is older than three seconds. At the end the
-gateway is killed with SIGKILL, and the ledger has to close: what its spool's file has given numbers to is what came, or
-what still waits. It ends with 1 where a number is missing, or the ledger does not close.
+`python -m tests.bench.fleet_faults [--seconds 20] [--tls] [--postgres] [FAULT …]`. A gateway is the output `mqtt` in a
+process of its own, with one device at 1 kHz, every sample as a slot and statistics of 10 Hz. Each fault begins once
+samples arrive, and lasts `--seconds`; catching up is from its end until nothing waits that is older than three seconds.
+At the end the gateway is killed with SIGKILL, and the ledger has to close: what its spool's file has given numbers to
+is what came, or what still waits. It ends with 1 where a number is missing, or the ledger does not close.
+
+With --tls the gateway speaks TLS, with certificates of both sides. With --postgres `imud fleet collect` writes rows
+meanwhile, of which there have to be as many as whole samples that came.
 """
 
 import argparse
+import signal
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, NamedTuple
 
 from imud.formats.fleet.topics import Stream
+from tests.bench.fleet_rows import RowCollector
+from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
+from tests.publishers.mqtt.authority import Authority
 from tests.publishers.mqtt.gateways import KilledGateway, closes, in_spool
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, Mosquitto, free_port
 from tests.publishers.mqtt.proxy import Proxy
@@ -32,12 +40,23 @@ SMALL_MB: Final = 1.0
 class Scene:
     """A broker, a proxy before it, a collector at the broker, and a gateway that speaks through the proxy."""
 
-    def __init__(self, folder: Path, *lines: str, spool_mb: float = 256.0) -> None:
+    def __init__(
+        self, folder: Path, *lines: str, spool_mb: float = 256.0, tls: bool = False, database: str = ""
+    ) -> None:
         self.folder, self.spool_mb = folder, spool_mb
         (folder / "broker").mkdir(parents=True)
-        self.broker = Mosquitto(folder / "broker", lines or ("allow_anonymous true",), free_port())
+        self.authority: Authority | None = None
+        port = free_port()
+        if tls:
+            (folder / "certificates").mkdir()
+            self.authority = Authority(folder / "certificates")
+            lines = (*lines, *(line for line in self.authority.listener(port) if line not in lines))
+        self.broker = Mosquitto(folder / "broker", lines, free_port())
         self.broker.start()
-        self.proxy = Proxy(self.broker.port)
+        self.proxy = Proxy(port if tls else self.broker.port)
+        self.rows: RowCollector | None = None
+        if database:
+            self.rows = RowCollector(f"mqtt://127.0.0.1:{self.broker.port}", database, folder / "collector.log")
         self.held = threading.Event()
         self.collector = Collector(self.broker.port, prepare=self._prepare)
         self.spool = folder / "spool"
@@ -60,7 +79,7 @@ class Scene:
     def start_gateway(self) -> None:
         """Start the gateway, with another boot."""
         self.epoch += 1
-        self.gateway = KilledGateway(self.proxy.port, self.spool, self.epoch, self.spool_mb)
+        self.gateway = KilledGateway(self.proxy.port, self.spool, self.epoch, self.spool_mb, self.authority)
 
     def watch(self, seconds: float, until: Callable[[int], bool] = lambda waiting: False) -> float:
         """Read what the gateway says for so long, or until its waiting messages fulfil something; return how long."""
@@ -85,6 +104,8 @@ class Scene:
         """End all of it."""
         self.gateway.kill()
         self.collector.close()
+        if self.rows is not None:
+            self.rows.end(signal.SIGKILL)
         self.proxy.close()
         self.broker.stop()
 
@@ -182,6 +203,17 @@ def kill_full(scene: Scene, seconds: float) -> None:
     scene.proxy.restore()
 
 
+def kill_collector(scene: Scene, seconds: float) -> None:
+    """The collector that writes rows is killed with SIGKILL three times, and is away for a while."""
+    for _ in range(3):
+        scene.watch(seconds / 6)
+        if scene.rows is not None:
+            scene.rows.end(signal.SIGKILL)
+        scene.watch(seconds / 6)
+        if scene.rows is not None:
+            scene.rows.start()
+
+
 FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
     "none": (nothing, "none"),
     "restart": (restart, "the broker is ended and comes back"),
@@ -194,6 +226,7 @@ FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
     "slow-collector": (slow_collector, "the collector takes 5 messages a second"),
     "kill": (kill_gateway, "SIGKILL three times while the network is cut"),
     "kill-full": (kill_full, "the same with a spool of 1 MB that is full"),
+    "kill-collector": (kill_collector, "SIGKILL three times of the collector that writes rows"),
 }
 
 
@@ -209,16 +242,25 @@ class Result(NamedTuple):
     missing: int
     high_water: int
     catch_up_s: float
+    rows: int | None
+    """In the database; None without one."""
+
+    @property
+    def closes(self) -> bool:
+        """Whether every number is accounted for, and is in the database once."""
+        came = self.whole + self.thinned + self.dropped + self.waiting
+        return not self.missing and self.numbered == came and self.rows in (None, self.whole)
 
 
-def play(name: str, folder: Path, seconds: float) -> Result:
-    """Play one fault. Raises AssertionError where the ledger does not close."""
+def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -> Result:
+    """Play one fault; `database` is a PostgreSQL, empty for none. Raises AssertionError where the ledger is open."""
     fault, _ = FAULTS[name]
     rights = folder / "rights"
     rights.write_text("topic readwrite #\n")
     # with rights, mosquitto 2.0.11 keeps nothing for readers that are away since its restart (docs/fleet.md)
     lines = ("allow_anonymous true", *((f"acl_file {rights}",) if name == "refuse" else ()))
-    scene = Scene(folder, *lines, spool_mb=SMALL_MB if name == "kill-full" else 256.0)
+    spool_mb = SMALL_MB if name == "kill-full" else 256.0
+    scene = Scene(folder, *lines, spool_mb=spool_mb, tls=tls, database=database)
     try:
         scene.collector.wait_for(lambda: len(scene.collector.fresh) > 5, 60.0)
         fault(scene, seconds)
@@ -226,6 +268,9 @@ def play(name: str, folder: Path, seconds: float) -> Result:
         scene.watch(2.0)
         scene.gateway.kill()
         counts = [one for (_, stream), one in closes(scene.collector, scene.spool).items() if stream == Stream.SAMPLES]
+        rows = None if scene.rows is None else scene.rows.rows_after(sum(one.whole for one in counts))
+        if scene.rows is not None and (missing := scene.rows.missing()):
+            raise AssertionError(f"the ledger in the database misses {missing}")
     finally:
         scene.close()
     numbered = last_numbers(scene.spool)
@@ -233,7 +278,7 @@ def play(name: str, folder: Path, seconds: float) -> Result:
     return Result(
         numbered, sum(one.whole for one in counts), sum(one.thinned for one in counts),
         sum(sum(one.dropped.values()) for one in counts), numbered - came, sum(one.duplicates for one in counts),
-        sum(one.missing for one in counts), scene.high_water, catch_up_s,
+        sum(one.missing for one in counts), scene.high_water, catch_up_s, rows,
     )  # fmt: skip
 
 
@@ -248,25 +293,30 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-faults")
     parser.add_argument("faults", nargs="*", choices=[[], *FAULTS], metavar="FAULT", help=", ".join(FAULTS))
     parser.add_argument("--seconds", type=float, default=20.0, help="how long each fault lasts (default: %(default)g)")
+    parser.add_argument("--tls", action="store_true", help="between gateway and broker")
+    parser.add_argument("--postgres", action="store_true", help="count the rows that `imud fleet collect` writes")
     args = parser.parse_args()
-    if NO_MOSQUITTO:
-        print(NO_MOSQUITTO)
+    if missing := NO_MOSQUITTO or (NO_POSTGRES if args.postgres else ""):
+        print(missing)
         return 1
     failed = False
-    print("| fault | numbered | whole | thinned | dropped | waiting | duplicate | lost | spool, kB | catching up, s |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    head = "| fault | numbered | whole | thinned | dropped | waiting | duplicate | lost | spool, kB | catching up, s |"
+    print(f"{head} rows |\n{'|---' * 11}|")
     for name in args.faults or FAULTS:
-        with tempfile.TemporaryDirectory(prefix="imud-faults-") as folder:
+        with ExitStack() as stack:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-faults-"))
+            database = stack.enter_context(running_postgres()) if args.postgres else ""
             try:
-                one = play(name, Path(folder), args.seconds)
+                one = play(name, Path(folder), args.seconds, tls=args.tls, database=database)
             except (AssertionError, TimeoutError) as error:
                 failed = True
                 print(f"| {name} | FAILED: {error} |", flush=True)
                 continue
-        failed |= bool(one.missing) or one.numbered != one.whole + one.thinned + one.dropped + one.waiting
+        failed |= not one.closes
         print(
             f"| {FAULTS[name][1]} | {one.numbered} | {one.whole} | {one.thinned} | {one.dropped} |"
-            f" {one.waiting} | {one.duplicates} | {one.missing} | {one.high_water / 1000:.0f} | {one.catch_up_s:.1f} |",
+            f" {one.waiting} | {one.duplicates} | {one.missing} | {one.high_water / 1000:.0f} | {one.catch_up_s:.1f} |"
+            f" {'-' if one.rows is None else one.rows} |",
             flush=True,
         )
     return int(failed)

@@ -19,15 +19,16 @@ TICK_S = 0.05
 EVERY = {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.2}}
 
 
-def main(port: str, spool: str, epoch: str, megabytes: str = "256") -> None:
-    """Run until killed."""
-    settings = msgspec.convert(
-        {
-            "brokers": [f"mqtt://127.0.0.1:{port}"], "gateway": "gw", "spool_directory": spool, "retry_max_s": 1,
-            "devices": EVERY, "spool_mb": float(megabytes),
-        },
-        MqttSettings,
-    )  # fmt: skip
+def main(port: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "") -> None:
+    """Run until killed. `certificates`: folder of an `Authority`, for TLS; empty for none."""
+    made: dict[str, object] = {
+        "brokers": [f"{'mqtts' if certificates else 'mqtt'}://127.0.0.1:{port}"], "gateway": "gw",
+        "spool_directory": spool, "retry_max_s": 1, "devices": EVERY, "spool_mb": float(megabytes),
+    }  # fmt: skip
+    if certificates:
+        made |= {"ca_file": f"{certificates}/ca.pem", "cert_file": f"{certificates}/gateway.pem"}
+        made |= {"key_file": f"{certificates}/gateway.key"}
+    settings = msgspec.convert(made, MqttSettings)
     offset_ns = time.time_ns() - time.monotonic_ns()
     context = PublisherContext(list, int(epoch), time.monotonic_ns, utc_offset_ns=lambda: offset_ns)
     output = MqttPublisher(settings, context)

@@ -23,6 +23,7 @@ from imud.publishers.mqtt.settings import MqttSettings
 from imud.publishers.mqtt.spool import Spool, Spooled
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
+from tests.publishers.mqtt.authority import Authority
 from tests.publishers.mqtt.mosquitto import LIMIT_S, Collector
 
 
@@ -112,9 +113,12 @@ class GatewayState(NamedTuple):
 class KilledGateway:
     """`gateway_process`, which is killed."""
 
-    def __init__(self, port: int, spool: Path, epoch: int, megabytes: float = 256) -> None:
+    def __init__(
+        self, port: int, spool: Path, epoch: int, megabytes: float = 256, authority: Authority | None = None
+    ) -> None:
+        """With an authority it speaks TLS."""
         self._read = b""
-        words = [str(port), str(spool), str(epoch), str(megabytes)]
+        words = [str(port), str(spool), str(epoch), str(megabytes), str(authority.folder) if authority else ""]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "tests.publishers.mqtt.gateway_process", *words],
             stdout=subprocess.PIPE,
