@@ -1,7 +1,7 @@
 """A daemon on simulated devices, each with a fault of its own that can be switched on and off.
 
     Feeder ──frames, 20 Hz──▶ Wire (pty) ──▶ Daemon in a thread ──▶ metrics
-    a simulated module, a module on RS-485, lines and PPS in memory ──▶ the same daemon
+    a simulated module, a module on RS-485, lines and PPS in memory ──▶ the same daemon ──▶ mosquitto, a recording
 
 The faults of `STATUS_FAULTS` cannot be made on a machine without the hardware, or are bugs of imud that do not exist:
 the state that the daemon shows is altered instead. Everything else really happens.
@@ -10,6 +10,7 @@ the state that the daemon shows is altered instead. Everything else really happe
 import asyncio
 import logging
 import os
+import resource
 import shutil
 import threading
 import time
@@ -18,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
+from unittest import mock
 
 import msgspec
 
@@ -29,11 +31,13 @@ from imud.daemon import Daemon
 from imud.devices.hipnuc.uart.codec import encode_hi91
 from imud.errors import LinkError
 from imud.log import LogWriter
+from imud.publishers.recorder.writer import RecordQueue
 from imud.runtime import event_loop
 from imud.sim.hipnuc.uart.settings import ModuleSettings, Output
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.ports.lines import MemoryLines
 from imud.units import NS_PER_MS, NS_PER_S
+from tests.publishers.mqtt.mosquitto import running_broker
 from tests.support.daemon_process import wait_until, write_config
 from tests.support.pty_port import BAUD, plugged, slave, wired
 from tests.test_daemon import Cable
@@ -42,6 +46,9 @@ PERIOD_MS: Final = 50
 LIMIT_S: Final = 120.0
 WIRES: Final = ("quiet", "gone", "flapping", "lossy", "noisy", "hot", "late", "jumping", "tilted", "lines", "mute")
 FLAP_S: Final = 1.5
+PutRecord = Callable[[RecordQueue[object], bytes], None]
+DISK_BYTES: Final = 16_384
+"""A file of this process that is longer cannot be written further: as on a full disk."""
 
 
 class Wire(Cable):
@@ -153,6 +160,8 @@ class Site:
         """Wires of another daemon, which are fed as well."""
         self.memory = MemoryLines(time.monotonic_ns)
         self.faulty = False
+        self.queue_is_full = False
+        """Whether the recorder's queue has no room, as with a disk that has been too slow for minutes."""
         self._stack = ExitStack()
         self._clients: list[Client] = []
         self._pps = True
@@ -173,6 +182,8 @@ class Site:
         self._module = stack.enter_context(plugged(folder / "module/port", module))
         self._slave = slave(80)
         self._line, _ = stack.enter_context(wired(folder / "boom", self._slave))
+        self._broker = stack.enter_context(running_broker(folder / "broker"))
+        stack.enter_context(mock.patch.object(RecordQueue, "put", self._put_or_drop(RecordQueue.put)))
         settings = config.load(self._write(faulty=False))
         self.daemon = AlteredDaemon(
             settings, file=folder / "imud.yaml", state_dir=folder, lines=self.memory.maker
@@ -231,11 +242,15 @@ class Site:
         client.watch(encoding="json")  # and never read
         self._clients.append(client)
         shutil.move(self.folder / "shm", self.folder / "away")
+        self._broker.stop()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, resource.RLIM_INFINITY))
         self.faulty = True
 
     def mend_everything(self) -> None:
         """Switch every fault off."""
         self.faulty = False
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        self._broker.start()
         shutil.move(self.folder / "away", self.folder / "shm")
         for client in self._clients:
             client.close()
@@ -266,6 +281,15 @@ class Site:
         sout = inputs["late sout"]
         sout.open_error = LinkError("the test took the chip away")
         sout.vanish(sout.open_error)
+
+    def _put_or_drop(self, put: PutRecord) -> PutRecord:
+        def put_or_drop(queue: RecordQueue[object], record: bytes) -> None:
+            if self.queue_is_full:
+                queue.dropped += 1
+            else:
+                put(queue, record)
+
+        return put_or_drop
 
     def block_loop(self, seconds: float) -> None:
         """Let nothing else run in the daemon's loop."""
@@ -342,8 +366,13 @@ class Site:
         if faulty:
             devices["mute"] |= {"identify": True, "settings": {"mode": "9-axis"}}
             devices["quiet"]["rmc"] = {"source": "gpsd", "tcp_port": 9}
+        recorder = {"enabled": True, "directory": str(self.folder / "recordings")}
+        mqtt = {
+            "enabled": True, "brokers": [f"mqtt://127.0.0.1:{self._broker.port}"], "gateway": "site",
+            "spool_directory": str(self.folder / "spool"), "retry_max_s": 1, "devices": {"*": {"whole": "slots"}},
+        }  # fmt: skip
         return write_config(
-            self.folder, devices, log_level="info", metrics={"port": self.port},
+            self.folder, devices, log_level="info", metrics={"port": self.port}, recorder=recorder, mqtt=mqtt,
             shm={"directory": str(self.folder / "shm")},
             socket={"path": str(self.folder / "imud.sock"), "queue_samples": 16},
         )  # fmt: skip

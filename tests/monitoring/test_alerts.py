@@ -33,6 +33,7 @@ from tests.monitoring.prometheus import (
     real_prometheus,
     shortened,
 )
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO
 from tests.support.daemon_process import wait_until, write_config
 
 DEVICE_OF: Final = {
@@ -44,7 +45,10 @@ DEVICE_OF: Final = {
     "ImudClockResets": "jumping", "ImudLineProblem": "late", "ImudEdgesLost": "lines", "ImudUtcProblem": "quiet",
     "ImudPulsesMissing": "lines", "ImudRingStopped": "quiet", "ImudLedgerOpen": "tilted",
 }  # fmt: skip
-SITE_ALERTS: Final = ("ImudLoopLate", "ImudLogMessagesDropped", "ImudClientsTooSlow")
+SITE_ALERTS: Final = (
+    "ImudLoopLate", "ImudLogMessagesDropped", "ImudClientsTooSlow", "ImudRecordingStopped", "ImudRecordsLost",
+    "ImudBrokerLost", "ImudSpoolStopped",
+)  # fmt: skip
 SPARE_ALERTS: Final = ("ImudDown", "ImudRestarts", "ImudNoDevices", "ImudFilesNearLimit")
 
 
@@ -190,6 +194,7 @@ def mend_spare(spare: Spare) -> None:
 
 
 @needs("prometheus")
+@pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
 @pytest.mark.skipif("IMUD_ALERTS" not in os.environ, reason="takes more than a minute of real time: make alerts")
 @pytest.mark.timeout(1500)  # 67 s at a load of 3 on two cores
 def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
@@ -223,6 +228,12 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
             watcher.look()
             assert time.monotonic() < begin + LIMIT_S
         fired["ImudLoopLate"] = watcher.after_s["ImudLoopLate"]
+
+        watcher.begin(firing=True)
+        one.queue_is_full = True
+        watcher.wait("ImudRecordsLost")
+        one.queue_is_full = False
+        fired["ImudRecordsLost"] = watcher.after_s["ImudRecordsLost"]
 
         watcher.begin(firing=True)
         one.break_everything()

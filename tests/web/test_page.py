@@ -155,7 +155,7 @@ def test_the_page_goes_on_after_a_restart_of_the_daemon_and_of_imud_web(page: Pa
             own_port = int(url.rstrip("/").rpartition(":")[2])
             with serving_web(socket, port=own_port):
                 page.until_text("#daemon", "imud 0.")
-                assert page.js("return document.querySelector('#problem').hidden")
+                page.until("return document.querySelector('#problem').hidden")
         with serving_web(socket, port=own_port):
             page.until_text("#daemon", "not connected")
             page.until_text("#problem", "imud.sock")
