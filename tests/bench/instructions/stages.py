@@ -26,6 +26,7 @@ from imud.formats.slot import encode_slot, encode_slots
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.links.can.frame_reader import FrameReader
+from imud.publishers.mqtt.writer import WriterQueue
 from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.runtime.path import PathContext, StreamPath
@@ -294,6 +295,15 @@ def _socket(clients: int, encoding: str, frames: int, total: int, directory: str
     return run
 
 
+# --- output mqtt ----------------------------------------------------------------------------------------------------
+
+
+def _mqtt_queue(total: int, _directory: str) -> Run:
+    """What the event loop does for the output `mqtt`: the rest is done by threads beside it."""
+    queue = WriterQueue()
+    return _taking([partial(queue.put_batch, Batch("d0", 0, [sample])) for sample in _samples(total)])
+
+
 # --- all of it ------------------------------------------------------------------------------------------------------
 
 
@@ -353,6 +363,7 @@ STAGES: Final = (
     CountedStage("socket, 10 binary clients", partial(_socket, 10, "binary", 1), 96),
     CountedStage("socket, 10 JSON clients", partial(_socket, 10, "json", 1), 96),
     CountedStage("socket, 10 binary clients, 20 samples in a batch", partial(_socket, 10, "binary", 20), 16, 20),
+    CountedStage("queue of the output mqtt, a sample", _mqtt_queue, 200),
     CountedStage("bytes to publishers, a sample per read", partial(_path, 1), 1000),
     CountedStage("bytes to publishers, 20 samples per read", partial(_path, 20), 50, 20),
     CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1), 1000),
