@@ -67,6 +67,8 @@ class TopApp(App[None]):
     .curve Sparkline { width: 1fr; }
     #block { height: auto; margin: 1 0 0 0; }
     #events { height: 6; border-top: solid $secondary; }
+    HelpPanel { split: bottom; width: 100%; max-width: 100%; height: 50%; }
+    HelpPanel { border-left: none; border-top: solid $secondary; }
     """
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[BindingType]] = [

@@ -165,8 +165,12 @@ def test_a_pause_leaves_the_picture_and_a_daemon_that_is_gone_is_said_to_be() ->
     play(steps)
 
 
-def test_help_shows_the_keys() -> None:
+def test_help_shows_the_keys_and_leaves_the_rows_as_they_are() -> None:
     async def steps(pilot: Pilot[None], app: TopApp) -> None:
+        before = await give(pilot, app)
+        shown = await press(pilot, app, "question_mark")
+        assert shown[:3] == before[:3], "head and row are as wide as without"
+        await press(pilot, app, "question_mark")
         assert any("Reverse" in line for line in (await press(pilot, app, "question_mark"))[:-1])
         assert not any("Reverse" in line for line in (await press(pilot, app, "question_mark"))[:-1])
 
