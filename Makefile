@@ -21,6 +21,7 @@
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
 # make lab-debian   boots Debian 12 and 13 with systemd and checks the package there (as root; tests/lab_debian/README.md)
+# make lab-debian-suite   the whole test suite on the own Python, compiler and broker of Debian 13
 # make lab-arm64    the same short on emulated arm64, and unit tests on its Python
 # make attack hostile clients beside a 1 kHz device (ARGS=--short: at most a minute)
 SHELL := /bin/sh
@@ -32,7 +33,7 @@ LAB_OPTIONS ?= --steady
 RIG_OPTIONS ?=
 CHAOS_OPTIONS ?= --steady --limit 14400
 
-.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try monitoring-deps lab-debian lab-debian-deps lab-arm64 lab-arm64-deps
+.PHONY: all demo test lint check bench bench-instructions bench-deps bench-compare attack soak pictures fuzz fuzz-deps clean lab lab-deps chaos audit deb deb-deps deb-try monitoring-deps lab-debian lab-debian-deps lab-debian-suite lab-arm64 lab-arm64-deps
 
 all: check
 
@@ -159,6 +160,10 @@ chaos: $(VENV)/made
 # As root; RIG_OPTIONS="--suite trixie" ARGS=replug: one release, one group of checks.
 lab-debian: $(VENV)/made
 	tests/lab_debian/run $(RIG_OPTIONS) $(ARGS)
+
+# As root; ARGS="bookworm tests/clock": another release, some of the tests.
+lab-debian-suite:
+	tests/lab_debian/suite $(ARGS)
 
 lab-debian-deps: deb-deps
 	tests/lab_debian/deps amd64
