@@ -13,7 +13,7 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +27,8 @@ LOOP_RATIO_LIMIT: Final = 1.05
 """Of the event loop's thread: with the output it puts each batch into a queue."""
 SAMPLES: Final[Mapping[str, object]] = {"whole": "slots", "rate_hz": 1}
 READ_BYTES: Final = 1000
+QUICK: Final = ("present", "gone", "stopped")
+"""Brokers of the short form."""
 HOUR_S: Final = 3600
 Place = Callable[[Path], AbstractContextManager[int]]
 
@@ -37,10 +39,11 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         print(f"skipped: {NO_MOSQUITTO}")
         return
     rounds, seconds = (1, 2.0) if quick else (3, 6.0)
-    outcomes: dict[str, list[Outcome]] = {name: [] for name in ("without", *BROKERS)}
+    brokers = {name: BROKERS[name] for name in QUICK} if quick else BROKERS
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in ("without", *brokers)}
     for _ in range(rounds):
         outcomes["without"].append(run(Load(seconds=seconds)))
-        for name, place in BROKERS.items():
+        for name, place in brokers.items():
             outcomes[name].append(run_with(place, Load(seconds=seconds), SAMPLES))
     best = {name: min(found, key=lambda one: one.loop_us_per_sample) for name, found in outcomes.items()}
     plain = best.pop("without")
@@ -53,17 +56,17 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         )
         lost = max(one.lost for one in outcomes[name])
         yield at_most(f"1 kHz, broker {name}: samples lost", float(lost), "samples", 0)
-    yield from wear_rows(10.0 if quick else 60.0)
+    yield from wear_rows(5.0, ("present",)) if quick else wear_rows(60.0, ("present", "gone"))
 
 
-def wear_rows(seconds: float) -> Iterator[Row]:
+def wear_rows(seconds: float, brokers: Sequence[str]) -> Iterator[Row]:
     """Bytes written in an hour, from a shorter time at a steady load."""
     for words, sending, rate_hz in (
         ("statistics of 1 Hz of 100 Hz", {"rate_hz": 1}, 100.0),
         ("statistics of 10 Hz of 1 kHz", {"rate_hz": 10}, 1000.0),
         ("all samples of 1 kHz as slots", {"whole": "slots", "rate_hz": None}, 1000.0),
     ):
-        for name in ("present", "gone"):
+        for name in brokers:
             outcome = run_with(BROKERS[name], Load(seconds=seconds, rate_hz=rate_hz), sending)
             yield Row(f"{words}, broker {name}: written in an hour", outcome.written_bytes_s * HOUR_S / 1e6, "MB")
 
