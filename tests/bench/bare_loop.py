@@ -1,7 +1,7 @@
 """The least a Python process can do: epoll, read, find/crc/unpack, pack, send. What imud is measured against.
 
-No clock, no ledger, no shared memory, no slow-client care. `python -m tests.bench.bare_loop SOCKET ENCODING PTY…`
-prints `ready` and serves every client that connects until SIGTERM.
+No clock, no ledger, no shared memory, no slow-client care. It prints `ready` and serves each client that connects until
+SIGTERM: `python -m tests.bench.bare_loop SOCKET ENCODING HOLD_MS PTY…`.
 """
 
 import binascii
@@ -35,8 +35,8 @@ def as_json(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:
     return JSON.encode({"jsonrpc": "2.0", "method": "sample", "params": params}) + b"\n"
 
 
-def serve(path: str, encoding: str, ports: list[str]) -> None:
-    """Run for ever."""
+def serve(path: str, encoding: str, hold_s: float, ports: list[str]) -> None:
+    """Run for ever; data waits for `hold_s` before it is read, so that a read has many samples."""
     pack = binary if encoding == "binary" else as_json
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(path)
@@ -54,7 +54,10 @@ def serve(path: str, encoding: str, ports: list[str]) -> None:
     print("ready", flush=True)
     crc = binascii.crc_hqx
     while True:
-        for fd, _ in poll.poll():
+        ready = poll.poll()
+        if hold_s:
+            time.sleep(hold_s)
+        for fd, _ in ready:
             if fd not in tails:
                 clients.append(listener.accept()[0])
                 continue
@@ -77,4 +80,4 @@ def serve(path: str, encoding: str, ports: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    serve(sys.argv[1], sys.argv[2], sys.argv[3:])
+    serve(sys.argv[1], sys.argv[2], float(sys.argv[3]) / 1e3, sys.argv[4:])

@@ -189,9 +189,8 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
     """The daemon or the bare loop, ready for clients."""
     path = folder / "s"
     if load.bare:
-        server = stack.enter_context(
-            Process(SERVER_CORE, "-m", "tests.bench.bare_loop", str(path), load.encoding, *ports)
-        )
+        args = [str(path), load.encoding, str(load.latency_ms or 0.0), *ports]
+        server = stack.enter_context(Process(SERVER_CORE, "-m", "tests.bench.bare_loop", *args))
         server.line()
         return server
     file = configuration(folder, ports, load)
