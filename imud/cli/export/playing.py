@@ -9,6 +9,8 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from fcntl import F_SETPIPE_SZ, fcntl
 from operator import attrgetter
 from pathlib import Path
 from typing import IO, Any, BinaryIO, Final
@@ -31,6 +33,8 @@ HEAD: Final = struct.Struct("<BIQ")
 """Kind, length, and how many bytes of the file are read."""
 LENGTH_MAX: Final = 1 << 26
 """Far more than a message has: beyond it something else writes into the pipe."""
+PIPE_BYTES: Final = 1 << 20
+"""Of the pipe, as far as the kernel allows it: playing goes on while a chunk of some hundred kilobytes is written."""
 SAMPLES: Final = 64
 """Samples in a message at most: a sixth of a second at 400 Hz, so that messages of a file are nearly in their order."""
 GC_ALLOCATIONS: Final = 50_000
@@ -83,6 +87,8 @@ def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[in
     argv = [sys.executable, "-I", "-m", "imud.cli.export.playing", str(path.absolute()), *devices]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as process:
         assert process.stdout is not None
+        with suppress(OSError):  # more than pipe-max-size, or than this user may have: it is slower, and the same
+            fcntl(process.stdout, F_SETPIPE_SZ, PIPE_BYTES)
         try:
             return _take(process.stdout, path, sink, at)
         finally:

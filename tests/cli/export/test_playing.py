@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+from fcntl import F_GETPIPE_SZ, fcntl
 from pathlib import Path
 
 import pytest
 
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.cli import main
+from imud.cli.export import playing
 from imud.cli.export.playing import play_beside, play_here
 from imud.contracts.publisher import Batch
 from imud.errors import ImudError
@@ -56,6 +58,28 @@ def test_both_ways_give_the_same_in_the_same_order(file: Path, devices: list[str
     assert 1 < beside.largest < 2000
     assert positions == sorted(positions)
     assert 0 < positions[-1] <= file.stat().st_size
+
+
+def test_playing_goes_on_while_a_chunk_is_written(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes: list[int] = []
+
+    def kept(pipe: int, command: int, size: int) -> None:
+        fcntl(pipe, command, size)
+        sizes.append(fcntl(pipe, F_GETPIPE_SZ))
+
+    monkeypatch.setattr(playing, "fcntl", kept)
+    play_beside(file, KeepingSink(), [], lambda _at: None)
+    assert sizes == [playing.PIPE_BYTES]
+
+
+def test_a_kernel_that_allows_no_larger_pipe_changes_nothing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_arguments: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(playing, "fcntl", refuse)
+    sink = KeepingSink()
+    play_beside(file, sink, [], lambda _at: None)
+    assert len(sink.taken) > FRAMES
 
 
 def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
