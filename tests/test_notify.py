@@ -9,6 +9,9 @@ import pytest
 
 from imud.notify import STATUS_NS, ServiceManager, notify, status_line, watchdog_interval_s
 
+NO_PROCESS = str(1 << 30)
+"""Above the largest number of a process (proc(5), pid_max)."""
+
 
 def test_state_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
@@ -40,7 +43,7 @@ def test_no_manager_no_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ca
 
 @pytest.mark.parametrize(
     ("usec", "pid", "expected"),
-    [("10000000", "", 5.0), ("", "", None), ("0", "", None), ("x", "", None), ("10000000", "1", None)],
+    [("10000000", "", 5.0), ("", "", None), ("0", "", None), ("x", "", None), ("10000000", NO_PROCESS, None)],
 )
 def test_watchdog_interval(usec: str, pid: str, expected: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", usec)

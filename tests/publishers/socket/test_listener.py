@@ -203,17 +203,20 @@ def test_leftovers_of_dead_daemons_go_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "imud.sock"
     with subprocess.Popen(["true"]) as ended:
         pass
-    for number in (ended.pid, os.getpid(), os.getppid()):
-        leave_socket(tmp_path / f"imud.sock.{number}")
     for name in (f"imud.sock.{ended.pid}.x", "imud.sock.x", f"other.{ended.pid}"):
         leave_socket(tmp_path / name)
     (tmp_path / f"imud.sock.0{ended.pid}").touch()
-    with socket.socket(socket.AF_UNIX) as alive:  # of a container, whose processes are not seen from here
+    with (
+        subprocess.Popen(["cat"], stdin=subprocess.PIPE) as other,
+        socket.socket(socket.AF_UNIX) as alive,  # of a container, whose processes are not seen from here
+    ):
+        for number in (ended.pid, os.getpid(), other.pid):
+            leave_socket(tmp_path / f"imud.sock.{number}")
         alive.bind(str(tmp_path / f"imud.sock.00{ended.pid}"))
         alive.listen()
         Listener(path, GROUP).close()
     assert {file.name for file in tmp_path.iterdir()} == {
-        f"imud.sock.{os.getppid()}",
+        f"imud.sock.{other.pid}",
         f"imud.sock.{ended.pid}.x",
         "imud.sock.x",
         f"other.{ended.pid}",
