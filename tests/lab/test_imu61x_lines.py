@@ -1,6 +1,7 @@
 """The IMU61x's wires on gpio-sim beside its buses: reset as an independent reader sees it, data ready edge by edge."""
 
 import asyncio
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -96,21 +97,26 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
 
 
 class Stepped:
-    """A device that renews its registers when told to, and says so by an edge on SOUT."""
+    """A device that renews its registers when told to, and says so by an edge on SOUT in the same instant.
+
+    The values and the edge change under a lock: a transaction that sees new values ends after their edge.
+    """
 
     def __init__(self, chip: GpioChip, **more: Any) -> None:
         self._chip = chip
         self.t_ns = STEP_NS
-        self.device = Imu61xRegisters(lambda: self.t_ns, update_ns=1, **more)
+        self._lock = threading.Lock()
+        self.device = Imu61xRegisters(self._now_ns, update_ns=1, **more)
         self.stamps_ns: list[tuple[int, int]] = []
         """Before and after each edge."""
 
     def renew(self) -> None:
         """The next values."""
         self._chip.drive("SOUT", False)
-        self.t_ns += STEP_NS
-        before_ns = monotonic_ns()
-        self._chip.drive("SOUT", True)
+        with self._lock:
+            self.t_ns += STEP_NS
+            before_ns = monotonic_ns()
+            self._chip.drive("SOUT", True)
         self.stamps_ns.append((before_ns, monotonic_ns()))
 
     def has(self, sample: Sample) -> None:
@@ -134,6 +140,10 @@ class Stepped:
         assert len(numbers) == 1
         assert numbers[0] >= sample.edge_seq
         assert self.stamps_ns[numbers[0] - 1][0] - sample.t_ns <= 2 * sample.t_err_ns
+
+    def _now_ns(self) -> int:
+        with self._lock:
+            return self.t_ns
 
 
 @pytest.fixture(params=["i2c", "spi8"])
