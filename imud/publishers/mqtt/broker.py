@@ -8,6 +8,7 @@ import importlib
 import logging
 import os
 import select
+import threading
 from contextlib import suppress
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -110,6 +111,8 @@ class PahoConnection:
         self._problem = ""
         self._topics: dict[int, str] = {}
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._bell_lock = threading.Lock()
+        """Held while the bell is rung: it is closed by another thread, and its number may then be another file's."""
         try:
             self._client = self._made(settings, client_id, will)
             self._client.connect(
@@ -183,14 +186,16 @@ class PahoConnection:
 
     def ring(self) -> None:
         """End the present wait, or the next."""
-        if not self._closed:
-            os.eventfd_write(self._bell, 1)
+        with self._bell_lock:
+            if not self._closed:
+                os.eventfd_write(self._bell, 1)
 
     def close(self) -> None:
         """End the connection; may be called twice."""
-        if self._closed:
-            return
-        self._closed = True
+        with self._bell_lock:
+            if self._closed:
+                return
+            self._closed = True
         client = getattr(self, "_client", None)
         if client is not None:
             with suppress(OSError, ValueError):  # it is gone already

@@ -1,7 +1,9 @@
 """Connections to a real mosquitto: both versions, TLS with certificates, passwords, websockets, refusals."""
 
+import os
 import shutil
 import subprocess
+import threading
 from pathlib import Path
 
 import msgspec
@@ -79,6 +81,24 @@ def test_a_broker_that_ends_is_noticed(tmp_path: Path) -> None:
         with pytest.raises(BrokerError, match=r"lost|ended|reset"):
             wait_for_the_end(connection)
         connection.close()
+
+
+def test_the_bell_is_not_closed_while_another_thread_rings_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with running_broker(tmp_path / "broker") as broker:
+        connection = connect(f"mqtt://127.0.0.1:{broker.port}")
+        closing = threading.Thread(target=connection.close)
+        write = os.eventfd_write
+
+        def write_late(bell: int, value: int) -> None:
+            closing.start()
+            closing.join(0.1)  # it goes on as far as it can
+            write(bell, value)
+
+        monkeypatch.setattr(os, "eventfd_write", write_late)
+        connection.ring()
+        closing.join()
+        monkeypatch.undo()
+        connection.ring()  # nothing: the number of the descriptor may be another file's
 
 
 def test_user_and_password(tmp_path: Path) -> None:
