@@ -1,38 +1,51 @@
-"""Thinning: the first sample at or after each due instant, without drift; the mean of what is between."""
+"""Thinning: the sample nearest to each due instant, without drift; the mean of what is between."""
 
 import random
+from itertools import pairwise
 from math import ceil
 
 import msgspec
 import pytest
 
-from imud.publishers.thinning import MeanRate, Pace
+from imud.publishers.thinning import MeanRate, Pace, RateThinner
 from imud.sample import Sample, Sync
 
 START_NS = 80_000_000_000_001
 
 
 def taken(pace: Pace, times_ns: list[int]) -> list[int]:
-    return [t_ns for t_ns in times_ns if pace.is_due(t_ns)]
+    return [t_ns for before_ns, t_ns in pairwise([times_ns[0], *times_ns]) if pace.is_due(t_ns, t_ns - before_ns)]
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 3.0, 7.3, 99.9, 100.0])
-def test_it_takes_the_first_sample_at_or_after_each_due_instant(rate_hz: float) -> None:
+@pytest.mark.parametrize("rate_hz", [1.0, 3.0, 7.3, 99.9, 100.0, 300.0])
+def test_it_takes_the_sample_nearest_to_each_due_instant(rate_hz: float) -> None:
     rng = random.Random(5)
     times_ns = [START_NS]
     while times_ns[-1] < START_NS + 10_000_000_000:
         times_ns.append(times_ns[-1] + rng.randrange(1_900_000, 2_100_000))
     instants = [START_NS + ceil(k * 1e9 / rate_hz) for k in range(int(10 * rate_hz))]
-    expected = [next(t_ns for t_ns in times_ns if t_ns >= due_ns) for due_ns in instants]
-    assert taken(Pace(rate_hz), times_ns)[: len(expected)] == expected
+    chosen = taken(Pace(rate_hz), times_ns)[: len(instants)]
+    assert len(chosen) == len(instants)
+    away_ns = [abs(t_ns - due_ns) for t_ns, due_ns in zip(chosen, instants, strict=True)]
+    assert away_ns[1] <= 2_100_000, "the step between samples is not known yet"
+    assert max(away_ns[2:]) <= 1_150_000, "half a step, and what steps differ by"
+
+
+@pytest.mark.parametrize("device_hz", [99.99, 100.0, 100.01])
+def test_a_device_that_sends_just_at_the_rate_has_its_samples_taken(device_hz: float) -> None:
+    rng = random.Random(7)
+    times_ns = [START_NS + int(k * 1e9 / device_hz) + rng.randrange(-300_000, 300_000) for k in range(30_000)]
+    times_ns[100:103] = times_ns[1_000:1_001] = []  # lost ones take no others with them
+    assert len(taken(Pace(100.0), times_ns)) >= len(times_ns) - 5  # the second at most, and those above 100 Hz
 
 
 def test_it_does_not_drift_in_a_day() -> None:
-    pace = Pace(3.0)
-    last_ns = START_NS + 86_400 * 1_000_000_000
-    assert taken(pace, [START_NS, last_ns - 1]) == [START_NS, last_ns - 1]
-    assert not pace.is_due(last_ns - 1)
-    assert pace.is_due(last_ns)  # due instant number 259,200 exactly
+    pace, instants = Pace(3.0), 259_200
+    times_ns = [START_NS + ceil(k * 1e9 / 3.0) for k in range(instants)]
+    assert sum(pace.is_due(t_ns, 333_333_333) for t_ns in times_ns) == instants
+    assert (
+        pace.due_ns == START_NS + 86_400 * 1_000_000_000 - 166_666_667 + 1
+    )  # half a step before due instant number 259,200
 
 
 def test_a_rate_above_the_device_s_takes_everything() -> None:
@@ -45,6 +58,26 @@ def test_a_rate_above_the_device_s_takes_everything() -> None:
 def test_after_a_pause_there_is_no_burst() -> None:
     times_ns = [START_NS, *(START_NS + 5_000_000_000 + k * 10_000_000 for k in range(10))]
     assert taken(Pace(10.0), times_ns) == times_ns[:2]
+
+
+def samples(*times_ns: int) -> list[Sample]:
+    return [Sample("bow", number, t_ns, 0, Sync.ARRIVAL, t_ns, 0) for number, t_ns in enumerate(times_ns)]
+
+
+def test_a_thinner_chooses_for_each_rate_across_batches() -> None:
+    thinner, ms = RateThinner(), 1_000_000
+    assert not thinner.choose(samples(0))
+    for rate_hz in (100.0, 250.0, 100.0):
+        thinner.add(rate_hz)
+    assert thinner.choose(samples(*(k * ms for k in range(1, 11)))) == {100.0: (0,), 250.0: (0, 4, 8)}
+    assert not thinner.choose(samples(11 * ms - 600_000))  # 0.6 ms before the due instant of the slower
+    assert thinner.choose(samples(11 * ms, 12 * ms)) == {100.0: (0,)}
+    thinner.discard(100.0)
+    thinner.discard(250.0)
+    assert not thinner.choose(samples(21 * ms - 300_001))  # the step before the last one taken was 0.6 ms
+    assert thinner.choose(samples(21 * ms - 300_000)) == {100.0: (0,)}
+    thinner.discard(100.0)
+    assert not thinner.choose(samples(31 * ms))
 
 
 def test_a_mean_leaves_out_what_has_no_rate() -> None:

@@ -108,7 +108,7 @@ class Nmea0183:
         self._names: dict[str, None] = {}
         self._device: str | None = None
         self._reference = HeadingReference()
-        self._looked_ns = 0
+        self._looked_ns = self._newest_ns = 0
         self._rate = MeanRate()
         self._warned = ""
 
@@ -142,7 +142,9 @@ class Nmea0183:
         if Formatter.ROT in self._paces:
             self._rate.add(batch.samples)
         newest = batch.samples[-1]
-        due = [kind for kind, pace in self._paces.items() if newest.t_ns >= pace.due_ns and pace.is_due(newest.t_ns)]
+        t_ns = newest.t_ns
+        step_ns, self._newest_ns = t_ns - self._newest_ns, t_ns
+        due = [kind for kind, pace in self._paces.items() if t_ns >= pace.due_ns and pace.is_due(t_ns, step_ns)]
         if not due:
             return
         if Formatter.ROT in due:

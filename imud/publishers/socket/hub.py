@@ -123,7 +123,7 @@ class Hub:
         plan = DeliveryPlan(self._pool.next_order)
         for number, wanted in self._subscriptions.items():
             if wanted.matches(device):
-                plan.add(device, wanted, self._connections[number].outbox)
+                plan.add(wanted, self._connections[number].outbox)
         return plan
 
     def _wake_all(self, device: str) -> None:
@@ -172,7 +172,7 @@ class Hub:
         self.context.latencies.ask(_asker(connection), subscription.latency_ns, subscription.devices)
         for device, plan in self._plans.items():
             if subscription.matches(device):
-                plan.add(device, subscription, connection.outbox)
+                plan.add(subscription, connection.outbox)
 
     def unsubscribe(self, connection: Connection) -> None:
         """Send no more samples to a client; no-op if it watches none."""

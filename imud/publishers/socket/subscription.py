@@ -1,6 +1,6 @@
 """What clients watch (devices, form, rate), and the plan by which a batch goes to all that watch its device."""
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import chain
@@ -11,7 +11,7 @@ from imud.frames.conventions import Convention
 from imud.publishers.socket.encoding import BinaryEncoding, ConvertedEncoding, Encoding, JsonEncoding
 from imud.publishers.socket.outbox import Delivery, Outbox
 from imud.publishers.socket.serving import TokenBucket
-from imud.publishers.thinning import Pace
+from imud.publishers.thinning import RateThinner
 
 PUBLISH_NS: Final = 1_000_000
 """Sending a batch takes so long at most; the clients that are left are served by the scheduler, in several turns."""
@@ -20,6 +20,8 @@ CLIENTS_PER_LOOK: Final = 32
 FORMS_AT_ONCE: Final = 16
 """So many forms are encoded while a batch is sent. Others are encoded when their clients are served, in their time."""
 _BINARY: Final = BinaryEncoding()
+ChosenSamples = Mapping[float, tuple[int, ...]]
+"""Indices of the samples of a batch that go to clients with a rate, by that rate."""
 
 
 class Form(StrEnum):
@@ -57,7 +59,6 @@ class Subscription:
     """How late samples may be; 0: each at once."""
     key: FormKey = field(init=False)
     """What clients have in common that get the same messages."""
-    _paces: dict[str, Pace] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         json = self.form is Form.JSON
@@ -75,12 +76,6 @@ class Subscription:
         """Whether samples of `device` are wanted."""
         return self.devices is None or device in self.devices
 
-    def pace_of(self, device: str) -> Pace | None:
-        """The pace that thins samples of `device`; None where all are wanted."""
-        if not self.rate_hz:
-            return None
-        return self._paces.setdefault(device, Pace(self.rate_hz))
-
 
 class DeliveryGroup:
     """Clients that get samples of one device in the same form: each message is encoded once for all of them.
@@ -93,31 +88,35 @@ class DeliveryGroup:
     def __init__(self, encoding: Encoding, order: Callable[[], int]) -> None:
         self.encoding = encoding
         self._order = order
-        self._paces: dict[Outbox, Pace | None] = {}
-        """The clients; None for one that gets every sample."""
+        self._rates_hz: dict[Outbox, float] = {}
+        """The clients; 0 for one that gets every sample."""
         self._changed = False
         """Whether the lists are not those of the clients any more."""
         self._direct: list[list[Outbox]] = []
         """Of clients that get every sample, in lists of CLIENTS_PER_LOOK at most."""
-        self._paced: list[tuple[Pace, Outbox]] = []
+        self._thinned: dict[float, list[Outbox]] = {}
+        """Of clients that get samples at a rate, by it."""
+
+    def __contains__(self, outbox: Outbox) -> bool:
+        return outbox in self._rates_hz
 
     @property
     def is_small(self) -> bool:
         """Whether sending to all takes so little time that no look at the clock is needed."""
-        return len(self._paces) <= CLIENTS_PER_LOOK
+        return len(self._rates_hz) <= CLIENTS_PER_LOOK
 
-    def add(self, outbox: Outbox, pace: Pace | None) -> None:
-        """Add a client."""
-        self._paces[outbox] = pace
+    def add(self, outbox: Outbox, rate_hz: float) -> None:
+        """Add a client; with the rate 0 it gets every sample."""
+        self._rates_hz[outbox] = rate_hz
         self._changed = True
 
     def discard(self, outbox: Outbox) -> bool:
         """Remove a client if it is there; return whether none is left."""
-        self._paces.pop(outbox, None)
+        self._rates_hz.pop(outbox, None)
         self._changed = True
-        return not self._paces
+        return not self._rates_hz
 
-    def send(self, batch: Batch, now_ns: Callable[[], int], end_ns: int) -> None:
+    def send(self, batch: Batch, chosen: ChosenSamples, now_ns: Callable[[], int], end_ns: int) -> None:
         """Send the batch to every client of the group until `end_ns`, then queue it for the others."""
         if self._changed:
             self._make_lists()
@@ -128,40 +127,36 @@ class DeliveryGroup:
             Outbox.put_samples(self._direct[0], messages, batch, encoding)
             if len(self._direct) > 1:
                 self._send_parts(self._direct[1:], messages, batch, None, now_ns, end_ns)
-        if self._paced:
-            for chosen, outboxes in self._due(batch).items():
-                if messages:
-                    some: Sequence[bytes] = [messages[index] for index in chosen]
-                else:
-                    some = [encoding.encode_one(batch, index) for index in chosen]
-                self._send_parts(_in_parts(outboxes), some, batch, chosen, now_ns, end_ns)
+        for indices, outboxes in self._due(chosen):
+            if messages:
+                some: Sequence[bytes] = [messages[index] for index in indices]
+            else:
+                some = [encoding.encode_one(batch, index) for index in indices]
+            self._send_parts(_in_parts(outboxes), some, batch, indices, now_ns, end_ns)
 
-    def defer(self, batch: Batch) -> None:
+    def defer(self, batch: Batch, chosen: ChosenSamples) -> None:
         """Queue the batch for every client of the group; it is encoded when the first of them is served."""
         if self._changed:
             self._make_lists()
-        for chosen, outboxes in self._due(batch).items():
-            _defer(outboxes, Delivery(self._order(), batch, self.encoding, None, chosen))
+        for indices, outboxes in self._due(chosen):
+            _defer(outboxes, Delivery(self._order(), batch, self.encoding, None, indices))
         if self._direct:
             _defer(chain(*self._direct), Delivery(self._order(), batch, self.encoding, None))
 
     def _make_lists(self) -> None:
         self._changed = False
-        self._direct = _in_parts([outbox for outbox, pace in self._paces.items() if pace is None])
-        self._paced = [(pace, outbox) for outbox, pace in self._paces.items() if pace is not None]
+        self._direct = _in_parts([outbox for outbox, rate_hz in self._rates_hz.items() if not rate_hz])
+        self._thinned = {}
+        for outbox, rate_hz in self._rates_hz.items():
+            if rate_hz:
+                self._thinned.setdefault(rate_hz, []).append(outbox)
 
-    def _due(self, batch: Batch) -> dict[tuple[int, ...], list[Outbox]]:
-        """Which samples of the batch are due for clients that get only some, by their indices."""
-        found: dict[tuple[int, ...], list[Outbox]] = {}
-        times_ns = [sample.t_ns for sample in batch.samples]
-        newest_ns = times_ns[-1]
-        for pace, outbox in self._paced:
-            if newest_ns < pace.due_ns:
-                continue  # the usual case, so no call for it
-            chosen = tuple([index for index, t_ns in enumerate(times_ns) if pace.is_due(t_ns)])
-            if chosen:
-                found.setdefault(chosen, []).append(outbox)
-        return found
+    def _due(self, chosen: ChosenSamples) -> list[tuple[tuple[int, ...], list[Outbox]]]:
+        """Which samples of a batch go to which clients of those that get only some."""
+        if not chosen or not self._thinned:
+            return []
+        thinned = self._thinned
+        return [(indices, thinned[rate_hz]) for rate_hz, indices in chosen.items() if rate_hz in thinned]
 
     def _send_parts(
         self, parts: Iterable[list[Outbox]], messages: Sequence[bytes], batch: Batch, chosen: Sequence[int] | None,
@@ -194,26 +189,33 @@ class DeliveryPlan:
 
     def __init__(self, order: Callable[[], int]) -> None:
         self._next_order = order
+        self._thinner = RateThinner()
         self._groups: dict[FormKey, DeliveryGroup] = {}
         self._order: tuple[DeliveryGroup, ...] = ()
 
     def __len__(self) -> int:
         return len(self._groups)
 
-    def add(self, device: str, wanted: Subscription, outbox: Outbox) -> None:
-        """Send to a client that watches this device."""
+    def add(self, wanted: Subscription, outbox: Outbox) -> None:
+        """Send to a client that watches the device, and is not in the plan."""
         key = wanted.key
         group = self._groups.get(key)
         if group is None:
             group = self._groups[key] = DeliveryGroup(wanted.encoding(), self._next_order)
             self._order = tuple(self._groups.values())
-        group.add(outbox, wanted.pace_of(device))
+        group.add(outbox, wanted.rate_hz)
+        if wanted.rate_hz:
+            self._thinner.add(wanted.rate_hz)
 
     def discard(self, wanted: Subscription, outbox: Outbox) -> None:
         """Send to a client no more; no-op if absent."""
         key = wanted.key
         group = self._groups.get(key)
-        if group is not None and group.discard(outbox):
+        if group is None or outbox not in group:
+            return
+        if wanted.rate_hz:
+            self._thinner.discard(wanted.rate_hz)
+        if group.discard(outbox):
             del self._groups[key]
             self._order = tuple(self._groups.values())
 
@@ -225,15 +227,16 @@ class DeliveryPlan:
         groups = self._order
         if not groups:
             return
+        chosen = self._thinner.choose(batch.samples)
         if len(groups) == 1 and groups[0].is_small:
-            groups[0].send(batch, now_ns, NEVER_NS)
+            groups[0].send(batch, chosen, now_ns, NEVER_NS)
             return
         begun_ns = now_ns()
         time.fill(begun_ns)
         end_ns = begun_ns + PUBLISH_NS if time.level > 0 else begun_ns
         for number, group in enumerate(groups):
             if number and (number >= FORMS_AT_ONCE or now_ns() > end_ns):
-                group.defer(batch)
+                group.defer(batch, chosen)
             else:
-                group.send(batch, now_ns, end_ns)
+                group.send(batch, chosen, now_ns, end_ns)
         time.use(now_ns() - begun_ns)

@@ -12,10 +12,8 @@ def test_subscription_matches() -> None:
     everything = Subscription(None, None, 0, Form.JSON)
     one = Subscription(("imu0",), None, 2.0, Form.BINARY)
     assert everything.matches("new")
-    assert everything.pace_of("new") is None
     assert one.matches("imu0")
     assert not one.matches("imu1")
-    assert one.pace_of("imu0") is one.pace_of("imu0")
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
@@ -48,6 +46,28 @@ def test_rates_of_clients_are_independent(tmp_path: Path) -> None:
             for peer, numbers in zip(peers, expected, strict=True):
                 assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
                 peer.close()
+
+    run(body)
+
+
+def test_clients_with_one_rate_get_the_same_samples(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            first, second = await Peer.greeted(server), await Peer.greeted(server)
+            await first.result("watch", rate_hz=100)
+            for seq in range(1, 6):
+                server.publish(batch("imu0", seq))
+            await second.result("watch", rate_hz=100, fields=["gyro_rad_s"])
+            for seq in range(6, 32):
+                server.publish(batch("imu0", seq))
+            for peer, numbers in ((first, [1, 11, 21, 31]), (second, [11, 21, 31])):
+                assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
+            first.close()
+            await second.result("watch", rate_hz=500)  # the rate before is forgotten with the last that wanted it
+            for seq in range(32, 37):
+                server.publish(batch("imu0", seq))
+            assert [(await second.message())["params"]["seq"] for _ in range(3)] == [32, 34, 36]
+            second.close()
 
     run(body)
 
