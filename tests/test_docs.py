@@ -47,7 +47,7 @@ def name(example: Example) -> str:
 def imud_lines() -> Iterator[list[str]]:
     """Every `imud …` command line of the shell examples, without comments and without where its output goes."""
     for example in examples("sh"):
-        for line in example.text.splitlines():
+        for line in example.text.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
             if words[:1] == ["imud"]:
                 yield words[1 : words.index(">")] if ">" in words else words[1:]

@@ -1,4 +1,4 @@
-"""Upgrade, removal and purge of the package while the service runs."""
+"""Upgrade, the way back, removal and purge of the package while the service runs."""
 
 from pathlib import Path
 
@@ -31,6 +31,13 @@ def check(checks: Checks, _host: Host) -> None:
         must("apt-get", "--quiet", "--yes", "reinstall", "/run/lab/next.deb", limit_s=LIMIT_S)
         expect("active", run("systemctl", "is-active", "imud").stdout.strip(), "inactive")
         start_service()
+    with checks("the former version comes back over the newer one, and keeps configuration and state"):
+        options = ("--quiet", "--yes", "--allow-downgrades")
+        must("apt-get", *options, "install", "/run/lab/imud.deb", limit_s=LIMIT_S)
+        assert "lab1" not in must("dpkg-query", "--show", "imud-daemon"), "the version is the newer one"
+        wait_streaming("usb")
+        assert CONFIG.read_text().startswith("# mine"), "the configuration is another"
+        assert any(STATE.iterdir()), "the state is gone"
     with checks("a removal stops the service and keeps configuration and state"):
         must("apt-get", "--quiet", "--yes", "remove", "imud-daemon", limit_s=LIMIT_S)
         expect("active", run("systemctl", "is-active", "imud").stdout.strip(), "inactive")
