@@ -7,10 +7,13 @@ import re
 import shutil
 import subprocess
 from ipaddress import ip_address, ip_network
+from pathlib import Path
 
 import pytest
 
 from imud.cli import build_parser
+from imud.publishers.recorder.settings import FlightSettings
+from imud.publishers.shm.publisher import ShmSettings
 from imud.web.guard import is_loopback
 from tests.support.files import ROOT
 
@@ -18,6 +21,10 @@ UNIT = ROOT / "systemd" / "imud.service"
 WEB_UNIT = ROOT / "systemd" / "imud-web.service"
 EXPOSURE_MAX = 2.0
 """docs/operate.md says what it is made of; the guest's check has the same limit."""
+REASON_WORDS = 5
+"""Of the shortest reason: fewer words repeat the directive's name."""
+PAGE = ROOT / "docs" / "operate.md"
+DROP_INS = re.findall(r"^```ini\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
 OFFLINE_SINCE = 250
 """Version of systemd whose systemd-analyze judges a file."""
 
@@ -53,6 +60,53 @@ def test_systemd_judges_the_unit_as_little_exposed(tmp_path_factory: pytest.Temp
     text = UNIT.read_text()
     assert exposure(text, folder) <= EXPOSURE_MAX
     assert exposure(text.replace("\nIPAddressDeny=any\n", "\n"), folder) > EXPOSURE_MAX, "the judge sees a setting go"
+
+
+def directives() -> set[str]:
+    """Names of all directives of the unit."""
+    return set(re.findall(r"^(\w+)=", UNIT.read_text(), re.MULTILINE))
+
+
+def reasons() -> dict[str, str]:
+    """Reasons by directive, from the table in docs/operate.md."""
+    text = PAGE.read_text().partition("\n## Directives of the unit\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| ((?:`\w+=`(?:, )?)+) \| (.*) \|$", text, re.MULTILINE)
+    found = [(name, reason) for names, reason in rows for name in re.findall(r"`(\w+)=`", names)]
+    assert len(dict(found)) == len(found), "a directive has two rows"
+    return dict(found)
+
+
+def test_every_directive_of_the_unit_has_its_reason_in_the_document_and_nothing_else_has() -> None:
+    assert len(directives()) > 50
+    assert reasons().keys() == directives()
+    assert all(len(reason.split()) >= REASON_WORDS for reason in reasons().values())
+
+
+def test_the_rings_are_where_removing_ipc_does_not_reach_unless_the_configuration_says_so() -> None:
+    """RemoveIPC= of systemd.exec(5): System V and POSIX IPC, which is /dev/shm and message queues."""
+    assert values("RemoveIPC") == ["yes"]
+    assert not any(folder.startswith("/dev/shm") for folder in (ShmSettings().directory, FlightSettings().directory))
+    assert f"/run/{values('RuntimeDirectory')[1]}" == ShmSettings().directory
+
+
+@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
+@pytest.mark.parametrize("text", DROP_INS, ids=lambda text: text.splitlines()[0])
+def test_drop_ins_of_the_document_are_taken_by_systemd(text: str, tmp_path: Path) -> None:
+    head, _, rest = text.partition("\n")
+    assert re.fullmatch(r"# /etc/systemd/system/imud\.service\.d/\w+\.conf", head)
+    unit = tmp_path / "imud.service"
+    plain = re.sub(r"^Exec\w+=.*", "", UNIT.read_text(), flags=re.MULTILINE).replace("Type=notify", "Type=oneshot")
+    plain = re.sub(r"^(Wants|Restart|After)=.*", "", plain, flags=re.MULTILINE)
+    unit.write_text(f"{plain}\n{rest}ExecStart=/bin/true\n")
+    argv = ["systemd-analyze", "verify", "--man=no", str(unit)]
+    said = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
+    assert [line for line in said.stderr.splitlines() if "imud.service" in line] == []
+
+
+@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
+def test_without_removing_ipc_the_unit_is_more_exposed_than_is_allowed(tmp_path: Path) -> None:
+    text = UNIT.read_text()
+    assert exposure(text.replace("\nRemoveIPC=yes\n", "\n"), str(tmp_path)) > EXPOSURE_MAX
 
 
 @pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
@@ -91,9 +145,9 @@ def test_only_this_machine_and_private_networks_are_reached() -> None:
 
 
 def test_the_documents_name_the_same_limit_and_no_setting_as_left_open_that_is_set() -> None:
-    text = (ROOT / "docs" / "operate.md").read_text()
+    text = PAGE.read_text()
     assert f"`systemd-analyze security imud` gives {EXPOSURE_MAX} " in text
-    left_open = re.findall(r"^\| `(\w+)=(\w*)` \|", text, re.MULTILINE)
+    left_open = re.findall(r"^\| `(\w+)=(\w*)` \|", text.partition("\n## Directives of the unit\n")[0], re.MULTILINE)
     assert left_open
     for name, value in left_open:
         assert value not in values(name) if value else not values(name), name

@@ -44,6 +44,7 @@ CHECKS: Final = (
     DoctorCheck("power", host.power),
     DoctorCheck("processor", host.processor),
     DoctorCheck("kernel log", kernel_log.kernel_log),
+    DoctorCheck("shared memory", outputs.shared_memory),
     DoctorCheck("Prometheus", outputs.prometheus),
 )
 """In the order in which they are explained by one another; docs/doctor.md has them all."""

@@ -1,4 +1,4 @@
-"""Checks of what reads from the daemon by network: Prometheus.
+"""Checks of what reads from the daemon: files in shared memory that end with the service, Prometheus.
 
 The metrics endpoint counts how often it was asked; `/scrapes` gives that number without being counted itself.
 """
@@ -11,11 +11,42 @@ from imud.cli.doctor.finding import Findings, error, not_checked, note, ok, warn
 from imud.cli.doctor.surroundings import Surroundings
 from imud.errors import reason_of
 from imud.publishers.metrics.publisher import MetricsSettings, Scrapes
+from imud.publishers.recorder.settings import RecorderSettings
+from imud.publishers.shm.publisher import ShmSettings
 
 STALE_S: Final = 300.0
 """Prometheus scrapes every 15 s to 1 min; five times as long is no slow configuration."""
+SHARED_MEMORY: Final = "/dev/shm"
+"""Where RemoveIPC= of a unit removes what the service's user or group owns (systemd.exec(5))."""
 EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 """An address to listen on that is no address to connect to, and one that is."""
+
+
+def shared_memory(at: Surroundings) -> Findings:
+    """Look whether systemd removes files that the configuration wants to outlive a daemon that is killed."""
+    folders = _in_shared_memory(at)
+    if not folders or not at.installed:
+        return
+    for key, folder in folders:
+        if at.unit_value("RemoveIPC") == "yes":
+            yield warning(
+                f"{key} is {folder}, and RemoveIPC= of imud.service removes what is there whenever the daemon ends",
+                "`sudo systemctl edit imud`, add `[Service]` and `RemoveIPC=no`, restart imud (docs/operate.md)",
+            )
+        else:
+            yield ok(f"{key}: what is in {folder} stays when the daemon is killed")
+
+
+def _in_shared_memory(at: Surroundings) -> list[tuple[str, str]]:
+    """Keys and folders of the configuration that lie in SHARED_MEMORY."""
+    publishers = at.config.publishers if at.config is not None else {}
+    shm, recorder = publishers.get("shm"), publishers.get("recorder")
+    found = []
+    if isinstance(shm, ShmSettings) and shm.enabled:
+        found.append(("shm.directory", shm.directory))
+    if isinstance(recorder, RecorderSettings) and recorder.flight.enabled:
+        found.append(("recorder.flight.directory", recorder.flight.directory))
+    return [(key, folder) for key, folder in found if f"{folder}/".startswith(f"{SHARED_MEMORY}/")]
 
 
 def prometheus(at: Surroundings) -> Findings:

@@ -1,18 +1,18 @@
-"""Whether something scrapes the metrics, by what the endpoint says."""
+"""Files that end with the service; whether something scrapes the metrics, by what the endpoint says."""
 
 import asyncio
 
 import pytest
 
 from imud.cli.doctor.finding import DoctorCheck
-from imud.cli.doctor.outputs import prometheus
+from imud.cli.doctor.outputs import prometheus, shared_memory
 from imud.cli.doctor.surroundings import fetch_over_http
 from imud.contracts.publisher import PublisherContext
 from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
 from tests.support.metrics import ask
 from tests.support.surroundings import Machine
 
-PROMETHEUS = DoctorCheck("p", prometheus)
+PROMETHEUS, SHARED = DoctorCheck("p", prometheus), DoctorCheck("s", shared_memory)
 AT = ("127.0.0.1", 9321, "/scrapes")
 
 
@@ -81,3 +81,28 @@ def test_the_endpoint_itself_is_understood(running: Machine) -> None:
         running.pages[AT] = page
         severities.append(str(running.find(PROMETHEUS)[0].severity))
     assert severities == ["note", "ok"]
+
+
+RINGS, FLIGHT = "shm: {directory: /dev/shm}\n", "recorder: {flight: {enabled: true, directory: /dev/shm/imud-flight}}\n"
+
+
+@pytest.mark.parametrize(
+    ("more", "removes", "severities"),
+    [
+        (RINGS + FLIGHT, "yes", ["warning", "warning"]),
+        (RINGS + FLIGHT, "no", ["ok", "ok"]),
+        (FLIGHT, "yes", ["warning"]),
+        (FLIGHT.replace("true", "false"), "yes", []),
+        ("shm: {directory: /dev/shmem}\n", "yes", []),
+        ("", "yes", []),
+    ],
+)
+def test_files_in_shared_memory_that_systemd_removes(
+    machine: Machine, more: str, removes: str, severities: list[str]
+) -> None:
+    machine.configure(more=more)
+    assert machine.find(SHARED) == [], "without a service nothing removes them"
+    machine.unit(f"RemoveIPC={removes}")
+    told = machine.told(SHARED)
+    assert [severity for severity, _ in told] == severities
+    assert all("RemoveIPC=no" in text for severity, text in told if severity == "warning")
