@@ -1,0 +1,126 @@
+"""Wheel and sdist, built by the backend that is installed here, without the network: both have all files."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from email import message_from_bytes
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from imud import __version__
+from tests.support.files import ROOT
+
+LIMIT_S: Final = 50
+BUILD: Final = "from hatchling import build; print(build.build_{1}({0!r}))"
+NOT_DISTRIBUTED: Final = {".git", ".venv", "PKG-INFO"}
+"""Of the top folder: the repository, an environment, and what an sdist has besides."""
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("hatchling") is None and not os.environ.get("CI"),
+    reason="no hatchling on this machine (it is in the extra dev)",
+)
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Wheel and sdist of this tree."""
+    folder = tmp_path_factory.mktemp("dist")
+    return build(ROOT, folder, "wheel"), build(ROOT, folder, "sdist")
+
+
+def build(tree: Path, folder: Path, what: str) -> Path:
+    """Build the wheel or the sdist of a tree, into a folder."""
+    done = subprocess.run(
+        [sys.executable, "-c", BUILD.format(str(folder), what)], cwd=tree, capture_output=True, text=True, check=False,
+        timeout=LIMIT_S,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder / done.stdout.strip()
+
+
+def repository() -> set[str]:
+    """Paths of all files of the repository that are to be distributed: those that .gitignore does not name."""
+    patterns = [line for line in (ROOT / ".gitignore").read_text().splitlines() if line]
+
+    def is_kept(name: str, *, folder: bool) -> bool:
+        return not any(fnmatch(f"{name}/" if folder else name, pattern) for pattern in patterns)
+
+    found = set()
+    for folder, folders, names in os.walk(ROOT):
+        top = NOT_DISTRIBUTED if folder == str(ROOT) else set()
+        folders[:] = [one for one in folders if one not in top and is_kept(one, folder=True)]
+        files = [one for one in names if one not in top and is_kept(one, folder=False)]
+        found |= {str(Path(folder, one).relative_to(ROOT)) for one in files}
+    return found
+
+
+def members(sdist: Path) -> dict[str, bytes]:
+    """Content of the files of an sdist, by path in the repository."""
+    with tarfile.open(sdist) as tar:
+        read = {one.name.partition("/")[2]: tar.extractfile(one) for one in tar.getmembers() if one.isfile()}
+        return {name: file.read() for name, file in read.items() if file is not None}
+
+
+def test_the_wheel_has_every_file_of_the_package_as_it_is_and_no_other(distributions: tuple[Path, Path]) -> None:
+    wanted = {path for path in repository() if path.startswith("imud/")}
+    with zipfile.ZipFile(distributions[0]) as wheel:
+        content = {name: wheel.read(name) for name in wheel.namelist() if ".dist-info/" not in name}
+    assert content.keys() == wanted
+    assert all(data == (ROOT / path).read_bytes() for path, data in content.items())
+    for pattern in (
+        "imud/py.typed",
+        "imud/include/imud.h",
+        "imud/web/static/*.html",
+        "imud/web/static/uplot/*LICENSE*",
+    ):
+        assert any(fnmatch(path, pattern) for path in content), pattern
+
+
+def test_the_wheel_starts_the_command_and_needs_what_the_project_says(distributions: tuple[Path, Path]) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    with zipfile.ZipFile(distributions[0]) as wheel:
+        info = f"imud-{__version__}.dist-info"
+        entries = wheel.read(f"{info}/entry_points.txt").decode()
+        metadata = message_from_bytes(wheel.read(f"{info}/METADATA"))
+        assert f"{info}/licenses/LICENSE" in wheel.namelist()
+    assert entries.split() == ["[console_scripts]", "imud", "=", "imud.cli:main"]
+    plain = [text for text in metadata.get_all("Requires-Dist") or () if "extra ==" not in text]
+    assert sorted(text.lower() for text in plain) == sorted(text.lower() for text in project["dependencies"])
+    assert set(metadata.get_all("Provides-Extra") or ()) == set(project["optional-dependencies"])
+    environment = {**os.environ, "PYTHONPATH": str(distributions[0])}
+    code = "import sys, imud.cli; print(imud.__file__); sys.argv = ['imud', '--version']; imud.cli.main()"
+    argv, folder = [sys.executable, "-c", code], distributions[0].parent
+    done = subprocess.run(argv, cwd=folder, env=environment, capture_output=True, text=True, check=True, timeout=30)
+    assert done.stdout.splitlines() == [f"{distributions[0]}/imud/__init__.py", f"imud {__version__}"]
+
+
+def test_the_sdist_has_every_file_of_the_repository_as_it_is(distributions: tuple[Path, Path]) -> None:
+    """So that `make check` finds there what it finds here."""
+    content = members(distributions[1])
+    assert content.keys() - {"PKG-INFO"} == repository()
+    assert {"Makefile", ".ci/run", "tests/lab_debian/run", "docs/pictures/time_stamps.svg"} <= content.keys()
+    assert all(data == (ROOT / path).read_bytes() for path, data in content.items() if path != "PKG-INFO")
+
+
+def test_an_unpacked_sdist_is_checked_and_built_as_the_repository_is(
+    distributions: tuple[Path, Path], tmp_path: Path
+) -> None:
+    with tarfile.open(distributions[1]) as tar:
+        tar.extractall(tmp_path, filter="data")
+    tree = tmp_path / f"imud-{__version__}"
+    for program in (".ci/run", "packaging/debian/build"):
+        assert os.access(tree / program, os.X_OK), program
+    said = subprocess.run(
+        ["make", "--dry-run", "check"], cwd=tree, capture_output=True, text=True, check=True, timeout=30
+    )
+    for program in ("ruff check .", "mypy", "pytest"):
+        assert f"/{program}" in said.stdout
+    (tmp_path / "again").mkdir()
+    with zipfile.ZipFile(build(tree, tmp_path / "again", "wheel")) as ours, zipfile.ZipFile(distributions[0]) as theirs:
+        assert sorted(ours.namelist()) == sorted(theirs.namelist())
