@@ -3,6 +3,7 @@
 The metrics endpoint counts how often it was asked; `/scrapes` gives that number without being counted itself.
 """
 
+import re
 from typing import Final
 
 import msgspec
@@ -16,6 +17,10 @@ from imud.publishers.shm.publisher import ShmSettings
 
 STALE_S: Final = 300.0
 """Prometheus scrapes every 15 s to 1 min; five times as long is no slow configuration."""
+NEVER_S: Final = 300.0
+"""The same for a daemon that was never scraped: Prometheus may be started after it, and reads its targets anew."""
+CONFIGURED: Final = re.compile(r"^metrics:", re.MULTILINE)
+"""The key of the metrics in the configuration; without it they are on, and nobody has asked for them."""
 SHARED_MEMORY: Final = "/dev/shm"
 """Where RemoveIPC= of a unit removes what the service's user or group owns (systemd.exec(5))."""
 EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
@@ -80,9 +85,11 @@ def prometheus(at: Surroundings) -> Findings:
         )
         return
     if not counted.scrapes:
-        yield note(
-            f"Prometheus has not scraped {place} since the daemon started",
-            'where it should: `up{job="imud"}` in Prometheus; from another machine `address: 0.0.0.0`; docs/metrics.md',
+        missed = counted.age_s > NEVER_S and CONFIGURED.search(at.text(at.config_file) or "")
+        yield (warning if missed else note)(
+            f"nothing has scraped {place} since it was opened {_ago(counted.age_s)} ago",
+            'where Prometheus should: `up{job="imud"}` there; from another machine `address: 0.0.0.0`; '
+            "docs/monitoring.md. Where nothing is to: `metrics: {enabled: false}`",
         )
     elif counted.age_s > STALE_S:
         yield warning(
@@ -91,3 +98,7 @@ def prometheus(at: Surroundings) -> Findings:
         )
     else:
         yield ok(f"metrics at {place}: scraped {counted.scrapes} times, last {counted.age_s:.0f} s ago")
+
+
+def _ago(seconds: float) -> str:
+    return f"{seconds / 60:.0f} minutes" if seconds >= 120 else f"{seconds:.0f} s"

@@ -11,6 +11,8 @@ HEARD_BYTES: Final = 200
 """Fewer bytes than a module sends in a second at its lowest rate are noise, or echoes of what imud sent."""
 DAMAGED_SHARE: Final = 0.001
 """Share of bad frames above which a line is not in order; a good one has none in days."""
+ANSWERED_AFTER_S: Final = 60.0
+"""A device is asked who it is when it was found, and 5 and 35 s later; so long without an answer is no lost reply."""
 RESETS: Final = 3
 RESETS_PER_H: Final = 1.0
 """More restarts of a device per hour are no operator's."""
@@ -34,11 +36,12 @@ def heard(at: Surroundings) -> Findings:
             continue
         if counts["frames_good"]:
             yield from _damage(one)
+            yield from _answers(at, one)
         elif counts["bytes_in"] == 0:
             yield error(
-                f"{one.name}: nothing is heard on {one.link}",
-                "is it powered? Are TX and RX swapped? Is ground connected? Are the levels the same "
-                "(TTL 3.3 V, RS-232 or RS-485)?",
+                f"{one.name}: nothing is heard on {one.link}: no power, or its TX is not wired to RX of this port",
+                "is it powered? Are TX and RX swapped? TX of each end goes to RX of the other: exchange the two "
+                "wires and look again. Is ground connected? Are the levels the same (TTL 3.3 V, RS-232 or RS-485)?",
             )
         elif one.kernel.framing or one.kernel.break_:
             yield error(
@@ -74,6 +77,20 @@ def _damage(one: DeviceStatus) -> Findings:
         )
     elif not kernel.overrun:
         yield ok(f"{one.name}: {counts['frames_good']} good frames, {bad} damaged")
+
+
+def _answers(at: Surroundings, one: DeviceStatus) -> Findings:
+    """Judge a device whose samples come: one that never answered does not hear what imud sends."""
+    asked = any(device.name == one.name and device.identify for device in (at.config.devices if at.config else ()))
+    rate_hz = one.expected_rate_hz or one.rate_hz
+    if not asked or one.identity.get("product") or one.ledger["frames_in_replies"]:
+        return
+    if one.state is DeviceState.RUNNING and one.ledger["samples"] > ANSWERED_AFTER_S * rate_hz > 0:
+        yield warning(
+            f"{one.name}: samples come, but no answer ever did: RX of the module is not wired to TX of this port",
+            "wire TX of the adapter to RX of the module, with its level (3.3 V or RS-232); until then its settings "
+            "cannot be changed. For a line of one direction: `identify: false`",
+        )
 
 
 def half_duplex(at: Surroundings) -> Findings:

@@ -81,7 +81,7 @@ class Scrapes(msgspec.Struct, frozen=True):
 
     scrapes: int
     age_s: float
-    """Time since the last one, s; without meaning before the first."""
+    """Time since the last one, or before the first since the endpoint was made, s."""
 
 
 class ClientTotals:
@@ -188,7 +188,7 @@ class MetricsPublisher:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server: ScrapeServer | None = None
         self._scrapes = 0
-        self._scraped_ns = 0
+        self._scraped_ns = context.now_ns()
 
     @property
     def port(self) -> int:

@@ -1,11 +1,16 @@
 """I2C and SPI: nodes, transfers, and what is likely wrong."""
 
+import errno
+
 import msgspec
 import pytest
 
 from imud.cli.doctor.buses import bus_nodes, i2c_transfers, spi_transfers
 from imud.cli.doctor.finding import DoctorCheck
 from imud.contracts.status import DeviceState, DeviceStatus, PollingStatus
+from imud.devices.imu61x.common.register_driver import identity_of
+from imud.errors import DeviceRefused, LinkError
+from imud.links.spi import WR_BITS_PER_WORD, WR_MODE, SpiLink, SpiSettings
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
 
@@ -82,4 +87,50 @@ def test_a_device_that_does_not_answer(machine: Machine) -> None:
     assert "words of 8 bits" in machine.told(SPI)[0][1]
     assert "has mode 3" in machine.told(SPI)[0][1]
     machine.configure("mast: {driver: imu61x-spi, spi: {port: /dev/spidev0.0}}")
-    assert "mode 0 or 3" in machine.told(SPI)[0][1]
+    assert "has mode 0 or 3" in machine.told(SPI)[0][1]
+
+
+def refused(product_id: str) -> str:
+    """The problem of a device on SPI that answers with these bytes, as the driver puts it."""
+    with pytest.raises(DeviceRefused) as refusal:
+        identity_of(bytes.fromhex(product_id))
+    return f"mode 0: {refusal.value}"
+
+
+def unusable(**refuse: int) -> str:
+    """The problem of an SPI node whose kernel refuses requests with EINVAL: all of this number, from this mode on."""
+
+    def ioctl(_fd: int, request: int, argument: bytes) -> None:
+        if request == refuse["request"] and argument[0] >= refuse.get("least", 0):
+            raise OSError(errno.EINVAL, "Invalid argument")
+
+    link = SpiLink(SpiSettings(port="/dev/spidev0.0"), ioctl=ioctl, open_node=lambda *_: 0, close_node=lambda _: None)
+    try:
+        link.open()
+        link.select(3)
+    except LinkError as error:
+        return str(error)
+    raise AssertionError("it was not refused")
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        # 00 00 'IMU614': 0000 494D 5536 3134; one bit early: 0000 929A AA6C 6268; late: 0000 24A6 AA9B 189A
+        (refused("0000929aaa6c6268"), "→ SPI mode: the answer is shifted by one bit"),
+        (refused("000024a6aa9b189a"), "→ SPI mode"),
+        (refused("800024a6aa9b189a"), "→ SPI mode"),
+        (refused("00004d4936553431"), "→ word size: both bytes of each word are exchanged"),
+        (refused("0000494d55363130"), "→ all bytes 00"),
+        (refused("0000000000000000"), "→ all bytes 00"),
+        (f"{refused('ffffffffffffffff')}; {refused('00004d4936553431')}", "→ word size"),
+        (unusable(request=WR_BITS_PER_WORD), "→ the controller refuses words of 16 and of 8 bits"),
+        (unusable(request=WR_MODE, least=3), "→ this controller does not have the mode"),
+    ],
+)
+def test_mode_and_word_size_by_what_was_read(machine: Machine, problem: str, words: str) -> None:
+    machine.configure(MAST)
+    machine.status = [msgspec.structs.replace(polled("mast", DeviceState.SEARCHING), problem=problem)]
+    ((severity, text),) = machine.told(SPI)
+    assert severity == "error"
+    assert words in text

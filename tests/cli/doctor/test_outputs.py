@@ -6,6 +6,7 @@ import pytest
 
 from imud.cli.doctor.finding import DoctorCheck
 from imud.cli.doctor.outputs import prometheus, shared_memory
+from imud.cli.doctor.report import examine, exit_status
 from imud.cli.doctor.surroundings import fetch_over_http
 from imud.contracts.publisher import PublisherContext
 from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
@@ -26,7 +27,12 @@ def running(machine: Machine) -> Machine:
 @pytest.mark.parametrize(
     ("page", "severity", "words"),
     [
-        ('{"scrapes":0,"age_s":9.0}', "note", "has not scraped 127.0.0.1 port 9321"),
+        (
+            '{"scrapes":0,"age_s":9.0}',
+            "note",
+            "nothing has scraped 127.0.0.1 port 9321 since it was opened 9 s ago",
+        ),
+        ('{"scrapes":0,"age_s":3000.0}', "note", "opened 50 minutes ago"),
         ('{"scrapes":7,"age_s":9.0}', "ok", "scraped 7 times, last 9 s ago"),
         ('{"scrapes":7,"age_s":301.0}', "warning", "for 5 minutes, 7 times before"),
         ("<html>", "error", "another program than imud"),
@@ -37,6 +43,17 @@ def test_scrapes(running: Machine, page: str, severity: str, words: str) -> None
     ((got, text),) = running.told(PROMETHEUS)
     assert got == severity
     assert words in text
+
+
+@pytest.mark.parametrize(("age_s", "severity"), [(300.0, "note"), (301.0, "warning")])
+def test_metrics_that_are_configured_and_never_scraped_are_a_warning_after_five_minutes(
+    running: Machine, age_s: float, severity: str
+) -> None:
+    running.configure(more="metrics: {port: 9321}\n")
+    running.pages[AT] = f'{{"scrapes":0,"age_s":{age_s}}}'
+    examined = examine([PROMETHEUS], running.surroundings())
+    assert [finding.severity for finding in examined[0].findings] == [severity]
+    assert exit_status(examined) == (severity == "warning")
 
 
 def test_an_address_of_every_network_is_asked_at_home(running: Machine) -> None:

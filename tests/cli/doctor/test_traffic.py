@@ -65,6 +65,36 @@ def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, word
     assert words.lower() in text.lower()
 
 
+def one_way(**changes: object) -> DeviceStatus:
+    """A device whose samples come at 100 Hz for 70 s, and that never answered."""
+    made = counted(DeviceState.RUNNING, frames_good=7000, samples=7000)
+    made = msgspec.structs.replace(made, identity={}, expected_rate_hz=100.0)
+    return msgspec.structs.replace(made, **changes)
+
+
+@pytest.mark.parametrize(
+    ("status", "severities"),
+    [
+        (one_way(), ["ok", "warning"]),
+        (one_way(identity={"product": "HI14"}), ["ok"]),
+        (one_way(ledger=one_way().ledger | {"frames_in_replies": 1}), ["ok"]),
+        (one_way(ledger=one_way().ledger | {"samples": 6000}), ["ok"]),
+        (one_way(state=DeviceState.SILENT), ["ok"]),
+        (one_way(expected_rate_hz=0.0, rate_hz=0.0), ["ok"]),
+    ],
+)
+def test_a_device_that_never_answers_does_not_hear_imud(
+    machine: Machine, status: DeviceStatus, severities: list[str]
+) -> None:
+    machine.configure(UART)
+    machine.status = [status]
+    told = machine.told(HEARD)
+    assert [severity for severity, _ in told] == severities
+    assert all("RX of the module is not wired" in text for severity, text in told if severity == "warning")
+    machine.configure(UART.replace("bow: {", "bow: {identify: false, "))
+    assert [finding.severity for finding in machine.find(HEARD)] == ["ok"]
+
+
 def test_a_missing_port_is_not_judged_by_its_bytes(machine: Machine) -> None:
     machine.configure(UART)
     machine.status = [counted(DeviceState.MISSING)]

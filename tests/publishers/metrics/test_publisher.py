@@ -76,9 +76,9 @@ def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
 def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
     async def run() -> None:
         async with publisher(
-            PublisherContext(lambda: DEVICES, 1, iter(range(0, 10**12, 2 * 10**9)).__next__)
+            PublisherContext(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
         ) as served:
-            assert (await ask(served.port, "/scrapes"))[2].startswith('{"scrapes":0,')
+            assert (await ask(served.port, "/scrapes"))[2] == '{"scrapes":0,"age_s":2.0}', "since the start"
             await ask(served.port)
             line, head, body = await ask(served.port, "/scrapes")
             assert line == "HTTP/1.1 200 OK"
