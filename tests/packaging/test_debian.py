@@ -38,7 +38,7 @@ def test_maintainer_scripts_are_shell_and_leave_a_place_for_debhelper(name: str)
     subprocess.run(["sh", "-n", str(DEBIAN / name)], check=True, timeout=30)
 
 
-@pytest.mark.parametrize("name", ["build", "try"])
+@pytest.mark.parametrize("name", ["build", "try", "unit"])
 def test_programs_of_the_package_are_shell(name: str) -> None:
     assert os.access(DEBIAN / name, os.X_OK)
     subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=30)
@@ -145,6 +145,52 @@ def test_every_file_that_the_build_takes_is_there() -> None:
     (names,) = re.findall(r"for file in ([^;]*);", text)
     assert {"control", "changelog", "rules", *SCRIPTS} <= set(names.replace("\\", "").split())
     assert all((DEBIAN / one).is_file() for one in names.replace("\\", "").split())
+
+
+def unit_for(release: str, text: str) -> subprocess.CompletedProcess[str]:
+    """Run packaging/debian/unit on a unit."""
+    argv = [str(DEBIAN / "unit"), release]
+    return subprocess.run(argv, input=text, capture_output=True, text=True, check=False, timeout=30)
+
+
+def test_the_unit_of_a_release_reloads_as_its_systemd_can() -> None:
+    text = (ROOT / "systemd/imud.service").read_text()
+    assert unit_for("bookworm", text).stdout == text
+    lines = unit_for("trixie", text).stdout.splitlines()
+    assert [line for line in lines if line.startswith("Type=")] == ["Type=notify-reload"]
+    assert len(lines) == len(text.splitlines()) - 1, "all but ExecReload="
+    assert set(text.splitlines()) - set(lines) == {"Type=notify", "ExecReload=/bin/kill -HUP $MAINPID"}
+
+
+@pytest.mark.parametrize(
+    ("release", "text"),
+    [
+        ("trixie", "[Service]\nType = notify\nExecReload=/bin/kill\n"),
+        ("trixie", "[Service]\nType=notify \n"),
+        ("trixie", "[Service]\nType=simple\n"),
+        ("trixie", "[Service]\nType=notify\nExecReload=\nType=notify\n"),
+        ("bookworm", "[Service]\nType=notify\n"),
+        ("bookworm", "[Service]\nType=notify-reload\nExecReload=/bin/kill\n"),
+    ],
+)
+def test_a_unit_that_would_not_reload_ends_the_build(release: str, text: str) -> None:
+    done = unit_for(release, text)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "expected one Type=" in done.stderr
+
+
+@pytest.mark.parametrize(("ci", "said"), [("true", "lintian is missing, and CI=true"), ("", "expected the release")])
+def test_without_lintian_ci_makes_no_package(tmp_path: Path, ci: str, said: str) -> None:
+    for name in ("dirname", "true"):
+        found = shutil.which(name)
+        (tmp_path / name).symlink_to(found or "/bin/false")
+    (tmp_path / "dh").symlink_to(tmp_path / "true")
+    argv = ["/bin/bash", str(DEBIAN / "build"), "sid", "amd64"]
+    environment = {"PATH": str(tmp_path), "CI": ci}
+    done = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False, timeout=30)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "THIS PACKAGE IS NOT CHECKED" in (DEBIAN / "build").read_text()
 
 
 def test_overrides_have_reasons_and_the_launcher_its_own_python() -> None:
