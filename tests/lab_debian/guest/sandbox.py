@@ -1,4 +1,8 @@
-"""The unit's confinement: systemd's own score, what the process may not do, and that nodes of all kinds open."""
+"""The unit's confinement: systemd's own score, what the process may not do, and that nodes of all kinds open.
+
+What it may not do is tried three times: by root without the unit's settings, who must be able to (else the refusal
+would say nothing); by the service's user with them; and by root with them, whom modes and groups of files let in.
+"""
 
 import json
 import platform
@@ -37,11 +41,20 @@ FORBIDDEN = {
     "make a namespace": "import ctypes; l = ctypes.CDLL(None, use_errno=True); assert not l.unshare(0x10000000)",
     "map memory that is written and executed": "import mmap; mmap.mmap(-1, 4096, prot=7)",
     "open a packet socket": "import socket; socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)",
-    "load a module": f"import ctypes; assert not ctypes.CDLL(None).syscall({INIT_MODULE}, 0, 0, 0)",
-    "make a node": "import os, stat; os.mknod('/var/lib/imud/n', stat.S_IFCHR | 0o600, os.makedev(1, 3))",
-    "make a set-uid file": "import os; open('/var/lib/imud/s', 'w'); os.chmod('/var/lib/imud/s', 0o4755)",
+    "load a module": (
+        "import ctypes, errno; l = ctypes.CDLL(None, use_errno=True); "
+        f"l.syscall({INIT_MODULE}, 0, 0, 0); assert ctypes.get_errno() != errno.EPERM"  # who may gets ENOEXEC
+    ),
+    "make a node": "import os, stat; os.mknod('/dev/shm/n', stat.S_IFCHR | 0o600, os.makedev(1, 3))",
+    "make a set-uid file": "import os; open('/dev/shm/s', 'w'); os.chmod('/dev/shm/s', 0o4755)",
 }
 """What the confined user must not be able to do, as Python that raises when it is refused."""
+LEFT = ("/usr/probe", "/etc/probe", "/dev/shm/n", "/dev/shm/s")
+"""Files that those leave who can."""
+FREE_FOR_ROOT = {"see other users' processes"}
+"""hidepid= of /proc, by which ProtectProc= works, leaves members of group root alone (proc(5), `gid=`)."""
+NOT_FOR_ROOT = "StateDirectory"
+"""Begin of settings by which systemd would give the daemon's state to root."""
 NEEDED = {
     "ask the kernel for the clock's state": (
         "import ctypes; b = ctypes.create_string_buffer(512); assert ctypes.CDLL(None).adjtimex(b) >= 0"
@@ -53,8 +66,6 @@ NEEDED = {
     "read when the machine was started, for the metrics of the process": "open('/proc/stat').read()",
 }
 """What imud does besides opening devices; a setting that breaks it would be seen late or never."""
-NODES = ("ttyUSB0", "ttyS1", "ttyAMA0", "i2c-0", "spidev*", "gpiochip0")
-"""Patterns of names in /dev, one for each kind of node."""
 TRY_ALL = """
 import json, os
 said = {}
@@ -105,12 +116,12 @@ def check(checks: Checks, _host: Host) -> None:
     for address in (PUBLIC, PRIVATE):
         must("ip", "address", "replace", f"{address}/32", "dev", "lo")
     settings = confinement()
+    buses.make_nodes()
     nodes = {node: OPEN.format(node=node) for node in present_nodes(checks)}
+    able = tried(FORBIDDEN, [], user="root")
     results = tried({**FORBIDDEN, **NEEDED, **nodes}, settings)
-    for name in FORBIDDEN:
-        with checks(f"confined as the unit is, a program may not {name}"):
-            if "Error" not in results[name]:
-                raise Failed(results[name] or "it could")
+    of_root = tried(FORBIDDEN, [one for one in settings if not one.startswith(NOT_FOR_ROOT)], user="root")
+    judge(checks, able, results, of_root)
     for name in NEEDED:
         with checks(f"confined as the unit is, a program may {name}"):
             expect("result", results[name], "")
@@ -119,21 +130,44 @@ def check(checks: Checks, _host: Host) -> None:
             expect("result", results[node], "")
 
 
-def present_nodes(checks: Checks) -> list[str]:
-    """One node of each kind that this machine has."""
-    buses.make_nodes()
+def judge(checks: Checks, able: dict[str, str], results: dict[str, str], of_root: dict[str, str]) -> None:
+    """A check for each of FORBIDDEN, by what was raised: for root without the settings, the user and root with them."""
+    for name in FORBIDDEN:
+        with checks(f"confined as the unit is, a program may not {name}, which root may without the unit"):
+            expect("result of root without the unit's settings", able[name], "")
+            refused("the service's user", results[name])
+            if name not in FREE_FOR_ROOT:
+                refused("root under the unit's settings", of_root[name])
+
+
+def refused(who: str, result: str) -> None:
+    """Failed unless the result is an error."""
+    if "Error" not in result:
+        raise Failed(f"{who}: {result or 'could'}")
+
+
+def present_nodes(checks: Checks, folder: Path = Path("/dev"), machine: str = "") -> list[str]:
+    """One node of each kind that this machine is promised to have; a check that fails for each that is not there."""
     found = []
-    for pattern in NODES:
-        nodes = sorted(str(path) for path in Path("/dev").glob(pattern))
+    for pattern in buses.NODES[machine or platform.machine()]:
+        nodes = sorted(str(path) for path in folder.glob(pattern))
         if not nodes:
-            checks.skip(f"/dev/{pattern} opens under the unit's settings", "this machine has none")
+            with checks(f"/dev/{pattern} is there"):
+                raise Failed("the rig has none: was its driver loaded (README.md, What the guest has)?")
         found += nodes[:1]
     return found
 
 
-def tried(snippets: dict[str, str], settings: list[str]) -> dict[str, str]:
-    """Run each piece of Python in a process of its own under the settings; what it raised, empty for nothing."""
-    said = confined(f"SNIPPETS = {snippets!r}\n{TRY_ALL}", *settings)
+def tried(snippets: dict[str, str], settings: list[str], user: str = "imud") -> dict[str, str]:
+    """Run each piece of Python in a process of its own under the settings; what it raised, empty for nothing.
+
+    What a piece left behind is removed.
+    """
+    try:
+        said = confined(f"SNIPPETS = {snippets!r}\n{TRY_ALL}", *settings, user=user)
+    finally:
+        for path in LEFT:
+            Path(path).unlink(missing_ok=True)
     for line in said.splitlines():
         if line.startswith("{"):
             found: dict[str, str] = json.loads(line)

@@ -39,6 +39,8 @@ CAN = """\
     socketcan: {interface: vcan0}
 """
 CAN_RATE_HZ = 20
+NOTIFY_RELOAD_SINCE = 253
+"""Version of systemd; trixie has 257, bookworm 252."""
 START_LIMIT_S = 400
 """Above TimeoutStartSec=, so that systemd's own limit is the one that is seen."""
 
@@ -53,6 +55,17 @@ def check(checks: Checks, host: Host) -> None:
 
 def check_reload(checks: Checks) -> None:
     """`systemctl reload`, with a file that can be used and with one that cannot."""
+    with checks("a reload is waited for where systemd can"):
+        waits = int(must("systemctl", "--version").split()[1]) >= NOTIFY_RELOAD_SINCE
+        expect("type", shown("Type"), "notify-reload" if waits else "notify")
+        if waits:
+            configure(USB)
+            must("systemctl", "reload", UNIT)
+            expect("the device that is not in the file any more, right after", device("can"), None)
+            configure(USB + CAN)
+            must("systemctl", "reload", UNIT)
+            assert device("can"), "the device that came back is not there right after"
+            wait_streaming("can")
     with checks("reload of a changed file keeps the process and the devices that did not change"):
         before, seq = pid(), newest("usb")
         configure(USB)
