@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.lab_debian.guest import buses, sandbox
+from imud.cli.setup.command import sudo_user
+from imud.cli.setup.journal import FILE
+from imud.cli.setup.udev import MODEM_MANAGER, RULES
+from tests.lab_debian.guest import buses, first_contact, sandbox
 from tests.lab_debian.guest.checks import Checks
 from tests.lab_debian.host.machine import PLATFORMS
 from tests.support.files import ROOT
@@ -101,3 +104,23 @@ def test_the_document_promises_the_same_nodes() -> None:
     for pattern in buses.NODES["x86_64"]:
         kind = re.sub(r"[\d*]+$", "", pattern)
         assert f"/dev/{kind}" in table or f"{kind} bound" in table, pattern
+
+
+# --- imud setup -------------------------------------------------------------------------------------------------------
+
+
+def test_the_guest_looks_where_imud_setup_writes() -> None:
+    assert str(first_contact.RULES) == RULES
+    assert str(first_contact.JOURNAL) == FILE
+    assert first_contact.MODEM_MANAGER.name == MODEM_MANAGER
+
+
+def test_a_property_of_an_adapter_is_one_of_its_own_line() -> None:
+    text = "P: /devices/x\nN: ttyUSB0\nE: DEVNAME=/dev/ttyUSB0\nE: ID_MM_DEVICE_IGNORE=1\nS: ID_X=1\n"
+    assert first_contact.properties(text) == ["DEVNAME=/dev/ttyUSB0", "ID_MM_DEVICE_IGNORE=1"]
+
+
+def test_the_user_that_runs_sudo_is_known_to_imud_setup(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert first_contact.SETUP[:2] == ("env", f"SUDO_USER={first_contact.OPERATOR}")
+    monkeypatch.setenv(*first_contact.SETUP[1].split("="))
+    assert sudo_user() == first_contact.OPERATOR

@@ -1,14 +1,20 @@
 """`imud doctor` on a system that is in order and on one that is not; `imud setup --yes` from nothing to samples."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
 
 from tests.lab_debian.guest.checks import Checks, expect, expect_in, wait_until
 from tests.lab_debian.guest.service import CAN, USB
 from tests.lab_debian.guest.system import (
     CONFIG,
     EXAMPLE,
+    NODE,
     UNIT,
     Host,
+    add_user,
     ask,
     configure,
     device,
@@ -20,6 +26,23 @@ from tests.lab_debian.guest.system import (
 )
 
 ERROR = 2
+OPERATOR = "skipper"
+"""Runs sudo, of which the rig has only the variable."""
+SETUP = ("env", f"SUDO_USER={OPERATOR}", "imud", "setup")
+RULES = Path("/etc/udev/rules.d/61-imud-setup.rules")
+JOURNAL = Path("/var/lib/imud-setup/journal.json")
+MODEM_MANAGER = Path("/etc/systemd/system/ModemManager.service")
+LATENCY_DEFAULT_MS = 16
+"""Of the chip, and so of ftdi_sio."""
+
+
+class AdapterNow(NamedTuple):
+    """What udev's rules make of the USB adapter."""
+
+    latency_ms: int
+    """How long it holds bytes back (`latency_timer` of ftdi_sio)."""
+    ignored: bool
+    """Whether ModemManager leaves it alone (`ID_MM_DEVICE_IGNORE`)."""
 
 
 def check_doctor(checks: Checks, host: Host) -> None:
@@ -57,22 +80,86 @@ def errors() -> list[dict[str, str]]:
     return found
 
 
-def check_setup(checks: Checks, _host: Host) -> None:
-    """`imud setup --yes` from the package's example to samples, and `--undo`."""
+def check_setup(checks: Checks, host: Host) -> None:
+    """`imud setup --yes` from the package's example to samples, and `--undo`; on a machine with ModemManager."""
     must("systemctl", "disable", "--now", UNIT)
     CONFIG.write_bytes(EXAMPLE.read_bytes())
-    with checks("imud setup --yes ends with a service that is enabled and has samples of what is attached"):
-        said = must("imud", "setup", "--yes", limit_s=900)
-        expect("enabled", run("systemctl", "is-enabled", UNIT).stdout.strip(), "enabled")
-        expect("active", shown("ActiveState"), "active")
-        expect_in("/dev/serial/by-id/", CONFIG.read_text(), f"configuration after: {said}")
-        for found in ask("status")["devices"]:
-            wait_streaming(found["name"])
-    with checks("imud setup --undo takes it back"):
-        must("imud", "setup", "--undo", "--yes", limit_s=900)
-        expect("enabled", run("systemctl", "is-enabled", UNIT).stdout.strip(), "disabled")
-        assert CONFIG.read_bytes() == EXAMPLE.read_bytes(), "the configuration is not the one before"
+    add_user(OPERATOR)
+    with modem_manager():
+        before = replugged(host)
+        with checks("imud setup --yes ends with a service that is enabled and has samples of what is attached"):
+            said = must(*SETUP, "--yes", limit_s=900)
+            expect("enabled", run("systemctl", "is-enabled", UNIT).stdout.strip(), "enabled")
+            expect("active", shown("ActiveState"), "active")
+            expect_in("/dev/serial/by-id/", CONFIG.read_text(), f"configuration after: {said}")
+            for found in ask("status")["devices"]:
+                wait_streaming(found["name"])
+        check_made(checks, host, before)
+        with checks("imud setup --undo takes back configuration, service, rules, group and journal"):
+            must(*SETUP, "--undo", "--yes", limit_s=900)
+            expect("enabled", run("systemctl", "is-enabled", UNIT).stdout.strip(), "disabled")
+            assert CONFIG.read_bytes() == EXAMPLE.read_bytes(), "the configuration is not the one before"
+            left = [path for path in (RULES, JOURNAL, *CONFIG.parent.glob(f"{CONFIG.name}.*")) if path.exists()]
+            expect("left of what it made", left, [])
+            expect("groups of the user that runs sudo", groups(), {OPERATOR})
+            expect("the adapter, when it is plugged in again", replugged(host), before)
     configure(USB + CAN)
     must("systemctl", "enable", UNIT)
     start_service()
     wait_streaming("usb")
+
+
+def check_made(checks: Checks, host: Host, before: AdapterNow) -> None:
+    """What `imud setup` changed beside configuration and service; `before`: the adapter as it was without."""
+    with checks("the user that runs sudo may read samples after imud setup"):
+        expect("groups", groups(), {OPERATOR, "imud"})
+    with checks("after imud setup udev keeps ModemManager from the adapter, and has its bytes sent at once"):
+        expect("without the rules", before, AdapterNow(LATENCY_DEFAULT_MS, ignored=False))
+        expect("as it is", adapter().ignored, True)
+        must(
+            "systemctl", "stop", UNIT
+        )  # a daemon that asks the driver for low latency has it show 1, whatever udev set
+        try:
+            expect("plugged in again", replugged(host), AdapterNow(1, ignored=True))
+        finally:
+            start_service()
+    with checks("the journal of imud setup is there, for root only"):
+        expect("mode", JOURNAL.stat().st_mode & 0o777, 0o600)
+
+
+@contextmanager
+def modem_manager() -> Iterator[None]:
+    """A service of that name that runs, for as long as the block: the rig's Debian has none."""
+    MODEM_MANAGER.write_text("[Service]\nExecStart=/bin/sleep infinity\n")
+    must("systemctl", "daemon-reload")
+    must("systemctl", "start", MODEM_MANAGER.name)
+    try:
+        yield
+    finally:
+        run("systemctl", "stop", MODEM_MANAGER.name)
+        MODEM_MANAGER.unlink()
+        must("systemctl", "daemon-reload")
+
+
+def replugged(host: Host) -> AdapterNow:
+    """Pull the adapter out, plug it in; what udev made of it."""
+    host.unplug()
+    host.plug()
+    must("udevadm", "settle")
+    return adapter()
+
+
+def adapter() -> AdapterNow:
+    """Latency timer and ModemManager's property of the adapter, from the kernel and from udev's database."""
+    latency = Path(f"/sys/bus/usb-serial/devices/{NODE.name}/latency_timer").read_text()
+    return AdapterNow(int(latency), "ID_MM_DEVICE_IGNORE=1" in properties(must("udevadm", "info", str(NODE))))
+
+
+def properties(text: str) -> list[str]:
+    """Properties of a device in what `udevadm info` prints."""
+    return [line.removeprefix("E: ") for line in text.splitlines() if line.startswith("E: ")]
+
+
+def groups() -> set[str]:
+    """Groups of the user that runs sudo, by the database."""
+    return set(must("id", "-nG", OPERATOR).split())
