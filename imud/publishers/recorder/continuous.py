@@ -129,22 +129,27 @@ class Recorder:
 
     # --- files -------------------------------------------------------------------------------------------------------
 
-    def _begin_file(self) -> None:
-        """Begin a file with what all records after it need."""
+    def _begin_file(self, end_of_last: str = "") -> None:
+        """Begin a file with what all records after it need; before it, end the last one, where a reason is given.
+
+        Each look at the clocks may record a reading of them: all come before the end of the last file.
+        """
         context, now_ns = self._context, self._context.now_ns()
         utc_ns = now_ns + context.utc_offset_ns()
         self._directory.in_use.discard(self._path.name)
         self._path = self._directory.new_file(utc_ns, context.epoch, self._number)
         self._directory.in_use.add(self._path.name)
+        session = self._feed.session(self._number, now_ns)
+        if end_of_last:
+            self._end_file(end_of_last)
         self._queue.mark(self._path)
-        self._feed.put(self._feed.session(self._number, now_ns))
+        self._feed.put(session)
         self._number += 1
         self._begun_ns = now_ns
         self._feed.describe(at_once=True)
 
     def _next_file(self, now_ns: int) -> None:
-        self._end_file("a new file begins")
-        self._begin_file()
+        self._begin_file("a new file begins")
         try:
             removed = self._directory.make_room(self._file_bytes)
         except OSError as error:

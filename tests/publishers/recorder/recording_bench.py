@@ -57,8 +57,10 @@ class RecordingBench:
         self.clock, self.source = VirtualClock(), HandSource()
         self.events: list[Event] = []
         self.workers: list[HandWorker] = []
+        self.on_clocks_read: Callable[[], None] = lambda: None
+        """Called where the recorder looks at the host's clocks, which may record a reading."""
         self.context = PublisherContext(
-            list, EPOCH, self.clock.now_ns, recording=self.source, utc_offset_ns=lambda: UTC_OFFSET_NS,
+            list, EPOCH, self.clock.now_ns, recording=self.source, utc_offset_ns=self._utc_offset_ns,
             raise_event=self.events.append,
         )  # fmt: skip
 
@@ -66,6 +68,10 @@ class RecordingBench:
         """As `StartWorker`."""
         self.workers.append(HandWorker(name, work, failed))
         return self.workers[-1]
+
+    def _utc_offset_ns(self) -> int:
+        self.on_clocks_read()
+        return UTC_OFFSET_NS
 
     def advance(self, seconds: float) -> int:
         """Let time pass; return CLOCK_MONOTONIC."""

@@ -93,6 +93,26 @@ def test_a_new_file_begins_by_size_and_by_time_with_the_states_again(tmp_path: P
     assert [one.number for one in sessions] == [0, 1, 2]
 
 
+def test_a_reading_of_the_clocks_stands_neither_after_the_end_of_a_file_nor_before_the_begin_of_one(
+    tmp_path: Path,
+) -> None:
+    bench = RecorderBench(tmp_path, file_minutes=1)
+    bench.tick()
+
+    def record_reading() -> None:
+        for put in bench.source.listening:
+            put(records.encode_clocks(records.ClocksRecord(1, 1, 1, 1, 1, 0)))
+
+    bench.on_clocks_read = record_reading
+    bench.tick(61)
+    bench.recorder.close()
+    assert len(list(bench.folder.iterdir())) == 2
+    for number in range(2):
+        found = bench.kinds(number)
+        assert Kind.CLOCKS in found
+        assert [found[0], found[-1]] == [Kind.SESSION, Kind.END]
+
+
 def test_what_is_dropped_stands_in_the_file_and_the_states_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
