@@ -1,6 +1,6 @@
 # make demo   one simulated sensor through the real daemon          make test   everything that needs no lab
 # make lab    tests on a booted kernel          make chaos  random faults on a booted kernel (ARGS="--seed N --seconds S")
-# make soak   100 devices, 20 clients, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
+# make soak   100 devices, 20 clients, all recorded, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
 # make test-pythons   the tests on every supported Python that is here; those that are missing are named
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 #                                                                   (14 minutes; ARGS=--short: at most 5)

@@ -16,21 +16,46 @@ import struct
 import sys
 import time
 from collections.abc import Callable
+from random import Random
 from typing import Final
 
 from imud.devices.imu61x.uart.codec import encode_ahrs
+from imud.sample import Vector3
 from imud.sim.ports.pty import sharpen_timers
+from imud.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 from tests.bench.writer import open_ptys, template
 
 BEGIN_NS: Final = 10_000_000
+SEED: Final = 25
+VALUES: Final = 997
+"""Different values that follow one another again and again: a recording cannot compress them away."""
+ACCEL_AND_GYRO: Final = slice(18, 42)
+"""Of a HI91 frame, in g and °/s."""
+
+
+def noisy_values() -> list[tuple[Vector3, Vector3]]:
+    """Acceleration and rotation rate of a module at rest, with its noise; the same in every run."""
+    random = Random(SEED)
+    return [
+        (
+            (random.gauss(0.1, 0.02), random.gauss(0.2, 0.02), random.gauss(9.8, 0.02)),
+            (random.gauss(0.01, 0.001), random.gauss(0.02, 0.001), random.gauss(0.03, 0.001)),
+        )
+        for _ in range(VALUES)
+    ]
 
 
 def hi91_frames(rate_hz: float) -> Callable[[int], bytes]:
     """Frames of a HiPNUC module by number."""
     frame = template()
     head = binascii.crc_hqx(bytes(frame[:4]), 0)
+    values = [
+        struct.pack("<6f", *(one / STANDARD_GRAVITY_M_S2 for one in accel), *(one / RAD_PER_DEG for one in gyro))
+        for accel, gyro in noisy_values()
+    ]
 
     def make(number: int) -> bytes:
+        frame[ACCEL_AND_GYRO] = values[number % VALUES]
         struct.pack_into("<I", frame, 14, int(number * 1000 / rate_hz))
         struct.pack_into("<H", frame, 4, binascii.crc_hqx(frame[6:], head))
         return bytes(frame)
@@ -40,10 +65,12 @@ def hi91_frames(rate_hz: float) -> Callable[[int], bytes]:
 
 def ahrs_frames(rate_hz: float) -> Callable[[int], bytes]:
     """Frames of an IMU61x by number."""
+    values = noisy_values()
 
     def make(number: int) -> bytes:
+        accel, gyro = values[number % VALUES]
         return encode_ahrs(
-            timer_us=int(number * 1e6 / rate_hz), accel_m_s2=(0.1, 0.2, 9.8), gyro_rad_s=(0.01, 0.02, 0.03),
+            timer_us=int(number * 1e6 / rate_hz), accel_m_s2=accel, gyro_rad_s=gyro,
             euler_rad=(0.1, 0.2, 0.3), temperature_c=30.0,
         )  # fmt: skip
 

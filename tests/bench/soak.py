@@ -1,9 +1,11 @@
-"""`make soak`: 100 devices at 1 … 400 Hz, 20 clients, a scrape every 5 s: memory flat, every loss in the ledger.
+"""`make soak`: 100 devices at 1 … 400 Hz, 20 clients, scrapes, all recorded: memory flat, every loss in the ledger.
 
 Passed means: anonymous memory rises by less than SLOPE_LIMIT after the first ten minutes; each device's samples are the
-frames that its pty took, and its losses those that it refused (±1); every ledger closes; a client misses only samples
-that the daemon says it dropped; descriptors and threads stay what they were. A run that is too short for a slope is
-held to a growth in its second half instead. In the first minutes the clients do not read for a while, until samples are
+frames that its pty took, and its losses those that it refused (±1); what a line of Modbus modules answered came as good
+frames; every ledger closes; a client misses only samples that the daemon says it dropped; descriptors and threads stay
+what they were; the recorder's account closes, and its files are whole and replay as the run was (`soak_recordings`).
+Nothing is drawn by chance: frames are made by number, noise has a seed. A run that is too short for a slope is held to
+a growth in its second half instead. In the first minutes the clients do not read for a while, until samples are
 dropped: what the queues need then is part of the memory that must not rise. The rings' shared memory is shown apart:
 its pages become resident when a device first writes them, which takes more than an hour at 1 Hz.
 """
@@ -26,14 +28,23 @@ import msgspec
 
 from imud.client import Client
 from imud.contracts.status import DeviceStatus
-from imud.ledger import bytes_open, frames_open
+from imud.ledger import bytes_open, frames_open, lost
+from tests.bench import soak_recordings
 from tests.bench.fleet_writer import hi91_frames
 from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Process, cpu_ns, wait_for
+from tests.bench.soak_recordings import Recordings
 from tests.bench.soak_single import run_single, slope_mb_per_h
 from tests.support.files import CaptureWriter
 
-RATES: Final = ((1.0, 42), (10.0, 22), (20.0, 14), (50.0, 8), (100.0, 3), (400.0, 1))
+RATES: Final = ((1.0, 34), (10.0, 22), (20.0, 14), (50.0, 8), (100.0, 3), (400.0, 1))
 """Rate in Hz and how many ptys have it; every other one is an IMU61x."""
+MODULES: Final = 8
+"""Modbus modules on one line behind a pty of its own, which imud asks at MODULE_HZ each."""
+MODULE_HZ: Final = 5.0
+MODULE_BAUD: Final = 115200
+LINE_SEED: Final = 25
+DEADLINE_TOLERANCE: Final = 2
+"""Deadlines between the moment for which a status stands and those before and after it was asked for."""
 REPLAYS: Final = 10
 REPLAY_HZ: Final = 10.0
 CLIENTS: Final = 20
@@ -49,6 +60,8 @@ BEHIND_AT_S: Final = 60.0
 BEHIND_S: Final = 10.0
 """Clients do not read for so long, until more waits for some than may."""
 TAIL_S: Final = 1.0
+END_LIMIT_S: Final = 20.0
+"""Until the daemon has written what waits and ended."""
 LOST_TOLERANCE: Final = 1
 
 
@@ -57,7 +70,7 @@ class Fleet:
     """The devices of a run."""
 
     written: tuple[str, ...]
-    """DRIVER:HZ of those behind ptys."""
+    """Names of those behind ptys that `fleet_writer` plays."""
     configuration: Path
 
 
@@ -76,8 +89,8 @@ def write_capture(path: Path, seconds: float) -> None:
             capture.write(make(number), int((number + 1) * 1e9 / REPLAY_HZ))
 
 
-def write_configuration(folder: Path, ports: list[str], port: int) -> Fleet:
-    """The configuration of everything below `folder`."""
+def write_configuration(folder: Path, ports: list[str], line: str, port: int) -> Fleet:
+    """The configuration of everything below `folder`; `line` is the port of the Modbus modules."""
     written = written_devices()
     devices: dict[str, Any] = {
         f"{name.partition(':')[0]}-{n}": {
@@ -90,17 +103,21 @@ def write_configuration(folder: Path, ports: list[str], port: int) -> Fleet:
     for n in range(REPLAYS):
         replay = {"path": str(folder / "capture"), "speed": "recorded"}
         devices[f"replay-{n}"] = {"driver": "hipnuc-uart", "identify": False, "replay": replay}
+    for address in range(1, MODULES + 1):
+        link = {"line": line, "baud": MODULE_BAUD, "address": address, "rate_hz": MODULE_HZ}
+        devices[f"modbus-{address}"] = {"driver": "hipnuc-modbus", "rs485": link}
     tree = {
         "log_level": "error",
         "state_dir": str(folder),
         "socket": {"path": str(folder / "s")},
         "shm": {"directory": str(folder)},
         "metrics": {"port": port},
+        "recorder": soak_recordings.settings(folder / "recordings"),
         "devices": devices,
     }
     file = folder / "imud.yaml"
     file.write_bytes(msgspec.json.encode(tree))
-    return Fleet(tuple(name for name in devices if not name.startswith("replay")), file)
+    return Fleet(tuple(name for name in devices if not name.startswith(("replay", "modbus"))), file)
 
 
 class Watched:
@@ -135,12 +152,12 @@ class Watched:
         """Print the figures of the last minute, or of what there was of it."""
         statuses, dropped = ask_all(self._socket)
         samples = sum(status.ledger["samples"] for status in statuses.values())
-        lost = sum(count for status in statuses.values() for name, count in status.ledger.items() if "lost_" in name)
+        missing = sum(count for status in statuses.values() for name, count in status.ledger.items() if "lost_" in name)
         used_ns = cpu_ns(self._pid)
         share = (used_ns - self._cpu_ns) / over_s / 1e9
         print(
             f"{elapsed_s:5.0f} s  RSS {self.points[-1][1]:6.2f} + {self._shared_mb:6.2f} MB shared  CPU {share:3.0%}  "
-            f"{(samples - self._samples) / over_s:6.0f} samples/s  lost {lost}  dropped {dropped}  "
+            f"{(samples - self._samples) / over_s:6.0f} samples/s  lost {missing}  dropped {dropped}  "
             f"fds {self.usage[-1][0]} threads {self.usage[-1][1]}  "
             f"scrape {self._scrape_ms:.0f} ms, {self._scrape_kb:.0f} kB",
             flush=True,
@@ -170,11 +187,11 @@ def judge(
     found = []
     for name, (taken, refused) in zip(fleet.written, counts, strict=True):
         ledger = statuses[name].ledger
-        lost = sum(count for key, count in ledger.items() if key.startswith("lost_"))
+        missing = sum(count for key, count in ledger.items() if key.startswith("lost_"))
         if ledger["samples"] != taken:
             found.append(f"{name}: {ledger['samples']} samples of {taken} frames that its pty took")
-        if abs(lost - refused) > LOST_TOLERANCE * (refused > 0):
-            found.append(f"{name}: the ledger says {lost} lost, its pty refused {refused}")
+        if abs(missing - refused) > LOST_TOLERANCE * (refused > 0):
+            found.append(f"{name}: the ledger says {missing} lost, its pty refused {refused}")
     for name, status in statuses.items():
         if bytes_open(status.ledger) or frames_open(status.ledger):
             found.append(f"{name}: the ledger does not close: {status.ledger}")
@@ -182,6 +199,57 @@ def judge(
             found.append(f"{name}: losses in a replay: {status.ledger}")
     if gaps > dropped:
         found.append(f"clients miss {gaps} samples, the daemon says it dropped {dropped}")
+    return found
+
+
+def start_line(stack: ExitStack) -> Process:
+    """The Modbus modules, which print their port."""
+    addresses = ",".join(map(str, range(1, MODULES + 1)))
+    argv = ["--device", "hipnuc-modbus", "--message", addresses, "--baud", str(MODULE_BAUD), "--seed", str(LINE_SEED)]
+    return stack.enter_context(Process(REST_CORES, "-m", "imud.sim", *argv))
+
+
+@dataclass(frozen=True)
+class LineState:
+    """What imud says of the Modbus modules, and what they say."""
+
+    asked_s: float
+    """CLOCK_MONOTONIC before …"""
+    answered_s: float
+    """… and after imud was asked."""
+    ledgers: Mapping[str, Mapping[str, int]]
+    failed: Mapping[str, int]
+    """Polls without a sample, by module: a loss after one of them is known within one."""
+    replies: int
+    """Replies that the modules had sent, asked after imud was."""
+
+
+def ask_line(path: Path, line: Process) -> LineState:
+    """The state now."""
+    asked_s, statuses, answered_s = monotonic(), ask_all(path)[0], monotonic()
+    modules = {name: status for name, status in statuses.items() if name.startswith("modbus")}
+    failed = {name: status.polling.failed if status.polling else 0 for name, status in modules.items()}
+    line.say("stats")
+    replies: int = json.loads(line.line())["answered"]
+    return LineState(asked_s, answered_s, {name: s.ledger for name, s in modules.items()}, failed, replies)
+
+
+def judge_line(begin: LineState, end: LineState) -> list[str]:
+    """What is wrong with the line: each deadline is a sample or a loss, and no module said more than it did.
+
+    A gap of which the ledger knows no size, after a module was searched for, leaves the sum of that module open.
+    """
+    found = []
+    for name, before in begin.ledgers.items():
+        after, failed = end.ledgers[name], end.failed[name] - begin.failed[name]
+        counted = after["samples"] + lost(after) - before["samples"] - lost(before)
+        due_min = MODULE_HZ * (end.asked_s - begin.answered_s) - failed - DEADLINE_TOLERANCE
+        due_max = MODULE_HZ * (end.answered_s - begin.asked_s) + failed + DEADLINE_TOLERANCE
+        if counted > due_max or (counted < due_min and after["lost_unknown"] == before["lost_unknown"]):
+            found.append(f"{name}: {counted} samples and losses, expected {due_min:.0f} to {due_max:.0f}")
+    good = sum(ledger["frames_good"] for ledger in end.ledgers.values())
+    if good > end.replies:
+        found.append(f"modbus: {good} good frames of {end.replies} that the modules sent")
     return found
 
 
@@ -200,8 +268,8 @@ def judge_memory(points: list[tuple[float, float]], seconds: float) -> tuple[str
     return words, growth < GROWTH_LIMIT_MB
 
 
-def watch_for(watched: Watched, readers: Process, seconds: float) -> None:
-    """Scrape and print until the time is over."""
+def watch_for(watched: Watched, recordings: Recordings, readers: Process, seconds: float) -> None:
+    """Scrape, read recordings and print until the time is over."""
     begin = monotonic()
     next_scrape, minute = 0.0, 0.0
     behind_s = min(BEHIND_AT_S, seconds / 4)
@@ -212,6 +280,7 @@ def watch_for(watched: Watched, readers: Process, seconds: float) -> None:
         if elapsed >= next_scrape:
             watched.scrape(elapsed)
             next_scrape += SCRAPE_S
+            recordings.look()
         if elapsed - minute >= MINUTE_S:
             watched.minute(elapsed, elapsed - minute)
             minute = elapsed
@@ -224,17 +293,19 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
     """Run for so long; return the exit status."""
     written = written_devices()
     print(
-        f"soak: {len(written)} devices behind ptys and {REPLAYS} replays, {sum(r * n for r, n in RATES):g} samples/s + "
-        f"{REPLAYS * REPLAY_HZ:g}, {CLIENTS} clients, a scrape every {SCRAPE_S:g} s, {seconds:g} s"
+        f"soak: {len(written)} devices behind ptys, {MODULES} Modbus modules on a line and {REPLAYS} replays, "
+        f"{sum(r * n for r, n in RATES):g} + {MODULES * MODULE_HZ:g} + {REPLAYS * REPLAY_HZ:g} samples/s, "
+        f"{CLIENTS} clients, a scrape every {SCRAPE_S:g} s, all recorded, {seconds:g} s"
     )
-    print("soak: CAN left out: it needs virtual CAN interfaces, which `make chaos` has in the lab")
+    print("soak: CAN, I2C and SPI left out: they need a kernel's buses, which `make chaos` has in the lab")
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-soak-") as name, ExitStack() as stack:
         folder = Path(name)
         write_capture(folder / "capture", seconds + START_LIMIT_S)
         writer = stack.enter_context(
             Process(REST_CORES, "-m", "tests.bench.fleet_writer", "--seconds", str(seconds), *written)
         )
-        fleet = write_configuration(folder, writer.line().split(), metrics_port)
+        line = start_line(stack)
+        fleet = write_configuration(folder, writer.line().split(), line.line(), metrics_port)
         server = stack.enter_context(Process(SERVER_CORE, "-m", "imud", "run", "-c", str(fleet.configuration)))
         wait_for(folder / "s")
         wait_open(folder / "s", fleet)
@@ -242,15 +313,21 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
         argv = ["--socket", str(folder / "s"), "--clients", str(CLIENTS), *names]
         readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.fleet_readers", *argv))
         readers.line()
-        watched = Watched(server.popen.pid, folder / "s", metrics_port)
+        watched, recordings = Watched(server.popen.pid, folder / "s", metrics_port), Recordings(folder / "recordings")
+        begin = ask_line(folder / "s", line)
         writer.say("go")
-        watch_for(watched, readers, seconds)
+        watch_for(watched, recordings, readers, seconds)
         counts = [tuple(pair) for pair in json.loads(writer.line())]
         sleep(TAIL_S)
         statuses, dropped = ask_all(folder / "s")
+        found = judge_line(begin, ask_line(folder / "s", line))
+        found += recordings.close_account(metrics_port)
         readers.say("end")
         figures = json.loads(readers.line())
-    found = judge(fleet, counts, statuses, dropped, figures["gaps"])
+        server.popen.terminate()
+        server.popen.wait(END_LIMIT_S)
+        recorded = recordings.finish()
+    found += recordings.problems + judge(fleet, counts, statuses, dropped, figures["gaps"])
     words, flat = judge_memory(watched.points, seconds)
     if not flat:
         found.append(words)
@@ -258,15 +335,19 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
         found.append(f"descriptors and threads {watched.usage[-1]}, in the beginning {watched.usage[0]}")
     taken, refused = (sum(column) for column in zip(*counts, strict=True))
     print(f"frames taken by ptys {taken}, refused {refused}; clients {figures}, dropped {dropped}; "
-          f"scrapes {len(watched.points)}, without a page {watched.unanswered}; {words}")  # fmt: skip
+          f"scrapes {len(watched.points)}, without a page {watched.unanswered}; {recorded}; {words}")  # fmt: skip
     print("\n".join(found or ["passed"]))
     return 1 if found else 0
 
 
 def wait_open(path: Path, fleet: Fleet) -> None:
-    """Wait until every pty is open. Raises TimeoutError."""
+    """Wait until every pty is open and every module of the line was found. Raises TimeoutError."""
     end = monotonic() + START_LIMIT_S
-    while any(ask_all(path)[0][name].state != "searching" for name in fleet.written):
+    while True:
+        states = {name: status.state for name, status in ask_all(path)[0].items()}
+        modules = [state for name, state in states.items() if name.startswith("modbus")]
+        if all(states[name] == "searching" for name in fleet.written) and set(modules) == {"running"}:
+            return
         if monotonic() > end:
             raise TimeoutError("the daemon did not open all ports")
         sleep(0.2)
