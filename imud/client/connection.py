@@ -12,11 +12,11 @@ import errno
 import os
 import socket
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import ExitStack
 from time import monotonic
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import msgspec
 
@@ -40,6 +40,8 @@ FDS_MAX: Final = 4
 INBOX_MAX: Final = 65536
 """Messages kept for an iterator while another one, or a question, waits for something else."""
 
+T = TypeVar("T")
+
 Message = dict[str, Any] | bytes
 """A JSON object, or whole slots."""
 
@@ -54,6 +56,33 @@ class Hello(msgspec.Struct, frozen=True):
     """Random number of this start of the daemon."""
     rights: tuple[str, ...]
     """`read`, `control`."""
+
+
+class WatchAnswer(msgspec.Struct, frozen=True):
+    """The answer to `watch`, as far as the client needs it."""
+
+    devices: dict[str, int]
+    """Device → its number in slots."""
+    convention: str | None = None
+
+
+class PollAnswer(msgspec.Struct, frozen=True):
+    """The answer to `poll`."""
+
+    samples: list[dict[str, Any]]
+    convention: str | None = None
+
+
+class StopAnswer(msgspec.Struct, frozen=True):
+    """The answer to `record.stop`."""
+
+    records_dropped: int
+
+
+class SnapshotAnswer(msgspec.Struct, frozen=True):
+    """The answer to `record.snapshot`."""
+
+    seconds: float
 
 
 class Client:
@@ -102,21 +131,21 @@ class Client:
 
     def devices(self) -> list[dict[str, Any]]:
         """Request the list of devices, one mapping each."""
-        return msgspec.convert(self.call("devices"), list[dict[str, Any]])
+        return self._answer("devices", list[dict[str, Any]])
 
     def status(self) -> dict[str, Any]:
         """Request the full status: `now_ns`, `devices`, `socket`."""
-        return msgspec.convert(self.call("status"), dict[str, Any])
+        return self._answer("status", dict[str, Any])
 
     def schema(self) -> dict[str, Any]:
         """Descriptions of the members of samples: `fields`, `devices`, `slot`."""
-        return msgspec.convert(self.call("schema"), dict[str, Any])
+        return self._answer("schema", dict[str, Any])
 
     def poll(self, devices: Iterable[str] | None = None, convention: str | None = None) -> list[Sample]:
         """Request the newest sample of each device that has one; `convention` as for `watch`."""
-        reply = self.call("poll", devices=_listed(devices), convention=convention)
-        _check_convention(reply, convention)
-        return [sample_of(params) for params in reply["samples"]]
+        reply = self._answer("poll", PollAnswer, devices=_listed(devices), convention=convention)
+        _check_convention(reply.convention, convention)
+        return [sample_of(params) for params in reply.samples]
 
     def call(self, method: str, **params: object) -> Any:
         """Call a method by its name; parameters that are None are left out. Returns the result as JSON values."""
@@ -154,17 +183,17 @@ class Client:
         `timeout_s` for a sample raises TimeoutError.
         """
         wanted = None if fields is None else sorted({*fields, "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
-        reply = self.call(
-            "watch", devices=_listed(devices), fields=wanted, rate_hz=rate_hz, encoding=encoding, convention=convention,
-            latency_ms=latency_ms,
+        reply = self._answer(
+            "watch", WatchAnswer, devices=_listed(devices), fields=wanted, rate_hz=rate_hz, encoding=encoding,
+            convention=convention, latency_ms=latency_ms,
         )  # fmt: skip
         if encoding == "binary":
             self._framed = True
-        _check_convention(reply, convention)
+        _check_convention(reply.convention, convention)
         self._end_watch()
         while self.kept_message(Watch.NAMES) is not None:
             pass  # of the earlier one
-        self._watch = Watch(self, reply["devices"], timeout_s)
+        self._watch = Watch(self, reply.devices, timeout_s)
         return self._watch
 
     def unwatch(self) -> None:
@@ -200,15 +229,15 @@ class Client:
 
     def stop_recording(self) -> int:
         """End the recording of this connection; what waits still comes. Return how many records were not read."""
-        return int(self.call("record.stop")["records_dropped"])
+        return self._answer("record.stop", StopAnswer).records_dropped
 
     def snapshot(self) -> tuple[int, float]:
         """A descriptor from which the last minutes are read, as with `record`, and how long they are, s.
 
         RpcError where the configuration has no flight recorder.
         """
-        seconds = self.call("record.snapshot")["seconds"]
-        return self._descriptor("record.snapshot"), float(seconds)
+        seconds = self._answer("record.snapshot", SnapshotAnswer).seconds
+        return self._descriptor("record.snapshot"), seconds
 
     def kept_message(self, names: frozenset[str]) -> Message | None:
         """Return the oldest such message among those kept while waiting for another; None for none."""
@@ -227,6 +256,14 @@ class Client:
         while not _is_one_of(message := self._receive(deadline_s, " or ".join(sorted(names))), names):
             self._keep(message)
         return message
+
+    def _answer(self, method: str, kind: type[T], **params: object) -> T:
+        """Call a method whose answer is of this form. Raises ServerError for one that is not."""
+        result = self.call(method, **params)
+        try:
+            return msgspec.convert(result, kind)
+        except msgspec.ValidationError as error:
+            raise ServerError(f"{self.path}: the answer to {method} is not understood: {reason_of(error)}") from error
 
     # --- messages ---------------------------------------------------------------------------------------------------
 
@@ -336,9 +373,9 @@ def _is_one_of(message: Message, names: frozenset[str]) -> bool:
     return "sample" in names if isinstance(message, bytes) else message.get("method") in names
 
 
-def _check_convention(reply: Mapping[str, Any], convention: str | None) -> None:
+def _check_convention(given: str | None, convention: str | None) -> None:
     """Raise ServerError where the daemon ignored the convention."""
-    if convention is not None and reply.get("convention") != convention:
+    if convention is not None and given != convention:
         raise ServerError(f"the daemon gives no samples as {convention}: it is older than this client")
 
 

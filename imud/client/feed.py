@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from imud.client.connection import Client, Hello
-from imud.client.watch import EventStream, Watch, event_of
+from imud.client.watch import EventStream, Watch, event_of, params_of
 from imud.contracts.status import DeviceStatus
 from imud.errors import ImudError
 from imud.event import Event
@@ -189,7 +189,7 @@ class _Reading:
         try:
             if self._watch is None:
                 message = self._client.next_message(EventStream.NAMES, limit_s)
-                self._first_event = event_of(message.get("params", {})) if isinstance(message, dict) else None
+                self._first_event = event_of(params_of(message)) if isinstance(message, dict) else None
             else:
                 while monotonic() < end_s and len(found) < SAMPLES_MAX:
                     found.append(next(self._watch))
@@ -204,7 +204,7 @@ class _Reading:
             found.append(self._first_event)
             self._first_event = None
         while isinstance(message := self._client.kept_message(EventStream.NAMES), dict):
-            found.append(event_of(message.get("params", {})))
+            found.append(event_of(params_of(message)))
         return tuple(found)
 
 

@@ -2,17 +2,45 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Protocol, Self, TypeVar
 
 import msgspec
 
 from imud.contracts.settings import wrong_values
-from imud.errors import ServerError
+from imud.errors import ServerError, reason_of
 from imud.event import Event, kind_of
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.sample import Sample
 
 _DEVICE_ID_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")
+
+
+T = TypeVar("T")
+
+
+class DeviceNumber(msgspec.Struct, frozen=True):
+    """The number of a device in slots."""
+
+    device: str
+    device_id: int
+
+
+class DroppedSamples(msgspec.Struct, frozen=True):
+    """How many samples of a device were dropped."""
+
+    device: str
+    dropped: int
+
+
+class ToldEvent(msgspec.Struct, frozen=True):
+    """An event as it came."""
+
+    t_ns: int
+    device: str
+    kind: str
+    """Of an older or newer daemon it may be one that this client does not know."""
+    message: str
+    detail: dict[str, Any] = {}  # msgspec copies a mutable default
 
 
 class Source(Protocol):
@@ -67,14 +95,16 @@ class Watch:
             for start in range(0, len(message), SLOT_BYTES):
                 self._ready.append(self._decode(message[start : start + SLOT_BYTES]))
             return
-        params = message.get("params", {})
+        params = params_of(message)
         if message["method"] == "device":
-            self.device_ids[params["device"]] = params["device_id"]
-            self._names[params["device_id"]] = params["device"]
+            known = _understood(params, DeviceNumber, "the number of a device")
+            self.device_ids[known.device] = known.device_id
+            self._names[known.device_id] = known.device
             return
-        dropped = params.pop("dropped", 0)
-        if dropped:
-            self._note_dropped(params["device"], dropped)
+        if params.get("dropped"):
+            lost = _understood(params, DroppedSamples, "a number of dropped samples")
+            self._note_dropped(lost.device, lost.dropped)
+        params.pop("dropped", None)
         if message["method"] == "sample":
             self._ready.append(sample_of(params))
 
@@ -109,7 +139,7 @@ class EventStream:
     def __next__(self) -> Event:
         message = self._source.next_message(self.NAMES, self._timeout_s)
         assert isinstance(message, dict)
-        return event_of(message.get("params", {}))
+        return event_of(params_of(message))
 
 
 def sample_of(params: Mapping[str, Any]) -> Sample:
@@ -124,12 +154,24 @@ def sample_of(params: Mapping[str, Any]) -> Sample:
 
 def event_of(params: Mapping[str, Any]) -> Event:
     """Decode the event in a JSON notification. An unknown kind stays a plain string. Raises ServerError."""
+    told = _understood(params, ToldEvent, "an event")
+    return Event(told.t_ns, told.device, kind_of(told.kind), told.message, told.detail)
+
+
+def params_of(message: Mapping[str, Any]) -> dict[str, Any]:
+    """The members of a notification. Raises ServerError."""
+    params = message.get("params", {})
+    if not isinstance(params, dict):
+        raise ServerError(f"a notification {message.get('method')!r:.80} whose members are not understood")
+    return params
+
+
+def _understood(params: Mapping[str, Any], kind: type[T], what: str) -> T:
+    """The members of a notification in this form; `what` is for the message. Raises ServerError."""
     try:
-        kind = kind_of(params["kind"])
-        event = Event(params["t_ns"], params["device"], kind, params["message"], params.get("detail", {}))
-    except KeyError as error:
-        raise ServerError(f"an event without its member {error}") from error
-    return event
+        return msgspec.convert(params, kind)
+    except msgspec.ValidationError as error:
+        raise ServerError(f"{what} that is not understood: {reason_of(error)}") from error
 
 
 def _with_nan(value: object) -> object:

@@ -41,19 +41,6 @@ FAILURE_S: Final = 2.0
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a login."""
-
-    token: str
-
-
-class CallRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a question or an order."""
-
-    method: str
-    params: dict[str, Any] = {}  # msgspec copies a mutable default
-
-
 class WebServer:
     """The server for the daemon at `path`. `make_app` makes what aiohttp runs."""
 
@@ -114,8 +101,8 @@ class WebServer:
 
     async def _login(self, request: web.Request) -> web.StreamResponse:
         try:
-            token = msgspec.json.decode(await request.read(), type=LoginRequest).token
-        except msgspec.DecodeError:
+            token = messages.decode_body(await request.read(), messages.LoginRequest).token
+        except ValueError:
             return _refusal(400, 'expected a token, as {"token": "…"}')
         if not self._guard.has_token:
             return _refusal(403, "this server was started without a token: nothing can be controlled")
@@ -170,15 +157,15 @@ class WebServer:
     def _looked(self, browser: Browser, text: str) -> None:
         assert self.hub is not None
         try:
-            self.hub.look(browser, messages.decode_look(text))
-        except msgspec.DecodeError:
+            self.hub.look(browser, messages.decode_body(text, messages.Look))
+        except ValueError:
             problem = messages.ProblemMessage("the page asked for something that imud web does not know: reload it")
             browser.mailbox.put_newest("problem", messages.encode(problem).decode())
 
     async def _call(self, request: web.Request) -> web.StreamResponse:
         try:
-            asked = msgspec.json.decode(await request.read(), type=CallRequest)
-        except msgspec.DecodeError:
+            asked = messages.decode_body(await request.read(), messages.CallRequest)
+        except ValueError:
             return _refusal(400, 'expected a method and its parameters, as {"method": "status", "params": {}}')
         rights = self._rights_of(request)
         if asked.method not in READING | CONTROLLING:
@@ -188,7 +175,7 @@ class WebServer:
             return _refusal(401, "expected the token: log in first")
         return await self._answered(asked)
 
-    async def _answered(self, asked: CallRequest) -> web.Response:
+    async def _answered(self, asked: messages.CallRequest) -> web.Response:
         try:
             return _answer({"result": await self._calls.call(asked.method, asked.params)})
         except RpcError as error:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from imud.client.connection import rpc_error
+from imud.client.watch import params_of
 from imud.errors import LinkDenied, LinkMissing, ServerError, reason_of
 from imud.formats.jsonrpc import PROTOCOL, encode_request, line_of, parse_object
 
@@ -61,7 +62,7 @@ class Calls:
             hello = await self._message(reader)
             if "error" in hello:
                 raise LinkDenied(f"the daemon refuses: {rpc_error(hello['error'])}")
-            if hello.get("params", {}).get("protocol") != PROTOCOL:
+            if params_of(hello).get("protocol") != PROTOCOL:
                 raise ServerError(f"{self._path}: expected a daemon of protocol {PROTOCOL}")
             writer.write(line_of(encode_request(method, params, 1)))
             await writer.drain()

@@ -1,9 +1,11 @@
 """Contract of the messages between `imud web` and its page: JSON objects on a WebSocket. Times are s as floating-point
 numbers, since JavaScript has no integers of 64 bits; at an uptime of a year a double still resolves 4 ns."""
 
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 import msgspec
+
+T = TypeVar("T")
 
 RATES_HZ: Final = (10, 20, 50)
 """Buckets per second that a page can ask for."""
@@ -174,6 +176,26 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     by sending the one of before."""
 
 
+class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a login."""
+
+    token: str
+
+
+class CallRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of a question or an order."""
+
+    method: str
+    params: dict[str, Any] = {}  # msgspec copies a mutable default
+
+
 encode: Final = msgspec.json.Encoder().encode
 """JSON; NaN and infinity are null."""
-decode_look: Final = msgspec.json.Decoder(Look).decode
+
+
+def decode_body(body: bytes | str, kind: type[T]) -> T:
+    """What a page sent, in this form. Raises ValueError for anything else."""
+    try:
+        return msgspec.json.decode(body, type=kind)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error

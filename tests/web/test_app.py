@@ -156,6 +156,19 @@ def test_control_needs_the_token_and_a_cookie_does_for_it(tmp_path: Path) -> Non
     run(body)
 
 
+@pytest.mark.parametrize(
+    "body", [b'{"method":"actions","params":{"a":' + b"[" * 30_000, b'{"method":"\xff"}', b"", b"[]"]
+)
+def test_a_body_that_cannot_be_read_is_refused(tmp_path: Path, body: bytes) -> None:
+    async def work() -> None:
+        async with running(tmp_path) as site:
+            for path in ("/api/call", "/api/login"):
+                answer = await site.client.post(path, data=body, headers=BEARER)
+                assert (answer.status, "expected" in (await answer.json())["error"]) == (400, True), path
+
+    run(work)
+
+
 def test_reading_can_need_the_token_too(tmp_path: Path) -> None:
     async def body() -> None:
         async with running(tmp_path, reading_needs_token=True) as site:

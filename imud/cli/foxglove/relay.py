@@ -11,7 +11,7 @@ import msgspec
 from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.json_channels import JsonDialect
 from imud.client import Client
-from imud.client.watch import EventStream, Watch, event_of
+from imud.client.watch import EventStream, Watch, event_of, params_of
 from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.status import DeviceStatus
 from imud.errors import ImudError
@@ -118,7 +118,7 @@ class Relay:
             else:
                 self._show_samples(watch)
             while isinstance(message := client.kept_message(EventStream.NAMES), dict):
-                self._show_event(event_of(message.get("params", {})))
+                self._show_event(event_of(params_of(message)))
 
     def _show_samples(self, watch: Watch) -> None:
         """Relay what comes in a round, each at once."""
