@@ -53,6 +53,23 @@ def test_atheris_tries_the_same_again_with_the_same_seed(tmp_path: Path) -> None
     assert kept[0][:shared] == kept[1][:shared]
 
 
+@pytest.mark.parametrize(
+    ("ci", "user", "apt"), [("true", 0, True), ("", 0, True), ("true", 1000, True), ("true", 0, False)]
+)
+def test_a_gate_that_could_install_clang_does_not_leave_the_header_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], ci: str, user: int, *, apt: bool
+) -> None:
+    monkeypatch.setenv("CI", ci)
+    monkeypatch.setattr("os.geteuid", lambda: user)
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/apt-get" if name == "apt-get" and apt else None)
+    if ci and not user and apt:
+        with pytest.raises(SystemExit, match="there is no clang"):
+            runner.plan([], "hypothesis")
+        return
+    assert ("c-header", "clang") not in runner.plan([], "hypothesis")
+    assert "c-header is left out: there is no clang" in capsys.readouterr().out
+
+
 def test_a_result_shows_its_findings() -> None:
     good = runner.Result("utc/rmc", "atheris", 1000, 10.0, "82", "145", "22", (), failed=False)
     assert str(good).split() == ["utc/rmc", "atheris", "1000", "100", "82", "145", "22", "none"]
