@@ -18,6 +18,9 @@ GROUPS: Final = {
     "http": "tests.fuzz.scrape",
     "mqtt": "tests.fuzz.broker",
     "fleet": "tests.fuzz.fleet",
+    "command": "tests.fuzz.commands",
+    "state": "tests.fuzz.state",
+    "client": "tests.fuzz.answers",
 }
 """Module of each group; imported when one of its targets is used, so that only its code is instrumented."""
 

@@ -1,15 +1,19 @@
 """What fuzzing found, one test each."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from imud import config
-from imud.errors import ConfigError
+from imud.client.watch import EventStream, Watch
+from imud.errors import ConfigError, ServerError
+from imud.formats.jsonrpc import encode_result, line_of
 from imud.formats.ring import OFFSETS
 from imud.publishers.metrics.publisher import encoder_for
 from imud.utc.sentence_stream import LINE_BYTES_MAX, SentenceSplitter
-from tests.fuzz import c_header
+from imud.web.messages import CallRequest, LoginRequest, Look, decode_body
+from tests.fuzz import answers, c_header
 from tests.fuzz.shm import HEALTH, written
 
 SENTENCE = b"$GPRMC,083559.00,A,4717.11437,N,00833.91522,E,0.004,77.52,091202,,,A*57\r\n"
@@ -59,6 +63,60 @@ def test_bad_options_of_a_polled_driver_are_refused(text: str) -> None:
     """config/yaml: the load of a bus was computed from options that could not be read, an AttributeError."""
     with pytest.raises(ConfigError, match=r"imud\.yaml:1:.*options"):
         config.parse(text, "imud.yaml")
+
+
+@pytest.mark.parametrize("kind", [LoginRequest, CallRequest, Look])
+@pytest.mark.parametrize(
+    "body", [b'{"params":{"a":' + b"[" * 30_000, b'{"token":"\xff","method":"\xff","device":"\xff"}']
+)
+def test_a_body_that_is_no_text_or_too_deep_is_refused_in_one_way(kind: type, body: bytes) -> None:
+    """http/request: a POST to `imud web` with either was answered with 500, and a traceback in the log."""
+    with pytest.raises(ValueError, match=r"nested too deeply|can't decode byte|unknown field|malformed"):
+        decode_body(body, kind)
+
+
+@pytest.mark.parametrize("result", [None, 5, [], {}, "x"])
+def test_an_answer_of_another_form_is_a_server_error(result: object) -> None:
+    """client/answers: TypeError, KeyError and msgspec's ValidationError came out of the client's methods."""
+    answer = line_of(encode_result(1, result))
+    for use in (0, 2, 4):  # questions, samples, the end of a recording
+        answers.run(bytes([use]) + answer)
+
+
+@pytest.mark.parametrize(
+    ("name", "params"),
+    [
+        ("sample", []),
+        ("sample", {"device": "bow", "dropped": "x"}),
+        ("device", {"device": "bow"}),
+        ("device", {"device": "bow", "device_id": []}),
+    ],
+)
+def test_a_notification_of_another_form_is_a_server_error(name: str, params: object) -> None:
+    """client/answers: a TypeError or KeyError ended the iterator."""
+    message = {"method": name, "params": params}
+    with pytest.raises(ServerError, match="understood"):
+        next(Watch(_Once(message), {"bow": 0}, None))
+
+
+@pytest.mark.parametrize("params", [[], {"t_ns": "x", "device": "bow", "kind": "up", "message": ""}])
+def test_an_event_of_another_form_is_a_server_error(params: object) -> None:
+    """client/answers: as it came, or a TypeError."""
+    with pytest.raises(ServerError, match="understood"):
+        next(EventStream(_Once({"method": "event", "params": params}), None))
+
+
+class _Once:
+    """A source with one message."""
+
+    def __init__(self, message: dict[str, Any]) -> None:
+        self._message = message
+
+    def kept_message(self, _names: frozenset[str]) -> None:
+        return None
+
+    def next_message(self, _names: frozenset[str], _timeout_s: float | None) -> dict[str, Any]:
+        return self._message
 
 
 def test_heartbeat_at_the_end_of_its_range_is_no_undefined_behaviour(tmp_path: Path) -> None:

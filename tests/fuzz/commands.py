@@ -1,0 +1,131 @@
+"""The command channel over MQTT: whatever comes on its topics, what runs is in the list, fresh, and runs once."""
+
+import asyncio
+import logging
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, Final
+
+import msgspec
+
+from imud.devices import DRIVERS
+from imud.errors import Rejected
+from imud.formats.fleet.commands import CommandAnswer, Outcome
+from imud.formats.fleet.messages import VERSION
+from imud.formats.fleet.topics import ANSWER, COMMAND, topic_of
+from imud.publishers.mqtt.broker import Received
+from imud.publishers.mqtt.commands import WAITING_MAX, CommandChannel, CommandReply
+from imud.publishers.mqtt.settings import CommandSettings
+from imud.publishers.mqtt.streams import Gateway
+from imud.units import NS_PER_S
+from tests.fuzz.target import Target
+from tests.support.socket_rig import FakeControl
+
+UTC_NS: Final = 1_800_000_000 * NS_PER_S
+AGE_NS: Final = NS_PER_S
+SETTINGS: Final = CommandSettings(enabled=True, actions=["output", "mode", "bow/save"], per_minute=12)
+GATEWAY: Final = Gateway("site", "gw", "0")
+TOPIC: Final = topic_of("site", "gw", "bow", COMMAND)
+OWN: Final = topic_of("site", "gw", "bow", ANSWER)
+SEPARATOR: Final = b"\t"
+"""Between topic, wanted response topic and payload; messages are lines. JSON needs neither."""
+ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
+
+
+def names() -> Sequence[str]:
+    """The one target."""
+    return ["request"]
+
+
+def make(_name: str) -> Target:
+    """The channel with all that it takes apart."""
+    logging.getLogger("imud.publishers.mqtt.commands").setLevel(logging.CRITICAL)
+    return Target(run, seeds, words=words)
+
+
+class _Control(FakeControl):
+    """A device that notes what it is asked, after the check of the arguments that the daemon makes."""
+
+    def __init__(self, device: str, asked: list[tuple[str, str]]) -> None:
+        super().__init__(device)
+        self._device, self._asked = device, asked
+
+    async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
+        self._asked.append((self._device, name))
+        if name not in ACTIONS:
+            raise Rejected(f"no action {name}")
+        ACTIONS[name].arguments(arguments)
+        return {"done": name}
+
+
+@cache
+def _loop() -> asyncio.AbstractEventLoop:
+    return asyncio.new_event_loop()
+
+
+def run(data: bytes) -> None:
+    """Take each message, carry out what may be, and look at all that came of it."""
+    asked: list[tuple[str, str]] = []
+    replies: list[CommandReply] = []
+    channel = CommandChannel(SETTINGS, GATEWAY, lambda name: _Control(name, asked), lambda: AGE_NS, lambda: UTC_NS)
+    channel.answer = replies.append
+    messages = data.split(b"\n")
+    for number, message in enumerate(messages):
+        topic, wanted, payload = [*message.split(SEPARATOR, 2), b"", b""][:3]
+        texts = [one.decode("utf-8", "replace") for one in (topic, wanted)]
+        channel.take(Received(texts[0], payload, number % 16 == 15, texts[1], topic[:3] or None))
+    _loop().run_until_complete(_carry_out(channel))
+    answers = [msgspec.json.decode(reply.payload, type=CommandAnswer) for reply in replies]
+    carried_out = [answer for answer in answers if answer.outcome in (Outcome.DONE, Outcome.FAILED)]
+    assert channel.run == len(asked) == len(carried_out) <= min(SETTINGS.per_minute, WAITING_MAX)
+    assert channel.run + channel.refused == len(messages)
+    assert len({answer.id for answer in carried_out}) == len(carried_out)
+    assert all(SETTINGS.allows(device, action) for device, action in asked)
+    for reply, answer in zip(replies, answers, strict=True):
+        own, below = topic_of("site", "gw", answer.device, ANSWER), reply.topic.rpartition("/")[0]
+        assert own in (reply.topic, below)
+        assert not {"+", "#", "\0"} & set(reply.topic)
+        assert "defect" not in answer.error, answer.error
+
+
+async def _carry_out(channel: CommandChannel) -> None:
+    """Let the loop turn until nothing waits: an action here takes one turn."""
+    for _ in range(2 * WAITING_MAX + 2):
+        channel.run_next()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+    channel.close()
+
+
+def _message(identifier: str, action: str, arguments: object, *, topic: str = TOPIC, wanted: str = "") -> bytes:
+    request = {"v": VERSION, "id": identifier, "action": action, "arguments": arguments}
+    payload = msgspec.json.encode({**request, "issued_utc_ns": UTC_NS + AGE_NS})
+    return SEPARATOR.join((topic.encode(), wanted.encode(), payload))
+
+
+def seeds() -> list[bytes]:
+    """Each action; a request that comes twice, many, old ones, other topics, answers elsewhere, what is none."""
+    every = [_message(f"id-{n}", action, {"rate_hz": 100}) for n, action in enumerate(ACTIONS)]
+    twice = _message("a", "save", {})
+    odd = [
+        b"",
+        SEPARATOR.join((TOPIC.encode(), b"", b"{}")),
+        SEPARATOR.join((TOPIC.encode(), b"", b"[" * 2000)),
+        SEPARATOR.join((TOPIC.encode(), b"", b'"\xff"')),
+        _message("b", "save", {"a": [1e300, None, "\U0001f600", {"b": 2**63}]}),
+        _message("c", "save", {}, topic="imud/site/other/bow/command"),
+        _message("d", "save", {}, topic="imud/site/gw/stern/command"),
+        _message("e", "save", {}, wanted=f"{OWN}/mine"),
+        _message("f", "save", {}, wanted="imud/site/other/bow/state"),
+        _message("g", "save", {}).replace(str(UTC_NS + AGE_NS).encode(), str(2**70).encode()),
+    ]
+    return [
+        *every[:6], b"\n".join(every), twice + b"\n" + twice, *odd, b"\n".join(odd),
+        b"\n".join(_message(f"n{n}", "save", {}) for n in range(16)),
+    ]  # fmt: skip
+
+
+def words() -> list[bytes]:
+    """Names of members and actions."""
+    own = ["v", "id", "action", "arguments", "issued_utc_ns", *ACTIONS]
+    return [TOPIC.encode(), OWN.encode(), SEPARATOR, str(UTC_NS + AGE_NS).encode(), *(f'"{w}"'.encode() for w in own)]

@@ -1,0 +1,82 @@
+"""Files of the state directory: whatever is in `found.json` and `settings.json`, the daemon starts and goes on."""
+
+import atexit
+import logging
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from imud.runtime.detection import remembered
+from imud.runtime.detection.remembered import Remembered, RememberedDevice
+from imud.runtime.settings import flash
+from imud.runtime.settings.flash import LIMIT_ASKED, MODULES_MAX, FlashWrites
+from imud.units import NS_PER_S
+from tests.fuzz.target import Target
+
+UTC_NS: Final = 1_800_000_000 * NS_PER_S
+MODULE: Final = "hipnuc 0123"
+
+
+def names() -> Sequence[str]:
+    """The one target."""
+    return ["json"]
+
+
+def make(_name: str) -> Target:
+    """Both files, as the daemon reads, changes and writes them."""
+    logging.getLogger("imud.runtime.state_file").setLevel(logging.CRITICAL)
+    return Target(run, seeds, words=words)
+
+
+@cache
+def _folder() -> Path:
+    folder = tempfile.TemporaryDirectory(prefix="imud-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
+    atexit.register(folder.cleanup)
+    return Path(folder.name)
+
+
+def run(data: bytes) -> None:
+    """What the daemon makes of the file as either; what it then writes is read again."""
+    folder = _folder()
+    (folder / remembered.FILE_NAME).write_bytes(data)
+    devices = Remembered(folder)
+    assert isinstance(devices.get("bow"), RememberedDevice | None)
+    devices.put("new", RememberedDevice("hipnuc-uart", 115200))
+    devices.close()
+    assert Remembered(None).get("new") is None
+    again = msgspec.json.decode((folder / remembered.FILE_NAME).read_bytes(), type=dict[str, RememberedDevice])
+    assert again["new"] == devices.get("new")
+    (folder / flash.FILE_NAME).write_bytes(data)
+    writes = FlashWrites(folder, lambda: UTC_NS)
+    before = writes.writes(MODULE)
+    assert bool(writes.refusal(MODULE, asked=True)) == (writes.writes_day(MODULE) >= LIMIT_ASKED)
+    writes.count(MODULE)
+    assert writes.writes(MODULE) == before + 1
+    assert 1 <= writes.writes_day(MODULE) <= LIMIT_ASKED
+    writes.keep_told(MODULE, {"a": 1})
+    writes.close()
+    kept = msgspec.json.decode((folder / flash.FILE_NAME).read_bytes(), type=dict[str, flash.ModuleRecord])
+    assert len(kept) <= MODULES_MAX
+    assert kept[MODULE].writes == before + 1
+
+
+def seeds() -> list[bytes]:
+    """Both files as they are written, times of the future, numbers that are too large, what is none."""
+    record = {"writes": 3, "times_s": [UTC_NS // NS_PER_S - 5, 2**40], "told": {"rate_hz": 100, "axes": [1, None]}}
+    found = {"bow": {"driver": "hipnuc-uart", "baud": 921600}, "c": {"driver": "imu61x-can", "baud": 0, "node": 5}}
+    trees = [
+        found, {MODULE: record}, {MODULE: {"writes": 2**63 - 1}}, {MODULE: {"writes": 2**64 - 1, "times_s": [2**63]}},
+        {MODULE: {"writes": -5, "times_s": list(range(100))}}, {}, [], {str(n): {} for n in range(50)},
+    ]  # fmt: skip
+    texts = [b"", b"[" * 3000, b"\xff", b'{"hipnuc 0123":{"writes":1e3,"told":{"a":1e400}}}', b"{" * 10]
+    huge = b'{"hipnuc 0123":{"writes":' + b"9" * 40 + b',"times_s":[' + b"9" * 40 + b"]}}"
+    return [*map(msgspec.json.encode, trees), *texts, huge]
+
+
+def words() -> list[bytes]:
+    """Names of members."""
+    return [f'"{word}"'.encode() for word in (MODULE, "writes", "times_s", "told", "bow", "driver", "baud", "node")]
