@@ -39,10 +39,14 @@ class ServerSide:
 class Connection:
     """A connected client with at least the right to read. Synchronization: the event loop's thread."""
 
-    def __init__(self, number: int, sock: socket.socket, peer: Peer, rights: Rights, server: ServerSide) -> None:
+    def __init__(
+        self, number: int, sock: socket.socket, peer: Peer, rights: Rights, server: ServerSide, reserved: bool = False
+    ) -> None:
         self.number = number
         self.peer = peer
         self.rights = rights
+        self.reserved = reserved
+        """Whether it has one of the places that are reserved for those who can set things right."""
         self.outbox = Outbox(sock, server.limits, server.pool, self)
         self.wakers = ClientWakers()
         self.closed = False

@@ -53,7 +53,7 @@ class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     clients_max: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
     """At most so many clients at a time; one more gets an error and is disconnected."""
     clients_per_user: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 128
-    """At most so many of them belong to one user; root and the daemon's own user may have them all."""
+    """At most so many of them belong to one user; not for root and the daemon's own user."""
     memory_mb: Annotated[int, msgspec.Meta(ge=8, le=4096)] = 64
     """At most so much memory for what waits for all clients together."""
     queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
@@ -185,21 +185,23 @@ class SocketServer:
             sock.close()
             return
         rights = self._guard.rights_of(peer)
-        refusal = self._refusal(peer, rights, sock.fileno())
-        if refusal is not None:
+        try:
+            reserved = self._admit(peer, rights, sock.fileno())
+        except RpcError as refusal:
             self.hub.count_refused()
             _refuse(sock, refusal)
             return
         assert self._side is not None
-        connection = Connection(self.hub.next_number(), sock, peer, rights, self._side)
+        connection = Connection(self.hub.next_number(), sock, peer, rights, self._side, reserved)
         self.hub.add(connection)
         connection.post(hello(self.hub, connection))
 
-    def _refusal(self, peer: Peer, rights: Rights, fd: int) -> RpcError | None:
+    def _admit(self, peer: Peer, rights: Rights, fd: int) -> bool:
+        """Return whether the client's place is a reserved one. Raises RpcError when it is refused."""
         if Rights.READ not in rights:
             message = f"uid {peer.uid} may not read: expected root or a member of group {self._settings.group!r}"
-            return RpcError(Code.DENIED, message)
-        return self._quota.refuse_client(peer, rights, fd, self.hub.connections.values())
+            raise RpcError(Code.DENIED, message)
+        return self._quota.admit(peer, rights, fd, self.hub.connections.values())
 
     def _on_line(self, connection: Connection, line: bytes) -> None:
         handle_line(self.hub, connection, line)

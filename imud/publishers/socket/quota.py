@@ -3,11 +3,18 @@
 | limit                        | for                                   | why                                         |
 |------------------------------|---------------------------------------|---------------------------------------------|
 | clients in all               | all                                   | memory is bounded                           |
-| but RESERVED_CLIENTS         | all but root, own user, control group | those who can set things right get in       |
+| open places                  | all                                   | the other RESERVED_CLIENTS are for those    |
+|                              |                                       | who can set things right                    |
+| reserved places              | own user, control group               | those of one user lock out no other         |
+| places of root               | root                                  | root gets in whatever all others do         |
 | clients and wakers of a user | all but root, own user                | one user cannot use up what is for all      |
 | selections of fields         | all                                   | each is encoded apart                       |
 | connections per second       | all but root                          | a connection costs 0.1 ms of CPU time       |
-| numbers of descriptors       | all                                   | the highest RESERVED_FDS are for devices |
+| numbers of descriptors       | all                                   | the highest RESERVED_FDS are for devices,   |
+|                              |                                       | but one for each reserved place             |
+
+A client has the place that it got when it connected until it leaves: an open one while there are any, else one of those
+reserved for it. Clients of root have root's places first, then open ones.
 """
 
 import resource
@@ -22,7 +29,9 @@ from imud.publishers.socket.serving import TokenBucket
 from imud.units import NS_PER_S
 
 RESERVED_CLIENTS: Final = 16
-"""At most a quarter of all."""
+"""At most a quarter of all; places of root are among them."""
+ROOT_SHARE: Final = 4
+"""One of so many reserved places is root's alone, and a user may have one of so many of the others; at least one."""
 RESERVED_FDS: Final = 256
 """At most a quarter of the process limit. A device that is plugged in needs up to five, a scrape one."""
 FDS_MAX: Final = 16384
@@ -43,6 +52,10 @@ class Connected(Protocol):
     def peer(self) -> Peer: ...
     @property
     def wakers(self) -> Collection[str]: ...
+    @property
+    def reserved(self) -> bool:
+        """Whether it has a reserved place, as `Quota.admit` said."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +67,19 @@ class Shares:
     clients_per_user: int
 
     @property
-    def open_clients(self) -> int:
-        """Those that are not reserved."""
-        return self.clients - min(RESERVED_CLIENTS, self.clients // 4)
+    def reserved(self) -> int:
+        """Places that are not open to all."""
+        return min(RESERVED_CLIENTS, self.clients // 4)
+
+    @property
+    def root(self) -> int:
+        """Those of the reserved places that only root can have."""
+        return _share_of(self.reserved)
+
+    @property
+    def reserved_per_user(self) -> int:
+        """Of the other reserved places, those that one user may have."""
+        return _share_of(self.reserved - self.root)
 
 
 class Quota:
@@ -66,27 +89,54 @@ class Quota:
         self._shares = shares
         self._own_uid = own_uid
         self._fd_end = fd_limit - min(RESERVED_FDS, fd_limit // 4)
+        self._reserved_fd_end = self._fd_end + shares.reserved
         self._now_ns = now_ns
         self._connects: dict[int, TokenBucket] = {}
         self._forms: dict[int, Counter[object]] = {}
         """How many clients of each user watch samples in each form."""
 
-    def refuse_client(self, peer: Peer, rights: Rights, fd: int, clients: Collection[Connected]) -> RpcError | None:
-        """Why a client that has just connected with the right to read cannot stay; None if it can."""
-        if peer.uid and not self._count_connect(peer.uid):
-            return _too_many(f"uid {peer.uid} connects more than {CONNECTS_PER_S} times a second")
-        count, most = len(clients), self._shares.clients
-        if count >= most:
-            return _too_many(f"there are {most} clients already, as many as socket.clients_max allows")
-        if peer.uid in (0, self._own_uid):
-            return self._refuse_fd(fd)
-        if count >= self._shares.open_clients and Rights.CONTROL not in rights:
-            return _too_many(
-                f"there are {count} clients already; the others that socket.clients_max allows are reserved"
+    def admit(self, peer: Peer, rights: Rights, fd: int, clients: Collection[Connected]) -> bool:
+        """Let a client in that has just connected with the right to read; return whether its place is a reserved one.
+
+        Raises RpcError when it cannot stay. `clients` are those that have been let in before.
+        """
+        uid = peer.uid
+        if uid and not self._count_connect(uid):
+            raise _too_many(f"uid {uid} connects more than {CONNECTS_PER_S} times a second")
+        if len(clients) >= self._shares.clients:
+            most = self._shares.clients
+            raise _too_many(f"there are {most} clients already, as many as socket.clients_max allows")
+        if not uid:
+            self._check_fd(fd, self._reserved_fd_end)
+            return False
+        own = sum(client.peer.uid == uid for client in clients)
+        if uid != self._own_uid and own >= self._shares.clients_per_user:
+            raise _too_many(f"uid {uid} has as many clients already as socket.clients_per_user allows")
+        if fd < self._fd_end and self._has_open_place(clients):
+            return False
+        if uid != self._own_uid and Rights.CONTROL not in rights:
+            self._check_fd(fd, self._fd_end)
+            raise _too_many(
+                f"there are {len(clients)} clients already; the others that socket.clients_max allows are reserved"
             )
-        if sum(client.peer.uid == peer.uid for client in clients) >= self._shares.clients_per_user:
-            return _too_many(f"uid {peer.uid} has as many clients already as socket.clients_per_user allows")
-        return self._refuse_fd(fd)
+        self._check_reserved(uid, clients)
+        self._check_fd(fd, self._reserved_fd_end)
+        return True
+
+    def _has_open_place(self, clients: Collection[Connected]) -> bool:
+        shares = self._shares
+        reserved = sum(client.reserved for client in clients)
+        of_root = sum(not client.peer.uid for client in clients)
+        taken = len(clients) - reserved - min(of_root, shares.root)
+        return taken < shares.clients - shares.reserved
+
+    def _check_reserved(self, uid: int, clients: Collection[Connected]) -> None:
+        """Raise RpcError when there is no reserved place for a user other than root."""
+        users = [client.peer.uid for client in clients if client.reserved]
+        if users.count(uid) >= self._shares.reserved_per_user:
+            raise _too_many(f"uid {uid} has {users.count(uid)} of the reserved places already, as many as a user may")
+        if len(users) >= self._shares.reserved - self._shares.root:
+            raise _too_many("all reserved places are taken; those that are left are for root")
 
     def check_waker(self, peer: Peer, clients: Collection[Connected]) -> None:
         """Raises RpcError when a user has as many wakers as it may."""
@@ -144,9 +194,11 @@ class Quota:
         bucket.use(1)
         return True
 
-    def _refuse_fd(self, fd: int) -> RpcError | None:
+    @staticmethod
+    def _check_fd(fd: int, end: int) -> None:
         """The kernel gives the lowest number that is free: one this high means that all below are in use."""
-        return _too_many("the daemon has no descriptor to spare for clients") if fd >= self._fd_end else None
+        if fd >= end:
+            raise _too_many("the daemon has no descriptor to spare for clients")
 
 
 class Seldom:
@@ -180,3 +232,8 @@ def raise_fd_limit() -> int:
 
 def _too_many(message: str) -> RpcError:
     return RpcError(Code.TOO_MANY_CLIENTS, message)
+
+
+def _share_of(places: int) -> int:
+    """One of ROOT_SHARE; at least one where there is any."""
+    return max(min(places, 1), places // ROOT_SHARE)

@@ -21,6 +21,7 @@ class Client:
 
     peer: Peer
     wakers: list[str] = field(default_factory=list)
+    reserved: bool = False
 
 
 class House:
@@ -34,12 +35,24 @@ class House:
     def connect(self, uid: int, rights: Rights = READ, fd: int = 50) -> str:
         """Let one in; why not, if not."""
         peer = Peer(1, uid, frozenset())
-        refusal = self.quota.refuse_client(peer, rights, fd, self.clients)
-        if refusal is None:
-            self.clients.append(Client(peer))
-            return ""
-        assert refusal.code == Code.TOO_MANY_CLIENTS
-        return str(refusal)
+        try:
+            reserved = self.quota.admit(peer, rights, fd, self.clients)
+        except RpcError as refusal:
+            return str(refusal) if refusal.code == Code.TOO_MANY_CLIENTS else pytest.fail(str(refusal))
+        self.clients.append(Client(peer, reserved=reserved))
+        return ""
+
+    def fill(self, uids: tuple[int, ...], rights: Rights = READ) -> int:
+        """Let clients of these users in, in turns, until none of them gets in; how many did."""
+        before = len(self.clients)
+        while [uid for uid in uids if not self.connect(uid, rights)]:
+            pass
+        return len(self.clients) - before
+
+    def leave(self, uid: int, count: int) -> None:
+        """Have the oldest clients of a user leave."""
+        for client in [client for client in self.clients if client.peer.uid == uid][:count]:
+            self.clients.remove(client)
 
 
 def test_one_user_gets_its_share_and_others_get_in() -> None:
@@ -57,19 +70,83 @@ def test_many_users_leave_places_for_root_and_control() -> None:
     assert all("reserved" in words for words in outcomes[48:])
     assert house.connect(0, ALL) == ""
     assert house.connect(OWN_UID) == ""
-    assert [house.connect(2000, ALL) for _ in range(14)] == [""] * 14
+    assert [house.connect(2000, ALL) for _ in range(14)].count("") == 3
+    assert [house.connect(2001, ALL) for _ in range(14)].count("") == 3
+
+
+def test_root_and_another_member_get_in_beside_two_readers_and_a_member_that_take_all() -> None:
+    """With the defaults: 128 and 112 clients of two readers and 16 of one member of the control group are 256."""
+    house = House(clients=256, per_user=128)
+    assert house.fill((1000, 1001)) == 240
+    assert house.fill((2000,), ALL) == 3
+    assert "uid 2000 has 3 of the reserved places" in house.connect(2000, ALL)
+    assert house.connect(2001, ALL) == ""
+    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
+
+
+def test_root_has_places_that_nobody_else_can_take() -> None:
+    house = House(clients=256, per_user=128)
+    house.fill(tuple(range(1000, 1010)))
+    house.fill((OWN_UID, *range(2000, 2010)), ALL)
+    assert len(house.clients) == 252
+    assert "for root" in house.connect(2011, ALL)
+    assert [house.connect(0, ALL) for _ in range(5)].count("") == 4
+    assert len(house.clients) == 256  # the total is kept
     assert "socket.clients_max" in house.connect(0, ALL)
 
 
-def test_a_member_of_the_control_group_cannot_lock_out_root() -> None:
-    house = House()
-    assert [house.connect(1000, ALL) for _ in range(30)].count("") == 20
+def test_the_daemon_s_own_user_does_not_lock_out_root_and_control() -> None:
+    house = House(clients=256, per_user=128)
+    assert house.fill((OWN_UID,)) == 243
+    assert house.connect(2000, ALL) == ""
     assert house.connect(0, ALL) == ""
 
 
-def test_a_small_house_has_no_reserved_places() -> None:
-    house = House(clients=2)
-    assert [house.connect(1000), house.connect(1000)] == ["", ""]
+def test_places_that_come_free_do_not_give_a_member_more_of_the_reserved_ones() -> None:
+    house = House(clients=256, per_user=128)
+    house.fill((1000, 1001))
+    house.fill((2000,), ALL)
+    for _ in range(10):  # takes what readers leave, who come back for more
+        house.leave(1000, 30)
+        house.fill((2000,), ALL)
+        house.fill((1000, 1001))
+        assert house.connect(2001, ALL) == ""
+        house.leave(2001, 1)
+        house.leave(2000, 20)
+        house.fill((1000, 1001))
+        house.fill((2000,), ALL)
+        assert house.connect(2001, ALL) == ""
+        house.leave(2001, 1)
+        assert house.connect(0, ALL) == ""
+        house.leave(0, 1)
+
+
+def test_a_member_with_many_clients_has_reserved_places_besides() -> None:
+    house = House(clients=256, per_user=128)
+    assert [house.connect(2000, ALL) for _ in range(20)] == [""] * 20
+    house.fill((1000, 1001))
+    assert house.connect(2000, ALL) == ""
+
+
+def test_root_s_own_clients_take_its_own_places_first() -> None:
+    house = House(clients=256, per_user=128)
+    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
+    assert house.fill((1000, 1001)) == 240
+    house = House(clients=256, per_user=128)
+    assert [house.connect(0, ALL) for _ in range(20)] == [""] * 20
+    assert house.fill((1000, 1001)) == 224  # the others of root have open places
+    assert [house.connect(uid, ALL) for uid in (2000, 2001, 2002, 2003)] == [""] * 4
+
+
+def test_a_small_house_has_few_reserved_places_or_none() -> None:
+    house = House(clients=3)
+    assert [house.connect(1000) for _ in range(4)].count("") == 3
+    house = House(clients=4)
+    assert [house.connect(1000) for _ in range(4)].count("") == 3
+    assert house.connect(0, ALL) == ""
+    house = House(clients=8)
+    assert [house.connect(1000) for _ in range(8)].count("") == 6
+    assert [house.connect(2000, ALL), house.connect(0, ALL)] == ["", ""]
 
 
 def test_connecting_again_and_again_is_limited_by_user() -> None:
@@ -92,7 +169,9 @@ def test_high_descriptors_are_kept_for_devices() -> None:
     house = House(fd_limit=1024)
     assert house.connect(1000, fd=767) == ""
     assert "descriptor" in house.connect(1000, fd=768)
-    assert "descriptor" in house.connect(0, fd=768)
+    assert "descriptor" in house.connect(OWN_UID, fd=784)
+    assert [house.connect(uid, ALL, fd=783) for uid in (0, 2000)] == ["", ""]  # one for each reserved place
+    assert "descriptor" in house.connect(0, ALL, fd=784)
     house.quota.check_fds((5, 767))
     with pytest.raises(RpcError, match="no descriptor to spare"):
         house.quota.check_fds((5, 768))
