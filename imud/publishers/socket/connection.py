@@ -160,11 +160,16 @@ class Connection:
     def on_failure(self, error: Exception) -> None:
         """End the connection with an error: what its request met is a mistake in this program."""
         self._server.on_failed(error)
-        if not self.closed:
+        if self.closed:
+            return
+        try:
             self.post(
                 encode_error(RpcError(Code.INTERNAL, "an error in the daemon, which is logged; this connection ends"))
             )
             self.finish()
+        except Exception:
+            log.exception("client %d is closed without the reason: that cannot be sent either", self.number)
+            self.close()
 
     def on_overload(self) -> None:
         """Evict the client."""

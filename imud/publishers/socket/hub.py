@@ -142,12 +142,17 @@ class Hub:
         end_ns = now_ns() + WAKE_NS
         while waiting:
             for _ in range(min(CLIENTS_PER_LOOK, len(waiting))):
-                connection = waiting.pop()
-                if not connection.wakers.wake(device):
-                    self._forget_waker(connection, device)
+                self._wake(waiting.pop(), device)
             if waiting and now_ns() > end_ns:
                 asyncio.get_running_loop().call_soon(self._wake_some, device)
                 return
+
+    def _wake(self, connection: Connection, device: str) -> None:
+        try:
+            if not connection.wakers.wake(device):
+                self._forget_waker(connection, device)
+        except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+            connection.on_failure(error)
 
     def _forget_waker(self, connection: Connection, device: str) -> None:
         wanting = self._wanting_wake.get(device)
@@ -230,6 +235,11 @@ class Hub:
         self._accepted += 1
         return self._accepted
 
+    @property
+    def accepted(self) -> int:
+        """Connections accepted since start; the number of the newest."""
+        return self._accepted
+
     def add(self, connection: Connection) -> None:
         """Add a client that was accepted."""
         self._connections[connection.number] = connection
@@ -267,6 +277,14 @@ class Hub:
         """The state of the socket."""
         return SocketStatus(self.path, self.clients(), self._accepted, self._refused, self._evicted, self._failed)
 
+    def tick(self) -> None:
+        """Close clients that lingered long enough."""
+        for connection in list(self._connections.values()):
+            try:
+                connection.tick()
+            except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+                connection.on_failure(error)
+
     def close(self) -> None:
         """Close every client and cancel what is still being carried out; may be called twice."""
         self.recordings.close()
@@ -283,7 +301,10 @@ class Hub:
 def post_all(connections: Iterable[Connection], body: bytes) -> None:
     """Send one JSON object to several clients."""
     for connection in connections:
-        connection.post(body)
+        try:
+            connection.post(body)
+        except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+            connection.on_failure(error)
 
 
 def _asker(connection: Connection, notified: str = "") -> str:

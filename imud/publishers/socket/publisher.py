@@ -129,8 +129,7 @@ class SocketServer:
 
     def tick(self, now_ns: int) -> None:
         """Close what lingered long enough, fill allowances; accept again after a pause."""
-        for connection in list(self.hub.connections.values()):
-            connection.tick()
+        self.hub.tick()
         if self._side is not None:
             self._side.scheduler.tick()
             self._pool.trim()
@@ -179,6 +178,19 @@ class SocketServer:
         self._paused = True
 
     def _welcome(self, sock: socket.socket) -> None:
+        """Let a client in or refuse it. Whatever it meets ends that client, not the daemon."""
+        before = self.hub.accepted
+        try:
+            self._let_in(sock)
+        except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+            made = self.hub.connections.get(before + 1)
+            if made is not None:
+                made.on_failure(error)
+            else:
+                self.hub.count_failed(error)
+                sock.close()
+
+    def _let_in(self, sock: socket.socket) -> None:
         try:
             peer = peer_of(sock)
         except OSError:  # gone already

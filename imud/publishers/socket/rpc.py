@@ -148,15 +148,15 @@ def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
 async def _answer_later(connection: Connection, request: RpcRequest, later: Later) -> None:
     """Wait for the result and send it."""
     try:
-        result = await later
-        body = encode_result(request.request_id, result, texts=connection.text_numbers)
-    except ImudError as error:
-        body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
+        try:
+            result = await later
+            body = encode_result(request.request_id, result, texts=connection.text_numbers)
+        except ImudError as error:
+            body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
+        if request.wants_reply:
+            connection.post(body)
     except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
         connection.on_failure(error)
-        return
-    if request.wants_reply:
-        connection.post(body)
 
 
 def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Later | None:

@@ -14,6 +14,7 @@ the one served last, so what was consumed long ago does not count.
 """
 
 import asyncio
+import logging
 import select
 from collections.abc import Callable
 from enum import Enum, auto
@@ -21,6 +22,8 @@ from heapq import heappop, heappush
 from typing import Final, Protocol
 
 from imud.units import NS_PER_S
+
+log = logging.getLogger(__name__)
 
 TURN_NS: Final = 1_000_000
 """Serving in one turn of the event loop: a period of a 1 kHz device, whose samples are read between two turns."""
@@ -218,12 +221,12 @@ class Scheduler:
 
     def add(self, client: ServedClient, fd: int, number: int, uid: int) -> Place:
         """Wait for requests of a client from now on; clients of one user have the same `uid`."""
+        self._epoll.register(fd, select.EPOLLIN | select.EPOLLONESHOT)
         user = self._users.get(uid)
         if user is None:
             user = self._users[uid] = _User(uid, self._served_ns)
         user.clients += 1
         place = self._places[fd] = Place(self, client, fd, number, user, self._now_ns())
-        self._epoll.register(fd, select.EPOLLIN | select.EPOLLONESHOT)
         return place
 
     def remove(self, place: Place) -> None:
@@ -264,11 +267,17 @@ class Scheduler:
             place.over_ticks = place.over_ticks + 1 if place.state is _State.PARKED else max(0, place.over_ticks - 1)
         for place in list(self._parked):
             if place.over_ticks > OVER_TICKS_MAX:
-                place.client.on_overload()
+                self._overload(place)
             elif not place.is_over:
                 del self._parked[place]
                 place.state = _State.IDLE
                 self.line_up(place)
+
+    def _overload(self, place: Place) -> None:
+        try:
+            place.client.on_overload()
+        except Exception as error:  # noqa: BLE001 - whatever one client meets ends that client, not the daemon
+            self._fail(place, error)
 
     def close(self) -> None:
         """Serve nobody any more; may be called twice."""
@@ -327,8 +336,14 @@ class Scheduler:
         for fd, events in self._epoll.poll(0, EVENTS_MAX):
             place = self._places.get(fd)
             if place is not None:
-                place.client.on_ready(events)
-                place.line_up()
+                self._on_ready(place, events)
+
+    def _on_ready(self, place: Place, events: int) -> None:
+        try:
+            place.client.on_ready(events)
+            place.line_up()
+        except Exception as error:  # noqa: BLE001 - as above
+            self._fail(place, error)
 
     def _next(self, all_of_them: bool) -> Place | None:
         """Take the next client out of the line; None if there is none, or none of those that may be served now."""
@@ -354,16 +369,27 @@ class Scheduler:
         try:
             more = client.serve()
         except Exception as error:  # noqa: BLE001 - whatever one client's request meets ends that client, not the daemon
-            client.on_failure(error)
+            self._fail(place, error)
             more = True
         place.charge(self._cpu_ns() - begun_ns + PIECE_NS)
         if place.state is not _State.SERVED:
             return
         place.state = _State.IDLE
         if not more:
-            self.arm(place)
+            try:
+                self.arm(place)
+            except Exception as error:  # noqa: BLE001 - as above
+                self._fail(place, error)
         elif place.is_over:
             place.state = _State.PARKED
             self._parked[place] = None
         else:
             self.line_up(place)
+
+    def _fail(self, place: Place, error: Exception) -> None:
+        """End a client that met a mistake of ours; one that cannot even be ended is served no more."""
+        try:
+            place.client.on_failure(error)
+        except Exception:
+            log.exception("client %d cannot be ended, and is served no more", place.number)
+            place.leave()

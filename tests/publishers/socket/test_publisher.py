@@ -6,6 +6,7 @@ import os
 import random
 import socket
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,19 @@ from imud.publishers import PUBLISHERS
 from imud.publishers.socket.publisher import PUBLISHER, SocketServer, SocketSettings
 from imud.publishers.socket.quota import FORMS_PER_USER
 from imud.sample import SAMPLE_FIELDS
-from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, Peer, batch, context, run, sample, serving, until
+from tests.support.socket_rig import (
+    DEVICES,
+    EPOCH,
+    NOW_NS,
+    Peer,
+    batch,
+    context,
+    done_late,
+    run,
+    sample,
+    serving,
+    until,
+)
 
 
 def test_row_is_the_table_s() -> None:
@@ -431,3 +444,80 @@ def test_running_out_of_descriptors_is_logged_once(
 
     run(body)
     assert caplog.text.count("cannot accept") == 1
+
+
+def broken(*_args: object, **_names: object) -> bytes:
+    """A mistake of ours."""
+    raise ZeroDivisionError("a mistake")
+
+
+@pytest.mark.parametrize(
+    "place", ["Quota.admit", "Connection.__init__", "hello", "peer_of"], ids=lambda place: place.split(".")[0]
+)
+def test_an_error_while_a_client_is_welcomed_ends_that_client_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            good = await Peer.greeted(server)
+            with monkeypatch.context() as patch:
+                patch.setattr(f"imud.publishers.socket.publisher.{place}", broken)
+                bad = await Peer.connect(server)
+                if place == "hello":
+                    assert (await bad.message())["error"]["code"] == -32603
+                assert await bad.ended()
+            assert server.hub.status().failed == 1
+            assert len(server.hub.connections) == 1
+            other = await Peer.greeted(server)
+            for peer in (good, other):
+                assert len(await peer.result("devices")) == 2
+            for peer in (good, bad, other):
+                peer.close()
+
+    run(body)
+
+
+@pytest.mark.parametrize("what", ["wake", "tick", "event", "reply"])
+def test_an_error_in_one_client_s_part_ends_that_client_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    async def body() -> None:
+        async with serving(tmp_path) as server:
+            bad, good = await Peer.greeted(server), await Peer.greeted(server)
+            connection, _ = server.hub.connections.values()
+            for peer in (bad, good):
+                await peer.result("events")
+            os.close(await descriptor(bad))
+            if what == "wake":
+                monkeypatch.setattr(connection.wakers, "wake", broken)
+                server.publish(batch())
+            elif what == "tick":
+                monkeypatch.setattr(connection, "tick", broken)
+                server.tick(0)
+            else:
+                monkeypatch.setattr(connection, "post", broken)
+                if what == "event":
+                    server.event(Event(5, "", EventKind.UP, "back"))
+                else:
+                    done_late.set()
+                    await bad.send(
+                        b'{"jsonrpc":"2.0","id":9,"method":"command","params":{"device":"imu0","name":"wait"}}\n'
+                    )
+            await until(lambda: connection.closed)
+            assert server.hub.status().failed == 1
+            assert len(await good.result("devices")) == 2
+            bad.close()
+            good.close()
+
+    done_late.clear()
+    run(body)
+
+
+async def descriptor(peer: Peer) -> int:
+    """Ask to be woken by imu0; the descriptor."""
+    await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
+    while True:
+        await asyncio.sleep(0)
+        with suppress(BlockingIOError):
+            _data, fds, _flags, _address = socket.recv_fds(peer.sock, 4096, 4)
+            return fds[0]

@@ -217,6 +217,59 @@ def test_an_error_ends_that_client_and_no_other(caplog: pytest.LogCaptureFixture
     run(body)
 
 
+@pytest.mark.parametrize("where", ["on_overload", "on_ready", "wanted_events"])
+def test_an_error_outside_of_a_piece_ends_that_client_too(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """None of them may reach the loop, whose handler ends the daemon; `run` fails then."""
+
+    async def body() -> None:
+        with scheduling() as rig:
+            bad, place = rig.add("bad", 1, 10_000 if where == "on_overload" else 1, 5 * MS)
+
+            def broken(*_: object) -> int:
+                raise ZeroDivisionError(where)
+
+            monkeypatch.setattr(bad, where, broken)
+            if where == "on_ready":
+                rig.socks[1].send(b"x")
+            else:
+                place.line_up()
+            for _ in range(serving.OVER_TICKS_MAX + 10):
+                for _ in range(30):
+                    await asyncio.sleep(0)
+                rig.clock.ns += 2 * MS
+                rig.scheduler.tick()
+                if bad.failures:
+                    break
+            assert str(bad.failures[0]) == where
+            other, other_place = rig.add("other", 1, 1, 1000)
+            other_place.line_up()
+            await until(lambda: not other.pieces)
+
+    run(body)
+
+
+def test_a_client_that_cannot_even_be_ended_is_served_no_more(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def body() -> None:
+        with scheduling() as rig:
+            bad, place = rig.add("bad", 1, 1000, 1000)
+            bad.error = RecursionError("deep")
+
+            def broken(_error: Exception) -> None:
+                raise ZeroDivisionError
+
+            monkeypatch.setattr(bad, "on_failure", broken)
+            other, other_place = rig.add("other", 1, 3, 1000)
+            place.line_up()
+            other_place.line_up()
+            await until(lambda: not other.pieces)
+            assert rig.log.count("bad") == 1
+
+    run(body)
+    assert "served no more" in caplog.text
+
+
 def test_a_client_that_left_is_not_served() -> None:
     async def body() -> None:
         with scheduling() as rig:
