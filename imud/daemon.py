@@ -9,7 +9,7 @@ import gc
 import logging
 import secrets
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -83,7 +83,8 @@ class Daemon:
         self._latencies = LatencyBudget()
         self._context = PublisherContext(
             self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns, self.ledgers,
-            latencies=self._latencies, recording=DeviceTaps(self._devices, host), utc_offset_ns=host.utc_offset_ns,
+            status_in_turn=self.each_status, latencies=self._latencies,
+            recording=DeviceTaps(self._devices, host), utc_offset_ns=host.utc_offset_ns,
             raise_event=self._send_event, watch_line=watching(lines, host.now_ns),
         )  # fmt: skip
         self._extra = dict(extra or {})
@@ -211,6 +212,13 @@ class Daemon:
     def status(self) -> list[DeviceStatus]:
         """Return the state of every device."""
         return [device.status() for device in self._devices.values()]
+
+    def each_status(self) -> Iterator[DeviceStatus]:
+        """Return the state of each device when its turn comes; one that is removed in between is left out."""
+        for name in list(self._devices):
+            device = self._devices.get(name)
+            if device is not None:
+                yield device.status()
 
     def ledgers(self) -> list[DeviceLedger]:
         """Return the ledger of every device."""

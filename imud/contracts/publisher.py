@@ -1,6 +1,6 @@
 """Contract of a publisher: it outputs samples and events, and never makes the pipeline wait."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Final, Protocol
@@ -196,6 +196,8 @@ class PublisherContext:
     """CPU time of the event loop's thread."""
     ledger_source: Callable[[], Sequence[DeviceLedger]] | None = None
     """`ledgers` without the rest of the state, which costs five times as much; None: from `status`."""
+    status_in_turn: Callable[[], Iterator[DeviceStatus]] | None = None
+    """`each_status`; None: `status` at once."""
     client_sources: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     """Publishers that serve clients add a callable while they are open, so that another can show them."""
     recorder_sources: list[Callable[[], RecorderStatus]] = field(default_factory=list)
@@ -228,6 +230,13 @@ class PublisherContext:
         if self.ledger_source is not None:
             return self.ledger_source()
         return [(status.name, status.driver, status.ledger) for status in self.status()]
+
+    def each_status(self) -> Iterator[DeviceStatus]:
+        """The state of every device, each taken when its turn comes: for answers that are made in pieces.
+
+        To be called, and gone through, in the event loop's thread only.
+        """
+        return iter(self.status()) if self.status_in_turn is None else self.status_in_turn()
 
     def clients(self) -> list[ClientStatus]:
         """The clients of all publishers now. To be called in the event loop's thread only."""

@@ -3,7 +3,7 @@
 import logging
 import select
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,7 +17,8 @@ from imud.publishers.socket.waker import ClientWakers
 log = logging.getLogger(__name__)
 
 RECV_BYTES: Final = 16384
-"""What is read at once; nothing is read while a whole line waits, so a client has at most this and a line in memory."""
+"""What is read at once; nothing is read while a whole line waits, so a client has at most this and a line in memory,
+which the pool counts."""
 BLANK: Final = b" \t\r\n"
 LINGER_TICKS: Final = 20
 """A client that ended its side has so many ticks (100 ms each) to read what still waits for it."""
@@ -44,6 +45,7 @@ class Connection:
     ) -> None:
         self.number = number
         self.peer = peer
+        self.uid = peer.uid
         self.rights = rights
         self.reserved = reserved
         """Whether it has one of the places that are reserved for those who can set things right."""
@@ -57,6 +59,9 @@ class Connection:
         self._server = server
         self._input = bytearray()
         self._searched = 0
+        self._work: Iterator[int] | None = None
+        """An answer in the making."""
+        self._made_bytes = 0
         self._readable = self._writable = False
         self._linger_ticks: int | None = None
         self._place = server.scheduler.add(self, sock.fileno(), number, peer.uid)
@@ -78,6 +83,11 @@ class Connection:
         self._framed = True
 
     @property
+    def unread_bytes(self) -> int:
+        """What the client has sent and is not carried out yet, and its answer in the making."""
+        return len(self._input) + self._made_bytes
+
+    @property
     def finishing(self) -> bool:
         """Whether the connection only sends what waits, and ends then."""
         return self._linger_ticks is not None
@@ -97,11 +107,19 @@ class Connection:
             queue_bytes=outbox.queue_bytes,
         )
 
+    def work_on(self, work: Iterator[int]) -> None:
+        """Have an answer made in pieces, one now and one in each turn of the client; no request is read meanwhile.
+
+        Each piece gives the bytes that it holds by then; the last one posts the answer.
+        """
+        self._work = work
+        self._step()
+
     def finish(self) -> None:
         """Read nothing more from the client, send what waits, then close; no-op if already so."""
         if self.closed or self.finishing:
             return
-        self._input.clear()
+        self._drop_requests()
         self._linger_ticks = LINGER_TICKS
         if not self.outbox.waiting:
             self.close()
@@ -122,7 +140,7 @@ class Connection:
         self.outbox.close()
         self._sock.close()
         self.wakers.close()
-        self._input.clear()
+        self._drop_requests()
         self._server.on_close(self)
 
     def evict(self, reason: str) -> None:
@@ -144,12 +162,12 @@ class Connection:
         if self._writable and self.outbox.waiting:
             self.outbox.flush()
         if not self.closed and not self.finishing:
-            line = self._next_line()
-            if line is None and self._readable and not self.finishing:
-                self._read()
-                line = self._next_line()
-            if line is not None:
-                self._server.on_line(self, line)
+            if self._work is not None:
+                self._step()
+            else:
+                self._serve_line()
+        if not self.closed:
+            self.outbox.count_owned(self.unread_bytes)
         return self._has_work()
 
     def wanted_events(self) -> int:
@@ -162,6 +180,7 @@ class Connection:
         self._server.on_failed(error)
         if self.closed:
             return
+        self._drop_requests()
         try:
             self.post(
                 encode_error(RpcError(Code.INTERNAL, "an error in the daemon, which is logged; this connection ends"))
@@ -180,7 +199,31 @@ class Connection:
             return False
         if self._writable and self.outbox.waiting:
             return True
-        return not self.finishing and (self._readable or self._input.find(b"\n", self._searched) >= 0)
+        return not self.finishing and (
+            self._work is not None or self._readable or self._input.find(b"\n", self._searched) >= 0
+        )
+
+    def _serve_line(self) -> None:
+        line = self._next_line()
+        if line is None and self._readable and not self.finishing:
+            self._read()
+            line = self._next_line()
+        if line is not None:
+            self._server.on_line(self, line)
+
+    def _step(self) -> None:
+        """Make the next piece of the answer."""
+        assert self._work is not None
+        made_bytes = next(self._work, None)
+        if made_bytes is None:
+            self._work = None
+        self._made_bytes = made_bytes or 0
+
+    def _drop_requests(self) -> None:
+        """Forget what the client has sent and asked."""
+        self._input.clear()
+        self._work = None
+        self._made_bytes = 0
 
     def _read(self) -> None:
         try:
@@ -231,7 +274,7 @@ class Connection:
 
     def on_flooded(self) -> None:
         """Evict the client."""
-        self.evict("it does not read the answers to what it asks")
+        self.evict("it makes the daemon hold too much: it does not read the answers to what it asks")
 
     def on_full(self) -> None:
         """Go on sending when the socket has room."""

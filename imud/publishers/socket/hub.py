@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Collection, Coroutine, Iterable, Mapping
+from collections.abc import Collection, Coroutine, Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from imud.contracts.publisher import Batch, PublisherContext
@@ -271,11 +271,18 @@ class Hub:
 
     def clients(self) -> tuple[ClientStatus, ...]:
         """The state of every client."""
-        return tuple(connection.status(self._encoding(number)) for number, connection in self._connections.items())
+        return tuple(self.each_client())
 
-    def status(self) -> SocketStatus:
-        """The state of the socket."""
-        return SocketStatus(self.path, self.clients(), self._accepted, self._refused, self._evicted, self._failed)
+    def each_client(self) -> Iterator[ClientStatus]:
+        """The state of every client that is there now, each as it is when its turn comes."""
+        for number, connection in list(self._connections.items()):
+            yield connection.status(self._encoding(number))
+
+    def status(self, clients: tuple[ClientStatus, ...] | None = None) -> SocketStatus:
+        """The state of the socket; `clients` are those asked for before, None: now."""
+        if clients is None:
+            clients = self.clients()
+        return SocketStatus(self.path, clients, self._accepted, self._refused, self._evicted, self._failed)
 
     def tick(self) -> None:
         """Close clients that lingered long enough."""

@@ -13,8 +13,8 @@ is encoded when the first client sends it.
 
 import array
 import socket
-from collections import deque
-from collections.abc import Iterable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -26,6 +26,8 @@ CHUNK_BYTES: Final = 32768
 """Queued messages are sent together up to this size: what a socket buffer of the usual 208 KiB takes at once."""
 SAMPLE_BYTES: Final = 300
 """What a sample in a queue needs in addition to its message, most of it shared by the clients of a form."""
+REPLY_BYTES: Final = 200
+"""What a reply in a queue needs in addition to its text: the objects around it."""
 NO_FD: Final = -1
 
 
@@ -80,28 +82,47 @@ class Delivery:
 
 
 class Pool:
-    """What waits for all clients together: three eighths of `limit_bytes` for samples, an eighth for replies.
+    """All memory that clients make the daemon hold: half of `limit_bytes` for samples, half for everything else.
 
-    The other half is for messages that were sent in part and for what clients have sent and is not carried out yet,
-    which have a limit for each client: 32 KiB or one message, and 80 KiB (connection.py).
+    Samples: each client that waits has an equal share of three eighths of the limit. The share shrinks with each client
+    that begins to wait; when half of the limit is full in between, all are cut to their share at once.
+
+    Everything else (replies, messages that were sent in part, what clients have sent and is not carried out yet,
+    answers in the making): over the limit, clients are disconnected until it is kept. Of the user that makes the daemon
+    hold most, it is the client with most, times how long none of it has moved: one that reads its reply, however
+    large, stays before one that does not. Time is counted in moves of all clients, so that no clock is needed.
     """
 
     def __init__(self, limit_bytes: int) -> None:
-        self._sample_bytes = limit_bytes * 3 // 8
-        self._reply_bytes = limit_bytes // 8
+        self._share_bytes = limit_bytes * 3 // 8
+        self._half_bytes = limit_bytes // 2
         self._waiting: dict[Outbox, None] = {}
-        self._replies = 0
+        self._holding: dict[Outbox, None] = {}
+        """Clients for which anything but samples is held."""
+        self._sample_bytes = 0
+        self._other_bytes = 0
         self._order = 0
+        self._moves = 0
 
     def next_order(self) -> int:
         """The number of the next message that is queued, for all clients: within each they ascend."""
         self._order += 1
         return self._order
 
+    def next_move(self) -> int:
+        """Count that something moved that is held for a client."""
+        self._moves += 1
+        return self._moves
+
+    @property
+    def held_bytes(self) -> int:
+        """All that is held for all clients."""
+        return self._sample_bytes + self._other_bytes
+
     @property
     def share_bytes(self) -> int:
         """The samples that may wait for one client: an equal share for each that waits."""
-        return self._sample_bytes // (len(self._waiting) or 1)
+        return self._share_bytes // (len(self._waiting) or 1)
 
     def add(self, outbox: "Outbox") -> None:
         """Count a client for which something waits from now on."""
@@ -111,30 +132,64 @@ class Pool:
         """Count a client no longer."""
         self._waiting.pop(outbox, None)
 
-    def count_replies(self, size_bytes: int) -> None:
-        """Add to the bytes of replies that wait; negative to subtract."""
-        self._replies += size_bytes
+    def count_samples(self, size_bytes: int) -> None:
+        """Add to the bytes of samples that wait; negative to subtract."""
+        self._sample_bytes += size_bytes
+
+    def count_others(self, outbox: "Outbox", size_bytes: int) -> None:
+        """Add to the bytes of everything else that is held for a client; negative to subtract."""
+        self._other_bytes += size_bytes
+        if outbox.held_bytes:
+            self._holding[outbox] = None
+        else:
+            self._holding.pop(outbox, None)
 
     def evict(self) -> None:
-        """Report the client with the most replies to its owner if too many wait for all together."""
-        if self._replies > self._reply_bytes and self._waiting:
-            max(self._waiting, key=lambda outbox: outbox.reply_bytes).flood()
+        """Report clients to their owners until what is held besides samples is within the limit.
+
+        Not to be called while samples are sent to a list of clients: one of them could be closed in between.
+        """
+        while self._other_bytes > self._half_bytes and self._holding:
+            worst = self._worst()
+            del self._holding[worst]
+            worst.flood()
 
     def trim(self) -> None:
         """Drop samples of clients that have more than the share, which shrinks with each client that waits."""
         for outbox in self._waiting:
             outbox.trim()
 
+    def trim_if_full(self) -> None:
+        """The same when too many wait for all; it frees an eighth of the limit, so it is seldom."""
+        if self._sample_bytes > self._half_bytes:
+            self.trim()
+
+    def _worst(self) -> "Outbox":
+        users: Counter[int] = Counter()
+        for outbox in self._holding:
+            users[outbox.uid] += outbox.held_bytes
+        uid = max(users, key=users.__getitem__)
+        moves = self._moves
+        return max(
+            (outbox for outbox in self._holding if outbox.uid == uid),
+            key=lambda outbox: outbox.held_bytes * (moves - outbox.moved + 1),
+        )
+
 
 class Owner(Protocol):
     """Whose outbox it is."""
+
+    @property
+    def uid(self) -> int:
+        """The user that it serves."""
+        ...
 
     def on_broken(self, reason: str) -> None:
         """The socket failed."""
         ...
 
     def on_flooded(self) -> None:
-        """More replies wait than may."""
+        """More is held for the client than may be."""
         ...
 
     def on_full(self) -> None:
@@ -154,8 +209,9 @@ class Outbox:
     """The sending side of one non-blocking socket. Synchronization: the event loop's thread."""
 
     __slots__ = (
-        "_limits", "_owner", "_partial", "_partial_fd", "_pool", "_replies", "_sample_bytes", "_sample_count",
-        "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "reply_bytes", "sent", "waiting",
+        "_limits", "_owned_bytes", "_owner", "_partial", "_partial_fd", "_pool", "_replies", "_sample_bytes",
+        "_sample_count", "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "held_bytes", "moved",
+        "reply_bytes", "sent", "uid", "waiting",
     )  # fmt: skip
 
     def __init__(self, sock: socket.socket, limits: Limits, pool: Pool, owner: Owner) -> None:
@@ -167,6 +223,12 @@ class Outbox:
         """Whether anything waits; then everything new has to wait behind it."""
         self.reply_bytes = 0
         """Bytes of replies that wait."""
+        self.held_bytes = 0
+        """All but samples that the daemon holds for the client, as the pool has it."""
+        self.moved = 0
+        """The pool's count of moves when something of it was sent or carried out last."""
+        self.uid = owner.uid
+        self._owned_bytes = 0
         self._sock = sock
         self._send = sock.send
         self._limits = limits
@@ -243,14 +305,22 @@ class Outbox:
             return
         self._replies.append((self._pool.next_order(), message, fd))
         self.reply_bytes += len(message)
-        self._pool.count_replies(len(message))
+        self._count_held()
         if len(self._replies) > self._limits.replies or self.reply_bytes > self._limits.reply_bytes:
             self.flood()
         else:
             self._pool.evict()
 
+    def count_owned(self, size_bytes: int) -> None:
+        """Set what the owner itself holds for the client: its input, and an answer in the making."""
+        if size_bytes != self._owned_bytes:
+            self._owned_bytes = size_bytes
+            self.moved = self._pool.next_move()
+            self._count_held()
+            self._pool.evict()
+
     def flood(self) -> None:
-        """Report to the owner that more replies wait than may."""
+        """Report to the owner that more is held for the client than may be."""
         self._owner.on_flooded()
 
     def trim(self) -> None:
@@ -266,8 +336,7 @@ class Outbox:
                 count = delivery.count - self._skip
                 samples.popleft()
                 self._skip = 0
-                self._sample_count -= count
-                self._sample_bytes -= count * delivery.each_bytes
+                self._count_samples(-count, delivery)
             device = delivery.device
             self._unreported[device] = self._unreported.get(device, 0) + count
             self.dropped += count
@@ -278,10 +347,11 @@ class Outbox:
         self._samples.clear()
         self._replies.clear()
         self._partial = b""
-        self._sample_bytes = self._sample_count = 0
-        waited, self.reply_bytes = self.reply_bytes, 0
+        self.reply_bytes = self._owned_bytes = 0
         self._pool.remove(self)
-        self._pool.count_replies(-waited)
+        self._pool.count_samples(-self._sample_bytes)
+        self._sample_bytes = self._sample_count = 0
+        self._count_held()
 
     # --- queueing ---------------------------------------------------------------------------------------------------
 
@@ -298,25 +368,41 @@ class Outbox:
         self.sent += whole
         if whole < len(messages):
             self._skip = whole
-            self._sample_count -= whole
-            self._sample_bytes -= whole * delivery.each_bytes
+            self._count_samples(-whole, delivery)
             self._queue_samples(delivery)
         self._wait()
+        self._count_held()
         self._owner.on_full()
 
     def _queue_samples(self, delivery: Delivery) -> None:
         self._samples.append(delivery)
-        self._sample_count += delivery.count
-        self._sample_bytes += delivery.count * delivery.each_bytes
+        self._count_samples(delivery.count, delivery)
         limits, size_bytes = self._limits, self._sample_bytes
         if self._sample_count > limits.samples or size_bytes > min(limits.sample_bytes, self._pool.share_bytes):
             self.trim()
+        self._pool.trim_if_full()
+
+    def _count_samples(self, count: int, delivery: Delivery) -> None:
+        """Add samples of a delivery to those that wait; negative to subtract."""
+        size_bytes = count * delivery.each_bytes
+        self._sample_count += count
+        self._sample_bytes += size_bytes
+        self._pool.count_samples(size_bytes)
+
+    def _count_held(self) -> None:
+        """Have the pool count what is held besides samples as it is now."""
+        held = self.reply_bytes + REPLY_BYTES * len(self._replies) + len(self._partial) + self._owned_bytes
+        change = held - self.held_bytes
+        if change:
+            if not self.held_bytes:
+                self.moved = self._pool.next_move()
+            self.held_bytes = held
+            self._pool.count_others(self, change)
 
     def _take_sample(self) -> tuple[Delivery, int]:
         """Remove the oldest sample from the queue: its delivery and its place in it."""
         delivery, place = self._samples[0], self._skip
-        self._sample_count -= 1
-        self._sample_bytes -= delivery.each_bytes
+        self._count_samples(-1, delivery)
         self._skip += 1
         if self._skip == delivery.count:
             self._samples.popleft()
@@ -337,23 +423,30 @@ class Outbox:
                 return self._emptied()
             count = self._send_partial()
         except BlockingIOError:
-            self._wait()
-            self._owner.on_full()
+            self._keep(self._owner.on_full)
             return False
         except OSError as error:
             self._owner.on_broken(reason_of(error))
             return False
         self._partial = self._partial[count:]
         if self._partial or self._samples or self._replies:
-            self._wait()
-            self._owner.on_deferred()
-            return True
+            self.moved = self._pool.next_move()
+            self._keep(self._owner.on_deferred)
+            return self.waiting
         return self._emptied()
+
+    def _keep(self, report: Callable[[], None]) -> None:
+        """Keep what is not sent yet, and report that; all that is held may be too much then."""
+        self._wait()
+        self._count_held()
+        report()
+        self._pool.evict()
 
     def _emptied(self) -> bool:
         if self.waiting:
             self.waiting = False
             self._pool.remove(self)
+            self._count_held()
             self._owner.on_emptied()
         return False
 
@@ -386,7 +479,6 @@ class Outbox:
     def _next_reply(self) -> bytes:
         _, message, self._partial_fd = self._replies.popleft()
         self.reply_bytes -= len(message)
-        self._pool.count_replies(-len(message))
         return message
 
     def _next_sample(self) -> bytes:

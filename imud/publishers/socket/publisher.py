@@ -55,7 +55,7 @@ class SocketSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     clients_per_user: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 128
     """At most so many of them belong to one user; not for root and the daemon's own user."""
     memory_mb: Annotated[int, msgspec.Meta(ge=8, le=4096)] = 64
-    """At most so much memory for what waits for all clients together."""
+    """At most so much memory for all that clients make imud hold: what waits for them, and what they have sent."""
     queue_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 4096
     """At most so many samples wait for a client that does not read; 4096 are 4 s at 1 kHz. The oldest are dropped."""
     queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
@@ -76,9 +76,10 @@ class SocketServer:
         self._context = context
         shares = Shares(settings.clients_max, settings.clients_per_user)
         self._quota = Quota(shares, os.geteuid(), raise_fd_limit(), context.now_ns)
-        self._pool = Pool(settings.memory_mb * MIB)
+        self.pool = Pool(settings.memory_mb * MIB)
+        """What is held for clients."""
         self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.now_ns())
-        self.hub = Hub(settings.path, context, self._quota, self._time, self._pool)
+        self.hub = Hub(settings.path, context, self._quota, self._time, self.pool)
         self._side: ServerSide | None = None
         self._listener: Listener | None = None
         self._guard = Guard(os.geteuid(), None, None)
@@ -97,7 +98,7 @@ class SocketServer:
             self.hub.count_evicted,
             self.hub.count_failed,
             Limits(settings.queue_samples, settings.queue_bytes),
-            self._pool,
+            self.pool,
             Scheduler(self._context.now_ns, self._context.cpu_ns, self._time),
         )
         asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
@@ -132,7 +133,7 @@ class SocketServer:
         self.hub.tick()
         if self._side is not None:
             self._side.scheduler.tick()
-            self._pool.trim()
+            self.pool.trim()
         self._quota.tick()
         self.hub.recordings.tick(now_ns)
         if self._paused and self._listener is not None:

@@ -1,6 +1,6 @@
 """The methods of the UNIX socket: a table of name → parameters and handler, and the way from a line to its reply."""
 
-from collections.abc import Callable, Collection, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine, Generator, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
@@ -12,7 +12,6 @@ from imud.contracts.control.calibration import CalibrationInfo, CalibrationResul
 from imud.contracts.device_settings import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.publisher import Batch
 from imud.contracts.settings import wrong_values
-from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
 from imud.errors import ImudError
 from imud.formats.jsonrpc import (
     PROTOCOL,
@@ -24,8 +23,8 @@ from imud.formats.jsonrpc import (
     encode_result,
     parse_request,
 )
-from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
 from imud.frames.conventions import Convention
+from imud.publishers.socket import questions
 from imud.publishers.socket.connection import Connection
 from imud.publishers.socket.encoding import selector
 from imud.publishers.socket.hub import Hub
@@ -33,7 +32,6 @@ from imud.publishers.socket.messages import (
     BigNumbers,
     CalibrateParams,
     CommandParams,
-    DeviceFrame,
     DeviceParams,
     DeviceSummary,
     EventsParams,
@@ -53,18 +51,16 @@ from imud.publishers.socket.messages import (
     SchemaResult,
     SettingsChangeParams,
     SettingsParams,
-    SlotMember,
-    SlotSchema,
     SnapshotResult,
     StatusResult,
     StopResult,
     WatchParams,
     WatchResult,
 )
-from imud.publishers.socket.outbox import NO_FD
+from imud.publishers.socket.questions import Answer, Pieces
 from imud.publishers.socket.rights import Rights
 from imud.publishers.socket.subscription import Form, Subscription
-from imud.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
+from imud.sample import SAMPLE_FIELDS, Sample
 from imud.units import NS_PER_MS
 
 RATE_MIN_HZ: Final = 0.001
@@ -83,19 +79,6 @@ NAME_MAX: Final = 64
 P = TypeVar("P", bound=msgspec.Struct)
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What a method answers."""
-
-    result: object
-    fd: int = NO_FD
-    """A descriptor whose copy goes with the reply."""
-    framed_from_here: bool = False
-    """Whether everything after this reply goes out as frames."""
-    big_numbers: bool = True
-    """Whether integers in it may exceed 2⁵³; names of members are no data then."""
-
-
 Later = Coroutine[Any, Any, object]
 """A result that takes its time; other requests of the client are answered before it. May raise ImudError."""
 
@@ -105,7 +88,7 @@ class Method(Generic[P]):
     """A row of the table."""
 
     params: type[P]
-    run: Callable[[Hub, Connection, P], Answer | Later]
+    run: Callable[[Hub, Connection, P], Answer | Pieces | Later]
     right: Rights = Rights.READ
     """The permission that the client needs."""
     acts: bool = False
@@ -135,14 +118,26 @@ def handle_line(hub: Hub, connection: Connection, line: bytes) -> None:
         return
     if answer is None:
         return
-    if not isinstance(answer, Answer):
+    if isinstance(answer, Generator):
+        connection.work_on(_answer_in_pieces(connection, request, answer))
+    elif isinstance(answer, Answer):
+        _send(connection, request, answer)
+    else:
         hub.do_later(connection, _answer_later(connection, request, answer))
-        return
+
+
+def _send(connection: Connection, request: RpcRequest, answer: Answer) -> None:
     if request.wants_reply:
         texts = connection.text_numbers and answer.big_numbers
         connection.post(encode_result(request.request_id, answer.result, texts=texts), answer.fd)
     if answer.framed_from_here:
         connection.use_frames()
+
+
+def _answer_in_pieces(connection: Connection, request: RpcRequest, pieces: Pieces) -> Iterator[int]:
+    """Make the answer and send it at the end."""
+    answer = yield from pieces
+    _send(connection, request, answer)
 
 
 async def _answer_later(connection: Connection, request: RpcRequest, later: Later) -> None:
@@ -159,7 +154,7 @@ async def _answer_later(connection: Connection, request: RpcRequest, later: Late
         connection.on_failure(error)
 
 
-def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Later | None:
+def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Pieces | Later | None:
     method = METHODS.get(request.method)
     if method is None:
         message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
@@ -179,59 +174,12 @@ def _call(hub: Hub, connection: Connection, request: RpcRequest) -> Answer | Lat
 # --- questions ------------------------------------------------------------------------------------------------------
 
 
-def _devices(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
-    """The devices, each in one line."""
-    rings = hub.context.rings
-    return Answer(
-        [
-            DeviceSummary(
-                one.name, one.device_id, one.driver, one.link, one.state, one.problem, one.identity, one.rate_hz,
-                one.clock.sync, rings.get(one.name),
-            )
-            for one in hub.context.status()
-        ]
-    )  # fmt: skip
-
-
 def _options(hub: Hub, connection: Connection, params: OptionsParams) -> Answer:
     """Set how messages are written on this connection; a `watch` that runs goes on as it is."""
     if params.big_numbers is not None:
         connection.text_numbers = params.big_numbers is BigNumbers.STRING
     form = BigNumbers.STRING if connection.text_numbers else BigNumbers.NUMBER
     return Answer(OptionsResult(form, hub.context.epoch))
-
-
-def _status(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
-    """The full state: each device with its clock and ledger, the socket with its clients."""
-    return Answer(StatusResult(hub.context.now_ns(), list(hub.context.status()), hub.status()))
-
-
-def _schema(hub: Hub, _connection: Connection, _params: NoParams) -> Answer:
-    """What the members of samples mean, per device where that differs, and how a slot is laid out."""
-    devices = {device.name: _frame_of(device) for device in hub.context.status()}
-    bounds, states = list(LATENCY_BOUNDS_NS), list(DeviceState)
-    result = SchemaResult(PROTOCOL, list(SAMPLE_SCHEMA), devices, SLOT_SCHEMA, bounds, states)
-    return Answer(result, big_numbers=False)
-
-
-def _frame_of(device: DeviceStatus) -> DeviceFrame:
-    """Axes and angles of a device's samples; without a known driver only that."""
-    known = DeviceFrame(device.driver, device.euler_convention, device.navigation_frame, device.status_bit_names)
-    frame = device.frame
-    if frame is not None:
-        known.frame, known.convention, known.heading = frame.frame, frame.convention, frame.heading
-        known.declination_deg, known.conventions = frame.declination_deg, frame.conventions
-    return known
-
-
-SLOT_SCHEMA: Final = SlotSchema(
-    bytes=SLOT_BYTES,
-    layout_version=SLOT_LAYOUT_VERSION,
-    byte_order="little",
-    fields=[SlotMember(f.name, f.code, f.count, f.offset) for f in SLOT_FIELDS],
-    present_bits=dict(PRESENT_BITS),
-    sync_codes={str(name): code for name, code in SYNC_CODES.items()},
-)
 
 
 # --- samples --------------------------------------------------------------------------------------------------------
@@ -398,9 +346,9 @@ def _check_name(method: str, name: str) -> None:
 
 
 METHODS: Final[Mapping[str, Method[Any]]] = {
-    "devices": Method(NoParams, _devices, result=list[DeviceSummary]),
-    "status": Method(NoParams, _status, result=StatusResult),
-    "schema": Method(NoParams, _schema, result=SchemaResult),
+    "devices": Method(NoParams, questions.devices, result=list[DeviceSummary]),
+    "status": Method(NoParams, questions.status, result=StatusResult),
+    "schema": Method(NoParams, questions.schema, result=SchemaResult),
     "options": Method(OptionsParams, _options, acts=True, result=OptionsResult),
     "watch": Method(WatchParams, _watch, acts=True, result=WatchResult),
     "unwatch": Method(NoParams, _unwatch, acts=True, result=NothingMore),

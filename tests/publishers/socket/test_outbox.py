@@ -6,6 +6,8 @@ import os
 import random
 import socket
 import sys
+import tracemalloc
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -335,6 +337,7 @@ class Trickle:
 class Sink:
     """An owner that has nothing to do: the test sends what waits."""
 
+    uid = 0
     on_broken = on_flooded = staticmethod(pytest.fail)
 
     def on_full(self) -> None:
@@ -420,3 +423,129 @@ def test_what_waits_as_messages_holds_no_samples() -> None:
     outbox.close()
     ours.close()
     theirs.close()
+
+
+BIG_BYTES = 800_000
+"""A `status` of 256 devices."""
+
+
+def held_bytes(server: SocketServer) -> int:
+    """All that is held for clients, looked up in the objects themselves."""
+    connections = server.hub.connections.values()
+    return sum(one.outbox.queue_bytes + one.unread_bytes for one in connections)
+
+
+def test_large_replies_that_nobody_reads_stay_within_the_memory_and_a_good_client_gets_its_own(tmp_path: Path) -> None:
+    big = "x" * BIG_BYTES
+
+    async def body() -> None:
+        async with serving(tmp_path, memory_mb=16, clients_max=256) as server:
+            good = await Peer.greeted(server)
+            (connection,) = server.hub.connections.values()
+            silent = [await Peer.greeted(server) for _ in range(250)]
+            tracemalloc.start()
+            for one in list(server.hub.connections.values()):
+                if one is not connection:
+                    one.post(encode_notification("big", big))
+                    assert held_bytes(server) <= server.pool.held_bytes <= 16 << 20
+            connection.post(encode_notification("big", big + "good"))  # the largest of all, and the last
+            assert tracemalloc.get_traced_memory()[0] < 16 << 20
+            tracemalloc.stop()
+            evicted = server.hub.status().evicted
+            assert 200 < evicted < 250
+            assert (await good.body()).endswith(b'good"}')
+            assert len(await good.result("devices")) == 2
+            assert not connection.closed
+            for peer in (good, *silent):
+                peer.close()
+            await until(lambda: not server.hub.connections)
+            assert server.pool.held_bytes == 0
+
+    run(body)
+
+
+def test_half_lines_are_counted_and_evicted(tmp_path: Path) -> None:
+    async def body() -> None:
+        async with serving(tmp_path, memory_mb=8) as server:
+            good = await Peer.greeted(server)
+            silent = [await Peer.greeted(server) for _ in range(120)]
+            for peer in silent:
+                with suppress(ConnectionResetError, BrokenPipeError):
+                    await peer.send(b"x" * 60_000)
+            await until(lambda: server.hub.status().evicted > 40)  # 69 half lines fit into 4 MiB
+            assert held_bytes(server) == server.pool.held_bytes <= 4 << 20
+            assert len(await good.result("devices")) == 2
+            for peer in (good, *silent):
+                peer.close()
+            await until(lambda: not server.hub.connections)
+            assert server.pool.held_bytes == 0
+
+    run(body)
+
+
+class Blocked:
+    """A socket that takes nothing."""
+
+    def send(self, data: bytes) -> int:
+        """Have no room."""
+        raise BlockingIOError
+
+
+class Evicted(Sink):
+    """An owner that closes what is too much."""
+
+    def __init__(self, uid: int) -> None:
+        self.uid = uid
+        self.gone = False
+        self.outbox: Outbox | None = None
+
+    def on_flooded(self) -> None:  # type: ignore[override]  # a method in place of the other's failure
+        """Close."""
+        assert self.outbox is not None
+        self.gone = True
+        self.outbox.close()
+
+
+def waiting(pool: Pool, uid: int, size_bytes: int) -> Evicted:
+    """A client that does not read, for which so much waits."""
+    owner = Evicted(uid)
+    owner.outbox = Outbox(Blocked(), Limits(20, 1 << 20), pool, owner)  # type: ignore[arg-type]  # all that Outbox uses
+    owner.outbox.put_reply(bytes(size_bytes))
+    return owner
+
+
+def test_the_user_that_holds_most_loses_a_client() -> None:
+    pool = Pool(2_000_000)
+    one = waiting(pool, 1, 300_000)
+    many = [waiting(pool, 2, 100_000) for _ in range(8)]
+    assert not one.gone  # the largest, but of a user that holds less
+    assert sum(owner.gone for owner in many) == 1
+    assert pool.held_bytes <= 1_000_000
+
+
+def test_among_a_user_s_clients_the_one_that_does_not_move_goes() -> None:
+    pool = Pool(2_000_000)
+    owners = [waiting(pool, 1, 300_000) for _ in range(3)]
+    late = waiting(pool, 1, 400_000)
+    assert [owner.gone for owner in (*owners, late)] == [True, False, False, False]
+
+
+def test_samples_are_cut_at_once_when_more_and_more_clients_wait() -> None:
+    """Each had the share of those that waited when its own came; without a tick they must not add up."""
+    pool = Pool(1 << 20)
+    encoding = BinaryEncoding()
+    some = batch("imu0", 1, 50)
+    messages = encoding.encode(some)
+    outboxes = [
+        Outbox(Blocked(), Limits(4096, 1 << 22), pool, Evicted(1))  # type: ignore[arg-type]  # all that Outbox uses
+        for _ in range(32)
+    ]
+    most = 0
+    for outbox in outboxes:
+        for _ in range(40):
+            Outbox.put_samples([outbox], messages, some, encoding)
+            most = max(most, pool.held_bytes)
+    assert 1 << 18 < most <= (1 << 19) + 30_000  # a batch is 28 kB
+    for outbox in outboxes:
+        outbox.close()
+    assert pool.held_bytes == 0

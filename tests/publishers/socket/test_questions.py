@@ -1,0 +1,111 @@
+"""Answers about many devices are made in pieces, with samples in between, and are whole in the end."""
+
+import asyncio
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from imud.contracts.status import DeviceStatus
+from imud.publishers.socket.publisher import SocketServer, SocketSettings
+from imud.publishers.socket.questions import DEVICES_PER_PIECE
+from imud.publishers.socket.serving import TURN_NS
+from tests.support.socket_rig import NOW_NS, Peer, batch, context, device_status, run, until
+
+DEVICES = 256
+DEVICE_NS = 30_000
+"""What the state of a running device takes."""
+
+
+class Fleet:
+    """A server with many devices, whose clock moves when the state of one is taken."""
+
+    def __init__(self, directory: Path) -> None:
+        self.now_ns = NOW_NS
+        self.taken = 0
+        self.names = [f"imu{number}" for number in range(DEVICES)]
+        known = dataclasses.replace(context(lambda: self.now_ns), status_in_turn=self.each_status)
+        self.server = SocketServer(SocketSettings(path=str(directory / "s")), known)
+
+    def each_status(self) -> Iterator[DeviceStatus]:
+        """The states, one by one."""
+        for number, name in enumerate(list(self.names)):
+            self.now_ns += DEVICE_NS
+            self.taken += 1
+            yield device_status(name, number)
+
+    async def most_in_a_turn(self, done: asyncio.Task[object]) -> int:
+        """The most states that were taken in one turn of the loop."""
+        most, before = 0, self.taken
+        while not done.done():
+            await asyncio.sleep(0)
+            most, before = max(most, self.taken - before), self.taken
+        return most
+
+
+@pytest.mark.parametrize("method", ["devices", "status", "schema"])
+@pytest.mark.parametrize("form", ["number", "string"])
+def test_the_state_of_many_devices_is_taken_in_many_turns(tmp_path: Path, method: str, form: str) -> None:
+    async def body() -> None:
+        fleet = Fleet(tmp_path)
+        fleet.server.start()
+        peer = await Peer.greeted(fleet.server)
+        await peer.result("options", big_numbers=form)
+        asked = asyncio.ensure_future(peer.result(method))
+        most = await fleet.most_in_a_turn(asked)
+        assert 0 < most * DEVICE_NS < TURN_NS + DEVICES_PER_PIECE * DEVICE_NS
+        result = await asked
+        found = result if method == "devices" else result["devices"]
+        names = list(found) if method == "schema" else [device["name"] for device in found]
+        assert names == fleet.names
+        if method == "status":
+            numbers = (result["now_ns"], found[-1]["latency_sum_ns"])
+            assert all(isinstance(number, str if form == "string" else int) for number in numbers)
+            assert int(result["now_ns"]) == fleet.now_ns
+            assert len(result["socket"]["clients"]) == 1
+        fleet.server.close()
+        peer.close()
+
+    run(body)
+
+
+def test_samples_and_other_clients_come_between_and_requests_keep_their_order(tmp_path: Path) -> None:
+    async def body() -> None:
+        fleet = Fleet(tmp_path)
+        fleet.server.start()
+        asking, watching = await Peer.greeted(fleet.server), await Peer.greeted(fleet.server)
+        await watching.result("watch")
+        lines = [json.dumps({"jsonrpc": "2.0", "id": n, "method": m}) for n, m in ((1, "status"), (2, "poll"))]
+        await asking.send("\n".join([*lines, ""]).encode())
+        await until(lambda: 0 < fleet.taken < DEVICES)
+        fleet.server.publish(batch("imu0", 1))
+        connection, _ = fleet.server.hub.connections.values()
+        assert fleet.server.pool.held_bytes > 1000  # the answer in the making counts
+        assert (await watching.message())["params"]["seq"] == 1
+        assert fleet.taken < DEVICES
+        assert [(await asking.message())["id"] for _ in range(2)] == [1, 2]
+        assert connection.unread_bytes == 0
+        assert fleet.server.pool.held_bytes == 0
+        fleet.server.close()
+        asking.close()
+        watching.close()
+
+    run(body)
+
+
+def test_who_leaves_while_its_answer_is_made_leaves_nothing(tmp_path: Path) -> None:
+    async def body() -> None:
+        fleet = Fleet(tmp_path)
+        fleet.server.start()
+        peer = await Peer.greeted(fleet.server)
+        await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"status"}\n')
+        await until(lambda: fleet.taken > 0)
+        peer.close()
+        await until(lambda: not fleet.server.hub.connections)
+        assert fleet.server.pool.held_bytes == 0
+        assert fleet.server.hub.status().failed == 0
+        fleet.server.close()
+
+    run(body)
