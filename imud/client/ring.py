@@ -48,6 +48,7 @@ from imud.formats.ring import (
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, decode_slot
 from imud.sample import Sample
 
+ROOT_UID = 0
 _ATTEMPTS = 3
 """The writer may overtake one copy, hardly three in a row."""
 _DRAIN_BYTES = 4096
@@ -70,21 +71,23 @@ class Ring:
 
     def __init__(
         self, device_or_path: str | Path, *, directory: str | None = None, from_oldest: bool = False,
-        now_ns: Callable[[], int] = time.monotonic_ns,
+        owner_uid: int = ROOT_UID, now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
         """Open by device name, or by path if there is a '/' in it; `read` gives the samples that come from now on.
 
         `from_oldest`: it begins with the oldest sample that is still in the ring.
 
-        A name is looked up in `directory`, by default as `default_directory` says.
-        Raises ServerError: no such ring, not permitted, or of another layout.
+        A name is looked up in `directory`, by default as `default_directory` says. The file must belong to root, to
+        the owner of the directory it is in, or to `owner_uid`, the daemon's user where that directory is a shared one
+        such as /dev/shm. Raises ServerError: no such ring, not permitted, of another user, or of another layout.
         """
         text = str(device_or_path)
         self.path = Path(text) if "/" in text else ring_path(directory or default_directory(text), text)
         self.missed = 0
         """Samples missed since opening."""
         self._now_ns = now_ns
-        self._change_to(_RingFile.open(self.path))
+        self._owner_uid = owner_uid
+        self._change_to(_RingFile.open(self.path, owner_uid))
         newest = self.newest_seq
         self._next = self._oldest(newest) if from_oldest and newest else newest + 1
 
@@ -145,7 +148,7 @@ class Ring:
 
         Samples come from the first on, or where the same daemon goes on with its numbers, from the last one read on;
         those that the ring no longer holds count as missed. Raises ServerError when there is a file that cannot be
-        used, for example one of another layout version.
+        used, for example one of another user or another layout version.
         """
         try:
             status = self.path.lstat()
@@ -154,7 +157,7 @@ class Ring:
         if (status.st_dev, status.st_ino) == self._inode:
             return False
         try:
-            file = _RingFile.open(self.path)
+            file = _RingFile.open(self.path, self._owner_uid)
         except ServerError:
             if os.path.lexists(self.path):
                 raise
@@ -297,8 +300,8 @@ class _RingFile(NamedTuple):
     inode: tuple[int, int]
 
     @classmethod
-    def open(cls, path: Path) -> Self:
-        """Raises ServerError for anything but a ring that may be read."""
+    def open(cls, path: Path, owner_uid: int) -> Self:
+        """Raises ServerError for anything but a ring that may be read and believed."""
         try:
             descriptor = os.open(path, OPEN_FLAGS)
         except FileNotFoundError:
@@ -310,7 +313,7 @@ class _RingFile(NamedTuple):
         except OSError as error:
             raise ServerError(f"{path} cannot be read: {error.strerror}") from error
         try:
-            return cls._mapped(descriptor, path)
+            return cls._mapped(descriptor, path, owner_uid)
         except OSError as error:
             os.close(descriptor)
             raise ServerError(f"{path} cannot be read: {error.strerror}") from error
@@ -319,17 +322,31 @@ class _RingFile(NamedTuple):
             raise
 
     @classmethod
-    def _mapped(cls, descriptor: int, path: Path) -> Self:
+    def _mapped(cls, descriptor: int, path: Path, owner_uid: int) -> Self:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             kind = stat.filemode(status.st_mode)[0]
             raise ServerError(f"{path} is no ring of imud: expected a regular file (-), found another kind ({kind})")
+        _check_owner(path, status.st_uid, owner_uid)
         header = decode_header(os.pread(descriptor, HEADER_BYTES, 0), str(path))
         expected_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
         if status.st_size < expected_bytes:
             raise ServerError(f"{path}: expected {expected_bytes} bytes, found {status.st_size}; the file was cut")
         memory = mmap.mmap(descriptor, expected_bytes, prot=mmap.PROT_READ)
         return cls(header, memory, descriptor, (status.st_dev, status.st_ino))
+
+
+def _check_owner(path: Path, found_uid: int, owner_uid: int) -> None:
+    """Raise ServerError where a user may have planted the file who is neither trusted nor named.
+
+    The owner of the directory may replace every file in it anyway. The header's pid is no proof: it can be forged.
+    """
+    directory_uid = path.parent.stat().st_uid
+    if found_uid not in (ROOT_UID, directory_uid, owner_uid):
+        raise ServerError(
+            f"{path} belongs to user {found_uid}, who may have planted it: expected root or user {directory_uid}, the"
+            f" owner of {path.parent}; if the daemon runs as user {found_uid}, name him (owner_uid)"
+        )
 
 
 def _what_there_is(path: Path) -> str:

@@ -22,7 +22,8 @@
  * Synchronization: a ring belongs to one thread; several threads or processes may each open their own.
  *
  * A ring is looked up by name in the directory of the environment variable IMUD_SHM; where that is not set, in
- * /run/imud/shm, then in $XDG_RUNTIME_DIR/imud/shm.
+ * /run/imud/shm, then in $XDG_RUNTIME_DIR/imud/shm. Its file must belong to root or to the owner of that directory. In a
+ * directory where every user may make files, such as /dev/shm, name the daemon's user: imud_open_owned.
  *
  * Reading a page that was cut off the file raises SIGBUS. Only root and the daemon's user can cut it; the daemon
  * restores the size with its next sample, at the latest a tenth of a second later; imud_health looks at the size first.
@@ -47,6 +48,7 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
+#include <sys/types.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -193,7 +195,8 @@ enum {
     IMUD_E_VERSION = -4, /* a ring of another layout version */
     IMUD_E_SYSTEM = -5,  /* see errno */
     IMUD_E_NAME = -6,    /* name too long or empty */
-    IMUD_E_ENDED = -7    /* the daemon ended the descriptor to wait on: ask its socket for another */
+    IMUD_E_ENDED = -7,   /* the daemon ended the descriptor to wait on: ask its socket for another */
+    IMUD_E_OWNER = -8    /* the file belongs to a user who may have planted it: see imud_open_owned */
 };
 
 typedef enum imud_health_state {
@@ -214,7 +217,8 @@ typedef struct imud_ring {
     uint64_t torn_newest;  /* ... the newest sequence number then */
     dev_t dev;
     ino_t ino;
-    int fd; /* of the mapped file, to look at its size */
+    int fd;          /* of the mapped file, to look at its size */
+    uid_t owner_uid; /* whose rings are believed beside those of root and of the directory's owner; 0: nobody's */
     char path[256];
     uint32_t crc_table[256];
 } imud_ring;
@@ -228,6 +232,9 @@ static inline const char *imud_strerror(int error)
     case IMUD_E_VERSION: return "the ring has another layout version: build with the imud.h of the running daemon";
     case IMUD_E_NAME: return "expected a device name or a path of less than 256 characters";
     case IMUD_E_ENDED: return "the daemon ended the descriptor: connect to its socket and ask for another";
+    case IMUD_E_OWNER:
+        return "the file belongs neither to root nor to the owner of its directory: if that is the daemon's user, name him "
+               "(imud_open_owned)";
     case IMUD_E_SYSTEM: return strerror(errno);
     default: return "no error";
     }
@@ -341,6 +348,22 @@ static inline int imud_look_(int fd, imud_header *header, struct stat *status)
     return length == (ssize_t)sizeof *header ? imud_check_(header, (uint64_t)status->st_size) : IMUD_E_FORMAT;
 }
 
+/* Whether a file of user `uid` at ring->path is to be believed: its owner is root, the owner of the directory, who may
+ * replace every file in it anyway, or the user that was named. The header's pid is no proof: it can be forged. */
+static inline int imud_check_owner_(const imud_ring *ring, uid_t uid)
+{
+    char directory[sizeof ring->path];
+    struct stat status;
+    size_t length = (size_t)(strrchr(ring->path, '/') - ring->path) + 1; /* with the slash: "/" is one too */
+    if (uid == 0 || uid == ring->owner_uid)
+        return 0;
+    memcpy(directory, ring->path, length);
+    directory[length] = 0;
+    if (stat(directory, &status) != 0)
+        return imud_errno_();
+    return status.st_uid == uid ? 0 : IMUD_E_OWNER;
+}
+
 /* Maps the file at ring->path into ring; leaves ring as it was on error. Follows no symbolic link and does not wait for
  * the writer of a FIFO. */
 static inline int imud_map_(imud_ring *ring)
@@ -353,6 +376,8 @@ static inline int imud_map_(imud_ring *ring)
     if (fd < 0)
         return imud_errno_();
     error = imud_look_(fd, &header, &status);
+    if (!error)
+        error = imud_check_owner_(ring, status.st_uid);
     if (error) {
         close(fd);
         return error;
@@ -416,13 +441,14 @@ static inline uint64_t imud_newest_seq(const imud_ring *ring)
     return imud_load_(ring->base + offsetof(imud_header, newest_seq));
 }
 
-/* Opens the ring of a device, or a path if there is a '/' in it. imud_next will give the samples that come after this
- * call. Returns 0 or IMUD_E_...; after an error the ring is closed. */
-static inline int imud_open(imud_ring *ring, const char *device_or_path)
+/* Opens as imud_open does a ring that may also belong to `owner_uid`: the user that the daemon runs as, for a directory
+ * where every user may make files. Returns as imud_open. */
+static inline int imud_open_owned(imud_ring *ring, const char *device_or_path, uid_t owner_uid)
 {
     size_t length = strlen(device_or_path);
     int error;
     memset(ring, 0, sizeof *ring);
+    ring->owner_uid = owner_uid;
     if (length == 0 || length >= sizeof ring->path)
         return IMUD_E_NAME;
     imud_crc_init_(ring->crc_table);
@@ -435,6 +461,14 @@ static inline int imud_open(imud_ring *ring, const char *device_or_path)
     if (!error)
         ring->next_seq = imud_newest_seq(ring) + 1;
     return error;
+}
+
+/* Opens the ring of a device, or a path if there is a '/' in it; it must belong to root or to the owner of its directory.
+ * imud_next will give the samples that come after this call. Returns 0 or IMUD_E_...; after an error the ring is
+ * closed. */
+static inline int imud_open(imud_ring *ring, const char *device_or_path)
+{
+    return imud_open_owned(ring, device_or_path, 0);
 }
 
 /* Releases the ring; may be called twice. */

@@ -70,7 +70,7 @@ def test_daemon_does_not_care(folder: Path, mode: int) -> None:
         assert daemon.stdout is not None
         assert daemon.stdout.readline() == "ready\n"
         arguments = (str(shm), str(HOSTILE_UID), str(ACTS))
-        with Ring(shm / f"imud.{DEVICE}") as ring, python_as(0, HOSTILE, *arguments) as other:
+        with Ring(shm / f"imud.{DEVICE}", owner_uid=DAEMON_UID) as ring, python_as(0, HOSTILE, *arguments) as other:
             out, errors = other.communicate()
             assert (out, other.returncode) == (f"{ACTS}\n", 0), errors
             end.touch()

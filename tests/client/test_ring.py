@@ -16,6 +16,7 @@ from imud.formats.ring import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode
 from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, encode_slot
 from imud.publishers.socket.waker import Waker
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
 
 
 @pytest.fixture(name="board")
@@ -100,6 +101,40 @@ def test_cut_file_is_refused(board: Board) -> None:
     os.truncate(board.path, HEADER_BYTES + SLOTS * SLOT_BYTES - 1)
     with pytest.raises(ServerError, match="expected 20480 bytes, found 20479"):
         Ring(board.path)
+
+
+@needs_root
+def test_owner(board: Board) -> None:
+    """Root's, the directory owner's and the named user's rings are believed; the mode of the directory is no matter."""
+    for mode in (0o1777, 0o755):
+        board.path.parent.chmod(mode)
+        os.chown(board.path, HOSTILE_UID, -1)
+        with pytest.raises(ServerError, match=f"belongs to user {HOSTILE_UID}, who may have planted it"):
+            Ring(board.path)
+        with pytest.raises(ServerError, match="may have planted"):
+            Ring(board.path, owner_uid=DAEMON_UID)
+        Ring(board.path, owner_uid=HOSTILE_UID).close()
+        os.chown(board.path.parent, DAEMON_UID, -1)
+        os.chown(board.path, DAEMON_UID, -1)
+        Ring(board.path).close()
+        os.chown(board.path, 0, -1)
+        Ring(board.path, owner_uid=HOSTILE_UID).close()
+        os.chown(board.path.parent, 0, -1)
+
+
+@needs_root
+def test_owner_of_a_ring_that_is_opened_again(board: Board) -> None:
+    """A ring that another user plants in the place of one that is gone is refused; the daemon's next one is taken."""
+    board.publish([1])
+    os.chown(board.path, DAEMON_UID, -1)
+    with Ring(board.path, from_oldest=True, owner_uid=DAEMON_UID, now_ns=lambda: board.now_ns) as ring:
+        assert numbers(ring) == ([1], 0)
+        board.die()
+        os.chown(board.path, HOSTILE_UID, -1)
+        with pytest.raises(ServerError, match="may have planted"):
+            ring.reopen()
+        os.chown(board.path, DAEMON_UID, -1)
+        assert ring.reopen()
 
 
 @pytest.mark.usefixtures("ring")

@@ -124,7 +124,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     make(path);
     for (; at < size; steps++) {
         if (!opened && steps >= data[0]) {
-            if (imud_open(&ring, path) != 0)
+            if (imud_open_owned(&ring, path, getuid()) != 0)
                 break;
             opened = 1;
         }

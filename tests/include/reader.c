@@ -114,9 +114,9 @@ int main(int argc, char **argv)
 {
     imud_ring ring;
     int error, result;
-    if (argc != 3)
+    if (argc != 3 && argc != 4)
         return 2;
-    error = imud_open(&ring, argv[2]);
+    error = argc == 3 ? imud_open(&ring, argv[2]) : imud_open_owned(&ring, argv[2], (uid_t)atol(argv[3]));
     if (error) {
         printf("error %d %s\n", error, imud_strerror(error));
         return 1;

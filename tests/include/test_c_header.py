@@ -28,6 +28,7 @@ from imud.ledger import LEDGER_FIELDS
 from imud.publishers.socket.waker import Waker
 from imud.sample import Sample
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
 
 INCLUDE = Path(__file__).parents[2] / "imud" / "include"
 READER = Path(__file__).with_name("reader.c")
@@ -346,6 +347,37 @@ def test_no_wait_for_a_fifo(build: Build, tmp_path: Path) -> None:
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=10
         )
         assert done.stdout.startswith("error -3 "), name
+
+
+@needs_root
+@pytest.mark.parametrize("language", ["c99", "c++17"])
+def test_owner(build: Build, board: Board, language: str) -> None:
+    """As of the Python reader: a ring of root, of the directory's owner, or of the user that is named."""
+
+    def opened(directory_uid: int, file_uid: int, *named_uid: int) -> str:
+        os.chown(board.path.parent, directory_uid, -1)
+        os.chown(board.path, file_uid, -1)
+        command = [str(build(READER, language)), "commands", str(board.path), *map(str, named_uid)]
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=10
+        )
+        return done.stdout.split(" ", 2)[1] if done.returncode else "open"
+
+    assert opened(0, HOSTILE_UID) == "-8"
+    assert opened(0, HOSTILE_UID, DAEMON_UID) == "-8"
+    assert opened(DAEMON_UID, HOSTILE_UID) == "-8"
+    assert opened(0, DAEMON_UID, DAEMON_UID) == "open"
+    assert opened(DAEMON_UID, DAEMON_UID) == "open"
+    assert opened(DAEMON_UID, 0, HOSTILE_UID) == "open"
+
+
+@needs_root
+def test_owner_of_a_ring_that_is_opened_again(board: Board, reader: Reader) -> None:
+    board.die()
+    os.chown(board.path, HOSTILE_UID, -1)
+    assert reader.ask("reopen") == ["reopen", "-8", "77"]
+    os.chown(board.path, 0, -1)
+    assert reader.ask("reopen") == ["reopen", "1", "77"]
 
 
 def test_ledger(board: Board, reader: Reader) -> None:
