@@ -189,6 +189,8 @@ class MetricsPublisher:
         self._server: ScrapeServer | None = None
         self._scrapes = 0
         self._scraped_ns = context.now_ns()
+        self._turn = asyncio.Lock()
+        """Of the HTTP thread: 32 snapshots at once would be 32 in one turn of the daemon's event loop."""
 
     @property
     def port(self) -> int:
@@ -240,6 +242,10 @@ class MetricsPublisher:
             return HttpResponse("200 OK", msgspec.json.encode(Scrapes(self._scrapes, age_ns / NS_PER_S)), JSON)
         if request.path != "/metrics":
             return HttpResponse("404 Not Found", b"there is only /metrics\n")
+        async with self._turn:
+            return await self._scrape(request)
+
+    async def _scrape(self, request: HttpRequest) -> HttpResponse:
         self._scrapes += 1
         now_ns = self._scraped_ns = self._context.now_ns()
         try:

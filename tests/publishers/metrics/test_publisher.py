@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -86,6 +87,32 @@ def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
             assert body == '{"scrapes":1,"age_s":4.0}'  # the clock of the test goes on 2 s a look: status, and here
 
     asyncio.run(run())
+
+
+def test_scrapes_at_once_ask_the_loop_one_after_another() -> None:
+    """Each snapshot takes the loop's time; 32 in one turn would make samples and clients wait for all of them."""
+    turn, seen = 0, []
+
+    def status() -> Sequence[DeviceStatus]:
+        seen.append(turn)
+        time.sleep(0.02)  # the other requests are there when the loop goes on
+        return DEVICES
+
+    async def count_turns() -> None:
+        nonlocal turn
+        while True:
+            turn += 1
+            await asyncio.sleep(0)
+
+    async def run() -> None:
+        async with publisher(context(status)) as served:
+            counting = asyncio.create_task(count_turns())
+            answers = await asyncio.gather(*(ask(served.port) for _ in range(8)))
+            counting.cancel()
+            assert {line for line, _, _ in answers} == {"HTTP/1.1 200 OK"}
+
+    asyncio.run(run())
+    assert len(set(seen)) == len(seen) == 8
 
 
 def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
