@@ -1,112 +1,163 @@
 """Table: the attacks. Another one is a function that is given the stage and is a row of ATTACKS."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from time import monotonic, sleep
 
-from tests.attack import starvation
-from tests.attack.hostile import KINDS
-from tests.attack.stage import HOSTILE_UIDS, READ_GID, AttackedDaemon
-from tests.bench.rig import REST_CORES
+from tests.attack import rings, starvation
+from tests.attack.bounds import CLIENTS
+from tests.attack.hostile import KINDS, Deeds
+from tests.attack.stage import HOSTILE_UIDS, PIPE_BYTES, READ_GID, AttackedDaemon
 
-CLIENTS = 256
-SHARED_MEMORY = """
-import sys, time
-from pathlib import Path
-from tests.attack.shared_memory import attack
-end_s = time.monotonic() + float(sys.argv[3])
-print(attack(Path(sys.argv[1]), int(sys.argv[2]), lambda: time.monotonic() > end_s))
-"""
-SHORT = ("nested", "empty-lines", "field-orders", "rates", "statuses", "watch-unread", "connects")
+SHORT = (
+    "nested", "empty-lines", "field-orders", "rates", "statuses", "watch-unread", "connects", "event-storm", "scrapes",
+)  # fmt: skip
 """Kinds of hostile clients in the short form, one of each sort."""
+MANY_DEVICES = 100
+HANG_UPS_S = 0.005
+STARVE_S, STARVE_SEED = 4.0, 5
+"""The second stop of this seed is of 2 s: more than a port holds."""
+LINE_BYTES = 512
+"""A message of the log is shorter: a pipe with less room than that takes no other."""
 
 
-def hostile(stage: AttackedDaemon, seconds: float, kind: str) -> list[str]:
+@dataclass
+class Done:
+    """What came of an attack."""
+
+    problems: list[str] = field(default_factory=list)
+    deeds: Deeds = field(default_factory=Deeds)
+    stops: int = 0
+    """How often the daemon was stopped."""
+
+
+def start(stage: AttackedDaemon, seconds: float, kind: str) -> list[subprocess.Popen[str]]:
     """Hostile clients, half of them of one user and half of another where this process may become others."""
     children = []
     for number, uid in enumerate(HOSTILE_UIDS):
         argv = [
             sys.executable, "-m", "tests.attack.hostile", kind, "--socket", str(stage.socket),
+            "--metrics-port", str(stage.metrics_port), "--nice", str(stage.scheduling.hostile_nice),
             "--clients", str(CLIENTS // len(HOSTILE_UIDS)), "--seconds", str(seconds), "--seed", str(number),
         ]  # fmt: skip
         if os.geteuid() == 0:
             argv += ["--uid", str(uid), "--gid", str(READ_GID)]
         child = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True)
-        os.sched_setaffinity(child.pid, REST_CORES)
+        os.sched_setaffinity(child.pid, stage.scheduling.hostile_cores)
         children.append(child)
-    problems = []
+    return children
+
+
+def end(children: list[subprocess.Popen[str]], seconds: float) -> Done:
+    """Wait for hostile clients; what they did."""
+    done = Done()
     for child in children:
-        child.communicate(timeout=seconds + 30)
+        out, _ = child.communicate(timeout=seconds + 30)
         if child.returncode:
-            problems.append(f"hostile process ended with {child.returncode}")
-    return problems
+            done.problems.append(f"hostile process ended with {child.returncode}")
+        else:
+            done.deeds += Deeds(**json.loads(out))
+    if not done.deeds.connections:
+        done.problems.append("no hostile client could connect")
+    return done
 
 
-def replug(stage: AttackedDaemon, seconds: float) -> list[str]:
+def hostile(stage: AttackedDaemon, seconds: float, kind: str) -> Done:
+    """Hostile clients alone."""
+    return end(start(stage, seconds, kind), seconds)
+
+
+def replug(stage: AttackedDaemon, seconds: float) -> Done:
     """All descriptors that clients can get, then a device is unplugged and plugged in again."""
-    children = []
-    for uid in HOSTILE_UIDS:
-        argv = [
-            sys.executable, "-m", "tests.attack.hostile", "wakers", "--socket", str(stage.socket),
-            "--clients", str(CLIENTS // len(HOSTILE_UIDS)), "--seconds", str(seconds),
-        ]  # fmt: skip
-        if os.geteuid() == 0:
-            argv += ["--uid", str(uid), "--gid", str(READ_GID)]
-        children.append(subprocess.Popen(argv, stdout=subprocess.DEVNULL))
+    children = start(stage, seconds, "wakers")
     sleep(seconds / 2)
-    problems = [] if stage.replug() else ["the device that was plugged in again was not opened"]
-    for child in children:
-        child.wait(timeout=seconds + 30)
-    return problems
+    plugged = stage.replug()
+    done = end(children, seconds)
+    if not plugged:
+        done.problems.append("the device that was plugged in again was not opened")
+    return done
 
 
-def shared_memory(stage: AttackedDaemon, seconds: float) -> list[str]:
+def hang_ups(stage: AttackedDaemon, seconds: float) -> int:
+    """A flood of SIGHUP; how many."""
+    end_s, count = monotonic() + seconds, 0
+    while monotonic() < end_s and stage.alive:
+        stage.signal(signal.SIGHUP)
+        count += 1
+        sleep(HANG_UPS_S)
+    return count
+
+
+def reloads(stage: AttackedDaemon, seconds: float) -> Done:
+    """A flood of SIGHUP alone."""
+    return Done(deeds=Deeds(requests=hang_ups(stage, seconds)))
+
+
+def event_flood(stage: AttackedDaemon, seconds: float) -> Done:
+    """Each reload is an event for all hostile clients."""
+    children = start(stage, seconds, "event-watch")
+    count = hang_ups(stage, seconds)
+    done = end(children, seconds)
+    done.deeds += Deeds(requests=count)
+    return done
+
+
+def unread_log(stage: AttackedDaemon, seconds: float) -> Done:
+    """Nobody reads the log, which is full, while there is something to write into it: each reload is refused."""
+    seen = stage.log.spoilt
+    stage.spoil_configuration()
+    stage.log.stop_reading()
+    done = reloads(stage, seconds)
+    waiting_bytes = stage.log.waiting_bytes
+    stage.log.read_on()
+    stage.change()
+    if waiting_bytes < PIPE_BYTES - LINE_BYTES:
+        done.problems.append(f"the log was not full: {waiting_bytes} bytes of {PIPE_BYTES}")
+    if stage.log.spoilt == seen:
+        done.problems.append("the daemon had nothing to write into the log")
+    return done
+
+
+def shared_memory(stage: AttackedDaemon, seconds: float, sticky: bool) -> Done:
     """Another user in the directory of the rings; left out, and said so, where this process may not become one."""
     if os.geteuid():
-        print("shared-memory: left out, only root can act as another user", flush=True)
-        return []
-    child = subprocess.run(
-        [sys.executable, "-c", SHARED_MEMORY, str(stage.folder), str(HOSTILE_UIDS[0]), str(seconds)],
-        stdout=subprocess.PIPE, text=True, timeout=seconds + 30, check=False,
-    )  # fmt: skip
-    return [] if child.returncode == 0 and int(child.stdout) else [f"hostile process ended with {child.returncode}"]
+        print("shared memory: left out, only root can act as another user", flush=True)
+        sleep(seconds)
+        return Done()
+    problems, acts = rings.attack(stage, HOSTILE_UIDS[0], seconds, sticky)
+    return Done(problems, Deeds(clients=1, requests=acts))
 
 
-def reloads(stage: AttackedDaemon, seconds: float) -> list[str]:
-    """A flood of SIGHUP."""
-    end_s = monotonic() + seconds
-    while monotonic() < end_s and stage.alive:
-        os.kill(stage.pid, signal.SIGHUP)
-        sleep(0.005)
-    return []
+def starved(stage: AttackedDaemon, seconds: float) -> Done:
+    """SIGSTOP and CPU hogs: samples are lost then, as many as the port refused."""
+    before = stage.port_refused
+    stops = starvation.attack(stage.pid, max(seconds, STARVE_S), STARVE_SEED)
+    problems = [] if stops and stage.port_refused > before else ["the daemon was never stopped for long enough"]
+    return Done(problems, Deeds(requests=stops), stops)
 
 
-def starved(stage: AttackedDaemon, seconds: float) -> list[str]:
-    """SIGSTOP and CPU hogs. Samples are lost then; tests/attack/test_starvation.py proves that the ledger has them."""
-    return [] if starvation.attack(stage.pid, seconds) else ["the daemon was never stopped"]
-
-
-def calm(_stage: AttackedDaemon, seconds: float) -> list[str]:
+def calm(_stage: AttackedDaemon, seconds: float) -> Done:
     """No attack: what the machine itself does."""
     sleep(seconds)
-    return []
+    return Done()
 
 
 @dataclass(frozen=True)
 class Attack:
     """A row of the table."""
 
-    run: Callable[[AttackedDaemon, float], list[str]]
-    """Attacks for so many seconds; returns what went wrong."""
+    run: Callable[[AttackedDaemon, float], Done]
+    """Attacks for so many seconds."""
     short: bool = True
     """Whether it is in the short form."""
-    starves: bool = False
-    """Whether it takes the processor away: losses and delays are its aim then, and have no bound."""
+    devices: int = 0
+    """Devices beside the usual four."""
 
 
 ATTACKS: dict[str, Attack] = {
@@ -114,7 +165,13 @@ ATTACKS: dict[str, Attack] = {
     **{kind: Attack(partial(hostile, kind=kind), kind in SHORT) for kind in KINDS},
     "mix": Attack(partial(hostile, kind="mix")),
     "replug": Attack(replug),
-    "shared-memory": Attack(shared_memory),
+    "shared-memory": Attack(partial(shared_memory, sticky=False)),
+    "sticky-memory": Attack(partial(shared_memory, sticky=True)),
     "reloads": Attack(reloads),
-    "starved": Attack(starved, starves=True),
+    "event-flood": Attack(event_flood),
+    "unread-log": Attack(unread_log),
+    "schemas-100": Attack(partial(hostile, kind="schemas"), devices=MANY_DEVICES),
+    "statuses-100": Attack(partial(hostile, kind="statuses"), devices=MANY_DEVICES),
+    "mix-100": Attack(partial(hostile, kind="mix"), False, devices=MANY_DEVICES),
+    "starved": Attack(starved),
 }

@@ -1,7 +1,8 @@
 """A well-behaved client: watches every sample, asks `poll` every 10 ms; prints its figures when it gets a line.
 
-`python -m tests.attack.good_client SOCKET`. Frame i of the writer, at 1 kHz, carries i ms as its time, so a gap there
-is a sample that is lost wherever it was lost: in the port, in the daemon, or on the way to this client.
+`python -m tests.attack.good_client SOCKET [UID GID]`, as that user where one is given. Frame i of the writer, at 1 kHz,
+carries i ms as its time, so a gap there is a sample that is lost wherever it was lost: in the port, in the daemon, or
+on the way to this client.
 """
 
 import json
@@ -15,6 +16,7 @@ from dataclasses import dataclass, field
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.units import NS_PER_MS
+from tests.attack.hostile import become
 
 ASK_S = 0.01
 
@@ -97,6 +99,8 @@ def connect(path: str) -> socket.socket:
 
 def main() -> None:
     """Run until standard input ends."""
+    if len(sys.argv) == 4:
+        become(int(sys.argv[2]), int(sys.argv[3]))
     watcher = Watcher(sys.argv[1])
     asking = connect(sys.argv[1])
     question = line_of(encode_request("poll", {"devices": ["d0"]}, 7))

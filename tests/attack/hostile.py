@@ -1,7 +1,7 @@
 """A process full of hostile clients: `python -m tests.attack.hostile KIND --socket PATH --clients N --seconds S`.
 
 Each kind says what its clients send and how they read. The engine writes and reads as fast as that allows, connects
-again when it is disconnected, and ends after the given time.
+again when it is disconnected, ends after the given time, and prints what it did as JSON (`Deeds`).
 """
 
 import argparse
@@ -13,14 +13,13 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum, auto
 
 from imud.sample import SAMPLE_FIELDS
 
-NICE = 10
-"""Hostile processes are to cost the daemon its own time, not that of the machine's scheduler."""
 RECONNECTS_PER_S = 200
+LOOPBACK = "127.0.0.1"
 
 
 class Reading(Enum):
@@ -42,6 +41,26 @@ class Kind:
     """Whether it sends only once per connection."""
     leaves: bool = False
     """Whether it disconnects as soon as it has sent."""
+    scrapes: bool = False
+    """Whether it is a client of the metrics page, and not of the socket."""
+
+
+@dataclass
+class Deeds:
+    """What hostile clients, or another attack, did."""
+
+    clients: int = 0
+    """At the same time."""
+    connections: int = 0
+    requests: int = 0
+    """Lines that were sent to the socket, scrapes, signals, acts on files."""
+    sent_bytes: int = 0
+
+    def __add__(self, other: "Deeds") -> "Deeds":
+        return Deeds(
+            self.clients + other.clients, self.connections + other.connections, self.requests + other.requests,
+            self.sent_bytes + other.sent_bytes,
+        )  # fmt: skip
 
 
 def request(method: str, **params: object) -> bytes:
@@ -96,6 +115,10 @@ KINDS: dict[str, Kind] = {
     "rates": Kind(any_rate),
     "polls": Kind(lambda _rng: request("poll") * 16),
     "statuses": Kind(lambda _rng: request("status") * 4),
+    "schemas": Kind(lambda _rng: request("schema") * 4),
+    "event-watch": Kind(lambda _rng: request("events"), once=True),
+    "event-storm": Kind(lambda _rng: request("events") * 16),
+    "scrapes": Kind(lambda _rng: b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n", once=True, scrapes=True),
     "never-reads": Kind(lambda _rng: request("watch") + request("status") * 2, Reading.NEVER),
     "watch-unread": Kind(lambda _rng: request("watch"), Reading.NEVER, once=True),
     "reads-slowly": Kind(lambda _rng: request("watch") + request("events"), Reading.SLOWLY, once=True),
@@ -108,22 +131,27 @@ KINDS: dict[str, Kind] = {
 class Hostile:
     """One hostile client."""
 
-    def __init__(self, path: str, kind: Kind, rng: random.Random) -> None:
-        self._path, self._kind, self._rng = path, kind, rng
+    def __init__(self, path: str, metrics_port: int, kind: Kind, rng: random.Random, deeds: Deeds) -> None:
+        self._path, self._port, self._kind, self._rng, self._deeds = path, metrics_port, kind, rng, deeds
         self._left = b""
         self._sent = False
         self.sock: socket.socket | None = None
 
     def connect(self) -> socket.socket | None:
         """Connect; None when that was refused at once."""
-        sock = socket.socket(socket.AF_UNIX)
+        sock = socket.socket(socket.AF_INET if self._kind.scrapes else socket.AF_UNIX)
         sock.setblocking(False)
         try:
-            sock.connect(self._path)
+            sock.connect((LOOPBACK, self._port) if self._kind.scrapes else self._path)
+        except BlockingIOError:  # TCP; a full queue of a UNIX socket
+            if not self._kind.scrapes:
+                sock.close()
+                return None
         except OSError:
             sock.close()
             return None
         self.sock, self._left, self._sent = sock, b"", False
+        self._deeds.connections += 1
         return sock
 
     def write(self) -> bool:
@@ -134,7 +162,10 @@ class Hostile:
                 return not self._kind.leaves
             self._left, self._sent = self._kind.sends(self._rng), True
         try:
-            self._left = self._left[self.sock.send(self._left) :]
+            size_bytes = self.sock.send(self._left)
+            self._deeds.sent_bytes += size_bytes
+            self._deeds.requests += 1 if self._kind.scrapes else self._left.count(b"\n", 0, size_bytes)
+            self._left = self._left[size_bytes:]
         except BlockingIOError:
             return True
         except OSError:
@@ -162,18 +193,20 @@ class Hostile:
     def events(self) -> int:
         """What to wait for."""
         reads = 0 if self._kind.reading is Reading.NEVER else selectors.EVENT_READ
-        writes = 0 if self._sent and self._kind.once and not self._left else selectors.EVENT_WRITE
+        done = self._sent and self._kind.once and not self._left and not self._kind.leaves
+        writes = 0 if done else selectors.EVENT_WRITE
         return reads | writes
 
 
-def attack(kinds: list[Kind], path: str, clients: int, seconds: float, seed: int) -> int:
-    """Run the clients; return how many connections were made."""
+def attack(kinds: list[Kind], path: str, metrics_port: int, clients: int, seconds: float, seed: int) -> Deeds:
+    """Run the clients; return what they did."""
     rng = random.Random(seed)
     end_s = time.monotonic() + seconds
     selector = selectors.DefaultSelector()
-    everyone = [Hostile(path, kinds[number % len(kinds)], rng) for number in range(clients)]
+    deeds = Deeds(clients)
+    everyone = [Hostile(path, metrics_port, kinds[number % len(kinds)], rng, deeds) for number in range(clients)]
     idle = list(everyone)  # a client that waits for nothing is in no other list, and its connection has to last
-    connections, allowed = 0, float(clients)
+    allowed = float(clients)
     last_s = time.monotonic()
     slow = any(kind.reading is Reading.SLOWLY for kind in kinds)
     while (now_s := time.monotonic()) < end_s:
@@ -185,7 +218,6 @@ def attack(kinds: list[Kind], path: str, clients: int, seconds: float, seed: int
             if sock is None:
                 idle.insert(0, client)
                 break
-            connections += 1
             selector.register(sock, selectors.EVENT_READ | selectors.EVENT_WRITE, client)
         for key, events in selector.select(0.01):
             client = key.data
@@ -204,7 +236,7 @@ def attack(kinds: list[Kind], path: str, clients: int, seconds: float, seed: int
                     selector.unregister(key.fileobj)
         if slow:
             time.sleep(0.01)
-    return connections
+    return deeds
 
 
 def become(uid: int, gid: int) -> None:
@@ -219,6 +251,8 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("kind", choices=[*KINDS, "mix"])
     parser.add_argument("--socket", required=True)
+    parser.add_argument("--metrics-port", type=int, default=0)
+    parser.add_argument("--nice", type=int, default=0)
     parser.add_argument("--clients", type=int, default=128)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--uid", type=int)
@@ -226,11 +260,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     with suppress(OSError):
-        os.nice(NICE)
+        os.nice(args.nice)
     if args.uid is not None:
         become(args.uid, args.gid)
     kinds = list(KINDS.values()) if args.kind == "mix" else [KINDS[args.kind]]
-    print(attack(kinds, args.socket, args.clients, args.seconds, args.seed), flush=True)
+    deeds = attack(kinds, args.socket, args.metrics_port, args.clients, args.seconds, args.seed)
+    print(json.dumps(asdict(deeds)), flush=True)
 
 
 if __name__ == "__main__":

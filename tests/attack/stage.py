@@ -1,12 +1,21 @@
-"""The daemon under attack: `imud run` with a 1 kHz device and three idle ones, and a well-behaved client."""
+"""The daemon under attack: `imud run` with a 1 kHz device and idle ones, and a well-behaved client."""
 
+import fcntl
 import grp
 import json
 import os
 import pty
+import resource
+import signal
+import socket
+import subprocess
+import sys
 import tempfile
+import termios
+import threading
 import tty
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from enum import Enum
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, Self
@@ -15,9 +24,13 @@ import msgspec
 
 from imud.cli.arguments import statuses
 from imud.client import Client
-from tests.bench.rig import REST_CORES, SERVER_CORE, Process, cpu_ns, rss_mb, wait_for
+from imud.ledger import lost
+from tests.attack.hostile import LOOPBACK
+from tests.bench.rig import CORES, REST_CORES, SERVER_CORE, Process, cpu_ns, rss_mb, wait_for
 
 HOSTILE_UIDS = (65_534, 65_533)
+GOOD_UID = 65_532
+"""An ordinary reader: neither root, nor the daemon's user, nor one of the hostile ones."""
 READ_GID, CONTROL_GID = 65_534, 1
 RATE_HZ = 1000
 PRIORITY = 10
@@ -28,6 +41,46 @@ IDLE_DEVICES = 3
 REPLUG_LIMIT_S = 5.0
 CLIENTS_MAX = 320
 """Room for 256 hostile clients beside the reserved places."""
+FDS_MAX = 16_384
+PIPE_BYTES = 4096
+"""The least that a pipe has room for, so that it is full soon."""
+FILL_S = 0.2
+SLOTS = 1024
+"""256 KiB of memory for a ring: there are a hundred devices in some attacks."""
+LOST_SETTLE_S = 1.0
+"""A loss is known with the sample after it."""
+QUIET_LIMIT_S = 10.0
+"""Closed connections are gone by then, those that waited to be accepted at 64 per second and user included."""
+LOG_SPOILT = b"the configuration stays as it was"
+LOG_FILLER = b"-" * 63
+LOG_EXPECTED = (b"nothing is heard on", LOG_SPOILT, LOG_FILLER, b" is gone (hung up)")
+"""Of idle devices, and of what attacks put into the log: not shown."""
+PROBLEMS = 20
+"""As many of a configuration as the log has."""
+
+
+class Scheduling(Enum):
+    """How the daemon runs; the device and the good client, which measure, are real-time in both."""
+
+    UNIT = "unit"
+    """As the unit has it: the default policy, nice 0, any core; so do hostile clients."""
+    REAL_TIME = "real-time"
+    """Real-time on a core of its own, hostile clients at nice 10 on the others: what the daemon itself takes."""
+
+    @property
+    def daemon_cores(self) -> set[int]:
+        """Where the daemon may run."""
+        return set(CORES) if self is Scheduling.UNIT else SERVER_CORE
+
+    @property
+    def hostile_cores(self) -> set[int]:
+        """Where hostile clients may run."""
+        return set(CORES) if self is Scheduling.UNIT else REST_CORES
+
+    @property
+    def hostile_nice(self) -> int:
+        """Of hostile clients."""
+        return 0 if self is Scheduling.UNIT else 10
 
 
 def before_others(pid: int) -> bool:
@@ -61,36 +114,109 @@ class IdlePort:
             os.close(fd)
 
 
+class LogPipe:
+    """The daemon's standard error: a pipe that is read, or not, as an attack wants it."""
+
+    def __init__(self) -> None:
+        self._reader, self.writer = os.pipe()
+        fcntl.fcntl(self.writer, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        self._reads = threading.Event()
+        self._reads.set()
+        self._thread = threading.Thread(target=self._pass_on)
+        self.spoilt = 0
+        """Lines that say that a configuration was refused."""
+
+    @property
+    def waiting_bytes(self) -> int:
+        """What is in the pipe."""
+        size = fcntl.ioctl(self._reader, termios.FIONREAD, bytes(4))
+        return int.from_bytes(size, sys.byteorder)
+
+    def stop_reading(self) -> None:
+        """Leave in it what comes from now on, and fill it, so that nothing that comes from now on can go into it."""
+        self._reads.clear()
+        writer = os.open(f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK)  # the daemon's blocks
+        try:
+            end_s = monotonic() + FILL_S  # what the reader still had in hand takes one turn
+            while monotonic() < end_s:
+                with suppress(BlockingIOError):
+                    os.write(writer, LOG_FILLER + b"\n")
+                    continue
+                sleep(0.01)
+        finally:
+            os.close(writer)
+
+    def read_on(self) -> None:
+        """Read again."""
+        self._reads.set()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.read_on()
+        os.close(self.writer)
+        self._thread.join()
+        os.close(self._reader)
+
+    def _pass_on(self) -> None:
+        """Print what is read, but for what is expected."""
+        rest = b""
+        while data := os.read(self._reader, 65536):
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                self.spoilt += LOG_SPOILT in line
+                if not any(expected in line for expected in LOG_EXPECTED):
+                    print(line.decode(errors="backslashreplace"), file=sys.stderr, flush=True)
+            self._reads.wait()
+
+
+class Daemon(Process):
+    """`imud run`, with its log in a pipe."""
+
+    def __init__(self, cores: set[int], file: Path, log: LogPipe) -> None:
+        self.popen = subprocess.Popen(
+            [sys.executable, "-m", "imud", "run", "-c", str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=log.writer, text=True, cwd=Path(__file__).parents[2],
+        )  # fmt: skip
+        os.sched_setaffinity(self.popen.pid, cores)
+
+
 class AttackedDaemon:
     """A running daemon in a folder of its own. Use as a context."""
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, scheduling: Scheduling) -> None:
         self._seconds = seconds
         self._stack = ExitStack()
+        self.scheduling = scheduling
         self.undisturbed = True
-        """Whether daemon, device and good client run before other programs of the machine, hostile clients included."""
+        """Whether device and good client, and a real-time daemon, could be made to run before other programs."""
+        self.metrics_port = free_port()
+        self.log = LogPipe()
 
     def __enter__(self) -> Self:
+        raise_descriptors()
         stack = self._stack
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-attack-")))
         self.folder.chmod(0o755)
-        self.socket = self.folder / "s"
-        frames = int(self._seconds * RATE_HZ)
-        (self.folder / "times").write_bytes(bytes(8 * frames))
-        self._writer = stack.enter_context(
-            Process(
-                REST_CORES, "-m", "tests.bench.writer", "--rate", str(RATE_HZ), "--frames", str(frames),
-                "--times", str(self.folder / "times"),
-            )
-        )  # fmt: skip
+        self.socket, self.rings, self._file = self.folder / "s", self.folder / "shm", self.folder / "imud.yaml"
+        self.rings.mkdir(0o755)
+        self._writer = self._start_device(stack)
         self.idle = [IdlePort(self.folder / f"port{number}") for number in range(1, 1 + IDLE_DEVICES)]
-        file = self._configure(self._writer.line())
-        self._daemon = stack.enter_context(Process(SERVER_CORE, "-m", "imud", "run", "-c", str(file)))
+        self._ports = [self._writer.line(), *(str(port.path) for port in self.idle)]
+        self._configure(self._ports)
+        stack.enter_context(self.log)
+        self._daemon = stack.enter_context(Daemon(self.scheduling.daemon_cores, self._file, self.log))
         wait_for(self.socket)
         self._writer.say("go")
-        self.good = stack.enter_context(Process(REST_CORES, "-m", "tests.attack.good_client", str(self.socket)))
+        user = [str(GOOD_UID), str(READ_GID)] if os.geteuid() == 0 else []
+        self.good = stack.enter_context(Process(REST_CORES, "-m", "tests.attack.good_client", str(self.socket), *user))
         self.good.line()
-        for process in (self._writer, self._daemon, self.good):
+        preferred = [self._writer, self.good]
+        if self.scheduling is Scheduling.REAL_TIME:
+            preferred.append(self._daemon)
+        for process in preferred:
             self.undisturbed = self.undisturbed and before_others(process.popen.pid)
         sleep(SETTLE_S)
         self.figures()
@@ -131,6 +257,47 @@ class AttackedDaemon:
         assert isinstance(found, dict)
         return found
 
+    @property
+    def port_refused(self) -> int:
+        """Frames so far that the device's port had no room for."""
+        return int.from_bytes((self.folder / "refused").read_bytes(), sys.byteorder)
+
+    def losses(self) -> tuple[int, int]:
+        """Lost samples of the 1 kHz device in the daemon's ledger, and gaps of unknown size."""
+        with Client(str(self.socket)) as client:
+            ledger = next(found for found in statuses(client) if found.name == "d0").ledger
+        return lost(ledger), ledger["lost_unknown"]
+
+    def fds_above(self, before: int, limit: int) -> int:
+        """Open descriptors above `before`, once they are at most `limit` or have had the time to become so few."""
+        end_s = monotonic() + QUIET_LIMIT_S
+        while (above := self.fds - before) > limit and monotonic() < end_s:
+            sleep(0.05)
+        return above
+
+    def signal(self, number: int) -> None:
+        """Send the daemon a signal."""
+        os.kill(self.pid, number)
+
+    def spoil_configuration(self) -> None:
+        """Leave a configuration that a reload refuses for many reasons; `change` mends it."""
+        self._file.write_bytes(msgspec.json.encode({f"no-such-key-{number}": 1 for number in range(PROBLEMS)}))
+
+    def change(self, *, devices: int = 0, slots: int = SLOTS) -> None:
+        """Reload with so many more idle devices and with rings of another size; wait until the devices are there."""
+        for number in range(len(self._ports) - 1 - IDLE_DEVICES, devices):
+            port = IdlePort(self.folder / f"more{number}")
+            self._ports.append(str(port.path))
+        self._configure(self._ports[: 1 + IDLE_DEVICES + devices], slots)
+        self.signal(signal.SIGHUP)
+        end_s = monotonic() + REPLUG_LIMIT_S
+        while monotonic() < end_s:
+            with Client(str(self.socket)) as client:
+                if len(statuses(client)) == 1 + IDLE_DEVICES + devices:
+                    return
+            sleep(0.05)
+        raise TimeoutError(f"the daemon did not change to {devices} more devices within {REPLUG_LIMIT_S:g} s")
+
     def status(self) -> dict[str, Any]:
         """The state of the socket."""
         with Client(str(self.socket)) as client:
@@ -155,11 +322,21 @@ class AttackedDaemon:
                 sleep(0.05)
         return False
 
-    def _configure(self, port: str) -> Path:
-        paths = [port, *(str(port.path) for port in self.idle)]
+    def _start_device(self, stack: ExitStack) -> Process:
+        frames = int(self._seconds * RATE_HZ)
+        (self.folder / "times").write_bytes(bytes(8 * frames))
+        (self.folder / "refused").write_bytes(bytes(8))
+        return stack.enter_context(
+            Process(
+                REST_CORES, "-m", "tests.bench.writer", "--rate", str(RATE_HZ), "--frames", str(frames),
+                "--times", str(self.folder / "times"), "--refused", str(self.folder / "refused"),
+            )
+        )  # fmt: skip
+
+    def _configure(self, ports: list[str], slots: int = SLOTS) -> None:
         devices = {
             f"d{number}": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": path, "baud": 921600}}
-            for number, path in enumerate(paths)
+            for number, path in enumerate(ports)
         }
         groups = {"group": grp.getgrgid(READ_GID).gr_name, "control_group": grp.getgrgid(CONTROL_GID).gr_name}
         if os.geteuid():
@@ -168,10 +345,25 @@ class AttackedDaemon:
             "log_level": "warning",
             "state_dir": str(self.folder),
             "socket": {"path": str(self.socket), "clients_max": CLIENTS_MAX, **groups},
-            "shm": {"directory": str(self.folder)},
-            "metrics": {"port": 0},
+            "shm": {"directory": str(self.rings), "slots": slots, "group": groups["group"]},
+            "metrics": {"port": self.metrics_port},
             "devices": devices,
         }
-        file = self.folder / "imud.yaml"
-        file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
-        return file
+        new = self._file.with_suffix(".new")
+        new.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
+        new.replace(self._file)
+
+
+def free_port() -> int:
+    """A TCP port of the loopback address that nothing listens on."""
+    with socket.socket() as sock:
+        sock.bind((LOOPBACK, 0))
+        port = sock.getsockname()[1]
+        assert isinstance(port, int)
+        return port
+
+
+def raise_descriptors() -> None:
+    """Let this process, and the daemon, have as many as LimitNOFILE of the unit allows."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(FDS_MAX, hard), hard))

@@ -2,8 +2,9 @@
 
 Prints one line with the slave paths, waits for a line on standard input, writes, prints how many frames each pty took.
 Frame i carries FIRST_PA + i in its pressure field, and the time of its write stands in an array of i64 in the file
-`--times`, so that a reader knows each sample's true moment without any cost on the measured side. With `--udp PORT`
-attitude sentences of NMEA 0183 go to that port instead, for gpsd.
+`--times`, so that a reader knows each sample's true moment without any cost on the measured side; `--refused` names a
+file of one i64 that has the number of frames so far that a pty did not take whole. With `--udp PORT` attitude sentences
+of NMEA 0183 go to that port instead, for gpsd.
 """
 
 import argparse
@@ -87,9 +88,12 @@ def sentence(i: int) -> bytes:
 
 
 def play(
-    masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, make: MakeFrame, edges: int = -1
-) -> int:
+    masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, make: MakeFrame, edges: int = -1,
+    count: mmap.mmap | None = None,
+) -> int:  # fmt: skip
     """Write `frames` frames to every master, in `phases` groups over each period; return how many were refused.
+
+    A frame that is taken in part is refused. The number so far is in `count`.
 
     With a descriptor for `edges`, the event of a pulse on SOUT goes there right before each frame.
     """
@@ -112,11 +116,24 @@ def play(
                 if edges >= 0:
                     os.write(edges, EVENT.pack(time.monotonic_ns() - PULSE_NS, RISING, 0, i + 1, i + 1))
             for master in group:
-                try:
-                    os.write(master, frame)
-                except BlockingIOError:
+                if not _takes(master, frame):
                     refused += 1
+                    if count:
+                        pack("<q", count, 0, refused)
     return refused
+
+
+def _takes(master: int, frame: bytes | bytearray) -> bool:
+    try:
+        return os.write(master, frame) == len(frame)
+    except BlockingIOError:
+        return False
+
+
+def mapped(path: str, size_bytes: int) -> mmap.mmap:
+    """A file of that size that others read."""
+    with open(path, "r+b") as file:
+        return mmap.mmap(file.fileno(), size_bytes)
 
 
 def main() -> None:
@@ -127,11 +144,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, required=True)
     parser.add_argument("--phases", type=int, default=1)
     parser.add_argument("--times", required=True)
+    parser.add_argument("--refused", metavar="FILE")
     parser.add_argument("--udp", type=int, metavar="PORT")
     parser.add_argument("--edges", help="FIFO that gets the events of SOUT")
     args = parser.parse_args()
-    with open(args.times, "r+b") as file:
-        times = mmap.mmap(file.fileno(), 8 * args.frames)
+    times, count = mapped(args.times, 8 * args.frames), mapped(args.refused, 8) if args.refused else None
     if args.udp:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.connect(("127.0.0.1", args.udp))
@@ -145,7 +162,7 @@ def main() -> None:
     sys.stdin.readline()
     edges = os.open(args.edges, os.O_WRONLY) if args.edges else -1
     masters, make = [master for master, _ in pairs], hi91_frames(args.rate)
-    print(play(masters, args.rate, args.frames, args.phases, times, make, edges), flush=True)
+    print(play(masters, args.rate, args.frames, args.phases, times, make, edges, count), flush=True)
     sys.stdin.readline()
 
 

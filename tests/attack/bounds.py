@@ -1,0 +1,102 @@
+"""What was measured while an attack ran, and the bounds that it must keep."""
+
+from dataclasses import dataclass
+from math import inf
+from typing import Final
+
+from tests.attack.hostile import Deeds
+
+CLIENTS: Final = 256
+"""Hostile clients at the same time."""
+P99_LIMIT_MS: Final = 5.0
+"""Of answers to the good client; its samples may be as late, from the arrival of their last byte to the client."""
+RSS_LIMIT_MB: Final = 64 * 1.048576
+"""Above idle: `socket.memory_mb`, which bounds all that waits for clients."""
+WAKERS_PER_USER: Final = 4 * 128
+"""4 × `socket.clients_per_user` (docs/socket.md): descriptors by `notify` of one user."""
+HOSTILE_USERS: Final = 2
+FDS_OTHERS: Final = 64
+"""32 connections of scrapes, 5 of a device that is plugged in again, clients of this program, what is just closed."""
+FDS_LIMIT: Final = CLIENTS + HOSTILE_USERS * WAKERS_PER_USER + FDS_OTHERS
+"""Descriptors above idle: one for each hostile client, and one for each of the wakers that their users may have."""
+FDS_LEFT_LIMIT: Final = 4
+"""Above those of before, a while after the attack: connections of this program; more is a leak."""
+LEDGER_TOLERANCE: Final = 1
+"""Samples by which losses in the ledger may differ from what the port refused, over any number of stops."""
+
+
+@dataclass
+class Measured:
+    """What happened while one attack ran."""
+
+    deeds: Deeds
+    samples: int = 0
+    """Of the good client."""
+    lost: int = 0
+    """Missing at the good client."""
+    dropped: int = 0
+    """Of these, what the daemon says that it dropped."""
+    reply_p50_ms: float = 0.0
+    reply_p99_ms: float = 0.0
+    reply_max_ms: float = 0.0
+    sample_p99_ms: float = 0.0
+    above_mb: float = 0.0
+    fds: int = 0
+    """The most there were, above idle."""
+    fds_left: int = 0
+    """Above those of before the attack, when it was over."""
+    cpu_share: float = 0.0
+    refused: int = 0
+    evicted: int = 0
+    failed: int = 0
+    """Errors in the daemon while a client was served."""
+    port_refused: int = 0
+    """Frames that the device's port had no room for: the true losses."""
+    ledger_lost: int = 0
+    ledger_unknown: int = 0
+    """Gaps of unknown size in the ledger."""
+    stops: int = 0
+    """How often the attack stopped the daemon."""
+
+
+def exceeded(seen: Measured, *, delays: bool = True) -> list[str]:
+    """The bounds that were exceeded; those of delays only where they are judged.
+
+    An attack that stops the daemon has losses and delays as its aim: losses must be those of the port then.
+    """
+    starves = seen.stops > 0
+    p99_limit_ms = P99_LIMIT_MS if delays and not starves else inf
+    problems = [
+        f"{name} {value:.4g}{unit}, expected at most {limit:.4g}{unit}"
+        for name, value, limit, unit in (
+            ("p99 of the good client's answers", seen.reply_p99_ms, p99_limit_ms, " ms"),
+            ("p99 of the good client's samples", seen.sample_p99_ms, p99_limit_ms, " ms"),
+            ("memory above idle", seen.above_mb, RSS_LIMIT_MB, " MB"),
+            ("descriptors above idle", seen.fds, FDS_LIMIT, ""),
+            ("descriptors left over", seen.fds_left, FDS_LEFT_LIMIT, ""),
+            ("errors in the daemon while a client was served", seen.failed, 0, ""),
+        )
+        if value > limit
+    ]
+    if not seen.samples:
+        problems.append("the good client got no samples")
+    return problems + _losses(seen, starves)
+
+
+def _losses(seen: Measured, starves: bool) -> list[str]:
+    problems = []
+    if not starves and (seen.lost or seen.dropped or seen.port_refused):
+        problems.append(
+            f"{seen.lost} samples lost, {seen.dropped} of them dropped for the good client,"
+            f" {seen.port_refused} refused by the port"
+        )
+    if abs(seen.ledger_lost - seen.port_refused) > LEDGER_TOLERANCE:
+        problems.append(
+            f"the ledger has {seen.ledger_lost} lost samples, the port refused {seen.port_refused}:"
+            f" expected a difference of at most {LEDGER_TOLERANCE}"
+        )
+    if abs(seen.lost - seen.dropped - seen.port_refused) > LEDGER_TOLERANCE:
+        problems.append(f"the good client missed {seen.lost} samples, the port refused {seen.port_refused}")
+    if seen.ledger_unknown:
+        problems.append(f"{seen.ledger_unknown} gaps of unknown size, of a device that sends its time")
+    return problems

@@ -1,0 +1,114 @@
+"""The attack on shared memory beside a running daemon, with a reader that must not be misled.
+
+The directory is one where only the daemon may make names, or a sticky one. In a sticky one the daemon makes rings of
+other sizes meanwhile, so that names become free that the hostile user is after.
+"""
+
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import dataclass, field
+from threading import Event, Thread
+from time import monotonic_ns, sleep
+from typing import Final
+
+from imud.client import Ring
+from imud.errors import ServerError
+from tests.attack.shared_memory import DEVICES
+from tests.attack.stage import SLOTS, AttackedDaemon
+
+PRIVATE_MODE: Final = 0o755
+STICKY_MODE: Final = 0o1777
+OTHER_SLOTS: Final = 2 * SLOTS
+READ_S: Final = 0.02
+SETTLE_S: Final = 0.3
+"""Rings that were made anew have samples, and a heartbeat."""
+REMADE_MISSED_MAX: Final = 500
+"""Samples that a reader may miss while all rings are made anew twice, of a device with 1 kHz: half a second."""
+HOSTILE: Final = """
+import sys, time
+from pathlib import Path
+from tests.attack.shared_memory import attack
+end_s = time.monotonic() + float(sys.argv[3])
+print(attack(Path(sys.argv[1]), int(sys.argv[2]), lambda: time.monotonic() > end_s))
+"""
+
+
+@dataclass
+class Witness:
+    """Reads the ring of `d0` all the time, and tries to open what the hostile user made."""
+
+    stage: AttackedDaemon
+    samples: int = 0
+    missed: int = 0
+    newest: int = 0
+    refused: int = 0
+    """Files that were not believed."""
+    problems: list[str] = field(default_factory=list)
+    over: Event = field(default_factory=Event)
+
+    def run(self) -> None:
+        """Read until it is over."""
+        try:
+            with Ring(self.stage.rings / "imud.d0") as ring:
+                self._follow(ring)
+        except ServerError as error:
+            self.problems.append(f"a reader was stopped: {error}")
+
+    def _follow(self, ring: Ring) -> None:
+        epoch, self.newest = ring.epoch, ring.newest_seq
+        while not self.over.wait(READ_S):
+            samples, missed = ring.read()
+            self.samples += len(samples)
+            self.missed += missed
+            for sample in samples:
+                if sample.seq <= self.newest:
+                    self.problems.append(f"a reader got sample {sample.seq} after {self.newest}")
+                self.newest = sample.seq
+            self._open_foreign(epoch)
+        if ring.epoch != epoch or not ring.alive(monotonic_ns()):
+            self.problems.append("a reader has no living ring of the daemon at the end")
+
+    def _open_foreign(self, epoch: int) -> None:
+        for name in DEVICES:
+            try:
+                with closing(Ring(self.stage.rings / f"imud.{name}")) as ring:
+                    if ring.epoch != epoch:
+                        self.problems.append(f"a reader believed a forged ring of {name}")
+            except ServerError as error:
+                self.refused += "no such ring" not in str(error)
+
+
+def attack(stage: AttackedDaemon, uid: int, seconds: float, sticky: bool) -> tuple[list[str], int]:
+    """Let user `uid` act in the directory of the rings; what went wrong, and the number of his acts."""
+    stage.rings.chmod(STICKY_MODE if sticky else PRIVATE_MODE)
+    witness = Witness(stage)
+    reading = Thread(target=witness.run)
+    reading.start()
+    child = subprocess.Popen(
+        [sys.executable, "-c", HOSTILE, str(stage.rings), str(uid), str(seconds)], stdout=subprocess.PIPE, text=True
+    )
+    if sticky:
+        sleep(seconds / 2)
+        stage.change(slots=OTHER_SLOTS)
+        sleep(SETTLE_S)
+        stage.change()
+    out, _ = child.communicate(timeout=seconds + 30)
+    sleep(SETTLE_S)
+    witness.over.set()
+    reading.join()
+    stage.rings.chmod(PRIVATE_MODE)
+    problems = [] if child.returncode == 0 and int(out) else [f"hostile process ended with {child.returncode}"]
+    return problems + witness.problems + _judged(witness, sticky), int(out or 0)
+
+
+def _judged(witness: Witness, sticky: bool) -> list[str]:
+    problems = []
+    if not witness.samples:
+        problems.append("a reader got no samples")
+    limit = REMADE_MISSED_MAX if sticky else 0
+    if witness.missed > limit:
+        problems.append(f"a reader missed {witness.missed} samples, expected at most {limit}")
+    if sticky and not witness.refused:
+        problems.append("no hostile file was ever there for a reader to refuse: this attack tried nothing")
+    return problems

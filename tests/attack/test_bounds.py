@@ -1,0 +1,59 @@
+"""Each bound of `make attack` is seen when it is exceeded."""
+
+from dataclasses import replace
+
+import pytest
+
+from tests.attack.bounds import FDS_LEFT_LIMIT, FDS_LIMIT, P99_LIMIT_MS, RSS_LIMIT_MB, Measured, exceeded
+from tests.attack.hostile import Deeds
+
+GOOD = Measured(Deeds(256), samples=1000)
+AT_THE_BOUNDS = replace(
+    GOOD, reply_p99_ms=P99_LIMIT_MS, sample_p99_ms=P99_LIMIT_MS, above_mb=RSS_LIMIT_MB, fds=FDS_LIMIT,
+    fds_left=FDS_LEFT_LIMIT, ledger_lost=1,
+)  # fmt: skip
+STARVED = replace(GOOD, stops=4, lost=400, port_refused=400, ledger_lost=400, reply_p99_ms=700.0, sample_p99_ms=700.0)
+
+
+@pytest.mark.parametrize("seen", [GOOD, AT_THE_BOUNDS, STARVED, replace(STARVED, lost=410, dropped=10)])
+def test_kept(seen: Measured) -> None:
+    assert exceeded(seen) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"lost": 1, "dropped": 1}, "1 samples lost, 1 of them dropped"),
+        ({"port_refused": 1}, "1 refused by the port"),
+        ({"samples": 0}, "no samples"),
+        ({"reply_p99_ms": 5.1}, "answers 5.1 ms, expected at most 5 ms"),
+        ({"sample_p99_ms": 5.1}, "samples 5.1 ms, expected at most 5 ms"),
+        ({"above_mb": RSS_LIMIT_MB + 1}, "memory above idle"),
+        ({"fds": FDS_LIMIT + 1}, "descriptors above idle 1345, expected at most 1344"),
+        ({"fds_left": FDS_LEFT_LIMIT + 1}, "descriptors left over"),
+        ({"failed": 1}, "errors in the daemon"),
+        ({"ledger_lost": 2}, "the ledger has 2 lost samples, the port refused 0"),
+        ({"ledger_unknown": 1}, "1 gaps of unknown size"),
+    ],
+)
+def test_exceeded(change: dict[str, float], problem: str) -> None:
+    (found,) = exceeded(replace(GOOD, **change))  # type: ignore[arg-type]  # of any member
+    assert problem in found
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"ledger_lost": 398}, "the ledger has 398 lost samples, the port refused 400"),
+        ({"ledger_lost": 402}, "expected a difference of at most 1"),
+        ({"lost": 402}, "the good client missed 402 samples"),
+        ({"ledger_unknown": 1}, "unknown size"),
+    ],
+)
+def test_ledger_of_a_starved_daemon(change: dict[str, int], problem: str) -> None:
+    (found,) = exceeded(replace(STARVED, **change))  # type: ignore[arg-type]  # of any member
+    assert problem in found
+
+
+def test_delays_are_not_judged() -> None:
+    assert exceeded(replace(GOOD, reply_p99_ms=9.0, sample_p99_ms=9.0), delays=False) == []
