@@ -122,7 +122,7 @@ class LogPipe:
         fcntl.fcntl(self.writer, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._reads = threading.Event()
         self._reads.set()
-        self._thread = threading.Thread(target=self._pass_on)
+        self._thread = threading.Thread(target=self._pass_on, daemon=True)
         self.spoilt = 0
         """Lines that say that a configuration was refused."""
 
@@ -197,7 +197,14 @@ class AttackedDaemon:
 
     def __enter__(self) -> Self:
         raise_descriptors()
-        stack = self._stack
+        try:
+            self._start(self._stack)
+        except BaseException:  # what was started does not stay behind
+            self._stack.close()
+            raise
+        return self
+
+    def _start(self, stack: ExitStack) -> None:
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-attack-")))
         self.folder.chmod(0o755)
         self.socket, self.rings, self._file = self.folder / "s", self.folder / "shm", self.folder / "imud.yaml"
@@ -220,7 +227,6 @@ class AttackedDaemon:
             self.undisturbed = self.undisturbed and before_others(process.popen.pid)
         sleep(SETTLE_S)
         self.figures()
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
