@@ -345,7 +345,7 @@ def _check_owner(path: Path, found_uid: int, owner_uid: int) -> None:
     if found_uid not in (ROOT_UID, directory_uid, owner_uid):
         raise ServerError(
             f"{path} belongs to user {found_uid}, who may have planted it: expected root or user {directory_uid}, the"
-            f" owner of {path.parent}; if the daemon runs as user {found_uid}, name him (owner_uid)"
+            f" owner of {path.parent}; if the daemon runs as user {found_uid}, name that user (owner_uid)"
         )
 
 

@@ -233,7 +233,7 @@ static inline const char *imud_strerror(int error)
     case IMUD_E_NAME: return "expected a device name or a path of less than 256 characters";
     case IMUD_E_ENDED: return "the daemon ended the descriptor: connect to its socket and ask for another";
     case IMUD_E_OWNER:
-        return "the file belongs neither to root nor to the owner of its directory: if that is the daemon's user, name him "
+        return "the file belongs neither to root nor to the owner of its directory: if that is the daemon's user, name it "
                "(imud_open_owned)";
     case IMUD_E_SYSTEM: return strerror(errno);
     default: return "no error";
