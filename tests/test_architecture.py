@@ -309,6 +309,7 @@ CROSS_CUTTING = {
     "test_end_to_end.py": "the daemon as a process, with its clients",
     "clock/test_steered_host.py": "the whole clock on hosts whose clocks are slewed, stepped, suspended or stopped",
     "publishers/shm/test_hostile.py": "the directory of the rings against other users",
+    "cli/foxglove/test_physics.py": "`imud foxglove`, a daemon and a simulated module, by a client of the protocol",
     "cli/test_main.py": "`main` of imud/cli/__init__.py",
     "clock/test_accuracy.py": "every part of the clock against the truth of a simulation",
     "clock/test_clock_table.py": "the stated error in cells of the table of adversities",

@@ -5,8 +5,9 @@ needs to know nothing of their messages. Axes and frames are those of REP-103, a
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 from imud.contracts.sensors.deviations import Deviations
@@ -77,6 +78,34 @@ class StampedEvent(NamedTuple):
         return LEVELS.get(self.event.kind, logging.WARNING) >= logging.WARNING
 
 
+class DiagnosisLevel(IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+class Diagnosis(NamedTuple):
+    """How one device is."""
+
+    device: str
+    level: DiagnosisLevel
+    message: str
+    hardware: str
+    """Its serial number; where that is not known its product, else empty."""
+    values: Mapping[str, str]
+    """Names end in units, as those of the status."""
+
+
+class Diagnoses(NamedTuple):
+    """How all devices are, at one moment."""
+
+    utc_ns: int
+    devices: tuple[Diagnosis, ...]
+
+
 class MessageFrames(NamedTuple):
     """Names of the frames of a device, and of what is known of its noise.
 
@@ -111,7 +140,7 @@ class ByteWriter(Protocol):
 
 
 class Dialect(Protocol):
-    """A way to say samples, losses and events."""
+    """A way to say samples, losses, events and diagnoses."""
 
     @property
     def profile(self) -> str:
@@ -128,6 +157,10 @@ class Dialect(Protocol):
 
     def events(self) -> MessageChannel[StampedEvent]:
         """Channel of the events of all devices."""
+        ...
+
+    def diagnostics(self) -> MessageChannel[Diagnoses]:
+        """Channel of how all devices are."""
         ...
 
 
@@ -164,3 +197,8 @@ def topic(device: str, name: str) -> str:
     """Return the topic of a device's channel; what a name may have and a topic of ROS 2 may not becomes `_`."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in device)
     return f"/{'_' if plain[:1].isdigit() else ''}{plain}/{name}"
+
+
+def diagnosis_name(device: str) -> str:
+    """Return the name of a device's diagnosis: node and task, as diagnostic_updater makes it."""
+    return f"imud: {device}"

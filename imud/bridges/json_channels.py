@@ -1,4 +1,5 @@
-"""Samples as JSON messages with JSON schemas: attitude and events in those of Foxglove, the others imud's own.
+"""Samples as JSON messages with JSON schemas: attitude and events in those of Foxglove, diagnostics in that
+of ROS, the others imud's own.
 
     /NAME/imu/data       imud.Imu                  angular rate, specific force, attitude
     /NAME/imu/mag        imud.MagneticField
@@ -9,6 +10,7 @@
     /NAME/losses         imud.Losses               after each loss
     /NAME/status         imud.DeviceStatus         of a live device, as `imud status --json` has it
     /events              foxglove.Log
+    /diagnostics         diagnostic_msgs/DiagnosticArray   all devices
 
 Names of members are those of the ROS messages for the same thing, so that both dialects read the same in a viewer. What
 a sample does not have is left out; NaN is null. Covariances are there where they are known.
@@ -22,6 +24,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.bridges.channel import (
+    Diagnoses,
     LossCounts,
     MessageChannel,
     MessageFrames,
@@ -29,6 +32,7 @@ from imud.bridges.channel import (
     StampedEvent,
     Steady,
     covariance,
+    diagnosis_name,
     topic,
 )
 from imud.bridges.json_types import (
@@ -71,6 +75,10 @@ def _numbers(names: str, meaning: str = "") -> Properties:
 
 def _matrix(meaning: str) -> Properties:
     return {"type": "array", "items": {"type": "number"}, "minItems": 9, "maxItems": 9, "description": meaning}
+
+
+def _list(items: Properties) -> Properties:
+    return {"type": "array", "items": items}
 
 
 def _schema(name: str, properties: Properties) -> MessageSchema:
@@ -129,6 +137,28 @@ LOG_SCHEMA: Final = _schema(
     "foxglove.Log", {"level": _INTEGER, "message": _TEXT, "name": _TEXT, "file": _TEXT, "line": _INTEGER}
 )
 
+DIAGNOSTICS_SCHEMA: Final = MessageSchema(
+    "diagnostic_msgs/DiagnosticArray",
+    "jsonschema",
+    _encode(
+        {"title": "diagnostic_msgs/DiagnosticArray"}
+        | _object(
+            {
+                "header": _object({"stamp": _object({"sec": _INTEGER, "nsec": _INTEGER}), "frame_id": _TEXT}),
+                "status": _list(
+                    _object(
+                        {
+                            "level": _INTEGER, "name": _TEXT, "message": _TEXT, "hardware_id": _TEXT,
+                            "values": _list(_object({"key": _TEXT, "value": _TEXT})),
+                        }
+                    )
+                ),
+            }
+        )
+    ),
+)  # fmt: skip
+"""The name is the one by which the diagnostics panels of Foxglove and Lichtblick find their topics."""
+
 # --- messages ---------------------------------------------------------------------------------------------------------
 
 
@@ -161,9 +191,17 @@ class JsonDialect:
         """Channel of the events of all devices."""
         return MessageChannel("/events", LOG_SCHEMA, "json", _log)
 
-    def status(self, device: str) -> MessageChannel[tuple[DeviceStatus, int]]:
-        """Channel of the status of a live device, each with the CLOCK_REALTIME at which it was asked for."""
-        return MessageChannel(topic(device, "status"), STATUS_SCHEMA, "json", _status)
+    def diagnostics(self) -> MessageChannel[Diagnoses]:
+        """Channel of how all devices are."""
+        return MessageChannel("/diagnostics", DIAGNOSTICS_SCHEMA, "json", _diagnostics)
+
+
+def status_channel(device: str) -> MessageChannel[tuple[DeviceStatus, int]]:
+    """Channel of the status of a live device, each with the CLOCK_REALTIME at which it was asked for.
+
+    It is JSON beside messages of either dialect: no message of ROS has a place for it.
+    """
+    return MessageChannel(topic(device, "status"), STATUS_SCHEMA, "json", _status)
 
 
 def _imu(frames: MessageFrames) -> Encoder:
@@ -261,3 +299,14 @@ def _log(stamped: StampedEvent) -> bytes:
 def _status(told: tuple[DeviceStatus, int]) -> bytes:
     status, utc_ns = told
     return _encode({"timestamp": timestamp(utc_ns), **msgspec.to_builtins(status)})
+
+
+def _diagnostics(diagnoses: Diagnoses) -> bytes:
+    statuses = [
+        {
+            "level": one.level, "name": diagnosis_name(one.device), "message": one.message, "hardware_id": one.hardware,
+            "values": [{"key": key, "value": value} for key, value in one.values.items()],
+        }
+        for one in diagnoses.devices
+    ]  # fmt: skip
+    return _encode({"header": {"stamp": timestamp(diagnoses.utc_ns), "frame_id": ""}, "status": statuses})

@@ -1,4 +1,4 @@
-"""Samples as ROS 2 messages in CDR: sensor_msgs, tf2_msgs, and two types of imud's own (`ros2_types`).
+"""Samples as ROS 2 messages in CDR: sensor_msgs, tf2_msgs, diagnostic_msgs, and two types of imud's own (`ros2_types`).
 
     /NAME/imu/data       sensor_msgs/Imu            with the attitude; /NAME/imu/data_raw of a device that sends none
     /NAME/imu/mag        sensor_msgs/MagneticField
@@ -8,6 +8,7 @@
     /NAME/stamp          imud_msgs/SampleStamp      number, times and error of each sample, and what has no other place
     /NAME/losses         imud_msgs/Losses           after each loss
     /events              rcl_interfaces/Log
+    /diagnostics         diagnostic_msgs/DiagnosticArray   all devices
 
 Names of the topics of Imu and MagneticField are those of REP-145. The encoders are made for a device once: frames and
 covariances are constant, so that a message is one call of `struct`. Measured: 1 µs per message.
@@ -20,12 +21,14 @@ from typing import Final
 
 from imud.bridges.cdr import ENCAPSULATION, CdrWriter, Layout
 from imud.bridges.channel import (
+    Diagnoses,
     LossCounts,
     MessageChannel,
     MessageFrames,
     StampedEvent,
     Steady,
     covariance,
+    diagnosis_name,
     topic,
 )
 from imud.bridges.ros2_types import NONE, schema
@@ -87,6 +90,10 @@ class Ros2Dialect:
     def events(self) -> MessageChannel[StampedEvent]:
         """Channel of the events of all devices."""
         return MessageChannel("/events", schema("rcl_interfaces/Log"), "cdr", _log)
+
+    def diagnostics(self) -> MessageChannel[Diagnoses]:
+        """Channel of how all devices are."""
+        return MessageChannel("/diagnostics", schema("diagnostic_msgs/DiagnosticArray"), "cdr", _diagnostics)
 
 
 _IMU: Final = {"accel_m_s2", "gyro_rad_s", "quat_wxyz"}
@@ -201,3 +208,15 @@ def _log(stamped: StampedEvent) -> bytes:
     writer.number("B", LEVEL_WARN if stamped.is_warning else LEVEL_INFO)
     writer.text(event.device or "imud").text(f"{event.kind}: {event.message}")
     return writer.text("").text("").number("I", 0).done()
+
+
+def _diagnostics(diagnoses: Diagnoses) -> bytes:
+    sec, nanosec = time_of(diagnoses.utc_ns)
+    writer = CdrWriter().number("i", sec).number("I", nanosec).text("")
+    writer.number("I", len(diagnoses.devices))
+    for one in diagnoses.devices:
+        writer.number("B", one.level).text(diagnosis_name(one.device)).text(one.message).text(one.hardware)
+        writer.number("I", len(one.values))
+        for key, value in one.values.items():
+            writer.text(key).text(value)
+    return writer.done()

@@ -1,7 +1,7 @@
 """Table: definitions of the ROS 2 messages that imud makes, as MCAP and rosbag2 store them (`ros2msg`).
 
-Types of sensor_msgs, tf2_msgs and rcl_interfaces are those of ROS 2, field by field. Two types are imud's own: what
-ROS has no message for. A file has the definition with it, so that readers need not know them.
+Types of sensor_msgs, tf2_msgs, diagnostic_msgs and rcl_interfaces are those of ROS 2, field by field. Two types are
+imud's own: what ROS has no message for. A file has the definition with it, so that readers need not know them.
 """
 
 from typing import Final
@@ -36,6 +36,12 @@ FIELDS: Final = {
         "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\n"
         "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line"
     ),
+    "diagnostic_msgs/KeyValue": "string key\nstring value",
+    "diagnostic_msgs/DiagnosticStatus": (
+        "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n"
+        "byte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values"
+    ),
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
     "imud_msgs/SampleStamp": "\n".join(
         [f"uint8 {sync.upper()}={code}" for code, sync in enumerate(Sync)]
         + [

@@ -6,8 +6,16 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from imud.bridges.channel import LossCounts, MessageChannel, MessageFrames, StampedEvent
-from imud.bridges.json_channels import JsonDialect
+from imud.bridges.channel import (
+    Diagnoses,
+    Diagnosis,
+    DiagnosisLevel,
+    LossCounts,
+    MessageChannel,
+    MessageFrames,
+    StampedEvent,
+)
+from imud.bridges.json_channels import JsonDialect, status_channel
 from imud.contracts.sensors.deviations import Deviations
 from imud.sample import Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
@@ -115,8 +123,21 @@ def test_losses_and_status() -> None:
         "timestamp": STAMP, "samples": 100, "lost_gap_device": 1, "lost_crc": 2, "lost_overrun": 3, "lost_queue": 4,
         "lost_unknown": 5,
     }  # fmt: skip
-    status = read(DIALECT.status("bow"), (device_status("bow", 0), UTC_NS))
+    status = read(status_channel("bow"), (device_status("bow", 0), UTC_NS))
     assert (status["state"], status["rate_hz"], status["clock"]["sync"]) == ("running", 1000.0, "regression")
+
+
+def test_diagnoses() -> None:
+    bow = Diagnosis("bow", DiagnosisLevel.WARN, "searching", "17", {"t_err_ns": "12000"})
+    assert read(DIALECT.diagnostics(), Diagnoses(UTC_NS, (bow,))) == {
+        "header": {"stamp": STAMP, "frame_id": ""},
+        "status": [
+            {
+                "level": 1, "name": "imud: bow", "message": "searching", "hardware_id": "17",
+                "values": [{"key": "t_err_ns", "value": "12000"}],
+            }
+        ],
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["imu/data", "imu/mag", "temperature", "pressure", "attitude", "stamp"])

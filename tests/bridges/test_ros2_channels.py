@@ -6,7 +6,15 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imud.bridges.channel import LossCounts, MessageChannel, MessageFrames, StampedEvent
+from imud.bridges.channel import (
+    Diagnoses,
+    Diagnosis,
+    DiagnosisLevel,
+    LossCounts,
+    MessageChannel,
+    MessageFrames,
+    StampedEvent,
+)
 from imud.bridges.ros2_channels import Ros2Dialect, time_of
 from imud.bridges.ros2_types import FIELDS, schema
 from imud.contracts.sensors.deviations import Deviations
@@ -121,6 +129,21 @@ def test_losses_and_events() -> None:
     log = read(DIALECT.events(), StampedEvent(EVENT, UTC_NS))
     assert (log.level, log.name, log.msg) == (30, "bow", 'loss: lost 3, "damaged"')
     assert log.stamp.sec == 1_790_000_000
+
+
+def test_diagnoses() -> None:
+    values = {"t_err_ns": "12000", "state": "running"}
+    bow = Diagnosis("bow", DiagnosisLevel.OK, "running", "17", values)
+    mast = Diagnosis("mast", DiagnosisLevel.STALE, "silent: nothing comes", "", {})
+    channel = DIALECT.diagnostics()
+    assert channel.topic == "/diagnostics"
+    array = read(channel, Diagnoses(UTC_NS, (bow, mast)))
+    assert (array.header.stamp.sec, array.header.stamp.nanosec) == (1_790_000_000, 123_456_789)
+    first, second = array.status
+    assert (first.level, first.name, first.message, first.hardware_id) == (first.OK, "imud: bow", "running", "17")
+    assert {one.key: one.value for one in first.values} == values
+    assert (second.level, second.name, second.values) == (second.STALE, "imud: mast", [])
+    assert bytes(ROS.serialize_cdr(array, channel.schema.name)) == channel.encode(Diagnoses(UTC_NS, (bow, mast)))
 
 
 def test_definitions_are_those_of_ros_2() -> None:

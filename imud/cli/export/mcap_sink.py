@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 
-from imud.bridges.channel import Dialect, LossCounts, MessageChannel, MessageFrames, StampedEvent
+from imud.bridges.channel import Diagnoses, Dialect, LossCounts, MessageChannel, MessageFrames, StampedEvent
+from imud.bridges.diagnosis import RecordedDiagnosis
 from imud.bridges.mcap_file import McapChannel, McapFile
 from imud.contracts.publisher import Batch
 from imud.contracts.sensors.deviations import Deviations
@@ -30,6 +31,8 @@ class McapSink:
         self._devices: dict[str, list[_SampleChannel]] = {}
         self._losses: dict[str, tuple[MessageChannel[LossCounts], McapChannel]] = {}
         self._events: tuple[MessageChannel[StampedEvent], McapChannel] | None = None
+        self._diagnosis = RecordedDiagnosis()
+        self._diagnostics: tuple[MessageChannel[Diagnoses], McapChannel] | None = None
         self._shared: dict[str, McapChannel] = {}
         """Channels by their topic: that of transforms is one for all devices."""
 
@@ -42,9 +45,11 @@ class McapSink:
         times_ns = [sample.utc_ns for sample in samples]
         for channel in channels:
             channel.add(samples, times_ns)
+        self._diagnose(self._diagnosis.samples(batch.device, samples))
 
     def losses(self, losses: LossCounts) -> None:
         """Write the message."""
+        self._diagnosis.losses(losses)
         known = self._losses.get(losses.device)
         if known is None:
             described = self._dialect.losses(losses.device)
@@ -63,6 +68,19 @@ class McapSink:
         data = described.encode(event)
         if data is not None:
             channel.add(event.utc_ns, data)
+        self._diagnose(self._diagnosis.event(event))
+
+    def _diagnose(self, diagnoses: Diagnoses | None) -> None:
+        """Write the message, where there is one."""
+        if diagnoses is None:
+            return
+        if self._diagnostics is None:
+            described = self._dialect.diagnostics()
+            self._diagnostics = described, self._file.add_channel(described)
+        described, channel = self._diagnostics
+        data = described.encode(diagnoses)
+        if data is not None:
+            channel.add(diagnoses.utc_ns, data)
 
     def finish(self) -> None:
         """Write what waits, and the index."""

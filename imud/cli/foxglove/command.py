@@ -2,9 +2,13 @@
 
 import argparse
 import signal
+from collections.abc import Callable
 from contextlib import closing
 from typing import Final
 
+from imud.bridges.channel import Dialect
+from imud.bridges.json_channels import JsonDialect
+from imud.bridges.ros2_channels import Ros2Dialect
 from imud.cli.arguments import CliCommand, add_noise, add_socket, noise_by_device
 from imud.cli.foxglove.origins import ViewerOrigins
 from imud.cli.foxglove.relay import Relay
@@ -18,6 +22,9 @@ PORT: Final = 8765
 PORT_MAX: Final = 65535
 RATE_HZ: Final = 100.0
 """Samples a second of each device: smooth on any screen; a viewer draws 60 pictures a second."""
+DIALECTS: Final[dict[str, Callable[[], Dialect]]] = {"ros2": Ros2Dialect, "json": JsonDialect}
+SCHEMA: Final = "ros2"
+"""PlotJuggler passes over every channel that is not CDR with a definition of ROS 2 or IDL."""
 OPEN: Final = (
     "WARNING: {address} is not a loopback address: everybody who reaches port {port} can read all samples, events and "
     "states; there is no password and no encryption"
@@ -54,6 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate", type=float, default=RATE_HZ, metavar="HZ",
         help="at most this many samples a second of each device; 0: all (default: %(default)g)",
     )  # fmt: skip
+    parser.add_argument(
+        "--schema", choices=list(DIALECTS), default=SCHEMA,
+        help="messages: of ROS 2 in CDR, which all viewers read, or JSON, which PlotJuggler does not read "
+        "(default: %(default)s)",
+    )  # fmt: skip
     add_noise(parser)
 
 
@@ -79,7 +91,8 @@ def run(args: argparse.Namespace) -> int:
         if not is_loopback(args.address):
             complain(OPEN.format(address=args.address, port=server.url.rpartition(":")[2]))
         complain(f"imud foxglove: open {server.url} in Foxglove, Lichtblick or PlotJuggler; Ctrl-C ends")
-        relay = Relay(args.socket, server, devices=args.device, rate_hz=args.rate or None, noise=noise)
+        dialect = DIALECTS[args.schema]()
+        relay = Relay(args.socket, server, dialect, devices=args.device, rate_hz=args.rate or None, noise=noise)
         signal.signal(signal.SIGTERM, lambda *_: relay.stop())
         relay.run()
     return 0

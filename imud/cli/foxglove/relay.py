@@ -1,6 +1,6 @@
-"""Relay of the daemon's samples, events and status to a viewer, as messages in JSON (`imud.bridges.json_channels`)."""
+"""Relay of the daemon's samples, events and status to a viewer, as messages of a dialect (`imud.bridges`)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from threading import Event as Flag
 from time import monotonic, monotonic_ns, time_ns
@@ -8,8 +8,9 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
-from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
-from imud.bridges.json_channels import JsonDialect
+from imud.bridges.channel import Diagnoses, Dialect, MessageChannel, MessageFrames, StampedEvent
+from imud.bridges.diagnosis import LiveDiagnosis
+from imud.bridges.json_channels import status_channel
 from imud.client import Client
 from imud.client.watch import EventStream, Watch, event_of, params_of
 from imud.contracts.sensors.deviations import Deviations
@@ -60,6 +61,7 @@ class Relay:
         self,
         path: str,
         viewer: Viewer,
+        dialect: Dialect,
         *,
         devices: Sequence[str] = (),
         rate_hz: float | None = None,
@@ -76,20 +78,24 @@ class Relay:
         self._rate_hz = rate_hz
         self._noise = noise or {}
         self._utc_offset_ns = utc_offset_ns
-        self._dialect = JsonDialect()
-        self._events = self._dialect.events()
+        self._dialect = dialect
+        self._events = dialect.events()
+        self._diagnostics = dialect.diagnostics()
+        self._diagnosis = LiveDiagnosis()
         self._devices: dict[str, _ShownDevice] = {}
         self._stop = Flag()
 
     def run(self) -> None:
         """Relay until `stop`."""
         self._viewer.open(self._events)
+        self._viewer.open(self._diagnostics)
         while not self._stop.is_set():
             try:
                 with Client(self._path) as client:
                     self._read(client)
             except (ImudError, TimeoutError) as error:
                 self._viewer.problem(str(error))
+                self._show_diagnoses(self._diagnosis.stale(str(error), monotonic_ns() + self._utc_offset_ns()))
                 self._stop.wait(RETRY_S)
 
     def stop(self) -> None:
@@ -134,6 +140,10 @@ class Relay:
         stamped = StampedEvent(event, event.t_ns + self._utc_offset_ns())
         self._viewer.send(self._events, stamped, stamped.utc_ns)
 
+    def _show_diagnoses(self, diagnoses: Diagnoses) -> None:
+        if diagnoses.devices:
+            self._viewer.send(self._diagnostics, diagnoses, diagnoses.utc_ns)
+
     def _show_status(self, client: Client) -> None:
         answer = client.status()
         statuses = msgspec.convert(answer["devices"], list[DeviceStatus])
@@ -141,7 +151,8 @@ class Relay:
         self._viewer.problem("")
         there = {status.name: status for status in statuses if not self._wanted or status.name in self._wanted}
         for name in self._devices.keys() - there.keys():
-            self._devices.pop(name).close()
+            gone = self._devices.pop(name)
+            gone.close(kept=frozenset().union(*(device.topics for device in self._devices.values())))
         for name, status in there.items():
             known = self._devices.get(name)
             noise = (status.noise or Deviations()).updated(self._noise.get(name, Deviations()))
@@ -149,6 +160,7 @@ class Relay:
             if known is None or known.frames != frames:
                 known = self._devices[name] = _ShownDevice(self._viewer, self._dialect, frames)
             known.show_status(status, utc_ns)
+        self._show_diagnoses(self._diagnosis.of(there.values(), utc_ns))
         unknown = [name for name, device in self._devices.items() if not device.is_offered]
         for sample in client.poll(unknown, convention=Convention.ENU_FLU) if unknown else ():
             self._devices[sample.device].show(sample)
@@ -157,10 +169,10 @@ class Relay:
 class _ShownDevice:
     """The channels of one device."""
 
-    def __init__(self, viewer: Viewer, dialect: JsonDialect, frames: MessageFrames) -> None:
+    def __init__(self, viewer: Viewer, dialect: Dialect, frames: MessageFrames) -> None:
         self.frames = frames
         self._viewer = viewer
-        self._status = dialect.status(frames.device)
+        self._status = status_channel(frames.device)
         self._channels = dialect.samples(frames)
         self._open: set[str] = set()
         viewer.open(self._status)
@@ -184,9 +196,14 @@ class _ShownDevice:
         """Send the status."""
         self._viewer.send(self._status, (status, utc_ns), utc_ns)
 
-    def close(self) -> None:
-        """Offer nothing of it any more."""
-        for topic in (*self._open, self._status.topic):
+    @property
+    def topics(self) -> frozenset[str]:
+        """Topics that are offered for it; that of transforms is one for all devices."""
+        return frozenset((*self._open, self._status.topic))
+
+    def close(self, kept: Collection[str]) -> None:
+        """Offer nothing of it any more but the topics that others have as well."""
+        for topic in self.topics.difference(kept):
             self._viewer.close_topic(topic)
 
 

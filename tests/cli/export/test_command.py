@@ -140,7 +140,7 @@ def test_mcap_with_json(recorded: Recorded, tmp_path: Path) -> None:
     assert set(found) == {
         "/bow/imu/data", "/bow/imu/mag", "/bow/temperature", "/bow/pressure", "/bow/attitude", "/bow/stamp",
         "/bow/losses", "/mast/imu/data", "/mast/temperature", "/mast/attitude", "/mast/stamp", "/mast/losses",
-        "/events",
+        "/events", "/diagnostics",
     }  # fmt: skip
     for device in ("bow", "mast"):
         samples = recorded.of(device)
@@ -172,6 +172,7 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
     assert types["/bow/pressure"] == "sensor_msgs/msg/FluidPressure"
     assert types["/tf"] == "tf2_msgs/msg/TFMessage"
     assert types["/events"] == "rcl_interfaces/msg/Log"
+    assert types["/diagnostics"] == "diagnostic_msgs/msg/DiagnosticArray"
     for device in ("bow", "mast"):
         for (t_ns, imu), (_, stamp), sample in zip(
             found[f"/{device}/imu/data"], found[f"/{device}/stamp"], recorded.of(device), strict=True
@@ -184,6 +185,35 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
             assert (stamp.seq, stamp.t_ns, stamp.t_err_ns) == (sample.seq, sample.t_ns, sample.t_err_ns)
     assert len(found["/tf"]) == len(recorded.samples)
     assert found["/bow/losses"][0][1].lost_crc == 0
+
+
+def test_diagnostics_of_a_recording_have_its_losses_states_and_errors(recorded: Recorded, tmp_path: Path) -> None:
+    """Of a recording for the errors; of a capture in which 7 messages are missing for the losses."""
+    accel, gyro = resting(1500, 100.0)
+    gap = write_capture(tmp_path / "gap.capture", accel, gyro, rate_hz=100.0, missing=range(700, 707))
+    for file in (recorded.file, gap):
+        out = tmp_path / f"{file.name}.mcap"
+        assert main(["export", "--to", "mcap", "--schema", "ros2", "-o", str(out), str(file)]) == 0
+        with AnyReader([out]) as reader:
+            found = [
+                (t_ns, reader.deserialize(data, connection.msgtype))
+                for connection, t_ns, data in reader.messages()
+                if connection.topic == "/diagnostics"
+            ]
+        if file == gap:
+            break
+        by_device = {one.name: one for _, array in found for one in array.status}  # type: ignore[attr-defined]
+        assert by_device.keys() == {"imud: bow", "imud: mast"}
+        newest = {one.key: one.value for one in by_device["imud: bow"].values}
+        sample = next(one for one in recorded.of("bow") if str(one.seq) == newest["samples"])
+        assert (newest["t_err_ns"], newest["sync"]) == (str(sample.t_err_ns), sample.sync)
+    arrays: list[Any] = [array for _, array in found]
+    statuses = [array.status[0] for array in arrays]
+    assert [one.level for one in statuses] == 7 * [statuses[0].OK] + 8 * [statuses[0].WARN]
+    lost = [{one.key: one.value for one in status.values}["lost_gap_device"] for status in statuses]
+    assert lost == 7 * ["0"] + 8 * ["7"]
+    stamps_ns = [array.header.stamp.sec * 10**9 + array.header.stamp.nanosec for array in arrays]
+    assert [t_ns for t_ns, _ in found] == [max(stamp_ns, 0) for stamp_ns in stamps_ns], "MCAP begins in 1970"
 
 
 def test_covariances_come_from_the_configuration_and_from_reports(
@@ -218,7 +248,7 @@ def test_fields_choose_channels(recorded: Recorded, tmp_path: Path) -> None:
     words = ["--to", "mcap", "--fields", "mag_t,temperature_c", "--device", "bow", "-o", str(out)]
     assert main(["export", *words, str(recorded.file)]) == 0
     topics = {topic for topic, *_ in messages(out)}
-    assert topics == {"/bow/imu/mag", "/bow/temperature", "/bow/losses", "/events"}
+    assert topics == {"/bow/imu/mag", "/bow/temperature", "/bow/losses", "/events", "/diagnostics"}
 
 
 def test_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path) -> None:

@@ -8,12 +8,18 @@ from threading import Thread
 from typing import Any, NamedTuple
 
 import msgspec
+import pytest
 
-from imud.bridges.channel import MessageChannel
+from imud.bridges.channel import Dialect, MessageChannel
+from imud.bridges.json_channels import JsonDialect
+from imud.bridges.ros2_channels import Ros2Dialect
 from imud.cli.foxglove.relay import Relay
+from imud.contracts.publisher import Batch
 from imud.contracts.sensors.deviations import Deviations
 from imud.event import Event, EventKind
-from tests.support.socket_rig import batch, daemon
+from imud.publishers.socket.publisher import SocketServer
+from tests.support import socket_rig
+from tests.support.socket_rig import NOW_NS, batch, daemon
 
 LIMIT_S = 10.0
 OFFSET_NS = 1_000_000_000_000
@@ -43,7 +49,8 @@ class FakeViewer:
     def send(self, channel: MessageChannel[Any], item: object, utc_ns: int) -> None:
         data = channel.encode(item)
         if data is not None:
-            self.said.put(Said(channel.topic, msgspec.json.decode(data), utc_ns))
+            message = msgspec.json.decode(data) if channel.message_encoding == "json" else {"data": data}
+            self.said.put(Said(channel.topic, message, utc_ns))
 
     def problem(self, text: str) -> None:
         self.said.put(Said("problem", {"text": text}, 0))
@@ -55,8 +62,8 @@ class FakeViewer:
 
 
 @contextmanager
-def relaying(path: str | Path, viewer: FakeViewer, **options: Any) -> Iterator[Relay]:
-    relay = Relay(str(path), viewer, utc_offset_ns=lambda: OFFSET_NS, **options)
+def relaying(path: str | Path, viewer: FakeViewer, dialect: Dialect | None = None, **options: Any) -> Iterator[Relay]:
+    relay = Relay(str(path), viewer, dialect or JsonDialect(), utc_offset_ns=lambda: OFFSET_NS, **options)
     thread = Thread(target=relay.run)
     thread.start()
     try:
@@ -150,3 +157,54 @@ def test_it_goes_on_after_the_daemon_was_restarted(tmp_path: Path) -> None:
             viewer.wait_for("/imu0/stamp", lambda said: said.message["seq"] == 9)
     finally:
         relay.__exit__(None, None, None)
+
+
+def levels(said: Said) -> dict[str, int]:
+    return {one["name"]: one["level"] for one in said.message["status"]}
+
+
+def test_diagnostics_come_and_are_stale_without_the_daemon(tmp_path: Path) -> None:
+    viewer = FakeViewer()
+    with relaying(tmp_path / "imud.sock", viewer):
+        with daemon(tmp_path):
+            said = viewer.wait_for("/diagnostics")
+            assert levels(said) == {"imud: imu0": 0, "imud: imu1": 0}
+            assert said.utc_ns == NOW_NS + OFFSET_NS
+        stale = viewer.wait_for("/diagnostics", lambda said: 0 not in levels(said).values())
+        assert levels(stale) == {"imud: imu0": 3, "imud: imu1": 3}
+        assert str(tmp_path) in stale.message["status"][0]["message"]
+        with daemon(tmp_path):
+            viewer.wait_for("/diagnostics", lambda said: set(levels(said).values()) == {0})
+
+
+def test_the_topic_of_transforms_stays_while_another_device_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewer = FakeViewer()
+
+    def until(topic: str) -> list[str]:
+        """Topics of all that the viewer is given until this one comes."""
+        topics: list[str] = []
+        while topic not in topics:
+            topics.append(viewer.said.get(timeout=LIMIT_S).topic)
+        return topics
+
+    def publish(server: SocketServer, name: str) -> None:
+        (plain,) = batch(name).samples
+        turned = msgspec.structs.replace(plain, quat_wxyz=(1.0, 0.0, 0.0, 0.0))
+        server.publish(Batch(name, socket_rig.DEVICES[name], [turned]))
+
+    with relaying(tmp_path / "imud.sock", viewer, Ros2Dialect()):
+        with daemon(tmp_path) as served:
+            until("/imu1/status")
+            for name in socket_rig.DEVICES:
+                served.do(lambda server, name=name: publish(server, name))  # type: ignore[misc]
+                until("open /tf" if name == "imu0" else "open /imu1/imu/data")
+        monkeypatch.setattr(socket_rig, "DEVICES", {"imu1": 1})
+        with daemon(tmp_path):
+            topics = until("/imu1/status")
+            assert "close /imu0/imu/data" in topics
+            assert "close /tf" not in topics
+        monkeypatch.setattr(socket_rig, "DEVICES", {"imu2": 2})
+        with daemon(tmp_path):
+            assert "close /tf" in until("/imu2/status")

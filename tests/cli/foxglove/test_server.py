@@ -4,11 +4,10 @@ import asyncio
 import json
 import re
 import signal
-import struct
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, closing
+from collections.abc import Callable
+from contextlib import closing
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -23,63 +22,11 @@ from imud.cli.foxglove.origins import ViewerOrigins
 from imud.cli.foxglove.server import FoxgloveServer, hidden_address
 from imud.errors import ServerError
 from tests.bridges.samples import EVENT, FULL, UTC_NS
+from tests.cli.foxglove.protocol_client import LIMIT_S, SUBPROTOCOL, connected
 from tests.support.daemon_process import running_daemon
 from tests.test_daemon import cable, device
 
-SUBPROTOCOL = "foxglove.sdk.v1"
-MESSAGE_DATA = 1
-LIMIT_S = 15.0
 DIALECT = JsonDialect()
-
-
-class ProtocolClient:
-    """A client of the protocol: channels by topic, and messages of those that it subscribes to."""
-
-    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
-        self._socket = socket
-        self.channels: dict[str, dict[str, Any]] = {}
-        self.statuses: list[str] = []
-        self._topics: dict[int, str] = {}
-
-    async def receive(self, is_it: Callable[[str, int, Any], object]) -> tuple[str, int, Any]:
-        """The first message (topic, time, content) that is it; advertisements are noted meanwhile."""
-        while True:
-            got = await asyncio.wait_for(self._socket.receive(), LIMIT_S)
-            if got.type is aiohttp.WSMsgType.TEXT:
-                self._note(json.loads(got.data))
-                if is_it("", 0, None):
-                    return "", 0, None
-            elif got.type is aiohttp.WSMsgType.BINARY and got.data[0] == MESSAGE_DATA:
-                subscription, t_ns = struct.unpack_from("<IQ", got.data, 1)
-                topic, message = self._topics[subscription], json.loads(got.data[13:])
-                if is_it(topic, t_ns, message):
-                    return topic, t_ns, message
-            else:
-                assert got.type is aiohttp.WSMsgType.BINARY, got
-
-    async def wait_for_channel(self, topic: str) -> None:
-        if topic not in self.channels:
-            await self.receive(lambda *_: topic in self.channels)
-
-    async def subscribe(self, topic: str) -> None:
-        await self.wait_for_channel(topic)
-        number = len(self._topics) + 100
-        self._topics[number] = topic
-        wanted = [{"id": number, "channelId": self.channels[topic]["id"]}]
-        await self._socket.send_json({"op": "subscribe", "subscriptions": wanted})
-
-    def _note(self, told: dict[str, Any]) -> None:
-        if told["op"] == "advertise":
-            self.channels |= {channel["topic"]: channel for channel in told["channels"]}
-        elif told["op"] == "status":
-            self.statuses.append(told["message"])
-
-
-@asynccontextmanager
-async def connected(url: str) -> AsyncIterator[ProtocolClient]:
-    async with aiohttp.ClientSession() as session, session.ws_connect(url, protocols=(SUBPROTOCOL,)) as socket:
-        assert socket.protocol == SUBPROTOCOL
-        yield ProtocolClient(socket)
 
 
 def serve(notes: list[str]) -> FoxgloveServer:
@@ -177,7 +124,7 @@ def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
         daemon.wait_for("bow", "searching")
         port.send(1)
         daemon.wait_for("bow", "running")
-        argv = [sys.executable, "-m", "imud", "foxglove", "--port", "0", "--rate", "0"]
+        argv = [sys.executable, "-m", "imud", "foxglove", "--port", "0", "--rate", "0", "--schema", "json"]
         argv += ["--socket", str(tmp_path / "imud.sock")]
         with subprocess.Popen(argv, stderr=subprocess.PIPE, text=True) as process:
             assert process.stderr is not None

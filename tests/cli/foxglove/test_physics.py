@@ -1,0 +1,238 @@
+"""What a viewer gets over the protocol, in messages of ROS 2, is what the simulated module measured.
+
+The module moves in a known way and its file of truth says when each sample was taken, so that every message is compared
+with the ideal measurement of that instant: values, units, axes, frames, and the error that is stated with each time.
+"""
+
+import asyncio
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import hypot
+from statistics import median
+from typing import Any, NamedTuple
+
+import pytest
+
+from imud.sim.physics.motion import FIELD_ENU_T, GRAVITY_M_S2, MOTIONS, Truth
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.cli.foxglove.protocol_client import LIMIT_S, ProtocolClient, connected
+from tests.support.daemon_process import RunningDaemon, daemon_with_module
+
+SAMPLES = 200
+ENOUGH = 100
+"""That are compared: topics are subscribed one after the other, and end in the middle of a sample."""
+TOPICS = {
+    "/bow/imu/data": "sensor_msgs/msg/Imu",
+    "/bow/imu/mag": "sensor_msgs/msg/MagneticField",
+    "/bow/temperature": "sensor_msgs/msg/Temperature",
+    "/bow/pressure": "sensor_msgs/msg/FluidPressure",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/bow/stamp": "imud_msgs/msg/SampleStamp",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+NOISE = {"accel_m_s2": 0.5, "gyro_rad_s": 0.25, "mag_t": 2.0, "attitude_rad": 0.125, "temperature_c": 3.0}
+
+Messages = dict[str, list[tuple[int, Any]]]
+
+
+class Seen(NamedTuple):
+    """What a viewer got, and the truth."""
+
+    messages: Messages
+    """By topic: the time in the protocol, and the message."""
+    stale: Any
+    """The diagnostics after the daemon had ended."""
+    truth: dict[int, Truth]
+    """Ideal measurements by the time of the module, ms."""
+    taken_ns: dict[int, int]
+    """When they were taken, CLOCK_MONOTONIC, by the same."""
+
+
+@contextmanager
+def served(daemon: RunningDaemon) -> Iterator[str]:
+    """`imud foxglove` as a process; its address."""
+    argv = [sys.executable, "-m", "imud", "foxglove", "--port", "0", "--rate", "0", "--socket", str(daemon.socket)]
+    with subprocess.Popen(argv, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        found = None
+        while found is None:
+            line = process.stderr.readline()
+            assert line, "it ended"
+            found = re.search(r"ws://\S+", line)
+        yield found[0]
+        process.send_signal(signal.SIGTERM)
+        rest = process.communicate(timeout=LIMIT_S)[1]
+        assert process.returncode == 0, rest
+
+
+async def look(client: ProtocolClient, messages: Messages) -> None:
+    """Subscribe to everything, and take messages until there are enough of each kind."""
+    for topic, schema in TOPICS.items():
+        await client.subscribe(topic)
+        assert client.channels[topic]["schemaName"] == schema
+        assert client.channels[topic]["encoding"] == "cdr"
+        messages[topic] = []
+    while len(messages["/bow/imu/data"]) < SAMPLES or not all(messages.values()):
+        topic, t_ns, message = await client.receive(lambda topic, *_: topic)
+        messages[topic].append((t_ns, message))
+
+
+async def watch(url: str, daemon: RunningDaemon) -> tuple[Messages, Any]:
+    """Look while the daemon runs, and see its end."""
+    messages: Messages = {}
+    async with connected(url) as client:
+        await look(client, messages)
+        daemon.process.terminate()
+        while True:
+            _, _, message = await client.receive(lambda topic, *_: topic == "/diagnostics")
+            if message.status[0].level == message.status[0].STALE:
+                return messages, message
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    folder = tmp_path_factory.mktemp("foxglove")
+    options = ["--motion", "swing", "--no-noise", "--boot", "0", "--truth", str(folder / "truth.csv")]
+    with daemon_with_module(folder, *options, noise=NOISE) as daemon, served(daemon) as url:
+        messages, stale = asyncio.run(watch(url, daemon))
+    head, _, *rows = (folder / "truth.csv").read_text().splitlines()
+    epoch_ns, motion = int(head.partition("=")[2]), MOTIONS["swing"](GRAVITY_M_S2)
+    taken_ns = {int(row.split(",")[1]): int(row.split(",")[0]) for row in rows}
+    truth = {ms: motion.at((t_ns - epoch_ns) / NS_PER_S) for ms, t_ns in taken_ns.items()}
+    return Seen(messages, stale, truth, taken_ns)
+
+
+def utc_ns(header: Any) -> int:
+    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
+
+
+def xyz(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def forward_left_up(sensor: tuple[float, float, float]) -> tuple[float, float, float]:
+    """A vector of the module, x right and y forward, in the axes of REP-103."""
+    right, forward, up = sensor
+    return forward, -right, up
+
+
+def turned(quaternion: Any, vector: Any) -> tuple[float, float, float]:
+    """A vector of the body in the navigation frame, by the matrix of the quaternion."""
+    w, (x, y, z), (a, b, c) = quaternion.w, xyz(quaternion), xyz(vector)
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c,
+        2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c,
+        2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )
+
+
+def by_time(seen: Seen, topic: str) -> dict[int, Any]:
+    """Messages of a topic by their time."""
+    return dict(seen.messages[topic])
+
+
+def paired(seen: Seen, topic: str, other: str) -> list[tuple[Any, Any]]:
+    """Messages of a topic with those of another of the same time, all between the first and the last of the other."""
+    others = by_time(seen, other)
+    first, last = min(others), max(others)
+    return [(one, others[t_ns]) for t_ns, one in seen.messages[topic] if first <= t_ns <= last]
+
+
+def with_truth(seen: Seen, topic: str) -> list[tuple[Any, Truth]]:
+    """Messages of a topic, each with the truth of its instant, found by the stamp of the same time."""
+    found = [(one, seen.truth[stamp.t_dev_ns // NS_PER_MS]) for one, stamp in paired(seen, topic, "/bow/stamp")]
+    assert found
+    return found
+
+
+def test_the_time_of_every_message_is_that_of_measurement(seen: Seen) -> None:
+    for topic, messages in seen.messages.items():
+        for t_ns, message in messages:
+            header = message.transforms[0].header if topic == "/tf" else message.header
+            assert utc_ns(header) == t_ns, topic
+    offsets = {utc_ns(stamp.header) - stamp.t_ns for _, stamp in seen.messages["/bow/stamp"]}
+    assert max(offsets) - min(offsets) < NS_PER_MS, "CLOCK_REALTIME minus CLOCK_MONOTONIC"
+
+
+def test_the_error_beside_each_time_is_honest(seen: Seen) -> None:
+    ratios = []
+    for _, stamp in seen.messages["/bow/stamp"]:
+        assert 0 < stamp.t_err_ns < 100 * NS_PER_MS
+        assert stamp.t_ns <= stamp.t_rx_ns
+        ratios.append(abs(stamp.t_ns - seen.taken_ns[stamp.t_dev_ns // NS_PER_MS]) / stamp.t_err_ns)
+    assert median(ratios) < 2, "one sigma"
+    assert {one.sync for _, one in seen.messages["/bow/stamp"]} <= {0, 1}, "no edge, no UTC"
+
+
+def test_specific_force_and_turn_rate_are_those_of_the_motion_in_the_axes_of_rep_103(seen: Seen) -> None:
+    found = with_truth(seen, "/bow/imu/data")
+    assert len(found) >= ENOUGH
+    for imu, truth in found:
+        assert imu.header.frame_id == "bow"
+        assert xyz(imu.linear_acceleration) == pytest.approx(forward_left_up(truth.accel_m_s2), abs=0.01)
+        assert xyz(imu.angular_velocity) == pytest.approx(forward_left_up(truth.gyro_rad_s), abs=0.005)
+    forces = [hypot(*xyz(imu.linear_acceleration)) for imu, _ in found]
+    assert sum(forces) / len(forces) == pytest.approx(GRAVITY_M_S2, rel=0.05)
+    turning = [hypot(*xyz(imu.angular_velocity)) for imu, _ in found]
+    assert max(turning) > 0.1, "it moves, or the axes would not be seen"
+
+
+def test_the_attitude_turns_the_field_to_north_and_gravity_up(seen: Seen) -> None:
+    for field, truth in with_truth(seen, "/bow/imu/mag"):
+        assert field.header.frame_id == "bow"
+        assert xyz(field.magnetic_field) == pytest.approx(forward_left_up(truth.mag_t), abs=2e-7)
+        assert hypot(*xyz(field.magnetic_field)) == pytest.approx(hypot(*FIELD_ENU_T), abs=2e-7)
+    found = paired(seen, "/bow/imu/mag", "/bow/imu/data")
+    assert len(found) >= ENOUGH
+    for field, imu in found:
+        assert turned(imu.orientation, field.magnetic_field) == pytest.approx(FIELD_ENU_T, abs=5e-7)
+    ups = [turned(imu.orientation, imu.linear_acceleration)[2] for _, imu in seen.messages["/bow/imu/data"]]
+    assert sum(ups) / len(ups) == pytest.approx(GRAVITY_M_S2, rel=0.05)
+
+
+def test_the_transform_is_the_attitude(seen: Seen) -> None:
+    found = paired(seen, "/tf", "/bow/imu/data")
+    assert len(found) >= ENOUGH
+    for message, imu in found:
+        (one,) = message.transforms
+        assert (one.header.frame_id, one.child_frame_id) == ("enu", "bow")
+        assert (one.transform.rotation.w, *xyz(one.transform.rotation)) == (imu.orientation.w, *xyz(imu.orientation))
+        assert xyz(one.transform.translation) == (0, 0, 0)
+
+
+def test_temperature_and_pressure(seen: Seen) -> None:
+    for temperature, truth in with_truth(seen, "/bow/temperature"):
+        assert temperature.temperature == pytest.approx(truth.temperature_c, abs=1), "the module sends whole degrees"
+        assert temperature.variance == 9.0
+    for pressure, truth in with_truth(seen, "/bow/pressure"):
+        assert pressure.fluid_pressure == pytest.approx(truth.pressure_pa, abs=1)
+        assert pressure.variance == 0, "not known"
+
+
+def test_covariances_are_those_of_the_configuration(seen: Seen) -> None:
+    _, imu = seen.messages["/bow/imu/data"][0]
+    assert list(imu.linear_acceleration_covariance) == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
+    assert imu.angular_velocity_covariance[4] == 0.0625
+    assert imu.orientation_covariance[8] == 0.015625
+    assert seen.messages["/bow/imu/mag"][0][1].magnetic_field_covariance[0] == 4.0
+
+
+def test_diagnostics_have_state_losses_and_the_error_of_the_clock(seen: Seen) -> None:
+    stamps = [stamp.t_err_ns for _, stamp in seen.messages["/bow/stamp"]]
+    for _, array in seen.messages["/diagnostics"]:
+        (bow,) = array.status
+        assert bow.name == "imud: bow"
+        assert (bow.level, bow.message[:7]) == (bow.OK if bow.message == "running" else bow.WARN, "running")
+        values = {one.key: one.value for one in bow.values}
+        assert values["state"] == "running"
+        assert min(stamps) / 10 < int(values["t_err_ns"]) < max(stamps) * 10
+        assert float(values["rate_hz"]) == pytest.approx(100, rel=0.5), "of the last seconds, on a busy machine"
+        assert all(values[f"lost_{cause}"] == "0" for cause in ("gap_device", "crc", "overrun", "queue", "unknown"))
+    assert any(array.status[0].level == 0 for _, array in seen.messages["/diagnostics"])
+    (bow,) = seen.stale.status
+    assert (bow.name, bow.level) == ("imud: bow", bow.STALE)
+    assert "daemon" in bow.message
