@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
+from time import monotonic_ns, time_ns
 from typing import ClassVar, Final, Protocol
 
 from textual.app import App, ComposeResult
@@ -12,21 +13,20 @@ from textual.screen import Screen
 from textual.widgets import Footer, Input, Label, OptionList, RichLog, Sparkline, Static
 from textual.widgets.option_list import Option
 
+from imud.cli.live.events import as_text, printed
 from imud.cli.status import WELL, block
 from imud.cli.top.history import CURVES, DeviceHistories, DeviceHistory
 from imud.cli.top.rows import SORTS, TEXT_MAX, VIEWS, chosen, head, row
 from imud.client.feed import News
 from imud.event import Event
 from imud.log import printable
-from imud.units import NS_PER_S
 
 EVENTS_KEPT: Final = 200
 
 
-def event_line(event: Event) -> str:
-    """Format an event as one line: its time on CLOCK_MONOTONIC, its device, what happened."""
-    words = f"{event.t_ns / NS_PER_S:14.3f} {event.device} {event.kind}: {event.message}"
-    return printable(words, TEXT_MAX)
+def event_line(event: Event, utc_offset_ns: int) -> str:
+    """Format an event as `imud events` does, in one line; `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    return as_text(printed(event, utc_offset_ns))[:TEXT_MAX]
 
 
 class NewsSource(Protocol):
@@ -290,7 +290,7 @@ class DevicePage(TopScreen):
                     yield Label(markup=False)
                     yield Sparkline()
             yield Static(id="block", markup=False)
-        yield RichLog(id="events", max_lines=EVENTS_KEPT)
+        yield RichLog(id="events", max_lines=EVENTS_KEPT, wrap=True)
         yield Footer()
 
     def on_mount(self) -> None:
@@ -329,5 +329,5 @@ class DevicePage(TopScreen):
             fresh.append(event)
         for event in reversed(fresh):
             if event.device == self._device:
-                events.write(event_line(event))
+                events.write(event_line(event, time_ns() - monotonic_ns()))
         self._shown = self.top.events[-1] if self.top.events else None

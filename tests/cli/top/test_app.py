@@ -1,8 +1,11 @@
 """The screens of `imud top`, driven by keys in a terminal of 80 columns that is not drawn."""
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import msgspec
@@ -11,6 +14,7 @@ from textual.pilot import Pilot
 
 from imud.cli.top.app import DevicePage, NewsCame, Overview, TopApp, event_line
 from imud.cli.top.command import TopFeed
+from imud.cli.top.rows import TEXT_MAX
 from imud.client.feed import News
 from imud.contracts.status import DeviceState
 from imud.event import Event, EventKind
@@ -19,6 +23,7 @@ from tests.support.socket_rig import sample
 
 SIZE = (80, 24)
 LOOK_S, LOOKS = 0.05, 100
+OFFSET_NS = 1_790_000_000_000_000_000  # 2026-09-21 14:13:20 UTC
 NEWS = News(
     statuses=(
         device("bow", 0), device("stern", 1, state=DeviceState.MISSING, problem="/dev/ttyUSB1 is not there"),
@@ -135,7 +140,10 @@ def test_the_page_of_a_device_has_curves_status_and_its_events() -> None:
         assert "mag x" not in text, "what it does not send takes no line"
         events = (Event(5, "bow", EventKind.UP, "is there"), Event(6, "mast", EventKind.UP, "too"))
         text = "\n".join(await give(pilot, app, NEWS._replace(events=events)))
-        assert "0.000 bow up: is there" in text
+        written = re.search(r"^(\S+) info    bow: up: is there$", text, re.MULTILINE)
+        assert written is not None, "as `imud events` prints it"
+        since_start = datetime.now().astimezone() - datetime.fromisoformat(written[1])
+        assert since_start.total_seconds() == pytest.approx(monotonic(), abs=60), "5 ns after the host's start"
         assert "mast" not in text
         await press(pilot, app, "escape")
         assert isinstance(app.screen, Overview)
@@ -189,5 +197,8 @@ def test_without_a_daemon_it_says_so_and_tries_again(tmp_path: Path) -> None:
 
 
 def test_what_a_device_sends_cannot_write_to_the_terminal() -> None:
-    line = event_line(Event(5_250_000_000, "bow", EventKind.UP, "\x1b[2J\nred"))
-    assert line == r"         5.250 bow up: \x1b[2J\nred"
+    line = event_line(Event(5_250_000_000, "bow", EventKind.UP, "\x1b[2J\nred"), OFFSET_NS)
+    time, _, rest = line.partition(" ")
+    assert datetime.fromisoformat(time) == datetime(2026, 9, 21, 14, 13, 25, 250_000, UTC)
+    assert rest == r"info    bow: up: \x1b[2J\nred"
+    assert len(event_line(Event(0, "bow", EventKind.UP, 1000 * "x"), OFFSET_NS)) == TEXT_MAX
