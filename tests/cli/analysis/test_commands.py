@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from math import hypot
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ import pytest
 from imud.cli import main
 from imud.cli.analysis.commands import bands_hz
 from imud.cli.output import COLUMNS
+from imud.sim.physics.motion import GRAVITY_M_S2
+from imud.sim.physics.noise import NoiseLevels
 from tests.cli.analysis.captures import frame, resting, shaken, write_capture
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
-from tests.support.daemon_process import RunningDaemon, sending_daemon
+from tests.support.daemon_process import RunningDaemon, daemon_with_module, sending_daemon
 
 SET_HZ, TRUE_HZ, SHAKEN_HZ = 400.0, 408.0, 63.7
 SHEET = "source: a sheet\ngyro: {random_walk_deg_sqrt_h: 0.5}\naccel: {random_walk_m_s_sqrt_h: 0.001}\n"
@@ -206,3 +209,28 @@ def test_a_live_device(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]
     assert measurement["begun_utc_ns"] > 0
     assert main(["noise", "--for", "1s", "--socket", str(daemon.socket), "stern"]) == 2
     assert "stern: expected a file, or a device of the daemon (bow)" in capsys.readouterr().err
+
+
+def test_the_noise_of_a_live_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A simulated module at rest: its white noise is what the simulator adds, whatever its bias."""
+    levels = NoiseLevels()
+    with daemon_with_module(tmp_path, "--motion", "still", "--boot", "0") as daemon:
+        words = ["noise", "--socket", str(daemon.socket), "bow"]
+        assert main([*words, "--json", "--for", "3s"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert main([*words, "--skip", "0.2s", "--for", "1.5s"]) == 0
+        text = capsys.readouterr().out
+    measurement, sensors = told["measurement"], told["sensors"]
+    assert (measurement["device"], measurement["driver"]) == ("bow", "hipnuc-uart")
+    assert measurement["source"] == f"live from {daemon.socket}"
+    assert measurement["duration_s"] == pytest.approx(3, abs=0.1)
+    assert 200 < measurement["samples"] <= 302
+    assert sensors["accel"]["rate_hz"] == pytest.approx(100, rel=0.02)
+    for sensor, sigma in (("accel", levels.accel_m_s2), ("gyro", levels.gyro_rad_s)):
+        for axis in "xyz":
+            assert sensors[sensor]["axes"][axis]["spread"]["value"] == pytest.approx(sigma, rel=0.2), (sensor, axis)
+    means = [sensors["accel"]["axes"][axis]["mean"]["value"] for axis in "xyz"]
+    assert hypot(*means) == pytest.approx(GRAVITY_M_S2, abs=2 * levels.accel_bias_m_s2)
+    assert max(map(len, text.splitlines())) <= COLUMNS
+    for word in ("live from", "angle random walk N", "bow, driver hipnuc-uart"):
+        assert word in text, word

@@ -1,19 +1,36 @@
-"""The live spectrum: a page of at most 80 columns whose bars and shades are where the line is."""
+"""The live spectrum: a page of at most 80 columns whose bars and shades are where the line is, drawn in a terminal."""
+
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import tty
+from collections.abc import Sequence
+from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
 
 from imud.analysis.spectrum import power_spectrum
-from imud.cli.analysis.spectrum_live import HEIGHT, SHADES, LiveView, axis_line, curve_rows, in_columns
+from imud.cli.analysis.spectrum_live import CLEAR, HEIGHT, SHADES, LiveView, axis_line, curve_rows, in_columns
 from imud.cli.analysis.spectrum_report import SpectrumSettings
 from imud.cli.analysis.taking import Collector
 from imud.cli.output import COLUMNS
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_S
-from tests.cli.analysis.captures import shaken
+from tests.cli.analysis.captures import frame, shaken
+from tests.support.daemon_process import sending_daemon
 
 RATE_HZ = 200.0
 COUNT = 2000
+DRAWN_LIMIT_S = 60.0
+"""The libraries of the analysis take ten seconds to load on a busy machine."""
+PAGES = 7
+"""The newest has some hundred samples, in which the line stands out of the noise."""
+SHAKEN_HZ = 12.0
 
 
 def collected(frequency_hz: float, count: int = COUNT) -> Collector:
@@ -74,3 +91,48 @@ def test_the_axis() -> None:
     assert line.startswith("0")
     assert line.endswith("200 Hz")
     assert line.split() == ["0", "50", "100", "150", "200", "Hz"]
+
+
+# --- in a terminal ----------------------------------------------------------------------------------------------------
+
+
+def drawn(argv: Sequence[str], enough: int) -> tuple[list[str], int]:
+    """Pages that a command draws in a terminal until there are enough and Ctrl-C; and its exit status."""
+    terminal, inside = os.openpty()
+    tty.setraw(inside)  # line ends stay as they are written
+    text, end_s = b"", monotonic() + DRAWN_LIMIT_S
+    try:
+        with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=inside, stderr=subprocess.PIPE) as process:
+            os.close(inside)
+            while text.count(CLEAR.encode()) <= enough:
+                assert monotonic() < end_s, text
+                if select.select([terminal], [], [], 0.1)[0]:
+                    text += os.read(terminal, 65536)
+            process.send_signal(signal.SIGINT)
+            _, complaints = process.communicate(timeout=DRAWN_LIMIT_S)
+            assert complaints == b""
+    finally:
+        os.close(terminal)
+    whole = text.split(CLEAR.encode())[1 : enough + 1]  # what follows may end within a character
+    return [page.decode() for page in whole], process.returncode
+
+
+@pytest.mark.timeout(150)
+def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
+    accel, gyro = shaken(1000, 100.0, SHAKEN_HZ)
+    with sending_daemon(tmp_path, lambda n: frame(10 * n, accel[n % 1000], gyro[n % 1000])) as daemon:
+        argv = [sys.executable, "-m", "imud", "spectrum", "--socket", str(daemon.socket), "bow"]
+        pages, status = drawn(argv, PAGES)
+    assert status == 0
+    for number, page in enumerate(pages[1:], 2):  # the first may have too few samples yet
+        assert max(map(len, page.splitlines())) <= COLUMNS
+        assert re.match(r"bow accelerometer: [0-9.]+ Hz, \d+ missing", page), page
+        past = re.search(r"the last (\d+) s, newest above", page)
+        assert past is not None, page
+        assert int(past[1]) in (number - 1, number), "a row for each second"
+    head = re.match(r"bow accelerometer: ([0-9.]+) Hz", pages[-1])
+    line = re.search(r"^ +P1 +([0-9.]+)", pages[-1], re.MULTILINE)
+    assert head is not None
+    assert line is not None, pages[-1]
+    assert float(head[1]) == pytest.approx(100, rel=0.02)
+    assert float(line[1]) == pytest.approx(SHAKEN_HZ, abs=0.5)
