@@ -9,7 +9,7 @@ connection to the daemon.
 
 from collections.abc import Callable
 from threading import Condition, Thread
-from time import monotonic, monotonic_ns
+from time import monotonic, monotonic_ns, time_ns
 from typing import Final, NamedTuple
 
 import msgspec
@@ -26,6 +26,9 @@ STATUS_S: Final = 1.0
 STATUS_DEVICES: Final = 50
 """With more devices the status is asked for less often: each costs the daemon some 50 µs."""
 RETRY_S: Final = 1.0
+SAME_CLOCK_NS: Final = 2_000_000_000
+"""CLOCK_MONOTONIC begins with the start of a machine: clocks that are this near are taken for one, read at different
+times, since an answer takes its time on a busy machine."""
 SAMPLES_MAX: Final = 4096
 """Of one piece of news; what comes beyond waits in the socket, and the daemon counts what does not fit there."""
 
@@ -55,7 +58,9 @@ class News(NamedTuple):
     clients: int = 0
     """Of the daemon, with `statuses`."""
     now_ns: int = 0
-    """CLOCK_MONOTONIC."""
+    """CLOCK_MONOTONIC of the daemon's machine."""
+    ahead_ns: int = 0
+    """That clock minus the one of this machine; 0 where it is the same."""
     samples: tuple[Sample, ...] = ()
     events: tuple[Event, ...] = ()
     newest: tuple[Sample, ...] | None = None
@@ -77,6 +82,7 @@ class Feed:
         self._wanted = wanted
         self._changed = Condition()
         self._stopped = False
+        self._ahead_ns = 0
         self._thread = Thread(target=self._run, name="feed", daemon=True)
 
     def start(self) -> None:
@@ -103,7 +109,7 @@ class Feed:
                 with Client(self._path) as client:
                     self._read(client)
             except (ImudError, TimeoutError) as error:
-                self._on_news(News(str(error), now_ns=monotonic_ns()))
+                self._on_news(News(str(error), now_ns=monotonic_ns() + self._ahead_ns, ahead_ns=self._ahead_ns))
                 with self._changed:
                     self._changed.wait_for(lambda: self._stopped, RETRY_S)
 
@@ -120,8 +126,23 @@ class Feed:
         hello: Hello | None = client.hello
         while not self._stopped and (wanted := self._wanted) is not None:
             news = reading.next(wanted)
+            self._ahead_ns = news.ahead_ns
             self._on_news(news._replace(hello=hello))
             hello = None
+
+
+def clock_ahead_ns(daemon_now_ns: int) -> int:
+    """Return CLOCK_MONOTONIC of the daemon's machine, which an answer had just now, minus that of this machine.
+
+    0 where both are one clock; they are not where SSH forwards the socket from another machine.
+    """
+    ahead_ns = daemon_now_ns - monotonic_ns()
+    return ahead_ns if abs(ahead_ns) > SAME_CLOCK_NS else 0
+
+
+def utc_offset_ns(ahead_ns: int) -> int:
+    """Return what makes UTC of a time of the daemon, with the CLOCK_REALTIME of this machine."""
+    return time_ns() - monotonic_ns() - ahead_ns
 
 
 class _Reading:
@@ -134,6 +155,7 @@ class _Reading:
         self._watched: tuple[tuple[str, ...] | None, float | None, float] | None = None
         self._watch: Watch | None = None
         self._dropped = 0
+        self._ahead_ns = 0
         self._first_event: Event | None = None
         """One that came while there were no samples to wait for."""
 
@@ -144,19 +166,21 @@ class _Reading:
         samples = self._samples(wanted.news_s)
         events = self._events()
         dropped, self._dropped = self._dropped, 0
-        return news._replace(samples=samples, events=events, dropped=dropped, now_ns=monotonic_ns())
+        now_ns = monotonic_ns() + self._ahead_ns
+        return news._replace(samples=samples, events=events, dropped=dropped, now_ns=now_ns, ahead_ns=self._ahead_ns)
 
     def _asked(self, wanted: Wish) -> News:
         news = News()
         now_s = monotonic()
         if now_s >= self._status_due_s:
             answer = self._client.status()
+            self._ahead_ns = clock_ahead_ns(answer["now_ns"])
             statuses = msgspec.convert(answer["devices"], tuple[DeviceStatus, ...])
             self._known = frozenset(status.name for status in statuses)
             self._status_due_s = now_s + _pause_s(STATUS_S, len(statuses))
             news = News(statuses=statuses, clients=len(answer["socket"]["clients"]))
         if wanted.newest and now_s >= self._newest_due_s:
-            news = news._replace(newest=tuple(self._client.poll()), newest_ns=monotonic_ns())
+            news = news._replace(newest=tuple(self._client.poll()), newest_ns=monotonic_ns() + self._ahead_ns)
             self._newest_due_s = now_s + _pause_s(wanted.newest_s, len(self._known))
         return news
 

@@ -3,11 +3,15 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic_ns, time_ns
 
-from imud.client.feed import Feed, Wish
+import pytest
+
+from imud.client.feed import Feed, Wish, clock_ahead_ns, utc_offset_ns
 from imud.event import Event, EventKind
+from imud.units import NS_PER_S
 from tests.client.news import Listener
-from tests.support.socket_rig import Daemon, batch, daemon
+from tests.support.socket_rig import NOW_NS, Daemon, batch, daemon
 
 LIMIT_S = 10.0
 OVERVIEW = Wish((), news_s=0.02, newest=True, newest_s=0.02)
@@ -105,3 +109,17 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
         assert heard.wait_for(lambda news: news.hello).statuses
         feed.close()
         feed.close()
+
+
+def test_the_time_of_the_news_is_that_of_the_daemons_machine(tmp_path: Path) -> None:
+    """The rig's daemon has a clock of its own, as one on another machine whose socket SSH forwards."""
+    with daemon(tmp_path) as served, feeding(str(served.path), OVERVIEW) as (_, heard):
+        news = heard.wait_for(lambda news: news.statuses)
+        assert news.ahead_ns == pytest.approx(NOW_NS - monotonic_ns(), abs=LIMIT_S * NS_PER_S)
+        assert news.now_ns == pytest.approx(NOW_NS, abs=LIMIT_S * NS_PER_S)
+        assert NOW_NS + utc_offset_ns(news.ahead_ns) == pytest.approx(time_ns(), abs=LIMIT_S * NS_PER_S)
+
+
+def test_clocks_that_are_near_are_one_clock() -> None:
+    assert clock_ahead_ns(monotonic_ns() - NS_PER_S // 2) == 0, "an answer that came late"
+    assert clock_ahead_ns(monotonic_ns() + 60 * NS_PER_S) == pytest.approx(60 * NS_PER_S, abs=NS_PER_S)

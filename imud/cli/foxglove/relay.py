@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from threading import Event as Flag
-from time import monotonic, monotonic_ns, time_ns
+from time import monotonic, time_ns
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -12,6 +12,7 @@ from imud.bridges.channel import Diagnoses, Dialect, MessageChannel, MessageFram
 from imud.bridges.diagnosis import LiveDiagnosis
 from imud.bridges.json_channels import status_channel
 from imud.client import Client
+from imud.client.feed import clock_ahead_ns, utc_offset_ns
 from imud.client.watch import EventStream, Watch, event_of, params_of
 from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.status import DeviceStatus
@@ -66,10 +67,11 @@ class Relay:
         devices: Sequence[str] = (),
         rate_hz: float | None = None,
         noise: Mapping[str, Deviations] | None = None,
-        utc_offset_ns: Callable[[], int] = lambda: time_ns() - monotonic_ns(),
+        utc_offset_ns: Callable[[int], int] = lambda now_ns: utc_offset_ns(clock_ahead_ns(now_ns)),
     ) -> None:
         """`devices` are those that are shown, none: all; each at most `rate_hz`, None: every sample.
 
+        `utc_offset_ns` gets what the daemon's CLOCK_MONOTONIC was just now, and returns what makes UTC of it.
         `noise`, by device, is taken in place of what the daemon's configuration has.
         """
         self._path = path
@@ -77,7 +79,9 @@ class Relay:
         self._wanted = list(devices)
         self._rate_hz = rate_hz
         self._noise = noise or {}
-        self._utc_offset_ns = utc_offset_ns
+        self._utc_offset_of = utc_offset_ns
+        self._utc_offset_ns = 0
+        """As of the newest status."""
         self._dialect = dialect
         self._events = dialect.events()
         self._diagnostics = dialect.diagnostics()
@@ -95,7 +99,7 @@ class Relay:
                     self._read(client)
             except (ImudError, TimeoutError) as error:
                 self._viewer.problem(str(error))
-                self._show_diagnoses(self._diagnosis.stale(str(error), monotonic_ns() + self._utc_offset_ns()))
+                self._show_diagnoses(self._diagnosis.stale(str(error), time_ns()))
                 self._stop.wait(RETRY_S)
 
     def stop(self) -> None:
@@ -137,7 +141,7 @@ class Relay:
                     device.show(sample)
 
     def _show_event(self, event: Event) -> None:
-        stamped = StampedEvent(event, event.t_ns + self._utc_offset_ns())
+        stamped = StampedEvent(event, event.t_ns + self._utc_offset_ns)
         self._viewer.send(self._events, stamped, stamped.utc_ns)
 
     def _show_diagnoses(self, diagnoses: Diagnoses) -> None:
@@ -147,7 +151,8 @@ class Relay:
     def _show_status(self, client: Client) -> None:
         answer = client.status()
         statuses = msgspec.convert(answer["devices"], list[DeviceStatus])
-        utc_ns = answer["now_ns"] + self._utc_offset_ns()
+        self._utc_offset_ns = self._utc_offset_of(answer["now_ns"])
+        utc_ns = answer["now_ns"] + self._utc_offset_ns
         self._viewer.problem("")
         there = {status.name: status for status in statuses if not self._wanted or status.name in self._wanted}
         for name in self._devices.keys() - there.keys():

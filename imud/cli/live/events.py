@@ -9,7 +9,6 @@ What happened before the command began is not sent: `imud status` shows what it 
 import argparse
 import logging
 import sys
-import time
 from typing import Final
 
 import msgspec
@@ -19,6 +18,7 @@ from imud.cli.live.following import LOOK_S, keep_connected
 from imud.cli.output import local_time
 from imud.cli.streams import raise_if_unread
 from imud.client import Client
+from imud.client.feed import clock_ahead_ns, utc_offset_ns
 from imud.event import LEVELS, Event
 from imud.log import MESSAGE_CHARACTERS_MAX, printable
 
@@ -77,6 +77,7 @@ class _Printer:
 
     def work(self, client: Client) -> None:
         """Print the events of one connection."""
+        ahead_ns = clock_ahead_ns(client.status()["now_ns"])
         events = client.events(self._args.device or None, timeout_s=LOOK_S)
         show = as_json if self._args.json else as_text
         while self._left is None or self._left > 0:
@@ -87,7 +88,7 @@ class _Printer:
                 continue
             if level_of(event) < self._least:
                 continue
-            sys.stdout.write(show(printed(event, time.time_ns() - time.monotonic_ns())) + "\n")
+            sys.stdout.write(show(printed(event, utc_offset_ns(ahead_ns))) + "\n")
             sys.stdout.flush()
             if self._left is not None:
                 self._left -= 1

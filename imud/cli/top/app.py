@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable
-from time import monotonic_ns, time_ns
 from typing import ClassVar, Final, Protocol
 
 from textual.app import App, ComposeResult
@@ -17,7 +16,7 @@ from imud.cli.live.events import as_text, printed
 from imud.cli.status import WELL, block
 from imud.cli.top.history import CURVES, DeviceHistories, DeviceHistory
 from imud.cli.top.rows import SORTS, TEXT_MAX, VIEWS, chosen, head, row
-from imud.client.feed import News
+from imud.client.feed import News, utc_offset_ns
 from imud.event import Event
 from imud.log import printable
 
@@ -84,6 +83,8 @@ class TopApp(App[None]):
         self.problem = "connecting"
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.paused = False
+        self.ahead_ns = 0
+        """CLOCK_MONOTONIC of the daemon's machine minus that of this one."""
         self._feed = make_feed(self._post)
 
     def on_mount(self) -> None:
@@ -105,7 +106,7 @@ class TopApp(App[None]):
         self.problem = news.problem
         if news.statuses is not None:
             self.fleet.update(news.statuses, news.clients)
-        self.fleet.now_ns = news.now_ns
+        self.fleet.now_ns, self.ahead_ns = news.now_ns, news.ahead_ns
         for sample in news.samples:
             self.fleet.add(sample)
         self.events.extend(news.events)
@@ -329,5 +330,5 @@ class DevicePage(TopScreen):
             fresh.append(event)
         for event in reversed(fresh):
             if event.device == self._device:
-                events.write(event_line(event, time_ns() - monotonic_ns()))
+                events.write(event_line(event, utc_offset_ns(self.top.ahead_ns)))
         self._shown = self.top.events[-1] if self.top.events else None

@@ -63,7 +63,7 @@ class FakeViewer:
 
 @contextmanager
 def relaying(path: str | Path, viewer: FakeViewer, dialect: Dialect | None = None, **options: Any) -> Iterator[Relay]:
-    relay = Relay(str(path), viewer, dialect or JsonDialect(), utc_offset_ns=lambda: OFFSET_NS, **options)
+    relay = Relay(str(path), viewer, dialect or JsonDialect(), utc_offset_ns=lambda _now_ns: OFFSET_NS, **options)
     thread = Thread(target=relay.run)
     thread.start()
     try:

@@ -1,6 +1,7 @@
 """`imud events`: a line or an object per event, with its local time and priority."""
 
 import json
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from threading import Event as Flag
@@ -13,7 +14,7 @@ from imud.cli.live.events import as_json, as_text, printed
 from imud.event import Event, EventKind
 from imud.publishers.socket.publisher import SocketServer
 from imud.units import NS_PER_S
-from tests.support.socket_rig import Daemon, daemon
+from tests.support.socket_rig import NOW_NS, Daemon, daemon
 
 DOWN = Event(5 * NS_PER_S, "bow", EventKind.DOWN, "the adapter was pulled out", {"errno": 5})
 OFFSET_NS = 1_790_000_000 * NS_PER_S + 123_999_999  # 2026-09-21 14:13:20 UTC
@@ -93,6 +94,28 @@ def test_events_as_they_come(
     assert len(lines) == 6
     assert {word for word in words for line in lines if word in line} == words
     assert all(any(word in line for word in words) for line in lines)
+
+
+def test_the_time_is_right_where_the_daemons_clock_is_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As through a socket that SSH forwards: the rig's CLOCK_MONOTONIC is not that of this machine."""
+
+    def send(served: Daemon, ended: Flag) -> None:
+        while not ended.wait(0.01):
+            served.do(partial(raising, Event(NOW_NS - 3600 * NS_PER_S, "imu0", EventKind.UP, "an hour ago")))
+
+    with daemon(tmp_path) as served:
+        ended = Flag()
+        sender = Thread(target=send, args=(served, ended))
+        sender.start()
+        try:
+            assert main(["events", "--socket", str(served.path), "--count", "1"]) == 0
+        finally:
+            ended.set()
+            sender.join()
+    shown = datetime.fromisoformat(capsys.readouterr().out.split()[0])
+    assert (datetime.now(UTC) - shown).total_seconds() == pytest.approx(3600, abs=30)
 
 
 def test_an_unknown_device_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
