@@ -88,7 +88,7 @@ class ReaderConnection:
             await self._connect(access, client_id, session_s, is_v5=is_v5)
             await self._until(lambda: self._answered, "no answer")
             self._awaited = len(topics)
-            self._client.subscribe([(topic, 1) for topic in topics])
+            self._guarded(lambda: self._client.subscribe([(topic, 1) for topic in topics]))
             self._look_at_writing()
             # a session can have more messages than are read at once, and the answer stands behind them
             await self._until(lambda: not self._awaited or not self._has_room(), "no answer to the subscription")
@@ -112,6 +112,7 @@ class ReaderConnection:
         self._socket = client.socket()
         if self._socket is None:
             raise BrokerError(f"{self._broker.name}: the connection was lost")
+        client.on_socket_close = self._on_socket_close
         self._number = self._socket.fileno()
         asyncio.get_running_loop().add_reader(self._number, self._read)
         self._look_after()
@@ -133,9 +134,10 @@ class ReaderConnection:
         return found
 
     def acknowledge(self, number: int) -> None:
-        """Tell the broker that a message is done with; no-op when the connection is lost."""
-        if self._client is not None and not self._problem:
-            self._client.ack(number, 1)
+        """Tell the broker that a message is done with; no-op when the connection is lost, which may show here first."""
+        client = self._client
+        if client is not None and not self._problem:
+            self._guarded(lambda: client.ack(number, 1))
             self._look_at_writing()
 
     def close(self) -> None:
@@ -207,8 +209,9 @@ class ReaderConnection:
         return int(getattr(self._socket, "pending", lambda: 0)())
 
     def _write(self) -> None:
-        self._guarded(self._client.loop_write)
-        self._look_at_writing()
+        if self._client is not None:
+            self._guarded(self._client.loop_write)
+            self._look_at_writing()
 
     def _look_at_writing(self) -> None:
         """Wait for room in the socket while paho-mqtt has something to write."""
@@ -228,7 +231,7 @@ class ReaderConnection:
         self._look_at_writing()
 
     def _guarded(self, work: Any) -> None:
-        """Call paho-mqtt, and note a connection that is lost."""
+        """Call paho-mqtt, and note a connection that is lost: whatever writes or reads can close the socket."""
         try:
             work()
         except (OSError, ValueError) as error:
@@ -240,12 +243,13 @@ class ReaderConnection:
             self._came.set()
 
     def _forget_socket(self) -> None:
-        """Stop waiting for the socket."""
+        """Stop waiting for the socket, whose descriptor may be closed, or be another file's by now."""
         sock, self._socket = self._socket, None
         if sock is not None:
             loop = asyncio.get_running_loop()
-            loop.remove_reader(self._number)
-            loop.remove_writer(self._number)
+            for remove in (loop.remove_reader, loop.remove_writer):
+                with suppress(OSError):
+                    remove(self._number)
 
     # --- what paho-mqtt calls ----------------------------------------------------------------------------------------
 
@@ -267,6 +271,11 @@ class ReaderConnection:
             self.refused += 1
             return
         self._queue.append(FleetDelivery(message.topic, message.payload, bool(message.retain), message.mid, self))
+        self._came.set()
+
+    def _on_socket_close(self, _client: Any, _data: Any, _sock: Any) -> None:
+        """Forget the socket while its descriptor is still its own: paho-mqtt closes it next."""
+        self._forget_socket()
         self._came.set()
 
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.fleet_gateway import SendingGateway
+from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.conftest import authority
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 
-__all__ = ["authority", "broker", "gateway"]
+__all__ = ["authority", "broker", "gateway", "proxy"]
 
 
 @pytest.fixture
@@ -23,5 +24,12 @@ def broker(tmp_path: Path) -> Iterator[Mosquitto]:
 @pytest.fixture
 def gateway(broker: Mosquitto) -> Iterator[SendingGateway]:
     one = SendingGateway(broker.port)
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def proxy(broker: Mosquitto) -> Iterator[ResettingProxy]:
+    one = ResettingProxy(broker.port)
     yield one
     one.close()

@@ -10,6 +10,7 @@ from imud.fleet import Fleet, FleetBatch
 from imud.fleet.collect import FleetCollector
 from imud.formats.fleet.ledger import Accounts, FleetLedger, StoredAccount, StreamKey
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, samples_message
+from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.mosquitto import Mosquitto
 
 
@@ -39,7 +40,7 @@ class MemoryStore:
         pass
 
 
-def collect(broker: Mosquitto, store: MemoryStore, most: int) -> Fleet:
+def collect(broker: Mosquitto | ResettingProxy, store: MemoryStore, most: int) -> Fleet:
     """Run the collector until the store has so many rows."""
     fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
     store.most = most
@@ -83,3 +84,31 @@ def test_a_restarted_collector_knows_what_it_had(broker: Mosquitto, gateway: Sen
     (account,) = fleet.accounts.values()
     assert (account.received, account.counts.duplicates, account.balance) == (9, 5, 0)
     assert store.accounts == {StreamKey("gw", "1", "bow", "samples"): StoredAccount(account.counts, [])}
+
+
+class ResettingStore(MemoryStore):
+    """A store whose collector loses its connection while it writes, so that acknowledgements meet the reset."""
+
+    def __init__(self, proxy: ResettingProxy, resets: int) -> None:
+        super().__init__()
+        self.proxy, self.resets = proxy, resets
+
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
+        super().write(batches, accounts)
+        if self.resets:
+            self.resets -= 1
+            self.proxy.reset()
+
+
+def test_a_reset_while_a_transaction_is_acknowledged_costs_a_connection_and_nothing_else(
+    broker: Mosquitto, gateway: SendingGateway, proxy: ResettingProxy
+) -> None:
+    begin_session(broker)
+    gateway.send(*(samples_message(n, n) for n in range(1, 501)))
+    store = ResettingStore(proxy, 3)
+    fleet = collect(proxy, store, 500)
+    assert store.rows == list(range(1, 501))
+    (account,) = fleet.accounts.values()
+    assert (account.received, account.balance) == (500, 0)
+    assert 2 <= fleet.connections <= 4, "the next transaction can be of the connection that is lost"
+    assert account.counts.duplicates > 0

@@ -1,6 +1,8 @@
 """One connection of a reader with a real broker: deliveries, acknowledgements, its end."""
 
 import asyncio
+import errno
+import socket
 from contextlib import closing
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from imud.fleet.connection import RECEIVE_MAX, ReaderConnection
 from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.settings import broker_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway
+from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.authority import Authority
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
 
@@ -23,6 +26,12 @@ async def opened(
     broker = broker_of(f"{scheme}://127.0.0.1:{port}")
     assert broker is not None
     return await ReaderConnection.open(broker, access, "reader", ["imud/#"], session_s, is_v5=is_v5)
+
+
+async def lost(connection: ReaderConnection) -> None:
+    """Take what had come before the connection was lost. Raises BrokerError then."""
+    while await connection.next(LIMIT_S) is not None:
+        pass
 
 
 BOTH = pytest.mark.parametrize("is_v5", [True, False], ids=["5", "3.1.1"])
@@ -123,6 +132,61 @@ def test_a_broker_that_ends_is_noticed(broker: Mosquitto) -> None:
         with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: "):
             await connection.next(LIMIT_S)
         connection.close()
+
+    asyncio.run(play())
+
+
+@BOTH
+def test_a_reset_that_an_acknowledgement_meets_is_a_loss_and_watches_no_other_file(
+    broker: Mosquitto, gateway: SendingGateway, proxy: ResettingProxy, is_v5: bool
+) -> None:
+    """paho-mqtt closes the socket inside `ack`, and the next file that is opened has its number."""
+
+    async def play() -> None:
+        connection = await opened(proxy.port, 60, is_v5=is_v5)
+        await asyncio.to_thread(gateway.publish, [(f"imud/{n}", b"") for n in range(4)])
+        first, second = await connection.next(LIMIT_S), await connection.next(LIMIT_S)
+        assert first is not None
+        assert second is not None
+        proxy.reset()  # and the event loop, which would read it, has no turn
+        connection.acknowledge(first.number)
+        others = [socket.socketpair() for _ in range(8)]  # one of them has the number that the connection had
+        try:
+            connection.acknowledge(second.number)
+            for pair in others:
+                for one in pair:
+                    assert not asyncio.get_running_loop().remove_reader(one)
+                    assert not asyncio.get_running_loop().remove_writer(one)
+            with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{proxy.port}: the connection was lost"):
+                await lost(connection)
+        finally:
+            connection.close()
+            for pair in others:
+                for one in pair:
+                    one.close()
+
+    asyncio.run(play())
+
+
+def test_a_descriptor_that_the_event_loop_cannot_forget_ends_the_connection_all_the_same(
+    broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """epoll of a descriptor that is closed already raises where both reading and writing were waited for."""
+
+    async def play() -> None:
+        connection = await opened(broker.port)
+        waiting = asyncio.ensure_future(connection.next())
+        await asyncio.sleep(0)
+        loop = asyncio.get_running_loop()
+
+        def refuse(number: int) -> bool:
+            raise OSError(errno.EBADF, "Bad file descriptor")
+
+        monkeypatch.setattr(loop, "remove_writer", refuse)
+        connection.close()
+        with pytest.raises(BrokerError, match="the connection is closed"):
+            async with asyncio.timeout(LIMIT_S):
+                await waiting
 
     asyncio.run(play())
 

@@ -18,6 +18,7 @@ from imud.formats.fleet.ledger import StreamKey
 from imud.formats.fleet.state import GatewayState, StreamPosition
 from imud.formats.fleet.topics import topic_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
+from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
 from tests.support.files import ROOT
 
@@ -150,6 +151,30 @@ def test_a_broker_that_restarts_loses_nothing(broker: Mosquitto, gateway: Sendin
         return found
 
     assert asyncio.run(play()) == [1, 11]
+
+
+def test_a_connection_that_is_reset_under_acknowledgements_is_made_again(
+    broker: Mosquitto, gateway: SendingGateway, proxy: ResettingProxy
+) -> None:
+    fleet = Fleet(f"mqtt://127.0.0.1:{proxy.port}", name="archive", retry_max_s=0.5)
+    gateway.send_state(STATE)
+
+    async def play() -> list[int]:
+        await session_begun(fleet)
+        batches, found = fleet.watch(), []
+        async with asyncio.timeout(LIMIT_S):
+            for begin in (1, 11, 21):
+                await asyncio.to_thread(gateway.send, *(samples_message(n, n) for n in range(begin, begin + 10)))
+                for _ in range(10):
+                    found.append((await anext(batches)).message.first)
+                    if found[-1] == begin + 4:
+                        proxy.reset()  # the next thing that is done is to acknowledge this one
+        await batches.aclose()
+        return found
+
+    assert asyncio.run(play()) == list(range(1, 31))
+    assert fleet.accounts[KEY].counts.missing == 0
+    assert 3 <= fleet.connections <= 5, "one for the session, and one after each reset that is noticed"
 
 
 def test_only_what_is_wanted_comes_even_where_the_session_had_more(broker: Mosquitto, gateway: SendingGateway) -> None:
