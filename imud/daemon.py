@@ -35,6 +35,7 @@ from imud.runtime.recording.tap import DeviceTaps
 from imud.signals.gpio import GPIO_LINES
 from imud.signals.watched_line import watching
 from imud.units import NS_PER_S
+from imud.utc.system_clock import kernel_clock, system_reference
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +87,7 @@ class Daemon:
             status_in_turn=self.each_status, latencies=self._latencies,
             recording=DeviceTaps(self._devices, host), utc_offset_ns=host.utc_offset_ns,
             raise_event=self._send_event, watch_line=watching(lines, host.now_ns),
+            utc_reference=lambda: system_reference(kernel_clock(), host.utc_offset_ns()),
         )  # fmt: skip
         self._extra = dict(extra or {})
         self._until_finished = until_finished

@@ -14,7 +14,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic, monotonic_ns, sleep, time_ns
 from typing import Any
 
 import msgspec
@@ -23,6 +23,8 @@ import pytest
 from imud.client import Ring
 from imud.config import Config
 from imud.daemon import Daemon
+from imud.units import NS_PER_S
+from imud.utc.system_clock import KernelClock
 from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.event_loops import in_loop
 from tests.support.files import hi91
@@ -108,6 +110,16 @@ async def test_the_thread_that_closes_is_there_from_the_beginning() -> None:
     assert set(threading.enumerate()) == threads
     daemon.stop()
     await running
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch, is_kept: bool) -> None:
+    monkeypatch.setattr("imud.daemon.kernel_clock", lambda: KernelClock(is_kept, 50, 0))
+    found = Daemon(Config("info", "", {}, ()))._context.utc_reference()
+    assert (found is not None) == is_kept
+    if found is not None:
+        assert found.error_ns == 50_000
+        assert abs(found.offset_ns - (time_ns() - monotonic_ns())) < NS_PER_S
 
 
 def test_port_that_appears_later_is_taken(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from imud.contracts.status import (
     OutputStatus,
     RecorderStatus,
 )
+from imud.contracts.timing import UtcReference
 from imud.errors import CommandError
 from imud.event import Event
 from imud.formats.slot import encode_slots
@@ -214,6 +215,8 @@ class PublisherContext:
     """A flight recorder adds a callable while it is open."""
     utc_offset_ns: Callable[[], int] = lambda: 0
     """CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    utc_reference: Callable[[], UtcReference | None] = lambda: None
+    """The same with its error; None while nothing keeps CLOCK_REALTIME. May be called in any thread."""
     watch_line: WatchLine = _no_line
     """Watches a GPIO line that belongs to no device."""
     raise_event: Callable[[Event], None] = lambda _event: None

@@ -2,24 +2,28 @@
 
     session ──delivery──▶ ledger ──batch──▶ store.write (one transaction, in a thread) ──▶ acknowledge
 
-A transaction has what came within COMMIT_S, at most BATCHES_MAX messages; the next one is taken while it is written. A
-store that keeps the ledger beside the rows
-gives it back after a restart, so that what comes again is known. A collector whose store fails ends: what it had not
-acknowledged is sent to the next one.
+A transaction has what came within COMMIT_S, at most BATCHES_MAX messages; the next one is taken while it
+is written. A store that keeps the ledger beside the rows gives it back after a restart, so that what comes again is
+known. A collector whose store fails ends: what it had not acknowledged is sent to the next one.
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
 from imud.fleet.connection import RECEIVE_MAX, FleetDelivery
 from imud.fleet.reader import Fleet, FleetBatch, FleetSession
+from imud.formats.fleet.boots import BootKey, BootOffset
 from imud.formats.fleet.ledger import Accounts, FleetLedger, StreamKey
 from imud.units import NS_PER_S
 
 COMMIT_S: Final = 0.5
 BATCHES_MAX: Final = RECEIVE_MAX // 2
 """Messages of one transaction: while it runs, the broker can send as many again."""
+
+
+Offsets = Mapping[BootKey, BootOffset]
+"""Wall clocks that are known from now on, by boot."""
 
 
 class FleetStore(Protocol):
@@ -29,8 +33,11 @@ class FleetStore(Protocol):
         """Enter the accounts that are kept into a ledger. Raises ServerError."""
         ...
 
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
-        """Keep batches and the accounts that they changed, all or nothing. Raises ServerError, OSError."""
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+        """Keep batches and the accounts that they changed, and place what waits for `offsets`, all or nothing.
+
+        Raises ServerError, OSError.
+        """
         ...
 
     def close(self) -> None:
@@ -44,6 +51,7 @@ class _Turn(NamedTuple):
     deliveries: list[FleetDelivery]
     batches: list[FleetBatch]
     accounts: Accounts
+    offsets: Offsets
 
 
 class Selection(NamedTuple):
@@ -91,7 +99,7 @@ class FleetCollector:
 
     async def _take(self, session: FleetSession) -> _Turn:
         """Take what comes within COMMIT_S."""
-        turn = _Turn([], [], {})
+        turn = _Turn([], [], {}, {})
         changed: set[StreamKey] = set()
         due_ns = self._now_ns() + round(COMMIT_S * NS_PER_S)
         while len(turn.deliveries) < BATCHES_MAX and (left_ns := due_ns - self._now_ns()) > 0 and not self._stopped:
@@ -102,12 +110,13 @@ class FleetCollector:
             batch = self._fleet.take(delivery, changed)
             if batch is not None:
                 turn.batches.append(batch)
-        return turn._replace(accounts={key: self._fleet.ledger.stored(key) for key in sorted(changed)})
+        accounts = {key: self._fleet.ledger.stored(key) for key in sorted(changed)}
+        return turn._replace(accounts=accounts, offsets=self._fleet.clocks.take_fresh())
 
     async def _write(self, session: FleetSession, turn: _Turn) -> None:
         """Write what was taken, and acknowledge it."""
-        if turn.batches or turn.accounts:
-            await asyncio.to_thread(self._store.write, turn.batches, turn.accounts)
+        if turn.batches or turn.accounts or turn.offsets:
+            await asyncio.to_thread(self._store.write, turn.batches, turn.accounts, turn.offsets)
             self.written += len(turn.batches)
         for delivery in turn.deliveries:
             session.acknowledge(delivery)

@@ -19,6 +19,7 @@ import msgspec
 
 from imud.errors import BadArgument, ServerError
 from imud.fleet.connection import FleetDelivery, ReaderConnection
+from imud.formats.fleet.boots import BootClocks, BootKey, BootOffset, PlacedTime, placed
 from imud.formats.fleet.ledger import FleetLedger, StreamKey, key_of
 from imud.formats.fleet.messages import FleetMessage, decode_message
 from imud.formats.fleet.state import GatewayState, SpoolPositions, StreamAccount, decode_state
@@ -55,6 +56,17 @@ class FleetBatch(NamedTuple):
     stream: Stream
     message: FleetMessage
     """Its samples are those that `imud.client` gives."""
+    offset: BootOffset | None = None
+    """The wall clock of its boot, as far as it is known: with it, what came before can be placed, too."""
+
+    def time_of(self, utc_ns: int, t_ns: int) -> PlacedTime:
+        """Where a record of the message with these two times lies on UTC, and whether its gateway knew the time."""
+        return placed(utc_ns, t_ns, self.message.clock, self.offset)
+
+    def time_of_newest(self) -> PlacedTime:
+        """The same of the newest of the message, which is all there is of what was dropped."""
+        message, t_ns = self.message, self.message.newest_t_ns
+        return placed(message.utc_ns, t_ns, message.clock, self.offset)
 
 
 def brokers_of(urls: Sequence[str]) -> list[Broker]:
@@ -106,12 +118,19 @@ class Fleet:
         """Connections that a broker has accepted, with their subscriptions."""
         self.problem = ""
         """Why nothing comes now, one sentence; empty while the connection is there."""
+        self.clocks = BootClocks()
+        """What gateways said of their wall clocks."""
         self._positions = SpoolPositions()
 
     @property
     def accounts(self) -> Mapping[StreamKey, StreamAccount]:
         """The account of every stream: sent, received, gaps by cause, still in the spool."""
         return self._positions.accounts(self.ledger)
+
+    @property
+    def offsets(self) -> Mapping[BootKey, BootOffset]:
+        """CLOCK_REALTIME less CLOCK_MONOTONIC of each gateway and boot whose clock was synchronised, with its error."""
+        return self.clocks.offsets
 
     async def watch(
         self, *, site: str | None = None, gateway: str | None = None, device: str | None = None
@@ -143,6 +162,7 @@ class Fleet:
                 state = decode_state(delivery.payload)
                 self.states[parts.site, parts.gateway] = state
                 self._positions.take(parts.gateway, state)
+                self.clocks.take_state(parts.gateway, state)
                 return None
             message, stream = decode_message(delivery.payload), Stream(parts.leaf)
             if (message.gateway, message.device) != (parts.gateway, parts.device):
@@ -150,7 +170,8 @@ class Fleet:
             fresh = self.ledger.take(message, stream)
             if changed is not None:
                 changed.add(key_of(message, stream))
-            return FleetBatch(parts.site, stream, fresh) if fresh is not None else None
+            offset = self.clocks.take(message)
+            return FleetBatch(parts.site, stream, fresh, offset) if fresh is not None else None
         except ValueError as error:
             self.ignored += 1
             log.warning("%s: %s", delivery.topic, error)

@@ -16,7 +16,7 @@ from time import monotonic, time_ns
 from typing import Any, Final
 
 from imud.fleet import Fleet, FleetBatch
-from imud.fleet.collect import FleetCollector
+from imud.fleet.collect import FleetCollector, Offsets
 from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS
 from imud.formats.fleet.ledger import Accounts, FleetLedger
@@ -40,10 +40,10 @@ class MeasuredStore:
         if self._to is not None:
             self._to.restore(ledger)
 
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
         """Write, then count."""
         if self._to is not None:
-            self._to.write(batches, accounts)
+            self._to.write(batches, accounts, offsets)
         now_ns = time_ns()
         self.came += sum(one.message.count for one in batches)
         self.delays_ms += [(now_ns - one.message.utc_ns) / NS_PER_MS for one in batches]

@@ -5,7 +5,17 @@ from typing import Any
 
 import msgspec
 
-from imud.formats.fleet.messages import VERSION, DropCause, FleetMessage, MessageKind, encode_message
+from imud.event import Event, EventKind
+from imud.formats.fleet.messages import (
+    VERSION,
+    DropCause,
+    FleetMessage,
+    GatewayClock,
+    Interval,
+    Measures,
+    MessageKind,
+    encode_message,
+)
 from imud.formats.fleet.state import GatewayState
 from imud.formats.fleet.topics import STATE, Stream, topic_of
 from imud.sample import Sample, Sync
@@ -30,6 +40,34 @@ def samples_message(
         v=VERSION, gateway=gateway, boot=boot, device=device, kind=MessageKind.SAMPLES, begin=1, first=first, last=last,
         count=len(samples), utc_ns=samples[-1].utc_ns, samples=samples,
     )  # fmt: skip
+
+
+def intervals_message(first: int, last: int, *, boot: str = "1", utc_ns: int = UTC_NS) -> FleetMessage:
+    """One interval of these samples."""
+    begin, end = first * NS_PER_MS, last * NS_PER_MS
+    one = Interval(
+        first, last, last - first + 1, begin, end, utc_ns + begin, utc_ns + end, 500, Sync.EDGE,
+        {"accel_m_s2": Measures(mean=(1.0, 2.0, 3.0))},
+    )  # fmt: skip
+    made = samples_message(first, last, boot=boot, utc_ns=utc_ns)
+    return msgspec.structs.replace(made, kind=MessageKind.INTERVALS, samples=[], intervals=[one])
+
+
+def event_message(number: int, t_ns: int, *, boot: str = "1", utc_ns: int = UTC_NS) -> FleetMessage:
+    """An event at a time of CLOCK_MONOTONIC."""
+    made = samples_message(number, number, boot=boot)
+    events = [Event(t_ns, "bow", EventKind.UP, "it is up")]
+    return msgspec.structs.replace(made, kind=MessageKind.EVENTS, samples=[], events=events, utc_ns=utc_ns + t_ns)
+
+
+def not_set(message: FleetMessage, utc_ns: int = 0) -> FleetMessage:
+    """The same message of a gateway whose clock nothing keeps; `utc_ns` is what it had at t_ns = 0."""
+    return msgspec.structs.replace(message, clock=GatewayClock(0, utc_ns, synchronised=False))
+
+
+def synchronised(message: FleetMessage, utc_ns: int = UTC_NS, *, t_ns: int = 0, error_ns: int = 1000) -> FleetMessage:
+    """The same message of a gateway whose clock is kept."""
+    return msgspec.structs.replace(message, clock=GatewayClock(t_ns, utc_ns, synchronised=True, error_ns=error_ns))
 
 
 def dropped_message(first: int, last: int, *, gateway: str = "gw", boot: str = "1") -> FleetMessage:

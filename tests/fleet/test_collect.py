@@ -7,9 +7,12 @@ import pytest
 
 from imud.errors import ServerError
 from imud.fleet import Fleet, FleetBatch
-from imud.fleet.collect import FleetCollector
+from imud.fleet.collect import BATCHES_MAX, FleetCollector, Offsets
+from imud.formats.fleet.boots import BootKey, BootOffset
 from imud.formats.fleet.ledger import Accounts, FleetLedger, StoredAccount, StreamKey
-from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, samples_message
+from imud.formats.fleet.messages import GatewayClock
+from imud.formats.fleet.state import GatewayState
+from tests.fleet.fleet_gateway import LIMIT_S, UTC_NS, SendingGateway, samples_message
 from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.mosquitto import Mosquitto
 
@@ -20,6 +23,7 @@ class MemoryStore:
     def __init__(self) -> None:
         self.rows: list[int] = []
         self.accounts: dict[StreamKey, StoredAccount] = {}
+        self.offsets: dict[BootKey, BootOffset] = {}
         self.fails = False
         self.collector: FleetCollector | None = None
         self.most = 1 << 30
@@ -28,11 +32,12 @@ class MemoryStore:
         for key, account in self.accounts.items():
             ledger.restore(key, account)
 
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
         if self.fails:
             raise ServerError("the store is full")
         self.rows += [sample.seq for batch in batches for sample in batch.message.samples]
         self.accounts |= accounts
+        self.offsets |= offsets
         if len(self.rows) >= self.most and self.collector is not None:
             self.collector.stop()
 
@@ -93,8 +98,8 @@ class ResettingStore(MemoryStore):
         super().__init__()
         self.proxy, self.resets = proxy, resets
 
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts) -> None:
-        super().write(batches, accounts)
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+        super().write(batches, accounts, offsets)
         if self.resets:
             self.resets -= 1
             self.proxy.reset()
@@ -104,11 +109,20 @@ def test_a_reset_while_a_transaction_is_acknowledged_costs_a_connection_and_noth
     broker: Mosquitto, gateway: SendingGateway, proxy: ResettingProxy
 ) -> None:
     begin_session(broker)
-    gateway.send(*(samples_message(n, n) for n in range(1, 501)))
+    number = 2 * BATCHES_MAX + 100
+    gateway.send(*(samples_message(n, n) for n in range(1, number + 1)))
     store = ResettingStore(proxy, 3)
-    fleet = collect(proxy, store, 500)
-    assert store.rows == list(range(1, 501))
+    fleet = collect(proxy, store, number)
+    assert store.rows == list(range(1, number + 1))
     (account,) = fleet.accounts.values()
-    assert (account.received, account.balance) == (500, 0)
+    assert (account.received, account.balance) == (number, 0)
     assert 2 <= fleet.connections <= 4, "the next transaction can be of the connection that is lost"
     assert account.counts.duplicates > 0
+
+
+def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquitto, gateway: SendingGateway) -> None:
+    clock = GatewayClock(9, UTC_NS, synchronised=True, error_ns=700)
+    gateway.send_state(GatewayState(v=1, online=True, boot="1", clock=clock))
+    store = MemoryStore()
+    asyncio.run(FleetCollector(Fleet(f"mqtt://127.0.0.1:{broker.port}"), store).run(stop_after_s=1.5))
+    assert store.offsets == {BootKey("gw", "1"): BootOffset(9, UTC_NS, 700)}

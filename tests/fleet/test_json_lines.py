@@ -9,10 +9,19 @@ import msgspec
 from imud.event import Event, EventKind
 from imud.fleet import FleetBatch
 from imud.fleet.json_lines import JsonLines, lines_of
-from imud.formats.fleet.messages import Interval, Measures, MessageKind
+from imud.formats.fleet.boots import BootClocks
+from imud.formats.fleet.messages import FleetMessage, Interval, Measures, MessageKind
 from imud.formats.fleet.topics import Stream
 from imud.sample import Sync
-from tests.fleet.fleet_gateway import dropped_message, samples_message
+from tests.fleet.fleet_gateway import (
+    UTC_NS,
+    dropped_message,
+    event_message,
+    intervals_message,
+    not_set,
+    samples_message,
+    synchronised,
+)
 
 HEAD = {"site": "mill", "gateway": "gw", "boot": "1", "device": "bow", "stream": "samples"}
 
@@ -46,9 +55,11 @@ def test_dropped_intervals_and_events_have_their_kinds() -> None:
         FleetBatch("mill", Stream.SAMPLES, thinned),
         FleetBatch("mill", Stream.EVENTS, event),
     ]
-    JsonLines(out).write(batches, {})
+    JsonLines(out).write(batches, {}, {})
     dropped, found, up = map(json.loads, out.getvalue().splitlines())
-    assert dropped == HEAD | {"kind": "dropped", "first": 1, "last": 4, "cause": "space"}
+    assert dropped == HEAD | {
+        "kind": "dropped", "first": 1, "last": 4, "cause": "space", "utc_ns": UTC_NS + 4_000_000,
+    }  # fmt: skip
     assert (found["kind"], found["values"]["accel_m_s2"]["mean"]) == ("interval", [1.0, 2.0, 3.0])
     assert (up["stream"], up["kind"], up["message"]) == ("events", "event", "it is up")
 
@@ -59,3 +70,29 @@ def test_an_event_keeps_its_own_kind() -> None:
     )
     (line,) = lines_of(FleetBatch("mill", Stream.EVENTS, event))
     assert json.loads(line)["event"] == "up"
+
+
+def test_lines_before_the_clock_is_set_say_so_and_the_line_of_the_clock_places_them() -> None:
+    messages = [
+        samples_message(1, 1, utc_ns=0), intervals_message(2, 3, utc_ns=0), event_message(4, 4_000_000, utc_ns=0),
+        dropped_message(5, 6),
+    ]  # fmt: skip
+    out, clocks = io.StringIO(), BootClocks()
+
+    def write(message: FleetMessage) -> None:
+        offset = clocks.take(message)
+        JsonLines(out).write([FleetBatch("mill", Stream.SAMPLES, message, offset)], {}, clocks.take_fresh())
+
+    for one in messages:
+        write(not_set(one))
+    write(synchronised(samples_message(7, 7), t_ns=7_000_000, error_ns=900))
+    write(not_set(samples_message(8, 8, utc_ns=0)))
+    lines = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [line.get("utc") for line in lines] == ["not set"] * 4 + [None] * 3
+    assert [line["kind"] for line in lines] == ["sample", "interval", "event", "dropped", "sample", "clock", "sample"]
+    assert lines[5] == {
+        "kind": "clock", "gateway": "gw", "boot": "1", "t_ns": 7_000_000, "utc_offset_ns": UTC_NS, "utc_err_ns": 900,
+    }  # fmt: skip
+    assert lines[0]["t_ns"] + lines[5]["utc_offset_ns"] == UTC_NS + 1_000_000
+    assert (lines[4]["utc_ns"], lines[4]["utc_err_ns"]) == (UTC_NS + 7_000_000, 900)
+    assert (lines[6]["utc_ns"], lines[6]["utc_err_ns"]) == (UTC_NS + 8_000_000, 900 + 1_000_000 // 2000)

@@ -13,10 +13,22 @@ import pytest
 
 from imud.errors import ServerError
 from imud.fleet import FleetBatch
-from imud.formats.fleet.ledger import FleetLedger, StoredAccount, StreamKey
-from imud.formats.fleet.messages import FleetMessage
+from imud.fleet.collect import Offsets
+from imud.formats.fleet.boots import BootClocks, BootKey, BootOffset
+from imud.formats.fleet.ledger import FleetLedger, StoredAccount, key_of
+from imud.formats.fleet.messages import FleetMessage, MessageKind
 from imud.formats.fleet.topics import Stream
-from tests.fleet.fleet_gateway import LIMIT_S, UTC_NS, SendingGateway, dropped_message, samples_message
+from tests.fleet.fleet_gateway import (
+    LIMIT_S,
+    UTC_NS,
+    SendingGateway,
+    dropped_message,
+    event_message,
+    intervals_message,
+    not_set,
+    samples_message,
+    synchronised,
+)
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 from tests.publishers.mqtt.mosquitto import Mosquitto
 
@@ -43,20 +55,25 @@ def query(url: str, text: str) -> list[Any]:
         return cursor.fetchall() if cursor.description else []
 
 
-def write(url: str, *messages: FleetMessage) -> FleetLedger:
-    """Write messages by a collector's store that begins anew."""
+NO_OFFSETS: Offsets = {}
+STREAMS = {MessageKind.INTERVALS: Stream.STATISTICS, MessageKind.EVENTS: Stream.EVENTS}
+
+
+def write(url: str, *messages: FleetMessage, offsets: Offsets = NO_OFFSETS) -> FleetLedger:
+    """Write messages by a collector's store that begins anew, in one transaction."""
     from imud.fleet.postgres import PostgresStore
 
-    store, ledger = PostgresStore(url), FleetLedger()
+    store, ledger, clocks = PostgresStore(url), FleetLedger(), BootClocks()
     store.restore(ledger)
     batches, changed = [], set()
     for message in messages:
-        fresh = ledger.take(message, Stream.SAMPLES)
-        changed.add(StreamKey(message.gateway, message.boot, message.device, "samples"))
+        stream = STREAMS.get(message.kind, Stream.SAMPLES)
+        fresh, offset = ledger.take(message, stream), clocks.take(message)
+        changed.add(key_of(message, stream))
         if fresh is not None:
-            batches.append(FleetBatch("mill", Stream.SAMPLES, fresh))
+            batches.append(FleetBatch("mill", stream, fresh, offset))
     try:
-        store.write(batches, {key: ledger.stored(key) for key in changed})
+        store.write(batches, {key: ledger.stored(key) for key in changed}, {**clocks.take_fresh(), **offsets})
     finally:
         store.close()
     return ledger
@@ -85,13 +102,79 @@ def test_what_comes_again_after_a_restart_is_a_duplicate_and_no_row(database: st
     assert (counts.whole, counts.duplicates, counts.balance) == (7, 7, 0)
 
 
-def test_samples_without_a_clock_wait_until_it_is_set(database: str) -> None:
-    write(database, samples_message(1, 3, utc_ns=0), samples_message(1, 2, boot="2", utc_ns=0))
-    assert query(database, "SELECT count(*) FROM imud_samples") == [(0,)]
-    write(database, samples_message(4, 5))
-    found = query(database, "SELECT seq, utc_ns, extract(epoch FROM time) * 1000000 FROM imud_samples ORDER BY seq")
-    assert found == [(n, UTC_NS + n * 1_000_000, (UTC_NS + n * 1_000_000) // 1000) for n in range(1, 6)]
-    assert query(database, "SELECT boot, seq FROM imud_unplaced ORDER BY seq") == [("2", 1), ("2", 2)]
+LIFTED_NS = 1_750_000_000_000_000_000
+"""Where systemd lifts a clock without a battery: after 2020, and wrong."""
+
+
+def placed(url: str) -> list[Any]:
+    """Everything that is placed, by its number in the table."""
+    return query(
+        url, "SELECT seq, utc_ns, extract(epoch FROM time) * 1000000, utc_set, utc_err_ns FROM imud_samples "
+        "UNION ALL SELECT first, utc_ns, extract(epoch FROM time) * 1000000, utc_set, utc_err_ns FROM imud_records "
+        "ORDER BY 1"
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong_ns", [0, LIFTED_NS])
+def test_what_comes_before_the_clock_is_set_is_placed_when_it_is(database: str, wrong_ns: int) -> None:
+    """Samples, intervals, events and what was dropped, of the device and of the device made anew; no other boot."""
+    before = [
+        samples_message(1, 2, utc_ns=wrong_ns), samples_message(3, 3, boot="1-2", utc_ns=wrong_ns),
+        intervals_message(4, 5, utc_ns=wrong_ns), event_message(6, 6_000_000, utc_ns=wrong_ns),
+        msgspec.structs.replace(dropped_message(7, 8), utc_ns=wrong_ns + 8_000_000),
+    ]  # fmt: skip
+    write(database, *(not_set(one, wrong_ns) for one in before))
+    write(database, not_set(samples_message(9, 9, boot="2", utc_ns=wrong_ns), wrong_ns))
+    assert [(seq, at_ns // 1_000_000_000, is_set, err) for seq, at_ns, _, is_set, err in placed(database)] == [
+        (number, wrong_ns // 1_000_000_000, False, None) for number in (1, 2, 3, 4, 6, 7, 9)
+    ]
+    write(database, synchronised(samples_message(10, 10), t_ns=10_000_000))
+    t_ns = {1: 1_000_000, 2: 2_000_000, 3: 3_000_000, 4: 4_000_000, 6: 6_000_000, 7: 8_000_000, 10: 10_000_000}
+    assert [row for row in placed(database) if row[3]] == [
+        (number, UTC_NS + at, (UTC_NS + at) // 1000, True, 1000 + (10_000_000 - at) // 2000)
+        for number, at in t_ns.items()
+    ]
+    assert [row[0] for row in placed(database) if not row[3]] == [9]
+    ((content,),) = query(database, "SELECT content FROM imud_records WHERE kind = 'interval'")
+    assert (content["begin_utc_ns"], content["end_utc_ns"]) == (UTC_NS + 4_000_000, UTC_NS + 5_000_000)
+
+
+def test_a_clock_that_is_known_places_what_comes_later_after_a_restart_too(database: str) -> None:
+    write(database, synchronised(intervals_message(1, 5), t_ns=5_000_000))
+    late = [samples_message(1, 1, utc_ns=0), intervals_message(6, 8, utc_ns=0), event_message(9, 9_000_000, utc_ns=0)]
+    write(database, *(not_set(one) for one in late))
+    assert [(number, at_ns, is_set) for number, at_ns, _, is_set, _ in placed(database)] == [
+        (1, UTC_NS + 1_000_000, True), (1, UTC_NS + 1_000_000, True), (6, UTC_NS + 6_000_000, True),
+        (9, UTC_NS + 9_000_000, True),
+    ]  # fmt: skip
+    found = query(database, "SELECT content->>'end_utc_ns' FROM imud_records WHERE kind = 'interval' ORDER BY first")
+    assert found == [(str(UTC_NS + 5_000_000),), (str(UTC_NS + 8_000_000),)]
+
+
+def test_intervals_alone_say_the_clock_of_a_gateway_that_speaks_of_none(database: str) -> None:
+    """What a gateway of an earlier version sends by default, first at 1970, then with a clock."""
+    write(database, intervals_message(1, 5, utc_ns=0))
+    write(database, intervals_message(6, 9))
+    assert placed(database) == [
+        (n, UTC_NS + n * 1_000_000, (UTC_NS + n * 1_000_000) // 1000, True, None) for n in (1, 6)
+    ]
+
+
+def test_the_state_of_a_gateway_places_what_came_before_it(database: str) -> None:
+    write(database, not_set(intervals_message(1, 5, utc_ns=0)))
+    write(database, offsets={BootKey("gw", "1"): BootOffset(0, UTC_NS, 7)})
+    assert placed(database) == [(1, UTC_NS + 1_000_000, (UTC_NS + 1_000_000) // 1000, True, 507)]
+
+
+def test_rows_that_the_ledger_does_not_know_stay_single(database: str) -> None:
+    first = write(database, samples_message(1, 5), intervals_message(1, 5), event_message(1, 1))
+    assert len(first.counts) == 3
+    query(database, "DELETE FROM imud_ledger")
+    write(database, samples_message(4, 9), intervals_message(1, 5), intervals_message(6, 9), event_message(1, 1))
+    assert query(database, "SELECT count(*), count(DISTINCT seq) FROM imud_samples") == [(9, 9)]
+    assert query(database, "SELECT kind, first FROM imud_records ORDER BY kind, first") == [
+        ("event", 1), ("interval", 1), ("interval", 6),
+    ]  # fmt: skip
 
 
 def test_a_transaction_that_fails_leaves_nothing(database: str) -> None:
@@ -109,48 +192,74 @@ def test_a_server_that_is_not_there_is_named() -> None:
         PostgresStore("postgresql:///postgres?host=/nowhere")
 
 
-@pytest.mark.timeout(180)
-def test_rows_are_exactly_once_when_the_collector_is_killed_at_random(
-    database: str, broker: Mosquitto, gateway: SendingGateway
-) -> None:
-    draw = random.Random(5)
+class Collecting:
+    """`imud fleet collect` as a process that is killed, or whose server is."""
 
-    def start() -> "subprocess.Popen[bytes]":
-        url = f"mqtt://127.0.0.1:{broker.port}"
-        return subprocess.Popen([sys.executable, "-m", "imud", "fleet", "collect", url, "--to", database])
+    def __init__(self, broker: Mosquitto, database: str) -> None:
+        self.broker, self.database = broker, database
+        write(database)
+        self.start()
+        while not any("imud-reader-collector 1 imud" in line for line in broker.log):
+            assert self.process.poll() is None
 
-    def rows() -> int:
-        return int(query(database, "SELECT count(*) FROM imud_samples")[0][0])
+    def start(self) -> None:
+        url = f"mqtt://127.0.0.1:{self.broker.port}"
+        words = [sys.executable, "-m", "imud", "fleet", "collect", url, "--to", self.database]
+        self.process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
 
-    def until(number: int) -> None:
+    def until(self, text: str, least: int) -> None:
+        """Wait until a query gives so much."""
         end = time.monotonic() + 3 * LIMIT_S
-        while rows() < number:
+        while (query(self.database, text)[0][0] or 0) < least:
             assert time.monotonic() < end
-            assert process.poll() is None
+            assert self.process.poll() is None
             time.sleep(0.02)
 
-    write(database)
-    process = start()
-    try:
-        while not any("imud-reader-collector 1 imud" in line for line in broker.log):
-            assert process.poll() is None
-        sent = 0
-        for _ in range(4):
-            gateway.send(*(samples_message(sent + 10 * n + 1, sent + 10 * n + 10) for n in range(300)))
-            sent += 3000
-            until(draw.randint(sent - 2900, sent - 1))
-            process.kill()
-            process.wait()
-            process = start()
-        until(sent)
-        while query(database, "SELECT account->'counts'->>'newest' FROM imud_ledger") != [(str(sent),)]:
-            assert process.poll() is None
-    finally:
-        process.kill()
-        process.wait()
+    def until_rows(self, number: int) -> None:
+        self.until("SELECT count(*) FROM imud_samples", number)
+
+    def settle(self, sent: int) -> None:
+        """Wait for everything, and end it."""
+        self.until_rows(sent)
+        self.until("SELECT max((account->'counts'->>'newest')::bigint) FROM imud_ledger", sent)
+        self.kill()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def collecting(database: str, broker: Mosquitto) -> Iterator[Collecting]:
+    one = Collecting(broker, database)
+    yield one
+    one.kill()
+
+
+def assert_exactly_once(database: str, sent: int) -> None:
     assert query(database, "SELECT count(*), count(DISTINCT seq), min(seq), max(seq) FROM imud_samples") == [
         (sent, sent, 1, sent)
     ]
     ((account,),) = query(database, "SELECT account FROM imud_ledger")
     counts = msgspec.json.decode(json.dumps(account), type=StoredAccount).counts
     assert (counts.whole, counts.missing, counts.balance) == (sent, 0, 0)
+
+
+def send(gateway: SendingGateway, sent: int) -> int:
+    """Send 3,000 samples more; return how many that makes."""
+    gateway.send(*(samples_message(sent + 10 * n + 1, sent + 10 * n + 10) for n in range(300)))
+    return sent + 3000
+
+
+@pytest.mark.timeout(180)
+def test_rows_are_exactly_once_when_the_collector_is_killed_at_random(
+    database: str, collecting: Collecting, gateway: SendingGateway
+) -> None:
+    draw, sent = random.Random(5), 0
+    for _ in range(4):
+        sent = send(gateway, sent)
+        collecting.until_rows(draw.randint(sent - 2900, sent - 1))
+        collecting.kill()
+        collecting.start()
+    collecting.settle(sent)
+    assert_exactly_once(database, sent)

@@ -7,11 +7,13 @@ from typing import Final
 
 from imud.cli.output import table
 from imud.fleet import Fleet, FleetBatch
-from imud.formats.fleet.state import StreamAccount
+from imud.formats.fleet.messages import GatewayClock
+from imud.formats.fleet.state import GatewayState, StreamAccount
 from imud.formats.fleet.topics import Stream
-from imud.units import NS_PER_S, NS_PER_US
+from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
-HEAD: Final = ("GATEWAY", "STATE", "DEVICES", "SAMPLES/S", "LOST", "MISSING", "SPOOL", "AGE S", "ERROR µs")
+HEAD: Final = ("GATEWAY", "STATE", "DEVICES", "SAMPLES/S", "LOST", "MISSING", "SPOOL", "AGE S", "ERROR µs", "UTC ms")
+NOT_SET: Final = "not set"
 RATE_NS: Final = 5 * NS_PER_S
 """Rates are over so much time."""
 
@@ -29,11 +31,15 @@ class FleetOverview:
         """Samples that came, by gateway and stream: when, and how many."""
         self._newest_ns: dict[str, int] = {}
         self._error_ns: dict[str, int] = {}
+        self._clocks: dict[str, GatewayClock] = {}
+        """What the last message of each gateway said of its wall clock."""
 
     def add(self, batch: FleetBatch) -> None:
         """Note what came."""
         message = batch.message
         name = message.gateway
+        if message.clock is not None:
+            self._clocks[name] = message.clock
         self._newest_ns[name] = max(message.utc_ns, self._newest_ns.get(name, 0))
         if batch.stream is not Stream.EVENTS:
             counts = self._counts.setdefault((name, batch.stream), deque())
@@ -71,7 +77,15 @@ class FleetOverview:
             str(sum(one.in_spool for one in found)),
             "-" if newest_ns is None else f"{max(self._utc_ns() - newest_ns, 0) / NS_PER_S:.1f}",
             "-" if error_ns is None else f"{error_ns / NS_PER_US:.0f}",
+            self._utc_text(name, state),
         )
+
+    def _utc_text(self, name: str, state: GatewayState) -> str:
+        """The error of a gateway's wall clock, by what came last; nothing of one that does not speak of it."""
+        clock = self._clocks.get(name, state.clock)
+        if clock is None or (clock.synchronised and clock.error_ns is None):
+            return "-"
+        return f"{clock.error_ns / NS_PER_MS:.3g}" if clock.synchronised and clock.error_ns is not None else NOT_SET
 
     def _rate_hz(self, name: str) -> float:
         """Samples a second that came or are told of: the same samples can be in both streams."""

@@ -98,6 +98,19 @@ class Interval(msgspec.Struct, frozen=True, omit_defaults=True):
     """Status bits that any of the samples had."""
 
 
+class GatewayClock(msgspec.Struct, frozen=True):
+    """The wall clock of a gateway, as its kernel reports it (adjtimex(2))."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC when it was read."""
+    utc_offset_ns: int
+    """CLOCK_REALTIME less CLOCK_MONOTONIC then."""
+    synchronised: bool
+    """Whether something keeps it: STA_UNSYNC is not set. Otherwise it can be wrong by any amount."""
+    error_ns: int | None = None
+    """One-sigma error of the offset; None while it is not synchronised."""
+
+
 class FleetMessage(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True):
     """A message of a stream."""
 
@@ -118,11 +131,18 @@ class FleetMessage(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True
     """Samples, or events, that the numbers stand for."""
     utc_ns: int
     """CLOCK_REALTIME of the newest of it."""
+    clock: GatewayClock | None = None
+    """The wall clock when the message was made; None of one by a version that did not say."""
     cause: DropCause | None = None
     """Why it was dropped."""
     samples: list[Sample] = []  # msgspec copies a mutable default
     intervals: list[Interval] = []
     events: list[Event] = []
+
+    @property
+    def newest_t_ns(self) -> int | None:
+        """CLOCK_MONOTONIC of the newest of it; None of a message that does not speak of the clock."""
+        return None if self.clock is None else self.utc_ns - self.clock.utc_offset_ns
 
 
 _ENCODER: Final = msgspec.json.Encoder()

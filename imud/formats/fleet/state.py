@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 
 from imud.formats.fleet.ledger import FleetLedger, StreamCounts, StreamKey
+from imud.formats.fleet.messages import GatewayClock
 
 POSITIONS_MAX: Final = 100_000
 """Streams of which a state may have spoken; beyond it a reader raises instead of growing without end."""
@@ -39,6 +40,8 @@ class GatewayState(msgspec.Struct, frozen=True, kw_only=True):
     """Why it is not online."""
     devices: list[str] = []  # msgspec copies a mutable default
     positions: list[StreamPosition] = []
+    clock: GatewayClock | None = None
+    """Its wall clock; None of one that is not online, or of a version that did not say."""
     mqtt: dict[str, object] = {}
     """Counters of the output, as `imud status --json` has them."""
 

@@ -20,7 +20,7 @@ from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.status import DeviceStatus, MqttStatus
 from imud.errors import ServerError, reason_of
 from imud.event import Event, EventKind
-from imud.formats.fleet.messages import VERSION, boot_text
+from imud.formats.fleet.messages import VERSION, GatewayClock, boot_text
 from imud.formats.fleet.topics import SCHEMA, SETTINGS, STATE, STATUS, is_name, topic_of
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
 from imud.publishers.mqtt.backoff import BrokerTurn
@@ -109,7 +109,7 @@ class MqttPublisher:
             self._commands.answer = self._sender.reply
         self._writer = SpoolWriter(
             settings, self._gateway, self._queue, self._spool, self._sender, context.now_ns, context.utc_offset_ns,
-            self._start_worker,
+            self._start_worker, self._clock,
         )  # fmt: skip
         self._sender.retain({will.topic: self._state(online=True)})
         self._sender.start()
@@ -244,10 +244,18 @@ class MqttPublisher:
         """The state of the gateway: birth, death, or last will."""
         found: dict[str, object] = {"v": VERSION, "online": online, "boot": boot_text(self._context.epoch)}
         if online:
-            found |= {"imud": __version__, "devices": sorted(self._sent)}
+            found |= {"imud": __version__, "devices": sorted(self._sent), "clock": self._clock()}
         else:
             found["reason"] = reason
         return msgspec.json.encode(found)
+
+    def _clock(self) -> GatewayClock:
+        """The wall clock now. Called in the writer's thread as well."""
+        context = self._context
+        reference = context.utc_reference()
+        if reference is None:
+            return GatewayClock(context.now_ns(), context.utc_offset_ns(), synchronised=False)
+        return GatewayClock(context.now_ns(), reference.offset_ns, synchronised=True, error_ns=reference.error_ns)
 
     # --- what goes wrong ---------------------------------------------------------------------------------------------
 

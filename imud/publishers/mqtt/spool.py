@@ -274,10 +274,12 @@ class Spool:
         self.messages += len(rows)
         ends = {row.key: row for row in rows}
         begins = {row.key: row.first for row in reversed(rows)}
+        # where the clock is not set, 0 here: the newest must not be the first to go
+        (after_ns,) = base.execute("SELECT COALESCE(MAX(stored_utc_ns), 0) FROM position").fetchone()
         base.executemany(
             "INSERT INTO position VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET last = excluded.last,"
             " stored_utc_ns = excluded.stored_utc_ns",
-            [(*key, begins[key], row.last, row.stored_utc_ns) for key, row in ends.items()],
+            [(*key, begins[key], row.last, max(utc_ns, after_ns + 1)) for key, row in ends.items()],
         )
         if begins and base.execute("SELECT COUNT(*) FROM position").fetchone()[0] > POSITIONS_MAX:
             base.execute(
@@ -300,11 +302,12 @@ class Spool:
             return
         old_ns = utc_ns - self._age_ns
         oldest = base.execute(
-            f"SELECT id, stored_utc_ns FROM message WHERE {_FREE} AND kind != 'dropped' ORDER BY id LIMIT ?",
-            (*self._taken, STEP),
+            f"SELECT id, stored_utc_ns FROM message WHERE {_FREE} AND kind != 'dropped' AND stored_utc_ns >= ? "
+            "ORDER BY id LIMIT ?",
+            (*self._taken, CLOCK_SET_NS, STEP),
         ).fetchall()
         for number, stored_utc_ns in oldest:
-            if not CLOCK_SET_NS <= stored_utc_ns < old_ns:
+            if stored_utc_ns >= old_ns:
                 break
             (row,) = base.execute(f"SELECT {_COLUMNS} FROM message WHERE id = ?", (number,))
             self._drop(base, Spooled(*row), DropCause.AGE)

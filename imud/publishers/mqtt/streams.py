@@ -7,7 +7,7 @@
 Samples that had no room in the queue show as a gap of `seq`: a message says so in their place.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from imud.event import Event
@@ -17,6 +17,7 @@ from imud.formats.fleet.messages import (
     VERSION,
     DropCause,
     FleetMessage,
+    GatewayClock,
     Interval,
     MessageKind,
     decode_message,
@@ -38,6 +39,15 @@ LATE_NS: Final = NS_PER_S
 """An interval is over so long after its end, when no later sample has come: samples come up to 50 ms late."""
 
 
+ReadClock = Callable[[], GatewayClock | None]
+"""Reads the wall clock of this gateway with its state."""
+
+
+def no_clock() -> GatewayClock | None:
+    """Say nothing of the clock."""
+    return None
+
+
 class Gateway(NamedTuple):
     """Names of this gateway, and of this start of its daemon."""
 
@@ -49,8 +59,8 @@ class Gateway(NamedTuple):
 class _Numbered:
     """One stream: makes messages and knows the next number."""
 
-    def __init__(self, gateway: Gateway, device: str, stream: Stream) -> None:
-        self._gateway, self._device, self._stream = gateway, device, stream
+    def __init__(self, gateway: Gateway, device: str, stream: Stream, clock: ReadClock) -> None:
+        self._gateway, self._device, self._stream, self._clock = gateway, device, stream, clock
         self._topic = topic_of(gateway.site, gateway.gateway, device, stream)
         self._begin = 0
         self.next = 0
@@ -66,7 +76,7 @@ class _Numbered:
         self.next = last + 1
         return FleetMessage(
             v=VERSION, gateway=self._gateway.gateway, boot=self._gateway.boot, device=self._device, kind=kind,
-            begin=self._begin, first=first, last=last, count=count, utc_ns=utc_ns, cause=cause,
+            begin=self._begin, first=first, last=last, count=count, utc_ns=utc_ns, clock=self._clock(), cause=cause,
             samples=samples or [], intervals=intervals or [], events=events or [],
         )  # fmt: skip
 
@@ -89,11 +99,14 @@ class _Numbered:
 class DeviceStreams:
     """The streams of one device, or of the gateway itself (empty name). Synchronization: one thread."""
 
-    def __init__(self, gateway: Gateway, device: str, device_id: int, sending: DeviceSending) -> None:
+    def __init__(
+        self, gateway: Gateway, device: str, device_id: int, sending: DeviceSending, clock: ReadClock = no_clock
+    ) -> None:
+        """`clock` is read for each message."""
         self._device_id, self._sending = device_id, sending
-        self._whole = _Numbered(gateway, device, Stream.SAMPLES) if device else None
-        self._statistics = _Numbered(gateway, device, Stream.STATISTICS) if device else None
-        self._events = _Numbered(gateway, device, Stream.EVENTS)
+        self._whole = _Numbered(gateway, device, Stream.SAMPLES, clock) if device else None
+        self._statistics = _Numbered(gateway, device, Stream.STATISTICS, clock) if device else None
+        self._events = _Numbered(gateway, device, Stream.EVENTS, clock)
         self._period_ns = round(NS_PER_S / sending.rate_hz) if sending.rate_hz else 0
         self._maker = IntervalMaker(sending.values)
         self._interval = 0

@@ -23,7 +23,7 @@ from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.sender import MqttSender
 from imud.publishers.mqtt.settings import DeviceSending, MqttSettings
 from imud.publishers.mqtt.spool import Spool, Spooled, SpoolError
-from imud.publishers.mqtt.streams import DeviceStreams, Gateway, notes_of
+from imud.publishers.mqtt.streams import DeviceStreams, Gateway, ReadClock, no_clock, notes_of
 from imud.units import NS_PER_S
 from imud.worker import StartWorker
 
@@ -106,7 +106,9 @@ class SpoolWriter:
     def __init__(
         self, settings: MqttSettings, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
         now_ns: Callable[[], int], utc_offset_ns: Callable[[], int], start_worker: StartWorker,
+        clock: ReadClock = no_clock,
     ) -> None:  # fmt: skip
+        """`clock` reads the wall clock with its state; what is spooled before it was synchronised has no age."""
         self.problem = ""
         """Why nothing is spooled, one sentence; empty while it is."""
         self.lost_on_disk = 0
@@ -117,7 +119,9 @@ class SpoolWriter:
         """How far the streams have come, as of the last transaction."""
         self._settings, self._gateway = settings, gateway
         self._queue, self._spool, self._sender = queue, spool, sender
-        self._now_ns, self._utc_offset_ns = now_ns, utc_offset_ns
+        self._now_ns, self._utc_offset_ns, self._clock = now_ns, utc_offset_ns, clock
+        self._is_set = False
+        """Whether the wall clock was synchronised at any time since the start: it goes on when the network is gone."""
         self._streams: dict[str, DeviceStreams] = {}
         self._resumable: dict[str, list[StreamPosition]] = {}
         self._boots: dict[str, int] = {}
@@ -204,7 +208,7 @@ class SpoolWriter:
                 return None
             number = self._boots.get(device, 1)
             gateway = self._gateway if number == 1 else self._gateway._replace(boot=f"{self._gateway.boot}-{number}")
-            found = self._streams[device] = DeviceStreams(gateway, device, device_id, sending)
+            found = self._streams[device] = DeviceStreams(gateway, device, device_id, sending, self._clock)
             for position in self._resumable.pop(device, []):
                 found.resume(position.stream, position)
         return found
@@ -240,7 +244,7 @@ class SpoolWriter:
             self.lost_on_disk += lost
         acknowledged = frozenset(self._acknowledged)
         try:
-            self._spool.commit(self._rows, acknowledged, now_ns, now_ns + self._utc_offset_ns())
+            self._spool.commit(self._rows, acknowledged, now_ns, self._stored_utc_ns(now_ns))
             self.positions = self._spool.positions()
         except SpoolError as error:
             self.problem = str(error)
@@ -251,11 +255,17 @@ class SpoolWriter:
         self._rows = []
         self._acknowledged -= acknowledged
 
+    def _stored_utc_ns(self, now_ns: int) -> int:
+        """CLOCK_REALTIME, by which messages age; 0 before it was ever synchronised, when it says nothing of ages."""
+        clock = self._clock()
+        self._is_set = self._is_set or clock is None or clock.synchronised
+        return now_ns + self._utc_offset_ns() if self._is_set else 0
+
     def _make_room(self, acknowledged: frozenset[int], now_ns: int) -> None:
         """Remove what was acknowledged, for which a disk can have room that has none for more."""
         if acknowledged:
             with suppress(SpoolError):
-                self._spool.commit((), acknowledged, now_ns, now_ns + self._utc_offset_ns())
+                self._spool.commit((), acknowledged, now_ns, self._stored_utc_ns(now_ns))
                 self._acknowledged -= acknowledged
 
     def _give(self, now_ns: int) -> int:

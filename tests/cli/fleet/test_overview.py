@@ -2,11 +2,11 @@
 
 from imud.cli.fleet.overview import FleetOverview
 from imud.fleet import Fleet, FleetBatch
-from imud.formats.fleet.messages import FleetMessage
+from imud.formats.fleet.messages import FleetMessage, GatewayClock
 from imud.formats.fleet.state import GatewayState, StreamPosition
 from imud.formats.fleet.topics import Stream
 from imud.units import NS_PER_S
-from tests.fleet.fleet_gateway import dropped_message, samples_message
+from tests.fleet.fleet_gateway import dropped_message, not_set, samples_message, synchronised
 
 
 def made() -> Fleet:
@@ -34,7 +34,7 @@ def test_a_row_for_each_gateway_those_that_are_away_first() -> None:
     take(fleet, overview, dropped_message(31, 35))
     take(fleet, overview, samples_message(41, 50))
     found = [line.split() for line in overview.text().splitlines()]
-    assert found[1] == ["mill/old", "connection", "lost", "0", "0.0", "0", "0", "0", "-", "-"]
+    assert found[1] == ["mill/old", "connection", "lost", "0", "0.0", "0", "0", "0", "-", "-", "-"]
     assert found[2][:7] == ["mill/gw", "online", "1", "9.0", "5", "5", "10"]
     assert found[2][7] == "2.0"
     assert overview.text().splitlines()[-1] == "2 gateways, 1 away"
@@ -42,6 +42,23 @@ def test_a_row_for_each_gateway_those_that_are_away_first() -> None:
     assert overview.text().splitlines()[2].split()[3] == "5.0"
     fleet.problem = "mqtt://broker.example:1883: the connection was lost"
     assert overview.text().endswith("2 gateways, 1 away; mqtt://broker.example:1883: the connection was lost")
+
+
+def test_the_wall_clock_of_a_gateway_has_its_error_or_is_not_set() -> None:
+    fleet = made()
+    overview = FleetOverview(fleet)
+
+    def last() -> str:
+        return overview.text().splitlines()[2].rpartition("  ")[2].strip()
+
+    assert last() == "-", "a gateway of an earlier version does not say"
+    clock = GatewayClock(0, 0, synchronised=False)
+    fleet.states["mill", "gw"] = GatewayState(v=1, online=True, boot="1", clock=clock)
+    assert last() == "not set"
+    take(fleet, overview, synchronised(samples_message(1, 2), error_ns=123_456))
+    assert last() == "0.123"
+    take(fleet, overview, not_set(samples_message(3, 4)))
+    assert last() == "not set"
 
 
 def test_before_there_is_anything_it_says_why() -> None:

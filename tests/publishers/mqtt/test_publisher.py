@@ -13,6 +13,7 @@ from imud.contracts.device_settings import OnDifference, SettingDifference, Sett
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.settings import wrong_values
 from imud.contracts.status import DeviceState, DeviceStatus
+from imud.contracts.timing import UtcReference
 from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.publishers.mqtt.broker import EXTRA_MISSING
@@ -34,7 +35,11 @@ class PublisherBench:
         self.statuses: list[DeviceStatus] = [device_status("imu0", 0)]
         self.asked = 0
         self.workers: list[HandWorker] = []
-        self.context = PublisherContext(self._status, 77, self.clock.now_ns, raise_event=self.events.append)
+        self.reference: UtcReference | None = None
+        self.context = PublisherContext(
+            self._status, 77, self.clock.now_ns, raise_event=self.events.append, utc_offset_ns=lambda: 99,
+            utc_reference=lambda: self.reference,
+        )  # fmt: skip
         made = msgspec.convert({"spool_directory": str(path), "gateway": "gw", **settings}, MqttSettings)
         self.output = MqttPublisher(
             made, self.context, connect=self.broker.connect, start_worker=self._start, host_name=lambda: "host.example"
@@ -279,3 +284,22 @@ def test_what_is_not_named_is_as_the_star_says() -> None:
     assert [getattr(settings.sending(name), "rate_hz", None) for name in ("bow", "mast")] == [5, 2]
     alone = msgspec.convert({"devices": {"bow": {}}}, MqttSettings)
     assert alone.sending("mast") is None
+
+
+def test_birth_and_messages_say_whether_the_wall_clock_is_set(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path)
+    bench.output.add_device("imu0", 0)
+    bench.output.start()
+    bench.reference = UtcReference(100, 40)
+    bench.tick(1000)  # more than status_s
+    bench.output.event(Event(1, "imu0", EventKind.UP, "it is up"))
+    bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/events")
+    sent = [(topic, json.loads(payload)) for topic, payload, _ in bench.close()]
+    first, *others = [found["clock"] for topic, found in sent if topic.endswith("/state") and found["online"]]
+    assert (first["synchronised"], first["utc_offset_ns"], first["error_ns"]) == (False, 99, None)
+    others += [found["clock"] for topic, found in sent if topic.endswith("/events")]
+    assert len(others) >= 2
+    for one in others:
+        assert (one["synchronised"], one["utc_offset_ns"], one["error_ns"]) == (True, 100, 40)
+        assert one["t_ns"] > first["t_ns"]

@@ -8,13 +8,13 @@ import msgspec
 from imud.contracts.publisher import Batch
 from imud.event import Event, EventKind
 from imud.formats.fleet.ledger import FleetLedger, StreamCounts
-from imud.formats.fleet.messages import decode_message
+from imud.formats.fleet.messages import GatewayClock, decode_message
 from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.backoff import BrokerTurn
 from imud.publishers.mqtt.broker import Will
 from imud.publishers.mqtt.sender import MqttSender
 from imud.publishers.mqtt.settings import Broker, MqttSettings
-from imud.publishers.mqtt.spool import Spool, SpoolError
+from imud.publishers.mqtt.spool import POSITIONS_MAX, Spool, SpoolError
 from imud.publishers.mqtt.streams import Gateway
 from imud.publishers.mqtt.writer import COMMIT_NS, DISK_RETRY_NS, PENDING_BYTES, SpoolWriter, WriterQueue
 from imud.sample import Sample, Sync
@@ -42,6 +42,8 @@ class WriterBench:
 
     def __init__(self, path: Path, boot: str = "1", messages_per_s: float | None = None, **settings: object) -> None:
         self.clock, self.broker = VirtualClock(), FakeBroker()
+        self.wall_clock: GatewayClock | None = None
+        self.utc_offset_ns = 0
         devices = {"bow": {"rate_hz": None, "whole": "slots", **settings}}
         made = msgspec.convert({"devices": devices, "messages_per_s": messages_per_s}, MqttSettings)
         self.queue = WriterQueue()
@@ -50,8 +52,8 @@ class WriterBench:
         self.sender = MqttSender(made, "me", Will("t", b""), turn, self.broker.connect, self.clock.now_ns)
         self.workers: list[HandWorker] = []
         self.writer = SpoolWriter(
-            made, Gateway("site", "gw", boot), self.queue, self.spool, self.sender, self.clock.now_ns, lambda: 0,
-            self._start,
+            made, Gateway("site", "gw", boot), self.queue, self.spool, self.sender, self.clock.now_ns,
+            lambda: self.utc_offset_ns, self._start, lambda: self.wall_clock,
         )  # fmt: skip
         self.seq = 0
 
@@ -285,3 +287,55 @@ def test_closing_stores_what_waits(tmp_path: Path) -> None:
     spool = Spool(tmp_path, 1_000_000, HOUR_NS)
     spool.open()
     assert [row.items for row in spool.after(9)] == [123]
+
+
+LIFTED_NS = 1_750_000_000 * NS_PER_S
+"""Where systemd lifts a clock without a battery: after 2020, and wrong."""
+
+
+def test_every_message_has_the_clock_as_it_was_when_it_was_made(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.wall_clock = GatewayClock(5, LIFTED_NS, synchronised=False)
+    bench.put(1000)
+    bench.work(2)
+    bench.wall_clock = GatewayClock(7, 2 * LIFTED_NS, synchronised=True, error_ns=30)
+    bench.put(1000)
+    bench.work(3)
+    clocks = [decode_message(payload).clock for payload in bench.arrived()]
+    assert clocks == [GatewayClock(5, LIFTED_NS, synchronised=False)] * 2 + [bench.wall_clock] * 2
+
+
+def test_what_was_spooled_before_the_clock_was_set_is_not_old_when_it_is(tmp_path: Path) -> None:
+    """The clock is stepped by more than the spool keeps anything, and goes on when nothing keeps it any more."""
+    bench = WriterBench(tmp_path)
+    bench.broker.problem = "no route"
+    bench.utc_offset_ns, bench.wall_clock = LIFTED_NS, GatewayClock(0, LIFTED_NS, synchronised=False)
+    bench.put(1000)
+    bench.work(2)
+    bench.utc_offset_ns += 10_000 * HOUR_NS
+    bench.wall_clock = GatewayClock(0, bench.utc_offset_ns, synchronised=True, error_ns=30)
+    bench.put(1000)
+    bench.work(2)
+    assert bench.counts().dropped == {}
+    bench.wall_clock = GatewayClock(0, bench.utc_offset_ns, synchronised=False)
+    bench.clock.advance(2 * HOUR_NS)
+    bench.put(1000)
+    bench.work(2)
+    assert bench.counts().dropped == {"age": 1000}, "of what was spooled while the clock was set"
+
+
+def test_positions_of_this_boot_stay_when_there_are_too_many_though_the_clock_is_not_set(tmp_path: Path) -> None:
+    old = WriterBench(tmp_path, "old")
+    old.utc_offset_ns = LIFTED_NS
+    for _ in range(POSITIONS_MAX):
+        old.queue.put_batch(Batch("bow", 0, [Sample("bow", 1, 1, 0, Sync.EDGE, 0, 0)]))
+        old.workers[0].work()
+        old.clock.advance(COMMIT_NS)
+    old.writer.close()
+    new = WriterBench(tmp_path, "new")
+    new.wall_clock = GatewayClock(0, 0, synchronised=False)
+    for _ in range(3):
+        new.put(1000)
+        new.work()
+    found = [one for one in new.writer.positions if one.boot == "new"]
+    assert [(one.begin, one.last) for one in found] == [(1, 2500)]
