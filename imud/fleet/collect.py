@@ -2,7 +2,7 @@
 
     session ──delivery──▶ ledger ──batch──▶ store.write (one transaction, in a thread) ──▶ acknowledge
 
-A transaction has what came within COMMIT_S, at most BATCHES_MAX messages; the next one is taken while it
+A transaction has what came within COMMIT_S, at most BATCHES_MAX messages or TURN_BYTES; the next one is taken while it
 is written. A store that keeps the ledger beside the rows gives it back after a restart, so that what comes again is
 known. A collector whose store fails ends: what it had not acknowledged is sent to the next one.
 """
@@ -20,6 +20,8 @@ from imud.units import NS_PER_S
 COMMIT_S: Final = 0.5
 BATCHES_MAX: Final = RECEIVE_MAX // 2
 """Messages of one transaction: while it runs, the broker can send as many again."""
+TURN_BYTES: Final = 8 << 20
+"""Bytes of the messages of one transaction: two are in memory at a time."""
 
 
 Offsets = Mapping[BootKey, BootOffset]
@@ -102,10 +104,15 @@ class FleetCollector:
         turn = _Turn([], [], {}, {})
         changed: set[StreamKey] = set()
         due_ns = self._now_ns() + round(COMMIT_S * NS_PER_S)
-        while len(turn.deliveries) < BATCHES_MAX and (left_ns := due_ns - self._now_ns()) > 0 and not self._stopped:
+        size = 0
+        while len(turn.deliveries) < BATCHES_MAX and size < TURN_BYTES and not self._stopped:
+            left_ns = due_ns - self._now_ns()
+            if left_ns <= 0:
+                break
             delivery = await session.next(left_ns / NS_PER_S)
             if delivery is None:
                 continue
+            size += len(delivery.payload)
             turn.deliveries.append(delivery)
             batch = self._fleet.take(delivery, changed)
             if batch is not None:

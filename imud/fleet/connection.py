@@ -23,8 +23,10 @@ from imud.publishers.mqtt.access import (
 )
 from imud.publishers.mqtt.settings import Broker
 
-RECEIVE_MAX: Final = 200
-"""Messages without an acknowledgement: of 130 kB each they take 26 MB."""
+RECEIVE_MAX: Final = 2000
+"""Messages without an acknowledgement: what 1,000 gateways with two devices send in a second."""
+WAITING_BYTES: Final = 16 << 20
+"""Bytes of messages that wait to be taken: 4 kB each is usual for statistics, but they can have 130 kB."""
 PACKET_BYTES: Final = 1_000_000
 """Longest message: those of gateways have 130 kB, states of a hundred devices less."""
 KEEP_ALIVE_S: Final = 30
@@ -54,6 +56,8 @@ class ReaderConnection:
         """Messages of QoS 0, which are left out: nothing bounds how many come."""
         self._broker = broker
         self._queue: deque[FleetDelivery] = deque()
+        self._bytes = 0
+        """Of the messages in the queue."""
         self._came = asyncio.Event()
         self._problem = ""
         self._answered = False
@@ -130,6 +134,7 @@ class ReaderConnection:
             with suppress(TimeoutError):
                 await self._until(lambda: bool(self._queue), "", timeout_s)
         found = self._queue.popleft() if self._queue else None
+        self._bytes -= len(found.payload) if found is not None else 0
         self._look_at_reading()
         return found
 
@@ -179,7 +184,7 @@ class ReaderConnection:
             known = len(self._queue)
             self._guarded(client.loop_read)
             has_more = len(self._queue) > known or self._pending()
-            if self._problem or not has_more or len(self._queue) > RECEIVE_MAX:
+            if self._problem or not has_more or len(self._queue) > RECEIVE_MAX or self._bytes > WAITING_BYTES:
                 break
         if self._socket is not None and len(self._queue) > before:
             loop = asyncio.get_running_loop()
@@ -202,7 +207,7 @@ class ReaderConnection:
                 loop.call_soon(self._read)
 
     def _has_room(self) -> bool:
-        return len(self._queue) <= RECEIVE_MAX // 2
+        return len(self._queue) <= RECEIVE_MAX // 2 and self._bytes <= WAITING_BYTES // 2
 
     def _pending(self) -> int:
         """Bytes that the TLS library has read from the socket already."""
@@ -270,6 +275,7 @@ class ReaderConnection:
         if not message.qos:
             self.refused += 1
             return
+        self._bytes += len(message.payload)
         self._queue.append(FleetDelivery(message.topic, message.payload, bool(message.retain), message.mid, self))
         self._came.set()
 

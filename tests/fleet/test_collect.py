@@ -1,17 +1,20 @@
 """The collector with a real broker: what the store has is acknowledged, and its ledger goes on."""
 
 import asyncio
+import threading
 from collections.abc import Sequence
 
+import msgspec
 import pytest
 
 from imud.errors import ServerError
 from imud.fleet import Fleet, FleetBatch
-from imud.fleet.collect import BATCHES_MAX, FleetCollector, Offsets
+from imud.fleet.collect import BATCHES_MAX, TURN_BYTES, FleetCollector, Offsets
+from imud.fleet.connection import RECEIVE_MAX
 from imud.formats.fleet.boots import BootKey, BootOffset
 from imud.formats.fleet.ledger import Accounts, FleetLedger, StoredAccount, StreamKey
 from imud.formats.fleet.messages import GatewayClock
-from imud.formats.fleet.state import GatewayState
+from imud.formats.fleet.state import GatewayState, StreamPosition
 from tests.fleet.fleet_gateway import LIMIT_S, UTC_NS, SendingGateway, samples_message
 from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.mosquitto import Mosquitto
@@ -118,6 +121,50 @@ def test_a_reset_while_a_transaction_is_acknowledged_costs_a_connection_and_noth
     assert (account.received, account.balance) == (number, 0)
     assert 2 <= fleet.connections <= 4, "the next transaction can be of the connection that is lost"
     assert account.counts.duplicates > 0
+
+
+class SlowStore(MemoryStore):
+    """A store that takes its time for each transaction, while gateways go on."""
+
+    def __init__(self, pause_s: float) -> None:
+        super().__init__()
+        self.pause_s = pause_s
+        self.sizes: list[int] = []
+
+    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+        self.sizes.append(len(batches))
+        threading.Event().wait(self.pause_s)
+        super().write(batches, accounts, offsets)
+
+
+def test_a_slow_store_is_given_more_at_once_and_its_ledger_closes(broker: Mosquitto, gateway: SendingGateway) -> None:
+    """Messages come faster than the store takes transactions: the rest waits at the broker, and none is lost."""
+    begin_session(broker)
+    number = 2 * RECEIVE_MAX
+    sending = threading.Thread(target=gateway.send, args=[samples_message(n, n) for n in range(1, number + 1)])
+    sending.start()
+    gateway.send_state(
+        GatewayState(v=1, online=True, boot="1", positions=[StreamPosition("1", "bow", "samples", 1, number)])
+    )
+    store = SlowStore(1.0)
+    fleet = collect(broker, store, number)
+    sending.join()
+    assert store.rows == list(range(1, number + 1))
+    assert max(store.sizes) <= BATCHES_MAX
+    assert number / BATCHES_MAX <= len(store.sizes) <= number / BATCHES_MAX + 4, "transactions are full"
+    (account,) = fleet.accounts.values()
+    assert (account.sent, account.received, account.in_spool, account.balance) == (number, number, 0, 0)
+    assert (account.counts.missing, account.counts.duplicates) == (0, 0)
+
+
+def test_what_waits_in_memory_is_bounded_in_bytes(broker: Mosquitto, gateway: SendingGateway) -> None:
+    begin_session(broker)
+    large = [msgspec.structs.replace(samples_message(n, n), gateway="gw", boot="1" * 100_000) for n in range(1, 301)]
+    gateway.send(*large)
+    store = SlowStore(0.0)
+    collect(broker, store, 300)
+    assert store.rows == list(range(1, 301))
+    assert max(store.sizes) <= TURN_BYTES // 100_000 + 1
 
 
 def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquitto, gateway: SendingGateway) -> None:
