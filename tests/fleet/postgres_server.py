@@ -23,31 +23,58 @@ NO_POSTGRES: Final = (
 )  # fmt: skip
 
 
-@contextmanager
-def running_postgres() -> Iterator[str]:
-    """A server that runs; its URL."""
-    assert BIN is not None
-    folder = Path(tempfile.mkdtemp(prefix="imud-pg-", dir="/tmp"))  # tmp_path is closed to other users
-    root = os.geteuid() == 0
-    before = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if root else []
-    if root:
-        shutil.chown(folder, "postgres", "postgres")
-    data = str(folder / "data")
+class PostgresServer:
+    """The server, with its data in a folder of its own. Synchronization: one thread."""
 
-    def call(program: str, *words: str) -> None:
+    def __init__(self, folder: Path) -> None:
+        """Make its data."""
+        self.url = f"postgresql:///postgres?host={folder}&user=imud"
+        self._folder = folder
+        self._runs = False
+        root = os.geteuid() == 0
+        self._before = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if root else []
+        if root:
+            shutil.chown(folder, "postgres", "postgres")
+        self._call("initdb", "-U", "imud", "--auth=trust", "--no-sync", "-E", "UTF8", "--locale=C")
+
+    def start(self) -> None:
+        """Start it, and wait until it answers; after `kill` it recovers from its log."""
+        options = f"-k {self._folder} -c listen_addresses='' -c fsync=off"
+        self._call("pg_ctl", "-l", str(self._folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
+        self._runs = True
+
+    def kill(self) -> None:
+        """End all its processes at once, in the midst of whatever they do; no-op where it does not run."""
+        if self._runs:
+            self._runs = False
+            self._call("pg_ctl", "-m", "immediate", "-w", "stop")
+
+    def _call(self, program: str, *words: str) -> None:
+        assert BIN is not None
         done = subprocess.run(
-            [*before, str(BIN / program), "-D", data, *words], cwd=folder, capture_output=True, text=True,
-            timeout=LIMIT_S, check=False,
+            [*self._before, str(BIN / program), "-D", str(self._folder / "data"), *words], cwd=self._folder,
+            capture_output=True, text=True, timeout=LIMIT_S, check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
 
+
+@contextmanager
+def running_server() -> Iterator[PostgresServer]:
+    """A server that runs."""
+    folder = Path(tempfile.mkdtemp(prefix="imud-pg-", dir="/tmp"))  # tmp_path is closed to other users
     try:
-        call("initdb", "-U", "imud", "--auth=trust", "--no-sync", "-E", "UTF8", "--locale=C")
-        options = f"-k {folder} -c listen_addresses='' -c fsync=off"
-        call("pg_ctl", "-l", str(folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
+        server = PostgresServer(folder)
+        server.start()
         try:
-            yield f"postgresql:///postgres?host={folder}&user=imud"
+            yield server
         finally:
-            call("pg_ctl", "-m", "immediate", "-w", "stop")
+            server.kill()
     finally:
         shutil.rmtree(folder)
+
+
+@contextmanager
+def running_postgres() -> Iterator[str]:
+    """A server that runs; its URL."""
+    with running_server() as server:
+        yield server.url

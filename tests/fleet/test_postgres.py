@@ -29,7 +29,7 @@ from tests.fleet.fleet_gateway import (
     samples_message,
     synchronised,
 )
-from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
+from tests.fleet.postgres_server import NO_POSTGRES, running_postgres, running_server
 from tests.publishers.mqtt.mosquitto import Mosquitto
 
 pytestmark = pytest.mark.skipif(bool(NO_POSTGRES), reason=NO_POSTGRES)
@@ -263,3 +263,34 @@ def test_rows_are_exactly_once_when_the_collector_is_killed_at_random(
         collecting.start()
     collecting.settle(sent)
     assert_exactly_once(database, sent)
+
+
+@pytest.mark.timeout(240)
+def test_rows_are_exactly_once_when_the_server_is_killed_in_a_transaction(
+    broker: Mosquitto, gateway: SendingGateway
+) -> None:
+    """The collector ends, and its service manager starts it again."""
+    import psycopg
+
+    with running_server() as server:
+        collecting, sent = Collecting(broker, server.url), 0
+        try:
+            for is_held in (True, False, True):
+                holder = psycopg.connect(server.url)
+                if is_held:  # the transaction has its rows and waits for the ledger
+                    holder.execute("LOCK TABLE imud_ledger IN EXCLUSIVE MODE")
+                sent = send(gateway, sent)
+                if is_held:
+                    collecting.until(
+                        "SELECT count(*) FROM pg_stat_activity WHERE wait_event_type = 'Lock' "
+                        "AND application_name = 'imud fleet collect' AND query LIKE '%imud_ledger%'", 1
+                    )  # fmt: skip
+                server.kill()
+                holder.close()
+                assert collecting.process.wait(LIMIT_S) == 2
+                server.start()
+                collecting.start()
+            collecting.settle(sent)
+            assert_exactly_once(server.url, sent)
+        finally:
+            collecting.kill()
