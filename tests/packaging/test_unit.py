@@ -19,12 +19,15 @@ from tests.support.files import ROOT
 
 UNIT = ROOT / "systemd" / "imud.service"
 WEB_UNIT = ROOT / "systemd" / "imud-web.service"
+FLEET_UNIT = ROOT / "systemd" / "imud-fleet-collect.service"
 EXPOSURE_MAX = 2.0
 """docs/operate.md says what it is made of; the guest's check has the same limit."""
 REASON_WORDS = 5
 """Of the shortest reason: fewer words repeat the directive's name."""
 PAGE = ROOT / "docs" / "operate.md"
 DROP_INS = re.findall(r"^```ini\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+COLLECTOR_EXPOSURE_MAX = 2.5
+"""It reaches brokers and databases anywhere: no IPAddressDeny."""
 OFFLINE_SINCE = 250
 """Version of systemd whose systemd-analyze judges a file."""
 
@@ -123,6 +126,31 @@ def test_the_unit_of_the_page_may_read_the_socket_and_listens_on_this_machine_on
     assert re.search(
         r"^# +ExecStart=.*--token-file \$\{CREDENTIALS_DIRECTORY\}/token$", WEB_UNIT.read_text(), re.MULTILINE
     )
+
+
+@pytest.mark.skipif(analyze_version() < OFFLINE_SINCE, reason="no systemd-analyze that judges a file on this machine")
+def test_systemd_judges_the_unit_of_the_collector_as_little_exposed(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    assert exposure(FLEET_UNIT.read_text(), str(tmp_path_factory.mktemp("unit"))) <= COLLECTOR_EXPOSURE_MAX
+
+
+def test_the_unit_of_the_collector_has_a_command_line_that_is_taken_and_starts_it_again_after_status_2() -> None:
+    text = FLEET_UNIT.read_text()
+    given = dict(re.findall(r"^#   (BROKERS|STORE|OPTIONS)=(.*?)(?:  .*)?$", text, re.MULTILINE))
+    (command,) = re.findall(r"^ExecStart=\S+/imud (.*)$", text, re.MULTILINE)
+    assert "${CREDENTIALS_DIRECTORY}/password" in command
+    for name, value in given.items():
+        command = command.replace(f"${{{name}}}", value).replace(f"${name}", value)
+    args = build_parser(("fleet",)).parse_args(command.split())
+    assert (args.urls, args.user) == (["mqtts://broker.example"], "collector")
+    assert args.to == "postgresql://imud@db.example/fleet"
+    assert "RestartPreventExitStatus" not in text, "2 is a database that is away (docs/fleet.md)"
+    assert "Restart=on-failure\n" in text
+    assert "StartLimitIntervalSec=0\n" in text
+    document = (ROOT / "docs" / "fleet.md").read_text()
+    for file in re.findall(r"^(?:EnvironmentFile=|LoadCredential=password:)(\S+)$", text, re.MULTILINE):
+        assert f"install -m 600 /dev/null {file} " in document
 
 
 def test_of_the_calls_for_the_clock_only_those_that_read_it_are_allowed() -> None:
