@@ -251,10 +251,9 @@ class ReaderConnection:
         """Stop waiting for the socket, whose descriptor may be closed, or be another file's by now."""
         sock, self._socket = self._socket, None
         if sock is not None:
-            loop = asyncio.get_running_loop()
-            for remove in (loop.remove_reader, loop.remove_writer):
-                with suppress(OSError):
-                    remove(self._number)
+            for forget in ("remove_reader", "remove_writer"):
+                with suppress(OSError, RuntimeError):  # RuntimeError: the loop has ended, and with it the waiting
+                    getattr(asyncio.get_running_loop(), forget)(self._number)
 
     # --- what paho-mqtt calls ----------------------------------------------------------------------------------------
 

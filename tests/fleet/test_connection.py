@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from imud.fleet import ReaderAccess
-from imud.fleet.connection import RECEIVE_MAX, ReaderConnection
+from imud.fleet.connection import RECEIVE_MAX, WAITING_BYTES, ReaderConnection
 from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.settings import broker_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway
@@ -116,6 +116,32 @@ def test_a_broker_that_sends_without_bound_waits_for_the_reader(
     with running_broker(tmp_path / "broker", "per_listener_settings true", *lines):
         most, found = asyncio.run(play())
     assert RECEIVE_MAX // 2 < most <= RECEIVE_MAX + 2, "a read takes two messages at most beyond the bound"
+    assert found == list(range(count))
+
+
+def test_large_messages_that_nobody_takes_wait_at_the_broker(broker: Mosquitto, gateway: SendingGateway) -> None:
+    size, count = 200_000, 300
+
+    async def play() -> tuple[int, list[int]]:
+        connection = await opened(broker.port)
+        sending = asyncio.to_thread(gateway.publish, [(f"imud/{number}", bytes(size)) for number in range(count)])
+        async with asyncio.timeout(LIMIT_S):
+            await sending
+            while connection.waiting <= WAITING_BYTES // 2 // size:
+                await asyncio.sleep(0)
+        for _ in range(100):  # what could come comes now
+            await asyncio.sleep(0.001)
+        most, found = connection.waiting, []
+        for _ in range(count):
+            delivery = await connection.next(LIMIT_S)
+            assert delivery is not None
+            connection.acknowledge(delivery.number)
+            found.append(int(delivery.topic.removeprefix("imud/")))
+        connection.close()
+        return most, found
+
+    most, found = asyncio.run(play())
+    assert most * size <= WAITING_BYTES + 2 * size, "a read takes two messages at most beyond the bound"
     assert found == list(range(count))
 
 
