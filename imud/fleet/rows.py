@@ -6,7 +6,8 @@ wants the column that it divides a table by in every unique index.
 """
 
 from collections.abc import Iterable
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import msgspec
@@ -14,6 +15,7 @@ import msgspec
 from imud.fleet.reader import FleetBatch
 from imud.formats.fleet.boots import PlacedTime
 from imud.formats.fleet.messages import Interval
+from imud.units import NS_PER_S
 
 VECTORS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "incli_rad")
 SCALARS: Final = ("temperature_c", "pressure_pa")
@@ -27,7 +29,7 @@ _OF_SAMPLE: Final = (
     *((name, "bigint") for name in NUMBERS),
 )  # fmt: skip
 _SAMPLE_NAMES: Final = tuple(name for name, _ in _OF_SAMPLE)
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_EPOCH: Final = datetime(1970, 1, 1)  # noqa: DTZ001  # its text has no offset, which stands behind the fraction
 
 Row = tuple[object, ...]
 """Values of all columns, in the order of `FleetTable.names`."""
@@ -114,13 +116,19 @@ def _head(batch: FleetBatch) -> Row:
 
 
 def _times(head: Row, at: PlacedTime) -> Row:
-    time = (_EPOCH + timedelta(microseconds=at.utc_ns // 1000)).isoformat()
-    return (time, *head, at.utc_ns, at.is_set, at.error_ns)
+    second, rest_ns = divmod(at.utc_ns, NS_PER_S)
+    return (f"{_second_text(second)}.{rest_ns // 1000:06}+00:00", *head, at.utc_ns, at.is_set, at.error_ns)
+
+
+@lru_cache(1024)
+def _second_text(second: int) -> str:
+    """A second as text, UTC: many rows are of the same one."""
+    return (_EPOCH + timedelta(seconds=second)).isoformat()
 
 
 def _placed(batch: FleetBatch, one: Interval, begin: PlacedTime) -> Interval:
-    """An interval with the times at which it lies."""
-    end = batch.time_of(one.end_utc_ns, one.end_t_ns)
-    if (begin.utc_ns, end.utc_ns) == (one.begin_utc_ns, one.end_utc_ns):
+    """An interval with the times at which it lies: where its begin stays, the clock was not stepped after it."""
+    if begin.utc_ns == one.begin_utc_ns:
         return one
+    end = batch.time_of(one.end_utc_ns, one.end_t_ns)
     return msgspec.structs.replace(one, begin_utc_ns=begin.utc_ns, end_utc_ns=end.utc_ns)
