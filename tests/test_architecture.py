@@ -342,6 +342,7 @@ CROSS_CUTTING = {
     "utc/test_gpsd_real.py": "a real gpsd",
     "web/test_calibration_page.py": "the calibrations of imud/web/static in a real browser",
     "web/test_page.py": "imud/web/static in a real browser, with the daemon and a module",
+    "web/test_spectrum_page.py": "the spectrum of imud/web/static in a real browser, with a module that loses samples",
 }
 """Test modules that mirror no module of imud, and what they test."""
 

@@ -128,7 +128,7 @@ class RawMessage(ToPage, frozen=True, tag="raw"):
     device: str
     member: str
     seq: tuple[int, ...]
-    """A step of more than 1 is a hole."""
+    """A step of more than 1: samples that the page did not get. What imud did not get is a step in `t_s` only."""
     t_s: tuple[float, ...]
     axes: tuple[tuple[float, ...], ...]
     """Values of x, of y, of z."""

@@ -15,8 +15,9 @@ from selenium.common.exceptions import JavascriptException
 from selenium.webdriver import Chrome, ChromeOptions, ChromeService
 from selenium.webdriver.support.ui import WebDriverWait
 
+from tests.support.daemon_process import RunningDaemon, running_daemon
 from tests.support.files import hi91
-from tests.test_daemon import Cable
+from tests.test_daemon import Cable, device
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 MISSING = "" if CHROMIUM and CHROMEDRIVER else "no chromium and chromedriver on this machine (make web-deps)"
@@ -127,13 +128,14 @@ def serving_web(socket: Path, *words: str, port: int = 0) -> Iterator[str]:
 
 
 class Sender:
-    """A module at the end of a cable that sends chosen values at 200 Hz; what it sent is kept."""
+    """A module at the end of a cable that measures at 200 Hz; what it sends of each measurement is chosen."""
 
-    def __init__(self, cable: Cable, value_of: Callable[[int], float]) -> None:
-        self.sent: list[float] = []
-        """acceleration along z, m/s², of each message since the first."""
+    def __init__(self, cable: Cable, frame_of: Callable[[int], bytes]) -> None:
+        """`frame_of` makes the bytes of a measurement, from its number; none: its frame is lost."""
+        self.measured = 0
+        """Measurements since the first, number 0."""
         self._cable = cable
-        self._value_of = value_of
+        self._frame_of = frame_of
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sender")
 
@@ -148,11 +150,31 @@ class Sender:
 
     def _run(self) -> None:
         begin = monotonic()
-        number = 0
         while not self._stopped.is_set():
-            value = self._value_of(number)
-            self.sent.append(value)
+            frame = self._frame_of(self.measured)
+            self.measured += 1
             with suppress(BlockingIOError):  # nobody reads any more: the daemon ends before this thread
-                os.write(self._cable.master, hi91(number * PERIOD_MS, value))
-            number += 1
-            sleep(max(0.0, begin + number * PERIOD_MS / 1000 - monotonic()))
+                os.write(self._cable.master, frame)
+            sleep(max(0.0, begin + self.measured * PERIOD_MS / 1000 - monotonic()))
+
+
+def upright(value_of: Callable[[int], float]) -> Callable[[int], bytes]:
+    """Frames of a module that stands still, with this acceleration along z (m/s²), each PERIOD_MS of its own time."""
+    return lambda number: hi91(number * PERIOD_MS, value_of(number))
+
+
+@contextmanager
+def sent_by(folder: Path, port: Cable) -> Iterator[RunningDaemon]:
+    """A daemon that reads the module at the end of a cable as `bow`."""
+    with running_daemon(folder, {"bow": device(port.name)}, python=()) as daemon:
+        yield daemon
+
+
+def choose(page: Page, selector: str, value: str) -> None:
+    """Choose a value of a list."""
+    page.js(
+        """const node = document.querySelector(arguments[0]);
+        node.value = arguments[1];
+        node.dispatchEvent(new Event('change'))""",
+        selector, value,
+    )  # fmt: skip

@@ -1,8 +1,5 @@
 """The page in a real browser: what is plotted is what a module sent, restarts, telephones, the token."""
 
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +7,18 @@ import numpy as np
 import pytest
 
 from imud.runtime.calibration.turning import cell_of
-from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon, wait_until
-from tests.test_daemon import Cable, cable, device
-from tests.web.browser import MISSING, PHONE, Page, Sender, browser, enter, serving_web
+from tests.support.daemon_process import daemon_with_module, wait_until
+from tests.test_daemon import cable
+from tests.web.browser import MISSING, PHONE, Page, Sender, browser, enter, sent_by, serving_web, upright
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
 
 TOKEN = "correct-horse-battery-staple"
 PEAK_EVERY = 40
-WAVE_HZ = 20.0
 POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
 PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
     return [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]]"""
 """Times, least and greatest acceleration along z, as uPlot has them."""
-
-
-CHOOSE = """const node = document.querySelector(arguments[0]);
-    node.value = arguments[1];
-    node.dispatchEvent(new Event('change'))"""
 
 
 DIRECTIONS = [(x, y, z) for x in (-0.9, 0.1, 0.5) for y in (-0.2, 0.3) for z in (-0.6, 0.4, 1.0)]
@@ -44,19 +35,8 @@ def peaks(number: int) -> float:
     return 9.5 if number % PEAK_EVERY else 20.0 + number / PEAK_EVERY / 8
 
 
-def wave(number: int) -> float:
-    """Vibration of 2 m/s² at WAVE_HZ, in messages at 200 Hz."""
-    return 9.8 + 2.0 * math.sin(2 * math.pi * WAVE_HZ * number / 200)
-
-
-@contextmanager
-def sent_by(folder: Path, port: Cable) -> Iterator[RunningDaemon]:
-    with running_daemon(folder, {"bow": device(port.name)}, python=()) as daemon:
-        yield daemon
-
-
 def test_what_is_plotted_is_what_was_sent_and_every_peak_of_it(page: Page, tmp_path: Path) -> None:
-    with cable(tmp_path) as port, Sender(port, peaks) as sender, sent_by(tmp_path, port) as daemon:
+    with cable(tmp_path) as port, Sender(port, upright(peaks)) as sender, sent_by(tmp_path, port) as daemon:
         daemon.wait_for("bow", "running")
         with serving_web(daemon.socket) as url:
             page.driver.get(f"{url}#/device/bow")
@@ -64,12 +44,12 @@ def test_what_is_plotted_is_what_was_sent_and_every_peak_of_it(page: Page, tmp_p
             page.click("#pause")
             page.until("return !window.imud.view.plots.get('accel_m_s2').isDue")
             times, least, greatest = page.js(PLOTTED)
-            sent = list(sender.sent)
+            measured = sender.measured
             assert page.problems() == []
     assert len(times) == len(least) == len(greatest) >= 80
     assert all(np.diff(times) > 0)
     assert set(np.round(least, 4)) <= {9.5}, "ten samples are in each bucket, and one of forty is a peak"
-    known = np.array(sent)
+    known = np.array([peaks(number) for number in range(measured)])
     plotted = [value for value in greatest if value > 15]
     assert len(plotted) >= 10, "a peak each 0.2 s"
     numbers = [int(np.argmin(np.abs(known - value))) for value in plotted]
@@ -77,43 +57,6 @@ def test_what_is_plotted_is_what_was_sent_and_every_peak_of_it(page: Page, tmp_p
     assert np.all(np.diff(numbers) == PEAK_EVERY), "no peak between the first and the last is missing"
     moments = [time for time, value in zip(times, greatest, strict=True) if value > 15]
     assert np.allclose(np.diff(moments), 0.2, atol=0.05), "they stand where they belong in time, within a bucket"
-
-
-def test_the_spectrum_has_the_frequency_and_the_size_of_a_vibration(page: Page, tmp_path: Path) -> None:
-    with cable(tmp_path) as port, Sender(port, wave), sent_by(tmp_path, port) as daemon:
-        daemon.wait_for("bow", "running")
-        with serving_web(daemon.socket) as url:
-            page.driver.get(f"{url}#/device/bow")
-            page.until(POINTS, 2)
-            page.js(CHOOSE, "#spectrum-of", "accel_m_s2")
-            page.until("return window.imud.view.spectrum.data", what="a spectrum")
-            frequencies, _, _, density = page.js("return window.imud.view.spectrum.data")
-            rate_hz, points = page.js(
-                "const one = window.imud.view.spectrum.spectrum; return [one.rate_hz, one.points]"
-            )
-            note = page.text("#spectrum .quiet")
-            assert page.problems() == []
-    assert rate_hz == pytest.approx(200, rel=0.02)
-    assert points == 512, "the greatest power of two in four seconds"
-    at = int(np.argmax(np.array(density, dtype=float)))
-    assert frequencies[at] == pytest.approx(WAVE_HZ, abs=200 / 512)
-    power = sum(value**2 for value in density[max(at - 4, 0) : at + 5]) * (frequencies[1] - frequencies[0])
-    assert power == pytest.approx(2.0**2 / 2, rel=0.1), "the mean square of a sine of 2 m/s²"
-    assert "every sample" in note
-
-
-def test_the_transform_is_that_of_numpy(page: Page, tmp_path: Path) -> None:
-    values = np.random.default_rng(5).normal(size=256)
-    with serving_web(tmp_path / "none") as url:
-        page.driver.get(url)
-        found = page.module(
-            "const { density } = await import('/static/spectrum.js'); return [...density(args[0], 128)]",
-            values.tolist(),
-        )
-    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(256) / 256)
-    expected = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2 / (128 * np.sum(window**2))
-    expected[1:-1] *= 2
-    assert np.allclose(found, expected, rtol=1e-9, atol=1e-15)
 
 
 def test_directions_and_rotations_are_those_of_the_daemon(page: Page, tmp_path: Path) -> None:
@@ -143,7 +86,7 @@ def test_directions_and_rotations_are_those_of_the_daemon(page: Page, tmp_path: 
 
 
 def test_the_page_goes_on_after_a_restart_of_the_daemon_and_of_imud_web(page: Page, tmp_path: Path) -> None:
-    with cable(tmp_path) as port, Sender(port, peaks):
+    with cable(tmp_path) as port, Sender(port, upright(peaks)):
         with sent_by(tmp_path, port) as daemon:
             daemon.wait_for("bow", "running")
             socket = daemon.socket

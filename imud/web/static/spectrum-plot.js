@@ -7,6 +7,13 @@ import { AXES, el, number, setText } from "./util.js";
 const UNITS = { accel_m_s2: "m/s²/√Hz", gyro_rad_s: "rad/s/√Hz", mag_t: "T/√Hz" };
 const NAMES = { accel_m_s2: "accelerometer", gyro_rad_s: "gyroscope", mag_t: "magnetometer" };
 
+/** What was done about samples that are missing. */
+function gapWords({ missing, gaps, isLocated }) {
+  const again = `begun again at ${number(gaps)} longer ${gaps === 1 ? "gap" : "gaps"}`;
+  const words = missing ? `${number(missing)} missing samples filled, ${again}` : gaps ? `Begun again at ${number(gaps)} ${gaps === 1 ? "gap" : "gaps"}` : "No sample is missing";
+  return isLocated ? `${words}.` : `${words}, as far as can be seen: the stamps scatter too much to show a single missing one.`;
+}
+
 const OFF = "Choose a vector. Every sample of it is sent then, and transformed here.";
 
 export class SpectrumPlot {
@@ -61,10 +68,10 @@ export class SpectrumPlot {
     });
     this.peaks = peaks;
     const words = peaks.map((one, axis) => `${AXES[axis]} ${number(one.frequency, 2)} Hz`).join(", ");
-    const { points, rate_hz, segments, holes } = this.spectrum;
+    const { points, rate_hz, segments } = this.spectrum;
     setText(this.note,
       `Highest peaks: ${words}. From every sample, at ${number(rate_hz, 2)} Hz by the time stamps: Hann window, ${points} points, ` +
-      `mean of ${segments.length} segments, resolution ${number(rate_hz / points, 2)} Hz; begun again at ${holes} holes.`);
+      `mean of ${segments.length} segments, resolution ${number(rate_hz / points, 2)} Hz. ${gapWords(this.spectrum)}`);
   }
 
   begin() {

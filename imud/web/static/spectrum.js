@@ -1,10 +1,14 @@
 // Amplitude spectral density of one vector, computed here from every sample (not from buckets): Welch's method with a
 // Hann window, segments that overlap by a half, the mean of the newest of them, at the sample rate by the time stamps.
+// A few missing samples are filled, and no segment reaches across more of them (grid.js).
+
+import { FILL_MOST, filled, gridOf } from "./grid.js";
 
 const SEGMENT_S = 4;
 const POINTS_MIN = 128;
 const POINTS_MAX = 4096;
 const SEGMENTS_MAX = 8;
+const RATE_STEP = 0.02; // with another rate than before, by so much, the spectrum begins again
 
 /** Fourier transform in place; lengths are powers of two. */
 export function fft(re, im) {
@@ -57,30 +61,30 @@ export function density(values, rate_hz) {
 
 export class Spectrum {
   constructor() {
-    this.clear();
+    this.gaps = 0; // so long that the spectrum was begun again
+    this.missing = 0; // samples in shorter ones, which were filled
+    this.isLocated = true;
+    this.begin([], [], [[], [], []]);
   }
 
-  clear() {
-    this.times = [];
-    this.axes = [[], [], []];
+  /** Begin again, with these samples. */
+  begin(times, numbers, axes) {
+    [this.times, this.numbers, this.axes] = [times, numbers, axes];
     this.segments = [];
     this.points = 0;
     this.rate_hz = 0;
-    this.newest = null;
-    this.holes ??= 0;
   }
 
   /** Take a message `raw`; true where there is a new spectrum. */
   add(raw) {
     let isNew = false;
     raw.seq.forEach((seq, index) => {
-      if (this.newest !== null && seq !== this.newest + 1) {
-        const holes = this.holes + 1;
-        this.clear();
-        this.holes = holes; // samples before and after a hole are never taken together
+      if (raw.t_s[index] <= this.times.at(-1)) {
+        this.begin([], [], [[], [], []]); // the host was restarted
+        this.gaps += 1;
       }
-      this.newest = seq;
       this.times.push(raw.t_s[index]);
+      this.numbers.push(seq);
       this.axes.forEach((axis, number) => axis.push(raw.axes[number][index]));
       isNew = this.take() || isNew;
     });
@@ -89,18 +93,36 @@ export class Spectrum {
 
   take() {
     const count = this.times.length;
-    if (!this.points && count >= POINTS_MIN) {
-      const rate_hz = (count - 1) / (this.times[count - 1] - this.times[0]);
-      const wanted = 2 ** Math.floor(Math.log2(rate_hz * SEGMENT_S));
-      this.points = Math.min(Math.max(wanted, POINTS_MIN), POINTS_MAX);
+    if (count < Math.max(this.points, POINTS_MIN)) return false;
+    const grid = gridOf(this.times, this.numbers);
+    this.isLocated = grid.isLocated;
+    const longs = grid.steps.flatMap((step, index) => (step > FILL_MOST + 1 ? [index + 1] : []));
+    const isOther = this.segments.length > 0 && Math.abs(grid.rate_hz / this.rate_hz - 1) > RATE_STEP;
+    if (longs.length || isOther) {
+      this.gaps += longs.length;
+      const from = isOther ? count : longs.at(-1);
+      this.begin(this.times.slice(from), this.numbers.slice(from), this.axes.map((axis) => axis.slice(from)));
+      return false;
     }
-    if (!this.points || count < this.points) return false;
-    this.rate_hz = (this.points - 1) / (this.times[this.points - 1] - this.times[0]);
-    this.segments.push(this.axes.map((axis) => density(axis.slice(0, this.points), this.rate_hz)));
-    if (this.segments.length > SEGMENTS_MAX) this.segments.shift();
-    this.times.splice(0, this.points / 2);
-    this.axes.forEach((axis) => axis.splice(0, this.points / 2));
+    this.rate_hz = grid.rate_hz;
+    if (!this.points) {
+      const wanted = 2 ** Math.floor(Math.log2(grid.rate_hz * SEGMENT_S));
+      this.points = Math.min(Math.max(wanted, POINTS_MIN), POINTS_MAX);
+      if (count < this.points) return false;
+    }
+    this.transform(grid.steps);
     return true;
+  }
+
+  /** Make a segment of the oldest samples, and keep its second half for the next one. */
+  transform(steps) {
+    const places = [0];
+    for (const step of steps) places.push(places.at(-1) + step);
+    this.segments.push(this.axes.map((axis) => density(filled(places, axis, this.points), this.rate_hz)));
+    if (this.segments.length > SEGMENTS_MAX) this.segments.shift();
+    const kept = places.findIndex((place) => place >= this.points / 2);
+    this.missing += places[kept] - kept;
+    for (const values of [this.times, this.numbers, ...this.axes]) values.splice(0, kept);
   }
 
   /** Frequencies in Hz and, per axis, unit / √Hz. */
