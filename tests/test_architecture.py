@@ -341,6 +341,7 @@ CROSS_CUTTING = {
     "utc/test_gpsd_daemon.py": "a real gpsd and the daemon",
     "utc/test_gpsd_real.py": "a real gpsd",
     "web/test_calibration_page.py": "the calibrations of imud/web/static in a real browser",
+    "web/test_device_page.py": "the page of a device of imud/web/static in a real browser: vectors, status, settings",
     "web/test_page.py": "imud/web/static in a real browser, with the daemon and a module",
     "web/test_spectrum_page.py": "the spectrum of imud/web/static in a real browser, with a module that loses samples",
 }

@@ -5,6 +5,8 @@ import { cleared, el } from "./util.js";
 const SIZE = 300;
 const BODY = [1.0, 0.7, 0.18]; // half edges along x, y, z of the device
 const CAMERA = { azimuth: -2.3, elevation: 0.5 }; // looked at from the south-west, above
+const GROUND = -1.7; // height of the compass
+const QUARTERS = [["E", 1, 0], ["N", 0, 1], ["W", -1, 0], ["S", 0, -1]];
 const FACES = [[0, 1], [0, -1], [1, 1], [1, -1], [2, 1], [2, -1]];
 
 /** Rotate a vector by a quaternion [w, x, y, z]. */
@@ -50,30 +52,40 @@ export class AttitudeView {
     context.font = "13px system-ui, sans-serif";
     context.textAlign = "center";
     context.textBaseline = "middle";
+    context.lineJoin = context.lineCap = "round"; // a corner of a thin face would else have a long spike
     this.drawCompass(context, style);
-    if (!this.quaternion) return;
-    this.drawAxes(context, false); // those that point away stand behind the block
-    this.drawBody(context, style);
-    this.drawAxes(context, true);
+    if (this.quaternion) {
+      this.drawAxes(context, false); // those that point away stand behind the block
+      this.drawBody(context, style);
+      this.drawAxes(context, true);
+    }
+    this.drawNames(context, style);
+  }
+
+  /** The quarters, in front of everything, in a border of the panel's colour: a block hides none. */
+  drawNames(context, style) {
+    context.fillStyle = style.getPropertyValue("--quiet");
+    context.strokeStyle = style.getPropertyValue("--card");
+    context.lineWidth = 4;
+    for (const [name, e, n] of QUARTERS) {
+      const at = this.project([1.85 * e, 1.85 * n, GROUND]).slice(0, 2);
+      context.strokeText(name, ...at);
+      context.fillText(name, ...at);
+    }
   }
 
   drawCompass(context, style) {
-    const down = -1.45;
     context.strokeStyle = style.getPropertyValue("--line");
-    context.fillStyle = style.getPropertyValue("--quiet");
     context.lineWidth = 1;
     for (const radius of [0.8, 1.6]) {
       context.beginPath();
       for (let step = 0; step <= 60; step += 1) {
         const angle = (step / 30) * Math.PI;
-        context.lineTo(...this.project([radius * Math.cos(angle), radius * Math.sin(angle), down]).slice(0, 2));
+        context.lineTo(...this.project([radius * Math.cos(angle), radius * Math.sin(angle), GROUND]).slice(0, 2));
       }
       context.stroke();
     }
-    for (const [name, e, n] of [["E", 1, 0], ["N", 0, 1], ["W", -1, 0], ["S", 0, -1]]) {
-      this.line(context, [0, 0, down], [1.6 * e, 1.6 * n, down]);
-      context.fillText(name, ...this.project([1.85 * e, 1.85 * n, down]).slice(0, 2));
-    }
+    for (const [, e, n] of QUARTERS) this.line(context, [0, 0, GROUND], [1.6 * e, 1.6 * n, GROUND]);
   }
 
   drawBody(context, style) {
@@ -93,6 +105,7 @@ export class AttitudeView {
     });
     faces.sort((a, b) => a.near - b.near);
     context.strokeStyle = style.getPropertyValue("--ink");
+    context.lineWidth = 2;
     for (const { corners, light } of faces) {
       context.fillStyle = `hsl(212 38% ${Math.round(52 + 20 * light)}%)`;
       context.beginPath();

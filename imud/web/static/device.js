@@ -1,12 +1,13 @@
 // The page of one device.
 
+import { aboutRows } from "./about.js";
 import { AttitudeView } from "./attitude.js";
 import { ActionsView, CalibrationView } from "./control.js";
 import { LatencyView, LedgerView } from "./ledger.js";
 import { RollingPlot } from "./plots.js";
 import { SettingsView } from "./settings.js";
 import { SpectrumPlot } from "./spectrum-plot.js";
-import { AXES, DEGREE, duration, el, facts, number, panel, setText } from "./util.js";
+import { AXES, DEGREE, el, facts, number, panel, setText } from "./util.js";
 
 const RATES_HZ = [10, 20, 50];
 const SPANS_S = [10, 30, 60];
@@ -133,7 +134,7 @@ export class DevicePage {
     if (!this.attitude.quaternion) this.attitude.draw();
     this.ledger.draw(message);
     this.latency.draw(message);
-    this.about.replaceChildren(facts(aboutRows(status, message.lost)));
+    this.about.replaceChildren(facts(aboutRows(message)));
   }
 
   addEvents(events) {
@@ -170,21 +171,4 @@ export class DevicePage {
 function select(id, values, chosen, unit, onChange) {
   const options = values.map((value) => el("option", { value, text: `${value} ${unit}`, selected: value === chosen }));
   return el("select", { id, "aria-label": id, onchange: (event) => onChange(Number(event.target.value)) }, ...options);
-}
-
-function aboutRows(status, lost) {
-  const { clock } = status;
-  const rows = [
-    ["link", `${status.link}, driver ${status.driver}, opened ${status.connects === 1 ? "once" : `${number(status.connects)} times`}`],
-    ["identity", Object.entries(status.identity).map(([name, value]) => `${name} ${value}`).join(", ") || "not known"],
-    ["rate", `${number(status.rate_hz, 1)} Hz seen, ${number(status.expected_rate_hz, 1)} Hz by the device's clock`],
-    ["clock", `${clock.sync}, skew ${number(clock.skew_ppm, 2)} ppm, residual ${duration(clock.residual_ns / 1e9)}, ${number(clock.resets)} resets`],
-    ["samples", `${number(status.ledger.samples)}; ${number(lost)} lost, ${number(status.ledger.lost_unknown)} gaps of unknown size`],
-    ["waiting", `${duration(status.hold_ns / 1e9)} to be processed together; ${status.hold_by || "nobody"} decides it`],
-    ["kernel", `${number(status.kernel.overrun)} overruns, ${number(status.kernel.framing)} framing, ${number(status.kernel.parity)} parity`],
-  ];
-  if (status.temperature_c !== null) rows.splice(3, 0, ["temperature", `${number(status.temperature_c, 1)} °C`]);
-  if (status.frame) rows.splice(2, 0, ["axes", `${status.frame.frame}; heading ${status.frame.heading}${status.frame.problem ? ` (${status.frame.problem})` : ""}`]);
-  if (status.status_words?.length) rows.push(["status", status.status_words.join(", ")]);
-  return rows;
 }

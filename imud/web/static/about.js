@@ -1,0 +1,105 @@
+// What `imud status` prints of a device (imud/cli/status.py), as rows of name and text.
+
+import { duration, number, shown } from "./util.js";
+
+const seconds = (ns) => duration(ns / 1e9);
+const times = (count) => (count === 1 ? "once" : `${number(count)} times`);
+const inBrackets = (words) => (words ? ` (${words})` : "");
+const pairs = (values) => Object.entries(values).map(([name, value]) => `${name} ${shown(value)}`).join(", ");
+
+/** message: `status` of imud/web/messages.py. */
+export function aboutRows({ status, lost, bytes_open, frames_open }) {
+  const { clock, ledger, kernel } = status;
+  const rows = [
+    ["link", `${status.link}, driver ${status.driver}, opened ${times(status.connects)}`],
+    ["identity", pairs(status.identity) || "not known"],
+    ["rate", `${number(status.rate_hz, 1)} Hz seen, ${number(status.expected_rate_hz, 1)} Hz by the device's clock`],
+    ["clock", `${clock.sync}, skew ${number(clock.skew_ppm, 2)} ppm, residual ${seconds(clock.residual_ns)}, error ${seconds(clock.t_err_ns)}, ${number(clock.resets)} resets`],
+    ["latency", latency(status)],
+    ["samples", `${number(ledger.samples)}; lost ${number(lost)} (device ${number(ledger.lost_gap_device)}, damaged ${number(ledger.lost_crc)}, ` +
+      `overrun ${number(ledger.lost_overrun)}, queue ${number(ledger.lost_queue)}), ${number(ledger.lost_unknown)} gaps of unknown size`],
+    ["bytes", `${number(ledger.bytes_in)}: the ledger ${bytes_open || frames_open ? "DOES NOT CLOSE" : "closes"}`],
+    ["kernel", `${number(kernel.overrun)} overruns, ${number(kernel.framing)} framing, ${number(kernel.parity)} parity`],
+  ];
+  if (status.temperature_c !== null) rows.splice(3, 0, ["temperature", `${number(status.temperature_c, 1)} °C`]);
+  if (status.frame) rows.splice(2, 0, ["axes", axes(status.frame)]);
+  return [...rows, ...parts(status)];
+}
+
+/** Rows that only some devices have. */
+function parts(status) {
+  const rows = [];
+  if (status.declared && status.declared.state !== "undeclared") rows.push(["settings", declared(status.declared)]);
+  if (Object.keys(status.status_bit_names).length && status.status_bits !== null)
+    rows.push(["status", status.status_words.join(", ") || "no bit that is known is set"]);
+  if (Object.keys(status.settings).length) rows.push(["present", pairs(status.settings)]);
+  if (status.polling) rows.push(["polling", polling(status.polling)]);
+  if (status.serial_line) rows.push(["line", serialLine(status.serial_line)]);
+  if (status.lines) rows.push(...lines(status.lines, status.clock));
+  if (status.utc) rows.push(["utc", utc(status.utc)]);
+  return rows;
+}
+
+function latency(status) {
+  const count = status.latency_buckets.reduce((a, b) => a + b, 0);
+  const mean = count ? `${seconds(status.latency_sum_ns / count)} mean over ${number(count)} samples` : "no samples";
+  return `${mean}; samples wait ${seconds(status.hold_ns)} to be processed together, ${seconds(status.hold_wanted_ns)} allowed by ${status.hold_by || "everybody"}`;
+}
+
+function axes(frame) {
+  const words = frame.convention === "device" ? frame.frame : `${frame.convention}, ${frame.frame}`;
+  const declination = frame.declination_deg === null ? "" : ` by a declination of ${shown(frame.declination_deg)}°`;
+  return `${words}; heading ${frame.heading}${declination}${inBrackets(frame.problem)}`;
+}
+
+function declared(settings) {
+  const differences = Object.entries(settings.differences).map(([name, one]) =>
+    `${name} is ${one.actual === null ? "not reported" : shown(one.actual)}, declared ${shown(one.declared)}`);
+  const words = differences.length ? `${settings.state}: ${differences.join(", ")}` : settings.state;
+  const unverified = settings.unverified.length ? `; not reported by the device: ${settings.unverified.join(", ")}` : "";
+  return words + unverified + inBrackets(settings.problem);
+}
+
+function polling(polls) {
+  return `${number(polls.polls)} reads, ${number(polls.late)} late, ${number(polls.missed)} missed, ${number(polls.stale)} stale, ` +
+    `${number(polls.failed)} failed; ${seconds(polls.late_mean_ns)} after the deadline, ${seconds(polls.late_worst_ns)} at worst; ` +
+    `vanished ${times(polls.vanished)}`;
+}
+
+function serialLine(line) {
+  return `${number(line.timeouts)} requests unanswered; ${number(line.late_bytes)} bytes unasked, ${number(line.strange_bytes)} strange; ` +
+    `${number(line.echoes)} echoes (all devices of the line)`;
+}
+
+/** A row for each input line, for SIN, and for what cannot be watched or driven. */
+function lines(status, clock) {
+  const { problems } = status;
+  const rows = Object.entries(status.edges).map(([name, edges]) => {
+    const words = [`${number(edges)} edges, ${number(status.edges_lost[name] ?? 0)} lost`];
+    if (name === "alarm") words.unshift(`${alarmLevel(status.alarm)}, raised ${times(status.alarms)}`);
+    return [name, words.join("; ") + inBrackets(problems[name])];
+  });
+  if (clock.edges)
+    rows.push(["pulses", `${number(clock.edges)}, of which ${number(clock.edges_unpaired)} belong to no sample; ${number(clock.samples_unpaired)} samples without one`]);
+  if (status.sin)
+    rows.push(["sin", `${number(status.triggers)} triggers, ${number(status.triggers_missed)} missed; ${seconds(status.trigger_late_mean_ns)} after the ` +
+      `deadline, ${seconds(status.trigger_late_worst_ns)} at worst; ${number(clock.triggers_missed)} unanswered${inBrackets(problems.sin)}`]);
+  const others = Object.keys(problems).filter((name) => !(name in status.edges) && name !== "sin");
+  return [...rows, ...others.sort().map((name) => [name, problems[name]])];
+}
+
+function alarmLevel(isActive) {
+  if (isActive === null) return "level not known";
+  return isActive ? "ACTIVE" : "inactive";
+}
+
+function utc(status) {
+  const words = [];
+  const refused = pairs(status.refused);
+  if (status.source)
+    words.push(`${status.source}: ${number(status.sentences)} sentences, ${number(status.sent)} sent${refused ? `, not sent: ${refused}` : ""}`);
+  if (status.pulses || status.pulses_ignored) words.push(`${number(status.pulses)} pulses, ${number(status.pulses_ignored)} ignored`);
+  if (status.chrony_sent || status.chrony_refused)
+    words.push(`chronyd accepted ${number(status.chrony_sent)}, refused ${number(status.chrony_refused)}`);
+  return (words.join("; ") || "nothing yet") + inBrackets(status.problem);
+}

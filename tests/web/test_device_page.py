@@ -1,0 +1,210 @@
+"""The page of a device in a real browser: vectors and angles as a module sent them, its status, its settings."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from imud.cli.status import block
+from imud.contracts.device_settings import OnDifference, SettingDifference, SettingsState, SettingsStatus
+from imud.contracts.status import ClockStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
+from imud.devices.hipnuc.uart.codec import encode_hi91
+from imud.web.hub import status_message
+from imud.web.messages import encode
+from tests.support.daemon_process import daemon_with_module
+from tests.support.metrics import device
+from tests.test_daemon import cable
+from tests.web.browser import MISSING, PERIOD_MS, Page, Sender, open_page, sent_by, serving_web
+
+pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
+
+Rows = NDArray[np.float64]
+PLOTTED = """return Object.fromEntries([...window.imud.view.plots].map(([member, plot]) =>
+    [member, plot.data.map((values) => [...values])]))"""
+"""Of each plot: times, then greatest and least value of each axis."""
+RISE = {
+    "accel_m_s2": (0.004, -0.003, 0.002),
+    "gyro_rad_s": (0.005, -0.006, 0.007),
+    "mag_t": (1e-8, -2e-8, 3e-8),
+    "euler_rad": (0.0004, -0.0003, 0.0),
+}
+"""How much each axis grows from a measurement to the next."""
+TURN_RAD = 0.02
+"""The same of yaw, which goes over ±180° each 314 measurements, 1.6 s."""
+SHOWN = {"gyro_rad_s": math.degrees(1.0), "mag_t": 1e6, "euler_rad": math.degrees(1.0), "accel_m_s2": 1.0}
+"""°/s per rad/s, µT per T, ° per rad."""
+
+
+def wrapped(angle_rad: float) -> float:
+    """The same angle within ±π."""
+    return math.remainder(angle_rad, 2 * math.pi)
+
+
+def vector(member: str, number: int) -> list[float]:
+    """Values of a member in a measurement."""
+    values = [rise * number for rise in RISE[member]]
+    return [*values[:2], wrapped(TURN_RAD * number)] if member == "euler_rad" else values
+
+
+def ramps(number: int) -> bytes:
+    """A measurement in which no axis has the value of another one, or of another measurement."""
+    values: dict[str, Any] = {member: vector(member, number) for member in RISE}
+    return encode_hi91(
+        system_time_ms=number * PERIOD_MS, quat_wxyz=(1.0, 0.0, 0.0, 0.0), temperature_c=20.0, pressure_pa=1e5, **values
+    )
+
+
+def expected(member: str, axis: int, spans: Sequence[tuple[int, int]]) -> Rows:
+    """Greatest and least value of the measurements from the first to the last of each span."""
+    found = []
+    for first, last in spans:
+        values = [vector(member, number)[axis] * SHOWN[member] for number in range(first, last + 1)]
+        found.append((max(values), min(values)))
+    return np.array(found)
+
+
+def test_every_vector_and_angle_is_plotted_as_it_was_sent_in_the_units_of_people(page: Page, tmp_path: Path) -> None:
+    with cable(tmp_path) as port, Sender(port, ramps), sent_by(tmp_path, port) as daemon:
+        daemon.wait_for("bow", "running")
+        with serving_web(daemon.socket) as url:
+            open_page(page, url, "bow")
+            page.until("return window.imud.view.plots.get('accel_m_s2').data[0].length >= 100", what="five seconds")
+            page.click("#pause")
+            plots = {member: np.array(rows, dtype=float) for member, rows in page.js(PLOTTED).items()}
+            assert page.problems() == []
+    greatest, least = plots["accel_m_s2"][1:3] / RISE["accel_m_s2"][0]
+    spans = [(round(low), round(high)) for low, high in zip(least, greatest, strict=True)]
+    assert sum(last - first + 1 for first, last in spans) == spans[-1][1] - spans[0][0] + 1, "no measurement is missing"
+    for member in RISE:
+        assert plots[member].shape == (7, len(spans)), member
+        for axis in range(3):
+            shown, wanted = plots[member][1 + 2 * axis : 3 + 2 * axis].T, expected(member, axis, spans)
+            is_yaw = (member, axis) == ("euler_rad", 2)
+            drawn = ~np.isnan(shown).any(axis=1) if is_yaw else np.ones(len(spans), dtype=bool)
+            assert np.allclose(shown[drawn], wanted[drawn], rtol=1e-5, atol=1e-4), (member, axis)
+    turns = {number for number in range(spans[0][0], spans[-1][1] + 1) if _is_turn(number) and number > spans[0][0]}
+    broken = [span for span, value in zip(spans, plots["euler_rad"][5], strict=True) if math.isnan(value)]
+    assert len(turns) >= 2, "yaw went over ±180° more than once"
+    assert len(broken) == len(turns), "the line of yaw is broken there, and nowhere else"
+    assert all(any(first <= turn <= last for turn in turns) for first, last in broken)
+
+
+def _is_turn(number: int) -> bool:
+    """Whether yaw went over the half turn since the measurement before."""
+    return abs(vector("euler_rad", number)[2] - vector("euler_rad", number - 1)[2]) > math.pi
+
+
+def test_the_corners_of_the_block_are_round_and_it_hides_no_quarter_of_the_compass(page: Page, tmp_path: Path) -> None:
+    with serving_web(tmp_path / "none") as url:
+        page.driver.get(url)
+        drawn = page.module(
+            """const { AttitudeView } = await import('/static/attitude.js');
+            const calls = [];
+            const kept = CanvasRenderingContext2D.prototype;
+            const [fill, fillText] = [kept.fill, kept.fillText];
+            kept.fill = function (...all) { calls.push(['face', this.lineJoin]); fill.apply(this, all); };
+            kept.fillText = function (...all) { calls.push([all[0], this.lineJoin]); fillText.apply(this, all); };
+            new AttitudeView().set([1, 0, 0, 0], 'ENU');
+            [kept.fill, kept.fillText] = [fill, fillText];
+            return calls"""
+        )
+    names = [name for name, _ in drawn]
+    assert {join for _, join in drawn} == {"round"}
+    assert names.count("face") == 6
+    last = max(at for at, name in enumerate(names) if name == "face")
+    assert {"N", "E", "S", "W"} <= set(names[last:])
+
+
+STATUS = msgspec.structs.replace(
+    device("bow"),
+    clock=ClockStatus(t_err_ns=31_000, edges=4101, edges_unpaired=17, samples_unpaired=19, triggers_missed=23),
+    settings={"mode": "6-axis"},
+    status_bits=4,
+    status_words=("gyroscope-saturated",),
+    status_bit_names={"2": "gyroscope-saturated"},
+    hold_ns=5_000_000,
+    hold_by="shared memory",
+    polling=PollingStatus(4211, 223, 227, 229, 233, 1, 41_000, 913_000),
+    serial_line=SerialLineCounters(311, 313, 317, 331),
+    lines=LinesStatus(
+        {"sin": "it is used by another program", "pps": "no such line"},
+        {"sout": 5003, "alarm": 6},
+        {"sout": 509},
+        alarm=True,
+        alarms=3,
+        sin=True,
+        triggers=6007,
+        triggers_missed=601,
+        trigger_late_mean_ns=61_000,
+        trigger_late_worst_ns=613_000,
+    ),
+    utc=UtcStatus("gpsd at localhost", "no fix", 7001, 701, {"no fix": 709}, 719, 727, 733, 739),
+    declared=SettingsStatus(
+        SettingsState.DIFFER,
+        OnDifference.REPORT,
+        differences={"mode": SettingDifference("9-axis", "6-axis")},
+        unverified=("baud",),
+    ),
+)
+"""A status with everything that a device can have, each count another number."""
+WORDS = {
+    "clock": ("error 31.0 µs", "0 resets"),
+    "polling": ("4,211 reads", "223 late", "227 missed", "229 stale", "233 failed",
+                "41.0 µs after the deadline", "913 µs at worst", "vanished once"),
+    "line": ("311 requests unanswered", "313 bytes unasked", "317 strange", "331 echoes"),
+    "sout": ("5,003 edges, 509 lost",),
+    "alarm": ("ACTIVE, raised 3 times; 6 edges, 0 lost",),
+    "pulses": ("4,101", "17 belong to no sample", "19 samples without one"),
+    "sin": ("6,007 triggers, 601 missed", "613 µs at worst", "23 unanswered", "(it is used by another program)"),
+    "pps": ("no such line",),
+    "utc": ("gpsd at localhost: 7,001 sentences, 701 sent, not sent: no fix 709", "719 pulses, 727 ignored",
+            "chronyd accepted 733, refused 739", "(no fix)"),
+    "settings": ("mode is 6-axis, declared 9-axis", "not reported by the device: baud"),
+    "status": ("gyroscope-saturated",),
+    "present": ("mode 6-axis",),
+    "latency": ("samples wait 5.0 ms to be processed together", "allowed by shared memory"),
+}  # fmt: skip
+
+
+def test_the_status_panel_has_every_row_of_imud_status(page: Page, tmp_path: Path) -> None:
+    with serving_web(tmp_path / "none") as url:
+        page.driver.get(url)
+        script = "const { aboutRows } = await import('/static/about.js'); return aboutRows(args[0])"
+        full = dict(page.module(script, msgspec.json.decode(encode(status_message("bow", STATUS, 5)))))
+        plain = dict(page.module(script, msgspec.json.decode(encode(status_message("bow", device("bow"), 5)))))
+    printed = [line.split()[0] for line in block(STATUS).splitlines() if line[2:3].strip() and line.startswith("  ")]
+    assert {"polling", "line", "sout", "alarm", "sin", "pps", "utc", "settings"} <= set(printed)
+    assert set(printed) <= set(full)
+    for name, words in WORDS.items():
+        for one in words:
+            assert one in full[name], name
+    assert not {"polling", "line", "sin", "utc", "settings", "pulses"} & set(plain), "rows that this device has not"
+
+
+def test_a_setting_that_is_not_as_declared_is_marked_on_the_page_and_in_the_overview(
+    page: Page, tmp_path: Path
+) -> None:
+    declared = {"mode": "9-axis", "magnetic_calibration": True}
+    with (
+        daemon_with_module(tmp_path, "--rate", "100", settings=declared) as daemon,
+        serving_web(daemon.socket) as url,
+    ):
+        open_page(page, url, "bow")
+        page.until_text("#about", "mode is 6-axis, declared 9-axis")
+        page.until("return document.querySelector('[data-setting=mode]')")
+        rows = page.js(
+            """return [...document.querySelectorAll('[data-setting]')].map((row) =>
+                [row.dataset.setting, [row.className, row.cells[1].innerText, row.cells[2].innerText]])"""
+        )
+        found = dict(rows)
+        assert found["mode"] == ["differs", "9-axis", "6-axis"]
+        assert found["magnetic_calibration"] == ["", "true", "true"]
+        assert [name for name, (kind, *_) in rows if kind] == ["mode"]
+        page.click(".back")
+        page.until_text(".card", "settings differ from the declared ones")
+        assert page.problems() == []
