@@ -1,21 +1,24 @@
 """The HTTP server: who may, what is answered, the WebSocket."""
 
 import asyncio
+import base64
 import hashlib
 import json
 import re
+import socket
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
-from aiohttp.test_utils import TestClient, TestServer
+from aiohttp.test_utils import TestClient, TestServer, get_port_socket
 
 from imud.event import Event, EventKind
 from imud.publishers.socket.publisher import SocketServer
 from imud.web import app as web_app
+from imud.web import mailbox
 from imud.web.app import STATIC, WebServer
 from imud.web.guard import COOKIE, WebGuard
 from tests.support.socket_rig import batch, run, serving, until
@@ -49,12 +52,59 @@ class Site:
 
 
 @asynccontextmanager
-async def running(folder: Path, *, token: str = TOKEN, reading_needs_token: bool = False) -> AsyncIterator[Site]:
+async def running(
+    folder: Path, *, token: str = TOKEN, reading_needs_token: bool = False, small_buffers: bool = False
+) -> AsyncIterator[Site]:
     async with serving(folder) as daemon:
         web = WebServer(daemon.hub.path, WebGuard(token.encode(), lambda: 1e9, reading_needs_token=reading_needs_token))
-        async with TestClient(TestServer(web.make_app())) as client:
+        server = TestServer(web.make_app(), socket_factory=small_socket if small_buffers else get_port_socket)
+        async with TestClient(server) as client:
             yield Site(web, client, daemon)
         await until(lambda: not daemon.hub.connections)
+
+
+def small_socket(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
+    """A listening socket, whose connections have as little room for what is sent as there can be."""
+    listening = get_port_socket(host, port, family)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, StalledPage.BUFFER_BYTES)
+    return listening
+
+
+class StalledPage:
+    """A page whose connection takes nothing more: it goes on sending, as if it drew all, and reads no byte."""
+
+    BUFFER_BYTES = 4096
+    """Of its kernel, as little as there can be."""
+
+    def __init__(self, site: Site) -> None:
+        url = site.client.make_url("")
+        self._socket = socket.socket()
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self.BUFFER_BYTES)
+        self._socket.setblocking(False)
+        self._address = (url.host, url.port)
+        self._head = (
+            f"GET /api/stream HTTP/1.1\r\nHost: {url.host}:{url.port}\r\nOrigin: {site.origin['Origin']}\r\n"
+            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            f"Sec-WebSocket-Key: {base64.b64encode(bytes(16)).decode()}\r\n\r\n"
+        )
+
+    async def open(self, **look: Any) -> None:
+        """Connect and ask for something."""
+        loop = asyncio.get_running_loop()
+        await loop.sock_connect(self._socket, self._address)
+        await loop.sock_sendall(self._socket, self._head.encode())
+        await self.send(**look)
+
+    async def send(self, **look: Any) -> None:
+        """Send a message, in a frame with a mask of zeros (RFC 6455, 5.2)."""
+        text = json.dumps(look).encode()
+        assert len(text) < 126
+        frame = bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
+        await asyncio.get_running_loop().sock_sendall(self._socket, frame)
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._socket.close()
 
 
 async def message(socket: ClientWebSocketResponse, kind: str) -> dict[str, Any]:
@@ -262,6 +312,49 @@ def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing_is_re
             for one in (socket, *others):
                 await one.close()
             await until(lambda: not site.daemon.hub.connections)
+
+    run(body)
+
+
+def test_a_page_that_takes_nothing_holds_up_no_other_and_nothing_piles_up_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its connection is full, and it acknowledges all the same, so that nothing but the connection can stop it."""
+    rounds, samples, waiting_max = 50, 400, 20
+    look = {"look": "device", "device": "imu0", "rate_hz": 50, "spectrum": "accel_m_s2"}
+
+    async def watched(site: Site, stalled: StalledPage) -> None:
+        await stalled.open(**look)
+        quick = await site.stream(**look)
+        await message(quick, "status")
+        assert site.web.hub is not None
+        browsers = site.web.hub.browsers
+        await until(lambda: len(browsers) == 2)
+        seen: list[int] = []
+        most = {"mailbox": 0, "daemon": 0}
+        for number in range(rounds):
+            site.daemon.publish(batch("imu0", 1 + samples * number, samples))
+            while not seen or seen[-1] < samples * (number + 1):
+                seen += (await message(quick, "raw"))["seq"]
+            await quick.send_json({**look, "acknowledged": 1000})
+            await stalled.send(**look, acknowledged=1000)
+            most["mailbox"] = max(most["mailbox"], *(one.mailbox.waiting for one in browsers))
+            (connection,) = site.daemon.hub.connections.values()
+            most["daemon"] = max(most["daemon"], connection.status("").queue_samples)
+        assert seen == [*range(1, rounds * samples + 1)], "the quick one got every sample"
+        full = [one for one in browsers if one.mailbox.dropped]
+        assert len(full) == 1, "the stalled one, and the quick one missed nothing"
+        assert full[0].mailbox.dropped > rounds // 2, "of two messages a round"
+        assert most["mailbox"] <= waiting_max + 5, "state, status, dropped and such are there once each"
+        assert most["daemon"] <= samples, "the daemon's queue does not grow for it"
+        assert site.web.hub.dropped_samples == 0
+        await quick.close()
+
+    async def body() -> None:
+        monkeypatch.setattr(mailbox, "FRAMES_MAX", waiting_max)
+        async with running(tmp_path, small_buffers=True) as site:
+            with closing(StalledPage(site)) as stalled:
+                await watched(site, stalled)
 
     run(body)
 
