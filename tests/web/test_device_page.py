@@ -99,7 +99,7 @@ def _is_turn(number: int) -> bool:
     return abs(vector("euler_rad", number)[2] - vector("euler_rad", number - 1)[2]) > math.pi
 
 
-def test_the_corners_of_the_block_are_round_and_it_hides_no_quarter_of_the_compass(page: Page, tmp_path: Path) -> None:
+def test_the_corners_of_the_block_are_round_and_it_hides_no_name(page: Page, tmp_path: Path) -> None:
     with serving_web(tmp_path / "none") as url:
         page.driver.get(url)
         drawn = page.module(
@@ -117,7 +117,7 @@ def test_the_corners_of_the_block_are_round_and_it_hides_no_quarter_of_the_compa
     assert {join for _, join in drawn} == {"round"}
     assert names.count("face") == 6
     last = max(at for at, name in enumerate(names) if name == "face")
-    assert {"N", "E", "S", "W"} <= set(names[last:])
+    assert {"N", "E", "S", "W", "x", "y", "z"} <= set(names[last:])
 
 
 STATUS = msgspec.structs.replace(

@@ -5,7 +5,7 @@ import { cleared, el } from "./util.js";
 const SIZE = 300;
 const BODY = [1.0, 0.7, 0.18]; // half edges along x, y, z of the device
 const CAMERA = { azimuth: -2.3, elevation: 0.5 }; // looked at from the south-west, above
-const GROUND = -1.7; // height of the compass
+const GROUND = -1.6; // height of the compass
 const QUARTERS = [["E", 1, 0], ["N", 0, 1], ["W", -1, 0], ["S", 0, -1]];
 const FACES = [[0, 1], [0, -1], [1, 1], [1, -1], [2, 1], [2, -1]];
 
@@ -42,8 +42,8 @@ export class AttitudeView {
     const away = e * -Math.cos(azimuth) + n * -Math.sin(azimuth);
     const up = u * Math.cos(elevation) + away * Math.sin(elevation);
     const near = u * Math.sin(elevation) - away * Math.cos(elevation);
-    const scale = (SIZE * 0.24) / (1 - near * 0.12);
-    return [SIZE / 2 + right * scale, SIZE * 0.42 - up * scale, near];
+    const scale = (SIZE * 0.225) / (1 - near * 0.12);
+    return [SIZE / 2 + right * scale, SIZE * 0.41 - up * scale, near];
   }
 
   draw() {
@@ -62,13 +62,16 @@ export class AttitudeView {
     this.drawNames(context, style);
   }
 
-  /** The quarters, in front of everything, in a border of the panel's colour: a block hides none. */
+  /** Names of the quarters and axes, in front of everything, in a border of the panel's colour: the block hides none. */
   drawNames(context, style) {
-    context.fillStyle = style.getPropertyValue("--quiet");
+    const quiet = style.getPropertyValue("--quiet");
+    const names = QUARTERS.map(([name, e, n]) => [name, quiet, [1.85 * e, 1.85 * n, GROUND]]);
+    if (this.quaternion) names.push(...this.axes().map(({ colour, name, end }) => [name, colour, end.map((one) => one * 1.12)]));
     context.strokeStyle = style.getPropertyValue("--card");
     context.lineWidth = 4;
-    for (const [name, e, n] of QUARTERS) {
-      const at = this.project([1.85 * e, 1.85 * n, GROUND]).slice(0, 2);
+    for (const [name, colour, place] of names) {
+      const at = this.project(place).slice(0, 2);
+      context.fillStyle = colour;
       context.strokeText(name, ...at);
       context.fillText(name, ...at);
     }
@@ -116,20 +119,23 @@ export class AttitudeView {
     }
   }
 
-  drawAxes(context, isNear) {
-    const axes = ["#d1495b", "#2e8b57", "#3a7bd5"].map((colour, axis) => {
+  /** Colour, name, and both ends of the device's axes outside of the block. */
+  axes() {
+    return ["#d1495b", "#2e8b57", "#3a7bd5"].map((colour, axis) => {
       const end = [0, 0, 0];
       end[axis] = 1.5;
       const start = [0, 0, 0];
       start[axis] = BODY[axis];
       return { colour, name: "xyz"[axis], start: this.toEnu(start), end: this.toEnu(end) };
     });
+  }
+
+  drawAxes(context, isNear) {
     context.lineWidth = 3;
-    for (const { colour, name, start, end } of axes) {
+    for (const { colour, start, end } of this.axes()) {
       if (this.project(end)[2] > 0 !== isNear) continue;
-      context.strokeStyle = context.fillStyle = colour;
+      context.strokeStyle = colour;
       this.line(context, start, end);
-      context.fillText(name, ...this.project(end.map((one) => one * 1.12)).slice(0, 2));
     }
   }
 

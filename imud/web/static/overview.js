@@ -5,7 +5,7 @@ import { DEGREE, duration, el, length, number, setText } from "./util.js";
 const FACTS = [
   ["rate", (row) => `${number(row.rate_hz, 1)} Hz`],
   ["attitude", (row) => (row.euler_rad ? row.euler_rad.map((one) => number(one / DEGREE, 1)).join(" / ") + "°" : "–")],
-  ["|a|", (row) => `${number(length(row.accel_m_s2), 2)} m/s²`],
+  ["|a|", (row) => (row.accel_m_s2 ? `${number(length(row.accel_m_s2), 2)} m/s²` : "–")],
   ["|ω|", (row) => (row.gyro_rad_s ? `${number(length(row.gyro_rad_s) / DEGREE, 1)} °/s` : "–")],
   ["stamp", (row) => (row.sync ? `±${duration(row.t_err_s)}, ${row.sync}` : "–")],
   ["lost", (row) => number(row.lost)],
