@@ -1,10 +1,17 @@
-"""The browser that all tests of a page share: its start takes seconds."""
+"""The browser that all tests of a page share: its start takes seconds. What it showed when a test failed is kept."""
 
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
 
 import pytest
+from selenium.common.exceptions import WebDriverException
 
+from tests.support.files import ROOT
 from tests.web.browser import Page, browser
+
+PICTURES: Final = ROOT / "build/web"
+"""Where what the browser showed goes when a test failed, by the name of the test."""
 
 
 @pytest.fixture(scope="session")
@@ -21,3 +28,32 @@ def page(window: Page) -> Page:
     window.driver.get("about:blank")
     window.problems()
     return window
+
+
+@pytest.fixture
+def phone(tmp_path: Path) -> Iterator[Page]:
+    """The tab of a browser on a telephone."""
+    with browser(tmp_path, phone=True) as one:
+        yield one
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    """Keep the picture of a page whose test failed, while it is still open."""
+    report: pytest.TestReport = yield  # type: ignore[assignment]  # a wrapper is sent the result
+    given = getattr(item, "funcargs", {})
+    pages = [one for name, one in given.items() if name in ("page", "phone")]
+    if report.failed and call.when == "call":
+        report.sections += [("screenshot", keep_picture(one, item.name)) for one in pages]
+    return report  # type: ignore[return-value]  # as the wrapper's result
+
+
+def keep_picture(page: Page, name: str) -> str:
+    """Save what the browser shows; return where, or why not."""
+    file = PICTURES / f"{''.join(one if one.isalnum() else '_' for one in name)}.png"
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    try:
+        file.write_bytes(page.driver.get_screenshot_as_png())
+    except WebDriverException as error:  # the browser itself has ended
+        return f"none: {error.msg}"
+    return str(file)

@@ -9,7 +9,7 @@ import pytest
 from imud.runtime.calibration.turning import cell_of
 from tests.support.daemon_process import daemon_with_module, wait_until
 from tests.test_daemon import cable
-from tests.web.browser import MISSING, PHONE, Page, Sender, browser, enter, sent_by, serving_web, upright
+from tests.web.browser import MISSING, PHONE, Page, Sender, enter, sent_by, serving_web, upright
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.timeout(180)]
 
@@ -178,22 +178,18 @@ def test_with_the_token_settings_are_planned_and_without_the_right_one_not(page:
         assert refused == []
 
 
-def test_both_views_fit_a_telephone(tmp_path: Path) -> None:
+def test_both_views_fit_a_telephone(phone: Page, tmp_path: Path) -> None:
     wide = "return [document.documentElement.scrollWidth, window.innerWidth]"
-    with (
-        daemon_with_module(tmp_path, "--rate", "100") as daemon,
-        serving_web(daemon.socket) as url,
-        browser(tmp_path, phone=True) as page,
-    ):
-        page.driver.get(url)
-        page.until("return document.querySelector('.card')")
-        page.until_text(".card", "Hz")
-        assert page.js(wide) == [PHONE[0], PHONE[0]]
-        page.click(".card")
-        page.until(POINTS, 5)
-        page.until("return document.querySelectorAll('[data-setting]').length > 3")
-        assert page.js(wide) == [PHONE[0], PHONE[0]]
-        cut: list[Any] = page.js(
+    with daemon_with_module(tmp_path, "--rate", "100") as daemon, serving_web(daemon.socket) as url:
+        phone.driver.get(url)
+        phone.until("return document.querySelector('.card')")
+        phone.until_text(".card", "Hz")
+        assert phone.js(wide) == [PHONE[0], PHONE[0]]
+        phone.click(".card")
+        phone.until(POINTS, 5)
+        phone.until("return document.querySelectorAll('[data-setting]').length > 3")
+        assert phone.js(wide) == [PHONE[0], PHONE[0]]
+        cut: list[Any] = phone.js(
             """return [...document.querySelectorAll('main *')].filter((one) => {
                 const box = one.getBoundingClientRect();
                 return box.width && box.right > window.innerWidth + 1 && !one.closest('.scroll');
