@@ -1,55 +1,124 @@
 """Takes the screenshots of `imud web` for README.md and docs/views.md: `make web-pictures`.
 
-Three simulated modules, one of them with faults on its line, in a real browser; and one that is turned: web-*.png in
-docs/pictures.
+Simulated modules in a real browser: one whose settings are not all as declared, that shakes with an engine and loses a
+sample now and then; one with a bad cable; one that falls silent; one that is not there; one that is turned. They make
+web-*.png in docs/pictures.
 """
 
+import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from io import BytesIO
 from pathlib import Path
+from typing import Any, Final
 
-from tests.support.daemon_process import running_daemon
+import numpy as np
+from PIL import Image
+
+from tests.support.daemon_process import RunningDaemon, running_daemon
 from tests.support.files import ROOT
-from tests.web.browser import MISSING, Page, browser, log_in, open_page, serving_web
+from tests.web.browser import MISSING, Page, browser, choose, log_in, open_page, serving_web
 from tests.web.turned import turned_module
 
 FOLDER = ROOT / "docs/pictures"
-MODULES = {
-    "bow": ("hipnuc-uart", "--rate", "200"),
-    "mast": ("imu61x-uart", "--rate", "100"),
-    "keel": ("hipnuc-uart", "--rate", "100", "--faults", "cut=0.01,flip=0.01"),
+PORTS: Final = Path("/tmp/serial/by-id")
+"""Names of the ports, the same in every picture."""
+MODULES: Final = {
+    "bow": ("hipnuc-uart", "--rate", "200", "--motion", "engine", "--faults", "lose=0.0004,flip=0.0002"),
+    "mast": ("imu61x-uart", "--rate", "100", "--faults", "cut=0.01,flip=0.01"),
+    "crane": ("hipnuc-uart", "--rate", "100", "--motion", "still"),
 }
+DECLARED: Final = {"bow": {"mode": "9-axis", "magnetic_calibration": True, "output": {"hi91": 200}, "sout_divisor": 8}}
+"""What the settings should be; the mode is another one."""
+ABSENT: Final = "stern"
+STATES: Final = {"bow": "running", "mast": "running", "crane": "silent", ABSENT: "missing"}
+COLOURS_MAX: Final = 256
+"""Of a picture, which has few: its file is a third as large, and looks the same."""
 FULL = "return window.imud.view.plots.get('accel_m_s2').data[0].length >= 580"
 """Nearly half a minute at 20 Hz."""
 TOKEN = "a-token-for-pictures-only"
-CHOOSE = """const node = document.querySelector('#spectrum-of');
-    node.value = 'accel_m_s2';
-    node.dispatchEvent(new Event('change'))"""
+
+
+class Module:
+    """A simulated module as a process."""
+
+    def __init__(self, name: str, process: subprocess.Popen[str]) -> None:
+        self.name = name
+        self._process = process
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """Of this device."""
+        return configuration(self.name, MODULES[self.name][0])
+
+    def unplug(self, seconds: float) -> None:
+        """Pull its cable for so long."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"unplug {seconds}\n")
+        self._process.stdin.flush()
+
+    def stand_still(self) -> None:
+        """Send nothing more, with the port still there."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def end(self) -> None:
+        """End the process, also one that stands still."""
+        self._process.terminate()
+        self._process.send_signal(signal.SIGCONT)
+        self._process.communicate()
+
+
+def configuration(name: str, driver: str) -> dict[str, Any]:
+    """Of the device behind the port with this name."""
+    port = {"driver": driver, "uart": {"port": str(PORTS / f"usb-{name}"), "baud": "auto"}}
+    return {**port, "settings": DECLARED[name]} if name in DECLARED else port
 
 
 @contextmanager
-def module(folder: Path, name: str) -> Iterator[dict[str, object]]:
-    """A simulated module; its configuration."""
+def module(name: str) -> Iterator[Module]:
+    """A simulated module that runs."""
     driver, *options = MODULES[name]
-    port = folder / f"port-{name}"
-    argv = [sys.executable, "-m", "imud.sim", "--device", driver, "--path", str(port), *options]
-    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    argv = [sys.executable, "-m", "tests.web.vibrating", "--device", driver, "--path", str(PORTS / f"usb-{name}")]
+    with subprocess.Popen([*argv, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        one = Module(name, process)
         try:
             assert process.stdout is not None
             assert process.stdout.readline()
-            yield {"driver": driver, "uart": {"port": str(port), "baud": "auto"}}
+            yield one
         finally:
-            process.terminate()
-            process.communicate()
+            one.end()
+
+
+@contextmanager
+def ports() -> Iterator[None]:
+    """The folder of the ports."""
+    PORTS.mkdir(parents=True)
+    try:
+        yield
+    finally:
+        shutil.rmtree(PORTS.parent)
+
+
+def save(name: str, png: bytes) -> None:
+    """Write a picture with a palette of its most frequent colours; the others become the nearest of these."""
+    with Image.open(BytesIO(png)) as read:
+        whole = np.asarray(read.convert("RGB"))
+    colours, places, counts = np.unique(whole.reshape(-1, 3), axis=0, return_inverse=True, return_counts=True)
+    frequent = colours[np.argsort(-counts)[:COLOURS_MAX]]
+    distances = ((colours[:, None, :].astype(np.float64) - frequent[None, :, :]) ** 2).sum(axis=2)
+    numbers = distances.argmin(axis=1).astype(np.uint8)[places.reshape(whole.shape[:2])]
+    few = Image.fromarray(numbers)
+    few.putpalette(frequent.tobytes())
+    few.save(FOLDER / f"web-{name}.png", optimize=True)
 
 
 def shot(page: Page, name: str) -> None:
     """Save what the window shows."""
-    page.until("return [...document.querySelectorAll('.plot')].length >= 0")
-    assert page.driver.save_screenshot(str(FOLDER / f"web-{name}.png"))
+    save(name, page.driver.get_screenshot_as_png())
 
 
 def fit(page: Page, width: int) -> None:
@@ -61,21 +130,29 @@ def fit(page: Page, width: int) -> None:
     page.until("return [...document.querySelectorAll('.plot canvas')].every((one) => one.width > 0)")
 
 
-def desktop(folder: Path, url: str) -> None:
+def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
     """The overview, and the page of a device, as who has logged in sees it."""
-    with browser(folder / "desktop", (1320, 560)) as page:
+    with browser(folder / "desktop", (1320, 900)) as page:
         page.driver.get(url)
-        page.until("return document.querySelectorAll('.card').length === arguments[0]", len(MODULES))
-        page.until("return [...document.querySelectorAll('.card .pill')].every((one) => one.innerText === 'running')")
+        page.until("return document.querySelectorAll('.card').length === arguments[0]", len(STATES))
+        for place, state in enumerate(STATES.values(), 1):
+            page.until_text(f".card:nth-child({place}) .pill", state)
         page.until_text(".card", "regression")
+        fit(page, 1320)
         shot(page, "overview")
         log_in(page, TOKEN)
-        page.driver.get(f"{url}#/device/bow")
-        page.driver.set_window_size(1320, 2400)
-        page.until("return Boolean(window.imud?.view?.plots)")
-        page.js(CHOOSE)
+        open_page(page, url, "bow")
+        bow.unplug(1.5)
+        daemon.wait_for("bow", "missing")
+        daemon.wait_for("bow", "running")
+        page.until_text("#event-list", "up")
+        page.until_text("#about", "mode is 6-axis, declared 9-axis")
+        page.click("#settings .buttons button")  # what was read before the module was there again
+        page.until("return document.querySelector('[data-setting=mode].differs')")
+        page.js("window.imud.view.clear()")  # the pause would be in the plots
+        choose(page, "#spectrum-of", "accel_m_s2")
         page.until(FULL)
-        page.until("return window.imud.view.spectrum.spectrum.segments.length >= 4")
+        page.until("return window.imud.view.spectrum.spectrum.segments.length >= 8")
         fit(page, 1320)
         shot(page, "device")
 
@@ -105,23 +182,26 @@ def calibration(folder: Path) -> None:
         page.click("#calibration [data-kind=magnetometer] button")
         page.until("return Number(document.querySelector('#calibration canvas').dataset.covered) > 12")
         (panel,) = page.driver.find_elements("css selector", "#calibration")
-        assert panel.screenshot(str(FOLDER / "web-calibration.png"))
+        save("calibration", panel.screenshot_as_png)
 
 
 def main() -> None:
     """Take all of them."""
     if MISSING:
         raise SystemExit(MISSING)
-    with ExitStack() as stack:
+    with ports(), ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-web-")))
-        devices = {name: stack.enter_context(module(folder, name)) for name in MODULES}
+        modules = {name: stack.enter_context(module(name)) for name in MODULES}
+        devices = {name: one.configuration for name, one in modules.items()}
+        devices[ABSENT] = configuration(ABSENT, "hipnuc-uart")
         daemon = stack.enter_context(running_daemon(folder, devices, python=()))
         for name in MODULES:
             daemon.wait_for(name, "running")
+        modules["crane"].stand_still()
         token = folder / "token"
         token.write_text(TOKEN)
         url = stack.enter_context(serving_web(daemon.socket, "--token-file", str(token)))
-        desktop(folder, url)
+        desktop(folder, url, modules["bow"], daemon)
         phone(folder, url)
     with tempfile.TemporaryDirectory(prefix="imud-web-") as name:
         calibration(Path(name))

@@ -1,0 +1,38 @@
+"""`python -m tests.web.vibrating`: `python -m imud.sim` with one motion more, `--motion engine`, for the pictures.
+
+A vessel whose engine runs: it rolls, pitches and yaws slowly, and shakes with the engine and twice as fast.
+"""
+
+import sys
+from math import pi
+from typing import Final
+
+from imud.sim.__main__ import main
+from imud.sim.physics.motion import MOTIONS, Motion, Sine, Swing
+
+ENGINE_HZ: Final = 31.0
+UP_M_S2: Final = 0.6
+"""Amplitude of the vertical vibration."""
+EAST_M_S2: Final = 0.15
+"""That of the horizontal one, at twice the frequency."""
+
+
+def shaking(amplitude_m_s2: float, frequency_hz: float) -> Sine:
+    """The position whose acceleration is a sine of this amplitude."""
+    return Sine(amplitude_m_s2 / (2 * pi * frequency_hz) ** 2, frequency_hz)
+
+
+def engine(gravity_m_s2: float) -> Motion:
+    """The motion `engine`."""
+    return Swing(
+        roll=(Sine(0.21, 0.13), Sine(0.03, 0.37, 0.4)),
+        pitch=(Sine(0.09, 0.17, 1.0), Sine(0.02, 0.41)),
+        yaw=(Sine(0.7, 0.021, 0.3), Sine(0.06, 0.11, 2.0)),
+        position_enu=((shaking(EAST_M_S2, 2 * ENGINE_HZ),), (), (Sine(0.3, 0.15), shaking(UP_M_S2, ENGINE_HZ))),
+        gravity_m_s2=gravity_m_s2,
+    )
+
+
+if __name__ == "__main__":
+    MOTIONS["engine"] = engine
+    sys.exit(main())
