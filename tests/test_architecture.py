@@ -204,6 +204,7 @@ MAY_READ_CLOCKS = (
     "imud.fleet.reader",
     "imud.sim.__main__",
     "imud.links",  # in the callback that reads, and in waits for the wire
+    "imud.runtime.event_loop",  # how long it still waits, by the clock of asyncio's timers
 )
 
 

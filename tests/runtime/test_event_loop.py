@@ -2,14 +2,17 @@
 
 import asyncio
 import os
+import selectors
 import signal
 import socket
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
-from imud.runtime.event_loop import SampleLoop, run
+from imud.runtime.event_loop import ReaderSelector, SampleLoop, run
 from tests.support.event_loops import in_loop
 
 TURNS = 3
@@ -227,12 +230,18 @@ async def test_a_reader_without_end_leaves_their_turns_to_tasks_timers_and_other
     ours, theirs = socket.socketpair()
     with flood, far, ours, theirs:
         far.send(b"never read")
-        loop.add_reader(flood, seen.append, "flood")
+        timer, late_s = loop.create_future(), time.monotonic() + 30
+
+        def note_flood() -> None:
+            seen.append("flood")
+            if time.monotonic() > late_s and not timer.done():
+                timer.set_exception(AssertionError("timers have no turn"))
+
+        loop.add_reader(flood, note_flood)
         loop.add_reader(ours, read, ours, seen, "other")
-        timer = loop.create_future()
         loop.call_later(0.001, timer.set_result, None)
         theirs.send(b"a")
-        await asyncio.wait_for(timer, 5)
+        await timer
         assert "other" in seen
         assert seen.count("flood") > 1
         loop.remove_reader(flood)
@@ -303,3 +312,125 @@ def test_a_reader_may_stop_the_loop(pair: tuple[socket.socket, socket.socket]) -
     theirs.send(b"a")
     loop.run_forever()
     loop.close()
+
+
+class CountingSelector(ReaderSelector):
+    """Counts the turns of its loop."""
+
+    turns = 0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self.turns += 1
+        return super().select(timeout)
+
+
+def test_the_loop_does_not_turn_for_readers_that_give_it_nothing(pair: tuple[socket.socket, socket.socket]) -> None:
+    ours, theirs = pair
+    selector = CountingSelector()
+    loop, calls, began = SampleLoop(selector), 100, list[int]()
+
+    def read_and_go_on() -> None:
+        ours.recv(1)
+        began.append(selector.turns)
+        theirs.send(b"a")
+        if len(began) == calls:
+            loop.stop()
+
+    loop.add_reader(ours, read_and_go_on)
+    theirs.send(b"a")
+    loop.run_forever()
+    assert began == calls * [1]
+    loop.close()
+
+
+def send_signal(loop: SampleLoop, done: asyncio.Future[None]) -> None:
+    """A signal comes a little later."""
+    loop.add_signal_handler(signal.SIGUSR1, done.set_result, None)
+    threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGUSR1)).start()
+
+
+@pytest.mark.parametrize(
+    "give",
+    [
+        lambda loop, done: loop.call_soon(done.set_result, None),
+        lambda loop, done: loop.call_later(0.001, done.set_result, None),
+        lambda loop, done: loop.call_at(loop.time() + 0.001, done.set_result, None),
+        lambda _loop, done: done.set_result(None),
+        lambda loop, done: loop.call_soon_threadsafe(done.set_result, None),
+        lambda loop, done: threading.Timer(0.01, loop.call_soon_threadsafe, (done.set_result, None)).start(),
+        lambda loop, done: loop.run_in_executor(None, int).add_done_callback(lambda _: done.set_result(None)),
+        lambda loop, done: loop.create_task(asyncio.sleep(0.001)).add_done_callback(lambda _: done.set_result(None)),
+        send_signal,
+    ],
+    ids=["soon", "later", "at", "future", "threadsafe", "thread", "executor", "task", "signal"],
+)
+def test_what_a_reader_gives_to_the_loop_is_done_at_once(
+    pair: tuple[socket.socket, socket.socket], give: Callable[[SampleLoop, asyncio.Future[None]], object]
+) -> None:
+    """Nothing else ends the wait of the loop: without its turn this would take as long as the next timer."""
+    ours, theirs = pair
+
+    async def main() -> None:
+        loop = loop_in_use()
+        done, begun_s = loop.create_future(), loop.time()
+
+        def read_and_give() -> None:
+            ours.recv(9)
+            give(loop, done)
+
+        loop.add_reader(ours, read_and_give)
+        loop.call_later(0.05, theirs.send, b"a")
+        await asyncio.wait_for(done, 30)
+        assert loop.time() - begun_s < 20
+        loop.remove_reader(ours)
+        loop.remove_signal_handler(signal.SIGUSR1)
+
+    was = signal.getsignal(signal.SIGUSR1)
+    run(main())
+    signal.signal(signal.SIGUSR1, was)
+
+
+@in_loop
+async def test_a_writer_that_a_reader_adds_is_called_at_once() -> None:
+    loop = loop_in_use()
+    ours, theirs = socket.socketpair()
+    done = loop.create_future()
+
+    def write() -> None:
+        loop.remove_writer(ours)
+        done.set_result(None)
+
+    def read_and_write() -> None:
+        ours.recv(9)
+        loop.add_writer(ours, write)
+
+    with ours, theirs:
+        loop.add_reader(ours, read_and_write)
+        loop.call_later(0.05, theirs.send, b"a")
+        await asyncio.wait_for(done, 30)
+        loop.remove_reader(ours)
+
+
+@in_loop
+async def test_a_descriptor_of_the_same_number_is_watched_from_the_next_wait_of_a_turn_on() -> None:
+    """The reader replaces its descriptor; what comes to the new one is seen though the loop did not turn."""
+    loop, seen = loop_in_use(), loop_in_use().create_future()
+    first, first_far = socket.socketpair()
+    second, second_far = socket.socketpair()
+
+    def take() -> None:
+        loop.remove_reader(first)
+        seen.set_result(first.recv(9))
+
+    def replace() -> None:
+        loop.remove_reader(first)
+        os.dup2(second.fileno(), first.fileno())
+        loop.add_reader(first, take)
+        second_far.send(b"new")
+
+    with first, first_far, second, second_far:
+        loop.add_reader(first, replace)
+        begun_s = loop.time()
+        loop.call_later(0.05, first_far.send, b"a")
+        assert await asyncio.wait_for(seen, 30) == b"new"
+        assert loop.time() - begun_s < 20

@@ -1,6 +1,6 @@
 """The real daemon on a pseudo-terminal, in virtual time: each wake-up of its event loop finds one read of the port.
 
-The module and the clients' reads have their turn where the loop would sleep (`_Feeder.select`), so the turns of the
+The module and the clients' reads have their turn where the loop would sleep (`_Feeder.poll`), so the turns of the
 loop, its ticks included, are those of a daemon in service.
 """
 
@@ -8,7 +8,6 @@ import asyncio
 import grp
 import os
 import select
-import selectors
 import socket
 from collections.abc import Iterator
 from typing import Final
@@ -30,20 +29,22 @@ CONNECT_MS: Final = 10
 BUFFER: Final = bytearray(1 << 20)
 
 
-class _Feeder(ReaderSelector):
-    """Gives the loop its next read when it would sleep; where none is left, the loop stops."""
+class _Feeder:
+    """Gives the loop its next read when it would sleep; where none is left, the loop stops. A `Poller`."""
 
     def __init__(self, master: int, slave: int) -> None:
-        super().__init__()
         self.loop: asyncio.AbstractEventLoop | None = None
         self.reads: Iterator[Read] = iter(())
         self.clients: list[socket.socket] = []
         self._master = master
         self._readable = select.poll()
         self._readable.register(slave, select.POLLIN)
+        self._epoll = select.epoll()
+        self.register, self.unregister, self.close = self._epoll.register, self._epoll.unregister, self._epoll.close
         self.wakes = 0
 
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+    def poll(self, timeout: float | None, maxevents: int) -> list[tuple[int, int]]:
+        """As that of an epoll, of a time that passes at once."""
         if timeout is None or timeout > 0:
             read = next(self.reads, None)
             if read is None:
@@ -51,7 +52,7 @@ class _Feeder(ReaderSelector):
                 self.loop.stop()
             else:
                 self._feed(read)
-        return super().select(0)
+        return self._epoll.poll(0, maxevents)
 
     def _feed(self, read: Read) -> None:
         virtual_time.set_now(read.t_rx_ns)
@@ -75,7 +76,7 @@ class VirtualDaemon:
         self._socket_path = f"{directory}/s"
         self._module = Module()
         self._feeder = _Feeder(self._master, slave)
-        self._loop = SampleLoop(self._feeder)
+        self._loop = SampleLoop(ReaderSelector(self._feeder))
         self._feeder.loop = self._loop
         self._running = self._loop.create_task(Daemon(_settings(directory, os.ttyname(slave))).run())
         self._pass_time(START_MS)
