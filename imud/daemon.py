@@ -9,7 +9,7 @@ import gc
 import logging
 import secrets
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -92,6 +92,8 @@ class Daemon:
         self._extra = dict(extra or {})
         self._until_finished = until_finished
         self._publishers: dict[str, Publisher] = {}
+        self._outputs: tuple[Callable[[Batch], None], ...] = ()
+        """Where samples go: `publish` of all publishers that have one."""
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
@@ -192,6 +194,7 @@ class Daemon:
         self._put_off.pop(name, None)
         if name in self._publishers:
             self._publishers.pop(name).close()
+            self._note_outputs()
         try:
             self._start_configured(name)
         except ServerError as error:
@@ -260,6 +263,11 @@ class Daemon:
             publisher.add_device(device_name, device.device_id)
         publisher.start()
         self._publishers[name] = publisher
+        self._note_outputs()
+
+    def _note_outputs(self) -> None:
+        found = [publisher.publish for publisher in self._publishers.values()]
+        self._outputs = tuple(publish for publish in found if publish is not None)
 
     def _start_device(self, config: DeviceConfig) -> None:
         device_id = self._ids.setdefault(config.name, len(self._ids))
@@ -301,8 +309,8 @@ class Daemon:
         self._stop.set()
 
     def _publish(self, batch: Batch) -> None:
-        for publisher in self._publishers.values():
-            publisher.publish(batch)
+        for publish in self._outputs:
+            publish(batch)
 
     def _send_event(self, event: Event) -> None:
         for publisher in self._publishers.values():

@@ -158,6 +158,24 @@ def test_reload_changes_what_differs_and_keeps_the_rest(tmp_path: Path) -> None:
         assert samples(daemon, "stern") == 2
 
 
+def test_an_output_that_is_changed_gets_the_samples_in_place_of_the_old_one(tmp_path: Path) -> None:
+    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
+        daemon.wait_for("bow", "searching")
+        port.send(3)
+        wait_until(lambda: samples(daemon) == 3, "three samples")
+        for place in ("first", "second"):
+            (tmp_path / place).mkdir(mode=0o755)
+            ring = tmp_path / place / "imud.bow"
+            write_config(tmp_path, {"bow": device(port.name)}, shm={"directory": str(tmp_path / place)})
+            daemon.signal(signal.SIGHUP)
+            wait_until(ring.exists, "the new ring is there")
+            port.send(2)
+            newest = {"first": 5, "second": 7}[place]
+            wait_until(lambda: samples(daemon) == newest, "two more samples")  # noqa: B023 - it is called here
+            assert Ring(ring).newest_seq == newest
+        assert daemon.statuses()["bow"].connects == 1
+
+
 def test_bad_new_file_leaves_the_old_running(tmp_path: Path) -> None:
     with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
         daemon.wait_for("bow", "searching")

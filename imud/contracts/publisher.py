@@ -54,9 +54,10 @@ class Batch:
 
     def slots(self) -> list[bytes]:
         """The samples as slots (`imud.formats.slot`), encoded on first use."""
-        if self._slots is None:
-            self._slots = encode_slots(self.samples, self.device_id)
-        return self._slots
+        slots = self._slots
+        if slots is None:
+            slots = self._slots = encode_slots(self.samples, self.device_id)
+        return slots
 
     def converted(self, convention: Convention | None) -> "Batch":
         """Return the samples in a convention, turned on first use; None is as they are published."""
@@ -75,6 +76,14 @@ class Batch:
 class Publisher(Protocol):
     """An output of samples. Every method returns at once and is called in the event loop's thread only."""
 
+    @property
+    def publish(self) -> Callable[[Batch], None] | None:
+        """Gives samples to readers; drops and counts them for slow readers. None for an output without samples.
+
+        It stays the same from `start` on: the daemon looks it up once.
+        """
+        ...
+
     def start(self) -> None:
         """Open what it needs (files, sockets, threads). Raises ServerError. Needs a running asyncio loop."""
         ...
@@ -85,10 +94,6 @@ class Publisher(Protocol):
 
     def remove_device(self, name: str) -> None:
         """Remove a device that left the configuration."""
-        ...
-
-    def publish(self, batch: Batch) -> None:
-        """Give the samples to readers; drop and count them for slow readers."""
         ...
 
     def event(self, event: Event) -> None:

@@ -68,6 +68,10 @@ class RateThinner:
         self._users: dict[float, int] = {}
         self._newest_ns = 0
 
+    def __bool__(self) -> bool:
+        """Whether any rate is wanted."""
+        return bool(self._paces)
+
     def add(self, rate_hz: float) -> None:
         """Choose samples for this rate, too; it may be wanted several times."""
         self._users[rate_hz] = self._users.get(rate_hz, 0) + 1

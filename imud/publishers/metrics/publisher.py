@@ -25,7 +25,7 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample as Line
 
-from imud.contracts.publisher import Batch, PublisherContext, PublisherType
+from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.contracts.settings import Settings, is_ip_address, shown
 from imud.contracts.status import ClientStatus
 from imud.event import Event
@@ -177,6 +177,9 @@ def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]
 class MetricsPublisher:
     """Publisher of metrics. Synchronization: the event loop's thread; `_answer` runs in the HTTP thread."""
 
+    publish: Final = None
+    """Samples are counted by the pipeline."""
+
     def __init__(self, settings: MetricsSettings, context: PublisherContext, *, snapshot_s: float = SNAPSHOT_S) -> None:
         self._settings = settings
         self._context = context
@@ -214,9 +217,6 @@ class MetricsPublisher:
         """Forget the device's events."""
         for key in [key for key in self._events if key[0] == name]:
             del self._events[key]
-
-    def publish(self, batch: Batch) -> None:
-        """No-op: samples are counted by the pipeline."""
 
     def event(self, event: Event) -> None:
         """Count it."""

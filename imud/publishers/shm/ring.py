@@ -78,20 +78,21 @@ class ShmRing:
             self._restore_size()
             self._newest = samples[-1].seq
             return
-        if len(slots) > 1 and self._write_run(samples[0].seq, samples[-1].seq, slots):
-            return
-        memory, words, mask, newest = self._memory, self._words, self._mask, self._newest
-        for sample, slot in zip(samples, slots):  # noqa: B905  # `strict` costs 0.1 µs; a batch has a slot per sample
-            seq = sample.seq
-            at = HEADER_BYTES + (seq & mask) * SLOT_BYTES
-            word = at >> 3
-            words[word] = SEQ_INVALID
-            memory[at + 8 : at + SLOT_BYTES] = slot[8:]
-            words[word] = words[NEWEST_WORD] = seq  # from left to right
-            if seq != newest + 1:  # samples in between were never here: readers must not wait for them
-                words[FIRST_WORD] = seq
-            newest = seq
-        self._newest = newest
+        if len(slots) == 1:
+            self._write_one(samples[0].seq, slots[0])
+        elif not self._write_run(samples[0].seq, samples[-1].seq, slots):
+            for sample, slot in zip(samples, slots, strict=True):
+                self._write_one(sample.seq, slot)
+
+    def _write_one(self, seq: int, slot: bytes) -> None:
+        words, at = self._words, HEADER_BYTES + (seq & self._mask) * SLOT_BYTES
+        word = at >> 3
+        words[word] = SEQ_INVALID
+        self._memory[at + 8 : at + SLOT_BYTES] = slot[_PAYLOAD]
+        words[word] = words[NEWEST_WORD] = seq  # from left to right
+        if seq != self._newest + 1:  # samples in between were never here: readers must not wait for them
+            words[FIRST_WORD] = seq
+        self._newest = seq
 
     def _write_run(self, first: int, last: int, slots: Sequence[bytes]) -> bool:
         """Write slots back to back: all are invalid before the first payload is stored, and until the last one is.

@@ -87,7 +87,10 @@ class BinaryEncoding:
 
     def encode(self, batch: Batch) -> list[bytes]:
         """Every sample of the batch as a frame."""
-        return [_SLOT_HEADER + slot for slot in batch.slots()]
+        slots = batch.slots()
+        if len(slots) == 1:  # the usual case, without a call for the list
+            return [_SLOT_HEADER + slots[0]]
+        return [_SLOT_HEADER + slot for slot in slots]
 
     def encode_one(self, batch: Batch, index: int) -> bytes:
         """One sample of the batch as a frame."""

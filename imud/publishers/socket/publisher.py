@@ -17,7 +17,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-from imud.contracts.publisher import Batch, PublisherContext, PublisherType
+from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.contracts.settings import Settings, shown
 from imud.errors import reason_of
 from imud.event import Event
@@ -80,6 +80,7 @@ class SocketServer:
         """What is held for clients."""
         self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.now_ns())
         self.hub = Hub(settings.path, context, self._quota, self._time, self.pool)
+        self.publish: Final = self.hub.publish
         self._side: ServerSide | None = None
         self._listener: Listener | None = None
         self._guard = Guard(os.geteuid(), None, None)
@@ -119,10 +120,6 @@ class SocketServer:
     def remove_device(self, name: str) -> None:
         """A device leaves."""
         self.hub.remove_device(name)
-
-    def publish(self, batch: Batch) -> None:
-        """Send the batch to the clients that watch its device."""
-        self.hub.publish(batch)
 
     def event(self, event: Event) -> None:
         """Send the event to the clients that asked for it."""

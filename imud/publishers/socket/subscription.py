@@ -11,7 +11,7 @@ from imud.frames.conventions import Convention
 from imud.publishers.socket.encoding import BinaryEncoding, ConvertedEncoding, Encoding, JsonEncoding
 from imud.publishers.socket.outbox import Delivery, Outbox
 from imud.publishers.socket.serving import TokenBucket
-from imud.publishers.thinning import RateThinner
+from imud.publishers.thinning import NOTHING, RateThinner
 
 PUBLISH_NS: Final = 1_000_000
 """Sending a batch takes so long at most; the clients that are left are served by the scheduler, in several turns."""
@@ -192,6 +192,10 @@ class DeliveryPlan:
         self._thinner = RateThinner()
         self._groups: dict[FormKey, DeliveryGroup] = {}
         self._order: tuple[DeliveryGroup, ...] = ()
+        self._only: DeliveryGroup | None = None
+        """The group of a plan that has one, of few clients."""
+        self._thins = False
+        """Whether any client has a rate."""
 
     def __len__(self) -> int:
         return len(self._groups)
@@ -206,6 +210,7 @@ class DeliveryPlan:
         group.add(outbox, wanted.rate_hz)
         if wanted.rate_hz:
             self._thinner.add(wanted.rate_hz)
+        self._note_groups()
 
     def discard(self, wanted: Subscription, outbox: Outbox) -> None:
         """Send to a client no more; no-op if absent."""
@@ -218,6 +223,12 @@ class DeliveryPlan:
         if group.discard(outbox):
             del self._groups[key]
             self._order = tuple(self._groups.values())
+        self._note_groups()
+
+    def _note_groups(self) -> None:
+        order = self._order
+        self._thins = bool(self._thinner)
+        self._only = order[0] if len(order) == 1 and order[0].is_small else None
 
     def send(self, batch: Batch, now_ns: Callable[[], int], time: TokenBucket) -> None:
         """Send a batch to all clients of the plan: to few at once, to many for PUBLISH_NS, then through their queues.
@@ -227,9 +238,9 @@ class DeliveryPlan:
         groups = self._order
         if not groups:
             return
-        chosen = self._thinner.choose(batch.samples)
-        if len(groups) == 1 and groups[0].is_small:
-            groups[0].send(batch, chosen, now_ns, NEVER_NS)
+        chosen = self._thinner.choose(batch.samples) if self._thins else NOTHING
+        if self._only is not None:
+            self._only.send(batch, chosen, now_ns, NEVER_NS)
             return
         begun_ns = now_ns()
         time.fill(begun_ns)

@@ -34,6 +34,7 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
         made.start()
         made.add_device("imu0", 0)
         made.tick(bench.advance(0.1))
+        assert made.publish is not None
         made.publish(batch("imu0"))
         made.remove_device("imu0")
         made.close()
