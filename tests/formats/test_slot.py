@@ -187,3 +187,22 @@ def test_a_batch_is_its_samples_one_by_one_also_where_one_does_not_fit() -> None
         slots = encode_slots(batch, 9)
         assert slots == [encode_slot(sample, 9) for sample in batch]
         assert [decode_slot(slot, "imu0").seq for slot in slots] == [sample.seq for sample in batch]
+
+
+HI91: dict[str, Any] = {
+    "t_dev_ns": 12, "accel_m_s2": (0.25, -1.0, 9.75), "gyro_rad_s": (1.5, 2.5, 3.5), "mag_t": (1e-5, 2e-5, 3e-5),
+    "quat_wxyz": (0.5, -0.5, 0.5, -0.5), "euler_rad": (0.125, 0.25, 0.375), "temperature_c": -31,
+    "pressure_pa": 101_325, "pps_age_ms": 17,
+}  # fmt: skip
+OTHERS: dict[str, Any] = {"incli_rad": (0.5, 0.25), "status": 5, "edge_seq": 3}
+
+
+@pytest.mark.parametrize("at", [0, 2])
+@pytest.mark.parametrize("name", PRESENT_BITS)
+def test_a_batch_of_hi91_messages_is_its_samples_one_by_one_also_where_one_has_other_values(name: str, at: int) -> None:
+    batch = [msgspec.structs.replace(BARE, seq=10 + n, t_ns=20 + n, sync=Sync.REGRESSION, **HI91) for n in range(3)]
+    assert encode_slots(batch, 9) == [encode_slot(sample, 9) for sample in batch]
+    batch[at] = msgspec.structs.replace(batch[at], **{name: OTHERS.get(name)})
+    slots = encode_slots(batch, 9)
+    assert slots == [encode_slot(sample, 9) for sample in batch]
+    assert getattr(decode_slot(slots[at], "imu0"), name) == OTHERS.get(name)
