@@ -5,18 +5,20 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
 from imud.client import Client
 from imud.client.connection import default_path
-from imud.contracts.driver import Driver
-from imud.contracts.sensors.deviations import Deviations
 from imud.contracts.settings import Settings, unknown_name, value_problem, wrong_values
 from imud.contracts.status import DeviceStatus
 from imud.errors import BadArgument
 from imud.sample import SAMPLE_FIELDS
+
+if TYPE_CHECKING:  # what drivers promise takes as long to import as all that `imud status` needs
+    from imud.contracts.driver import Driver
+    from imud.contracts.sensors.deviations import Deviations
 
 SECONDS_OF: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 DURATION: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
@@ -108,7 +110,7 @@ def add_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def given_options(driver: Driver, words: Sequence[str]) -> dict[str, object]:
+def given_options(driver: "Driver", words: Sequence[str]) -> dict[str, object]:
     """Check the options; return them by name. Raises BadArgument naming what was expected."""
     options = dict(map(argument, words))
     fields = {field.name: field for field in msgspec.structs.fields(driver.settings)}
@@ -120,7 +122,7 @@ def given_options(driver: Driver, words: Sequence[str]) -> dict[str, object]:
     return options
 
 
-def driver_settings(driver: Driver, options: Mapping[str, object]) -> Settings:
+def driver_settings(driver: "Driver", options: Mapping[str, object]) -> Settings:
     """Make the driver's settings from these options. Raises BadArgument for options that exclude each other."""
     for wrong in wrong_values(driver.settings, options, "option"):
         raise BadArgument(f"--option {wrong}")
@@ -138,7 +140,7 @@ def add_noise(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def noise_by_device(reports: Sequence[Path]) -> dict[str, Deviations]:
+def noise_by_device(reports: Sequence[Path]) -> "dict[str, Deviations]":
     """Return what reports say, by the name of the device; of two of one device the later wins. Raises ImudError."""
     from imud.bridges.noise_file import read_noise  # not part of every command's start
 

@@ -19,6 +19,7 @@ from tests.bench.rows import Row
 PARTS = (
     "decode", "clock", "clock_table", "clock_lines", "lines", "polling", "modbus", "can", "can_devices", "detect",
     "shm", "socket", "metrics", "end_to_end", "latency", "clock_hold", "gpsd", "sout", "recording", "mqtt", "web",
+    "start",
 )  # fmt: skip
 SHORT_LIMIT_S: Final = 300.0
 LAB_PARTS: Final = ("can",)

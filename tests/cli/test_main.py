@@ -73,3 +73,24 @@ def test_help_of_all_imports_no_command() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=20, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
     assert "calibrate" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "foreign"),
+    [(["--help"], set()), (["status", "--socket", "/nonexistent/socket"], {"msgspec", "typing_extensions"})],
+    ids=["help", "status"],
+)
+def test_what_is_called_often_imports_nothing_heavy(arguments: list[str], foreign: set[str]) -> None:
+    """Of other packages msgspec alone, and nothing of asyncio, TLS, HTTP or what drivers promise: each takes as long to
+    import as the command needs (`python -m tests.bench.start`)."""
+    program = (
+        "import sys\nbefore = set(sys.modules)\nfrom imud.cli import main\ntry:\n"
+        f"    main({arguments!r})\nexcept SystemExit:\n    pass\nprint()\nprint(*sys.modules.keys() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=20, check=True)
+    loaded = set(done.stdout.splitlines()[-1].split())
+    assert "imud.cli" in loaded
+    tops = {name.partition(".")[0] for name in loaded}
+    assert tops - sys.stdlib_module_names - {"imud"} <= foreign
+    assert not tops & {"asyncio", "ssl", "http", "email", "multiprocessing", "concurrent", "sqlite3", "unittest", "xml"}
+    assert not loaded & {"imud.daemon", "imud.contracts.driver", "imud.contracts.session", "imud.devices", "imud.clock"}
