@@ -6,7 +6,8 @@ On every core a program computes without end, another writes to disk without end
 the services of systemd are. A pty's bytes pass through a kernel worker, which competes with the programs as an ordinary
 task; those of a UART do not, so that the workers run at SCHED_FIFO while this measures, as do writer and reader: the
 figures are to be imud's. What is left is the kernel's own, and is measured first: how late a program at SCHED_FIFO runs
-that only waits for a timer of 1 kHz (a kernel without preemption lets a write to disk go on for milliseconds).
+that only waits for a timer of 1 kHz (in the preemption mode `none` a write to disk goes on for milliseconds); the mode
+is printed, as far as it can be known.
 
 Needs root. `python -m tests.bench busy`, or more rounds: `python -m tests.bench.busy 6`.
 """
@@ -211,8 +212,16 @@ def _schedule(pids: Sequence[int], policy: int, priority: int) -> None:
             os.sched_setscheduler(pid, policy, os.sched_param(priority))
 
 
+def preemption() -> str:
+    """What can be known of the kernel's preemption: the mode in force, or what it was built with."""
+    with suppress(OSError):
+        return f"preemption: {Path('/sys/kernel/debug/sched/preempt').read_text().strip()}"
+    return f"preemption: mode not readable (debugfs), uname -v: {os.uname().version}"
+
+
 def main() -> None:
     """Run as `python -m tests.bench.busy [ROUNDS]`: one line per setting and round."""
+    print(preemption())
     with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
         print(f"{'a timer alone, fifo':32} {timer(8.0)}", flush=True)
         for number in range(int(sys.argv[1]) if len(sys.argv) > 1 else ROUNDS):
