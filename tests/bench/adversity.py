@@ -1,15 +1,15 @@
 """What a clock meets: devices, links and hosts with a fault each, simulated with the truth known (for `clock_table`).
 
 The way of a message is that of `ArrivalModel`; here its parts misbehave. What no arrival can show, the constant part of
-a link's delay, differs from machine to machine: each seed is another machine, spread evenly over what imud allows for
-(`LinkDelay`), with another crystal. A stated error can be judged over several machines only: on one of them the
-constant part is whatever it is.
+a link's delay, differs from machine to machine: each seed is another machine (`machine_of`), within what imud allows
+for (`LinkDelay`), with another crystal, FIFO and timer. A stated error can be judged over several machines only: on one
+of them the constant part is whatever it is.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import pi, sin
+from math import ceil, pi, sin
 from random import Random
 from typing import Final, NamedTuple
 
@@ -20,12 +20,60 @@ from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 SECONDS: Final = 120
 WakeLaw = Callable[[Random, float], float]
 """Wake-up of a read at a host time, ns, above the machine's shortest."""
-SKEWS_PPM: Final = (12.0, -43.0, 50.0, -7.0, 28.0, 0.0)
-TIMERS_PPM: Final = (-30.0, 14.0, 3.0, -11.0, 40.0, 0.0)
-WAKE_MOST_NS: Final = 90 * NS_PER_US
-POLL_NS: Final = 60 * NS_PER_US
-"""Wait for a USB poll that differs from read to read; as much again is the machine's own."""
 STAMP_MODULUS: Final = 8192
+
+
+# --- machines -------------------------------------------------------------------------------------------------------
+
+WAKE_LEAST_NS: Final = 5 * NS_PER_US
+"""An interrupt and a switch to a process that waits: no host is faster."""
+WAKE_MOST_NS: Final = 90 * NS_PER_US
+"""Shortest wake-up of a machine, above that, at most: what imud takes as the bound (`LinkDelay`)."""
+POLL_NS: Final = 60 * NS_PER_US
+"""Wait for a USB poll that differs from read to read; as much again at most is the machine's own. Both together are a
+microframe of USB 2.0, 125 µs."""
+FIFO_MOST_BYTES: Final = 4.0
+"""A 16550 reports what is below its trigger level after four characters; one without a FIFO at once."""
+CRYSTAL_PPM: Final = 50.0
+"""Tolerance of a usual crystal, of a device and of an adapter's timer. More makes it easier to see through a timer: it
+beats with the samples sooner. Crystals that are 5 % off are in the table of `clock`."""
+
+
+class Machine(NamedTuple):
+    """What one installation has and another has otherwise. The shares are of the bounds above, from 0 to 1."""
+
+    wake: float
+    poll: float
+    fifo: float
+    timer_ppm: float
+    skew_ppm: float
+
+    def profile(self, link: "Link", name: str) -> ArrivalProfile:
+        """Return its delays on a link."""
+        poll = POLL_NS if link.timer_ns else 0
+        return ArrivalProfile(
+            name, timer_ns=link.timer_ns, timer_ppm=self.timer_ppm, packet_bytes=link.packet_bytes, poll_ns=poll,
+            fifo_bytes=0 if link.timer_ns else FIFO_MOST_BYTES * self.fifo,
+            floor_ns=WAKE_LEAST_NS + int(self.wake * WAKE_MOST_NS + self.poll * poll),
+        )  # fmt: skip
+
+
+NAMED: Final = tuple(
+    Machine((i + 0.5) / 6, (2 * i % 6 + 0.5) / 6, (2 * i % 6 + 0.5) / 6, timer_ppm, skew_ppm)
+    for i, (timer_ppm, skew_ppm) in enumerate(
+        ((-30.0, 12.0), (14.0, -43.0), (3.0, 50.0), (-11.0, -7.0), (40.0, 28.0), (0.0, 0.0))
+    )
+)
+"""Machines of seeds 0 to 5: spread evenly, and one in lockstep. The figures of `clock_table.json` are of these."""
+
+
+def machine_of(seed: int) -> Machine:
+    """Return the machine of a seed: one of `NAMED`, or drawn evenly from all that a machine can be."""
+    if seed < len(NAMED):
+        return NAMED[seed]
+    random = Random(f"machine {seed}")
+    tolerance = partial(random.uniform, -CRYSTAL_PPM, CRYSTAL_PPM)
+    return Machine(random.random(), random.random(), random.random(), tolerance(), tolerance())
 
 
 # --- links ----------------------------------------------------------------------------------------------------------
@@ -102,6 +150,31 @@ class Stalls:
         return since_ns - at + self.for_ns if since_ns >= self.from_ns and at < self.for_ns else since_ns
 
 
+@dataclass(frozen=True, slots=True)
+class HostClocks:
+    """What happens to the clocks of a host, in seconds from the first sample on."""
+
+    name: str
+    slews: tuple[tuple[float, float], ...] = ()
+    """(from then on, CLOCK_MONOTONIC runs so many ppm fast)."""
+    steps: tuple[tuple[float, float], ...] = ()
+    """(then, CLOCK_REALTIME is set forward by so many seconds)."""
+    suspend_s: tuple[float, float] | None = None
+    """(then, for so long): CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stand still, the device runs on unheard."""
+    stop_s: tuple[float, float] | None = None
+    """(then, for so long): the virtual machine does not run, and its clocks go on. What comes beyond WAITING_BYTES in
+    that time is lost."""
+
+    def stepped_ns(self, since_ns: int) -> int:
+        """How far CLOCK_REALTIME has been set forward by then: by steps, or by the time of a suspend."""
+        steps = (*self.steps, self.suspend_s) if self.suspend_s else self.steps
+        return sum(int(step_s * NS_PER_S) for at_s, step_s in steps if since_ns >= at_s * NS_PER_S)
+
+
+WAITING_BYTES: Final = 256
+"""Receive buffer of an FT232."""
+
+
 # --- devices --------------------------------------------------------------------------------------------------------
 
 
@@ -145,6 +218,8 @@ class Cell:
     device: Device = field(default_factory=Device)
     wake: WakeLaw = QUIET
     stalls: Stalls | None = None
+    host: HostClocks | None = None
+    """None: its clocks are left alone."""
 
     @property
     def name(self) -> str:
@@ -169,6 +244,7 @@ class _AdverseModel(ArrivalModel):
         if device.ticks_before_wrap is not None:
             dev_ns += ((1 << 32) - device.ticks_before_wrap) * NS_PER_MS - 5e12
         rates, restarts, rate = list(device.rates_hz), list(device.restarts_s), 1.0
+        suspend = self.cell.host.suspend_s if self.cell.host else None
         for _ in range(count):
             since_s = (t_ns - begin_ns) / NS_PER_S
             if rates and since_s >= rates[0][0]:
@@ -179,6 +255,11 @@ class _AdverseModel(ArrivalModel):
             if restarts and since_s >= restarts[0]:
                 restarts.pop(0)
                 t_ns, dev_ns = t_ns + 2 * NS_PER_S, 4e8 + random.random() * NS_PER_MS
+            if suspend and since_s >= suspend[0]:
+                unheard_ns, suspend = suspend[1] * NS_PER_S, None
+                samples = ceil(unheard_ns * rate / NS_PER_S)
+                dev_ns += samples * NS_PER_S / rate
+                t_ns += samples * NS_PER_S / rate / (1 + self.skew_ppm * 1e-6) - unheard_ns
             yield t_ns, dev_ns
             ppm = self.skew_ppm + device.swing_ppm * sin(2 * pi * since_s / device.swing_s)
             dev_ns += NS_PER_S / rate
@@ -209,27 +290,16 @@ class _AdverseModel(ArrivalModel):
             first = last + 1
 
 
-def _machine(cell: Cell, seed: int, of: int) -> ArrivalProfile:
-    """The link on machine `seed` of so many."""
-    link, part = cell.link, ((seed + 0.5) / of, (seed * 2 % of + 0.5) / of)
-    poll = POLL_NS if link.timer_ns else 0
-    return ArrivalProfile(
-        cell.name, timer_ns=link.timer_ns, timer_ppm=TIMERS_PPM[seed % len(TIMERS_PPM)], packet_bytes=link.packet_bytes,
-        poll_ns=poll, fifo_bytes=0 if link.timer_ns else 4 * part[1],
-        floor_ns=5 * NS_PER_US + int(part[0] * WAKE_MOST_NS + part[1] * poll),
-    )  # fmt: skip
-
-
-def messages(cell: Cell, seed: int, of: int, seconds: int = SECONDS) -> Iterator[Message]:
-    """The messages of a run on machine `seed` of so many."""
-    device, random = cell.device, Random(f"loss {cell.name} {seed}")
+def messages(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Message]:
+    """The messages of a run on the machine of that seed. Times are those of a clock that nothing steers."""
+    device, random, machine = cell.device, Random(f"loss {cell.name} {seed}"), machine_of(seed)
     model = _AdverseModel(
-        _machine(cell, seed % of, of), 1.0, seed, baud=cell.link.baud, size_bytes=device.size_bytes, cell=cell,
-        skew_ppm=SKEWS_PPM[seed % len(SKEWS_PPM)],
+        machine.profile(cell.link, cell.name), 1.0, seed, baud=cell.link.baud, size_bytes=device.size_bytes, cell=cell,
+        skew_ppm=machine.skew_ppm,
     )  # fmt: skip
     ends = [at for at, _ in device.rates_hz[1:]] + [float(seconds)]
     count = int(sum(rate * (end - at) for (at, rate), end in zip(device.rates_hz, ends, strict=True) if end > at))
-    for number, a in enumerate(model.run(count)):
+    for number, a in _heard(enumerate(model.run(count)), cell, model.begin_ns):
         if device.loss and random.random() < device.loss:
             continue
         if device.loss_burst_s is not None:
@@ -237,6 +307,23 @@ def messages(cell: Cell, seed: int, of: int, seconds: int = SECONDS) -> Iterator
             if (a.t_ns - model.begin_ns) / NS_PER_S % every < for_:
                 continue
         yield Message(a.t_ns, _measurement(device, a, number), a.t_rx_ns, a.t_rx_ns if cell.link is CAN else None)
+
+
+def _heard(arrivals: Iterator[tuple[int, Arrival]], cell: Cell, begin_ns: int) -> Iterator[tuple[int, Arrival]]:
+    """What a virtual machine gets that may have been stopped: the first of what came meanwhile, in one read."""
+    if cell.host is None or cell.host.stop_s is None:
+        yield from arrivals
+        return
+    at_s, for_s = cell.host.stop_s
+    stop_ns = begin_ns + int(at_s * NS_PER_S)
+    end_ns = stop_ns + int(for_s * NS_PER_S)
+    room = WAITING_BYTES // cell.device.size_bytes
+    for number, a in arrivals:
+        if not stop_ns <= a.t_rx_ns < end_ns:
+            yield number, a
+        elif room:
+            room -= 1
+            yield number, replace(a, t_rx_ns=end_ns, trailing_bytes=room * a.size_bytes if cell.link.baud else 0)
 
 
 def _measurement(device: Device, a: Arrival, number: int) -> Measurement:
