@@ -72,7 +72,7 @@ def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path,
 
 def test_without_the_token_a_calibration_is_seen_and_not_controlled(page: Page, tmp_path: Path, token: str) -> None:
     with (
-        turned_module(tmp_path) as daemon,
+        turned_module(tmp_path, speed=1) as daemon,  # it does not end before it is stopped
         serving_web(daemon.socket, "--token-file", token) as url,
         ThreadPoolExecutor(1) as pool,
     ):

@@ -48,7 +48,10 @@ def test_what_is_plotted_is_what_was_sent_and_every_peak_of_it(page: Page, tmp_p
             assert page.problems() == []
     assert len(times) == len(least) == len(greatest) >= 80
     assert all(np.diff(times) > 0)
-    assert set(np.round(least, 4)) <= {9.5}, "ten samples are in each bucket, and one of forty is a peak"
+    lowest = {
+        value for value, most in zip(np.round(least, 4), greatest, strict=True) if value < 15 or most > value + 1e-4
+    }
+    assert lowest == {9.5}, "one of forty samples is a peak, alone in its bucket only where the machine was late"
     known = np.array([peaks(number) for number in range(measured)])
     plotted = [value for value in greatest if value > 15]
     assert len(plotted) >= 10, "a peak each 0.2 s"

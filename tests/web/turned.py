@@ -20,9 +20,9 @@ BIAS: Final = "bias 14.14, -2.08, -8.75 µT"
 
 
 @contextmanager
-def turned_module(folder: Path) -> Iterator[RunningDaemon]:
+def turned_module(folder: Path, speed: float = SPEED) -> Iterator[RunningDaemon]:
     """A daemon with a module in nine-axis mode, `bow`, that is turned, and has iron beside it."""
-    motion = Swing(roll=(Sine(3.1, 0.043 * SPEED),), pitch=(Sine(1.4, 0.071 * SPEED),), yaw=(Sine(3.1, 0.037 * SPEED),))
+    motion = Swing(roll=(Sine(3.1, 0.043 * speed),), pitch=(Sine(1.4, 0.071 * speed),), yaw=(Sine(3.1, 0.037 * speed),))
     hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T)
     module = HipnucModule(monotonic_ns(), ModuleSettings(att_mode=1), hardware)
     with plugged(folder / "port", module) as path:
