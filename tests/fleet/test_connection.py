@@ -80,6 +80,20 @@ def test_only_what_was_acknowledged_is_done_with(broker: Mosquitto, gateway: Sen
     assert asyncio.run(play()) == ["imud/2", "imud/3"]
 
 
+async def waiting_and_taken(connection: ReaderConnection, count: int) -> tuple[int, list[int]]:
+    """How many messages wait in the reader when all that could come have come; then take all."""
+    for _ in range(100):
+        await asyncio.sleep(0.001)
+    most, found = connection.waiting, []
+    for _ in range(count):
+        delivery = await connection.next(LIMIT_S)
+        assert delivery is not None
+        connection.acknowledge(delivery.number)
+        found.append(int(delivery.topic.removeprefix("imud/")))
+    connection.close()
+    return most, found
+
+
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
 @pytest.mark.parametrize("scheme", ["mqtt", "mqtts"])
 def test_a_broker_that_sends_without_bound_waits_for_the_reader(
@@ -102,16 +116,7 @@ def test_a_broker_that_sends_without_bound_waits_for_the_reader(
                 await sending
                 while connection.waiting <= RECEIVE_MAX // 2:
                     await asyncio.sleep(0)
-            for _ in range(100):  # what could come comes now
-                await asyncio.sleep(0.001)
-        most, found = connection.waiting, []
-        for _ in range(count):
-            delivery = await connection.next(LIMIT_S)
-            assert delivery is not None
-            connection.acknowledge(delivery.number)
-            found.append(int(delivery.topic.removeprefix("imud/")))
-        connection.close()
-        return most, found
+        return await waiting_and_taken(connection, count)
 
     with running_broker(tmp_path / "broker", "per_listener_settings true", *lines):
         most, found = asyncio.run(play())
@@ -129,16 +134,7 @@ def test_large_messages_that_nobody_takes_wait_at_the_broker(broker: Mosquitto, 
             await sending
             while connection.waiting <= WAITING_BYTES // 2 // size:
                 await asyncio.sleep(0)
-        for _ in range(100):  # what could come comes now
-            await asyncio.sleep(0.001)
-        most, found = connection.waiting, []
-        for _ in range(count):
-            delivery = await connection.next(LIMIT_S)
-            assert delivery is not None
-            connection.acknowledge(delivery.number)
-            found.append(int(delivery.topic.removeprefix("imud/")))
-        connection.close()
-        return most, found
+        return await waiting_and_taken(connection, count)
 
     most, found = asyncio.run(play())
     assert most * size <= WAITING_BYTES + 2 * size, "a read takes two messages at most beyond the bound"
