@@ -55,20 +55,24 @@ devices:
     return file
 
 
-def new_files(folder: Path, before: set[Path]) -> list[Path]:
-    """Files that have begun since."""
-    return [one for one in (folder / "recordings").glob("*") if one not in before and one.stat().st_size]
+def new_files(folder: Path, before: set[Path], least_bytes: int) -> list[Path]:
+    """Files that have begun since, and have that size."""
+    found = (one for one in (folder / "recordings").glob("*") if one not in before)
+    return [one for one in found if one.stat().st_size >= least_bytes]
 
 
-def run_and_kill(folder: Path, after_s: float) -> tuple[Path, int]:
-    """Run a daemon and kill it so long after its file has begun; returns the file, and CLOCK_MONOTONIC of the kill."""
+def run_and_kill(folder: Path, after_s: float, least_bytes: int = 1) -> tuple[Path, int]:
+    """Run a daemon and kill it so long after its file has that size.
+
+    Returns the file, and CLOCK_MONOTONIC of the kill.
+    """
     before = set((folder / "recordings").glob("*"))
     daemon = subprocess.Popen(
         [sys.executable, "-m", "imud", "run", "--config", str(configured(folder))], stderr=subprocess.DEVNULL
     )
     try:
         end_s = time.monotonic() + 60
-        while not (new := new_files(folder, before)):
+        while not (new := new_files(folder, before, least_bytes)):
             assert daemon.poll() is None, f"the daemon ended with {daemon.returncode}"
             assert time.monotonic() < end_s, "no file begins"
             time.sleep(0.01)
