@@ -18,7 +18,7 @@ from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceState
 from imud.devices import DRIVERS
 from imud.event import Event, EventKind
-from imud.formats.recording.records import records_of
+from imud.formats.recording.records import Kind, PathRecord, decode_object, records_of
 from imud.host_clock import HostClock
 from imud.ledger import Ledger
 from imud.links import LINKS
@@ -130,7 +130,8 @@ class DeviceRigs:
     recording = bool(os.environ.get("IMUD_RECORD_RIGS"))
     """Whether devices are recorded from their begin to their end, and the replay is compared with what came out.
 
-    `IMUD_RECORD_RIGS=1 pytest tests/runtime tests/signals` does that in every test with rigs."""
+    `IMUD_RECORD_RIGS=1 pytest tests/runtime tests/signals` does that in every test with rigs, but those of fake
+    drivers, which a replay cannot find."""
 
     def __init__(
         self,
@@ -194,7 +195,7 @@ class DeviceRigs:
         assert not mistakes, mistakes
         assert all(rig.ledger.closes() for rig in rigs), [rig.ledger.snapshot() for rig in rigs]
         if self.recording:
-            for rig in rigs:
+            for rig in filter(is_replayed, rigs):
                 check_replay(rig)
 
     def _publish(self, batch: Batch) -> None:
@@ -206,6 +207,12 @@ class DeviceRigs:
 
     def _send_event(self, event: Event) -> None:
         self.rigs[event.device].events.append(event)
+
+
+def is_replayed(rig: DeviceRig) -> bool:
+    """Whether a replay knows all drivers that the device had."""
+    found = (record for one in rig.recorded for record in records_of(one) if record.kind == Kind.PATH)
+    return {decode_object(record, PathRecord).driver for record in found} <= set(DRIVERS)
 
 
 def check_replay(rig: DeviceRig) -> PlayedDevice:

@@ -94,7 +94,7 @@ class HoldBench:
     def play(self, story: Callable[[], Awaitable[None]], *, anew: bool = False) -> None:
         """Run the device until its fit is used, then the story; no sample may be missing at the end.
 
-        `anew`: the module's time began anew in the story.
+        `anew`: the module's time began anew in the story, or part of it was left out.
         """
 
         async def whole() -> None:
@@ -293,9 +293,9 @@ def test_the_first_sample_after_silence_waits_no_longer_than_the_others() -> Non
         ((at_ns, (only,)),) = bench.rig.published[since:]
         assert 19 * NS_PER_MS < at_ns - before_ns <= 20 * NS_PER_MS
         assert only.t_rx_ns == before_ns
-        bench.rig.samples.pop()
+        bench.sent += 1
 
-    bench.play(story)
+    bench.play(story, anew=True)  # half a second was left out
 
 
 def test_an_incomplete_frame_that_waits_is_not_given_up() -> None:
