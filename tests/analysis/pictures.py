@@ -1,21 +1,31 @@
 """Draws the pictures of docs/analysis.md: `python -m tests.analysis.pictures` (`make pictures`).
 
-Both are what the commands draw, of simulated sensors whose truth is known: `noise.svg` a gyroscope with coefficients of
-the table in docs/analysis.md, two hours at 100 Hz; `vibration.png` an accelerometer that is set to 400 Hz and whose
-crystal is 2 % fast, on a machine that starts, with 1 % of the samples missing.
+They are what the commands draw of simulated sensors whose truth is known. `noise.svg`: a gyroscope with coefficients
+of the table in docs/analysis.md, two hours at 100 Hz. `noise_page.png`: the begin of the page that `imud noise -o`
+writes for that gyroscope and an accelerometer, in chromium; it is left as it is where there is none. `vibration.png`:
+an accelerometer that is set to 400 Hz and whose crystal is 2 % fast, on a machine that starts, with 1 % of the samples
+missing.
 """
 
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imud.analysis.noise import SensorNoise, sensor_noise
 from imud.analysis.noise_plots import deviation_figure
 from imud.analysis.quantities import DEG_PER_RAD, ROOT_S_PER_ROOT_H, S_PER_H
 from imud.analysis.series import Readings
 from imud.analysis.spectrum_plots import SensorVibration, spectrum_figure
-from imud.cli.analysis.noise_page import picture
+from imud.cli.analysis.noise_page import html, picture
+from imud.cli.analysis.noise_report import noise_report
+from imud.cli.analysis.sheet import figures_for
 from imud.cli.analysis.spectrum_report import SpectrumSettings, sensor_vibration
+from imud.cli.analysis.taking import Taken
 from tests.analysis.synthetic import flicker, random_walk, stamps_ns, white
 from tests.support.files import ROOT
 
@@ -24,13 +34,16 @@ SEED: Final = 15
 RATE_HZ, HOURS = 100.0, 2
 N_DEG_SQRT_H, B_DEG_H, K_DEG_H_SQRT_H = 0.3, 4.0, 20.0
 """Coefficients of all three axes."""
+VRW_M_S_SQRT_H = 0.03
+PRODUCT = "HI14R3"
+PAGE_SIZE, PAGE_LIMIT_S = "960,1240", 120.0
 VIBRATION_HZ, VIBRATION_S = 408.0, 60
 START_S, FULL_S, FULL_HZ = 15.0, 30.0, 48.3
 """The machine starts, has its full speed, and turns so fast then."""
 
 
-def gyroscope() -> SensorNoise:
-    """The analysis of a gyroscope with known coefficients."""
+def turn_rates() -> NDArray[np.float64]:
+    """Of a gyroscope with known coefficients, rad/s."""
     random, count = np.random.default_rng(SEED), int(HOURS * S_PER_H * RATE_HZ)
     axes = [
         white(random, count, RATE_HZ, N_DEG_SQRT_H / DEG_PER_RAD / ROOT_S_PER_ROOT_H)
@@ -38,8 +51,39 @@ def gyroscope() -> SensorNoise:
         + random_walk(random, count, RATE_HZ, K_DEG_H_SQRT_H / DEG_PER_RAD / S_PER_H / ROOT_S_PER_ROOT_H)
         for _ in range(3)
     ]
-    values = np.stack(axes, axis=1)
-    return sensor_noise(Readings(stamps_ns(count, RATE_HZ), values, None, None), values)
+    return np.stack(axes, axis=1)
+
+
+def gyroscope() -> SensorNoise:
+    """The analysis of it."""
+    values = turn_rates()
+    return sensor_noise(Readings(stamps_ns(len(values), RATE_HZ), values, None, None), values)
+
+
+def page() -> str:
+    """The page of a report on that gyroscope, and on an accelerometer with noise alone."""
+    gyro = turn_rates()
+    random, count = np.random.default_rng(SEED + 1), len(gyro)
+    axes = [white(random, count, RATE_HZ, VRW_M_S_SQRT_H / ROOT_S_PER_ROOT_H) for _ in range(3)]
+    accel = np.stack(axes, axis=1) + np.array([0.0, 0.0, 9.8])
+    taken = Taken(
+        "simulated", "bow", "hipnuc-uart", identity={"product": PRODUCT},
+        readings=Readings(stamps_ns(count, RATE_HZ), gyro, accel, None), stamps="true",
+    )  # fmt: skip
+    return html(noise_report(taken, figures_for(taken.sheet, PRODUCT, None)))
+
+
+def noise_page_png(chromium: str) -> bytes:
+    """The begin of the page, as a browser shows it."""
+    with tempfile.TemporaryDirectory(prefix="imud-") as name:
+        file, picture_file = Path(name) / "noise.html", Path(name) / "noise.png"
+        file.write_text(page())
+        argv = [
+            chromium, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--user-data-dir={name}/of",
+            f"--screenshot={picture_file}", f"--window-size={PAGE_SIZE}", file.as_uri(),
+        ]  # fmt: skip
+        subprocess.run(argv, check=True, capture_output=True, timeout=PAGE_LIMIT_S)
+        return picture_file.read_bytes()
 
 
 def machine() -> SensorVibration:
@@ -73,3 +117,5 @@ def vibration_png() -> bytes:
 if __name__ == "__main__":
     (FOLDER / "noise.svg").write_bytes(noise_svg())
     (FOLDER / "vibration.png").write_bytes(vibration_png())
+    if browser := shutil.which("chromium"):
+        (FOLDER / "noise_page.png").write_bytes(noise_page_png(browser))

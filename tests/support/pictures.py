@@ -52,7 +52,7 @@ def text(x: float, y: float, words: str, more: str = "") -> str:
 # --- the terminal -----------------------------------------------------------------------------------------------------
 
 
-def terminal(lines: Sequence[str]) -> str:
+def terminal(lines: Sequence[str], title: str = "imud devices, status and watch in a terminal") -> str:
     """A terminal window with these lines; those that begin with `$ ` are what was typed."""
     step, left, top = 17, 14, 42
     width, height = left * 2 + round(max(map(len, lines)) * 7.25), top + step * len(lines)
@@ -67,7 +67,7 @@ def terminal(lines: Sequence[str]) -> str:
             f"<text x='{left}' y='{top + step * number}' xml:space='preserve' fill='{fill}' font-size='12' "
             f"font-family='DejaVu Sans Mono, Menlo, Consolas, monospace'>{escape(line)}</text>"
         )
-    return svg(width, height, "imud devices, status and watch in a terminal", parts)
+    return svg(width, height, title, parts)
 
 
 def session() -> list[str]:
