@@ -200,7 +200,7 @@ class Daemon:
         except ServerError as error:
             log.error("%s keeps its old settings: %s", name, error)
             self.config = replace(self.config, publishers={**self.config.publishers, name: old.publishers[name]})
-            self._start_configured(name)
+            self._start_or_put_off(name)
             return f"{name} keeps its old settings: {error}"
         return ""
 
@@ -350,12 +350,20 @@ class Daemon:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        for device in self._devices.values():
-            device.close()
-        self._factory.close()
-        for publisher in self._publishers.values():
-            publisher.tick(self._now_ns())
-            publisher.close()
+        for name, device in self._devices.items():
+            self._end_part(name, device.close)
+        self._end_part("devices", self._factory.close)
+        for name, publisher in self._publishers.items():
+            self._end_part(name, lambda publisher=publisher: publisher.tick(self._now_ns()))  # type: ignore[misc]
+            self._end_part(name, publisher.close)
+
+    def _end_part(self, name: str, step: Callable[[], None]) -> None:
+        """Do a step of the end; an error is the reason of the end, unless there is one, and the next steps follow."""
+        try:
+            step()
+        except Exception as error:
+            log.exception("%s: the end failed", name)
+            self._failure = self._failure or error
 
 
 def _one_thread() -> ThreadPoolExecutor:

@@ -15,13 +15,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic, monotonic_ns, sleep, time_ns
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
 
 from imud.client import Ring
 from imud.config import Config
+from imud.contracts.publisher import Publisher
 from imud.daemon import Daemon
 from imud.units import NS_PER_S
 from imud.utc.system_clock import KernelClock
@@ -120,6 +121,39 @@ def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch
     if found is not None:
         assert found.error_ns == 50_000
         assert abs(found.offset_ns - (time_ns() - monotonic_ns())) < NS_PER_S
+
+
+class EndingOutput:
+    """An output that fails at the end where it is asked to."""
+
+    def __init__(self, *failing: str) -> None:
+        self.failing = failing
+        self.did: list[str] = []
+        self.ends = False
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_: self._do(name)
+
+    def _do(self, name: str) -> None:
+        self.did.append(name)
+        if self.ends and name in self.failing:
+            raise RuntimeError(name)
+
+
+@in_loop
+async def test_whatever_an_output_raises_at_the_end_all_others_are_closed(caplog: pytest.LogCaptureFixture) -> None:
+    outputs = {"a": EndingOutput("tick", "close"), "b": EndingOutput("close"), "c": EndingOutput()}
+    daemon = Daemon(Config("info", "", {}, ()), extra=cast("dict[str, Publisher]", outputs))
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    for output in outputs.values():
+        output.ends = True
+    daemon.stop()
+    with pytest.raises(RuntimeError, match="tick"):  # the first is the reason
+        await running
+    for output in outputs.values():
+        assert output.did[-2:] == ["tick", "close"]
+    assert "b: the end failed" in caplog.text
 
 
 def test_port_that_appears_later_is_taken(tmp_path: Path) -> None:
