@@ -9,6 +9,7 @@ import logging
 import os
 import select
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -20,6 +21,8 @@ log = logging.getLogger(__name__)
 
 IN_FLIGHT_MAX: Final = 20
 """Messages without an acknowledgement, unless the broker allows fewer: what brokers usually allow."""
+LOOK_S: Final = 0.1
+"""While the broker's answer is waited for, the end of the output is looked at so often: less than it waits itself."""
 PACKET_BYTES: Final = 16_384
 """The broker may send so much at once: four times the longest request."""
 EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
@@ -84,8 +87,10 @@ class BrokerConnection(Protocol):
 class Connect(Protocol):
     """Function that connects to a broker."""
 
-    def __call__(self, broker: Broker, settings: MqttSettings, client_id: str, will: Will, /) -> BrokerConnection:
-        """Return a connection that the broker has accepted. Raises BrokerError."""
+    def __call__(
+        self, broker: Broker, settings: MqttSettings, client_id: str, will: Will, is_wanted: Callable[[], bool], /
+    ) -> BrokerConnection:
+        """Return a connection that the broker has accepted. Raises BrokerError, also once `is_wanted` returns False."""
         ...
 
 
@@ -100,8 +105,14 @@ def check_extra() -> None:
 class PahoConnection:
     """A connection by paho-mqtt. Synchronization: as `BrokerConnection`."""
 
-    def __init__(self, broker: Broker, settings: MqttSettings, client_id: str, will: Will) -> None:
-        """Connect and wait for the answer. Raises BrokerError."""
+    def __init__(
+        self, broker: Broker, settings: MqttSettings, client_id: str, will: Will,
+        is_wanted: Callable[[], bool] = lambda: True,
+    ) -> None:  # fmt: skip
+        """Connect and wait for the answer. Raises BrokerError.
+
+        `is_wanted` is asked when the socket is open and then every LOOK_S: the name of the client is another's soon.
+        """
         self.acknowledged: list[int] = []
         self.in_flight_max = IN_FLIGHT_MAX
         self.received: list[Received] = []
@@ -115,17 +126,11 @@ class PahoConnection:
         """Held while the bell is rung: it is closed by another thread, and its number may then be another file's."""
         try:
             self._client = self._made(settings, client_id, will)
+            self._client.on_socket_open = lambda *_: self._check_wanted(is_wanted)
             self._client.connect(
                 broker.host, broker.port, keepalive=settings.keep_alive_s, properties=self._connect_properties()
             )
-            for _ in range(1000):
-                if self._answered or self._problem:
-                    break
-                self._turn(CONNECT_S)
-                if not self._answered and not self._problem and not self._woke:
-                    self._problem = f"no answer within {CONNECT_S:g} s"
-            if self._problem:
-                raise BrokerError(self._problem)
+            self._wait_for_answer(is_wanted)
         except BrokerError as error:
             self.close()
             raise BrokerError(f"{broker.name}: {error}") from error
@@ -143,6 +148,24 @@ class PahoConnection:
         client.on_message = self._on_message
         client.on_subscribe = self._on_subscribe
         return client
+
+    def _wait_for_answer(self, is_wanted: Callable[[], bool]) -> None:
+        """Raises BrokerError for a refusal, without an answer, and where it is not wanted any more."""
+        silent = 0
+        for _ in range(1000):
+            if self._answered or self._problem:
+                break
+            self._turn(LOOK_S)
+            self._check_wanted(is_wanted)
+            silent = 0 if self._woke else silent + 1
+            if silent * LOOK_S >= CONNECT_S and not self._answered:
+                self._problem = self._problem or f"no answer within {CONNECT_S:g} s"
+        if self._problem:
+            raise BrokerError(self._problem)
+
+    def _check_wanted(self, is_wanted: Callable[[], bool]) -> None:
+        if not is_wanted():
+            raise BrokerError("the output ends")
 
     def _connect_properties(self) -> Any:
         """How much the broker may send at once; None with MQTT 3.1.1."""

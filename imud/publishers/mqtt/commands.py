@@ -8,11 +8,13 @@ configuration. The arguments are checked by the device's own description of the 
 The event loop does of it what it does for a client of the socket: it starts the action, and sends its result away.
 
 A request is carried out once: its id is remembered for as long as its age would let it be taken again, and what was
-issued before the output started is too old.
+issued before the output started is too old. An answer can be lost with its connection, and who asked then asks again:
+the same request with the same id is answered with the answer that it has.
 """
 
 import asyncio
 import logging
+import threading
 from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -37,6 +39,10 @@ WAITING_MAX: Final = 8
 CLOCK_SET_NS: Final = 1_577_836_800 * NS_PER_S
 """2020: a wall clock before it is not set, and says nothing of ages."""
 MINUTE_NS: Final = 60 * NS_PER_S
+ANSWERS_KEPT: Final = 32
+"""Answers that are kept for requests that come again, the newest."""
+ANSWER_BYTES: Final = 65_536
+"""Of an answer that is kept: 2 MB of all. What actions return has some kB."""
 
 
 class CommandReply(NamedTuple):
@@ -55,10 +61,15 @@ class _Asked(NamedTuple):
     topic: str
     correlation: bytes | None
 
+    def is_same(self, other: "_Asked") -> bool:
+        """Whether both ask for the same."""
+        mine, theirs = self.request, other.request
+        return (self.device, mine.action, mine.arguments) == (other.device, theirs.action, theirs.arguments)
+
 
 class CommandChannel:
     """The channel. Synchronization: `take` by the sender's thread, `run_next` and `close` by the event loop's; the
-    counters are read by any."""
+    counters are read by any. What both change is changed under a lock, which is held for no I/O."""
 
     def __init__(
         self, settings: CommandSettings, gateway: Gateway, control: Callable[[str], DeviceControl],
@@ -77,6 +88,9 @@ class CommandChannel:
         self._times_ns: deque[int] = deque()
         self._known: dict[str, int] = {}
         """When each id came, CLOCK_MONOTONIC; as many as the rate allows."""
+        self._lock = threading.Lock()
+        self._answers: dict[str, tuple[_Asked, bytes]] = {}
+        """Requests that ended and their answers, by id, the newest last."""
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -106,6 +120,8 @@ class CommandChannel:
             return
         asked = _Asked(parts.device, request, topic, received.correlation)
         outcome, problem = self._judged(asked)
+        if outcome is Outcome.DUPLICATE and self._repeat(asked):
+            return
         if outcome is not None:
             self._refuse(asked, outcome, problem)
             return
@@ -146,12 +162,24 @@ class CommandChannel:
             return "it was issued before the gateway's start, and may have been carried out then"
         return ""
 
+    def _repeat(self, asked: _Asked) -> bool:
+        """Give the answer that the request had when it came before; return whether there is one."""
+        with self._lock:
+            kept = self._answers.get(asked.request.id)
+        if kept is None or not asked.is_same(kept[0]):
+            return False
+        log.info("mqtt: %s: request %s came again, and is answered again", asked.device, asked.request.id)
+        self.answer(CommandReply(asked.topic, kept[1], asked.correlation))
+        return True
+
     def _ignore(self, problem: str) -> None:
-        self.refused += 1
+        with self._lock:
+            self.refused += 1
         log.warning("mqtt: a request is ignored: %s", problem)
 
     def _refuse(self, asked: _Asked, outcome: Outcome, problem: str) -> None:
-        self.refused += 1
+        with self._lock:
+            self.refused += 1
         log.warning(
             "mqtt: %s: request %s for %s is refused (%s): %s",
             asked.device, asked.request.id, shown(asked.request.action), outcome, problem,
@@ -182,13 +210,13 @@ class CommandChannel:
             result = await self._control(asked.device).act(request.action, request.arguments)
         except ImudError as error:
             log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error)
-            self._give_answer(asked, Outcome.FAILED, error=str(error))
+            self._end(asked, Outcome.FAILED, error=str(error))
         except Exception:
             log.exception("mqtt: %s: request %s ended by a defect of imud", asked.device, request.id)
-            self._give_answer(asked, Outcome.FAILED, error="a defect of imud; its log has more")
+            self._end(asked, Outcome.FAILED, error="a defect of imud; its log has more")
         else:
             log.info("mqtt: %s: request %s is done: %s", asked.device, request.id, shown(result))
-            self._give_answer(asked, Outcome.DONE, result=result)
+            self._end(asked, Outcome.DONE, result=result)
 
     def close(self) -> None:
         """End what runs, without an answer; may be called twice."""
@@ -196,9 +224,22 @@ class CommandChannel:
         if self._task is not None:
             self._task.cancel()
 
-    def _give_answer(self, asked: _Asked, outcome: Outcome, *, result: object = None, error: str = "") -> None:
+    def _end(self, asked: _Asked, outcome: Outcome, *, result: object = None, error: str = "") -> None:
+        """Answer what was carried out, and keep the answer."""
+        payload = self._give_answer(asked, outcome, result=result, error=error)
+        if len(payload) > ANSWER_BYTES:
+            return
+        with self._lock:
+            self._answers[asked.request.id] = asked, payload
+            while len(self._answers) > ANSWERS_KEPT:
+                del self._answers[next(iter(self._answers))]
+
+    def _give_answer(self, asked: _Asked, outcome: Outcome, *, result: object = None, error: str = "") -> bytes:
+        """Have an answer sent; return its payload."""
         answer = CommandAnswer(
             v=VERSION, id=asked.request.id, gateway=self._gateway.gateway, device=asked.device,
             action=asked.request.action, outcome=outcome, result=result, error=error,
         )  # fmt: skip
-        self.answer(CommandReply(asked.topic, msgspec.json.encode(answer), asked.correlation))
+        payload = msgspec.json.encode(answer)
+        self.answer(CommandReply(asked.topic, payload, asked.correlation))
+        return payload

@@ -62,6 +62,8 @@ class MqttSender:
         self._turn, self._connect, self._now_ns = turn, connect, now_ns
         self._commands = commands
         self._replies: deque[CommandReply] = deque(maxlen=REPLIES_MAX)
+        self._sent_replies: dict[int, CommandReply] = {}
+        """Answers without an acknowledgement, by the numbers of their messages."""
         self._lock = threading.Lock()
         self._outbox: deque[Spooled] = deque()
         self._in_flight: dict[int, int] = {}
@@ -81,12 +83,19 @@ class MqttSender:
         self._thread.start()
 
     def close(self, last_words: bytes) -> None:
-        """Publish the retained farewell and end; may be called twice. What is not acknowledged stays in the spool."""
+        """Publish the retained farewell and end; may be called twice. What is not acknowledged stays in the spool.
+
+        A thread that is still connecting makes no connection any more: its name may be that of the next output's.
+        """
         self._last_words = last_words
         self._ended = True
         self._ring()
+        self.join(CLOSE_S)
+
+    def join(self, seconds: float) -> None:
+        """Return when the thread has ended, or after so much time."""
         if self._thread is not None:
-            self._thread.join(CLOSE_S)
+            self._thread.join(seconds)
 
     # --- the writer's side -------------------------------------------------------------------------------------------
 
@@ -113,8 +122,9 @@ class MqttSender:
         self._ring()
 
     def reply(self, reply: CommandReply) -> None:
-        """Send an answer to a request, before all else. From any thread."""
-        self._replies.append(reply)
+        """Send an answer to a request, before all else, and again if its connection is lost. From any thread."""
+        with self._lock:
+            self._replies.append(reply)
         self._ring()
 
     def take_acknowledged(self) -> list[tuple[int, int]]:
@@ -165,7 +175,10 @@ class MqttSender:
 
     def _open(self) -> None:
         broker = self._turn.broker
-        connection = self._connect(broker, self._settings, self._client_id, self._will)
+        connection = self._connect(broker, self._settings, self._client_id, self._will, lambda: not self._ended)
+        if self._ended:
+            connection.close()
+            return
         if self._commands is not None:
             connection.subscribe(self._commands.subscription)
         self._turn.connected(self._now_ns())
@@ -181,12 +194,7 @@ class MqttSender:
     def _send(self, connection: BrokerConnection) -> None:
         """Send what the window has room for, what is retained first."""
         while len(self._in_flight) < connection.in_flight_max:
-            if self._replies:
-                reply = self._replies.popleft()
-                number = connection.publish(
-                    reply.topic, reply.payload, JSON_TYPE, retain=False, correlation=reply.correlation
-                )
-                self._in_flight[number] = 0
+            if self._send_reply(connection):
                 continue
             with self._lock:
                 topic = next(iter(self._due), None)
@@ -205,6 +213,20 @@ class MqttSender:
             else:
                 return
 
+    def _send_reply(self, connection: BrokerConnection) -> bool:
+        """Send the oldest answer; return whether there was one."""
+        with self._lock:
+            if not self._replies:
+                return False
+            reply = self._replies[0]
+        number = connection.publish(reply.topic, reply.payload, JSON_TYPE, retain=False, correlation=reply.correlation)
+        with self._lock:
+            if self._replies and self._replies[0] is reply:  # it is not where newer ones took its room meanwhile
+                self._replies.popleft()
+            self._sent_replies[number] = reply
+            self._in_flight[number] = 0
+        return True
+
     def _pass_on(self, connection: BrokerConnection) -> None:
         """Pass on what was acknowledged."""
         if not connection.acknowledged:
@@ -213,6 +235,8 @@ class MqttSender:
         connection.acknowledged.clear()
         with self._lock:
             ids = [self._in_flight.pop(number, 0) for number in numbers]
+            for number in numbers:
+                self._sent_replies.pop(number, None)
             self._answers += [(self.session, one) for one in ids if one]
             self.acknowledged += sum(map(bool, ids))
             is_low = 2 * (len(self._outbox) + len(self._in_flight)) <= OUTBOX_MAX
@@ -237,6 +261,8 @@ class MqttSender:
             self.connected, self.broker, self.problem = False, "", problem
             self._outbox.clear()
             self._in_flight.clear()
+            self._replies = deque([*self._sent_replies.values(), *self._replies], REPLIES_MAX)
+            self._sent_replies.clear()
         self.wanting()
 
     def _say_farewell(self) -> None:

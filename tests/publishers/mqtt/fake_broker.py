@@ -1,6 +1,7 @@
 """A broker in memory for the sender: takes what is sent when the test says so, and fails when it says so."""
 
 import threading
+from collections.abc import Callable
 from typing import Final
 
 from imud.publishers.mqtt.access import BrokerError
@@ -76,11 +77,20 @@ class FakeBroker:
         """Acknowledgements that are still given."""
         self.window = 4
         self.will: Will | None = None
+        self.connecting, self.accepts = threading.Event(), threading.Event()
+        self.accepts.set()
+        self.was_wanted = True
+        """What the sender said when the newest connection was accepted."""
 
-    def connect(self, broker: Broker, _settings: MqttSettings, _client_id: str, will: Will) -> FakeConnection:
-        """Accept, or not."""
+    def connect(
+        self, broker: Broker, _settings: MqttSettings, _client_id: str, will: Will, is_wanted: Callable[[], bool]
+    ) -> FakeConnection:
+        """Accept, or not; with `accepts` unset once it is set, whether the connection is still wanted or not."""
         self.asked.append(broker.host)
         self.will = will
+        self.connecting.set()
+        assert self.accepts.wait(LIMIT_S)
+        self.was_wanted = is_wanted()
         if self.problem:
             raise BrokerError(self.problem)
         self.connections.append(FakeConnection(self))

@@ -16,7 +16,7 @@ from imud.errors import BadArgument, CommandError
 from imud.formats.fleet.commands import REQUEST_BYTES, CommandAnswer, Outcome, answer_topic
 from imud.host_clock import HostClock
 from imud.publishers.mqtt.broker import Received
-from imud.publishers.mqtt.commands import WAITING_MAX, CommandChannel, CommandReply
+from imud.publishers.mqtt.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
 from imud.publishers.mqtt.publisher import MqttPublisher
 from imud.publishers.mqtt.settings import CommandSettings, MqttSettings
 from imud.publishers.mqtt.streams import Gateway
@@ -161,9 +161,46 @@ def test_a_request_is_carried_out_once_for_as_long_as_its_age_would_allow() -> N
     for _ in range(59):
         bench.clock.advance(NS_PER_S)
         age_s = (bench.clock.now_ns() + bench.offset_ns - issued_ahead_ns) / NS_PER_S
-        assert bench.ask(1, age_s=age_s) in (Outcome.DUPLICATE, Outcome.STALE)
+        assert bench.ask(1, "turn", age_s=age_s, angle=3) in (Outcome.DUPLICATE, Outcome.STALE)
+        bench.ask(1, age_s=age_s)
     bench.run()
     assert len(bench.device.done) == 1
+
+
+def test_a_request_that_comes_again_has_the_answer_that_it_had() -> None:
+    bench = ChannelBench()
+    bench.ask(1, "turn", angle=3)
+    assert bench.ask(1, "turn", angle=3) is Outcome.DUPLICATE, "it waits, and will have its answer"
+    bench.run()
+    bench.replies.clear()
+    bench.ask(1, "turn", angle=3, response_topic="imud/mill/gw/bow/answer/other")
+    (reply,) = bench.replies
+    assert (reply.topic, reply.correlation) == ("imud/mill/gw/bow/answer/other", b"c")
+    assert (bench.answers()[0].outcome, bench.answers()[0].result) == (Outcome.DONE, {"serial": 7})
+    bench.ask(1, "turn", angle=4)
+    assert bench.answers()[-1].outcome is Outcome.DUPLICATE, "another request with the id of this one"
+    bench.run()
+    assert bench.device.done == [("turn", {"angle": 3})]
+    assert (bench.channel.run, bench.channel.refused) == (1, 2)
+
+
+def test_a_request_that_failed_has_its_failure_again() -> None:
+    bench = ChannelBench()
+    bench.ask(1, "turn")
+    bench.run()
+    assert bench.ask(1, "turn") is Outcome.FAILED
+    assert len(bench.replies) == 2
+    assert "angle" in bench.answers()[1].error
+
+
+def test_as_many_answers_are_kept_as_are_allowed() -> None:
+    bench = ChannelBench(per_minute=600)
+    for number in range(ANSWERS_KEPT + 1):
+        bench.ask(number)
+        bench.run()
+    assert bench.ask(0) is Outcome.DUPLICATE
+    assert bench.ask(1) is Outcome.DONE
+    assert len(bench.device.done) == ANSWERS_KEPT + 1
 
 
 def test_more_than_the_rate_or_the_queue_has_room_for_is_busy() -> None:

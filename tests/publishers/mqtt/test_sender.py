@@ -1,14 +1,17 @@
 """The sender: a window of messages, retained ones first, everything again after a loss, in order."""
 
+import threading
+
 import pytest
 
 from imud.formats.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.publishers.mqtt.backoff import BrokerTurn
 from imud.publishers.mqtt.broker import Will
-from imud.publishers.mqtt.sender import OUTBOX_MAX, MqttSender
+from imud.publishers.mqtt.commands import CommandReply
+from imud.publishers.mqtt.sender import OUTBOX_MAX, REPLIES_MAX, MqttSender
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 from imud.publishers.mqtt.spool import Spooled
-from tests.publishers.mqtt.fake_broker import FakeBroker
+from tests.publishers.mqtt.fake_broker import LIMIT_S, FakeBroker
 from tests.support.event_loops import VirtualClock
 
 
@@ -110,10 +113,64 @@ def test_the_type_of_a_message_is_told() -> None:
 @pytest.mark.timeout(20)
 def test_it_ends_with_a_farewell() -> None:
     bench = SenderBench()
+    connected = threading.Event()
+    bench.sender.wanting = connected.set
     bench.sender.start()
+    assert connected.wait(LIMIT_S)
     bench.sender.close(b"bye")
     bench.sender.close(b"bye")
-    if bench.broker.connections:
-        assert bench.broker.connections[-1].sent[-1] == ("state", b"bye", True)
-        assert bench.broker.connections[-1].closed
+    assert bench.broker.connections[-1].sent[-1] == ("state", b"bye", True)
+    assert bench.broker.connections[-1].closed
     assert bench.sender.failure is None
+
+
+@pytest.mark.timeout(20)
+def test_what_is_still_connecting_at_the_end_says_nothing() -> None:
+    """The next output has the same name, and may be connected already."""
+    bench = SenderBench()
+    bench.broker.accepts.clear()
+    bench.sender.retain({"state": b"born"})
+    bench.sender.start()
+    assert bench.broker.connecting.wait(LIMIT_S)
+    bench.sender.close(b"bye")
+    bench.broker.accepts.set()
+    bench.sender.join(LIMIT_S)
+    (connection,) = bench.broker.connections
+    assert not bench.broker.was_wanted
+    assert (connection.sent, connection.closed, bench.sender.connected) == ([], True, False)
+    assert bench.broker.asked == ["a"], "it does not try again"
+
+
+def test_an_answer_that_is_lost_with_its_connection_goes_again() -> None:
+    bench = SenderBench()
+    bench.broker.answers = 1
+    bench.sender.work()
+    for number in range(3):
+        bench.sender.reply(CommandReply("answer", b"%d" % number, b"c"))
+    bench.sender.work()
+    assert bench.sent() == [b"0", b"1", b"2"]
+    bench.broker.problem = "the cable was pulled"
+    bench.sender.work()
+    bench.sender.reply(CommandReply("answer", b"3", None))
+    bench.broker.problem, bench.broker.answers = "", 100
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"1", b"2", b"3"]
+    assert bench.broker.connections[-1].correlations == [b"c", b"c", None]
+
+
+def test_answers_that_wait_are_bounded_and_the_oldest_go() -> None:
+    bench = SenderBench()
+    bench.broker.window, bench.broker.answers = 1000, 0
+    bench.sender.work()
+    for number in range(10):
+        bench.sender.reply(CommandReply("answer", b"%d" % number, None))
+    bench.sender.work()
+    bench.broker.problem = "the cable was pulled"
+    for number in range(10, REPLIES_MAX + 5):
+        bench.sender.reply(CommandReply("answer", b"%d" % number, None))
+    bench.sender.work()
+    bench.broker.problem = ""
+    bench.sender.work()
+    bench.sender.work()
+    assert bench.sent() == [b"%d" % number for number in range(5, REPLIES_MAX + 5)]
