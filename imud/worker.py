@@ -16,7 +16,8 @@ from typing import Final, Protocol
 from imud.units import NS_PER_S
 
 END_LIMIT_S = 5.0
-"""A transfer on a bus that hangs ends with the controller's own time-out, of one second at most."""
+"""A transfer on a bus that hangs ends with the controller's own time-out, of one second at most. A write to a disk that
+hangs has none: whoever shares something with such a call leaves it alone."""
 
 SWITCH_INTERVAL_S: Final = 0.0005
 """After so long a thread lets another one run that waits (sys.setswitchinterval, for the whole process). A read of an
@@ -40,8 +41,8 @@ class Worker(Protocol):
         """End the present sleep, or skip the next: there is work. From any thread."""
         ...
 
-    def end(self) -> None:
-        """Stop calling; return when the present call is over."""
+    def end(self) -> bool:
+        """Stop calling; return whether the present call is over, for which it waits END_LIMIT_S at most."""
         ...
 
 
@@ -168,14 +169,16 @@ class BusThread:
         if self._descriptors is not None:
             self._descriptors.discard(fd)
 
-    def end(self) -> None:
+    def end(self) -> bool:
         """Stop after the present transfer; may be called twice."""
         self._ended = True
         self.ring()
         self._thread.join(END_LIMIT_S)
         descriptors, self._descriptors = self._descriptors, None
-        if descriptors is not None and not self._thread.is_alive():
+        is_over = not self._thread.is_alive()
+        if descriptors is not None and is_over:
             descriptors.close()
+        return is_over
 
     def _run(self) -> None:
         _sharpen_timer()

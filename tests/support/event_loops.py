@@ -119,11 +119,12 @@ class LoopWorker:
     def unwatch(self, _fd: int) -> None:
         """Nothing is watched."""
 
-    def end(self) -> None:
+    def end(self) -> bool:
         """No more; may be called twice."""
         if self._next is not None:
             self._next.cancel()
             self._next = None
+        return True
 
     def _run(self) -> None:
         try:

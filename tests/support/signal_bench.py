@@ -30,8 +30,9 @@ class HandWorker:
     def ring(self) -> None:
         self.rung += 1
 
-    def end(self) -> None:
+    def end(self) -> bool:
         self.ended = True
+        return True
 
 
 class SignalBench:

@@ -111,6 +111,8 @@ class MqttPublisher:
             settings, self._gateway, self._queue, self._spool, self._sender, context.now_ns, context.utc_offset_ns,
             self._start_worker, self._clock,
         )  # fmt: skip
+        lock, self._lock = self._lock, -1
+        self._writer.closed = lambda: os.close(lock)  # a thread that hangs in the disk keeps it
         self._sender.retain({will.topic: self._state(online=True)})
         self._sender.start()
         context.mqtt_sources.append(self.status)
@@ -134,7 +136,7 @@ class MqttPublisher:
         if self._settings_known.pop(name, None) is not None:
             topics.append(self._topic(name, SETTINGS))
         if topics:
-            self._queue.put_event(SentState({}, dict.fromkeys(topics)))
+            self._queue.put_state(SentState({}, dict.fromkeys(topics)))
 
     def publish(self, batch: Batch) -> None:
         """Put samples into the queue."""
@@ -224,7 +226,7 @@ class MqttPublisher:
             state = msgspec.json.decode(self._state(online=True))
             other[self._topic("", STATE)] = state | {"mqtt": self.status(), "positions": self._positions()}
         if statuses or other:
-            self._queue.put_event(SentState(statuses, other))
+            self._queue.put_state(SentState(statuses, other))
 
     def _changed_settings(self, status: DeviceStatus) -> dict[str, object]:
         """The message about the settings of a device, where they are not what was published."""

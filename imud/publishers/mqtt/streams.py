@@ -150,6 +150,16 @@ class DeviceStreams:
         message = self._events.message(MessageKind.EVENTS, number, number, 1, utc_ns, events=[event])
         return [self._events.row(message, utc_ns)]
 
+    def missed_events(self, count: int, utc_ns: int) -> list[Spooled]:
+        """Take the count of events that had no room in the queue; return the message about them."""
+        if not self._sending.events:
+            return []
+        first = self._events.next or 1
+        message = self._events.message(
+            MessageKind.DROPPED, first, first + count - 1, count, utc_ns, cause=DropCause.QUEUE
+        )
+        return [self._events.row(message, utc_ns)]
+
     def look(self, now_ns: int) -> list[Spooled]:
         """Return messages that are due though no later sample has come."""
         made: list[Spooled] = []

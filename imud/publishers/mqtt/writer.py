@@ -4,9 +4,12 @@
                                                     ▲────────acknowledged──────────────┘
 
 The loop never waits: samples that have no room in the queue are counted, and show as a gap that a message explains. A
-disk that is full or fails ends the spooling; for a while messages wait in memory, then only their numbers do.
+disk that is full or fails ends the spooling; for a while messages wait in memory, then only their numbers do. What is
+newer than the last transaction, and samples whose `batch_s` is not over, are lost when the process is killed.
 """
 
+import logging
+import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -25,14 +28,16 @@ from imud.publishers.mqtt.settings import DeviceSending, MqttSettings
 from imud.publishers.mqtt.spool import Spool, Spooled, SpoolError
 from imud.publishers.mqtt.streams import DeviceStreams, Gateway, ReadClock, no_clock, notes_of
 from imud.units import NS_PER_S
-from imud.worker import StartWorker
+from imud.worker import END_LIMIT_S, StartWorker
+
+log = logging.getLogger(__name__)
 
 QUEUE_SAMPLES: Final = 20_000
 """Samples that wait for the writer: 20 s of a device at 1 kHz, about 20 MB. A flash card that erases stalls for a
 second, a checkpoint of the log for less."""
 QUEUE_EVENTS: Final = 2_000
 COMMIT_NS: Final = NS_PER_S
-"""Between two transactions: what is newer is lost when the process is killed."""
+"""Between two transactions: messages that are newer are lost when the process is killed."""
 DISK_RETRY_NS: Final = 10 * NS_PER_S
 """A disk that was full or failed is tried again after so long."""
 PENDING_BYTES: Final = 8 << 20
@@ -47,7 +52,17 @@ class SentState(NamedTuple):
     """Further messages by topic; None removes what is there."""
 
 
-Item = Batch | Event | SentState
+class MissedEvents:
+    """Events of a device that had no room, in their place."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self.count = 0
+        self.t_ns = 0
+        """CLOCK_MONOTONIC of the newest."""
+
+
+Item = Batch | Event | MissedEvents | SentState
 
 
 class WriterQueue:
@@ -59,7 +74,13 @@ class WriterQueue:
         self.dropped = 0
         """Samples and events that had no room."""
         self._samples_max, self._events_max = samples_max, events_max
-        self._items: deque[Item] = deque()
+        self._items: deque[Batch | Event | MissedEvents] = deque()
+        self._lock = threading.Lock()
+        """Held where states and counts of missed events are changed, which never waits for a disk."""
+        self._missed: dict[str, MissedEvents] = {}
+        """Of devices whose newest event had no room: what the next one that has none is added to."""
+        self._statuses: dict[str, DeviceStatus] = {}
+        self._other: dict[str, object] = {}
         self._put = self._taken = 0
         self._events_put = self._events_taken = 0
 
@@ -78,26 +99,57 @@ class WriterQueue:
         self._items.append(batch)
         self._put += count
 
-    def put_event(self, item: Event | SentState) -> None:
-        """Add an event or a state, or drop and count it."""
-        self.queued += isinstance(item, Event)
+    def put_event(self, event: Event) -> None:
+        """Add an event; of one without room only that it was there, which is counted."""
+        self.queued += 1
         if self._events_put - self._events_taken >= self._events_max:
             self.dropped += 1
+            self._miss(event)
             return
-        self._items.append(item)
+        self._missed.pop(event.device, None)
+        self._items.append(event)
         self._events_put += 1
 
+    def put_state(self, state: SentState) -> None:
+        """Add a state; of each topic the newest waits, so that there is always room."""
+        with self._lock:
+            for topic, status in state.statuses.items():
+                self._other.pop(topic, None)
+                self._statuses[topic] = status
+            for topic, other in state.other.items():
+                self._statuses.pop(topic, None)
+                self._other[topic] = other
+
     def take(self) -> Item | None:
-        """Return the oldest item; None for none."""
+        """Return the states that wait, or the oldest of all else; None for nothing."""
+        if self._statuses or self._other:
+            with self._lock:
+                state = SentState(self._statuses, self._other)
+                self._statuses, self._other = {}, {}
+            return state
         try:
             item = self._items.popleft()
         except IndexError:
             return None
         if isinstance(item, Batch):
             self._taken += len(item.samples)
-        else:
+        elif isinstance(item, Event):
             self._events_taken += 1
+        else:
+            with self._lock:  # what comes from now on is counted anew
+                if self._missed.get(item.device) is item:
+                    self._missed.pop(item.device, None)
         return item
+
+    def _miss(self, event: Event) -> None:
+        """Count an event in the place that it would have had. There is one place between two events at most."""
+        with self._lock:
+            missed = self._missed.get(event.device)
+            if missed is None:
+                missed = self._missed[event.device] = MissedEvents(event.device)
+                self._items.append(missed)
+            missed.count += 1
+            missed.t_ns = event.t_ns
 
 
 class SpoolWriter:
@@ -117,6 +169,9 @@ class SpoolWriter:
         """The exception that ended the thread, which is a defect of imud."""
         self.positions: list[StreamPosition] = []
         """How far the streams have come, as of the last transaction."""
+        self.closed: Callable[[], None] = lambda: None
+        """Called when the spool is closed, by the thread that closed it; set by who has its lock."""
+        self._is_closing = self._is_closed = False
         self._settings, self._gateway = settings, gateway
         self._queue, self._spool, self._sender = queue, spool, sender
         self._now_ns, self._utc_offset_ns, self._clock = now_ns, utc_offset_ns, clock
@@ -136,9 +191,25 @@ class SpoolWriter:
         sender.wanting = self._worker.ring
 
     def close(self) -> None:
-        """Store all that waits and end the thread; may be called twice."""
+        """Store all that waits and end the thread; may be called twice.
+
+        A thread that hangs in the disk is left with the spool: it does the same when the disk goes on.
+        """
         self._sender.wanting = lambda: None
-        self._worker.end()
+        self._is_closing = True
+        if self._worker.end():
+            self._finish()
+        else:
+            log.error(
+                "mqtt: the spool's thread has not ended within %g s (a disk that hangs?): %d samples wait, and are "
+                "stored if the disk goes on before imud ends", END_LIMIT_S, self._queue.waiting,
+            )  # fmt: skip
+
+    def _finish(self) -> None:
+        """Store all that waits and close the spool, once. By the thread, or after its end."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         self._take_answers()
         self._take_all()
         for streams in self._streams.values():
@@ -146,11 +217,18 @@ class SpoolWriter:
         self._due_ns = 0
         self._store(self._now_ns())
         self._spool.close()
+        self.closed()
 
     # --- the thread's side -------------------------------------------------------------------------------------------
 
     def work(self) -> int:
-        """Do what is due; return the time until the next round, ns."""
+        """Do what is due, the end included; return the time until the next round, ns."""
+        rest_ns = self._do_due()
+        if self._is_closing:
+            self._finish()
+        return rest_ns
+
+    def _do_due(self) -> int:
         self._take_answers()
         self._take_all()
         now_ns = self._now_ns()
@@ -180,6 +258,10 @@ class SpoolWriter:
                 streams = self._streams_of(item.device, 0)
                 if streams is not None:
                     self._rows += streams.event(item, item.t_ns + self._utc_offset_ns())
+            elif isinstance(item, MissedEvents):
+                streams = self._streams_of(item.device, 0)
+                if streams is not None:
+                    self._rows += streams.missed_events(item.count, item.t_ns + self._utc_offset_ns())
             else:
                 made = {topic: msgspec.json.encode(status) for topic, status in item.statuses.items()}
                 made |= {

@@ -1,7 +1,8 @@
 """A gateway that is killed, a broker that restarts, freezes or refuses: the collector's ledger closes every time.
 
 The truth is the spool's own file: after the end of the gateway, what it stored is what the collector has or what still
-waits. Samples of the last second of a gateway that is killed were never stored, and no number of theirs was given out.
+waits. What a gateway that is killed had in memory, samples of `batch_s` and what came since the last transaction, was never
+stored, and no number of theirs was given out.
 """
 
 from collections.abc import Iterator

@@ -1,9 +1,11 @@
 """The queue and the thread of the spool: bounded, nothing twice, a disk that fails costs only what it must."""
 
+import threading
 from itertools import pairwise
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from imud.contracts.publisher import Batch
 from imud.event import Event, EventKind
@@ -16,12 +18,22 @@ from imud.publishers.mqtt.sender import MqttSender
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 from imud.publishers.mqtt.spool import POSITIONS_MAX, Spool, SpoolError
 from imud.publishers.mqtt.streams import Gateway
-from imud.publishers.mqtt.writer import COMMIT_NS, DISK_RETRY_NS, PENDING_BYTES, SpoolWriter, WriterQueue
+from imud.publishers.mqtt.writer import (
+    COMMIT_NS,
+    DISK_RETRY_NS,
+    PENDING_BYTES,
+    MissedEvents,
+    SentState,
+    SpoolWriter,
+    WriterQueue,
+)
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
+from imud.worker import BusThread, StartWorker
 from tests.publishers.mqtt.fake_broker import FakeBroker
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorker
+from tests.support.socket_rig import device_status
 
 HOUR_NS = 3600 * NS_PER_S
 
@@ -40,20 +52,24 @@ class FailingSpool(Spool):
 class WriterBench:
     """Writer and sender by hand; one sample each millisecond."""
 
-    def __init__(self, path: Path, boot: str = "1", messages_per_s: float | None = None, **settings: object) -> None:
+    def __init__(
+        self, path: Path, boot: str = "1", messages_per_s: float | None = None, queue: WriterQueue | None = None,
+        spool: Spool | None = None, start_worker: StartWorker | None = None, **settings: object,
+    ) -> None:  # fmt: skip
         self.clock, self.broker = VirtualClock(), FakeBroker()
         self.wall_clock: GatewayClock | None = None
         self.utc_offset_ns = 0
         devices = {"bow": {"rate_hz": None, "whole": "slots", **settings}}
         made = msgspec.convert({"devices": devices, "messages_per_s": messages_per_s}, MqttSettings)
-        self.queue = WriterQueue()
-        self.spool = FailingSpool(path, 100_000_000, HOUR_NS)
+        self.queue = queue or WriterQueue()
+        self.disk = FailingSpool(path, 100_000_000, HOUR_NS)
+        self.spool = spool or self.disk
         turn = BrokerTurn([Broker("a", 1, False, False, "")], 60.0, lambda: 0.5)
         self.sender = MqttSender(made, "me", Will("t", b""), turn, self.broker.connect, self.clock.now_ns)
         self.workers: list[HandWorker] = []
         self.writer = SpoolWriter(
             made, Gateway("site", "gw", boot), self.queue, self.spool, self.sender, self.clock.now_ns,
-            lambda: self.utc_offset_ns, self._start, lambda: self.wall_clock,
+            lambda: self.utc_offset_ns, start_worker or self._start, lambda: self.wall_clock,
         )  # fmt: skip
         self.seq = 0
 
@@ -116,7 +132,7 @@ def test_everything_is_spooled_sent_and_removed(tmp_path: Path) -> None:
 def test_nothing_is_sent_before_it_is_stored(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     bench.work()
-    bench.spool.fails = True
+    bench.disk.fails = True
     bench.put(2000)
     bench.work(3)
     assert bench.arrived() == []
@@ -206,10 +222,10 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     bench.put(1000)
     bench.work()
-    bench.spool.fails = True
+    bench.disk.fails = True
     bench.put(1000)
     bench.work(2)
-    bench.spool.fails = False
+    bench.disk.fails = False
     bench.work(DISK_RETRY_NS // NS_PER_S + 1)
     assert bench.writer.problem == ""
     bench.work(3)
@@ -218,14 +234,14 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path) -> None:
 
 def test_a_disk_that_fails_for_long_leaves_the_numbers(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
-    bench.spool.fails = True
+    bench.disk.fails = True
     rounds = 0
     while not bench.writer.lost_on_disk:
         bench.put(10_000)
         bench.work(DISK_RETRY_NS // NS_PER_S)
         rounds += 1
         assert rounds * 10_000 < PENDING_BYTES
-    bench.spool.fails = False
+    bench.disk.fails = False
     bench.work(DISK_RETRY_NS // NS_PER_S + 5)
     counts = bench.counts()
     assert counts.missing == 0
@@ -272,12 +288,43 @@ def test_events_of_the_gateway_and_of_devices(tmp_path: Path) -> None:
 
 def test_the_queue_of_events_is_bounded() -> None:
     queue = WriterQueue(samples_max=10, events_max=2)
-    for _ in range(3):
-        queue.put_event(Event(1, "", EventKind.LINK, "x"))
-    assert (queue.queued, queue.dropped) == (3, 1)
+    for number in range(1000):
+        queue.put_event(Event(number, "", EventKind.LINK, "x"))
+    assert (queue.queued, queue.dropped) == (1000, 998)
     queue.take()
     queue.put_event(Event(1, "", EventKind.LINK, "x"))
-    assert queue.dropped == 1
+    assert queue.dropped == 998
+    taken = list(iter(queue.take, None))
+    assert [type(one) for one in taken] == [Event, MissedEvents, Event], "all that were missed are one item"
+    assert isinstance(taken[1], MissedEvents)
+    assert (taken[1].count, taken[1].t_ns) == (998, 999)
+
+
+def test_events_that_have_no_room_have_numbers_in_their_place(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path, queue=WriterQueue(events_max=2))
+    for _ in range(2):
+        for device in ("bow", "", "bow", "bow", "", "bow"):
+            bench.queue.put_event(Event(bench.clock.now_ns(), device, EventKind.LINK, "x"))
+        bench.work(4)
+    ledgers = FleetLedger(from_begin=True)
+    for payload in bench.arrived():
+        ledgers.take(decode_message(payload), Stream.EVENTS)
+    counts = {key.device: one for key, one in ledgers.counts.items()}
+    assert counts == {
+        "bow": StreamCounts(1, 8, whole=2, dropped={"queue": 6}),
+        "": StreamCounts(1, 4, whole=2, dropped={"queue": 2}),
+    }
+    assert bench.queue.dropped == 8
+    bench.writer.close()
+
+
+def test_of_states_the_newest_of_each_topic_waits() -> None:
+    queue = WriterQueue(events_max=0)
+    for number in range(1000):
+        queue.put_state(SentState({"a": device_status("a", number)}, {"b": number, "c": number}))
+    queue.put_state(SentState({"b": device_status("b", 1)}, {"a": None}))
+    assert queue.take() == SentState({"b": device_status("b", 1)}, {"c": 999, "a": None})
+    assert (queue.take(), queue.dropped) == (None, 0)
 
 
 def test_closing_stores_what_waits(tmp_path: Path) -> None:
@@ -339,3 +386,42 @@ def test_positions_of_this_boot_stay_when_there_are_too_many_though_the_clock_is
         new.work()
     found = [one for one in new.writer.positions if one.boot == "new"]
     assert [(one.begin, one.last) for one in found] == [(1, 2500)]
+
+
+class HangingSpool(Spool):
+    """A spool whose disk hangs in the first transaction until the test lets it go on."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, 100_000_000, HOUR_NS)
+        self.hangs, self.goes_on = threading.Event(), threading.Event()
+
+    def commit(self, new: object, acknowledged: object, now_ns: int, utc_ns: int) -> None:
+        if threading.current_thread().name == "mqtt spool" and not self.goes_on.is_set():
+            self.hangs.set()
+            assert self.goes_on.wait(20)
+        super().commit(new, acknowledged, now_ns, utc_ns)  # type: ignore[arg-type]
+
+
+@pytest.mark.timeout(60)
+def test_a_thread_that_hangs_in_the_disk_keeps_the_spool_and_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("imud.worker.END_LIMIT_S", 0.1)
+    spool, closed = HangingSpool(tmp_path), threading.Event()
+    bench = WriterBench(tmp_path, spool=spool, start_worker=BusThread)
+    bench.writer.closed = closed.set
+    bench.put(1000)
+    bench.clock.advance(COMMIT_NS)
+    bench.sender.wanting()
+    assert spool.hangs.wait(20)
+    bench.put(500)
+    bench.writer.close()
+    assert not closed.is_set()
+    assert "the spool's thread has not ended" in caplog.text
+    assert "500 samples wait" in caplog.text
+    spool.goes_on.set()
+    assert closed.wait(20)
+    assert bench.writer.failure is None
+    again = Spool(tmp_path, 100_000_000, HOUR_NS)
+    again.open()
+    assert sum(row.items for row in again.after(99)) == 1500
