@@ -12,6 +12,7 @@ from math import radians
 import msgspec
 import pynmea2
 import pytest
+from pynmea2.types.proprietary.ash import ASHRATT
 
 from imud.contracts.publisher import AS_SENT, Batch, PublisherContext
 from imud.contracts.settings import wrong_values
@@ -34,7 +35,8 @@ from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.socket_rig import device_status
 
 LIMIT_S = 20.0
-NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (Debian package gpsd)"
+NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (make bench-deps)"
+GPSD_VERSION = "" if NO_GPSD else subprocess.check_output(["gpsd", "-V"], text=True).split()[1]
 LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
 """As a HiPNUC module sends it: right side down by 10°, bow up by 5°, heading 45°."""
 
@@ -106,7 +108,7 @@ async def received(bench: OutputBench, reader: socket.socket) -> list[str]:
     data = reader.recv(65536).decode()
     sentences = data.splitlines()
     for one in sentences:
-        pynmea2.parse(one, check=True) if not one.startswith("$PASHR") else None
+        pynmea2.parse(one, check=True)
     return [one.partition("*")[0].removeprefix("$") for one in sentences]
 
 
@@ -157,6 +159,21 @@ def test_values_are_those_of_ships_whatever_the_axes_are(convention: Convention 
         bench.output.close()
 
     scene()
+
+
+@in_loop
+async def test_pynmea2_reads_the_attitude_of_pashr() -> None:
+    bench = OutputBench(sentences={"PASHR": 1.0})
+    reader = await ready_reader(bench)
+    bench.publish()
+    bench.publish(1000, euler=(radians(-20.5), radians(-7.25), radians(100.0)))
+    first, second = (pynmea2.parse(line, check=True) for line in reader.recv(65536).decode().splitlines())
+    for found, heading, roll, pitch in ((first, 45.0, 10.0, 5.0), (second, 260.0, -20.5, -7.25)):
+        assert isinstance(found, ASHRATT)
+        assert (found.true_heading, found.is_true_heading) == (heading, "T")
+        assert (found.roll, found.pitch) == (roll, pitch)
+    reader.close()
+    bench.output.close()
 
 
 @in_loop
@@ -271,8 +288,8 @@ def gpsd(port: int, source: str) -> Iterator[None]:
         process.wait(timeout=LIMIT_S)
 
 
-async def attitudes(port: int, bench: OutputBench, enough: int) -> list[dict[str, object]]:
-    """Attitude reports of gpsd while samples come."""
+async def reports(port: int, bench: OutputBench, enough: int) -> tuple[list[dict[str, object]], set[str]]:
+    """Attitude reports of gpsd while samples come, and which sentences its parser took, checksum included."""
     async with asyncio.timeout(LIMIT_S):
         while True:
             try:
@@ -280,28 +297,42 @@ async def attitudes(port: int, bench: OutputBench, enough: int) -> list[dict[str
                 break
             except ConnectionRefusedError:
                 await asyncio.sleep(0.05)
-        writer.write(b'?WATCH={"enable":true,"json":true};\n')
+        writer.write(b'?WATCH={"enable":true,"json":true,"raw":1};\n')
         found: list[dict[str, object]] = []
+        taken: set[str] = set()
         line = asyncio.ensure_future(reader.readline())
         while len(found) < enough:
-            bench.publish(100)
+            bench.publish(100, gyro_z=radians(-2.0))
             done, _ = await asyncio.wait([line], timeout=0.05)
             if done:
-                report = json.loads(line.result())
-                found += [report] if report["class"] == "ATT" else []
+                text = line.result().decode()
+                if text.startswith("$"):
+                    taken.add(text.partition(",")[0])
+                elif (report := json.loads(text))["class"] == "ATT":
+                    found.append(report)
                 line = asyncio.ensure_future(reader.readline())
         line.cancel()
         writer.close()
         await writer.wait_closed()
-    return found
+    return found, taken
 
 
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
 @in_loop
-async def test_gpsd_reads_the_heading() -> None:
+async def test_gpsd_takes_all_sentences_and_reports_what_it_knows_of_them() -> None:
+    """Bow to starboard at 2° a second, right side down by 10°, bow up by 5°.
+
+    gpsd 3.22 reports the heading alone; of one that knows more, signs and units are checked.
+    """
     bench = OutputBench(sentences={"HDT": 10.0, "HDG": 10.0, "ROT": 10.0, "XDR": 2.0, "PASHR": 10.0})
     port = free_port()
     with gpsd(port, f"tcp://127.0.0.1:{bench.port}"):
-        found = await attitudes(port, bench, 4)
+        found, taken = await reports(port, bench, 8)
     bench.output.close()
-    assert {report["heading"] for report in found} == {45.0}
+    assert taken == {"$HCHDT", "$HCHDG", "$TIROT", "$YXXDR", "$PASHR"}
+    for report in found:
+        assert report["heading"] == 45.0
+        assert (report.get("roll", 10.0), report.get("pitch", 5.0)) == (10.0, 5.0)
+        assert report.get("rot", 118.6) == pytest.approx(118.6, abs=0.1)
+    if GPSD_VERSION == "3.22":
+        assert {name for report in found for name in report} == {"class", "device", "heading"}
