@@ -19,8 +19,12 @@ TICK_S = 0.05
 EVERY = {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.2}}
 
 
-def main(port: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "") -> None:
-    """Run until killed. `certificates`: folder of an `Authority`, for TLS; empty for none."""
+def main(
+    port: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "", newest_seq: str = "0"
+) -> None:  # fmt: skip
+    """Run until killed. `certificates`: folder of an `Authority`, for TLS; empty for none. Samples count on from
+    `newest_seq`.
+    """
     made: dict[str, object] = {
         "brokers": [f"{'mqtts' if certificates else 'mqtt'}://127.0.0.1:{port}"], "gateway": "gw",
         "spool_directory": spool, "retry_max_s": 1, "devices": EVERY, "spool_mb": float(megabytes),
@@ -34,7 +38,8 @@ def main(port: str, spool: str, epoch: str, megabytes: str = "256", certificates
     output = MqttPublisher(settings, context)
     output.add_device("bow", 0)
     output.start()
-    begin_ns, seq, told = time.monotonic_ns(), 0, 0
+    seq, told = int(newest_seq), 0
+    begin_ns = time.monotonic_ns() - seq * NS_PER_MS
     while True:
         samples = []
         while begin_ns + seq * NS_PER_MS < time.monotonic_ns():

@@ -114,11 +114,13 @@ class KilledGateway:
     """`gateway_process`, which is killed."""
 
     def __init__(
-        self, port: int, spool: Path, epoch: int, megabytes: float = 256, authority: Authority | None = None
-    ) -> None:
-        """With an authority it speaks TLS."""
+        self, port: int, spool: Path, epoch: int, megabytes: float = 256, authority: Authority | None = None,
+        newest_seq: int = 0,
+    ) -> None:  # fmt: skip
+        """With an authority it speaks TLS. Its samples count on from `newest_seq`."""
         self._read = b""
         words = [str(port), str(spool), str(epoch), str(megabytes), str(authority.folder) if authority else ""]
+        words.append(str(newest_seq))
         self.process = subprocess.Popen(
             [sys.executable, "-m", "tests.publishers.mqtt.gateway_process", *words],
             stdout=subprocess.PIPE,

@@ -172,6 +172,28 @@ def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authorit
 
 
 @pytest.mark.filterwarnings(LEFT_OPEN)
+def test_websockets_with_tls(tmp_path: Path, authority: Authority) -> None:
+    port = free_port()
+    first, *others = authority.listener(port)
+    try:
+        with running_broker(tmp_path / "broker", first, "protocol websockets", *others) as broker:
+            own = {"cert_file": authority["gateway.pem"], "key_file": authority["gateway.key"]}
+            collector = Collector(broker.port)
+            connection = connect(f"wss://127.0.0.1:{port}", ca_file=authority["ca.pem"], **own)
+            send(connection, b"x" * 200_000)
+            collector.wait_for(lambda: bool(collector.messages))
+            assert collector.messages == [("imud/s/g/state", b"x" * 200_000)]
+            connection.close()
+            collector.close()
+            with pytest.raises(BrokerError, match=r"(?i)self[- ]signed certificate"):
+                connect(f"wss://127.0.0.1:{port}", **own)
+    except AssertionError as error:
+        if "Websockets support not available" in str(error):
+            pytest.skip("this mosquitto has no websockets")
+        raise
+
+
+@pytest.mark.filterwarnings(LEFT_OPEN)
 def test_a_broker_that_does_not_speak_tls_is_an_error(tmp_path: Path) -> None:
     with running_broker(tmp_path / "broker") as broker, pytest.raises(BrokerError, match=r"mqtts://127.0.0.1"):
         connect(f"mqtts://127.0.0.1:{broker.port}")

@@ -1,18 +1,22 @@
 """A gateway that is killed, a broker that restarts, freezes or refuses: the collector's ledger closes every time.
 
 The truth is the spool's own file: after the end of the gateway, what it stored is what the collector has or what still
-waits. What a gateway that is killed had in memory, samples of `batch_s` and what came since the last transaction, was never
-stored, and no number of theirs was given out.
+waits. What a gateway that is killed had in memory, samples of `batch_s` and what came since the last transaction, was
+never stored, and no number of theirs was given out.
 """
 
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
+from time import monotonic
 
 import pytest
 
-from imud.formats.fleet.ledger import StreamCounts
+from imud.formats.fleet.ledger import FleetLedger, StreamCounts
+from imud.formats.fleet.messages import decode_message
+from imud.formats.fleet.topics import Stream
 from tests.publishers.mqtt.gateways import KilledGateway, LiveGateway, closes, in_spool
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, Mosquitto, free_port, running_broker
+from tests.publishers.mqtt.mosquitto import LIMIT_S, NO_MOSQUITTO, Collector, Mosquitto, free_port, running_broker
 from tests.publishers.mqtt.proxy import Proxy
 
 pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.timeout(120)]
@@ -138,6 +142,86 @@ def test_kill_9_while_the_spool_is_full_closes_with_what_was_thinned(tmp_path: P
     one = counts[BOOT, "samples"]
     assert one.thinned > 0
     assert (one.newest, one.missing, one.balance) == (180_000, 0, 0)
+
+
+class Killings:
+    """Gateways one after another, each killed: at a random time, or while a transaction is written to the log."""
+
+    def __init__(self, port: int, spool: Path, seed: int) -> None:
+        self.newest: dict[int, int] = {}
+        """By epoch, the newest sample that the gateway spoke of."""
+        self.in_commit = 0
+        self._port, self._spool, self._random = port, spool, Random(seed)
+
+    def kill_one(self, epoch: int, *, in_commit: bool, newest_seq: int = 0) -> None:
+        """Start one and kill it, up to 1.5 s after it spoke of a transaction for the first time."""
+        gateway = KilledGateway(self._port, self._spool, epoch, newest_seq=newest_seq)
+        state = gateway.state(LIMIT_S)
+        end_s = monotonic() + self._random.uniform(0.0, 1.5)
+        if in_commit:
+            self.in_commit += self._wait_for_a_write()
+        while state is not None:
+            self.newest[epoch] = state.seq
+            state = gateway.state(0.0 if in_commit else max(0.0, end_s - monotonic()))
+        gateway.kill()
+
+    def _wait_for_a_write(self) -> bool:
+        """Until the log changes, which it does for each page of a transaction; return whether it did."""
+        log = self._spool / "spool.db-wal"
+        end_s, before = monotonic() + LIMIT_S, log.stat().st_mtime_ns
+        while monotonic() < end_s:
+            if log.stat().st_mtime_ns != before:
+                return True
+        return False
+
+
+IN_MEMORY_MAX = 1200
+"""Samples at 1 kHz that no transaction had: those of `batch_s` (0.2 s), and what came until it was told, with a slow
+disk. Without the newest transaction they would be as many more as come in a second."""
+
+
+@pytest.mark.timeout(400)
+def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> None:
+    port, spool = free_port(), tmp_path / "spool"
+    with running_broker(tmp_path / "broker", port=port):
+        collector = Collector(port)
+        killings = Killings(port, spool, seed=16)
+        for epoch in range(1, 21):
+            killings.kill_one(epoch, in_commit=bool(epoch % 2))
+        counts = closes(collector, spool)
+    assert killings.in_commit == 10
+    _, positions = in_spool(spool)
+    stored = {one.boot: one.last for one in positions if one.stream == "samples"}
+    for epoch, newest in killings.newest.items():
+        boot = f"{epoch:016x}"
+        assert newest - stored[boot] < IN_MEMORY_MAX, f"boot {epoch}"  # a transaction may be done that it did not tell
+        one = counts.get((boot, "samples"))
+        if one is not None:  # what came is without a gap; what did not waits
+            assert (one.missing, one.dropped, one.thinned, one.balance) == (0, {}, 0, 0)
+    assert len(stored) == 20
+
+
+@pytest.mark.timeout(400)
+def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
+    port, spool = free_port(), tmp_path / "spool"
+    begun: list[int] = []
+    with running_broker(tmp_path / "broker", port=port):
+        collector = Collector(port)
+        killings = Killings(port, spool, seed=17)
+        for number in range(10):
+            begun.append(killings.newest.get(7, 0) + 5000 * bool(number))
+            killings.kill_one(7, in_commit=bool(number % 2), newest_seq=begun[-1])
+        rows, positions = in_spool(spool)
+        closes(collector, spool)
+    whole = FleetLedger(from_begin=True)
+    came = [payload for topic, payload in collector.messages if topic.endswith("/samples")]
+    for payload in (*came, *(row.payload for row in rows if row.stream == Stream.SAMPLES)):
+        whole.take(decode_message(payload), Stream.SAMPLES)
+    (one,) = whole.counts.values()
+    (last,) = [position.last for position in positions if position.stream == "samples"]
+    assert (one.newest, one.missing, one.balance) == (last, 0, 0)
+    assert set(one.dropped) == {"off"}
+    assert 9 * (5000 - 1500) < one.dropped["off"] < 9 * (5000 + IN_MEMORY_MAX)
 
 
 @pytest.fixture

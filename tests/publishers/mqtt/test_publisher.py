@@ -2,12 +2,15 @@
 
 import builtins
 import json
+import struct
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+import zstandard
 
 from imud.contracts.device_settings import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.publisher import Batch, PublisherContext
@@ -19,7 +22,8 @@ from imud.event import Event, EventKind
 from imud.publishers.mqtt.broker import EXTRA_MISSING
 from imud.publishers.mqtt.publisher import MqttPublisher
 from imud.publishers.mqtt.settings import Broker, MqttSettings, broker_of
-from imud.units import NS_PER_S
+from imud.sample import Sample, Sync
+from imud.units import NS_PER_MS, NS_PER_S
 from tests.publishers.mqtt.fake_broker import FakeBroker
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorker
@@ -303,3 +307,53 @@ def test_birth_and_messages_say_whether_the_wall_clock_is_set(tmp_path: Path) ->
     for one in others:
         assert (one["synchronised"], one["utc_offset_ns"], one["error_ns"]) == (True, 100, 40)
         assert one["t_ns"] > first["t_ns"]
+
+
+# --- a reader that has only what is published -------------------------------------------------------------------------
+
+
+def fields_by_schema(slot: bytes, layout: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a slot that have a value, by the layout of the schema alone."""
+    order = {"little-endian": "<", "big-endian": ">"}[layout["byte_order"]]
+    found: dict[str, Any] = {}
+    for field in layout["fields"]:
+        values = struct.unpack_from(f"{order}{field['count']}{field['code']}", slot, field["offset"])
+        found[field["name"]] = values if field["count"] > 1 else values[0]
+    for name, bit in layout["present_bits"].items():
+        if not found["present"] & bit:
+            found.pop(name, None)
+    found["sync"] = {code: name for name, code in layout["sync_codes"].items()}[found["sync"]]
+    return found
+
+
+def test_slots_are_read_by_the_schema_that_is_published_beside_them(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, devices={"*": {"whole": "slots", "rate_hz": None}})
+    bench.output.add_device("imu0", 3)
+    bench.output.start()
+    sent = [
+        Sample(
+            "imu0", seq, seq * NS_PER_MS, 7, Sync.EDGE, seq * NS_PER_MS + 5, 1_800_000_000 * NS_PER_S + seq,
+            accel_m_s2=(seq / 3, -0.1, 9.8), temperature_c=20.5,
+        )
+        for seq in (1, 2, 3)
+    ]  # fmt: skip
+    bench.output.publish(Batch("imu0", 3, sent))
+    for _ in range(3):
+        bench.tick()
+    bench.broker.wait_for("imud/default/gw/imu0/samples")
+    topics = {topic: payload for topic, payload, _ in bench.close()}
+    layout = json.loads(topics["imud/default/gw/imu0/schema"])["slot"]
+    payload = topics["imud/default/gw/imu0/samples"]
+    begin = 8 + int.from_bytes(payload[6:8], "little")  # "IMUB", version, 0, bytes of the header (docs/fleet.md)
+    slots = zstandard.ZstdDecompressor().decompress(payload[begin:])
+    size = layout["bytes"]
+    assert len(slots) == 3 * size
+    for at, one in enumerate(sent):
+        found = fields_by_schema(slots[at * size : (at + 1) * size], layout)
+        assert {name: found[name] for name in ("seq", "t_ns", "t_rx_ns", "utc_ns", "device_id", "sync")} == {
+            "seq": one.seq, "t_ns": one.t_ns, "t_rx_ns": one.t_rx_ns, "utc_ns": one.utc_ns, "device_id": 3,
+            "sync": "edge",
+        }  # fmt: skip
+        assert (found["accel_m_s2"], found["temperature_c"]) == (one.accel_m_s2, 20.5)
+        assert not {"gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "pressure_pa", "t_dev_ns"} & set(found)
+        assert found["crc32"] == zlib.crc32(slots[at * size : (at + 1) * size - 4])
