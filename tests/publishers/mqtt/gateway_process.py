@@ -4,8 +4,13 @@ It makes samples of one device at 1 kHz in the real time of the machine, sends t
 each transaction how far each stream has come into the spool.
 """
 
+import os
+import signal
+import sqlite3
 import sys
 import time
+from functools import partial
+from typing import Any
 
 import msgspec
 
@@ -20,11 +25,14 @@ EVERY = {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.2}}
 
 
 def main(
-    port: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "", newest_seq: str = "0"
+    port: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "", newest_seq: str = "0",
+    statements: str = "0",
 ) -> None:  # fmt: skip
     """Run until killed. `certificates`: folder of an `Authority`, for TLS; empty for none. Samples count on from
-    `newest_seq`.
+    `newest_seq`. With `statements` it kills itself before that statement of all that are inside a transaction.
     """
+    if int(statements):
+        die_at_statement(int(statements))
     made: dict[str, object] = {
         "brokers": [f"{'mqtts' if certificates else 'mqtt'}://127.0.0.1:{port}"], "gateway": "gw",
         "spool_directory": spool, "retry_max_s": 1, "devices": EVERY, "spool_mb": float(megabytes),
@@ -54,6 +62,29 @@ def main(
             told = status.spooled
             print(f"{status.waiting} {seq} {status.spool_bytes}", flush=True)
         time.sleep(TICK_S)
+
+
+def die_at_statement(number: int) -> None:
+    """Have SQLite's connections count statements inside transactions, and kill this process before one of them."""
+    left = number
+    connect = sqlite3.connect
+
+    class Dying(sqlite3.Connection):
+        def execute(self, *args: Any) -> sqlite3.Cursor:
+            self._count()
+            return super().execute(*args)
+
+        def executemany(self, *args: Any) -> sqlite3.Cursor:
+            self._count()
+            return super().executemany(*args)
+
+        def _count(self) -> None:
+            nonlocal left
+            left -= self.in_transaction
+            if left <= 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    setattr(sqlite3, "connect", partial(connect, factory=Dying))  # noqa: B010 - its type has overloads
 
 
 if __name__ == "__main__":

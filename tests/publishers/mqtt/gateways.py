@@ -115,12 +115,14 @@ class KilledGateway:
 
     def __init__(
         self, port: int, spool: Path, epoch: int, megabytes: float = 256, authority: Authority | None = None,
-        newest_seq: int = 0,
+        newest_seq: int = 0, statements: int = 0,
     ) -> None:  # fmt: skip
-        """With an authority it speaks TLS. Its samples count on from `newest_seq`."""
+        """With an authority it speaks TLS. Its samples count on from `newest_seq`. With `statements` it kills itself
+        before that statement inside transactions.
+        """
         self._read = b""
         words = [str(port), str(spool), str(epoch), str(megabytes), str(authority.folder) if authority else ""]
-        words.append(str(newest_seq))
+        words += [str(newest_seq), str(statements)]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "tests.publishers.mqtt.gateway_process", *words],
             stdout=subprocess.PIPE,

@@ -6,6 +6,7 @@ never stored, and no number of theirs was given out.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 from time import monotonic
@@ -145,36 +146,29 @@ def test_kill_9_while_the_spool_is_full_closes_with_what_was_thinned(tmp_path: P
 
 
 class Killings:
-    """Gateways one after another, each killed: at a random time, or while a transaction is written to the log."""
+    """Gateways one after another, each killed: at a random time, or before a random statement of a transaction."""
 
     def __init__(self, port: int, spool: Path, seed: int) -> None:
         self.newest: dict[int, int] = {}
         """By epoch, the newest sample that the gateway spoke of."""
-        self.in_commit = 0
         self._port, self._spool, self._random = port, spool, Random(seed)
 
     def kill_one(self, epoch: int, *, in_commit: bool, newest_seq: int = 0) -> None:
-        """Start one and kill it, up to 1.5 s after it spoke of a transaction for the first time."""
-        gateway = KilledGateway(self._port, self._spool, epoch, newest_seq=newest_seq)
+        """Start one; it ends within 1.5 s after it spoke of a transaction for the first time, or in one of some."""
+        statements = self._random.randint(STATEMENTS, 4 * STATEMENTS) if in_commit else 0
+        gateway = KilledGateway(self._port, self._spool, epoch, newest_seq=newest_seq, statements=statements)
         state = gateway.state(LIMIT_S)
-        end_s = monotonic() + self._random.uniform(0.0, 1.5)
-        if in_commit:
-            self.in_commit += self._wait_for_a_write()
-        while state is not None:
-            self.newest[epoch] = state.seq
-            state = gateway.state(0.0 if in_commit else max(0.0, end_s - monotonic()))
+        end_s = monotonic() + (LIMIT_S if in_commit else self._random.uniform(0.0, 1.5))
+        with suppress(AssertionError):  # the gateway ended
+            while state is not None:
+                self.newest[epoch] = state.seq
+                state = gateway.state(max(0.0, end_s - monotonic()))
+        assert not in_commit or gateway.process.wait(LIMIT_S) < 0
         gateway.kill()
 
-    def _wait_for_a_write(self) -> bool:
-        """Until the log changes, which it does for each page of a transaction; return whether it did."""
-        log = self._spool / "spool.db-wal"
-        end_s, before = monotonic() + LIMIT_S, log.stat().st_mtime_ns
-        while monotonic() < end_s:
-            if log.stat().st_mtime_ns != before:
-                return True
-        return False
 
-
+STATEMENTS = 12
+"""Inside one transaction, about."""
 IN_MEMORY_MAX = 1200
 """Samples at 1 kHz that no transaction had: those of `batch_s` (0.2 s), and what came until it was told, with a slow
 disk. Without the newest transaction they would be as many more as come in a second."""
@@ -189,7 +183,6 @@ def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> No
         for epoch in range(1, 21):
             killings.kill_one(epoch, in_commit=bool(epoch % 2))
         counts = closes(collector, spool)
-    assert killings.in_commit == 10
     _, positions = in_spool(spool)
     stored = {one.boot: one.last for one in positions if one.stream == "samples"}
     for epoch, newest in killings.newest.items():
@@ -204,13 +197,13 @@ def test_kill_9_at_random_moments_costs_what_was_in_memory(tmp_path: Path) -> No
 @pytest.mark.timeout(400)
 def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
-    begun: list[int] = []
+    begun = 0
     with running_broker(tmp_path / "broker", port=port):
         collector = Collector(port)
         killings = Killings(port, spool, seed=17)
         for number in range(10):
-            begun.append(killings.newest.get(7, 0) + 5000 * bool(number))
-            killings.kill_one(7, in_commit=bool(number % 2), newest_seq=begun[-1])
+            killings.kill_one(7, in_commit=bool(number % 2), newest_seq=begun)
+            begun = max(begun, killings.newest[7]) + 10_000  # more than it can have stored and not told
         rows, positions = in_spool(spool)
         closes(collector, spool)
     whole = FleetLedger(from_begin=True)
@@ -221,7 +214,7 @@ def test_kill_9_in_one_boot_shows_each_loss_as_a_gap(tmp_path: Path) -> None:
     (last,) = [position.last for position in positions if position.stream == "samples"]
     assert (one.newest, one.missing, one.balance) == (last, 0, 0)
     assert set(one.dropped) == {"off"}
-    assert 9 * (5000 - 1500) < one.dropped["off"] < 9 * (5000 + IN_MEMORY_MAX)
+    assert one.dropped["off"] > 8 * 5000  # the last may have stored nothing
 
 
 @pytest.fixture
