@@ -1,21 +1,23 @@
 """`make fleet-day`: a spool with what a day without a network makes, and how long the broker then takes to get it.
 
-`python -m tests.bench.fleet_day [--hours 24] [--devices 2]`. Each device has statistics of 1 Hz in messages of 1 s,
-as by default. The spool is filled as fast as the disk takes it, by the output's own parts; then the output, mosquitto
-and a collector start, and the time is measured until the spool is empty. It ends with 1 where a number is missing, or
-came out of its order.
+`python -m tests.bench.fleet_day [--hours 24] [--devices 2] [--messages-per-s 200] [--newest-first] [--live-hz 100]`.
+Each device has statistics of 1 Hz in messages of 1 s, as by default. The spool is filled as fast as the disk takes it,
+by the output's own parts; then the output, mosquitto and a collector start, and the time is measured until the whole
+day has come. With --live-hz a further device has samples meanwhile, whole ones in messages of 1 s, and the time from
+the newest of a message to its arrival is printed. It ends with 1 where a number is missing, or came out of its order.
 """
 
 import argparse
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic, time_ns
 from typing import Final
 
-from imud.formats.fleet.topics import Stream
+from imud.contracts.publisher import Batch
 from imud.publishers.mqtt.settings import DeviceSending
 from imud.publishers.mqtt.spool import Spool
 from imud.publishers.mqtt.streams import DeviceStreams, Gateway
@@ -30,6 +32,10 @@ TOGETHER_S: Final = 60
 """Seconds that are written in one transaction."""
 LIMIT_S: Final = 1800.0
 SPOOL_BYTES: Final = 4 << 30
+LIVE: Final = "bow"
+"""The device whose samples come meanwhile."""
+DAY: Final = {"whole": "none", "rate_hz": 1, "batch_s": 1}
+NOW: Final = {"whole": "slots", "rate_hz": None, "batch_s": 1}
 
 
 def fill(folder: Path, hours: float, devices: int) -> tuple[int, int]:
@@ -60,11 +66,91 @@ def samples(device: int, begin_s: int, end_s: int) -> Iterator[Sample]:
         )  # fmt: skip
 
 
+class LiveData:
+    """Samples of the present, and how late their messages arrive."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self.delays_s: list[float] = []
+        """From the newest sample of a message to its arrival, in the order of arrivals, within the 20 ms of a look."""
+        self._looked = 0
+        self._rate_hz, self._begin_s, self._seq = rate_hz, monotonic(), 0
+
+    def publish(self, gateway: LiveGateway) -> None:
+        """Give what has become due."""
+        made = []
+        while (self._seq + 1) / self._rate_hz < monotonic() - self._begin_s:
+            self._seq += 1
+            t_ns = round((self._begin_s + self._seq / self._rate_hz) * NS_PER_S)
+            made.append(Sample(LIVE, self._seq, t_ns, 0, Sync.EDGE, t_ns, t_ns, accel_m_s2=(self._seq / 7, 0, 9.8)))
+        if made:
+            gateway.output.publish(Batch(LIVE, 0, made))
+
+    def look(self, collector: Collector) -> None:
+        """Note messages that came since the last call; `utc_ns` of these samples is CLOCK_MONOTONIC."""
+        fresh, now_s = collector.fresh, monotonic()
+        end = len(fresh)
+        found = [one.utc_ns / NS_PER_S for one in fresh[self._looked : end] if one.device == LIVE]
+        self._looked = end
+        self.delays_s += [now_s - newest_s for newest_s in found]
+
+
+def has_all(collector: Collector, devices: int, last: int) -> bool:
+    """Whether everything of the day has come."""
+    newest = {key.device: one.newest for key, one in list(collector.ledger.counts.items()) if key.device != LIVE}
+    return len(newest) == devices and all(one == last for one in newest.values())
+
+
+def replay(args: argparse.Namespace, spool: Path, port: int, messages: int) -> int:
+    """Send it all, print how long that took and the account; 1 where it does not close."""
+    data = LiveData(args.live_hz or 1.0)
+    collector = Collector(port)
+    begin_s, last = monotonic(), round(args.hours * 3600) * RATE_HZ
+    settings = {"messages_per_s": args.messages_per_s, "newest_first": args.newest_first}
+    devices = {LIVE: NOW, "*": DAY}
+    live = LiveGateway(spool, port, spool_mb=SPOOL_BYTES / 1e6, devices=devices, **settings)
+    pause = threading.Event()
+    took_s = 0.0
+    while monotonic() - begin_s < LIMIT_S and not (took_s and (data.delays_s or not args.live_hz)):
+        if not took_s and has_all(collector, args.devices, last):
+            took_s = monotonic() - begin_s
+        if args.live_hz:
+            data.publish(live)
+            data.look(collector)
+        live.output.tick(live.host.now_ns())
+        pause.wait(0.02)
+    live.output.close()
+    collector.close()
+    return report(args, collector, data, messages, took_s)
+
+
+def report(args: argparse.Namespace, collector: Collector, data: LiveData, messages: int, took_s: float) -> int:
+    """Print the account; 1 where a number is missing, or came out of its order."""
+    newest: dict[str, int] = {}
+    out_of_order = 0
+    for message in collector.fresh:
+        out_of_order += message.first != newest.get(message.device, 0) + 1
+        newest[message.device] = message.last
+    days = [one for key, one in collector.ledger.counts.items() if key.device != LIVE]
+    missing, duplicates = sum(one.missing for one in days), sum(one.duplicates for one in days)
+    took_s = took_s or LIMIT_S
+    times = args.hours * 3600 / took_s
+    print(f"  replayed in {took_s:.0f} s, {messages / took_s:.0f} messages/s, {times:.0f} times live")
+    print(f"  missing {missing}, duplicates {duplicates}, out of order {out_of_order}, streams {len(days)}")
+    if delays_s := sorted(data.delays_s):
+        p50_s, p99_s = delays_s[len(delays_s) // 2], delays_s[len(delays_s) * 99 // 100]
+        late = f"delay median {p50_s:.1f} s, p99 {p99_s:.1f} s, largest {delays_s[-1]:.1f} s"
+        print(f"  live meanwhile: {len(delays_s)} messages, {late}")
+    return int(bool(missing or out_of_order) or len(days) != args.devices)
+
+
 def main() -> int:
     """Run it."""
     parser = argparse.ArgumentParser(prog="make fleet-day")
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--devices", type=int, default=2)
+    parser.add_argument("--messages-per-s", type=float, help="bound of the replay, as mqtt.messages_per_s")
+    parser.add_argument("--newest-first", action="store_true", help="as mqtt.newest_first: live data before the day's")
+    parser.add_argument("--live-hz", type=float, default=0.0, help="samples of a further device meanwhile; 0: none")
     args = parser.parse_args()
     if NO_MOSQUITTO:
         print(NO_MOSQUITTO)
@@ -77,27 +163,7 @@ def main() -> int:
         begin_s = monotonic()
         messages, used_bytes = fill(spool, args.hours, args.devices)
         print(f"  {messages} messages, {used_bytes / 1e6:.0f} MB, filled in {monotonic() - begin_s:.0f} s", flush=True)
-        collector = Collector(broker.port)
-        begin_s = monotonic()
-        live = LiveGateway(spool, broker.port, spool_mb=SPOOL_BYTES / 1e6)
-        live.wait_for(lambda: live.output.status().waiting == 0, LIMIT_S)
-        took_s = monotonic() - begin_s
-        last = round(args.hours * 3600) * RATE_HZ
-        collector.wait_for(lambda: all(one.newest == last for one in collector.ledger.counts.values()), 60.0)
-        live.output.close()
-        collector.close()
-    newest: dict[str, int] = {}
-    out_of_order = 0
-    for message in collector.fresh:
-        out_of_order += message.first != newest.get(message.device, 0) + 1
-        newest[message.device] = message.last
-    counts = [one for key, one in collector.ledger.counts.items() if key.stream == Stream.STATISTICS]
-    missing, duplicates = sum(one.missing for one in counts), sum(one.duplicates for one in counts)
-    print(
-        f"  replayed in {took_s:.0f} s, {messages / took_s:.0f} messages/s, {args.hours * 3600 / took_s:.0f} times live"
-    )
-    print(f"  missing {missing}, duplicates {duplicates}, out of order {out_of_order}, streams {len(counts)}")
-    return int(bool(missing or out_of_order) or len(counts) != args.devices)
+        return replay(args, spool, broker.port, messages)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Cost of the output `mqtt`: CPU of the daemon at 1 kHz with and without it, whatever the broker does, and its wear.
 
 `python -m tests.bench.mqtt [--quick]`. Brokers: Debian's mosquitto; nobody at the port; mosquitto that refuses the
-user; a peer that accepts, and reads 1 kB a second; mosquitto that is stopped with SIGSTOP. The same load runs in turns,
-and the best round of each counts. All samples are sent as slots, and statistics of 1 Hz.
+user; a peer that accepts, and reads 1 kB a second; mosquitto that is stopped with SIGSTOP. Each round runs the load
+without the output right before and after each load with it; the ratio is to the mean of both, and the median of the
+rounds counts. All samples are sent as slots, and statistics of 1 Hz.
 
 The event loop's thread is what samples wait for; the whole daemon has the two threads of the output as well, which run
 beside it where there is a second core. Bytes written are `write_bytes` of /proc/PID/io, on the file system of the
@@ -17,7 +18,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from statistics import median
+from typing import Final, NamedTuple
 
 from tests.bench.rig import Load, Outcome, run
 from tests.bench.rows import Row, at_most
@@ -33,28 +35,49 @@ HOUR_S: Final = 3600
 Place = Callable[[Path], AbstractContextManager[int]]
 
 
+class Pair(NamedTuple):
+    """A measurement with the output, and those without it right before and after."""
+
+    outcome: Outcome
+    before: Outcome
+    after: Outcome
+
+    def ratio(self, part: str) -> float:
+        """Of a figure of `Outcome`, to the mean without the output."""
+        without = (getattr(self.before, part) + getattr(self.after, part)) / 2
+        return float(getattr(self.outcome, part) / without)
+
+
+def middle(outcomes: Sequence[Outcome], part: str) -> float:
+    """The median of a figure of `Outcome`."""
+    return float(median(getattr(one, part) for one in outcomes))
+
+
 def rows(*, quick: bool = False) -> Iterator[Row]:
     """All figures."""
     if NO_MOSQUITTO:
         print(f"skipped: {NO_MOSQUITTO}")
         return
-    rounds, seconds = (1, 2.0) if quick else (3, 6.0)
+    rounds, seconds = (1, 2.0) if quick else (5, 6.0)
     brokers = {name: BROKERS[name] for name in QUICK} if quick else BROKERS
-    outcomes: dict[str, list[Outcome]] = {name: [] for name in ("without", *brokers)}
+    plain = [run(Load(seconds=seconds))]
+    pairs: dict[str, list[Pair]] = {name: [] for name in brokers}
     for _ in range(rounds):
-        outcomes["without"].append(run(Load(seconds=seconds)))
         for name, place in brokers.items():
-            outcomes[name].append(run_with(place, Load(seconds=seconds), SAMPLES))
-    best = {name: min(found, key=lambda one: one.loop_us_per_sample) for name, found in outcomes.items()}
-    plain = best.pop("without")
-    yield Row("1 kHz, no output mqtt: CPU of the event loop per sample", plain.loop_us_per_sample, "us")
-    for name, outcome in best.items():
-        ratio = outcome.loop_us_per_sample / plain.loop_us_per_sample
-        yield at_most(f"1 kHz, broker {name}: CPU ratio of the event loop", ratio, "x", LOOP_RATIO_LIMIT)
-        yield Row(
-            f"1 kHz, broker {name}: CPU ratio of the daemon", outcome.cpu_us_per_sample / plain.cpu_us_per_sample, "x"
+            outcome = run_with(place, Load(seconds=seconds), SAMPLES)
+            plain.append(run(Load(seconds=seconds)))
+            pairs[name].append(Pair(outcome, plain[-2], plain[-1]))
+    yield Row("1 kHz, no output mqtt: CPU of the event loop per sample", middle(plain, "loop_us_per_sample"), "us")
+    yield Row("1 kHz, no output mqtt: latency of samples, p99", middle(plain, "p99_us"), "us")
+    for name, found in pairs.items():
+        loop, daemon = (
+            median(one.ratio(part) for one in found) for part in ("loop_us_per_sample", "cpu_us_per_sample")
         )
-        lost = max(one.lost for one in outcomes[name])
+        yield at_most(f"1 kHz, broker {name}: CPU ratio of the event loop", loop, "x", LOOP_RATIO_LIMIT)
+        yield Row(f"1 kHz, broker {name}: CPU ratio of the daemon", daemon, "x")
+        outcomes = [one.outcome for one in found]
+        yield Row(f"1 kHz, broker {name}: latency of samples, p99", middle(outcomes, "p99_us"), "us")
+        lost = max(one.lost for one in outcomes)
         yield at_most(f"1 kHz, broker {name}: samples lost", float(lost), "samples", 0)
     yield from wear_rows(5.0, ("present",)) if quick else wear_rows(60.0, ("present", "gone"))
 
