@@ -7,7 +7,7 @@ import os
 import select
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
@@ -97,6 +97,8 @@ class Machine:
         self.uid = 1000
         self.gids: frozenset[int] = frozenset({1000})
         self.boot_utc_ns = 0
+        self.on_pause: Callable[[], None] = lambda: None
+        """What happens while a check waits."""
 
     def write(self, path: str, text: str = "") -> Path:
         """Make a file, and the folders that it is in."""
@@ -147,13 +149,17 @@ class Machine:
             raise self.status
         return self.status
 
+    def pause(self, _seconds: float) -> None:
+        """Let happen at once what happens meanwhile."""
+        self.on_pause()
+
     def surroundings(self) -> Surroundings:
         """The machine as the checks see it."""
         times_s = iter(self.sync_s)
         return Surroundings(
             Path("/etc/imud.yaml"), self.ask, root=self.root, run=self.run, fetch=self.fetch,
             clock=lambda: self.clock, sync_s=lambda _folder: next(times_s), uid=self.uid, gids=self.gids,
-            boot_utc_ns=lambda: self.boot_utc_ns,
+            boot_utc_ns=lambda: self.boot_utc_ns, pause=self.pause,
         )  # fmt: skip
 
     def find(self, check: DoctorCheck) -> list[DoctorFinding]:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from imud.cli.doctor.finding import Findings, error, note, ok, warning
 from imud.cli.doctor.surroundings import Surroundings
-from imud.contracts.status import DeviceState
+from imud.contracts.status import DeviceState, DeviceStatus
 from imud.links.can.link import NATIVE
 from imud.links.can.netlink import absence, can_interfaces
 
@@ -19,6 +19,9 @@ COUNTER_LIMIT: Final = 96
 """Error counter of a controller in the state warning (ISO 11898-1)."""
 NO_ACKNOWLEDGEMENT: Final = 128
 """Where the transmit error counter stays when no other node acknowledges: then error-passive, never bus-off."""
+LISTEN_S: Final = 2.0
+"""A module sends once a second at its slowest: a bus without a frame for so long is silent."""
+ABSENT: Final = (DeviceState.SEARCHING, DeviceState.SILENT)
 BUS_ADVICE: Final = (
     "120 Ω at both ends (60 Ω between CAN_H and CAN_L without power)? CAN_H and CAN_L swapped? "
     "All nodes the same bit rate?"
@@ -70,8 +73,8 @@ def can_state(at: Surroundings) -> Findings:
                 "" if data.get("restart_ms") else f"`sudo ip link set {name} type can restart-ms 100` lets it recover; "
             )
             yield error(f"{told}: it has left the bus", restart + BUS_ADVICE)
-        elif (tx or rx) and not frames:
-            yield error(told, _without_traffic(tx, rx))
+        elif (tx or rx) and not _runs(at, name) and _silent(at, name, frames):
+            yield error(f"{told}, none now", _without_traffic(tx, rx))
         elif state in ("ERROR-PASSIVE", "ERROR-WARNING") or max(tx, rx) >= COUNTER_LIMIT:
             yield warning(told, BUS_ADVICE)
         else:
@@ -99,27 +102,40 @@ def can_bitrate(at: Surroundings) -> Findings:
         bitrate = int(data.get("bittiming", {}).get("bitrate", 0))
         if not bitrate:
             continue
-        down = [
-            one.name
-            for one in at.devices("socketcan")
-            if getattr(one.link_settings, "interface", "") == name
-            and (status := at.status_of(one.name)) is not None
-            and status.state is DeviceState.SEARCHING
-        ]
+        down = [one.name for one in _devices(at, name) if one.state in ABSENT]
         change = f"`sudo ip link set {name} down`, then `sudo ip link set {name} up type can bitrate RATE`"
         if bitrate not in BITRATES:
             yield warning(
                 f"{name} has {bitrate} bit/s, which no supported module has",
                 f"one of {', '.join(map(str, BITRATES))}: {change}",
             )
-        elif down and not frames:
+        elif down and not _runs(at, name) and _silent(at, name, frames):
             others = ", ".join(str(rate) for rate in BITRATES if rate != bitrate)
             yield error(
-                f"{', '.join(down)}: no frame came at {bitrate} bit/s on {name}",
+                f"{', '.join(down)}: no frame comes at {bitrate} bit/s on {name}",
                 f"try {others}: {change}; else power and wiring of the module",
             )
         else:
             yield ok(f"{name} has {bitrate} bit/s" + (f", {frames} frames received" if frames else ""))
+
+
+def _devices(at: Surroundings, name: str) -> list[DeviceStatus]:
+    """Status of the configured devices on an interface, as far as the daemon has it."""
+    found = (
+        at.status_of(one.name) for one in at.devices("socketcan") if getattr(one.link_settings, "interface", "") == name
+    )
+    return [status for status in found if status is not None]
+
+
+def _runs(at: Surroundings, name: str) -> bool:
+    return any(one.state is DeviceState.RUNNING for one in _devices(at, name))
+
+
+def _silent(at: Surroundings, name: str, frames: int) -> bool:
+    """Whether no frame comes within LISTEN_S. Those before, `frames`, may be from before the bit rate was changed."""
+    if frames:
+        at.pause(LISTEN_S)
+    return not frames or _details(at, name)[1] == frames
 
 
 def _up(at: Surroundings) -> list[str]:

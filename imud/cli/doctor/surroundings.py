@@ -73,10 +73,12 @@ class Surroundings:
         uid: int | None = None,
         gids: frozenset[int] | None = None,
         boot_utc_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns(),
+        pause: Callable[[float], None] = time.sleep,
     ) -> None:
         """`ask` returns the status of the daemon's devices, and raises ImudError or TimeoutError where it has none.
 
-        `sync_s` measures the time of writing to a folder; `boot_utc_ns` is UTC at zero of CLOCK_MONOTONIC.
+        `sync_s` measures the time of writing to a folder; `boot_utc_ns` is UTC at zero of CLOCK_MONOTONIC;
+        `pause` waits so many seconds.
         """
         self.config_file = config_file
         self.root = root
@@ -87,6 +89,7 @@ class Surroundings:
         self.uid = os.geteuid() if uid is None else uid
         self.gids = frozenset({*os.getgroups(), os.getegid()}) if gids is None else gids
         self.boot_utc_ns = boot_utc_ns
+        self.pause = pause
         self._ask = ask
 
     # --- files --------------------------------------------------------------------------------------------------------

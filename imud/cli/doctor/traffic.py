@@ -34,7 +34,7 @@ def heard(at: Surroundings) -> Findings:
         counts = one.ledger
         if one.state in (DeviceState.MISSING, DeviceState.FAILED, DeviceState.FINISHED):
             continue
-        if counts["frames_good"]:
+        if counts["samples"]:
             yield from _damage(one)
             yield from _answers(at, one)
         elif counts["bytes_in"] == 0:
@@ -56,9 +56,15 @@ def heard(at: Surroundings) -> Findings:
             )
         else:
             yield error(
-                f"{one.name}: {counts['bytes_in']} bytes on {one.link}, but no valid frame",
+                f"{one.name}: {counts['bytes_in']} bytes on {one.link}, but no {_missed(one)}",
                 "wrong rate, driver or device: set `baud: auto` and `driver: auto`; `imud probe` tries all",
             )
+
+
+def _missed(one: DeviceStatus) -> str:
+    """What did not come. Noise of a wrong rate has lines that count as replies, so valid frames alone say nothing."""
+    good = one.ledger["frames_good"]
+    return f"sample in {good} frames" if good else "valid frame"
 
 
 def _damage(one: DeviceStatus) -> Findings:

@@ -75,9 +75,20 @@ def test_state_and_error_counters(
     mast: Machine, data: dict[str, object], packets: int, severity: str, words: str
 ) -> None:
     interface(mast, packets=packets, data=data)
+    mast.on_pause = lambda: interface(mast, packets=packets + 20, data=data)
     ((got, text),) = mast.told(STATE)
     assert got == severity
     assert words in text
+
+
+def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
+    """The module was unplugged, or the bit rate changed: the kernel goes on counting frames from before."""
+    interface(mast, packets=100, data=controller("ERROR-PASSIVE", 128, 0))
+    ((severity, text),) = mast.told(STATE)
+    assert severity == "error"
+    assert "100 frames received, none now → no other node acknowledges" in text
+    mast.status = [device("mast", state=DeviceState.RUNNING)]  # one that sends when it is asked
+    assert mast.find(STATE)[0].severity == "warning"
 
 
 def test_bus_off_before_and_no_restart(mast: Machine) -> None:
@@ -93,7 +104,8 @@ def test_bus_off_before_and_no_restart(mast: Machine) -> None:
     ("bitrate", "packets", "state", "severity"),
     [
         (500_000, 0, DeviceState.SEARCHING, "error"),
-        (500_000, 9, DeviceState.SEARCHING, "ok"),
+        (500_000, 9, DeviceState.SEARCHING, "error"),
+        (500_000, 9, DeviceState.SILENT, "error"),
         (500_000, 0, DeviceState.RUNNING, "ok"),
         (100_000, 9, DeviceState.RUNNING, "warning"),
     ],
@@ -104,7 +116,14 @@ def test_bit_rates(mast: Machine, bitrate: int, packets: int, state: DeviceState
     ((got, text),) = mast.told(RATE)
     assert got == severity
     if severity == "error":
-        assert "mast: no frame came at 500000 bit/s on can0 → try 125000, 250000, 1000000" in text
+        assert "mast: no frame comes at 500000 bit/s on can0 → try 125000, 250000, 1000000" in text
+
+
+def test_a_bus_with_frames_of_others_has_their_bit_rate(mast: Machine) -> None:
+    interface(mast, packets=9, data=controller())
+    mast.status = [device("mast", state=DeviceState.SEARCHING)]
+    mast.on_pause = lambda: interface(mast, packets=10, data=controller())
+    assert mast.told(RATE) == [("ok", "can0 has 500000 bit/s, 9 frames received → ")]
 
 
 @pytest.mark.parametrize("answer", ["", "{}", "[]", "[1]", '[{"linkinfo": 3}]'])

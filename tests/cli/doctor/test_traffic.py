@@ -1,5 +1,7 @@
 """What the daemon's counters say of wires, rates, supplies and lines."""
 
+from typing import Any
+
 import msgspec
 import pytest
 
@@ -27,6 +29,8 @@ UART = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
 WIRED = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}, lines: {sout: {line: GPIO17}}}"
 RS485 = "bow: {driver: hipnuc-modbus, rs485: {line: /dev/ttyUSB0, address: 80}}"
 
+GOOD: dict[str, Any] = {"frames_good": 5000, "samples": 5000}
+
 
 def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> DeviceStatus:
     """A device with these counts, the others 0, and no errors of the kernel."""
@@ -52,9 +56,10 @@ def test_all_of_it_needs_the_daemon(machine: Machine) -> None:
             "error",
             "9 framing errors",
         ),
-        (counted(DeviceState.RUNNING, frames_good=5000, frames_bad_crc=3), "ok", "3 damaged"),
-        (counted(DeviceState.RUNNING, frames_good=5000, frames_bad_crc=6), "warning", "6 damaged frames"),
-        (msgspec.structs.replace(counted(frames_good=5000), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
+        (counted(bytes_in=5000, frames_good=7, frames_in_replies=7), "error", "but no sample in 7 frames"),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=3), "ok", "3 damaged"),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged frames"),
+        (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
     ],
 )
 def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, words: str) -> None:
