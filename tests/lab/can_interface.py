@@ -9,6 +9,7 @@ from tests.lab.tool import tool
 
 BITRATE = 500_000
 FAULT = Path("/sys/module/imud_lab/parameters/can_fault")
+COUNTERS = Path("/sys/module/imud_lab/parameters/can_counters")
 MODE_RESET = b"\x01"
 """Mode register, the first of an SJA1000, with bit RM alone."""
 
@@ -37,6 +38,15 @@ class CanInterface:
             with open(f"/sys/class/net/{self.name}/device/resource1", "r+b", buffering=0) as registers:
                 registers.write(MODE_RESET)
         FAULT.write_text(f"{self.name} {state}", encoding="ascii")
+
+    @contextmanager
+    def error_counters(self, tx: int, rx: int) -> Iterator[None]:
+        """Has its driver report these error counters for as long as the block; the emulated chip's stay 0."""
+        COUNTERS.write_text(f"{self.name} {tx} {rx}", encoding="ascii")
+        try:
+            yield
+        finally:
+            COUNTERS.write_text(f"{self.name} 0 0", encoding="ascii")
 
     def restart(self) -> None:
         """Restarts a controller that is bus-off, as an administrator does."""

@@ -8,6 +8,11 @@
  * does what a controller's driver does in its error interrupt: the interface
  * changes its state, an error frame goes to the sockets that want it, and after
  * bus-off the driver's own restart is due.
+ *
+ *   echo "can0 128 0" > /sys/module/imud_lab/parameters/can_counters
+ *
+ * has the driver report these error counters, transmit and receive, in place of
+ * the chip's, which stay 0; "can0 0 0" has it report the chip's again.
  */
 #include <linux/can/dev.h>
 #include <linux/can/error.h>
@@ -63,3 +68,54 @@ static int can_fault_set(const char *value, const struct kernel_param *param)
 static const struct kernel_param_ops can_fault_ops = { .set = can_fault_set };
 module_param_cb(can_fault, &can_fault_ops, NULL, 0200);
 MODULE_PARM_DESC(can_fault, "INTERFACE STATE: let a CAN controller enter an error state");
+
+/* The one interface whose counters are not the chip's, and its driver's function. */
+static struct net_device *counted;
+static int (*chip_counters)(const struct net_device *, struct can_berr_counter *);
+static struct can_berr_counter counters;
+
+static int given_counters(const struct net_device *dev, struct can_berr_counter *found)
+{
+	*found = counters;
+	return 0;
+}
+
+static int count(struct net_device *dev, u16 tx, u16 rx)
+{
+	struct can_priv *priv = safe_candev_priv(dev);
+
+	if (!priv || !priv->do_get_berr_counter)
+		return -EOPNOTSUPP;
+	if (counted)
+		safe_candev_priv(counted)->do_get_berr_counter = chip_counters;
+	counted = NULL;
+	counters.txerr = tx;
+	counters.rxerr = rx;
+	if (tx || rx) {
+		counted = dev;
+		chip_counters = priv->do_get_berr_counter;
+		priv->do_get_berr_counter = given_counters;
+	}
+	return 0;
+}
+
+static int can_counters_set(const char *value, const struct kernel_param *param)
+{
+	char name[IFNAMSIZ];
+	struct net_device *dev;
+	u16 tx, rx;
+	int result = -EINVAL;
+
+	if (sscanf(value, "%15s %hu %hu", name, &tx, &rx) != 3)
+		return -EINVAL;
+	rtnl_lock();
+	dev = __dev_get_by_name(&init_net, name);
+	if (dev)
+		result = count(dev, tx, rx);
+	rtnl_unlock();
+	return result;
+}
+
+static const struct kernel_param_ops can_counters_ops = { .set = can_counters_set };
+module_param_cb(can_counters, &can_counters_ops, NULL, 0200);
+MODULE_PARM_DESC(can_counters, "INTERFACE TX RX: error counters that a CAN controller's driver reports; 0 0: the chip's");
