@@ -1,6 +1,7 @@
-"""CAN interfaces by a made-up /sys and the JSON of ip(8)."""
+"""CAN interfaces by a made-up /sys and the JSON of ip(8), recorded from a controller of the lab's kernel."""
 
 import json
+from copy import deepcopy
 from typing import Any
 
 import pytest
@@ -9,10 +10,15 @@ from imud.cli.doctor.can import can_bitrate, can_state, can_up, interfaces
 from imud.cli.doctor.finding import DoctorCheck
 from imud.cli.doctor.report import examine
 from imud.contracts.status import DeviceState
+from tests.support.files import ROOT
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
 
 UP, STATE, RATE = DoctorCheck("u", can_up), DoctorCheck("s", can_state), DoctorCheck("r", can_bitrate)
+
+RECORDED: dict[str, Any] = json.loads((ROOT / "tests/cli/doctor/ip_link_can0.json").read_text())
+"""What `ip` printed of can0 by its state; `recorded` says where."""
+COMMAND = "ip -json -details -statistics link show can0"
 
 
 @pytest.fixture
@@ -24,14 +30,23 @@ def mast(machine: Machine) -> Machine:
 def interface(
     machine: Machine, flags: str = "0x40081", *, packets: int = 0, data: dict[str, Any] | None = None
 ) -> None:
-    """An interface, with the answer of `ip` written by hand: its members are not from a recording."""
+    """An interface with the recorded answer of `ip`, changed by these members; without `data` a virtual one."""
+    up(machine, flags)
+    answer = deepcopy(RECORDED["error-active"])
+    (link,) = answer
+    link["stats64"]["rx"]["packets"] = packets
+    data = dict(data or {})
+    link["linkinfo"]["info_xstats"]["bus_off"] = data.pop("bus_off", 0)
+    link["linkinfo"]["info_data"].update(data)
+    if not data:
+        link["linkinfo"] = {"info_kind": "vcan"}
+    machine.prints(COMMAND, json.dumps(answer))
+
+
+def up(machine: Machine, flags: str = "0x40081") -> None:
+    """The interface in /sys."""
     machine.write("/sys/class/net/can0/type", "280\n")
     machine.write("/sys/class/net/can0/flags", flags + "\n")
-    data = dict(data or {})
-    xstats = {"restarts": 0, "bus_error": 0, "error_passive": 1, "bus_off": data.pop("bus_off", 0)}
-    link = {"linkinfo": {"info_kind": "can", "info_data": data, "info_xstats": xstats}} if data else {}
-    answer = [{"ifname": "can0", "stats64": {"rx": {"packets": packets}}, **link}]
-    machine.prints("ip -json -details -statistics link show can0", json.dumps(answer))
 
 
 def controller(state: str = "ERROR-ACTIVE", tx: int = 0, rx: int = 0, **more: object) -> dict[str, object]:
@@ -43,7 +58,8 @@ def controller(state: str = "ERROR-ACTIVE", tx: int = 0, rx: int = 0, **more: ob
 
 def test_an_interface_that_is_not_there_down_or_up(mast: Machine) -> None:
     assert mast.told(UP)[0][1].startswith("can0 is not there; CAN interfaces of this machine: none →")
-    interface(mast, "0x40080")
+    up(mast, "0x40080")
+    mast.prints(COMMAND, json.dumps(RECORDED["down"]))
     ((severity, text),) = mast.told(UP)
     assert severity == "error"
     assert "can0 is down" in text
@@ -91,6 +107,23 @@ def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     assert mast.find(STATE)[0].severity == "warning"
 
 
+@pytest.mark.parametrize(
+    ("state", "severities", "words"),
+    [
+        ("error-active", ["ok", "note"], "can0 is ERROR-ACTIVE, error counters tx 0, rx 0, 2 frames received → "),
+        ("bus-off", ["error", "note"], "it has left the bus → `sudo ip link set can0 type can restart-ms 100` lets"),
+        ("error-passive", ["error", "warning", "note"], "2 frames received, none now → no other node acknowledges"),
+    ],
+)
+def test_states_as_they_were_recorded(mast: Machine, state: str, severities: list[str], words: str) -> None:
+    up(mast)
+    mast.prints(COMMAND, json.dumps(RECORDED[state]))
+    found = mast.told(STATE)
+    assert [severity for severity, _ in found] == severities
+    assert words in found[0][1]
+    assert mast.told(RATE) == [("ok", "can0 has 500000 bit/s, 2 frames received → ")]
+
+
 def test_bus_off_before_and_no_restart(mast: Machine) -> None:
     interface(mast, packets=9, data=controller(bus_off=4, restart_ms=0))
     found = mast.told(STATE)
@@ -129,7 +162,7 @@ def test_a_bus_with_frames_of_others_has_their_bit_rate(mast: Machine) -> None:
 @pytest.mark.parametrize("answer", ["", "{}", "[]", "[1]", '[{"linkinfo": 3}]'])
 def test_an_answer_of_another_form_is_not_checked(mast: Machine, answer: str) -> None:
     interface(mast)
-    mast.prints("ip -json -details -statistics link show can0", answer)
+    mast.prints(COMMAND, answer)
     (examined,) = examine([STATE], mast.surroundings())
     assert [finding.severity for finding in examined.findings] == ["not checked"]
 
@@ -137,7 +170,7 @@ def test_an_answer_of_another_form_is_not_checked(mast: Machine, answer: str) ->
 def test_ip_that_fails_or_is_not_installed_is_not_checked(mast: Machine) -> None:
     interface(mast)
     mast.prints("ip", "", 1, "Device does not exist")
-    mast.outputs["ip -json -details -statistics link show can0"] = FileNotFoundError(2, "No such file", "ip")
+    mast.outputs[COMMAND] = FileNotFoundError(2, "No such file", "ip")
     (examined,) = examine([STATE], mast.surroundings())
     assert examined.findings[0].seen == "s: ip is not there, or not installed"
 
