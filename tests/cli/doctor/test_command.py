@@ -1,6 +1,7 @@
 """`imud doctor` as a whole, on a made-up machine and on this one."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -73,3 +74,14 @@ def test_names_are_unique_and_in_the_document() -> None:
     assert len(set(names)) == len(names)
     for name in names:
         assert f"| {name} |" in text, name
+
+
+def test_the_document_has_the_checks_that_are_provoked_on_real_kernels() -> None:
+    """Each name that tests of a booted kernel see an error, a warning or a note of."""
+    tests = ("tests/lab/test_doctor.py", "tests/lab_debian/guest/first_contact.py")
+    call = re.compile(r'(?:has|expect_finding)\(\s*"([^"]+)",\s*"(?:error|warning|note|not checked)"')
+    provoked = {name for test in tests for name in call.findall((ROOT / test).read_text())}
+    assert provoked <= {check.name for check in CHECKS}
+    _, _, section = (ROOT / "docs/doctor.md").read_text().partition("## Provoked on real kernels")
+    rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| (?:lab|Debian|both) \|$", section, re.MULTILINE)
+    assert set(rows) == provoked

@@ -34,13 +34,17 @@ GROUPS: dict[str, Group] = {
     "buses": buses.check,
     "replug": replug.check,
     "doctor": first_contact.check_doctor,
+    "complaints": first_contact.check_complaints,
     "setup": first_contact.check_setup,
     "streaming": service.check_streaming,
     "removal": removal.check,
 }
 """In the order in which they run: the first leaves the package installed and the second the service running."""
 RUNS = {
-    "amd64": ("service", "rights", "sandbox", "outputs", "views", "buses", "replug", "doctor", "setup", "removal"),
+    "amd64": (
+        *("service", "rights", "sandbox", "outputs", "views", "buses", "replug", "doctor", "complaints", "setup"),
+        "removal",
+    ),
     "arm64": ("streaming", "sandbox", "doctor"),
 }
 

@@ -1,21 +1,24 @@
 """`imud doctor` on a system that is in order and on one that is not; `imud setup --yes` from nothing to samples."""
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.lab_debian.guest.checks import Checks, expect, expect_in, wait_until
+from tests.lab_debian.guest.checks import Checks, Failed, expect, expect_in, wait_until
 from tests.lab_debian.guest.service import CAN, USB
 from tests.lab_debian.guest.system import (
     CONFIG,
     EXAMPLE,
     NODE,
+    PYTHON,
     UNIT,
     Host,
     add_user,
     ask,
+    background,
     configure,
     device,
     must,
@@ -26,6 +29,14 @@ from tests.lab_debian.guest.system import (
 )
 
 ERROR = 2
+STATUS = {"warning": 1, "error": ERROR}
+"""Exit status of `imud doctor` by its worst finding."""
+HOLDER = "imud-lab-holder.service"
+HOLD_PORT = f"import serial, time; port = serial.Serial('{NODE}', exclusive=True); time.sleep(3600)"
+"""Has the port for itself, as terminal programs do."""
+DROP_IN = Path("/run/systemd/system/imud.service.d/90-lab.conf")
+WRONG_BYTES = 400
+"""Above the number up to which `imud doctor` takes bytes for an echo."""
 OPERATOR = "skipper"
 """Runs sudo, of which the rig has only the variable."""
 SETUP = ("env", f"SUDO_USER={OPERATOR}", "imud", "setup")
@@ -69,6 +80,102 @@ def check_doctor(checks: Checks, host: Host) -> None:
         expect_in("systemctl", result.stdout, "doctor")
         start_service()
         wait_streaming("usb")
+
+
+def check_complaints(checks: Checks, _host: Host) -> None:
+    """What keeps the daemon from its port or its boot; the next step that is advised is taken, and helps."""
+    configure(USB + CAN)
+    start_service()
+    wait_streaming("usb")
+    with checks("imud doctor names the program that has the port, and the daemon gets it afterwards"):
+        must("systemctl", "stop", UNIT)
+        background(HOLDER, PYTHON, "-c", HOLD_PORT)
+        wait_until(lambda: f"{NODE}" in open_files(), "another program has the port")
+        start_service()
+        wait_until(lambda: "in use by" in (device("usb") or {}).get("problem", ""), "the port is in use")
+        expect_finding("ports taken", "error", f"{NODE} is open in ", "stop that program")
+        must("systemctl", "stop", HOLDER)
+        wait_streaming("usb")
+    with checks("imud doctor tells of a user without the port's group, and its advice gives access"):
+        must("gpasswd", "--delete", "imud", "dialout")
+        start_service()
+        wait_until(lambda: "may not be opened" in (device("usb") or {}).get("problem", ""), "the port is refused")
+        command = "usermod --append --groups dialout imud"
+        expect_finding("rights", "error", f"{NODE} may not be opened by user imud", f"`sudo {command}`")
+        must(*command.split())
+        start_service()
+        wait_streaming("usb")
+    with checks("imud doctor tells of a unit that does not allow the port, and its advice gives access"), drop_in():
+        allow("char-pts rw")
+        wait_until(lambda: "EPERM" in (device("usb") or {}).get("problem", ""), "the port is refused")
+        entry = "char-ttyUSB rw"
+        expect_finding("rules of the unit", "error", f"{NODE} is not allowed by the unit's DeviceAllow=", entry)
+        allow("char-pts rw", entry)
+        wait_streaming("usb")
+    check_rate_and_boot(checks)
+
+
+def check_rate_and_boot(checks: Checks) -> None:
+    """A rate that is not the module's, and a service that does not start at boot."""
+    with checks("imud doctor tells of a wrong rate, and its advice finds the right one"):
+        configure(USB.replace("115200", "9600") + CAN)
+        start_service()
+        wait_until(lambda: bytes_in("usb") > WRONG_BYTES, "bytes at the wrong rate")
+        expect_finding("serial data", "error", "usb: ", "set `baud: auto`")
+        configure(USB.replace("115200", "auto") + CAN)
+        start_service()
+        wait_streaming("usb")
+        configure(USB + CAN)
+        start_service()
+        wait_streaming("usb")
+    with checks("imud doctor warns of a service that is not enabled"):
+        must("systemctl", "disable", UNIT)
+        try:
+            expect_finding("service", "warning", "it does not start at boot", "`sudo systemctl enable imud`")
+        finally:
+            must("systemctl", "enable", UNIT)
+
+
+def bytes_in(name: str) -> int:
+    """Bytes that a device's port gave; 0 where the daemon does not have it."""
+    return int((device(name) or {"ledger": {"bytes_in": 0}})["ledger"]["bytes_in"])
+
+
+def open_files() -> list[str]:
+    """What the holder of the port has open."""
+    holder = int(shown("MainPID", HOLDER))
+    return [os.readlink(one) for one in Path(f"/proc/{holder}/fd").iterdir()] if holder else []
+
+
+@contextmanager
+def drop_in() -> Iterator[None]:
+    """Settings of the unit may be added (`allow`) until the end of the block; then it runs without them."""
+    try:
+        yield
+    finally:
+        DROP_IN.unlink(missing_ok=True)
+        must("systemctl", "daemon-reload")
+        start_service()
+        wait_streaming("usb")
+
+
+def allow(*entries: str) -> None:
+    """Restart the service with these DeviceAllow= alone."""
+    DROP_IN.parent.mkdir(parents=True, exist_ok=True)
+    DROP_IN.write_text("[Service]\nDeviceAllow=\n" + "".join(f"DeviceAllow={entry}\n" for entry in entries))
+    must("systemctl", "daemon-reload")
+    start_service()
+
+
+def expect_finding(check: str, severity: str, seen: str, advice: str) -> None:
+    """Failed unless `imud doctor` has this finding of the check, and an exit status for it."""
+    result = run("imud", "doctor", "--json")
+    examined = json.loads(result.stdout)
+    found = [one for each in examined["checks"] if each["name"] == check for one in each["findings"]]
+    fitting = [one for one in found if one["severity"] == severity and seen in one["seen"] and advice in one["advice"]]
+    if not fitting:
+        raise Failed(f"{check}: expected {severity} {seen!r} with {advice!r}, got {found}")
+    assert result.returncode >= STATUS[severity], f"exit status {result.returncode} with {fitting}"
 
 
 def errors() -> list[dict[str, str]]:

@@ -1,0 +1,64 @@
+"""`imud doctor --json` as a process: its findings, and an exit status that follows from them."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+LIMIT_S: Final = 150.0
+STATUS: Final = {"error": 2, "warning": 1}
+"""Exit status by severity (docs/doctor.md); 0 for the others."""
+ORDINARY_USER: Final = (
+    "setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=+dac_read_search",
+    "--ambient-caps=+dac_read_search",
+)  # fmt: skip
+"""Runs a program as `nobody` without groups. It may read all files: the interpreter may be in root's home."""
+
+
+class Found(msgspec.Struct, frozen=True):
+    """One finding."""
+
+    severity: str
+    seen: str
+    advice: str
+
+
+class CheckOutcome(msgspec.Struct, frozen=True):
+    """A check with its findings."""
+
+    name: str
+    findings: list[Found]
+
+
+class Diagnosis(msgspec.Struct, frozen=True):
+    """What `imud doctor --json` prints."""
+
+    status: int
+    complete: bool
+    verdict: str
+    checks: list[CheckOutcome]
+
+    def of(self, severity: str) -> list[tuple[str, str]]:
+        """Check and text of every finding of a severity."""
+        return [
+            (check.name, found.seen) for check in self.checks for found in check.findings if found.severity == severity
+        ]
+
+    def has(self, check: str, severity: str, seen: str, advice: str = "") -> None:
+        """See that the check has a finding of this severity with these words, and these in its next step."""
+        found = [one for each in self.checks if each.name == check for one in each.findings]
+        fitting = [one for one in found if one.severity == severity and seen in one.seen and advice in one.advice]
+        assert fitting, f"{check}: no {severity} with {seen!r} and the step {advice!r} among {found}"
+
+
+def diagnose(config: Path, socket: Path, *prefix: str) -> Diagnosis:
+    """Run it, behind the words `prefix`; see that its exit status is that of its worst finding."""
+    doctor = (sys.executable, "-m", "imud", "doctor", "--json", "--socket", str(socket), "--config", str(config))
+    result = subprocess.run([*prefix, *doctor], capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert not result.stderr, result.stderr
+    found = msgspec.json.decode(result.stdout, type=Diagnosis)
+    severities = [one.severity for check in found.checks for one in check.findings]
+    assert result.returncode == found.status == max(STATUS.get(severity, 0) for severity in severities)
+    return found

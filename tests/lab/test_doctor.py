@@ -1,0 +1,400 @@
+"""Complaints that `imud doctor` is for, provoked on the kernel's own buses and diagnosed beside the real daemon.
+
+Every diagnosis is that of the command in a process of its own, and its exit status is compared with its findings.
+QEMU's buses make no electrical errors: the error counters of a CAN controller are those that the lab's module has its
+driver report (README.md), and bytes of a UART at a wrong rate are those of the simulator behind a pseudo terminal.
+"""
+
+import errno
+import os
+import select
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from threading import Event, Thread
+from urllib.request import urlopen
+
+import pytest
+import serial
+
+import imud
+from imud.contracts.status import DeviceState, DeviceStatus
+from tests.lab.bus import Bus
+from tests.lab.can_interface import CanInterface
+from tests.lab.diagnosis import LIMIT_S, ORDINARY_USER, Diagnosis, diagnose
+from tests.lab.gpio_chip import GpioChip
+from tests.lab.imu61x_bus import on_i2c, on_spi, registers
+from tests.lab.imu_process import running_imu, tell, tty
+from tests.lab.serial_port import PseudoTerminal, pseudo_terminal
+from tests.lab.test_gpio_lines import INTERRUPTS
+from tests.lab.tool import running, tool
+from tests.lab.waiting import wait_until
+from tests.lab.wire import I2cTransfer, Refuse, SpiTransfer
+from tests.support.daemon_process import RunningDaemon, running_daemon, write_config
+from tests.support.files import ROOT, hi91
+
+pytestmark = pytest.mark.timeout(600)
+
+METRICS_PORT = 19322
+DEAF_RATE_HZ = 10
+ANSWERED_AFTER_S = 60
+"""Of imud.cli.doctor.traffic: a device that was silent on requests for so long does not hear them."""
+DIALOUT = 20
+"""Debian's group of serial ports."""
+
+
+@contextmanager
+def daemon(folder: Path, devices: dict[str, object], **more: object) -> Iterator[RunningDaemon]:
+    with running_daemon(folder, devices, limit_s=LIMIT_S, python=(), **more) as made:
+        yield made
+
+
+def doctor(made: RunningDaemon, *prefix: str) -> Diagnosis:
+    return diagnose(made.folder / "imud.yaml", made.socket, *prefix)
+
+
+def wait_for(made: RunningDaemon, name: str, holds: Callable[[DeviceStatus], object], what: str) -> None:
+    wait_until(lambda: bool(holds(made.statuses()[name])), f"{name}: {what}", LIMIT_S)
+
+
+def wait_running(made: RunningDaemon, *names: str) -> None:
+    for name in names:
+        wait_for(made, name, lambda one: one.state is DeviceState.RUNNING, "samples")
+
+
+@contextmanager
+def simulator(*options: str) -> Iterator["subprocess.Popen[str]"]:
+    """A simulated device in a process of its own, ready; its commands are written to its stdin."""
+    command = [sys.executable, "-m", "imud.sim", "--boot", "0", *options]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        try:
+            yield process
+        finally:
+            process.communicate(timeout=LIMIT_S)
+
+
+@contextmanager
+def working(step: Callable[[Event], None]) -> Iterator[None]:
+    """A thread that runs `step` with the event that ends it."""
+    ended = Event()
+    thread = Thread(target=step, args=(ended,))
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(LIMIT_S)
+
+
+def echo(far: PseudoTerminal) -> Callable[[Event], None]:
+    """Give back what is sent, as an adapter does whose receiver stays on."""
+
+    def step(ended: Event) -> None:
+        while not ended.is_set():
+            if select.select([far.far_fd], [], [], 0.05)[0]:
+                far.write(os.read(far.far_fd, 4096))
+
+    return step
+
+
+def one_way(path: Path) -> Callable[[Event], None]:
+    """A module whose RX is not wired: it sends, and hears nothing."""
+
+    def step(ended: Event) -> None:
+        number = 0
+        with serial.Serial(str(path), 115200) as port:
+            while not ended.wait(1 / DEAF_RATE_HZ):
+                number += 1
+                port.write(hi91(number * 1000 // DEAF_RATE_HZ))
+
+    return step
+
+
+def uart(port: Path | str, baud: int = 115200) -> dict[str, object]:
+    return {"driver": "hipnuc-uart", "uart": {"port": str(port), "baud": baud}}
+
+
+def modbus(line: Path) -> dict[str, object]:
+    return {"driver": "hipnuc-modbus", "rs485": {"line": str(line), "baud": 115200, "address": 80}}
+
+
+def test_the_package_is_that_of_this_tree() -> None:
+    assert Path(imud.__file__).is_relative_to(ROOT)
+
+
+def test_healthy_devices_then_a_newer_file_then_no_daemon(
+    can_pair: tuple[CanInterface, CanInterface], i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], tmp_path: Path
+) -> None:
+    i2c.attach(0x18, on_i2c(registers()))
+    spi8.attach(0, on_spi(registers()))
+    devices: dict[str, object] = {
+        "bow": uart(tty(tmp_path)),
+        "mast": {"driver": "imu61x-can", "socketcan": {"interface": "can0"}},
+        "keel": {"driver": "imu61x-i2c", "i2c": {"bus": 0, "rate_hz": 10}},
+        "deck": {"driver": "imu61x-spi", "spi": {"port": "/dev/spidev0.0", "rate_hz": 10}},
+    }
+    metrics = {"port": METRICS_PORT}
+    with (
+        simulator("--path", str(tty(tmp_path)), "--rate", "10"),
+        simulator("--device", "imu61x-can", "--interface", "can1", "--rate", "10"),
+        daemon(tmp_path, devices, metrics=metrics) as made,
+    ):
+        wait_running(made, *devices)
+        found = doctor(made)
+        assert found.of("error") == []
+        allowed = {"clock", "processor", "kernel log", "CAN state"}  # an emulated machine after other tests
+        assert {check for check, _ in found.of("warning")} <= allowed
+        found.has("clock", "warning", "synchronised", "chrony")
+        found.has("service", "not checked", "no systemd runs here")
+        for check, seen in {
+            "configuration": "has no mistakes", "socket": "the daemon answers", "ports": "is there",
+            "rights": "may be opened by user root", "ports taken": "is used by no other program",
+            "serial data": "bow: ", "CAN interfaces": "can0 is up", "CAN state": "can0 is ERROR-ACTIVE",
+            "CAN bit rate": "can0 has 500000 bit/s", "bus nodes": "/dev/i2c-0 is there", "I2C": "keel: ",
+            "SPI": "deck: ", "stale configuration": "the daemon runs with what",
+        }.items():  # fmt: skip
+            found.has(check, "ok", seen)
+        found.has("Prometheus", "note", "nothing has scraped 127.0.0.1 port", "docs/monitoring.md")
+        with urlopen(f"http://127.0.0.1:{METRICS_PORT}/metrics", timeout=LIMIT_S) as answer:
+            assert answer.read()
+        write_config(tmp_path, {**devices, "stern": uart("/dev/ttyUSB9")}, metrics=metrics)
+        found = doctor(made)
+        found.has("Prometheus", "ok", "scraped 1 times")
+        found.has("stale configuration", "warning", "has bow, deck, keel, mast, stern", "systemctl reload imud")
+        found.has("ports", "error", "/dev/ttyUSB9 is not there; ports of this machine: ", "imud probe")
+    found = doctor(made)
+    found.has("socket", "error", str(made.socket), "systemctl start imud")
+    for check in ("devices", "serial data", "I2C", "SPI"):
+        found.has(check, "not checked", "the daemon does not answer")
+    assert not found.complete
+
+
+def test_mistakes_and_a_port_that_is_the_console(tmp_path: Path) -> None:
+    """No daemon runs: none is to open that port."""
+    config = write_config(tmp_path, {"bow": uart("/dev/ttyS0")})
+    found = diagnose(config, tmp_path / "imud.sock")
+    found.has("ports taken", "error", "/dev/ttyS0 is a console of the kernel", "remove `console=ttyS0`")
+    found.has("socket", "error", "imud.sock", "--socket")
+    write_config(tmp_path, {"bow": {"driver": "hipnuc-uart", "uart": {"prot": "/dev/ttyS1"}}})
+    found = diagnose(config, tmp_path / "imud.sock")
+    found.has("configuration", "error", "prot", "imud check")
+    found.has("stale configuration", "not checked", "no configuration that can be compared")
+
+
+def test_serial_ports(uarts: tuple[Path, Path], tmp_path: Path) -> None:
+    """On one daemon: silence, noise, a wrong rate, a held port, wires of one direction, RS-485 without its module."""
+    near, far = uarts
+    with ExitStack() as stack:
+        quiet, bits, held, line, loop = (stack.enter_context(pseudo_terminal()) for _ in range(5))
+        holder = stack.enter_context(port_held(held.path))
+        stack.enter_context(simulator("--path", str(tty(tmp_path)), "--rate", "20", "--baud", "115200"))
+        stack.enter_context(working(one_way(far)))
+        stack.enter_context(working(echo(loop)))
+        taken = stack.enter_context(socket.create_server(("127.0.0.1", METRICS_PORT)))
+        devices: dict[str, object] = {
+            "quiet": uart(quiet.path), "bits": uart(bits.path), "held": uart(held.path),
+            "slow": uart(tty(tmp_path), 9600), "deaf": uart(near), "line": modbus(line.path),
+            "loop": modbus(loop.path),
+        }  # fmt: skip
+        made = stack.enter_context(daemon(tmp_path, devices, metrics={"port": taken.getsockname()[1]}))
+        wait_for(made, "bits", lambda one: one.state is DeviceState.SEARCHING, "its port is open")
+        bits.write(b"\x55" * 40)
+        for name, enough in {"bits": 40, "slow": 400}.items():
+            wait_for(made, name, lambda one, least=enough: one.ledger["bytes_in"] >= least, "bytes")  # type: ignore[misc]  # a lambda's default
+        for name in ("line", "loop"):
+            wait_for(made, name, lambda one: one.serial_line and one.serial_line.timeouts > 3, "requests")
+        enough_samples = 1.1 * ANSWERED_AFTER_S * DEAF_RATE_HZ
+        wait_for(made, "deaf", lambda one: one.ledger["samples"] > enough_samples, "a minute of samples")
+        found = doctor(made)
+        assert found.status == 2
+        found.has("serial data", "error", "quiet: nothing is heard on", "exchange the two wires")
+        found.has("serial data", "error", "bits: only 40 bytes came", "an echo of what imud sends")
+        found.has("serial data", "error", "slow: ", "set `baud: auto`")
+        found.has("serial data", "warning", "deaf: samples come, but no answer", "wire TX of the adapter to RX")
+        found.has("RS-485", "error", "nothing heard on", "A and B swapped")
+        found.has("RS-485", "error", "echoes heard on", "switch its direction by itself")
+        found.has("ports taken", "error", f"{held.path} is open in ", "stop that program")
+        assert any(f"pid {holder.pid}" in seen for _, seen in found.of("error"))
+        found.has("devices", "error", "held is ", "see the findings on its port or bus")
+        found.has("Prometheus", "error", "metrics do not answer at 127.0.0.1", "is the port taken?")
+        check_rights(made, near)
+
+
+def check_rights(made: RunningDaemon, port: Path) -> None:
+    """A port that an ordinary user may not open: it belongs to root, then to a group, then to everyone."""
+    before = port.stat()
+    try:
+        os.chmod(port, 0o600)
+        os.chown(port, 0, 0)
+        found = doctor(made, *ORDINARY_USER)
+        refused = f"{port} may not be opened by user nobody: the node belongs to group "
+        found.has("rights", "error", f"{refused}root, EACCES", 'udev rule SUBSYSTEM=="tty", GROUP="dialout"')
+        found.has("socket", "not checked", "", "join the group and log in again")
+        found.has("ports taken", "not checked", f"whether {port} is open elsewhere", "`sudo imud doctor` sees them")
+        os.chmod(port, 0o660)
+        os.chown(port, 0, DIALOUT)
+        found = doctor(made, *ORDINARY_USER)
+        found.has("rights", "error", f"{refused}dialout, EACCES", "usermod --append --groups dialout nobody`")
+        member = [f"--groups={DIALOUT}" if word == "--clear-groups" else word for word in ORDINARY_USER]
+        doctor(made, *member).has("rights", "ok", f"{port} may be opened by user nobody")
+    finally:
+        os.chown(port, before.st_uid, before.st_gid)
+        os.chmod(port, before.st_mode & 0o777)
+
+
+@contextmanager
+def port_held(path: Path) -> Iterator["subprocess.Popen[str]"]:
+    """Another program that has the port for itself, as terminal programs do."""
+    code = f"import serial, time\nport = serial.Serial({str(path)!r}, exclusive=True)\nprint(1, flush=True)\n"
+    with running(sys.executable, "-c", code + "time.sleep(3600)") as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "1\n"
+        yield process
+
+
+def test_can(can_pair: tuple[CanInterface, CanInterface], tmp_path: Path) -> None:
+    near, _ = can_pair
+    with daemon(tmp_path, {"mast": {"driver": "imu61x-can", "socketcan": {"interface": near.name}}}) as made:
+        wait_for(made, "mast", lambda one: one.state is DeviceState.SEARCHING, "the interface is open")
+        doctor(made).has("CAN bit rate", "error", "mast: no frame comes at 500000", "try 125000, 250000, 1000000")
+        with near.error_counters(128, 0):
+            doctor(made).has("CAN state", "error", "tx 128, rx 0", "no other node acknowledges")
+        with near.error_counters(0, 127):
+            found = doctor(made)
+            found.has("CAN state", "error", "tx 0, rx 127", "a missing terminator or a wrong bit rate")
+        with simulator("--device", "imu61x-can", "--interface", "can1", "--rate", "10"):
+            wait_running(made, "mast")
+            found = doctor(made)
+            found.has("CAN state", "ok", f"{near.name} is ERROR-ACTIVE")
+            found.has("CAN state", "note", "does not return from bus-off by itself", "restart-ms 100")
+            check_states(made, near)
+        wait_for(made, "mast", lambda one: one.state is not DeviceState.RUNNING, "its module is gone")
+        with near.error_counters(128, 0):
+            found = doctor(made)
+            found.has("CAN state", "error", "tx 128", "no other node acknowledges")
+            found.has("CAN bit rate", "error", "mast: no frame comes at 500000", "power and wiring of the module")
+        near.down()
+        found = doctor(made)
+        found.has("CAN interfaces", "error", f"{near.name} is down", f"ip link set {near.name} up type can bitrate")
+        tool("ip", "link", "set", near.name, "type", "can", "bitrate", "100000")
+        near.up()
+        doctor(made).has("CAN bit rate", "warning", "100000 bit/s, which no supported module has", "one of 125000")
+
+
+def check_states(made: RunningDaemon, near: CanInterface) -> None:
+    """A controller that becomes error-passive, leaves its bus, and is restarted."""
+    near.enter("error-passive")
+    doctor(made).has("CAN state", "warning", f"{near.name} is ERROR-PASSIVE", "120 Ω at both ends")
+    near.enter("error-active")
+    near.enter("bus-off")
+    found = doctor(made)
+    found.has("CAN state", "error", f"{near.name} is BUS-OFF", "lets it recover; 120 Ω at both ends")
+    found.has("kernel log", "warning", "trouble of CAN controllers", "terminators, bit rate, wiring")
+    near.restart()
+    wait_running(made, "mast")
+    doctor(made).has("CAN state", "warning", f"{near.name} was bus-off ", "120 Ω at both ends")
+
+
+def test_i2c_and_spi(i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], spi16: Bus[SpiTransfer], tmp_path: Path) -> None:
+    """Silent addresses and chip selects, failing and damaged transfers, exchanged bytes, a wrong mode, absent nodes."""
+    damaged = registers()
+    i2c.attach(0x19, refusing(on_i2c(registers()), 10))
+    i2c.attach(0x1A, on_i2c(damaged))
+    shifted = registers(modes=frozenset({3}))
+    spi8.attach(1, exchanged(on_spi(registers())))
+    spi16.attach(0, on_spi(shifted))
+
+    def on(bus: int, address: int) -> dict[str, object]:
+        return {"driver": "imu61x-i2c", "i2c": {"bus": bus, "address": address, "rate_hz": 10}}
+
+    def at(port: str, **more: object) -> dict[str, object]:
+        return {"driver": "imu61x-spi", "spi": {"port": port, "rate_hz": 10, **more}}
+
+    devices: dict[str, object] = {
+        "absent": on(0, 0x18), "flaky": on(0, 0x19), "noisy": on(0, 0x1A), "nowhere": on(7, 0x18),
+        "dumb": at("/dev/spidev0.0"), "mixed": at("/dev/spidev0.1"), "late": at("/dev/spidev1.0", mode=0),
+        "away": at("/dev/spidev7.0"),
+    }  # fmt: skip
+    with daemon(tmp_path, devices) as made:
+        wait_running(made, "noisy")
+        damaged.faults.flips = 2
+        wait_for(made, "noisy", lambda one: one.ledger["frames_bad_crc"] > 0, "a damaged answer")
+        wait_for(made, "flaky", lambda one: one.polling and one.polling.failed > 1, "failed transfers")
+        for name in ("absent", "dumb", "mixed", "late"):
+            wait_for(made, name, lambda one: one.problem, "a reason")
+        wait_running(made, "flaky", "noisy")
+        found = doctor(made)
+    assert found.status == 2
+    found.has("bus nodes", "error", "/dev/i2c-7 is not there; of its kind there are: /dev/i2c-0", "modprobe i2c-dev")
+    found.has("bus nodes", "error", "/dev/spidev7.0 is not there; of its kind there are: /dev/spidev0.0", "spi=on")
+    found.has("I2C", "error", "absent: no samples on", "no answer at address 0x18: SDA and SCL swapped")
+    found.has("I2C", "warning", "transfers failed", "pull-ups of 2 to 5 kΩ")
+    found.has("I2C", "warning", "answers were damaged", "a lower bus clock")
+    found.has("SPI", "error", "dumb: no samples on", "all bytes 00: MISO or power")
+    found.has("SPI", "error", "mixed: no samples on", "both bytes of each word are exchanged")
+    found.has("SPI", "error", "late: no samples on", "shifted by one bit; imud has mode 0 by the configuration")
+
+
+def refusing(answer: Callable[[I2cTransfer], bytes], every: int) -> Callable[[I2cTransfer], bytes]:
+    """The device, but each transfer of that number fails, as with edges that are too slow."""
+    number = 0
+
+    def device(transfer: I2cTransfer) -> bytes:
+        nonlocal number
+        number += 1
+        if number % every == 0:
+            raise Refuse(errno.EIO)
+        return answer(transfer)
+
+    return device
+
+
+def exchanged(answer: Callable[[SpiTransfer], bytes]) -> Callable[[SpiTransfer], bytes]:
+    """The device behind a controller that sends and receives the bytes of each word in the wrong order."""
+
+    def device(transfer: SpiTransfer) -> bytes:
+        data = answer(transfer)
+        return bytes(data[place ^ 1] for place in range(len(data)))
+
+    return device
+
+
+def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
+    """SOUT, PPS and ALARM are not wired; the module restarts by itself."""
+    lines = {"sout": {"line": "SOUT"}, "pps": {"line": "PPS"}, "alarm": {"line": "ALARM"}}
+    devices: dict[str, object] = {"bow": {**uart(tty(tmp_path)), "lines": lines}}
+    with ExitStack() as stack:
+        imu = stack.enter_context(running_imu(tmp_path, gpio_chip, {}, "--rate", "20"))
+        tell(tmp_path, "CONFIG PMUX5 Y,-89,89,0,1")  # a range that it does not leave
+        made = stack.enter_context(daemon(tmp_path, devices))
+        wait_for(made, "bow", lambda one: one.ledger["samples"] > 250, "enough samples")
+        found = doctor(made)
+        found.has("lines", "warning", "bow: sout: no edge in", "is the line wired to this GPIO")
+        found.has("lines", "warning", "bow: pps: no pulse in", "has the receiver a fix?")
+        found.has("lines", "note", "bow: alarm: no edge so far", "tilt the module beyond its limit")
+        found.has("restarts", "ok", "bow has not restarted")
+        assert imu.process.stdin is not None
+        for number in range(1, 4):
+            seen = made.statuses()["bow"].ledger["samples"]
+            # a restart right after another one cannot be told from it by the device's time
+            wait_for(made, "bow", lambda one, least=seen + 20: one.ledger["samples"] >= least, "samples")  # type: ignore[misc]  # a lambda's default
+            imu.process.stdin.write("reboot\n")
+            imu.process.stdin.flush()
+            wait_for(made, "bow", lambda one, least=number: one.clock.resets >= least, "its restart is seen")  # type: ignore[misc]  # a lambda's default
+        doctor(made).has("restarts", "warning", "bow began its clock anew 3 times", "brown-out?")
+
+
+def test_a_line_of_another_program(gpio_chip: GpioChip, tmp_path: Path) -> None:
+    devices: dict[str, object] = {"bow": {**uart(tty(tmp_path)), "lines": {"alarm": {"line": "ALARM"}}}}
+    with running("gpiomon", gpio_chip.path.name, str(gpio_chip.names.index("ALARM"))):
+        wait_until(lambda: "gpiomon" in INTERRUPTS.read_text(encoding="ascii"), "gpiomon has its interrupt")
+        with daemon(tmp_path, devices) as made:
+            wait_for(made, "bow", lambda one: one.lines and one.lines.problems, "the line is busy")
+            found = doctor(made)
+            found.has("lines", "error", "is in use by gpiomon", "`gpioinfo` lists lines and who uses them")
+            found.has("ports", "error", f"{tty(tmp_path)} is not there", "")
