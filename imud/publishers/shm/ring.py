@@ -80,7 +80,7 @@ class ShmRing:
             return
         if len(slots) == 1:
             self._write_one(samples[0].seq, slots[0])
-        elif not self._write_run(samples[0].seq, samples[-1].seq, slots):
+        elif slots and not self._write_run(samples[0].seq, samples[-1].seq, slots):
             for sample, slot in zip(samples, slots, strict=True):
                 self._write_one(sample.seq, slot)
 
