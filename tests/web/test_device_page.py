@@ -196,7 +196,7 @@ def test_a_setting_that_is_not_as_declared_is_marked_on_the_page_and_in_the_over
     ):
         open_page(page, url, "bow")
         page.until_text("#about", "mode is 6-axis, declared 9-axis")
-        page.until("return document.querySelector('[data-setting=mode]')")
+        page.until("return document.querySelector('[data-setting=mode]')?.className")  # actual values come after names
         rows = page.js(
             """return [...document.querySelectorAll('[data-setting]')].map((row) =>
                 [row.dataset.setting, [row.className, row.cells[1].innerText, row.cells[2].innerText]])"""

@@ -76,8 +76,9 @@ export class DevicePage {
   /** After logging in or out: panels that show more or less then. */
   onSession() {
     this.calibration = new CalibrationView(this.name, this.session);
+    this.settings = new SettingsView(this.name, this.session);
     this.control.replaceChildren(
-      panel("settings", "Settings", new SettingsView(this.name, this.session).node),
+      panel("settings", "Settings", this.settings.node),
       panel("calibration", "Calibration", this.calibration.node),
       panel("actions", "Actions", new ActionsView(this.name, this.session).node));
   }
@@ -135,6 +136,7 @@ export class DevicePage {
     this.ledger.draw(message);
     this.latency.draw(message);
     this.about.replaceChildren(facts(aboutRows(message)));
+    this.settings.onStatus(status);
   }
 
   addEvents(events) {

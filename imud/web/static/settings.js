@@ -6,6 +6,8 @@ export class SettingsView {
   constructor(device, session) {
     this.device = device;
     this.session = session;
+    this.inputs = new Map();
+    this.known = "";
     this.state = el("p", { class: "quiet" });
     this.table = el("tbody");
     this.result = el("div", { class: "result" });
@@ -22,16 +24,24 @@ export class SettingsView {
     this.load();
   }
 
-  /** fresh: the device itself is asked, which needs the token. */
-  async load(fresh = false) {
+  /** What the daemon knows of the settings may have changed: a device that came back was read again. Fields keep their text. */
+  onStatus(status) {
+    const known = JSON.stringify([status.state, status.declared, status.settings]);
+    if (known === this.known) return;
+    this.known = known;
+    this.load(false, new Map([...this.inputs].map(([name, input]) => [name, input.value])));
+  }
+
+  /** fresh: the device itself is asked, which needs the token; texts: of fields, by name. */
+  async load(fresh = false, texts = new Map()) {
     try {
-      this.show(await call("settings.get", fresh ? { device: this.device, fresh } : { device: this.device }));
+      this.show(await call("settings.get", fresh ? { device: this.device, fresh } : { device: this.device }), texts);
     } catch (error) {
       this.state.textContent = String(error.message);
     }
   }
 
-  show(report) {
+  show(report, texts) {
     const { status, settings } = report;
     const words = [`declared and actual: ${status.state}`, status.problem, `${status.flash_writes} writes to flash by imud`];
     this.state.textContent = words.filter(Boolean).join("; ");
@@ -43,7 +53,7 @@ export class SettingsView {
       const name = el("td", {}, el("b", { text: one.name }), el("p", { class: "quiet", text: `${one.description} (${one.values}; ${one.effect})` }));
       const cells = [name, el("td", { text: shown(one.declared) }), el("td", { text: shown(one.actual) + (one.actual === null ? "" : unit) })];
       if (control) {
-        const input = el("input", { type: "text", "aria-label": `new value of ${one.name}`, size: 10 });
+        const input = el("input", { type: "text", "aria-label": `new value of ${one.name}`, size: 10, value: texts.get(one.name) ?? "" });
         if (one.declarable) this.inputs.set(one.name, input);
         cells.push(el("td", {}, one.declarable ? input : null));
       }
