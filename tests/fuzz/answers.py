@@ -4,8 +4,8 @@ import asyncio
 import atexit
 import socket
 import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -70,7 +70,7 @@ def make(_name: str) -> Target:
 
 
 class _Daemon:
-    """Sends an input to each client, and ends its side."""
+    """Sends an input to a client, and ends its side."""
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="imud-fuzz-")
@@ -78,26 +78,30 @@ class _Daemon:
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(self.path)
         self._listener.listen()
-        self.data = b""
-        self._thread = Thread(target=self._serve, name="daemon", daemon=True)
-        self._thread.start()
+        self._listener.settimeout(WAIT_S)
         self.loop = asyncio.new_event_loop()
         atexit.register(self._close)
 
-    def _serve(self) -> None:
-        """Until the listener is closed."""
-        with suppress(OSError):
-            while True:
-                with self._listener.accept()[0] as peer, suppress(OSError):
-                    peer.sendall(self.data)
-                    peer.shutdown(socket.SHUT_WR)
-                    while peer.recv(4096):
-                        pass
+    @contextmanager
+    def sending(self, data: bytes) -> Iterator[None]:
+        """A client that connects in the block gets the input. The thread ends with it."""
+        thread = Thread(target=self._serve, args=(data,), name="daemon")
+        thread.start()
+        try:
+            yield
+        finally:
+            thread.join(WAIT_S)
+
+    def _serve(self, data: bytes) -> None:
+        with suppress(OSError), self._listener.accept()[0] as peer:
+            peer.settimeout(WAIT_S)
+            peer.sendall(data)
+            peer.shutdown(socket.SHUT_WR)
+            while peer.recv(4096):
+                pass
 
     def _close(self) -> None:
-        self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
-        self._thread.join(WAIT_S)
         self.loop.close()
         self._folder.cleanup()
 
@@ -111,9 +115,8 @@ def run(data: bytes) -> None:
     """The first byte says what the client asks, and whether the greeting is the daemon's; the rest is what comes."""
     head, rest = data[0] if data else 0, data[1:]
     daemon = _daemon()
-    daemon.data = (HELLO if head < 0x80 else b"") + rest
     use = head % (CALLS + 1)
-    with suppress(ImudError):
+    with daemon.sending((HELLO if head < 0x80 else b"") + rest), suppress(ImudError):
         if use == CALLS:
             daemon.loop.run_until_complete(Calls(daemon.path).call("actions", {"device": "bow"}))
         else:

@@ -1,7 +1,6 @@
 """The command channel over MQTT: whatever comes on its topics, what runs is in the list, fresh, and runs once."""
 
 import asyncio
-import logging
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Final
@@ -39,7 +38,6 @@ def names() -> Sequence[str]:
 
 def make(_name: str) -> Target:
     """The channel with all that it takes apart."""
-    logging.getLogger("imud.publishers.mqtt.commands").setLevel(logging.CRITICAL)
     return Target(run, seeds, words=words)
 
 

@@ -1,7 +1,6 @@
 """Files of the state directory: whatever is in `found.json` and `settings.json`, the daemon starts and goes on."""
 
 import atexit
-import logging
 import tempfile
 from collections.abc import Sequence
 from functools import cache
@@ -28,7 +27,6 @@ def names() -> Sequence[str]:
 
 def make(_name: str) -> Target:
     """Both files, as the daemon reads, changes and writes them."""
-    logging.getLogger("imud.runtime.state_file").setLevel(logging.CRITICAL)
     return Target(run, seeds, words=words)
 
 

@@ -5,6 +5,7 @@ the process at a finding. The last lines say what was done, in the words of libF
 """
 
 import importlib
+import logging
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -148,6 +149,7 @@ def escaped(word: bytes) -> str:
 
 def main() -> int:
     """Run as `python -m tests.fuzz.worker`."""
+    logging.disable()  # what targets report of bad input, thousands of times a second
     engine, name, seconds, seed, folder, grown, *inputs = sys.argv[1:]
     if engine == "atheris":
         fuzz_with_atheris(name, float(seconds), int(seed), Path(folder), Path(grown), inputs)
