@@ -106,7 +106,7 @@ soak: $(VENV)/made
 
 pictures: $(VENV)/made
 	$(BIN)/python -m tests.support.pictures
-	$(BIN)/python -m tests.support.view_pictures
+	$(BIN)/python -m tests.cli.pictures
 	$(BIN)/python -m tests.analysis.pictures
 	$(BIN)/python -m tests.bench.clock_pictures
 

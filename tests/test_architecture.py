@@ -304,6 +304,7 @@ what Prometheus makes of the metrics."""
 
 CROSS_CUTTING = {
     "cli/recording/test_snapshot.py": "the flight recorder in a daemon, its command, and the replay of what it saves",
+    "publishers/recorder/test_kills.py": "daemons that record and are killed",
     "test_architecture.py": "the tree itself",
     "test_docs.py": "README.md, docs, Makefile",
     "test_daemon_signals.py": "the daemon as a process: log, reload, kill",

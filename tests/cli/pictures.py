@@ -1,4 +1,4 @@
-"""Draws pictures of docs/recording.md and docs/views.md: `python -m tests.support.view_pictures` (`make pictures`).
+"""Draws pictures of docs/recording.md and docs/views.md: `python -m tests.cli.pictures` (`make pictures`).
 
 `recording_info.svg` is what `imud info` prints of a recording of two simulated modules; `top.svg` and `top_device.svg`
 are the two screens of `imud top` on the same daemon. `flight.svg` is a run of the real daemon's flight recorder on a
