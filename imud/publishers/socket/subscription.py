@@ -127,12 +127,13 @@ class DeliveryGroup:
             Outbox.put_samples(self._direct[0], messages, batch, encoding)
             if len(self._direct) > 1:
                 self._send_parts(self._direct[1:], messages, batch, None, now_ns, end_ns)
-        for indices, outboxes in self._due(chosen):
-            if messages:
-                some: Sequence[bytes] = [messages[index] for index in indices]
-            else:
-                some = [encoding.encode_one(batch, index) for index in indices]
-            self._send_parts(_in_parts(outboxes), some, batch, indices, now_ns, end_ns)
+        if chosen:
+            for indices, outboxes in self._due(chosen):
+                if messages:
+                    some: Sequence[bytes] = [messages[index] for index in indices]
+                else:
+                    some = [encoding.encode_one(batch, index) for index in indices]
+                self._send_parts(_in_parts(outboxes), some, batch, indices, now_ns, end_ns)
 
     def defer(self, batch: Batch, chosen: ChosenSamples) -> None:
         """Queue the batch for every client of the group; it is encoded when the first of them is served."""
@@ -153,8 +154,6 @@ class DeliveryGroup:
 
     def _due(self, chosen: ChosenSamples) -> list[tuple[tuple[int, ...], list[Outbox]]]:
         """Which samples of a batch go to which clients of those that get only some."""
-        if not chosen or not self._thinned:
-            return []
         thinned = self._thinned
         return [(indices, thinned[rate_hz]) for rate_hz, indices in chosen.items() if rate_hz in thinned]
 
