@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+from itertools import islice
 from typing import Annotated, Final
 
 import msgspec
@@ -27,7 +28,7 @@ from prometheus_client.samples import Sample as Line
 
 from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.contracts.settings import Settings, is_ip_address, shown
-from imud.contracts.status import ClientStatus
+from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.event import Event
 from imud.log import messages_dropped
 from imud.publishers.metrics.families import FAMILIES
@@ -49,6 +50,8 @@ PAUSE_S: Final = 100e-6
 SAMPLES_PER_TURN: Final = 64
 """Lines rendered without a pause; one costs some 4 µs."""
 
+DEVICES_PER_TURN: Final = 8
+"""Devices whose status is taken in one turn of the event loop, about 0.3 ms."""
 JSON: Final = "application/json"
 ABOUT: Final = b"imud: metrics for Prometheus are at /metrics\n"
 
@@ -262,16 +265,28 @@ class MetricsPublisher:
         answer: Future[Snapshot] = Future()
         if self._loop is None or self._loop.is_closed():
             raise TimeoutError
-        self._loop.call_soon_threadsafe(self._give_snapshot, answer)
+        self._loop.call_soon_threadsafe(self._gather, answer, None, [])
         async with asyncio.timeout(self._snapshot_s):
             return await asyncio.wrap_future(answer)
 
-    def _give_snapshot(self, answer: "Future[Snapshot]") -> None:
+    def _gather(
+        self, answer: "Future[Snapshot]", rest: Iterator[DeviceStatus] | None, found: list[DeviceStatus]
+    ) -> None:
+        """Take the status of some devices, of the next ones in the next turn of the loop, and answer at the end."""
+        rest = self._context.each_status() if rest is None else rest
+        some = list(islice(rest, DEVICES_PER_TURN))
+        found += some
+        if len(some) == DEVICES_PER_TURN and not answer.cancelled():
+            asyncio.get_running_loop().call_soon(self._gather, answer, rest, found)
+        else:
+            self._give_snapshot(answer, found)
+
+    def _give_snapshot(self, answer: "Future[Snapshot]", devices: list[DeviceStatus]) -> None:
         if answer.set_running_or_notify_cancel():
             context = self._context
             answer.set_result(
                 Snapshot(
-                    context.status(),
+                    devices,
                     context.clients(),
                     tuple(self._events.items()),
                     context.now_ns() - self._tick_ns,

@@ -4,8 +4,10 @@ import asyncio
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ from imud.contracts.status import DeviceStatus
 from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.publishers import PUBLISHERS
-from imud.publishers.metrics.publisher import MetricsPublisher, MetricsSettings
+from imud.publishers.metrics.publisher import DEVICES_PER_TURN, MetricsPublisher, MetricsSettings
 from tests.support.metrics import LIMIT_S, ask, device, read_all
 from tests.support.rings import DEVICE, Board
 
@@ -113,6 +115,32 @@ def test_scrapes_at_once_ask_the_loop_one_after_another() -> None:
 
     asyncio.run(run())
     assert len(set(seen)) == len(seen) == 8
+
+
+def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_loop() -> None:
+    turn, seen = 0, []
+
+    def each_status() -> Iterator[DeviceStatus]:
+        for number in range(2 * DEVICES_PER_TURN + 1):
+            seen.append(turn)
+            yield device(f"imu{number}")
+
+    async def count_turns() -> None:
+        nonlocal turn
+        while True:
+            turn += 1
+            await asyncio.sleep(0)
+
+    async def run() -> None:
+        async with publisher(replace(context(), status_in_turn=each_status)) as served:
+            counting = asyncio.create_task(count_turns())
+            _, _, body = await ask(served.port)
+            counting.cancel()
+            assert f'imud_device_up{{device="imu{2 * DEVICES_PER_TURN}"' in str(body)
+
+    asyncio.run(run())
+    assert max(Counter(seen).values()) == DEVICES_PER_TURN
+    assert len(set(seen)) == 3
 
 
 def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
