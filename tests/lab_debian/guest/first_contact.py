@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -144,7 +144,10 @@ def bytes_in(name: str) -> int:
 def open_files() -> list[str]:
     """What the holder of the port has open."""
     holder = int(shown("MainPID", HOLDER))
-    return [os.readlink(one) for one in Path(f"/proc/{holder}/fd").iterdir()] if holder else []
+    found: list[str] = []
+    with suppress(FileNotFoundError):  # one was closed meanwhile, or the holder is no more
+        found.extend(os.readlink(one) for one in Path(f"/proc/{holder}/fd").iterdir())
+    return found
 
 
 @contextmanager
