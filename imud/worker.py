@@ -19,13 +19,14 @@ END_LIMIT_S = 5.0
 """A transfer on a bus that hangs ends with the controller's own time-out, of one second at most. A write to a disk that
 hangs has none: whoever shares something with such a call leaves it alone."""
 
-SWITCH_INTERVAL_S: Final = 0.0005
+SWITCH_INTERVAL_S: Final = 0.0003
 """After so long a thread lets another one run that waits (sys.setswitchinterval, for the whole process). A read of an
 SPI bus waits for the interpreter twice, when its thread wakes and after the transfer. Measured at 1 kHz beside a loop
 that computes 2 ms of every 20 ms, three times 8 s of each in turns: with the usual 5 ms reads begin 127 to 149 µs late
-on average, with this 92 to 98 µs; missed deadlines, 0.06 % and less, are not fewer. 0.1 ms costs a quarter more CPU. A
-scrape of the metrics (`scrape_server`) keeps samples waiting for 4.1 ms with the usual value and 300 silent clients,
-for 0.65 ms with this."""
+on average, with 0.5 or 0.3 ms 72 to 96 µs. Of data-ready edges 0.54 % were missed with 0.5 ms, because two waits and
+the transfer are longer than a period, 0.19 % with 0.3 ms, 0.17 % with 0.2 ms; 0.1 ms costs a quarter more CPU. A scrape
+of the metrics (`scrape_server`) keeps samples waiting for 4.1 ms with the usual value and 300 silent clients, for
+0.65 ms with 0.5 ms."""
 
 SELECT_FDS: Final = 1024
 """Descriptors that `select` takes are below this (FD_SETSIZE)."""

@@ -15,6 +15,7 @@ due_ns = time.monotonic_ns()
 while True:
     due_ns += int(sys.argv[1])
     time.sleep(max(0, due_ns - time.monotonic_ns()) / 1e9)
+    due_ns = max(due_ns, time.monotonic_ns() - 50_000)  # a sensor's edges never come in a heap
     os.write(1, struct.pack("q", time.monotonic_ns()))
 """
 
