@@ -46,6 +46,8 @@ class Load:
     """Samples a second that a client asks for; None: all."""
     stuck: bool = False
     phases: int = 1
+    apart: int = 0
+    """Frames after which the next device begins: 0 lets all begin at once."""
     shm: bool = True
     sout: bool = False
     """Whether the first device's SOUT is on a line."""
@@ -254,6 +256,7 @@ def run(load: Load) -> Outcome:
             Process(
                 REST_CORES, "-m", "tests.bench.writer", "--devices", str(load.devices), "--rate", str(load.rate_hz),
                 "--frames", str(load.frames), "--phases", str(load.phases), "--times", str(folder / "times"),
+                "--apart", str(load.apart),
                 *(["--edges", str(folder / "edges")] if load.sout else []),
             )
         )  # fmt: skip
@@ -266,7 +269,7 @@ def run(load: Load) -> Outcome:
         statuses = () if load.bare else tuple(ask(folder / "s"))
         readers.say("end")
         figures = json.loads(readers.line())
-    total = load.frames * load.devices
+    total = load.frames * load.devices - load.apart * sum(range(load.devices))
     counted = used.elapsed_s * load.rate_hz * load.devices
     return Outcome(
         cpu_us_per_sample=used.cpu_ns / 1e3 / counted,

@@ -89,17 +89,19 @@ def sentence(i: int) -> bytes:
 
 def play(
     masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, make: MakeFrame, edges: int = -1,
-    count: mmap.mmap | None = None,
+    count: mmap.mmap | None = None, apart: int = 0,
 ) -> int:  # fmt: skip
     """Write `frames` frames to every master, in `phases` groups over each period; return how many were refused.
 
-    A frame that is taken in part is refused. The number so far is in `count`.
+    A frame that is taken in part is refused. The number so far is in `count`. Each master but the first leaves out the
+    first `apart` frames of the one before it as well.
 
     With a descriptor for `edges`, the event of a pulse on SOUT goes there right before each frame.
     """
     pack = struct.pack_into
     period_ns = int(1e9 / rate_hz)
-    groups = [masters[i::phases] for i in range(phases)]
+    begins = [(master, apart * place) for place, master in enumerate(masters)]
+    groups = [begins[i::phases] for i in range(phases)]
     refused = 0
     start_ns = time.monotonic_ns() + 10_000_000
     for i in range(frames):
@@ -115,8 +117,8 @@ def play(
                 pack("<q", times, 8 * i, time.monotonic_ns())
                 if edges >= 0:
                     os.write(edges, EVENT.pack(time.monotonic_ns() - PULSE_NS, RISING, 0, i + 1, i + 1))
-            for master in group:
-                if not _takes(master, frame):
+            for master, first in group:
+                if i >= first and not _takes(master, frame):
                     refused += 1
                     if count:
                         pack("<q", count, 0, refused)
@@ -143,6 +145,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1000.0)
     parser.add_argument("--frames", type=int, required=True)
     parser.add_argument("--phases", type=int, default=1)
+    parser.add_argument("--apart", type=int, default=0, metavar="FRAMES", help="each begins so much later than another")
     parser.add_argument("--times", required=True)
     parser.add_argument("--refused", metavar="FILE")
     parser.add_argument("--udp", type=int, metavar="PORT")
@@ -162,7 +165,7 @@ def main() -> None:
     sys.stdin.readline()
     edges = os.open(args.edges, os.O_WRONLY) if args.edges else -1
     masters, make = [master for master, _ in pairs], hi91_frames(args.rate)
-    print(play(masters, args.rate, args.frames, args.phases, times, make, edges, count), flush=True)
+    print(play(masters, args.rate, args.frames, args.phases, times, make, edges, count, args.apart), flush=True)
     sys.stdin.readline()
 
 
