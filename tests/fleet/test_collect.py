@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from imud.errors import ServerError
+from imud.event import Event, EventKind
 from imud.fleet import Fleet, FleetBatch
 from imud.fleet.collect import BATCHES_MAX, TURN_BYTES, FleetCollector, Offsets
 from imud.fleet.connection import RECEIVE_MAX
@@ -159,7 +160,8 @@ def test_a_slow_store_is_given_more_at_once_and_its_ledger_closes(broker: Mosqui
 
 def test_what_waits_in_memory_is_bounded_in_bytes(broker: Mosquitto, gateway: SendingGateway) -> None:
     begin_session(broker)
-    large = [msgspec.structs.replace(samples_message(n, n), gateway="gw", boot="1" * 100_000) for n in range(1, 301)]
+    text = [Event(0, "bow", EventKind.UP, "1" * 100_000)]
+    large = [msgspec.structs.replace(samples_message(n, n), events=text) for n in range(1, 301)]
     gateway.send(*large)
     store = SlowStore(0.0)
     collect(broker, store, 300)

@@ -12,12 +12,21 @@ import msgspec
 import pytest
 
 from imud.errors import ServerError
+from imud.event import Event, EventKind
 from imud.fleet import FleetBatch
 from imud.fleet.collect import Offsets
 from imud.formats.fleet.boots import BootClocks, BootKey, BootOffset
 from imud.formats.fleet.ledger import FleetLedger, StoredAccount, key_of
-from imud.formats.fleet.messages import FleetMessage, MessageKind
+from imud.formats.fleet.messages import (
+    NUMBER_MOST,
+    FleetMessage,
+    GatewayClock,
+    MessageKind,
+    decode_message,
+    encode_message,
+)
 from imud.formats.fleet.topics import Stream
+from imud.sample import Sample, Sync
 from tests.fleet.fleet_gateway import (
     LIMIT_S,
     UTC_NS,
@@ -175,6 +184,32 @@ def test_rows_that_the_ledger_does_not_know_stay_single(database: str) -> None:
     assert query(database, "SELECT kind, first FROM imud_records ORDER BY kind, first") == [
         ("event", 1), ("interval", 1), ("interval", 6),
     ]  # fmt: skip
+
+
+MOST = NUMBER_MOST - 1
+
+
+@pytest.mark.parametrize("t_ns", [-MOST, MOST])
+@pytest.mark.parametrize("offset_ns", [-MOST, MOST])
+def test_the_largest_numbers_that_are_decoded_are_rows(database: str, t_ns: int, offset_ns: int) -> None:
+    """They come before the clock of their boot is known, which is known at the other end of time."""
+    sample = Sample("bow", MOST, t_ns, MOST, Sync.EDGE, t_ns, offset_ns, t_ns, status=MOST, pps_age_ms=MOST)
+    text = Event(t_ns, "bow", EventKind.UP, "\x01\ufffd'\"\\", {"number": MOST, "value": 1.7e308})
+    head = not_set(samples_message(1, 1), offset_ns)
+    messages = [
+        msgspec.structs.replace(head, first=MOST, last=MOST, utc_ns=offset_ns, samples=[sample]),
+        msgspec.structs.replace(
+            head, first=MOST, last=MOST, kind=MessageKind.EVENTS, utc_ns=offset_ns, samples=[], events=[text]
+        ),
+    ]
+    write(database, *(decode_message(encode_message(one)) for one in messages))
+    assert [row[1] for row in placed(database)] == [offset_ns, offset_ns]
+    clock = GatewayClock(-t_ns, offset_ns, synchronised=True, error_ns=MOST)
+    known = msgspec.structs.replace(intervals_message(1, 1), clock=clock)
+    write(database, decode_message(encode_message(known)))
+    assert [row[1] for row in placed(database) if row[0] == MOST] == [t_ns + offset_ns] * 2
+    ((content,),) = query(database, "SELECT content FROM imud_records WHERE kind = 'event'")
+    assert content["message"] == text.message
 
 
 def test_a_transaction_that_fails_leaves_nothing(database: str) -> None:

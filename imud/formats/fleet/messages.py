@@ -6,11 +6,15 @@
 Little-endian. Numbers `first` to `last` of a stream are covered by exactly one message, whatever its kind: whole
 samples, what is left of them when the spool had no room (`intervals` in the stream `samples`), or that they were
 dropped and why (`dropped`). What no message covers was lost on the way, and what two cover came twice.
+
+Whoever may publish on a broker can send anything, and what is decoded here goes into databases: numbers are so small
+that two of them add up within 64 bits, texts have no NUL, which PostgreSQL does not store.
 """
 
 import math
+import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from typing import Final
 
@@ -18,6 +22,7 @@ import msgspec
 import zstandard
 
 from imud.event import Event
+from imud.formats.fleet.topics import is_name
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.sample import Sample, Sync
 
@@ -30,6 +35,10 @@ SAMPLES_MAX: Final = 200
 HEADER_MAX: Final = 4096
 LEVEL: Final = 3
 """Of Zstandard, its own default."""
+NUMBER_MOST: Final = 1 << 62
+"""Numbers are smaller, either way; ns since 1970 reach it in 2116."""
+_NUL: Final = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
+"""NUL in a text of JSON."""
 _PREFIX: Final = struct.Struct("<4sBBH")
 JSON_TYPE: Final = "application/json"
 SLOTS_TYPE: Final = "application/vnd.imud.slots+zstd"
@@ -172,14 +181,61 @@ def encode_slots_message(message: FleetMessage, slots: Sequence[bytes]) -> bytes
 def decode_message(payload: bytes) -> FleetMessage:
     """The message in a payload, slots as samples. Raises ValueError for anything else."""
     try:
-        message = _decode_slots(payload) if payload.startswith(MAGIC) else _DECODER.decode(payload)
-    except (msgspec.DecodeError, zstandard.ZstdError, struct.error) as error:
+        message = _decode_slots(payload) if payload.startswith(MAGIC) else _DECODER.decode(checked_json(payload))
+    except (msgspec.DecodeError, RecursionError, zstandard.ZstdError, struct.error) as error:
         raise ValueError(f"expected a message of a gateway, got {len(payload)} other bytes") from error
     if message.v != VERSION:
         raise ValueError(f"expected a message of version {VERSION}, got {message.v}: the gateway has a newer imud")
     if not 0 < message.begin <= message.first <= message.last:
         raise ValueError(f"expected numbers in order, got {message.begin}, {message.first} and {message.last}")
+    numbers = message.last - message.first + 1
+    if len(message.events) > numbers:
+        raise ValueError(f"expected an event per number, got {len(message.events)} events for {numbers} numbers")
+    check_boot(message.boot)
+    check_numbers(_numbers(message))
     return message
+
+
+def checked_json(payload: bytes) -> bytes:
+    """The payload itself. Raises ValueError for JSON with NUL in a text."""
+    if _NUL.search(payload):
+        raise ValueError("expected text without NUL, got one with it")
+    return payload
+
+
+def check_boot(boot: str) -> None:
+    """Raises ValueError for what cannot be the number of a start."""
+    if not is_name(boot):
+        raise ValueError(f"expected the number of a start, 1 to 64 letters, digits, '_' or '-', got {boot[:100]!r}")
+
+
+def check_numbers(numbers: Iterable[int | None]) -> None:
+    """Raises ValueError for a number from NUMBER_MOST on."""
+    for number in numbers:
+        if number is not None and abs(number) >= NUMBER_MOST:
+            raise ValueError(f"expected numbers below 2**62, got one of {number.bit_length()} bits")
+
+
+def clock_numbers(clock: GatewayClock | None) -> tuple[int | None, ...]:
+    """The numbers in what a gateway says of its clock."""
+    return () if clock is None else (clock.t_ns, clock.utc_offset_ns, clock.error_ns)
+
+
+def _numbers(message: FleetMessage) -> Iterable[int | None]:
+    """All numbers that are no component of a physical value."""
+    yield from (message.last, message.count, message.utc_ns, *clock_numbers(message.clock))
+    for sample in message.samples:
+        yield from (
+            sample.seq, sample.t_ns, sample.t_err_ns, sample.t_rx_ns, sample.utc_ns, sample.t_dev_ns, sample.status,
+            sample.pps_age_ms, sample.edge_seq,
+        )  # fmt: skip
+    for one in message.intervals:
+        yield from (
+            one.first, one.last, one.count, one.begin_t_ns, one.end_t_ns, one.begin_utc_ns, one.end_utc_ns,
+            one.t_err_ns, one.status,
+        )  # fmt: skip
+    for event in message.events:
+        yield event.t_ns
 
 
 def _decode_slots(payload: bytes) -> FleetMessage:
@@ -187,7 +243,7 @@ def _decode_slots(payload: bytes) -> FleetMessage:
     if version != VERSION or size > HEADER_MAX:
         raise ValueError(f"expected slots of version {VERSION}, got {version} and a header of {size} bytes")
     begin = _PREFIX.size
-    message = _DECODER.decode(payload[begin : begin + size])
+    message = _DECODER.decode(checked_json(payload[begin : begin + size]))
     frame = payload[begin + size :]
     if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * SLOT_BYTES:  # it decides how much is allocated
         raise ValueError(f"expected 1 to {SLOTS_MAX} slots, got {zstandard.frame_content_size(frame)} bytes")

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from imud.formats.fleet.ledger import FleetLedger, StreamCounts, StreamKey
-from imud.formats.fleet.messages import GatewayClock
+from imud.formats.fleet.messages import GatewayClock, check_boot, check_numbers, checked_json, clock_numbers
 
 POSITIONS_MAX: Final = 100_000
 """Streams of which a state may have spoken; beyond it a reader raises instead of growing without end."""
@@ -102,6 +102,12 @@ _STATE: Final = msgspec.json.Decoder(GatewayState)
 def decode_state(payload: bytes) -> GatewayState:
     """The state in a payload. Raises ValueError for anything else."""
     try:
-        return _STATE.decode(payload)
-    except msgspec.DecodeError as error:
+        state = _STATE.decode(checked_json(payload))
+    except (msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"expected the state of a gateway, got {len(payload)} other bytes") from error
+    check_numbers(clock_numbers(state.clock))
+    for boot in (state.boot, *(one.boot for one in state.positions)):
+        check_boot(boot)
+    for one in state.positions:
+        check_numbers((one.begin, one.last))
+    return state

@@ -1,9 +1,13 @@
 """Payloads: JSON and slots come back as they went, and nothing else does."""
 
+import copy
+import functools
 import json
 import math
 import struct
+from collections.abc import Iterator
 from contextlib import suppress
+from typing import Any
 
 import msgspec
 import pytest
@@ -14,9 +18,12 @@ from hypothesis import strategies as st
 from imud.event import Event, EventKind
 from imud.formats.fleet.messages import (
     MAGIC,
+    NUMBER_MOST,
     SLOTS_MAX,
     VERSION,
     FleetMessage,
+    GatewayClock,
+    Interval,
     MessageKind,
     boot_text,
     decode_message,
@@ -80,7 +87,7 @@ def bomb() -> bytes:
 @pytest.mark.parametrize(
     "payload",
     [
-        b"", b"{}", b"IMUB", b"null", bomb(),
+        b"", b"{}", b"IMUB", b"null", bomb(), b'{"deep":' + b"[" * 100_000,
         encode_message(message(MessageKind.SAMPLES)).replace(b'"v":1', b'"v":2'),
         encode_message(message(MessageKind.SAMPLES, 8, 7)),
         encode_message(message(MessageKind.SAMPLES)).replace(b'"begin":1', b'"begin":0'),
@@ -91,6 +98,80 @@ def bomb() -> bytes:
 def test_anything_else_is_an_error_with_a_reason(payload: bytes) -> None:
     with pytest.raises(ValueError, match="expected"):
         decode_message(payload)
+
+
+def fields(kind: MessageKind, **more: Any) -> dict[str, Any]:
+    """A message as its JSON."""
+    found: dict[str, Any] = json.loads(encode_message(message(kind, **more)))
+    return found
+
+
+INTERVAL = Interval(5, 7, 3, 1, 2, 3, 4, 5, Sync.EDGE, {}, 6)
+CLOCK = GatewayClock(1, 2, synchronised=True, error_ns=3)
+FULL = (
+    fields(MessageKind.SAMPLES, samples=[msgspec.structs.replace(made(5), t_dev_ns=1, pps_age_ms=2, edge_seq=3)]),
+    fields(MessageKind.INTERVALS, intervals=[INTERVAL]),
+    fields(MessageKind.EVENTS, events=[Event(3, "bow", EventKind.UP, "up")], clock=CLOCK),
+)
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where integers are, but in the version."""
+    members = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, one in members:
+        yield from places(one, (*path, name))
+    if type(value) is int and path != ("v",):
+        yield path
+
+
+def put(value: Any, path: tuple[Any, ...], number: int) -> bytes:
+    """The JSON with another number in a place."""
+    copied = copy.deepcopy(value)
+    *above, name = path
+    functools.reduce(lambda inner, step: inner[step], above, copied)[name] = number
+    return msgspec.json.encode(copied) if abs(number) < 1 << 63 else json.dumps(copied).encode()
+
+
+@pytest.mark.parametrize(("whole", "path"), [(whole, path) for whole in FULL for path in places(whole)])
+def test_numbers_that_no_database_has_are_refused_wherever_they_are(
+    whole: dict[str, Any], path: tuple[Any, ...]
+) -> None:
+    for number in (NUMBER_MOST, -NUMBER_MOST, 1 << 63, 10**30):
+        with pytest.raises(ValueError, match="expected"):
+            decode_message(put(whole, path, number))
+    if path[-1] not in ("begin", "first"):
+        assert decode_message(put(whole, path, NUMBER_MOST - 1))
+
+
+def test_numbers_of_slots_are_refused_too() -> None:
+    slots = encode_slots([msgspec.structs.replace(made(5), t_ns=NUMBER_MOST, t_rx_ns=NUMBER_MOST)], 0)
+    with pytest.raises(ValueError, match=r"below 2\*\*62, got one of 63 bits"):
+        decode_message(encode_slots_message(message(MessageKind.SLOTS), slots))
+
+
+@pytest.mark.parametrize("boot", ["", "a b", "x" * 65, "1\n"])
+def test_a_start_has_the_number_of_a_start(boot: str) -> None:
+    with pytest.raises(ValueError, match="expected the number of a start"):
+        decode_message(encode_message(msgspec.structs.replace(message(MessageKind.SAMPLES), boot=boot)))
+
+
+@pytest.mark.parametrize("text", ["\0", "a\0", "\\\\\0"])
+def test_text_with_nul_is_refused(text: str) -> None:
+    event = Event(3, "bow", EventKind.UP, text)
+    with pytest.raises(ValueError, match="without NUL"):
+        decode_message(encode_message(message(MessageKind.EVENTS, events=[event])))
+
+
+@pytest.mark.parametrize("text", ["\\u0000", "\\\\u0000", "u0000", "\\\1"])
+def test_text_that_only_looks_like_nul_is_none(text: str) -> None:
+    event = Event(3, "bow", EventKind.UP, text)
+    assert decode_message(encode_message(message(MessageKind.EVENTS, events=[event]))).events == [event]
+
+
+def test_there_are_no_more_events_than_numbers() -> None:
+    events = [Event(3, "bow", EventKind.UP, "up")] * 4
+    with pytest.raises(ValueError, match="expected an event per number, got 4 events for 3 numbers"):
+        decode_message(encode_message(message(MessageKind.EVENTS, events=events)))
 
 
 @given(st.binary(max_size=200), st.integers(0, 400))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.formats.fleet.ledger import FleetLedger, StoredAccount, StreamCounts, StreamKey
-from imud.formats.fleet.messages import MessageKind
+from imud.formats.fleet.messages import GatewayClock, MessageKind
 from imud.formats.fleet.state import GatewayState, SpoolPositions, StreamPosition, decode_state
 from imud.formats.fleet.topics import Stream
 from tests.formats.fleet.test_ledger import message
@@ -45,10 +45,34 @@ def test_a_reboot_has_its_own_account() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("payload", [b"", b"[]", b'{"v":1}', b'{"v":1,"online":1,"boot":"1"}', b"\xff"])
+DEEP = b'{"v":1,"online":true,"boot":"1","mqtt":{"deep":' + b"[" * 100_000
+
+
+@pytest.mark.parametrize("payload", [b"", b"[]", b'{"v":1}', b'{"v":1,"online":1,"boot":"1"}', b"\xff", DEEP])
 def test_other_payloads_are_refused(payload: bytes) -> None:
     with pytest.raises(ValueError, match="expected the state of a gateway"):
         decode_state(payload)
+
+
+TOO_MUCH = 1 << 62
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        msgspec.structs.replace(state(3), boot="x" * 65),
+        msgspec.structs.replace(state(3), reason="\0"),
+        msgspec.structs.replace(state(3), clock=GatewayClock(TOO_MUCH, 0, synchronised=True)),
+        msgspec.structs.replace(state(3), clock=GatewayClock(0, -TOO_MUCH, synchronised=True)),
+        msgspec.structs.replace(state(3), clock=GatewayClock(0, 0, synchronised=True, error_ns=TOO_MUCH)),
+        msgspec.structs.replace(state(3), positions=[StreamPosition("", "bow", "samples", 1, 2)]),
+        state(TOO_MUCH),
+    ],
+)
+def test_what_no_database_has_is_refused(bad: GatewayState) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        decode_state(msgspec.json.encode(bad))
+    assert decode_state(msgspec.json.encode(state(TOO_MUCH - 1)))
 
 
 def test_a_will_is_a_state() -> None:
