@@ -1,10 +1,11 @@
 """`make fleet-cluster`: three NATS servers with JetStream and MQTT, of which one is killed while gateways send.
 
-`python -m tests.bench.fleet_cluster [--gateways 200] [--seconds 30]`. The servers are Debian's nats-server, which
-speaks MQTT 3.1.1; sessions and messages are on three of them. The collector is that of the package; with --postgres it
-writes rows. A third of the way through the server that it is connected to is killed with SIGKILL. Gateways and
-collector go to the next server of their lists, and gateways send again what was not acknowledged. It ends with 1 where
-a number is missing at the end.
+`python -m tests.bench.fleet_cluster [--gateways 200] [--outputs 3] [--seconds 30]`. The servers are Debian's
+nats-server, which speaks MQTT 3.1.1; sessions and messages are on three of them. Gateways are simulated, but for a few
+more that are the output `mqtt` itself, each in a process of its own, with a device at 1 kHz, every sample as a slot.
+The collector is that of the package; with --postgres it writes rows. A third of the way through the server that it is
+connected to is killed with SIGKILL. Gateways and collector go to the next server of their lists, and gateways send
+again what was not acknowledged. It ends with 1 where a number is missing at the end.
 """
 
 import argparse
@@ -24,6 +25,7 @@ from typing import Final
 from tests.bench.fleet_collector import CollectorProcess
 from tests.bench.fleet_load import GatewayFleet, acknowledged_by
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
+from tests.publishers.mqtt.gateways import KilledGateway, in_spool
 from tests.publishers.mqtt.mosquitto import free_port
 
 PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
@@ -90,6 +92,7 @@ def main() -> int:
     """Run it."""
     parser = argparse.ArgumentParser(prog="make fleet-cluster")
     parser.add_argument("--gateways", type=int, default=200)
+    parser.add_argument("--outputs", type=int, default=3, help="gateways that are the output mqtt")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--postgres", action="store_true", help="the collector writes into a PostgreSQL")
     args = parser.parse_args()
@@ -97,17 +100,43 @@ def main() -> int:
     if missing := missing or (NO_POSTGRES if args.postgres else ""):
         print(missing)
         return 1
-    print(f"{args.gateways} gateways, {args.seconds:g} s, load {os.getloadavg()[0]:.1f} before", flush=True)
-    with tempfile.TemporaryDirectory(prefix="imud-cluster-") as folder, ExitStack() as stack:
-        cluster = stack.enter_context(closing(Cluster(Path(folder))))
+    print(
+        f"{args.gateways} gateways, {args.outputs} outputs, {args.seconds:g} s, load {os.getloadavg()[0]:.1f} before",
+        flush=True,
+    )
+    with tempfile.TemporaryDirectory(prefix="imud-cluster-") as name, ExitStack() as stack:
+        folder = Path(name)
+        cluster = stack.enter_context(closing(Cluster(folder)))
         to = stack.enter_context(running_postgres()) if args.postgres else ""
-        return play(cluster, to, args.gateways, args.seconds)
+        collector = CollectorProcess(cluster.ports, version="3.1.1", to=to)
+        outputs = [Output(folder / f"spool-{n}", cluster.ports, f"imud-{n}") for n in range(args.outputs)]
+        for one in outputs:
+            stack.callback(one.gateway.kill)
+        return play(cluster, collector, GatewayFleet(args.gateways, cluster.ports), outputs, args.seconds)
 
 
-def play(cluster: Cluster, to: str, gateways: int, seconds: float) -> int:
+class Output:
+    """A gateway that is the output `mqtt` itself."""
+
+    def __init__(self, spool: Path, ports: Sequence[int], name: str) -> None:
+        self._spool = spool
+        self.gateway = KilledGateway(ports, spool, 1, name=name, version="3.1.1")
+
+    def end(self) -> int:
+        """Have it send what it has; return how many numbers it gave. Raises TimeoutError where something is left."""
+        drained = self.gateway.drain(LIMIT_S)
+        self.gateway.process.kill()
+        self.gateway.process.wait(10)
+        rows, positions = in_spool(self._spool)
+        if not drained or rows:
+            raise TimeoutError(f"{len(rows)} messages still wait after {LIMIT_S:g} s")
+        return sum(one.last - one.begin + 1 for one in positions)
+
+
+def play(
+    cluster: Cluster, collector: CollectorProcess, fleet: GatewayFleet, outputs: Sequence[Output], seconds: float
+) -> int:
     """Send for so long, kill a server meanwhile, and print the account; 1 where it does not close."""
-    collector = CollectorProcess(cluster.ports, version="3.1.1", to=to)
-    fleet = GatewayFleet(gateways, cluster.ports)
     fleet.run(8.0)
     killed = False
 
@@ -123,11 +152,16 @@ def play(cluster: Cluster, to: str, gateways: int, seconds: float) -> int:
     print(
         f"  waiting when gateways stop: {fleet.waiting} messages; acknowledged after {fleet.drain():.1f} s", flush=True
     )
-    account = collector.end(fleet.numbered)
+    own = sum(one.end() for one in outputs)
+    numbered = fleet.numbered + own
+    account = collector.end(numbered)
     fleet.clients.close()
-    print(f"  numbered {fleet.numbered}, came {account['came']}, connections of the collector {account['connects']}")
+    print(
+        f"  numbered {numbered}, {own} of them by outputs; came {account['came']}, "
+        f"connections of the collector {account['connects']}"
+    )
     print("  " + ", ".join(f"{word} {account[word]:.0f}" for word in ACCOUNT_WORDS))
-    return int(fleet.numbered != account["came"] or bool(account["open"]))
+    return int(numbered != account["came"] or bool(account["open"]))
 
 
 if __name__ == "__main__":

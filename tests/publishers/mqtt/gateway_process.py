@@ -1,13 +1,14 @@
-"""A gateway as a process of its own, to be killed: `python -m tests.publishers.mqtt.gateway_process PORT SPOOL EPOCH`.
+"""A gateway as a process of its own, to be killed: `python -m tests.publishers.mqtt.gateway_process PORTS SPOOL EPOCH`.
 
 It makes samples of one device at 1 kHz in the real time of the machine, sends them by the real output, and prints after
-each transaction how far each stream has come into the spool.
+each transaction how far each stream has come into the spool. After SIGTERM it makes no more, and prints what waits.
 """
 
 import os
 import signal
 import sqlite3
 import sys
+import threading
 import time
 from functools import partial
 from typing import Any
@@ -25,16 +26,18 @@ EVERY = {"*": {"whole": "slots", "rate_hz": 10, "batch_s": 0.2}}
 
 
 def main(
-    port: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "", newest_seq: str = "0",
-    statements: str = "0",
+    ports: str, spool: str, epoch: str, megabytes: str = "256", certificates: str = "", newest_seq: str = "0",
+    statements: str = "0", name: str = "gw", version: str = "5",
 ) -> None:  # fmt: skip
-    """Run until killed. `certificates`: folder of an `Authority`, for TLS; empty for none. Samples count on from
-    `newest_seq`. With `statements` it kills itself before that statement of all that are inside a transaction.
+    """Run until killed. `ports`: of the brokers of a cluster, with commas. `certificates`: folder of an `Authority`,
+    for TLS; empty for none. Samples count on from `newest_seq`. With `statements` it kills itself before that statement
+    of all that are inside a transaction. `version`: of MQTT.
     """
     if int(statements):
         die_at_statement(int(statements))
+    scheme = "mqtts" if certificates else "mqtt"
     made: dict[str, object] = {
-        "brokers": [f"{'mqtts' if certificates else 'mqtt'}://127.0.0.1:{port}"], "gateway": "gw",
+        "brokers": [f"{scheme}://127.0.0.1:{port}" for port in ports.split(",")], "gateway": name, "version": version,
         "spool_directory": spool, "retry_max_s": 1, "devices": EVERY, "spool_mb": float(megabytes),
     }  # fmt: skip
     if certificates:
@@ -46,19 +49,22 @@ def main(
     output = MqttPublisher(settings, context)
     output.add_device("bow", 0)
     output.start()
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())
     seq, told = int(newest_seq), 0
     begin_ns = time.monotonic_ns() - seq * NS_PER_MS
     while True:
         samples = []
-        while begin_ns + seq * NS_PER_MS < time.monotonic_ns():
+        while not ended.is_set() and begin_ns + seq * NS_PER_MS < time.monotonic_ns():
             seq += 1
             t_ns = begin_ns + seq * NS_PER_MS
             values = (seq * 0.37, seq / 7, 9.8)
             samples.append(Sample("bow", seq, t_ns, 0, Sync.EDGE, t_ns, t_ns + offset_ns, accel_m_s2=values))
-        output.publish(Batch("bow", 0, samples))
+        if samples:
+            output.publish(Batch("bow", 0, samples))
         output.tick(time.monotonic_ns())
         status = output.status()
-        if status.spooled != told:
+        if status.spooled != told or ended.is_set():
             told = status.spooled
             print(f"{status.waiting} {seq} {status.spool_bytes}", flush=True)
         time.sleep(TICK_S)

@@ -6,8 +6,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from time import monotonic
 from typing import NamedTuple
 
 import msgspec
@@ -114,15 +115,17 @@ class KilledGateway:
     """`gateway_process`, which is killed."""
 
     def __init__(
-        self, port: int, spool: Path, epoch: int, megabytes: float = 256, authority: Authority | None = None,
-        newest_seq: int = 0, statements: int = 0,
+        self, port: int | Sequence[int], spool: Path, epoch: int, megabytes: float = 256,
+        authority: Authority | None = None, newest_seq: int = 0, statements: int = 0, name: str = "gw",
+        version: str = "5",
     ) -> None:  # fmt: skip
-        """With an authority it speaks TLS. Its samples count on from `newest_seq`. With `statements` it kills itself
-        before that statement inside transactions.
+        """Several ports are of the brokers of a cluster. With an authority it speaks TLS. Its samples count on from
+        `newest_seq`. With `statements` it kills itself before that statement inside transactions. `version`: of MQTT.
         """
         self._read = b""
-        words = [str(port), str(spool), str(epoch), str(megabytes), str(authority.folder) if authority else ""]
-        words += [str(newest_seq), str(statements)]
+        ports = ",".join(map(str, [port] if isinstance(port, int) else port))
+        words = [ports, str(spool), str(epoch), str(megabytes), str(authority.folder) if authority else ""]
+        words += [str(newest_seq), str(statements), name, version]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "tests.publishers.mqtt.gateway_process", *words],
             stdout=subprocess.PIPE,
@@ -148,6 +151,15 @@ class KilledGateway:
             return None
         self._read = rest
         return GatewayState(*map(int, line.split()))
+
+    def drain(self, limit_s: float) -> bool:
+        """Have it make no more samples, and wait until it has sent all; return whether it has."""
+        self.process.send_signal(signal.SIGTERM)
+        end_s, waiting = monotonic() + limit_s, 1
+        while waiting and monotonic() < end_s:
+            state = self.state(max(0.0, end_s - monotonic()))
+            waiting = waiting if state is None else state.waiting
+        return not waiting
 
     def kill(self) -> None:
         """With SIGKILL."""
