@@ -114,9 +114,10 @@ class ArrivalFit:
     """
 
     __slots__ = (
-        "_begin_ns", "_bins", "_open", "_pause_count", "_pause_ns", "_slope_known", "_slope_known_error", "_wait_most",
-        "_width_ns", "count", "error_ns", "fitted_ns", "hidden_ns", "hold_ns", "measured_hold_ns", "recent_ns",
-        "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns", "slope", "slope_error", "until_ns",
+        "_begin_ns", "_bins", "_hull", "_hull_bins", "_open", "_pause_count", "_pause_ns", "_slope_known",
+        "_slope_known_error", "_wait_most", "_width_ns", "count", "error_ns", "fitted_ns", "hidden_ns", "hold_ns",
+        "measured_hold_ns", "recent_ns", "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns", "slope",
+        "slope_error", "until_ns",
     )  # fmt: skip
 
     def __init__(
@@ -155,6 +156,9 @@ class ArrivalFit:
         """Device time from which on an arrival begins a new bin, with which the fit changes."""
         self._open = _Bin(device_ns, arrival_ns, 0.0, 0.0)
         self._bins = [self._open]
+        self._hull: list[Point] = []
+        """Lower hull over the first `_hull_bins` bins, which change no more; from the point of the oldest."""
+        self._hull_bins = 0
 
     @property
     def span_ns(self) -> int:
@@ -213,6 +217,7 @@ class ArrivalFit:
     def _make_room(self) -> None:
         """Drop the oldest bin, or merge pairs of them while they are short."""
         bins = self._bins
+        self._hull_bins = 0
         if self._width_ns >= BIN_LONGEST_NS:
             del bins[0]
             return
@@ -226,7 +231,13 @@ class ArrivalFit:
         bins = self._bins
         origin = bins[0]
         x0, y0 = origin.device_ns, origin.arrival_ns
-        hull = lower_hull([(float(b.device_ns - x0), float(b.arrival_ns - y0)) for b in bins])
+        points = [(float(b.device_ns - x0), float(b.arrival_ns - y0)) for b in bins[self._hull_bins :]]
+        if not self._hull_bins:
+            self._hull.clear()
+        extend_lower_hull(self._hull, points[:-1])
+        self._hull_bins = len(bins) - 1
+        hull = self._hull.copy()
+        extend_lower_hull(hull, points[-1:])
         known, error = self._slope_known, self._slope_error_known(device_ns)
         lowest, highest = max(known - error, SLOPE_LOWEST), min(known + error, SLOPE_HIGHEST)
         slope, dx, dy = _edge_over(hull, SUPPORT_AT * (bins[-1].device_ns - x0), lowest, highest)
@@ -306,6 +317,10 @@ class ArrivalFit:
         """Change the line, and with it all distances above it."""
         x_old, y_old, slope_old = self.ref_device_ns, self.ref_arrival_ns, self.slope
         self.ref_device_ns, self.ref_arrival_ns, self.slope = ref_device_ns, ref_arrival_ns, slope
+        if not self.hold_ns:  # only a timer makes it worth while to look at waits
+            for b in self._bins:
+                b.lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
+            return
         for b in self._bins:
             lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
             was = b.arrival_ns - y_old - slope_old * (b.device_ns - x_old)
@@ -342,6 +357,12 @@ class ArrivalFit:
 def lower_hull(points: list[Point]) -> list[Point]:
     """Lower convex hull of points in order of x (Andrew's monotone chain)."""
     hull: list[Point] = []
+    extend_lower_hull(hull, points)
+    return hull
+
+
+def extend_lower_hull(hull: list[Point], points: list[Point]) -> None:
+    """Add points to a lower hull, in order of x and right of it."""
     for x, y in points:
         while len(hull) >= 2:
             (xa, ya), (xb, yb) = hull[-2], hull[-1]
@@ -349,7 +370,6 @@ def lower_hull(points: list[Point]) -> list[Point]:
                 break
             hull.pop()
         hull.append((x, y))
-    return hull
 
 
 def _edge_over(hull: list[Point], x: float, lowest: float, highest: float) -> tuple[float, float, float]:

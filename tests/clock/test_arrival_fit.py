@@ -1,11 +1,12 @@
 """The fit under the arrivals, and the lines that a latency timer leaves open, against a brute-force search."""
 
 from collections.abc import Iterable
+from itertools import pairwise
 from random import Random
 
 import pytest
 
-from imud.clock.arrival_fit import BINS, ArrivalFit, feasible_lines
+from imud.clock.arrival_fit import BINS, ArrivalFit, extend_lower_hull, feasible_lines, lower_hull
 from imud.units import NS_PER_MS, NS_PER_S
 
 
@@ -41,6 +42,37 @@ def test_it_is_young_but_not_wild() -> None:
     fit, off_ns = fitted(1.0, 1_000_000, 1)
     assert abs(off_ns) < 1_000_000
     assert fit.slope_error > 1e-5
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_point_is_under_the_hull_however_it_was_made(seed: int) -> None:
+    """Corners are points, the slopes between them rise, and a hull that was extended is that of all points at once."""
+    random = Random(seed)
+    points = [(float(x), random.gauss(0, 100)) for x in sorted(random.sample(range(10_000), 80))]
+    hull = lower_hull(points)
+    slopes = [(yb - ya) / (xb - xa) for (xa, ya), (xb, yb) in pairwise(hull)]
+    assert slopes == sorted(slopes)
+    assert {hull[0], hull[-1]} == {points[0], points[-1]}
+    assert set(hull) <= set(points)
+    for (xa, ya), (xb, yb) in pairwise(hull):
+        assert all(y >= ya + (yb - ya) / (xb - xa) * (x - xa) - 1e-9 for x, y in points if xa <= x <= xb)
+    at_once: list[tuple[float, float]] = []
+    for begin in range(0, 80, 7):
+        extend_lower_hull(at_once, points[begin : begin + 7])
+    assert at_once == hull
+
+
+def test_the_fit_is_over_the_bins_that_are_left() -> None:
+    """What went with the oldest bins, or was merged away, has no corner in the hull any more."""
+    random = Random(3)
+    fit, points = ArrivalFit(0, 0), [(0, 0)]
+    for i in range(1, 4000):
+        device_ns = i * 50 * NS_PER_MS
+        arrival_ns = int(1.00002 * device_ns + 1e-16 * -(device_ns**2) + random.expovariate(1e-5))
+        points.append((device_ns, arrival_ns))
+        if add(fit, device_ns, arrival_ns):
+            kept = [(x, y) for x, y in points if x >= device_ns - fit.span_ns]
+            assert min(y - at(fit, x) for x, y in kept) > -10_000  # a bin keeps what was lowest above an earlier fit
 
 
 def test_the_window_is_bounded() -> None:
