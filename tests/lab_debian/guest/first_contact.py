@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -133,7 +134,7 @@ def drop_in() -> Iterator[None]:
     try:
         yield
     finally:
-        DROP_IN.unlink(missing_ok=True)
+        shutil.rmtree(DROP_IN.parent, ignore_errors=True)
         must("systemctl", "daemon-reload")
         start_service()
         wait_streaming("usb")
@@ -232,7 +233,10 @@ def modem_manager() -> Iterator[None]:
 def replugged(host: Host) -> AdapterNow:
     """Pull the adapter out, plug it in; what udev made of it."""
     host.unplug()
+    wait_until(lambda: not NODE.exists(), f"{NODE} is gone")
     host.plug()
+    wait_until(NODE.exists, f"{NODE} is there")
+    must("udevadm", "wait", "--timeout=60", str(NODE))  # its own event, after that of the driver
     must("udevadm", "settle")
     return adapter()
 
