@@ -177,7 +177,7 @@ def test_processors_are_emulated_and_the_disk_stays_as_it_is(release: Release) -
 
 
 def test_the_adapter_is_there_from_the_start_and_comes_back_the_same() -> None:
-    assert "usb-serial,chardev=imu,id=imu,bus=xhci.0" in machine(TRIXIE)
+    assert "usb-serial,chardev=imu,id=imu,bus=xhci.0,serial=LAB0001" in machine(TRIXIE)
 
 
 def test_commas_in_paths_are_doubled() -> None:

@@ -17,8 +17,9 @@ PLATFORMS = {
 }
 """Machine, processor and console by architecture. Processors are always emulated: results must not depend on KVM."""
 
-ADAPTER = {"driver": "usb-serial", "chardev": "imu", "id": "imu", "bus": "xhci.0"}
-"""An FTDI adapter to the guest: ftdi_sio, /dev/ttyUSB0, /dev/serial/by-id/usb-QEMU_…"""
+ADAPTER = {"driver": "usb-serial", "chardev": "imu", "id": "imu", "bus": "xhci.0", "serial": "LAB0001"}
+"""An FTDI adapter to the guest: ftdi_sio, /dev/ttyUSB0, /dev/serial/by-id/usb-QEMU_…; without a serial number of its
+own it gets that of the USB port, which is another when it is plugged in again."""
 BUSES = {
     "amd64": (
         *("-smbios", "type=1,manufacturer=PC Engines", "-smbios", "type=2,product=apu2"),
