@@ -37,8 +37,10 @@ LEVEL: Final = 3
 """Of Zstandard, its own default."""
 NUMBER_MOST: Final = 1 << 62
 """Numbers are smaller, either way; ns since 1970 reach it in 2116."""
-_NUL: Final = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
-"""NUL in a text of JSON."""
+_NUL: Final = b"\\u0000"
+"""NUL in a text of JSON, or a backslash and five characters."""
+_NUL_ALONE: Final = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
+"""Only the first of these; looking for it takes ten times as long as the decoding."""
 _PREFIX: Final = struct.Struct("<4sBBH")
 JSON_TYPE: Final = "application/json"
 SLOTS_TYPE: Final = "application/vnd.imud.slots+zstd"
@@ -198,7 +200,7 @@ def decode_message(payload: bytes) -> FleetMessage:
 
 def checked_json(payload: bytes) -> bytes:
     """The payload itself. Raises ValueError for JSON with NUL in a text."""
-    if _NUL.search(payload):
+    if _NUL in payload and _NUL_ALONE.search(payload):
         raise ValueError("expected text without NUL, got one with it")
     return payload
 
