@@ -16,7 +16,7 @@ from time import monotonic, time_ns
 from typing import Any, Final
 
 from imud.fleet import Fleet, FleetBatch
-from imud.fleet.collect import FleetCollector, Offsets
+from imud.fleet.collect import FleetCollector, Offsets, cycles_seldom_sought
 from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS
 from imud.formats.fleet.ledger import Accounts, FleetLedger
@@ -103,7 +103,8 @@ def main() -> None:
     parser.add_argument("--version", choices=VERSIONS, default=VERSIONS[0])
     parser.add_argument("--to", default="")
     args = parser.parse_args()
-    print(json.dumps(asyncio.run(collect(args.urls, args.version, args.to))))
+    with cycles_seldom_sought():
+        print(json.dumps(asyncio.run(collect(args.urls, args.version, args.to))))
 
 
 if __name__ == "__main__":

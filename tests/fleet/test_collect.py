@@ -1,6 +1,7 @@
 """The collector with a real broker: what the store has is acknowledged, and its ledger goes on."""
 
 import asyncio
+import gc
 import threading
 from collections.abc import Sequence
 
@@ -10,13 +11,27 @@ import pytest
 from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.fleet import Fleet, FleetBatch
-from imud.fleet.collect import BATCHES_MAX, TURN_BYTES, FleetCollector, Offsets
+from imud.fleet.collect import (
+    BATCHES_MAX,
+    GC_ALLOCATIONS,
+    TURN_BYTES,
+    FleetCollector,
+    Offsets,
+    cycles_seldom_sought,
+)
 from imud.fleet.connection import RECEIVE_MAX
 from imud.formats.fleet.boots import BootKey, BootOffset
 from imud.formats.fleet.ledger import Accounts, FleetLedger, StoredAccount, StreamKey
-from imud.formats.fleet.messages import GatewayClock
+from imud.formats.fleet.messages import GatewayClock, decode_message, encode_message
 from imud.formats.fleet.state import GatewayState, StreamPosition
-from tests.fleet.fleet_gateway import LIMIT_S, UTC_NS, SendingGateway, samples_message
+from tests.fleet.fleet_gateway import (
+    LIMIT_S,
+    UTC_NS,
+    SendingGateway,
+    intervals_message,
+    samples_message,
+    synchronised,
+)
 from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.mosquitto import Mosquitto
 
@@ -175,3 +190,19 @@ def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquit
     store = MemoryStore()
     asyncio.run(FleetCollector(Fleet(f"mqtt://127.0.0.1:{broker.port}"), store).run(stop_after_s=1.5))
     assert store.offsets == {BootKey("gw", "1"): BootOffset(9, UTC_NS, 700)}
+
+
+def test_cycles_are_seldom_sought_while_a_collector_runs() -> None:
+    before = gc.get_threshold()
+    with cycles_seldom_sought():
+        assert gc.get_threshold()[0] == GC_ALLOCATIONS > before[0]
+    assert gc.get_threshold() == before
+    assert not gc.get_freeze_count()
+
+
+def test_what_is_decoded_is_nothing_to_the_search_for_cycles() -> None:
+    """A collector holds hundreds of thousands of these objects, which a search would go through."""
+    message = decode_message(encode_message(synchronised(intervals_message(1, 5))))
+    (interval,) = message.intervals
+    for one in (message, message.clock, interval, interval.values["accel_m_s2"]):
+        assert not gc.is_tracked(one)

@@ -12,7 +12,7 @@ from imud.cli.fleet.top import add_top, run_top
 from imud.cli.output import table
 from imud.errors import BadArgument
 from imud.fleet import Fleet, ReaderAccess
-from imud.fleet.collect import FleetCollector, FleetStore, Selection
+from imud.fleet.collect import FleetCollector, FleetStore, Selection, cycles_seldom_sought
 from imud.fleet.json_lines import JsonLines
 from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS
@@ -103,7 +103,8 @@ async def _collect(args: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, collector.stop)
     try:
-        await collector.run(stop_after_s=args.duration)
+        with cycles_seldom_sought():
+            await collector.run(stop_after_s=args.duration)
     finally:
         store.close()
     if ledger := account_table(fleet.accounts):

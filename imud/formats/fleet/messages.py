@@ -77,7 +77,7 @@ class DropCause(StrEnum):
     """The spool gave back what it was not given."""
 
 
-class Measures(msgspec.Struct, frozen=True, omit_defaults=True):
+class Measures(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     """Statistics of one quantity over an interval, a value for each of its components; left out are those not asked."""
 
     mean: tuple[float, ...] | None = None
@@ -86,7 +86,7 @@ class Measures(msgspec.Struct, frozen=True, omit_defaults=True):
     rms: tuple[float, ...] | None = None
 
 
-class Interval(msgspec.Struct, frozen=True, omit_defaults=True):
+class Interval(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     """Samples of one interval of time, summed up."""
 
     first: int
@@ -109,7 +109,7 @@ class Interval(msgspec.Struct, frozen=True, omit_defaults=True):
     """Status bits that any of the samples had."""
 
 
-class GatewayClock(msgspec.Struct, frozen=True):
+class GatewayClock(msgspec.Struct, frozen=True, gc=False):
     """The wall clock of a gateway, as its kernel reports it (adjtimex(2))."""
 
     t_ns: int
@@ -122,7 +122,7 @@ class GatewayClock(msgspec.Struct, frozen=True):
     """One-sigma error of the offset; None while it is not synchronised."""
 
 
-class FleetMessage(msgspec.Struct, frozen=True, omit_defaults=True, kw_only=True):
+class FleetMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True, kw_only=True):
     """A message of a stream."""
 
     v: int
