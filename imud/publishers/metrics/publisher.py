@@ -265,23 +265,26 @@ class MetricsPublisher:
         answer: Future[Snapshot] = Future()
         if self._loop is None or self._loop.is_closed():
             raise TimeoutError
-        self._loop.call_soon_threadsafe(self._gather, answer, None, [])
+        self._loop.call_soon_threadsafe(self._begin_snapshot, answer)
         async with asyncio.timeout(self._snapshot_s):
             return await asyncio.wrap_future(answer)
 
+    def _begin_snapshot(self, answer: "Future[Snapshot]") -> None:
+        """Begin with how late the loop is: in its next turn it has ticked, and is late no more."""
+        self._gather(answer, self._context.now_ns() - self._tick_ns, self._context.each_status(), [])
+
     def _gather(
-        self, answer: "Future[Snapshot]", rest: Iterator[DeviceStatus] | None, found: list[DeviceStatus]
+        self, answer: "Future[Snapshot]", late_ns: int, rest: Iterator[DeviceStatus], found: list[DeviceStatus]
     ) -> None:
         """Take the status of some devices, of the next ones in the next turn of the loop, and answer at the end."""
-        rest = self._context.each_status() if rest is None else rest
         some = list(islice(rest, DEVICES_PER_TURN))
         found += some
         if len(some) == DEVICES_PER_TURN and not answer.cancelled():
-            asyncio.get_running_loop().call_soon(self._gather, answer, rest, found)
+            asyncio.get_running_loop().call_soon(self._gather, answer, late_ns, rest, found)
         else:
-            self._give_snapshot(answer, found)
+            self._give_snapshot(answer, late_ns, found)
 
-    def _give_snapshot(self, answer: "Future[Snapshot]", devices: list[DeviceStatus]) -> None:
+    def _give_snapshot(self, answer: "Future[Snapshot]", late_ns: int, devices: list[DeviceStatus]) -> None:
         if answer.set_running_or_notify_cancel():
             context = self._context
             answer.set_result(
@@ -289,7 +292,7 @@ class MetricsPublisher:
                     devices,
                     context.clients(),
                     tuple(self._events.items()),
-                    context.now_ns() - self._tick_ns,
+                    late_ns,
                     messages_dropped(),
                     rings=dict.fromkeys(context.without_ring, "") | context.rings,
                     recorders=tuple(status() for status in context.recorder_sources),

@@ -143,6 +143,27 @@ def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_loop() 
     assert len(set(seen)) == 3
 
 
+@pytest.mark.parametrize("devices", [1, 3 * DEVICES_PER_TURN])
+def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are_looked_at(devices: int) -> None:
+    now_ns = 5_000_000_000
+    published: list[MetricsPublisher] = []
+
+    def each_status() -> Iterator[DeviceStatus]:
+        for number in range(devices):
+            yield device(f"imu{number}")
+            published[0].tick(now_ns)
+
+    async def run() -> None:
+        nonlocal now_ns
+        async with publisher(replace(context(), now_ns=lambda: now_ns, status_in_turn=each_status)) as served:
+            published.append(served)
+            now_ns += 1_500_000_000
+            _, _, body = await ask(served.port)
+            assert "imud_heartbeat_age_seconds 1.5\n" in body
+
+    asyncio.run(run())
+
+
 def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
     """Samples that are in shared memory when the scrape comes; a device without a ring shows as such."""
     board = Board(tmp_path)
