@@ -57,6 +57,23 @@ def test_a_machine_that_cannot_run_it_says_why_and_only_ci_succeeds(
             program.lab([])
 
 
+@pytest.mark.parametrize("ci", [True, False])
+def test_without_debians_packages_only_ci_succeeds(
+    ci: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def built(_release: Release, _say: object) -> image.Image:
+        raise LabError("no mirror answers")
+
+    monkeypatch.setattr(packages, "obstacle", lambda _release: "")
+    monkeypatch.setattr(image, "built", built)
+    if ci:
+        assert program.lab(["--ci", "--suite", "trixie"]) == 0
+        assert "left out: no mirror answers" in capsys.readouterr().err
+    else:
+        with pytest.raises(LabError, match="no mirror"):
+            program.lab(["--suite", "trixie"])
+
+
 def test_what_is_missing_is_named(fake_program: FakeProgram, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
