@@ -196,6 +196,8 @@ class MetricsPublisher:
         self._scrapes = 0
         self._scraped_ns = context.now_ns()
         self._turn = asyncio.Lock()
+        self._pages: dict[str, asyncio.Task[HttpResponse]] = {}
+        """Pages of which the event loop has given nothing yet, by content type, of which there are a handful."""
         """Of the HTTP thread: 32 snapshots at once would be 32 in one turn of the daemon's event loop."""
 
     @property
@@ -245,20 +247,34 @@ class MetricsPublisher:
             return HttpResponse("200 OK", msgspec.json.encode(Scrapes(self._scrapes, age_ns / NS_PER_S)), JSON)
         if request.path != "/metrics":
             return HttpResponse("404 Not Found", b"there is only /metrics\n")
-        async with self._turn:
-            return await self._scrape(request)
-
-    async def _scrape(self, request: HttpRequest) -> HttpResponse:
         self._scrapes += 1
-        now_ns = self._scraped_ns = self._context.now_ns()
-        try:
-            snapshot = await self._ask_loop()
-        except TimeoutError:
-            seconds = f"{self._snapshot_s:g}"
-            return HttpResponse("503 Service Unavailable", f"the daemon gave no status within {seconds} s\n".encode())
-        newest = {device.name: device.newest_seq for device in snapshot.devices}
-        views = self._rings.look(snapshot.rings, newest, now_ns)
-        return self._renderer.render(replace(snapshot, views=views), request.accept)
+        self._scraped_ns = self._context.now_ns()
+        return await self._page(request.accept)
+
+    async def _page(self, accept: str) -> HttpResponse:
+        """The page that others wait for as well, if there is one.
+
+        Scrapers that gave up would be answered before the one that waits, and each costs the loop a snapshot.
+        """
+        content_type = encoder_for(accept)[1]
+        page = self._pages.get(content_type)
+        if page is None:
+            page = self._pages[content_type] = asyncio.create_task(self._scrape(accept, content_type))
+        return await asyncio.shield(page)
+
+    async def _scrape(self, accept: str, content_type: str) -> HttpResponse:
+        """Make one page; who asks from the snapshot on gets another one."""
+        async with self._turn:
+            try:
+                snapshot = await self._ask_loop()
+            except TimeoutError:
+                text = f"the daemon gave no status within {self._snapshot_s:g} s\n"
+                return HttpResponse("503 Service Unavailable", text.encode())
+            finally:
+                del self._pages[content_type]
+            newest = {device.name: device.newest_seq for device in snapshot.devices}
+            views = self._rings.look(snapshot.rings, newest, self._scraped_ns)
+            return self._renderer.render(replace(snapshot, views=views), accept)
 
     async def _ask_loop(self) -> Snapshot:
         """Get a snapshot from the daemon's event loop. Raises TimeoutError when the loop is stuck or has ended."""

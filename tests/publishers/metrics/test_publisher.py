@@ -4,8 +4,10 @@ import asyncio
 import socket
 import threading
 import time
+import urllib.request
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,9 +32,11 @@ def context(status: Callable[[], Sequence[DeviceStatus]] = lambda: DEVICES) -> P
 
 
 @asynccontextmanager
-async def publisher(context: PublisherContext, **settings: object) -> AsyncIterator[MetricsPublisher]:
+async def publisher(
+    context: PublisherContext, snapshot_s: float = 0.05, **settings: object
+) -> AsyncIterator[MetricsPublisher]:
     """A started publisher that leaves no thread behind."""
-    made = MetricsPublisher(MetricsSettings(**{"port": 0, **settings}), context, snapshot_s=0.05)  # type: ignore[arg-type]  # any key
+    made = MetricsPublisher(MetricsSettings(**{"port": 0, **settings}), context, snapshot_s=snapshot_s)  # type: ignore[arg-type]  # any key
     made.start()
     try:
         yield made
@@ -91,30 +95,38 @@ def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
     asyncio.run(run())
 
 
-def test_scrapes_at_once_ask_the_loop_one_after_another() -> None:
-    """Each snapshot takes the loop's time; 32 in one turn would make samples and clients wait for all of them."""
-    turn, seen = 0, []
+def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
+    """Each snapshot takes the loop's time, and who gave up would be served before the one that still waits."""
+    seen: list[int] = []
 
     def status() -> Sequence[DeviceStatus]:
-        seen.append(turn)
-        time.sleep(0.02)  # the other requests are there when the loop goes on
+        seen.append(len(seen))
         return DEVICES
 
-    async def count_turns() -> None:
-        nonlocal turn
-        while True:
-            turn += 1
-            await asyncio.sleep(0)
+    def scrape(port: int, accept: str) -> str:
+        request = urllib.request.Request(f"http://127.0.0.1:{port}/metrics", headers={"Accept": accept})
+        with urllib.request.urlopen(request, timeout=LIMIT_S) as answer:
+            return str(answer.headers["Content-Type"])
+
+    def all_came(port: int, number: int) -> bool:
+        end = time.monotonic() + LIMIT_S
+        while time.monotonic() < end:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/scrapes", timeout=LIMIT_S) as answer:
+                if f'"scrapes":{number},' in answer.read().decode():
+                    return True
+        return False
 
     async def run() -> None:
-        async with publisher(context(status)) as served:
-            counting = asyncio.create_task(count_turns())
-            answers = await asyncio.gather(*(ask(served.port) for _ in range(8)))
-            counting.cancel()
-            assert {line for line, _, _ in answers} == {"HTTP/1.1 200 OK"}
+        async with publisher(context(status), snapshot_s=LIMIT_S) as served:
+            with ThreadPoolExecutor(10) as threads:
+                formats = ["text/plain"] * 9 + ["application/openmetrics-text; version=1.0.0"]
+                answers = [threads.submit(scrape, served.port, accept) for accept in formats]
+                assert all_came(served.port, len(formats))  # the loop stands still until then
+                types = [await asyncio.wrap_future(answer) for answer in answers]
+        assert [each.partition(";")[0] for each in types] == [each.partition(";")[0] for each in formats]
 
     asyncio.run(run())
-    assert len(set(seen)) == len(seen) == 8
+    assert len(seen) == 2
 
 
 def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_loop() -> None:
