@@ -200,7 +200,8 @@ class Site:
         self._log = stack.enter_context(_log_without_reader())
 
     def close(self) -> None:
-        """Stop everything."""
+        """Stop everything; the report of a test that failed between the faults can be written again."""
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         self._stack.close()
 
     def scrape_s(self) -> float:
