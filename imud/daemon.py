@@ -216,7 +216,7 @@ class Daemon:
 
     def status(self) -> list[DeviceStatus]:
         """Return the state of every device."""
-        return [device.status() for device in self._devices.values()]
+        return list(self.each_status())
 
     def each_status(self) -> Iterator[DeviceStatus]:
         """Return the state of each device when its turn comes; one that is removed in between is left out."""

@@ -145,9 +145,10 @@ class AlteredDaemon(Daemon):
         self.altered: Mapping[str, Callable[[DeviceStatus], DeviceStatus]] = {}
         super().__init__(settings, **more)
 
-    def status(self) -> list[DeviceStatus]:
+    def each_status(self) -> Iterator[DeviceStatus]:
         altered = self.altered
-        return [altered[one.name](one) if one.name in altered else one for one in super().status()]
+        for one in super().each_status():
+            yield altered[one.name](one) if one.name in altered else one
 
 
 class Site:
