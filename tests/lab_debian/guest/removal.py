@@ -19,6 +19,7 @@ def check(checks: Checks, _host: Host) -> None:
     CONFIG.write_text(f"# mine\n{USB}{CAN}")
     start_service()
     wait_streaming("usb")
+    must("systemctl", "enable", "imud")  # whatever was checked before
     KEPT.touch()
     with checks("an upgrade restarts the service and keeps configuration, state and what is enabled"):
         before = pid()
