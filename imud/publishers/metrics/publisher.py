@@ -196,9 +196,9 @@ class MetricsPublisher:
         self._scrapes = 0
         self._scraped_ns = context.now_ns()
         self._turn = asyncio.Lock()
+        """Of the HTTP thread: 32 snapshots at once would be 32 in one turn of the daemon's event loop."""
         self._pages: dict[str, asyncio.Task[HttpResponse]] = {}
         """Pages of which the event loop has given nothing yet, by content type, of which there are a handful."""
-        """Of the HTTP thread: 32 snapshots at once would be 32 in one turn of the daemon's event loop."""
 
     @property
     def port(self) -> int:
