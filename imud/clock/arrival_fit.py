@@ -217,6 +217,7 @@ class ArrivalFit:
     def _make_room(self) -> None:
         """Drop the oldest bin, or merge pairs of them while they are short."""
         bins = self._bins
+        self._hull.clear()
         self._hull_bins = 0
         if self._width_ns >= BIN_LONGEST_NS:
             del bins[0]
@@ -232,8 +233,6 @@ class ArrivalFit:
         origin = bins[0]
         x0, y0 = origin.device_ns, origin.arrival_ns
         points = [(float(b.device_ns - x0), float(b.arrival_ns - y0)) for b in bins[self._hull_bins :]]
-        if not self._hull_bins:
-            self._hull.clear()
         extend_lower_hull(self._hull, points[:-1])
         self._hull_bins = len(bins) - 1
         hull = self._hull.copy()
@@ -317,12 +316,10 @@ class ArrivalFit:
         """Change the line, and with it all distances above it."""
         x_old, y_old, slope_old = self.ref_device_ns, self.ref_arrival_ns, self.slope
         self.ref_device_ns, self.ref_arrival_ns, self.slope = ref_device_ns, ref_arrival_ns, slope
-        if not self.hold_ns:  # only a timer makes it worth while to look at waits
-            for b in self._bins:
-                b.lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
-            return
         for b in self._bins:
-            lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
+            b.lowest = lowest = b.arrival_ns - ref_arrival_ns - slope * (b.device_ns - ref_device_ns)
+            if not self.hold_ns:  # waits show something of a timer only
+                continue
             was = b.arrival_ns - y_old - slope_old * (b.device_ns - x_old)
             change = lowest - was
             b.wait += change * (b.count - b.late)
@@ -332,7 +329,6 @@ class ArrivalFit:
                 b.late_ns += change * b.late
                 if b.late_ns < 0.0:  # the fit was too low when they came
                     b.late, b.late_ns = 0, 0.0
-            b.lowest = lowest
 
     def _judge(self, device_ns: int) -> None:
         """Estimate the error of the fit from the distances of the bins above it."""
