@@ -125,8 +125,7 @@ class Output:
     def end(self) -> int:
         """Have it send what it has; return how many numbers it gave. Raises TimeoutError where something is left."""
         drained = self.gateway.drain(LIMIT_S)
-        self.gateway.process.kill()
-        self.gateway.process.wait(10)
+        self.gateway.kill()
         rows, positions = in_spool(self._spool)
         if not drained or rows:
             raise TimeoutError(f"{len(rows)} messages still wait after {LIMIT_S:g} s")
