@@ -4,12 +4,13 @@ A worker calls a function that returns how long it may sleep; tests call that fu
 (`tests/support/virtual_time.py`).
 """
 
+import gc
 import os
 import select
 import sys
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -70,6 +71,22 @@ StartWatchingWorker = Callable[[str, Round, Callable[[BaseException], None]], Wa
 def share_interpreter() -> None:
     """Have threads give way to others after SWITCH_INTERVAL_S. A shorter interval that is set already stays."""
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL_S))
+
+
+@contextmanager
+def rare_garbage_collection(allocations: int) -> Iterator[None]:
+    """Have the garbage collector run after so many new objects, and leave out what is there now.
+
+    For a process that makes next to no cycles and holds many objects: each run goes through all of them.
+    """
+    before = gc.get_threshold()
+    gc.freeze()
+    gc.set_threshold(allocations)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+        gc.unfreeze()
 
 
 class WakeEvent:

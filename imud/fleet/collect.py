@@ -8,9 +8,7 @@ known. A collector whose store fails ends: what it had not acknowledged is sent 
 """
 
 import asyncio
-import gc
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
 from imud.fleet.connection import RECEIVE_MAX, FleetDelivery
@@ -24,26 +22,8 @@ BATCHES_MAX: Final = RECEIVE_MAX // 2
 """Messages of one transaction: while it runs, the broker can send as many again."""
 TURN_BYTES: Final = 8 << 20
 """Bytes of the messages of one transaction: two are in memory at a time."""
-
-
 GC_ALLOCATIONS: Final = 100_000
-"""Objects between two looks for cycles, of which collecting makes next to none; a turn of large messages is as many."""
-
-
-@contextmanager
-def cycles_seldom_sought() -> Iterator[None]:
-    """Have the process seldom look for cycles: each look goes through all that waits to be written.
-
-    For a process that is nothing but a collector.
-    """
-    before = gc.get_threshold()
-    gc.freeze()
-    gc.set_threshold(GC_ALLOCATIONS)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
-        gc.unfreeze()
+"""Objects between two runs of the garbage collector, of which a turn of large messages makes as many."""
 
 
 Offsets = Mapping[BootKey, BootOffset]

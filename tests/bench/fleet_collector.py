@@ -16,11 +16,12 @@ from time import monotonic, time_ns
 from typing import Any, Final
 
 from imud.fleet import Fleet, FleetBatch
-from imud.fleet.collect import FleetCollector, Offsets, cycles_seldom_sought
+from imud.fleet.collect import GC_ALLOCATIONS, FleetCollector, Offsets
 from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS
 from imud.formats.fleet.ledger import Accounts, FleetLedger
 from imud.units import NS_PER_MS
+from imud.worker import rare_garbage_collection
 
 END_S: Final = 180.0
 """How long the rest may take to arrive."""
@@ -103,7 +104,7 @@ def main() -> None:
     parser.add_argument("--version", choices=VERSIONS, default=VERSIONS[0])
     parser.add_argument("--to", default="")
     args = parser.parse_args()
-    with cycles_seldom_sought():
+    with rare_garbage_collection(GC_ALLOCATIONS):
         print(json.dumps(asyncio.run(collect(args.urls, args.version, args.to))))
 
 

@@ -17,13 +17,13 @@ from imud.fleet.collect import (
     TURN_BYTES,
     FleetCollector,
     Offsets,
-    cycles_seldom_sought,
 )
 from imud.fleet.connection import RECEIVE_MAX
 from imud.formats.fleet.boots import BootKey, BootOffset
 from imud.formats.fleet.ledger import Accounts, FleetLedger, StoredAccount, StreamKey
 from imud.formats.fleet.messages import GatewayClock, decode_message, encode_message
 from imud.formats.fleet.state import GatewayState, StreamPosition
+from imud.worker import rare_garbage_collection
 from tests.fleet.fleet_gateway import (
     LIMIT_S,
     UTC_NS,
@@ -194,7 +194,7 @@ def test_a_state_that_knows_the_clock_gives_the_store_its_offset(broker: Mosquit
 
 def test_cycles_are_seldom_sought_while_a_collector_runs() -> None:
     before = gc.get_threshold()
-    with cycles_seldom_sought():
+    with rare_garbage_collection(GC_ALLOCATIONS):
         assert gc.get_threshold()[0] == GC_ALLOCATIONS > before[0]
     assert gc.get_threshold() == before
     assert not gc.get_freeze_count()

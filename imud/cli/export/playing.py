@@ -4,7 +4,6 @@ It is started as `python -m imud.cli.export.playing FILE DEVICE…` and writes t
 MessagePack with a head of kind and length. Nothing but `export_recording` starts it or reads that.
 """
 
-import gc
 import struct
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from imud.frames.published import PublishedFrame
 from imud.ledger import Ledger
 from imud.runtime.recording.player import Player, RecordedEvent
 from imud.sample import Sample
+from imud.worker import rare_garbage_collection
 
 HEAD: Final = struct.Struct("<BIQ")
 """Kind, length, and how many bytes of the file are read."""
@@ -181,9 +181,7 @@ class PipeSink:
 
 def main(path: str, devices: Sequence[str]) -> None:
     """Play a recording into standard output."""
-    gc.freeze()
-    gc.set_threshold(GC_ALLOCATIONS)
-    with open_regular(path) as file:
+    with rare_garbage_collection(GC_ALLOCATIONS), open_regular(path) as file:
         sink = PipeSink(sys.stdout.buffer, file.tell)
         try:
             sink.end(END, play_here(file, path, sink, devices))

@@ -12,12 +12,13 @@ from imud.cli.fleet.top import add_top, run_top
 from imud.cli.output import table
 from imud.errors import BadArgument
 from imud.fleet import Fleet, ReaderAccess
-from imud.fleet.collect import FleetCollector, FleetStore, Selection, cycles_seldom_sought
+from imud.fleet.collect import GC_ALLOCATIONS, FleetCollector, FleetStore, Selection
 from imud.fleet.json_lines import JsonLines
 from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS
 from imud.formats.fleet.ledger import StreamKey
 from imud.formats.fleet.state import StreamAccount
+from imud.worker import rare_garbage_collection
 
 NAME: Final = "collector"
 HEAD: Final = (
@@ -103,7 +104,7 @@ async def _collect(args: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, collector.stop)
     try:
-        with cycles_seldom_sought():
+        with rare_garbage_collection(GC_ALLOCATIONS):
             await collector.run(stop_after_s=args.duration)
     finally:
         store.close()
