@@ -7,7 +7,6 @@ import os
 import pty
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -25,8 +24,8 @@ import msgspec
 from imud.cli.arguments import statuses
 from imud.client import Client
 from imud.ledger import lost
-from tests.attack.hostile import LOOPBACK
 from tests.bench.rig import CORES, REST_CORES, SERVER_CORE, Process, cpu_ns, rss_mb, wait_for
+from tests.support.surroundings import free_port
 
 HOSTILE_UIDS = (65_534, 65_533)
 GOOD_UID = 65_532
@@ -358,15 +357,6 @@ class AttackedDaemon:
         new = self._file.with_suffix(".new")
         new.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
         new.replace(self._file)
-
-
-def free_port() -> int:
-    """A TCP port of the loopback address that nothing listens on."""
-    with socket.socket() as sock:
-        sock.bind((LOOPBACK, 0))
-        port = sock.getsockname()[1]
-        assert isinstance(port, int)
-        return port
 
 
 def raise_descriptors() -> None:

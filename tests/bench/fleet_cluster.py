@@ -26,7 +26,7 @@ from tests.bench.fleet_collector import CollectorProcess
 from tests.bench.fleet_load import GatewayFleet, acknowledged_by
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 from tests.publishers.mqtt.gateways import KilledGateway, in_spool
-from tests.publishers.mqtt.mosquitto import free_port
+from tests.support.surroundings import free_port
 
 PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
 SERVERS: Final = 3

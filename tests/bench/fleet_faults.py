@@ -26,8 +26,9 @@ from tests.bench.fleet_rows import RowCollector
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 from tests.publishers.mqtt.authority import Authority
 from tests.publishers.mqtt.gateways import KilledGateway, closes, in_spool
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, Mosquitto, free_port
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, Mosquitto
 from tests.publishers.mqtt.proxy import Proxy
+from tests.support.surroundings import free_port
 
 CAUGHT_UP: Final = 30
 """Messages in the spool of a gateway that is up to date: those of three transactions, ten in each."""

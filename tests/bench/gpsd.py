@@ -22,6 +22,7 @@ from time import monotonic, sleep
 
 from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Load, Process, measure_cpu, run
 from tests.bench.rows import Row, at_most
+from tests.support.surroundings import free_port
 
 LOAD = Load(clients=10, encoding="json", warm_s=1.5)
 ROUNDS = 3
@@ -30,14 +31,6 @@ RATIO_MOST = 0.8
 GATHERED_RATIO_MOST = 0.4
 LOST_MOST = 0.01
 """gpsd drops what a client does not take at once; more than this, and it did less work than asked for."""
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    """Return a port of 127.0.0.1 that nobody has."""
-    with socket.socket(socket.AF_INET, kind) as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 def start_gpsd(stack: ExitStack, program: str, port: int, input_port: int) -> int:

@@ -23,7 +23,8 @@ from typing import Final, NamedTuple
 
 from tests.bench.rig import Load, Outcome, run
 from tests.bench.rows import Row, at_most
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, free_port, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, running_broker
+from tests.support.surroundings import free_port
 
 LOOP_RATIO_LIMIT: Final = 1.05
 """Of the event loop's thread: with the output it puts each batch into a queue."""

@@ -15,7 +15,8 @@ from imud.publishers.mqtt.settings import broker_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway
 from tests.fleet.resetting_proxy import ResettingProxy
 from tests.publishers.mqtt.authority import Authority
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.support.surroundings import free_port
 
 ACCESS = ReaderAccess()
 

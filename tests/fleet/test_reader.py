@@ -19,8 +19,9 @@ from imud.formats.fleet.state import GatewayState, StreamPosition
 from imud.formats.fleet.topics import topic_of
 from tests.fleet.fleet_gateway import LIMIT_S, SendingGateway, dropped_message, samples_message
 from tests.fleet.resetting_proxy import ResettingProxy
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.files import ROOT
+from tests.support.surroundings import free_port
 
 KEY = StreamKey("gw", "1", "bow", "samples")
 

@@ -20,9 +20,10 @@ from typing import Any, Final, NamedTuple
 from imud.cli.demo.command import child, daemon
 from imud.client import Client
 from tests.monitoring.dashboard import dashboard, filled_in
-from tests.monitoring.prometheus import RealPrometheus, free_port, real_prometheus
+from tests.monitoring.prometheus import RealPrometheus, real_prometheus
 from tests.support.files import ROOT
 from tests.support.pictures import svg, text
+from tests.support.surroundings import free_port
 
 FILE: Final = ROOT / "docs/pictures/dashboard.svg"
 SECONDS, SILENT_S, STEP_S = 220.0, 15.0, 2.0

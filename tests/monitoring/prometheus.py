@@ -5,7 +5,6 @@ with all times shortened.
 import json
 import re
 import shutil
-import socket
 import subprocess
 import urllib.parse
 import urllib.request
@@ -19,6 +18,7 @@ import yaml
 
 from tests.support.daemon_process import wait_until
 from tests.support.files import ROOT
+from tests.support.surroundings import free_port
 
 RULES: Final = ROOT / "etc/prometheus/imud.rules.yml"
 LIMIT_S: Final = 120.0
@@ -130,13 +130,6 @@ class RealPrometheus:
         times = {"start": f"{start_s:.3f}", "end": f"{end_s:.3f}", "step": f"{step_s:.3f}"}
         result: list[dict[str, Any]] = self.get("query_range", query=expression, **times)["result"]
         return result
-
-
-def free_port() -> int:
-    """A TCP port that was free just now."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port: int = server.getsockname()[1]
-        return port
 
 
 def configuration(folder: Path, interval_ms: int, rules: Sequence[str]) -> str:

@@ -28,13 +28,13 @@ from tests.monitoring.prometheus import (
     Pace,
     RealPrometheus,
     alerts_of,
-    free_port,
     needs,
     real_prometheus,
     shortened,
 )
 from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO
 from tests.support.daemon_process import wait_until, write_config
+from tests.support.surroundings import free_port
 
 DEVICE_OF: Final = {
     "ImudDeviceDown": "gone", "ImudReconnects": "flapping", "ImudRateLow": "lossy", "ImudSamplesLost": "lossy",

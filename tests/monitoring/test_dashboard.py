@@ -10,8 +10,9 @@ import pytest
 
 from tests.monitoring import dashboard
 from tests.monitoring.faults import Site, site
-from tests.monitoring.prometheus import LIMIT_S, Pace, RealPrometheus, free_port, needs, real_prometheus
+from tests.monitoring.prometheus import LIMIT_S, Pace, RealPrometheus, needs, real_prometheus
 from tests.support.files import ROOT
+from tests.support.surroundings import free_port
 
 
 def test_the_file_is_that_of_the_description() -> None:

@@ -1,16 +1,19 @@
-"""Surroundings that a daemon must withstand, and made-up ones that `imud doctor` looks at.
+"""The machine around a test: what a daemon must withstand, ports for servers, and machines for `imud doctor`.
 
-The first are processes of other users, which only root can start, and pipes that nothing reads.
+A daemon must withstand processes of other users, which only root can start, and pipes that nothing reads. The machines
+that `imud doctor` looks at are made up.
 """
 
 import os
 import select
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import takewhile
 from pathlib import Path
+from random import SystemRandom
 from typing import Final
 
 import pytest
@@ -80,6 +83,28 @@ def read_until(descriptor: int, end: bytes) -> bytes:
         assert select.select([descriptor], [], [], 10)[0], data[-200:]
         data += os.read(descriptor, 65536)
     return data
+
+
+LOWEST_PORT: Final = 15000
+"""Above those that servers of tests have by custom, as 1883, 2947 and 9090."""
+PORT_TRIES_MAX: Final = 100
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A port of 127.0.0.1 that nothing has, for a server that a test starts.
+
+    It is below `net.ipv4.ip_local_port_range`. A port of that range may be given to any connection before the server
+    takes it, and a client that tries to reach it may be connected to itself (RFC 9293, section 3.5). Drawn at random,
+    so that tests that run at the same time do not meet on one.
+    """
+    above = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    assert above > LOWEST_PORT + PORT_TRIES_MAX, "net.ipv4.ip_local_port_range leaves no ports for servers"
+    for _ in range(PORT_TRIES_MAX):
+        port = SystemRandom().randrange(LOWEST_PORT, above)
+        with socket.socket(socket.AF_INET, kind) as one, suppress(OSError):
+            one.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError(f"no free port in {PORT_TRIES_MAX} tries")
 
 
 class Machine:

@@ -11,7 +11,8 @@ import pytest
 
 from imud.formats.rmc import Rmc, parse
 from tests.support.daemon_process import running_daemon
-from tests.utc.test_gpsd_real import LIMIT_S, NO_GPSD, Receiver, free_port, gpsd, receiver
+from tests.support.surroundings import free_port
+from tests.utc.test_gpsd_real import LIMIT_S, NO_GPSD, Receiver, gpsd, receiver
 
 __all__ = ["receiver"]
 WANTED = 3

@@ -3,7 +3,6 @@
 import asyncio
 import os
 import shutil
-import socket
 import subprocess
 import tty
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from imud.utc.receivers import GpsdSource
 from imud.utc.sentence_stream import Retry
 from imud.utc.source import RmcSettings
 from tests.support.rmc_sources import Sentences
+from tests.support.surroundings import free_port
 
 UTC_S = 1_795_000_000
 LIMIT_S = 30.0
@@ -73,13 +73,6 @@ def receiver() -> Iterator[Receiver]:
     made = Receiver()
     yield made
     made.close()
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)

@@ -7,7 +7,6 @@ comes meanwhile. mosquitto says on standard error when it listens, so that nothi
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -18,17 +17,13 @@ from typing import Any, Final
 from imud.formats.fleet.ledger import FleetLedger
 from imud.formats.fleet.messages import FleetMessage, decode_message
 from imud.formats.fleet.topics import Stream, parse_topic
+from tests.support.surroundings import free_port
 
 PROGRAM: Final = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/sbin")
 NO_MOSQUITTO: Final = "" if PROGRAM else "mosquitto is not installed (make mqtt-deps)"
 LIMIT_S: Final = 20.0
-
-
-def free_port() -> int:
-    """A port that nothing listens on now."""
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+RUNNING: Final = " running"
+"""How the line ends that it writes when it listens."""
 
 
 class Mosquitto:
@@ -69,7 +64,7 @@ class Mosquitto:
         self._reader = threading.Thread(target=self._read, args=(self._process, running), daemon=True)
         self._reader.start()
         assert running.wait(LIMIT_S), "\n".join(self.log)
-        assert self._process.poll() is None, "\n".join(self.log)
+        assert any(line.endswith(RUNNING) for line in self.log), "\n".join(self.log)
 
     @property
     def pid(self) -> int:
@@ -81,9 +76,9 @@ class Mosquitto:
         assert process.stdout is not None
         for line in process.stdout:
             self.log.append(line.rstrip())
-            if line.rstrip().endswith(" running"):
+            if line.rstrip().endswith(RUNNING):
                 running.set()
-        running.set()
+        running.set()  # it ended, perhaps before it listened
 
     def stop(self, number: int = signal.SIGTERM) -> None:
         """End it; with SIGTERM it keeps sessions. No-op where it does not run."""

@@ -13,7 +13,8 @@ from imud.publishers.mqtt.access import BrokerError
 from imud.publishers.mqtt.broker import PahoConnection, Will
 from imud.publishers.mqtt.settings import MqttSettings, broker_of
 from tests.publishers.mqtt.authority import Authority
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, free_port, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Collector, running_broker
+from tests.support.surroundings import free_port
 
 pytestmark = pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
 WILL = Will("imud/s/g/state", b'{"online":false}')

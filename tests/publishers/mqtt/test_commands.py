@@ -21,8 +21,9 @@ from imud.publishers.mqtt.publisher import MqttPublisher
 from imud.publishers.mqtt.settings import CommandSettings, MqttSettings
 from imud.publishers.mqtt.streams import Gateway
 from imud.units import NS_PER_S
-from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, free_port, running_broker
+from tests.publishers.mqtt.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.event_loops import VirtualClock
+from tests.support.surroundings import free_port
 
 UTC_NS = 1_800_000_000 * NS_PER_S
 DOCS = Path(__file__).parents[3] / "docs" / "fleet.md"

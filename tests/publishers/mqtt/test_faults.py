@@ -18,8 +18,9 @@ from imud.formats.fleet.ledger import FleetLedger, StreamCounts
 from imud.formats.fleet.messages import decode_message
 from imud.formats.fleet.topics import Stream
 from tests.publishers.mqtt.gateways import KilledGateway, LiveGateway, closes, in_spool
-from tests.publishers.mqtt.mosquitto import LIMIT_S, NO_MOSQUITTO, Collector, Mosquitto, free_port, running_broker
+from tests.publishers.mqtt.mosquitto import LIMIT_S, NO_MOSQUITTO, Collector, Mosquitto, running_broker
 from tests.publishers.mqtt.proxy import Proxy
+from tests.support.surroundings import free_port
 
 pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.timeout(120)]
 

@@ -33,6 +33,7 @@ from imud.sample import Sample, Sync, Vector3
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.socket_rig import device_status
+from tests.support.surroundings import free_port
 
 LIMIT_S = 20.0
 NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (make bench-deps)"
@@ -268,13 +269,6 @@ def test_the_usual_size_of_a_sentence_is_no_less_than_a_full_one(kind: Formatter
 
 
 # --- a reader that no one here wrote --------------------------------------------------------------------------------
-
-
-def free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 @contextmanager
