@@ -302,7 +302,7 @@ class Daemon:
             self._stop.set()
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-        """End the process after an exception in a callback, which is a defect of imud."""
+        """End the process after an exception in a callback, which is an internal error."""
         error = context.get("exception")
         log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))

@@ -101,8 +101,8 @@ class Reloader:
             return configuration.load(self._file, pause=lambda: time.sleep(PAUSE_S)), None
         except ConfigError as error:
             return None, error
-        except Exception as error:  # a mistake in reading a new configuration does not end what runs
-            log.exception("the configuration cannot be read because of a mistake in imud")
+        except Exception as error:  # an internal error in reading a new configuration does not end what runs
+            log.exception("the configuration cannot be read because of an internal error")
             return None, ConfigError(f"{self._file}: {type(error).__name__}: {printable(str(error))}")
 
 

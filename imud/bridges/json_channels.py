@@ -296,8 +296,8 @@ def _log(stamped: StampedEvent) -> bytes:
     )  # fmt: skip
 
 
-def _status(told: tuple[DeviceStatus, int]) -> bytes:
-    status, utc_ns = told
+def _status(timed: tuple[DeviceStatus, int]) -> bytes:
+    status, utc_ns = timed
     return _encode({"timestamp": timestamp(utc_ns), **msgspec.to_builtins(status)})
 
 

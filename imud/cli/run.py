@@ -23,8 +23,8 @@ from imud.runtime import event_loop
 
 log = logging.getLogger(__name__)
 
-EXIT_MISTAKE: Final = 1
-"""A mistake of imud's own, which is in the log."""
+EXIT_INTERNAL: Final = 1
+"""An internal error, which is in the log."""
 EXIT_OUTPUT: Final = 75
 """An output that is required cannot start, for example the socket that another imud has (EX_TEMPFAIL, sysexits.h)."""
 EXIT_CONFIGURATION: Final = 78
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
         except ImudError:
             raise
         except Exception:  # the top level of the daemon: the log has it, and the exit status says it
-            log.critical("imud ends because of a mistake of its own", exc_info=True)
-            return EXIT_MISTAKE
+            log.critical("imud ends because of an internal error", exc_info=True)
+            return EXIT_INTERNAL
     return 0
 
 

@@ -93,7 +93,7 @@ def _shown(report: SettingsReport, *, verbose: bool) -> str:
         SettingsState.UNDECLARED: "nothing is declared; `--yaml` prints what to paste into the configuration",
         SettingsState.UNKNOWN: "the device has not reported its settings",
         SettingsState.AGREE: "all that can be read is as declared",
-        SettingsState.DIFFER: f"{count} of {len(report.settings)} differ; `--apply` sets them, with `--save` for good",
+        SettingsState.DIFFER: f"{count} of {len(report.settings)} differ; `--apply` sets them, `--save` keeps them",
     }[status.state]
     lines = [table((*HEAD, *MORE) if verbose else HEAD, rows), "", words]
     if status.problem:

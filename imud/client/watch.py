@@ -32,7 +32,7 @@ class DroppedSamples(msgspec.Struct, frozen=True):
     dropped: int
 
 
-class ToldEvent(msgspec.Struct, frozen=True):
+class ReceivedEvent(msgspec.Struct, frozen=True):
     """An event as it came."""
 
     t_ns: int
@@ -154,8 +154,8 @@ def sample_of(params: Mapping[str, Any]) -> Sample:
 
 def event_of(params: Mapping[str, Any]) -> Event:
     """Decode the event in a JSON notification. An unknown kind stays a plain string. Raises ServerError."""
-    told = _understood(params, ToldEvent, "an event")
-    return Event(told.t_ns, told.device, kind_of(told.kind), told.message, told.detail)
+    received = _understood(params, ReceivedEvent, "an event")
+    return Event(received.t_ns, received.device, kind_of(received.kind), received.message, received.detail)
 
 
 def params_of(message: Mapping[str, Any]) -> dict[str, Any]:

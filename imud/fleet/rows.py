@@ -40,7 +40,7 @@ class FleetTable(NamedTuple):
 
     name: str
     columns: tuple[tuple[str, str], ...]
-    """Name and type, besides time and key."""
+    """Name and type, without those of time and key."""
     primary: str
 
     @property

@@ -52,7 +52,7 @@ class KnownIdentity:
         self.shown_settings: Mapping[str, str] = {}
         """The same for people."""
         self.answered = False
-        """Whether the device told all of it when it was asked last."""
+        """Whether the device answered every question about it when it was asked last."""
         self._notices = notices
         self._now_ns = now_ns
         self._on_settings = on_settings

@@ -1,7 +1,7 @@
 """Who may ask what: the header Host, the header Origin, the token, the cookie that a browser gets for it.
 
 - **Host** keeps out pages of other names that resolve to this address (DNS rebinding): a page cannot be served under an
-  IP address or `localhost` by somebody else, so these are good; other names have to be given.
+  IP address or `localhost` by another party, so these are good; other names have to be given.
 - **Origin** keeps out requests that pages of other sites send from the same browser. Browsers send it with every POST
   and every WebSocket. A program that has the token may leave it out.
 - **The token** is never in a URL, which logs keep. A browser exchanges it for a cookie that scripts cannot read and

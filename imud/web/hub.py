@@ -51,7 +51,7 @@ class Browser:
         self.look = Look()
         self.mailbox = Mailbox()
         self.left_out = (0, 0)
-        """What the page was told of: messages left out, and samples."""
+        """What the page was informed of: messages left out, and samples."""
 
 
 class BrowserHub:

@@ -55,7 +55,7 @@ def run(data: bytes) -> None:
     writes.count(MODULE)
     assert writes.writes(MODULE) == before + 1
     assert 1 <= writes.writes_day(MODULE) <= LIMIT_ASKED
-    writes.keep_told(MODULE, {"a": 1})
+    writes.keep_unreadable(MODULE, {"a": 1})
     writes.close()
     kept = msgspec.json.decode((folder / flash.FILE_NAME).read_bytes(), type=dict[str, flash.ModuleRecord])
     assert len(kept) <= MODULES_MAX

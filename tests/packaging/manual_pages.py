@@ -27,7 +27,7 @@ EXIT_STATUS: Final = (
 )
 RUN_STATUS: Final = (
     ("0", "Stopped by SIGTERM or SIGINT."),
-    ("1", "A mistake of imud's own; the log has where."),
+    ("1", "An internal error; the log has a traceback."),
     ("2", "Wrong command line."),
     ("75", "An output that is required cannot start."),
     ("78", "The configuration cannot be used; the log has file, line and column."),

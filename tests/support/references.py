@@ -206,11 +206,11 @@ def device_settings_part(driver: Driver) -> list[str]:
     title = [f"### `{driver.name}`: {driver.title}", ""]
     if driver.device_settings is None:
         return [*title, "None: this driver does not know them.", ""]
-    rows = ["| setting | values | unit | manual | in force | told | meaning |", "|---|---|---|---|---|---|---|"]
+    rows = ["| setting | values | unit | manual | in force | readable | meaning |", "|---|---|---|---|---|---|---|"]
     for one in described_settings(driver.device_settings, {}, None):
         force = str(one.effect) + (", last" if one.connection else "") if one.declarable else "only read"
-        told = "yes" if one.readable else "no"
-        cells = (cell(one.values), one.unit, one.section, force, told, cell(one.description))
+        readable = "yes" if one.readable else "no"
+        cells = (cell(one.values), one.unit, one.section, force, readable, cell(one.description))
         rows.append(f"| `{one.name}` | {' | '.join(cells)} |")
     return [*title, *rows, ""]
 

@@ -1,6 +1,6 @@
 """`imud demo`: the real daemon on a simulated sensor behind a real pty or CAN interface, watched by a real client.
 
-Three processes, as in life: the simulator plays the module, `imud run` owns its port, and this one is a client that
+Three processes: the simulator plays the module, `imud run` owns its port, and this one is a client that
 shows what arrives. At the end it prints rates, latency and the ledger.
 """
 

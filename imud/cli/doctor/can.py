@@ -67,18 +67,18 @@ def can_state(at: Surroundings) -> Findings:
         state = str(data.get("state", "unknown"))
         counters = data.get("berr_counter", {})
         tx, rx = int(counters.get("tx", 0)), int(counters.get("rx", 0))
-        told = f"{name} is {state}, error counters tx {tx}, rx {rx}, {frames} frames received"
+        seen = f"{name} is {state}, error counters tx {tx}, rx {rx}, {frames} frames received"
         if state == "BUS-OFF":
             restart = (
                 "" if data.get("restart_ms") else f"`sudo ip link set {name} type can restart-ms 100` lets it recover; "
             )
-            yield error(f"{told}: it has left the bus", restart + BUS_ADVICE)
+            yield error(f"{seen}: it has left the bus", restart + BUS_ADVICE)
         elif (tx or rx) and not _runs(at, name) and _silent(at, name, frames):
-            yield error(f"{told}, none now", _without_traffic(tx, rx))
+            yield error(f"{seen}, none now", _without_traffic(tx, rx))
         elif state in ("ERROR-PASSIVE", "ERROR-WARNING") or max(tx, rx) >= COUNTER_LIMIT:
-            yield warning(told, BUS_ADVICE)
+            yield warning(seen, BUS_ADVICE)
         else:
-            yield ok(told)
+            yield ok(seen)
         offs = int(data.get("bus_off", 0))
         if offs and state != "BUS-OFF":
             yield warning(f"{name} was bus-off {offs} times", BUS_ADVICE)

@@ -66,14 +66,14 @@ def storage(at: Surroundings) -> Findings:
         )
         return
     medium = _medium(at, Path(folder))
-    told = f"writing 4 KiB to {folder} ({medium}) took {worst_s * 1000:.0f} ms at worst of {SYNCS}"
+    seen = f"writing 4 KiB to {folder} ({medium}) took {worst_s * 1000:.0f} ms at worst of {SYNCS}"
     advice = "a worn or slow SD card? `sudo dmesg | grep mmc`; a card of class A1, or an SSD; logs in memory"
     if worst_s >= SYNC_BAD_S:
-        yield error(told, advice)
+        yield error(seen, advice)
     elif worst_s >= SYNC_SLOW_S:
-        yield warning(told, advice)
+        yield warning(seen, advice)
     else:
-        yield ok(told)
+        yield ok(seen)
 
 
 def _medium(at: Surroundings, folder: Path) -> str:
@@ -132,12 +132,12 @@ def processor(at: Surroundings) -> Findings:
     else:
         minutes = float(load.split()[1])
         waited = _pressure(at.text("/proc/pressure/cpu") or "")
-        told = f"load of {minutes:.1f} over 5 minutes on {cpus} processors"
-        told += f", {waited:.0f} % of a minute spent waiting for one" if waited is not None else ""
+        seen = f"load of {minutes:.1f} over 5 minutes on {cpus} processors"
+        seen += f", {waited:.0f} % of a minute spent waiting for one" if waited is not None else ""
         if minutes > LOAD_PER_CPU * cpus or (waited or 0.0) > PRESSURE_PERCENT:
-            yield warning(told, "`top`; nice other programs, lower rates or allow a latency; docs/latency.md")
+            yield warning(seen, "`top`; nice other programs, lower rates or allow a latency; docs/latency.md")
         else:
-            yield ok(told)
+            yield ok(seen)
     for one in at.status or ():
         yield from _late(one)
 

@@ -24,7 +24,7 @@ class Pattern(NamedTuple):
     expression: re.Pattern[str]
     advice: str
     least: int = 1
-    """So many lines are trouble; fewer may be somebody's hand."""
+    """So many lines are a fault; fewer may be a cable that was unplugged by hand."""
 
 
 USB_ADVICE: Final = "a shorter cable without extension, another port, a hub with its own supply"

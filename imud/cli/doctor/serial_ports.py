@@ -68,13 +68,13 @@ def ports_taken(at: Surroundings) -> Findings:
                 f"`sudo systemctl disable --now serial-getty@{name}`",
             )
         others = [one for one in holders_of(str(node), at.at("/proc")).split(", ") if one and not _is_daemon(one)]
-        told = [one for one in at.status or () if "is in use by" in one.problem and path in one.problem]
+        taken = [one for one in at.status or () if "is in use by" in one.problem and path in one.problem]
         if others:
             yield error(
                 f"{path} is open in {', '.join(others)}", "stop that program; imud opens the port by itself then"
             )
-        elif told:
-            yield error(told[0].problem, "stop that program" if at.uid == 0 else "`sudo imud doctor` sees which it is")
+        elif taken:
+            yield error(taken[0].problem, "stop that program" if at.uid == 0 else "`sudo imud doctor` sees which it is")
         elif at.uid == 0 or _runs_on(at, path):
             yield ok(f"{path} is used by no other program")
         else:

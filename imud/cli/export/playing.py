@@ -83,7 +83,7 @@ def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -
 
 
 def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[int], None]) -> Played:
-    """Play a recording in a process of its own; `at` is told how many bytes are read. Raises ImudError."""
+    """Play a recording in a process of its own; `at` is called with the bytes read so far. Raises ImudError."""
     argv = [sys.executable, "-I", "-m", "imud.cli.export.playing", str(path.absolute()), *devices]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as process:
         assert process.stdout is not None
@@ -115,8 +115,8 @@ def _take(pipe: IO[bytes], path: Path, sink: Sink, at: Callable[[int], None]) ->
         elif kind == LOSSES:
             sink.losses(msgspec.msgpack.decode(data, type=LossCounts))
         elif kind == EVENT:
-            told, utc_ns = msgspec.msgpack.decode(data, type=tuple[RecordedEvent, int])
-            event = Event(told.t_ns, told.device, kind_of(told.kind), told.message, told.detail)
+            recorded, utc_ns = msgspec.msgpack.decode(data, type=tuple[RecordedEvent, int])
+            event = Event(recorded.t_ns, recorded.device, kind_of(recorded.kind), recorded.message, recorded.detail)
             sink.event(StampedEvent(event, utc_ns))
         elif kind == END:
             played: Played = msgspec.msgpack.decode(data, type=Played)

@@ -88,7 +88,7 @@ class FleetOverview:
         return f"{clock.error_ns / NS_PER_MS:.3g}" if clock.synchronised and clock.error_ns is not None else NOT_SET
 
     def _rate_hz(self, name: str) -> float:
-        """Samples a second that came or are told of: the same samples can be in both streams."""
+        """Samples a second that came, or that statistics and status count: the same samples can be in both streams."""
         begin_ns, most = self._now_ns() - RATE_NS, 0
         for stream in (Stream.SAMPLES, Stream.STATISTICS):
             counts = self._counts.get((name, stream), deque())

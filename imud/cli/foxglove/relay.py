@@ -35,7 +35,7 @@ class Viewer(Protocol):
 
     @property
     def is_looked_at(self) -> bool:
-        """Whether somebody wants samples now."""
+        """Whether a viewer wants samples now."""
         ...
 
     def open(self, channel: MessageChannel[Any]) -> None:

@@ -133,9 +133,9 @@ def run(args: argparse.Namespace) -> int:
                 contents.add(record)
     except OSError as error:
         raise ImudError(f"{args.file}: {error.strerror}") from error
-    told = summary(contents, reader)
-    print(msgspec.json.encode(told).decode() if args.json else page(told))
-    return 1 if told["damage"] or told["records_dropped"] else 0
+    report = summary(contents, reader)
+    print(msgspec.json.encode(report).decode() if args.json else page(report))
+    return 1 if report["damage"] or report["records_dropped"] else 0
 
 
 def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
@@ -164,26 +164,26 @@ def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def page(told: dict[str, Any]) -> str:
+def page(report: dict[str, Any]) -> str:
     """Format it for people, in 80 columns."""
     begun = "not known"
-    if told["begun_utc_ns"] is not None:
-        begun = f"{datetime.fromtimestamp(told['begun_utc_ns'] // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    stored, plain = told["stored_bytes"], told["plain_bytes"]
-    samples = sum(device["samples"] for device in told["devices"])
-    size = f"{stored} bytes in {told['blocks']} blocks, {plain} unpacked"
+    if report["begun_utc_ns"] is not None:
+        begun = f"{datetime.fromtimestamp(report['begun_utc_ns'] // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    stored, plain = report["stored_bytes"], report["plain_bytes"]
+    samples = sum(device["samples"] for device in report["devices"])
+    size = f"{stored} bytes in {report['blocks']} blocks, {plain} unpacked"
     if samples:
         size += f"; {stored / samples:.1f} bytes per sample"
-    dropped = f"{told['records_dropped']} records were dropped, the disk was too slow"
+    dropped = f"{report['records_dropped']} records were dropped, the disk was too slow"
     rows = [
-        ("begun", f"{begun}, by imud {told['imud']} on {told['host']}, file {told['file_number']}"),
-        ("duration", f"{told['duration_s']:.1f} s"),
+        ("begun", f"{begun}, by imud {report['imud']} on {report['host']}, file {report['file_number']}"),
+        ("duration", f"{report['duration_s']:.1f} s"),
         ("size", size),
-        ("dropped", dropped if told["records_dropped"] else "nothing"),
-        ("integrity", "; ".join(told["problems"]) or "whole"),
+        ("dropped", dropped if report["records_dropped"] else "nothing"),
+        ("integrity", "; ".join(report["problems"]) or "whole"),
     ]
     lines = [line for name, text in rows for line in paragraph(f"{name:<11}", text)]
-    for device in told["devices"]:
+    for device in report["devices"]:
         identity = ", ".join(f"{name} {value}" for name, value in device["identity"].items()) or "not known"
         lines += ["", *paragraph(f"{device['name']}: ", f"{device['link']}, driver {device['driver']}")]
         parts = [

@@ -1,4 +1,4 @@
-"""One change of this machine: told before it is made, made, taken back. Two kinds: a file's content, and a command.
+"""One change of this machine: announced before it is made, made, undone. Two kinds: a file's content, and a command.
 
 A file is exchanged as a whole; its owner and mode stay. It is taken back only while it is as it was left: what a person
 wrote since is never overwritten. A command names the commands that take it back, and one whose output shows its effect.
@@ -73,7 +73,7 @@ class ChangeRecord(msgspec.Struct):
     """False for one that was interrupted: it may or may not have been made."""
 
 
-# --- told -------------------------------------------------------------------------------------------------------------
+# --- announced --------------------------------------------------------------------------------------------------------
 
 
 def describe(at: Surroundings, change: Change) -> list[str]:

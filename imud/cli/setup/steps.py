@@ -1,8 +1,8 @@
 """The course of `imud setup`: free the ports, look, propose, change, wait for samples; and all of it taken back.
 
-Two rounds of changes, each told and agreed before it is made: first what stands between imud and a port (a console, a
-CAN interface that is down), since what is behind it can only be seen afterwards; then configuration, adapters, group
-and service.
+Two rounds of changes, each announced and agreed before it is made: first what stands between imud and a port (a
+console, a CAN interface that is down), since what is behind it can only be seen afterwards; then configuration,
+adapters, group and service.
 """
 
 import os
@@ -73,7 +73,7 @@ class SetupSteps:
         self._now_s, self._sleep = now_s, sleep
         self._dry_run = dry_run
         self._user, self._date = user, date
-        self._told: list[str] = []
+        self._announced: list[str] = []
         self._notes: list[str] = []
         self._found: list[Attached] = []
         self._status: list[DeviceStatus] = []
@@ -196,7 +196,7 @@ class SetupSteps:
             self._talk.show(["", "Changes:"])
         for number, change in enumerate(changes, start=1):
             first, *more = describe(at, change)
-            self._told.append(first)
+            self._announced.append(first)
             self._talk.say(f"  {number}. {first}", indent="     ")
             self._talk.show([f"     {line}" for line in more])
         for note in notes:
@@ -228,7 +228,7 @@ class SetupSteps:
     def _samples(self, wait_s: float) -> int:
         """Wait for samples and show them."""
         at = self._look_around()
-        if not self._told:
+        if not self._announced:
             self._talk.say("Nothing to change.")
         names = [device.name for device in at.config.devices] if at.config else []
         if not at.at(SYSTEMD).exists() or state(at, UNIT, "is-active") != "active":
@@ -250,7 +250,7 @@ class SetupSteps:
     def as_json(self) -> bytes:
         """All that was found and done, for programs."""
         found: dict[str, Any] = {
-            "found": self._found, "changes": self._told, "made": self._changed, "notes": self._notes,
+            "found": self._found, "changes": self._announced, "made": self._changed, "notes": self._notes,
             "devices": self._status,
         }  # fmt: skip
         return msgspec.json.encode(found)

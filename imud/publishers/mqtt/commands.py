@@ -212,8 +212,8 @@ class CommandChannel:
             log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error)
             self._end(asked, Outcome.FAILED, error=str(error))
         except Exception:
-            log.exception("mqtt: %s: request %s ended by a defect of imud", asked.device, request.id)
-            self._end(asked, Outcome.FAILED, error="a defect of imud; its log has more")
+            log.exception("mqtt: %s: request %s ended by an internal error", asked.device, request.id)
+            self._end(asked, Outcome.FAILED, error="an internal error; the log of imud has a traceback")
         else:
             log.info("mqtt: %s: request %s is done: %s", asked.device, request.id, shown(result))
             self._end(asked, Outcome.DONE, result=result)

@@ -18,7 +18,7 @@ from imud.publishers.mqtt.settings import DeviceSending
 from imud.publishers.mqtt.streams import Gateway
 
 PREFIX: Final = "homeassistant"
-"""The prefix of discovery that Home Assistant has unless somebody changed it."""
+"""The prefix of discovery that Home Assistant has unless it was changed there."""
 DEG_PER_RAD: Final = "57.29577951308232"
 """180 / π, in templates."""
 ANGLES: Final = ("roll", "pitch", "yaw")

@@ -55,7 +55,7 @@ class MqttSender:
         self.reconnects = 0
         """Connections after the first."""
         self.failure: BaseException | None = None
-        """The exception that ended the thread, which is a defect of imud."""
+        """The exception that ended the thread, which is an internal error."""
         self.wanting: Callable[[], None] = lambda: None
         """Called in the thread when there is room for messages, or acknowledgements wait; set by the writer."""
         self._settings, self._client_id, self._will = settings, client_id, will
@@ -148,7 +148,7 @@ class MqttSender:
                 if rest_s > 0 and not self._ended:
                     self._wake_after(rest_s)
             self._say_farewell()
-        except BaseException as error:  # noqa: BLE001 - a defect of imud must end the daemon, not just this thread
+        except BaseException as error:  # noqa: BLE001 - an internal error must end the daemon, not just this thread
             self.failure = error
 
     def _wake_after(self, seconds: float) -> None:

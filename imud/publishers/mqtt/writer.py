@@ -166,7 +166,7 @@ class SpoolWriter:
         self.lost_on_disk = 0
         """Samples and events of which only the numbers are left because the disk failed."""
         self.failure: BaseException | None = None
-        """The exception that ended the thread, which is a defect of imud."""
+        """The exception that ended the thread, which is an internal error."""
         self.positions: list[StreamPosition] = []
         """How far the streams have come, as of the last transaction."""
         self.closed: Callable[[], None] = lambda: None

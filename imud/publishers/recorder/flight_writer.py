@@ -72,7 +72,7 @@ class FlightWriter:
         self.saved: deque[Saved] = deque()
         """What became of snapshots; the loop takes it."""
         self.failure: BaseException | None = None
-        """The exception that ended the thread, which is a defect of imud."""
+        """The exception that ended the thread, which is an internal error."""
         self._queue = queue
         self._ring = ring
         self._directory = directory

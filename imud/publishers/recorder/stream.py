@@ -99,7 +99,7 @@ class StreamWriter:
         self, queue: RecordQueue[LastRecords], sock: socket.socket, now_ns: Callable[[], int], start_worker: StartWorker
     ) -> None:
         self.failure: BaseException | None = None
-        """The exception that ended the thread, which is a defect of imud."""
+        """The exception that ended the thread, which is an internal error."""
         self._queue = queue
         self._sock = sock
         self._sender = BlockSender(sock, now_ns)

@@ -116,7 +116,7 @@ class RecordingWriter:
 
     @property
     def failure(self) -> BaseException | None:
-        """The exception that ended the thread, which is a defect of imud."""
+        """The exception that ended the thread, which is an internal error."""
         return self._failure
 
     # --- the thread's side -------------------------------------------------------------------------------------------

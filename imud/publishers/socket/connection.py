@@ -176,7 +176,7 @@ class Connection:
         return events | select.EPOLLOUT if self.outbox.waiting and not self._writable else events
 
     def on_failure(self, error: Exception) -> None:
-        """End the connection with an error: what its request met is a mistake in this program."""
+        """End the connection after an internal error in serving its request."""
         self._server.on_failed(error)
         if self.closed:
             return

@@ -151,7 +151,7 @@ class Hub:
         try:
             if not connection.wakers.wake(device):
                 self._forget_waker(connection, device)
-        except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
             connection.on_failure(error)
 
     def _forget_waker(self, connection: Connection, device: str) -> None:
@@ -263,11 +263,11 @@ class Hub:
         self._evicted += 1
 
     def count_failed(self, error: Exception) -> None:
-        """Count a client whose request met a mistake in this program; log the first, and one a minute of more."""
+        """Count a client that was ended by an internal error; log the first, and one a minute of more."""
         self._failed += 1
         count = self._failures.count()
         if count:
-            log.error("an error while a client was served (%d since the last report)", count, exc_info=error)
+            log.error("an internal error while a client was served (%d since the last report)", count, exc_info=error)
 
     def clients(self) -> tuple[ClientStatus, ...]:
         """The state of every client."""
@@ -289,7 +289,7 @@ class Hub:
         for connection in list(self._connections.values()):
             try:
                 connection.tick()
-            except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+            except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
                 connection.on_failure(error)
 
     def close(self) -> None:
@@ -310,7 +310,7 @@ def post_all(connections: Iterable[Connection], body: bytes) -> None:
     for connection in connections:
         try:
             connection.post(body)
-        except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
             connection.on_failure(error)
 
 

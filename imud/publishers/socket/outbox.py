@@ -45,7 +45,8 @@ class Delivery:
     """Samples of one batch in one form, or those of `chosen` indices; encoded on first use, for all clients.
 
     What is encoded does not hold the batch: a sample is some thirty small objects, whose memory the interpreter keeps
-    for good when thousands have waited (20 clients of 100 devices that do not read for 8 s: 29 MB, as messages 11).
+    until its end when thousands have waited (20 clients of 100 devices that do not read for 8 s: 29 MB, as messages
+    11).
     """
 
     __slots__ = ("_batch", "_chosen", "_messages", "count", "device", "each_bytes", "encoding", "order")
@@ -145,7 +146,7 @@ class Pool:
             self._holding.pop(outbox, None)
 
     def evict(self) -> None:
-        """Report clients to their owners until what is held besides samples is within the limit.
+        """Report clients to their owners until what is held in addition to samples is within the limit.
 
         Not to be called while samples are sent to a list of clients: one of them could be closed in between.
         """

@@ -180,7 +180,7 @@ class SocketServer:
         before = self.hub.accepted
         try:
             self._let_in(sock)
-        except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
             made = self.hub.connections.get(before + 1)
             if made is not None:
                 made.on_failure(error)

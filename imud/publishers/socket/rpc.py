@@ -150,7 +150,7 @@ async def _answer_later(connection: Connection, request: RpcRequest, later: Late
             body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
         if request.wants_reply:
             connection.post(body)
-    except Exception as error:  # noqa: BLE001 - a mistake of ours ends this client, not the daemon
+    except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
         connection.on_failure(error)
 
 

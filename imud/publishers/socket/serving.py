@@ -72,7 +72,7 @@ class ServedClient(Protocol):
         ...
 
     def on_failure(self, error: Exception) -> None:
-        """`serve` raised, which is a mistake of ours: end the connection."""
+        """`serve` raised, which is an internal error: end the connection."""
         ...
 
     def on_overload(self) -> None:
@@ -387,7 +387,7 @@ class Scheduler:
             self.line_up(place)
 
     def _fail(self, place: Place, error: Exception) -> None:
-        """End a client that met a mistake of ours; one that cannot even be ended is served no more."""
+        """End a client after an internal error; one that cannot even be ended is served no more."""
         try:
             place.client.on_failure(error)
         except Exception:

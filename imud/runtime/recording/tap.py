@@ -1,6 +1,6 @@
 """Taps: where a recording hears what goes into the path and the clock of a device, and the host's clocks.
 
-A tap without listeners costs nothing: the methods of path and clock are as their classes have them. While somebody
+A tap without listeners costs nothing: the methods of path and clock are as their classes have them. While anything
 listens, those of the device's own objects are replaced by ones that call them and then make a record: after, so that
 clocks that were read and edges that were fetched on the way stand before it.
 Synchronization: the event loop's thread only.

@@ -57,8 +57,8 @@ class Applying:
     flash: FlashBudget
     wanted: Values
     actual: Values
-    told: dict[str, Any] = field(default_factory=dict)
-    """Values written of settings that the device does not tell."""
+    written: dict[str, Any] = field(default_factory=dict)
+    """Values written of settings that cannot be read back."""
     saved: bool = False
     restarted: bool = False
     changed: bool = False
@@ -78,7 +78,7 @@ class Applying:
             await self._save()
         if not self.problem and (plan.restart or (self.pending and self.saved and self.table.restart is not None)):
             done = await self._restart(done)
-        found = differences(self.table, self.wanted, self.actual, self.told)
+        found = differences(self.table, self.wanted, self.actual, self.written)
         return AppliedSettings(
             tuple(done), self.saved, self.restarted, self.problem + self._present(), plan.left_out, found
         )
@@ -101,7 +101,7 @@ class Applying:
         if not await self._read_again():
             return self._failed(step, "written, and the device does not tell its settings since")
         if not setting.readable or (result in UNVERIFIED and step.name not in self.actual):
-            self.told[step.name] = value
+            self.written[step.name] = value
             return _applied(step, StepOutcome.NOT_VERIFIED)
         if result in PENDING:
             self.pending = True

@@ -16,22 +16,24 @@ Values = Mapping[str, Any]
 """Values of settings by name, in the types of the driver's table."""
 
 
-def has(table: DeviceSettings, name: str, wanted: Values, actual: Values, told: Values) -> bool:
+def has(table: DeviceSettings, name: str, wanted: Values, actual: Values, unreadable: Values) -> bool:
     """Whether a device has a wanted value: as it reports, or as was written to it where it does not."""
     setting = table.table[name]
-    known = actual if name in actual else told
+    known = actual if name in actual else unreadable
     return name in known and setting.agrees(wanted[name], known[name])
 
 
-def differences(table: DeviceSettings, wanted: Values, actual: Values, told: Values) -> dict[str, SettingDifference]:
+def differences(
+    table: DeviceSettings, wanted: Values, actual: Values, unreadable: Values
+) -> dict[str, SettingDifference]:
     """List the settings that can be read and are not as wanted, in the order of the table.
 
-    `told` are values as they were written, which count where the device does not say what it has.
+    `unreadable` are values as they were written, which count where the device does not say what it has.
     """
     return {
         name: SettingDifference(as_json(wanted[name]), as_json(actual.get(name)))
         for name, setting in table.table.items()
-        if name in wanted and setting.readable and not has(table, name, wanted, actual, told)
+        if name in wanted and setting.readable and not has(table, name, wanted, actual, unreadable)
     }
 
 

@@ -31,8 +31,8 @@ class ModuleRecord(msgspec.Struct):
     """Writes to its flash by imud."""
     times_s: list[int] = []  # msgspec copies a mutable default
     """Seconds of UTC of the newest, oldest first, LIMIT_ASKED at most."""
-    told: dict[str, Any] = {}  # msgspec copies a mutable default
-    """Values saved in its flash of settings that it does not tell, as JSON."""
+    unreadable: dict[str, Any] = msgspec.field(name="told", default_factory=dict)
+    """Values saved in its flash of settings that cannot be read back, as JSON."""
 
 
 class FlashWrites:
@@ -71,15 +71,15 @@ class FlashWrites:
         record.times_s = [*record.times_s, self._utc_ns() // NS_PER_S][-LIMIT_ASKED:]
         self._keep(module, record)
 
-    def told(self, module: str) -> Mapping[str, Any]:
-        """Values saved in the flash of a module of settings that it does not tell, as JSON."""
-        return self._record(module).told
+    def unreadable(self, module: str) -> Mapping[str, Any]:
+        """Values saved in the flash of a module of settings that cannot be read back, as JSON."""
+        return self._record(module).unreadable
 
-    def keep_told(self, module: str, told: Mapping[str, Any]) -> None:
+    def keep_unreadable(self, module: str, values: Mapping[str, Any]) -> None:
         """Remember such values: they are in the module's flash now."""
-        if self.told(module) != told:
+        if self.unreadable(module) != values:
             record = self._modules.pop(module, None) or ModuleRecord()
-            record.told = dict(told)
+            record.unreadable = dict(values)
             self._keep(module, record)
 
     def close(self) -> None:

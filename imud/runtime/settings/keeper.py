@@ -116,7 +116,7 @@ class SettingsKeeper:
         self._tries = 0
         self._actual: Values | None = None
         self._target: Target | None = None
-        self._told: dict[str, Any] = {}
+        self._written: dict[str, Any] = {}
         """Values written since the device's last restart, of settings that it does not tell."""
         self._unsaved = False
         """Whether something was written since then that flash does not have, as far as imud knows."""
@@ -162,12 +162,12 @@ class SettingsKeeper:
         self._wanted.clear()
 
     def close(self) -> None:
-        """End for good; may be called twice."""
+        """End, without a restart; may be called twice."""
         self.stop()
 
     def _begin_anew(self, after_ns: int) -> None:
         """Note that the device has what its flash has, and compare after a time."""
-        self._reported, self._told, self._unsaved, self._tries = {}, {}, False, 0
+        self._reported, self._written, self._unsaved, self._tries = {}, {}, False, 0
         self._due_ns = self._host.now_ns() + after_ns
 
     @property
@@ -306,7 +306,7 @@ class SettingsKeeper:
         try:
             actual = await self._read(table)
         except DEVICE_ERRORS as error:
-            self._not_told(error)
+            self._not_read(error)
             return
         self._tries, self._problem = 0, ""
         found = self._differences(table)
@@ -374,14 +374,14 @@ class SettingsKeeper:
         try:
             done = await applying.carry_out(plan)
         finally:
-            self._told |= applying.told
+            self._written |= applying.written
             self._unsaved |= applying.changed
             self._actual = applying.actual if applying.heard else None
             self._read_ns = self._host.now_ns()
             if applying.saved:
                 self._unsaved = False
-                told = {name: as_json(value) for name, value in self._all_told(table).items()}
-                self._writes.keep_told(self._module, told)
+                unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
+                self._writes.keep_unreadable(self._module, unreadable)
         if asked:  # the rest is an event, which is in the log
             log.info("%s: %s", self._config.name, _summary(done) or "settings are as wanted")
         self._tell(self._differences(table), quiet=True)
@@ -393,17 +393,17 @@ class SettingsKeeper:
         self, table: DeviceSettings, wanted: Values, actual: Values, *, save: bool, unsaved: bool
     ) -> SettingsPlan:
         assert self._target is not None
-        return make_plan(table, self._target, wanted, actual, self._all_told(table), save=save, unsaved=unsaved)
+        return make_plan(table, self._target, wanted, actual, self._all_written(table), save=save, unsaved=unsaved)
 
-    def _all_told(self, table: DeviceSettings) -> dict[str, Any]:
+    def _all_written(self, table: DeviceSettings) -> dict[str, Any]:
         """Values of settings that the device does not report, as written to it since its restart or before a save."""
         found: dict[str, Any] = {}
-        for name, value in self._writes.told(self._module).items():
+        for name, value in self._writes.unreadable(self._module).items():
             try:
                 found |= wanted_values(table, {name: value})
             except BadArgument:
                 log.debug("%s: %s of an earlier version is not used", self._config.name, name)
-        return found | self._told
+        return found | self._written
 
     # --- what is reported ---------------------------------------------------------------------------------------------
 
@@ -425,7 +425,7 @@ class SettingsKeeper:
         detail = {step.name: str(step.outcome) for step in applied.steps}
         self._raise(_summary(applied), saved=applied.saved, **detail)
 
-    def _not_told(self, error: Exception) -> None:
+    def _not_read(self, error: Exception) -> None:
         """Ask again later, a limited number of times."""
         self._tries += 1
         self._actual = None
@@ -463,7 +463,7 @@ class SettingsKeeper:
     def _differences(self, table: DeviceSettings) -> dict[str, SettingDifference]:
         if self._actual is None:
             return {}
-        return differences(table, self._declared, self._actual, self._all_told(table))
+        return differences(table, self._declared, self._actual, self._all_written(table))
 
     def _known_table(self) -> DeviceSettings | None:
         driver = self._driver()

@@ -17,14 +17,21 @@ CANNOT_SAVE: Final = "comes into force by save and restart only, and this driver
 
 
 def make_plan(
-    table: DeviceSettings, target: Target, wanted: Values, actual: Values, told: Values, *, save: bool, unsaved: bool
+    table: DeviceSettings,
+    target: Target,
+    wanted: Values,
+    actual: Values,
+    unreadable: Values,
+    *,
+    save: bool,
+    unsaved: bool,
 ) -> SettingsPlan:
     """Plan to make a device that has `actual` as `wanted`.
 
-    `told` are values of settings that cannot be read as they were written to this device, `unsaved` whether something
-    was written that flash does not have. Raises BadArgument for values that do not go together.
+    `unreadable` are values of settings that cannot be read back, as they were written to this device, `unsaved` whether
+    something was written that flash does not have. Raises BadArgument for values that do not go together.
     """
-    differing = [name for name in table.table if name in wanted and not has(table, name, wanted, actual, told)]
+    differing = [name for name in table.table if name in wanted and not has(table, name, wanted, actual, unreadable)]
     left_out = {name: why for name in differing if (why := _why_left_out(table, table.table[name], save))}
     written = [name for name in differing if name not in left_out]
     if written:

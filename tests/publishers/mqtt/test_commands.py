@@ -255,7 +255,7 @@ def test_errors_are_answers_and_a_defect_is_one_too() -> None:
     assert [(one.outcome, one.error) for one in bench.answers()] == [
         (Outcome.FAILED, "angle: expected a number, got nothing"),
         (Outcome.FAILED, "mast: no such device"),
-        (Outcome.FAILED, "a defect of imud; its log has more"),
+        (Outcome.FAILED, "an internal error; the log of imud has a traceback"),
     ]
 
 

@@ -241,7 +241,7 @@ def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: py
             other.close()
 
     run(body)
-    assert caplog.text.count("an error while a client was served") == 1
+    assert caplog.text.count("an internal error while a client was served") == 1
 
 
 def test_a_mistake_in_answering_ends_that_client_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,9 +18,9 @@ TARGET = Target(None, 0)
 class TableOfOne:
     """A device with the setting `x`: its scripts are done as soon as they are made."""
 
-    def __init__(self, result: object, *, told: bool = True, effect: Effect = Effect.AT_ONCE, **more: Any) -> None:
+    def __init__(self, result: object, *, readable: bool = True, effect: Effect = Effect.AT_ONCE, **more: Any) -> None:
         self.actual: dict[str, Any] = {"x": 1}
-        self.active: dict[str, Any] = {"x": 1} if told else {}
+        self.active: dict[str, Any] = {"x": 1} if readable else {}
         self.done: list[str] = []
         self.result = result
         self.table = DeviceSettings(
@@ -105,7 +105,7 @@ def test_what_a_script_says_needs_a_restart_gets_one_where_it_was_saved() -> Non
 
 @pytest.mark.parametrize("result", [Written.UNVERIFIED, Written.UNVERIFIED_PENDING])
 def test_a_device_that_ignores_reads_has_taken_the_value(result: Written) -> None:
-    found = applied(TableOfOne(result, told=False))
+    found = applied(TableOfOne(result, readable=False))
     assert found.steps[0].outcome is StepOutcome.NOT_VERIFIED
     assert (found.saved, found.problem, found.differences) == (True, "", {})
 

@@ -18,8 +18,10 @@ from tests.support.fake_drivers import FACTORY, FAKE_SETTINGS
 ACTUAL = {name: value for name, value in FACTORY.items() if name != "secret"}
 
 
-def differing(wanted: dict[str, Any], actual: dict[str, Any] = ACTUAL, told: dict[str, Any] | None = None) -> list[str]:
-    return list(differences(FAKE_SETTINGS, wanted, actual, told or {}))
+def differing(
+    wanted: dict[str, Any], actual: dict[str, Any] = ACTUAL, unreadable: dict[str, Any] | None = None
+) -> list[str]:
+    return list(differences(FAKE_SETTINGS, wanted, actual, unreadable or {}))
 
 
 def test_the_table_says_what_agrees() -> None:
@@ -29,7 +31,7 @@ def test_the_table_says_what_agrees() -> None:
     ]  # fmt: skip
 
 
-def test_what_the_device_does_not_tell_differs_unless_it_was_told() -> None:
+def test_what_cannot_be_read_back_differs_unless_it_was_written() -> None:
     found = differences(FAKE_SETTINGS, {"mode": "6-axis"}, {}, {})
     assert found == {"mode": SettingDifference("6-axis", None)}
     assert words(found) == 'mode is not reported, declared "6-axis"'

@@ -53,10 +53,10 @@ def test_counts_survive_a_restart_of_imud(tmp_path: Path) -> None:
     with closing(FlashWrites(tmp_path, days.utc_ns)) as writes:
         writes.count("A")
         writes.count("A")
-        writes.keep_told("A", {"secret": 5})
+        writes.keep_unreadable("A", {"secret": 5})
     with closing(FlashWrites(tmp_path, days.utc_ns)) as writes:
-        assert (writes.writes("A"), writes.writes_day("A"), writes.told("A")) == (2, 2, {"secret": 5})
-        assert (writes.writes("B"), writes.told("B")) == (0, {})
+        assert (writes.writes("A"), writes.writes_day("A"), writes.unreadable("A")) == (2, 2, {"secret": 5})
+        assert (writes.writes("B"), writes.unreadable("B")) == (0, {})
 
 
 def test_a_clock_that_was_wrong_does_not_forbid_writes_for_years() -> None:

@@ -15,8 +15,8 @@ ACTUAL = {name: value for name, value in FACTORY.items() if name != "secret"}
 TARGET = Target(None, 115200)
 
 
-def planned(wanted: dict[str, Any], *, save: bool = True, unsaved: bool = False, **told: Any) -> SettingsPlan:
-    return make_plan(FAKE_SETTINGS, TARGET, wanted, ACTUAL, told, save=save, unsaved=unsaved)
+def planned(wanted: dict[str, Any], *, save: bool = True, unsaved: bool = False, **written: Any) -> SettingsPlan:
+    return make_plan(FAKE_SETTINGS, TARGET, wanted, ACTUAL, written, save=save, unsaved=unsaved)
 
 
 def names(plan: SettingsPlan) -> list[str]:
@@ -29,7 +29,7 @@ def test_only_what_differs_is_written_and_flash_only_then() -> None:
     plan = planned({"mode": "9-axis", "output": {"a": 100}})
     assert plan == SettingsPlan((PlannedStep("mode", "9-axis", "6-axis"),), save=True)
     assert not planned({"mode": "9-axis"}, save=False).save
-    assert planned({"mode": "6-axis"}, unsaved=True).save  # told before and not saved
+    assert planned({"mode": "6-axis"}, unsaved=True).save  # written before and not saved
     assert not planned({"mode": "6-axis"}, save=False, unsaved=True).save
 
 
@@ -68,7 +68,7 @@ def test_a_driver_that_cannot_save_or_restart() -> None:
     assert (names(plan), plan.save, plan.restart) == (["mounting"], True, False)
 
 
-def test_what_is_not_told_is_written_unless_it_was() -> None:
+def test_what_cannot_be_read_back_is_written_unless_it_was() -> None:
     assert names(planned({"secret": 5})) == ["secret"]
     assert names(planned({"secret": 5}, secret=5)) == []
     assert names(planned({"secret": 5}, secret=4)) == ["secret"]

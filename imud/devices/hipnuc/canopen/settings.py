@@ -55,16 +55,16 @@ def transmission_name(tpdo: int) -> str:
 
 def values_of(values: Mapping[Place, int]) -> dict[str, Any]:
     """Settings by name from objects; what stands in none of the forms of the table is left out."""
-    told: dict[str, Any] = {}
+    reported: dict[str, Any] = {}
     for tpdo, index in TPDO_OBJECTS.items():
-        told[interval_name(tpdo)] = values.get((index, TPDO_TIMER))
-        told[transmission_name(tpdo)] = _BY_OF.get(values.get((index, TPDO_TYPE), -1))
+        reported[interval_name(tpdo)] = values.get((index, TPDO_TIMER))
+        reported[transmission_name(tpdo)] = _BY_OF.get(values.get((index, TPDO_TYPE), -1))
     signs = {"incli_x_reversed": session.INCLI_SIGN_X, "incli_y_reversed": session.INCLI_SIGN_Y}
-    told |= {name: {0: False, 1: True}.get(values.get((index, 0), -1)) for name, index in signs.items()}
-    told["heartbeat_ms"] = values.get((session.HEARTBEAT_TIME, 0))
-    told["bit_rate"] = BIT_RATE_OF.get(values.get((session.BIT_RATE, 0), -1))
-    told["node"] = values.get((session.NODE_ID, 0))
-    return {name: value for name, value in told.items() if value is not None}
+    reported |= {name: {0: False, 1: True}.get(values.get((index, 0), -1)) for name, index in signs.items()}
+    reported["heartbeat_ms"] = values.get((session.HEARTBEAT_TIME, 0))
+    reported["bit_rate"] = BIT_RATE_OF.get(values.get((session.BIT_RATE, 0), -1))
+    reported["node"] = values.get((session.NODE_ID, 0))
+    return {name: value for name, value in reported.items() if value is not None}
 
 
 def set_interval(target: Target, tpdo: TpdoNumber, interval_ms: int) -> RequestScript[Written]:

@@ -66,8 +66,9 @@ def restart(settings: HipnucJ1939Settings, bus_bit_s: int) -> RequestScript[str]
     saved = yield from session.read_values(peer, (ADDRESS, session.BITRATE))
     code = saved.get(session.BITRATE, len(session.BITRATES))
     rate = session.BITRATES[code] if code < len(session.BITRATES) else bus_bit_s
-    told = saved.get(ADDRESS, peer.address)
-    address = told if 0 <= told <= ADDRESS_MAX else peer.address  # no address of a node: it will stay where it is
+    saved_address = saved.get(ADDRESS, peer.address)
+    valid = 0 <= saved_address <= ADDRESS_MAX
+    address = saved_address if valid else peer.address  # not an address of a node: it will stay where it is
     places = tuple(dict.fromkeys((peer.address, address)))
     found = yield from _claim(session.restart_request(peer), (*places, FACTORY_ADDRESS) if saved else None)
     for place in places if found is None else ():

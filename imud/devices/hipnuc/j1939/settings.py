@@ -48,14 +48,14 @@ REGISTERS: Final = {
 
 def values_of(values: Mapping[int, int]) -> dict[str, Any]:
     """Settings by name from registers; what has none of the values of the table is left out."""
-    told: dict[str, Any] = {name: values.get(register) for name, register in REGISTERS.items()}
+    reported: dict[str, Any] = {name: values.get(register) for name, register in REGISTERS.items()}
     for pgn in INTERVALS:  # 0 or nothing: a message that this firmware does not send
-        told[interval_name(pgn)] = told[interval_name(pgn)] or None
+        reported[interval_name(pgn)] = reported[interval_name(pgn)] or None
     for name in ("x_reversed", "y_reversed"):
-        told[name] = {0: False, 1: True}.get(-1 if told[name] is None else told[name])
-    code = told["bit_rate"]
-    told["bit_rate"] = BITRATES[code] if code is not None and code < len(BITRATES) else None
-    return {name: value for name, value in told.items() if value is not None}
+        reported[name] = {0: False, 1: True}.get(-1 if reported[name] is None else reported[name])
+    code = reported["bit_rate"]
+    reported["bit_rate"] = BITRATES[code] if code is not None and code < len(BITRATES) else None
+    return {name: value for name, value in reported.items() if value is not None}
 
 
 def set_interval(target: Target, pgn: int, interval_ms: int) -> RequestScript[Written]:

@@ -93,7 +93,7 @@ def ask_outputs() -> RequestScript[ComConfig | None]:
 
 
 def rates_hz(config: ComConfig | None) -> dict[OutputMessage, float]:
-    """Output rates of the messages that have one; messages on mark are sent when somebody asks."""
+    """Output rates of the messages that have one; messages on mark are sent when they are asked for."""
     periods_s = config.periods_s if config is not None else {}
     return {OutputMessage(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}
 

@@ -66,7 +66,7 @@ def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
         axis.lower(): AngleAlarm(min_deg=one.low_deg, max_deg=one.high_deg, enabled=one.enabled)
         for axis, one in alarm_ranges(raw).by_axis.items()
     }
-    told: dict[str, Any] = {
+    reported: dict[str, Any] = {
         "output": {**rates, **{name.lower(): ON_MARK for name in com.on_mark}} or None,
         "mode": {0: "6-axis", 1: "9-axis"}.get(-1 if user.att_mode is None else user.att_mode),
         "mounting": None if user.urfr is None else _mounting_name(user.urfr),
@@ -77,7 +77,7 @@ def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
         "magnetometer_bias": None if mag.bias_ut is None else list(mag.bias_ut),
         "baud": com.baud if com.baud in BAUD_RATES else None,
     }
-    return {name: value for name, value in told.items() if value is not None}
+    return {name: value for name, value in reported.items() if value is not None}
 
 
 def shown(raw: Mapping[str, str]) -> dict[str, str]:
