@@ -26,6 +26,8 @@ T = TypeVar("T")
 
 ANSWER_S: Final = 5.0
 REPLIES_PER_LINE_MAX: Final = 1
+BLANK: Final = b" \t\r"
+"""What JSON takes for white space within a line (RFC 8259, section 2); `bytes.strip` knows more, as vertical tabs."""
 ERROR_CHARACTERS_MAX: Final = 1024
 METHODS: Final = (
     "devices", "status", "schema", "watch", "unwatch", "poll", "events", "notify", "actions", "command",
@@ -159,7 +161,7 @@ def _check_received(received: bytes, data: bytes) -> None:
             message = json.loads(line)
             assert message["jsonrpc"] == "2.0"
             replies += "method" not in message
-    lines = [line for line in data.split(b"\n") if line.strip()]
+    lines = [line for line in data.split(b"\n") if line.strip(BLANK)]
     assert replies <= REPLIES_PER_LINE_MAX * len(lines)
 
 
@@ -178,7 +180,15 @@ def seeds() -> list[bytes]:
     ]
     requests += [{"jsonrpc": "2.0", "id": "a", "method": method, "params": given} for method, given in params]
     lines = [json.dumps(request).encode() + b"\n" for request in requests]
-    odd = [b"{}\n", b"[]\n", b"\n\r\n \n", b"[" * 200 + b"\n", b'{"jsonrpc":"2.0","method":"poll"}\n', b"x" * 70_000]
+    odd = [
+        b"{}\n",
+        b"[]\n",
+        b"\n\r\n \n",
+        b"\x0b\n\r",
+        b"[" * 200 + b"\n",
+        b'{"jsonrpc":"2.0","method":"poll"}\n',
+        b"x" * 70_000,
+    ]
     return [*lines, b"".join(lines[:12]), b"".join(lines), *odd]
 
 
