@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
@@ -81,6 +82,11 @@ class Keys:
         self.problems.append(Problem(mark, path, message))
 
     def _value_fits(self, path: KeyPath, value: object, field_type: Any) -> bool:
+        before = len(self.problems)
+        if isinstance(value, dict):
+            self._check_inside(path, value, field_type)
+        if len(self.problems) > before:
+            return False
         if problem := value_problem(value, field_type):
             self.problem(path, problem)
             return False
@@ -88,6 +94,32 @@ class Keys:
         if text is not None:
             self.problem(path, f"expected text without control characters, got {got(text)}")
         return text is None
+
+    def _check_inside(self, path: KeyPath, values: Mapping[str, Any], field_type: Any) -> None:
+        """Add the problems of keys and values in a mapping, each at its own place, where `field_type` has mappings."""
+        for choice in _choices(field_type):
+            if isinstance(choice, type) and issubclass(choice, Settings):
+                self.part(choice, values, path)
+            elif get_origin(choice) is dict:
+                key_type, value_type = get_args(choice)
+                known = get_args(key_type) if get_origin(key_type) is Literal else None
+                if known is not None:
+                    self.unknown_keys(path, values, known)
+                for key, value in values.items():
+                    if (known is None or key in known) and len(self.problems) < PROBLEMS_MAX:
+                        self._value_fits((*path, key), value, value_type)
+
+
+def _choices(field_type: Any) -> Iterator[Any]:
+    """List the types of a union, or the one type, without annotations."""
+    origin = get_origin(field_type)
+    if origin is Annotated:
+        yield from _choices(get_args(field_type)[0])
+    elif origin is Union or origin is UnionType:
+        for one in get_args(field_type):
+            yield from _choices(one)
+    else:
+        yield field_type
 
 
 def _controlling(value: object) -> str | None:

@@ -23,12 +23,13 @@ def load(
 ) -> Config:
     """Read a configuration file. Raises ConfigError with every problem that was found, one per line.
 
-    `pause` is called after every piece of work of less than a millisecond; `missing` is the hint where no file is.
+    `pause` is called after every piece of work of less than a millisecond; `missing` is the hint where no such
+    file is.
     """
     try:
         content = read_regular(path, FILE_BYTES_MAX + 1)
     except OSError as error:
-        hint = missing if isinstance(error, FileNotFoundError) else "look at its owner and mode"
+        hint = "look at its owner and mode" if isinstance(error, PermissionError) else missing
         raise ConfigError(f"{path}: cannot be read: {error.strerror}; {hint}") from None
     return parse(content, str(path), tables, pause)
 

@@ -214,6 +214,30 @@ def test_error_with_its_place(text: str, line: str) -> None:
     assert errors(text) == ["f.yaml:" + line]
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("recorder: {flight: {enable: true}}", '1:21: recorder.flight.enable: expected a key that imud knows, got "enable"; did you mean enabled?'),
+        ("recorder:\n  flight:\n    minutes: 10min", '3:14: recorder.flight.minutes: expected a number from 0.1 to 1440, got "10min"'),
+        ("recorder: {flight: {line: {chip: x}}}", "1:21: recorder.flight.line: expected the key line (a whole number from 0 to 1023, or text that is not empty), got none"),
+        ("nmea0183: {sentences: {HTD: 1}}", '1:24: nmea0183.sentences.HTD: expected a key that imud knows, got "HTD"; did you mean HDT?'),
+        ("nmea0183:\n  sentences: {HDT: 1, ROT: 1000}", "2:28: nmea0183.sentences.ROT: expected a number from 0.01 to 100, got 1000"),
+        ("mqtt: {commands: {per_minute: 0}}", "1:31: mqtt.commands.per_minute: expected a whole number from 1 to 600, got 0"),
+        ("mqtt: {devices: {bow: {rate: 1}}}", '1:24: mqtt.devices.bow.rate: expected a key that imud knows, got "rate"; did you mean rate_hz?'),
+        ("mqtt: {devices: {bow: {rate_hz: fast}}}", '1:33: mqtt.devices.bow.rate_hz: expected a number from 0.01 to 100, or null, got "fast"'),
+    ],
+)  # fmt: skip
+def test_a_problem_inside_of_a_value_has_its_own_key_and_place(text: str, line: str) -> None:
+    (found,) = errors(text + "\ndevices: {}", TABLES)
+    assert found.startswith("f.yaml:" + line)
+
+
+def test_all_problems_inside_of_a_value_are_reported() -> None:
+    text = "mqtt: {devices: {a: {whole: xml, batch_s: 0}, b: {event: 1}}}\ndevices: {}"
+    keys = [line.split(": ")[1] for line in errors(text, TABLES)]
+    assert keys == ["mqtt.devices.a.whole", "mqtt.devices.a.batch_s", "mqtt.devices.b.event"]
+
+
 def test_all_errors_are_reported_in_the_order_of_the_file() -> None:
     text = (
         "log_levle: info\nout: {path: 1, ids: no}\ndevices:\n  a: {port: {prot: x, baud: 1}}\n  B: {file: {path: x}}\n"
@@ -526,6 +550,15 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
         config.load(tmp_path / "fifo", FAKE)
     with pytest.raises(ConfigError, match="is a character device"):
         config.load("/dev/zero", FAKE)
+
+
+def test_the_hint_of_a_file_that_cannot_be_read_fits_the_reason(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(ConfigError, match=r"cannot be read: Is a directory; is the path right\?"):
+        config.load(tmp_path, FAKE)
+    with pytest.raises(ConfigError, match=r"Too many levels of symbolic links; is the path right\?"):
+        config.load(tmp_path / "a", FAKE)
 
 
 @pytest.mark.timeout(10)
