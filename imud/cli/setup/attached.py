@@ -23,6 +23,8 @@ SHARED: Final = ("socketcan", "rs485", "i2c", "spi")
 """Links on which several devices may be, and which nobody has for himself."""
 MODEM_MANAGER: Final = ", which looks for modems on new ports for half a minute: run this again then"
 CONSOLE: Final = "a console of the kernel is on it"
+ABSENT: Final = "it is not there: is it plugged in, and is the name right?"
+OTHER: Final = "it is no serial port with hardware behind it"
 
 
 class Attached(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -133,6 +135,7 @@ def look(
             )
         else:
             listen.append(name)
+    found += _strangers(at, wanted, ports)
     active = {listened for listened in listen if _node(at, listened) in {_node(at, one) for one in wanted.active}}
     reports = finders.listen(listen, active) if listen else []
     heard = [_heard(at, report, ports) for report in reports]
@@ -141,6 +144,19 @@ def look(
     for kind, bus in wanted.buses:
         found += finders.ask_bus(kind, bus)
     return _known(at, sorted([*found, *heard], key=lambda one: one.node))
+
+
+def _strangers(at: Surroundings, wanted: Wanted, ports: Iterable[str]) -> list[Attached]:
+    """What is named as a port or an interface and is neither: not there, or something else."""
+    lines = {_node(at, path) for path, _ in wanted.rs485}
+    known = {*ports, *lines, *can_interfaces(at.at("/sys"), down=True)}
+    found = []
+    for place in dict.fromkeys((*wanted.places, *wanted.active)):
+        if _node(at, place) not in known:
+            there = place.startswith("/") and at.at(place).exists()
+            problem = OTHER if there else ABSENT
+            found.append(Attached(place, place, problem=problem))
+    return found
 
 
 def _node(at: Surroundings, place: str) -> str:

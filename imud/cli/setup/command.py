@@ -64,7 +64,7 @@ def numbered(text: str) -> tuple[str, int]:
     name, sign, number = text.partition("=")
     if not name or (sign and not (number.isdecimal() and int(number) > 0)):
         raise argparse.ArgumentTypeError(
-            f"expected a name, or a name and a rate in bit/s as {name}=500000, got {text!r}"
+            f"expected a name, or a name and a rate in bit/s as {name or 'can0'}=500000, got {text!r}"
         )
     return name, int(number or 0)
 

@@ -53,7 +53,11 @@ class Conversation:
             raise BadArgument("expected a terminal to ask on, or --yes")
         try:
             return input(f"{question} ").strip() or default
+        except KeyboardInterrupt:
+            self.show(["", "Nothing more was changed."])
+            raise
         except EOFError:
+            self.show([""])
             raise BadArgument("expected an answer, got the end of the input: nothing more was changed") from None
 
 

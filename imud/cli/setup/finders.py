@@ -13,6 +13,7 @@ from imud.cli.setup.attached import Attached, Finders
 from imud.contracts.driver import of_kind
 from imud.contracts.link import PolledLink
 from imud.contracts.polling import PolledDriver, run_transfer_script
+from imud.contracts.settings import wrong_values
 from imud.devices import DRIVERS
 from imud.devices.hipnuc.modbus.frames import FACTORY_ID
 from imud.devices.hipnuc.modbus.registers import FACTORY_BAUD
@@ -55,8 +56,10 @@ def ask_bus(kind: str, bus: str) -> list[Attached]:
     """Ask every driver of an I2C or SPI bus at every address or in every mode that it knows."""
     try:
         row = LINKS[kind]
-        settings = msgspec.convert({"bus": int(bus)} if kind == "i2c" else {"port": bus}, row.settings)
-        link = row.make_polled(settings)
+        given = {"bus": int(bus)} if kind == "i2c" else {"port": bus}
+        if wrong := wrong_values(row.settings, given):
+            return [Attached(bus, bus, problem="; ".join(map(str, wrong)))]
+        link = row.make_polled(msgspec.convert(given, row.settings))
         link.open()
     except (LinkError, ValueError) as error:
         return [Attached(bus, bus, problem=str(error))]

@@ -18,6 +18,7 @@ from imud.cli.setup.changes import (
     Change,
     ChangeRecord,
     ChangeRefused,
+    FileChange,
     begun,
     make,
     sync_folder,
@@ -70,20 +71,28 @@ class Journal:
     def take_back(self) -> list[str]:
         """Take all changes back, newest first; return why some of them were not. These stay in the journal.
 
+        The copy of a file stays as long as the file does: it has what the file was before.
         Raises OSError where a file cannot be written.
         """
         refused: list[str] = []
+        left: set[str] = set()
         for place in range(len(self.records) - 1, -1, -1):
+            change = self.records[place].change
+            path, original = (change.path, change.copy_of) if isinstance(change, FileChange) else ("", "")
+            if original in left:
+                refused.append(f"{path} stays, since it has the former content of {original}")
+                continue
             try:
                 notes = take_back(self._at, self.records[place])
             except ChangeRefused as reason:
                 refused.append(str(reason))
+                left.add(path)
                 continue
             for note in notes:
                 self._say(f"  {note}")
             del self.records[place]
             self._save()
-        return refused
+        return list(dict.fromkeys(refused))
 
     def _save(self) -> None:
         """Have it on the medium; an empty one is removed. Raises OSError."""

@@ -168,7 +168,8 @@ class SetupSteps:
         new = [one for one in self._found if one.driver and one.keys and not one.configured]
         taken = present_names(at)
         chosen: dict[str, Attached] = {}
-        for one, proposed in zip(new, proposed_names(new, taken), strict=True):
+        for one in new:
+            (proposed,) = proposed_names([one], [*taken, *chosen])
             for _ in range(ANSWERS_MAX):
                 question = f"Name of {one.driver} {one.device} on {one.node}? (`-` leaves it out) [{proposed}]"
                 name = self._talk.answer(" ".join(question.split()), proposed)
@@ -178,6 +179,8 @@ class SetupSteps:
                     chosen[name] = one
                     break
                 self._talk.say(f"{name}: expected a new name of a-z, 0-9, _ and -, at most 32 characters")
+            else:
+                self._talk.say(f"{one.node} is left out: {ANSWERS_MAX} answers were no new name")
         return chosen
 
     def _may_control(self, at: Surroundings) -> bool:

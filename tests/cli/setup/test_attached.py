@@ -98,3 +98,18 @@ def test_a_bus_that_is_asked_for(machine: LivingMachine, attachments: Attachment
     attachments.buses["i2c1"] = [Attached("/dev/i2c-1", "/dev/i2c-1", driver="imu61x-i2c", keys=keys)]
     (here,) = found(machine, attachments, Wanted(buses=(("i2c", "1"),)))
     assert here.configured == "keel"
+
+
+def test_what_is_named_and_not_there_is_said_to_be(gateway: LivingMachine, attachments: Attachments) -> None:
+    """Else a misspelled name looks like a machine without ports."""
+    gateway.write("/etc/passwd")
+    wanted = Wanted((USB0, "ttyUSB1", "can7", "/etc/passwd"), active=("/dev/ttyUSB9",))
+    problems = {one.place: one.problem for one in found(gateway, attachments, wanted)}
+    missing = "it is not there: is it plugged in, and is the name right?"
+    assert problems == {
+        USB0: "nothing is heard",
+        "ttyUSB1": missing,
+        "can7": missing,
+        "/dev/ttyUSB9": missing,
+        "/etc/passwd": "it is no serial port with hardware behind it",
+    }

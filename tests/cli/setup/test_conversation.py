@@ -39,7 +39,7 @@ def test_answers(answers: dict[str, str], word: str, default: bool, agreed: bool
     assert Conversation(ask=True).agreed("Sure?", default=default) is agreed
 
 
-def test_the_end_of_the_input_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_the_input_is_no_answer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def ended(_: str) -> str:
         raise EOFError
 
@@ -47,6 +47,20 @@ def test_the_end_of_the_input_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     with pytest.raises(BadArgument, match="end of the input"):
         Conversation(ask=True).agreed("Sure?", default=True)
+    assert capsys.readouterr().out == "\n"  # the error begins a line
+
+
+def test_an_interrupted_question_ends_it_with_a_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(_: str) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("builtins.input", interrupted)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        Conversation(ask=True).agreed("Sure?", default=True)
+    assert capsys.readouterr().out == "\nNothing more was changed.\n"
 
 
 def test_the_table_has_the_node_and_reasons_below() -> None:

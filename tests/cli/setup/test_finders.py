@@ -75,3 +75,8 @@ def test_a_bus_without_a_sensor_says_why(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_bus_that_is_not_there(kind: str, bus: str) -> None:
     (found,) = FINDERS.ask_bus(kind, bus)
     assert found.problem
+
+
+def test_a_number_that_no_bus_has() -> None:
+    (found,) = FINDERS.ask_bus("i2c", "256")
+    assert found.problem == "bus: expected a whole number from 0 to 255, got 256"

@@ -218,6 +218,25 @@ def test_questions_name_and_leave_out(
     assert (gateway.root / "etc/group").read_text().count(":ann\n") == 2
 
 
+def test_a_proposed_name_is_not_one_that_was_just_given(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments, answers: dict[str, str]
+) -> None:
+    gateway.usb_port("ttyUSB1", "usb-B", serial="B")
+    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    answers["on /dev/ttyUSB0?"] = "imu2"
+    gateway.status = [device("imu2"), device("imu")]
+    assert setup.steps(ask=True).set_up(PORT, ()) == 0
+    assert [one.name for one in config.load(gateway.root / "etc/imud.yaml").devices] == ["imu2", "imu"]
+
+
+def test_a_device_without_a_usable_name_is_left_out_and_that_is_said(
+    gateway: LivingMachine, setup: Setup, answers: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers["on /dev/ttyUSB0?"] = "My Sensor"
+    assert setup.steps(ask=True).set_up(PORT, ()) == 1
+    assert "/dev/ttyUSB0 is left out: 10 answers were no new name" in capsys.readouterr().out
+
+
 def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
     before = gateway.files()
     answers["Make these changes?"] = "n"
@@ -380,6 +399,37 @@ def test_a_file_changed_since_is_left_and_the_rest_taken_back(
     gateway.write("/etc/imud.yaml", mine.removesuffix("# mine\n"))  # the person takes it back
     assert setup.steps().undo() == 0
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_the_former_content_of_a_file_that_is_left_stays_to_be_put_back(
+    gone: bool, gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = gateway.files()
+    setup.steps().set_up(PORT, ())
+    file, copy = gateway.root / "etc/imud.yaml", gateway.root / "etc/imud.yaml.DATE"
+    file.write_text("devices: {}\n")
+    if gone:
+        file.unlink()
+    assert setup.steps().undo() == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "/etc/imud.yaml.DATE stays, since it has the former content of /etc/imud.yaml" in out
+    shutil.copy2(copy, file)  # the person settles it
+    assert setup.steps().undo() == 0
+    assert gateway.files() == before
+
+
+def test_what_two_runs_changed_and_a_person_since_is_named_once(
+    gateway: LivingMachine, setup: Setup, attachments: Attachments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    setup.steps().set_up(PORT, ())
+    gateway.usb_port("ttyUSB1", "usb-B", serial="B")
+    attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    setup.steps(date="LATER").set_up(PORT, (), wait_s=1)
+    gateway.write("/etc/imud.yaml", "devices: {}\n")
+    capsys.readouterr()
+    assert setup.steps().undo() == 1
+    assert " ".join(capsys.readouterr().out.split()).count("/etc/imud.yaml was changed since") == 1
 
 
 def test_a_link_in_place_of_the_configuration_is_followed(gateway: LivingMachine, setup: Setup) -> None:
