@@ -18,7 +18,7 @@ from imud.contracts.lines import DeviceLines
 from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ConfigError, ImudError, ServerError
-from imud.log import STDERR, log_to
+from imud.log import STDERR, is_journal, log_to
 from imud.runtime import event_loop
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         settings = config.load(args.config, missing="give the file with --config")
     except ConfigError as error:
-        complain(str(error))
+        refuse(error)
         return EXIT_CONFIGURATION
     with log_to(STDERR, settings.log_level):
         try:
@@ -58,6 +58,16 @@ def run(args: argparse.Namespace) -> int:
             log.critical("imud ends because of an internal error", exc_info=True)
             return EXIT_INTERNAL
     return 0
+
+
+def refuse(error: ConfigError) -> None:
+    """Say what is wrong with the configuration: with its priority to the journal, else as `imud check` does."""
+    if not is_journal(STDERR):
+        complain(str(error))
+        return
+    with log_to(STDERR, "info"):
+        for problem in str(error).splitlines():
+            log.critical("%s", problem)
 
 
 def check_arguments(parser: argparse.ArgumentParser) -> None:

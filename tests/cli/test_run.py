@@ -1,11 +1,15 @@
 """`imud check`; `imud run` is tested as a process in tests/test_daemon.py."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from imud.cli import main
 from tests.support.files import ROOT
+from tests.support.surroundings import pipe
 
 
 def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -31,6 +35,21 @@ def test_a_file_that_is_not_there(
     error = capsys.readouterr().err
     assert error.startswith(f"{tmp_path}/none: cannot be read: No such file or directory; ")
     assert hint in error
+
+
+def test_what_is_wrong_has_its_priority_in_the_journal(tmp_path: Path) -> None:
+    """Else `journalctl --priority=err` shows no reason why the service does not start."""
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("device: {}\nlog_level: loud\n")
+    with pipe() as (reader, writer):
+        status = os.fstat(writer)
+        journal = {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
+        command = [sys.executable, "-m", "imud", "run", "--config", str(bad)]
+        done = subprocess.run(command, stderr=writer, env=os.environ | journal, cwd=ROOT, timeout=60, check=False)
+        lines = os.read(reader, 1 << 16).decode().splitlines()
+    assert done.returncode == 78
+    assert len(lines) == 3
+    assert all(line.startswith(f"<2>{bad}:") for line in lines)
 
 
 @pytest.mark.parametrize(
