@@ -177,7 +177,7 @@ class Daemon:
         for name in (*change.devices_removed, *change.devices_changed):
             self._stop_device(name)
             await asyncio.sleep(0)
-        problems = []
+        problems = ["state_dir counts from the next start"] if "state_dir" in change.keys_changed else []
         for name in change.publishers_changed:
             problems.append(self._restart_publisher(name, old))
             await asyncio.sleep(0)

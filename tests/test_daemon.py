@@ -210,6 +210,17 @@ def test_an_output_that_is_changed_gets_the_samples_in_place_of_the_old_one(tmp_
         assert daemon.statuses()["bow"].connects == 1
 
 
+def test_a_new_state_directory_counts_from_the_next_start_and_that_is_said(tmp_path: Path) -> None:
+    devices = {"bow": device(tmp_path / "port")}
+    with running_daemon(tmp_path, devices) as daemon, daemon.client() as client:
+        events = client.events(timeout_s=10)
+        write_config(tmp_path, devices, state_dir=str(tmp_path / "other"))
+        daemon.signal(signal.SIGHUP)
+        assert next(events).message == (
+            "configuration read again: keys changed: state_dir; state_dir counts from the next start"
+        )
+
+
 def test_bad_new_file_leaves_the_old_running(tmp_path: Path) -> None:
     with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
         daemon.wait_for("bow", "searching")

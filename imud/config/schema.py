@@ -27,7 +27,7 @@ class General(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Lowest level of messages in the log."""
     state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
     """Folder of what imud remembers: at which rate each device was found, writes to flash, backups of settings.
-    imud makes it where it is missing. systemd's STATE_DIRECTORY wins over it."""
+    imud makes it where it is missing. A change counts from the next start. systemd's STATE_DIRECTORY wins over it."""
 
 
 class DeviceGeneral(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
