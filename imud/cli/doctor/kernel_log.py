@@ -54,7 +54,7 @@ PATTERNS: Final = (
     Pattern("overruns of serial ports", re.compile(r"tty\w*\d+: .*(overrun|input overrun)", re.IGNORECASE),
             "less load on this machine, a lower rate, an adapter with a larger buffer"),
     Pattern("lack of memory", re.compile(r"out of memory: killed process|oom-kill", re.IGNORECASE),
-            "less programs or more memory; `journalctl --dmesg | grep -i oom`"),
+            "fewer programs or more memory; `journalctl --dmesg | grep -i oom`"),
 )  # fmt: skip
 
 

@@ -38,6 +38,9 @@ def configuration(at: Surroundings) -> Findings:
         if problem.errno in (errno.EACCES, errno.EPERM):
             yield not_checked(f"{at.config_file} may not be read by this user", "run `sudo imud doctor`")
             return
+        if problem.errno == errno.ENOENT:
+            yield error(at.config_problem, "`sudo imud setup` writes one for what is attached")
+            return
     for line in at.config_problem.splitlines():
         yield error(line, f"correct it; `imud check {at.config_file}` opens no port")
 

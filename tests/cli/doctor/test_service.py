@@ -43,6 +43,8 @@ def test_no_configuration_is_an_error(machine: Machine) -> None:
     ((severity, text),) = machine.told(CONFIGURATION)
     assert severity == "error"
     assert "No such file" in text
+    assert "`sudo imud setup` writes one" in text
+    assert "correct it" not in text
 
 
 def test_a_service_that_runs(machine: Machine) -> None:
