@@ -45,7 +45,7 @@ def command_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
     parser.add_argument("device", metavar="DEVICE")
     parser.add_argument("name", nargs="?", metavar="ACTION", help="without it: list the actions of the device")
-    parser.add_argument("arguments", nargs="*", metavar="NAME=VALUE", help="as the list says")
+    parser.add_argument("arguments", nargs="*", default=[], metavar="NAME=VALUE", help="as the list says")
     parser.add_argument("--yes", action="store_true", help="do not ask before an action that cannot be taken back")
 
 

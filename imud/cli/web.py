@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 ADDRESS: Final = "127.0.0.1"
 PORT: Final = 9322
 """Beside that of the metrics."""
+PORT_MAX: Final = 65535
 STOP_S: Final = 3.0
 """How long the end waits for pages that are open."""
 
@@ -48,11 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal. Raises BadArgument without the library, and for what cannot be served safely."""
+    if not 0 <= args.port <= PORT_MAX:
+        raise BadArgument(f"--port: expected 0 to {PORT_MAX}, got {args.port}")
     guard = guard_of(args)
     try:
         from imud.web.app import WebServer
     except ModuleNotFoundError as error:
-        raise BadArgument(f"imud web needs {error.name}: pip install 'imud[web]'") from None
+        raise BadArgument(f"it needs {error.name}: pip install 'imud[web]'") from None
     asyncio.run(_serve(WebServer(args.socket, guard).make_app(), args))
     return 0
 

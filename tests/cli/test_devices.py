@@ -53,3 +53,9 @@ def test_values_are_json_or_text() -> None:
     for text in ("axes", "=9"):
         with pytest.raises(BadArgument):
             argument(text)
+
+
+def test_only_the_device_is_required(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["command"])
+    assert capsys.readouterr().err.endswith("the following arguments are required: DEVICE\n")

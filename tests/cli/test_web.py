@@ -81,6 +81,12 @@ def test_it_serves_until_a_signal_and_says_where_it_is_open(
     assert TOKEN not in line + errors
 
 
+@pytest.mark.parametrize("port", ["-1", "65536"])
+def test_a_port_that_no_machine_has_is_refused(port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["web", "--port", port]) == 2
+    assert capsys.readouterr().err == f"imud web: --port: expected 0 to 65535, got {port}\n"
+
+
 def test_a_port_that_is_taken_is_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import socket
 

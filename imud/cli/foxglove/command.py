@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         from imud.cli.foxglove.server import FoxgloveServer
     except ModuleNotFoundError as error:
-        raise BadArgument(f"imud foxglove: it needs {error.name}: pip install 'imud[foxglove]'") from None
+        raise BadArgument(f"it needs {error.name}: pip install 'imud[foxglove]'") from None
     server = FoxgloveServer(args.address, args.port, origins, note=lambda text: complain(f"imud foxglove: {text}"))
     with closing(server):
         if not is_loopback(args.address):
