@@ -3,6 +3,11 @@
 import grp
 import os
 import pwd
+import stat
+from typing import Final
+
+GROUP_ACCESS: Final = stat.S_IRGRP | stat.S_IWGRP
+"""Bits of a mode with which members of the node's group may open it for reading and writing."""
 
 
 def group_of(path: str, otherwise: str) -> str:

@@ -7,13 +7,15 @@ processes that have it open, read from the file system and /proc.
 import asyncio
 import errno
 import os
+import stat
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from imud.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble, reason_of
 from imud.links.inotify import wait_until
 from imud.log import printable
-from imud.permissions import group_of, user_name
+from imud.permissions import GROUP_ACCESS, group_of, user_name
 
 MISSING: Final = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN})
 """Errors of `open` without a device behind the path."""
@@ -29,7 +31,7 @@ STUCK: Final = frozenset({errno.ETIMEDOUT})
 ACCESS_WAIT_S: Final = 1.0
 """Time to wait for access before a refusal counts: udev sets a node's group some ms after it makes the node."""
 SERIAL_GROUP: Final = "dialout"
-"""Group of serial ports and buses on Debian and its relatives; named where only root may open the node."""
+"""Group of serial ports on Debian and its relatives; named where the node cannot be looked at."""
 PROC: Final = Path("/proc")
 OWN_PROCESS: Final = "this imud"
 COMMAND_BYTES: Final = 1024
@@ -82,15 +84,22 @@ def open_problem(error: Exception, path: str, missing: str, proc: Path = PROC) -
             f"not its group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
         )
     if number in REFUSED:
-        group = group_of(path, SERIAL_GROUP)
-        return LinkDenied(
-            f"{path} may not be opened by user {user_name()}: it belongs to group {group}; "
-            f"`sudo usermod -aG {group} {user_name()}` and a new login give access"
-        )
+        return LinkDenied(f"{path} may not be opened by user {user_name()}: {_refusal(path)}")
     if number in HELD:
         holders = holders_of(path, proc) or "another program or by a driver of the kernel"
         return LinkBusy(f"{path} is in use by {holders}: stop that first")
     return None
+
+
+def _refusal(path: str) -> str:
+    """Whose the node is, and what gives access: its group, or a udev rule where no group may open it."""
+    with suppress(OSError):
+        node = os.stat(path)
+        if node.st_gid == 0 or node.st_mode & GROUP_ACCESS != GROUP_ACCESS:
+            mode = f"{stat.S_IMODE(node.st_mode):04o}"
+            return f"it is for no group (mode {mode}, group {group_of(path, 'root')}); `imud doctor` has the udev rule"
+    group = group_of(path, SERIAL_GROUP)
+    return f"it belongs to group {group}; `sudo usermod -aG {group} {user_name()}` and a new login give access"
 
 
 def bus_open_problem(error: OSError, path: str, missing: str) -> LinkError:

@@ -2,6 +2,7 @@
 
 import asyncio
 import errno
+import grp
 import os
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ from imud.errors import LinkBusy, LinkDenied, LinkMissing
 from imud.links import LINKS
 from imud.links.device_node import SERIAL_GROUP, DeviceNode, holders_of, open_problem
 from imud.permissions import user_name
+from tests.support.surroundings import DAEMON_UID, needs_root
 
 
 def process(proc: Path, pid: int, name: str, *targets: str) -> None:
@@ -110,12 +112,35 @@ def test_a_process_without_a_name(tmp_path: Path) -> None:
     assert holders_of("/dev/ttyUSB0", tmp_path) == "a process (pid 10)"
 
 
-def test_the_group_of_serial_ports_where_only_root_may(tmp_path: Path) -> None:
-    root_only = ["/dev/null"] if os.stat("/dev/null").st_gid == 0 else []
-    for path in (str(tmp_path / "missing"), *root_only):
-        denied = open_problem(PermissionError(errno.EACCES, ""), path, "")
-        assert isinstance(denied, LinkDenied)
-        assert f"belongs to group {SERIAL_GROUP};" in str(denied)
+def test_the_group_of_serial_ports_where_the_node_cannot_be_looked_at(tmp_path: Path) -> None:
+    denied = open_problem(PermissionError(errno.EACCES, ""), str(tmp_path / "missing"), "")
+    assert isinstance(denied, LinkDenied)
+    assert f"belongs to group {SERIAL_GROUP};" in str(denied)
+
+
+@needs_root
+@pytest.mark.parametrize(("gid", "mode"), [(0, 0o600), (0, 0o660), (DAEMON_UID, 0o600), (DAEMON_UID, 0o640)])
+def test_a_node_that_no_group_may_open_needs_a_udev_rule(gid: int, mode: int, tmp_path: Path) -> None:
+    """As I2C and SPI nodes of plain Debian: to join a group gives no access."""
+    path = tmp_path / "i2c-1"
+    path.touch()
+    os.chown(path, 0, gid)
+    path.chmod(mode)
+    message = str(open_problem(PermissionError(errno.EACCES, ""), str(path), ""))
+    assert f"it is for no group (mode {mode:04o}, group " in message
+    assert message.endswith("`imud doctor` has the udev rule")
+
+
+@needs_root
+def test_a_node_of_a_group_names_it(tmp_path: Path) -> None:
+    path = tmp_path / "ttyUSB0"
+    path.touch()
+    os.chown(path, 0, DAEMON_UID)
+    path.chmod(0o660)
+    group = grp.getgrgid(DAEMON_UID).gr_name
+    assert f"it belongs to group {group}; `sudo usermod -aG {group} " in str(
+        open_problem(PermissionError(errno.EACCES, ""), str(path), "")
+    )
 
 
 def test_a_node_that_is_absent_or_held(tmp_path: Path) -> None:

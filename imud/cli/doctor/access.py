@@ -5,6 +5,7 @@ The device rules of the service's control group do with EPERM, for root too; onl
 (systemd.resource-control(5)). Both are judged from what is declared, and no node is opened.
 """
 
+import re
 import stat
 from collections.abc import Iterator
 from fnmatch import fnmatch
@@ -13,6 +14,7 @@ from typing import Final, NamedTuple
 from imud.cli.doctor.finding import DoctorFinding, Findings, error, not_checked, ok, warning
 from imud.cli.doctor.surroundings import Surroundings
 from imud.contracts.lines import DeviceLines, LineSettings
+from imud.permissions import GROUP_ACCESS
 
 CLASSES: Final = (
     ("ttyUSB", "ttyUSB", "dialout"), ("ttyACM", "ttyACM", "dialout"), ("ttyAMA", "ttyAMA", "dialout"),
@@ -47,21 +49,27 @@ def rights(at: Surroundings) -> Findings:
         elif _may_open(person, seen.st_mode, seen.st_uid, seen.st_gid):
             yield ok(f"{path} may be opened by user {person.name}")
         else:
-            yield _refused(at, path, person, seen.st_gid)
+            yield _refused(at, path, person, seen.st_gid, seen.st_mode)
 
 
-def _refused(at: Surroundings, path: str, person: Person, gid: int) -> DoctorFinding:
-    """Say how the user gets access: by the node's group, or where that is root, by a udev rule."""
+def _refused(at: Surroundings, path: str, person: Person, gid: int, mode: int) -> DoctorFinding:
+    """Say how the user gets access: by the node's group, or where that is root or may not either, by a udev rule."""
     group = _names_of(at, "group").get(gid, "")
     wanted = next((group for begin, _, group in CLASSES if _name(at, path).startswith(begin)), "dialout")
     seen = f"{path} may not be opened by user {person.name}: the node belongs to group {group or gid}, EACCES"
-    if gid == 0:
-        rule = f'SUBSYSTEM=="{SUBSYSTEMS[wanted]}", GROUP="{wanted}", MODE="0660"'
+    if gid == 0 or mode & GROUP_ACCESS != GROUP_ACCESS:
+        rule = f'SUBSYSTEM=="{SUBSYSTEMS[wanted]}", KERNEL=="{_kind(_name(at, path))}", GROUP="{wanted}", MODE="0660"'
         return error(seen, f"add the udev rule {rule} in /etc/udev/rules.d; then `sudo udevadm trigger`")
     if gid in person.listed_gids:
         return error(f"{seen} of a session that began before the user joined it", "log out and in again")
     again = "restart imud" if at.installed else "log in again"
     return error(seen, f"`sudo usermod --append --groups {group or gid} {person.name}`, then {again}")
+
+
+def _kind(name: str) -> str:
+    """Pattern of the nodes of the same kind, `ttyUSB*` for `ttyUSB0`; never `tty*`: /dev/tty is for all users."""
+    pattern = re.sub(r"[0-9].*", "*", name)
+    return name if pattern == "tty*" else pattern
 
 
 def unit_rules(at: Surroundings) -> Findings:
@@ -144,7 +152,7 @@ def _may_open(person: Person, mode: int, uid: int, gid: int) -> bool:
     if uid == person.uid:
         return mode & (stat.S_IRUSR | stat.S_IWUSR) == stat.S_IRUSR | stat.S_IWUSR
     if gid in person.gids:
-        return mode & (stat.S_IRGRP | stat.S_IWGRP) == stat.S_IRGRP | stat.S_IWGRP
+        return mode & GROUP_ACCESS == GROUP_ACCESS
     return mode & (stat.S_IROTH | stat.S_IWOTH) == stat.S_IROTH | stat.S_IWOTH
 
 

@@ -45,7 +45,24 @@ def test_a_node_of_group_root_needs_a_udev_rule(bow: Machine) -> None:
         pytest.skip("only root can make a file of root's group")
     os.chown(bow.root / "dev/ttyUSB0", 0, 0)
     ((_, text),) = bow.told(RIGHTS)
-    assert 'SUBSYSTEM=="tty", GROUP="dialout", MODE="0660"' in text
+    assert 'udev rule SUBSYSTEM=="tty", KERNEL=="ttyUSB*", GROUP="dialout", MODE="0660" in' in text
+
+
+@pytest.mark.parametrize(
+    ("node", "rule"),
+    [
+        ("ttyS0", 'SUBSYSTEM=="tty", KERNEL=="ttyS*", GROUP="dialout"'),
+        ("ttymxc2", 'SUBSYSTEM=="tty", KERNEL=="ttymxc*", GROUP="dialout"'),
+        ("tty7", 'SUBSYSTEM=="tty", KERNEL=="tty7", GROUP="dialout"'),
+        ("spidev0.0", 'SUBSYSTEM=="spidev", KERNEL=="spidev*", GROUP="spi"'),
+    ],
+)
+def test_the_rule_is_for_nodes_of_the_kind_only(node: str, rule: str, bow: Machine) -> None:
+    """Without it /dev/tty, of the same subsystem, would be closed to all users."""
+    bow.configure(f"bow: {{driver: hipnuc-uart, uart: {{port: /dev/{node}}}}}")
+    bow.port(node, mode=0o600)
+    ((_, text),) = bow.told(RIGHTS)
+    assert rule in text
 
 
 def test_a_user_who_joined_the_group_after_login(bow: Machine) -> None:
@@ -61,6 +78,7 @@ def test_the_mode_counts_too(bow: Machine) -> None:
     bow.gids = frozenset({PORT_GID})
     (bow.root / "dev/ttyUSB0").chmod(0o640)
     assert bow.find(RIGHTS)[0].severity == "error"
+    assert "usermod" not in bow.find(RIGHTS)[0].advice  # whoever joins the group may not open it either
     (bow.root / "dev/ttyUSB0").chmod(0o606)
     assert bow.find(RIGHTS)[0].severity == "error"  # the group's bits count for a member, not those of others
     bow.gids = frozenset({4003})
