@@ -15,12 +15,11 @@ from imud.cli.setup.attached import Wanted
 from imud.cli.setup.conversation import Conversation
 from imud.cli.setup.finders import FINDERS
 from imud.cli.setup.steps import SetupSteps
-from imud.cli.setup.ways import BITRATE_DEFAULT
+from imud.cli.setup.ways import BITRATE_DEFAULT, BITRATE_MAX
 from imud.errors import BadArgument
 
 COMMAND_LIMIT_S: Final = 330.0
 """Longer than the unit's own limit for a start, on a slow board."""
-BITRATE_MAX: Final = 1_000_000
 WAIT_S: Final = 30.0
 """Searching all rates of a port takes two seconds; a slow board gets more."""
 

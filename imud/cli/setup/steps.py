@@ -31,7 +31,7 @@ from imud.cli.setup.plan import (
     real_path,
 )
 from imud.cli.setup.samples import reasons, samples_table, wait_for_samples
-from imud.cli.setup.ways import BITRATE_DEFAULT, free_console, raise_can, state
+from imud.cli.setup.ways import BITRATE_DEFAULT, BITRATE_MAX, free_console, raise_can, state
 from imud.config import DEVICE_NAME
 from imud.contracts.status import DeviceStatus
 from imud.errors import ConfigError, ImudError
@@ -153,8 +153,9 @@ class SetupSteps:
     def _bitrate(self, name: str) -> int:
         for _ in range(ANSWERS_MAX):
             word = self._talk.answer(f"Bit rate of the bus at {name}, bit/s? [{BITRATE_DEFAULT}]", str(BITRATE_DEFAULT))
-            if word.isdecimal() and 0 < int(word) <= 1_000_000:
+            if word.isdecimal() and 0 < int(word) <= BITRATE_MAX:
                 return int(word)
+            self._talk.say(f"{word}: expected a whole number from 1 to {BITRATE_MAX}")
         raise ImudError(f"expected a bit rate for {name}")
 
     def _await_can(self, names: Sequence[str]) -> None:

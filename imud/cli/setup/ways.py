@@ -24,6 +24,7 @@ WAIT_ONLINE: Final = "systemd-networkd-wait-online.service"
 OTHERS: Final = (("NetworkManager.service", "NetworkManager"), ("networking.service", "ifupdown"))
 """What else may manage the network: unit, and its name."""
 BITRATE_DEFAULT: Final = 500_000
+BITRATE_MAX: Final = 1_000_000
 VIRTUAL: Final = "/sys/devices/virtual/net"
 
 

@@ -237,6 +237,16 @@ def test_a_device_without_a_usable_name_is_left_out_and_that_is_said(
     assert "/dev/ttyUSB0 is left out: 10 answers were no new name" in capsys.readouterr().out
 
 
+def test_a_bit_rate_that_is_none_is_explained(
+    gateway: LivingMachine, setup: Setup, answers: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    gateway.can("can0")
+    answers |= {"can0 is down": "y", "Bit rate": "500k"}
+    with pytest.raises(ImudError, match="expected a bit rate for can0"):
+        setup.steps(ask=True).set_up(PORT, ())
+    assert "500k: expected a whole number from 1 to 1000000" in capsys.readouterr().out
+
+
 def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
     before = gateway.files()
     answers["Make these changes?"] = "n"
