@@ -194,7 +194,8 @@ def _open(path: str) -> int:
         raise ServerError(f"{path} may not be opened by user {user_name()}; `ls -ld {path}` shows who may") from None
     except OSError as error:
         reason = "a symbolic link" if os.path.islink(path) else error.strerror
-        raise ServerError(f"{path}: expected a directory for shared memory ({reason}); is it mounted?") from error
+        hint = "make it, or set shm.directory"
+        raise ServerError(f"{path}: expected a directory for shared memory ({reason}); {hint}") from error
 
 
 def _checked(descriptor: int, path: str) -> os.stat_result:

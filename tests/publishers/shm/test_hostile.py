@@ -207,8 +207,8 @@ def test_directory_of_the_user_where_the_system_has_none(
     assert found.path == str(own / "imud" / "shm")
     assert stat.S_IMODE(Path(found.path).stat().st_mode) == 0o755
     assert caplog.messages == [
-        f"shm: {system}: expected a directory for shared memory (No such file or directory); is it mounted?;"
-        f" rings are in {found.path}"
+        f"shm: {system}: expected a directory for shared memory (No such file or directory); "
+        f"make it, or set shm.directory; rings are in {found.path}"
     ]
     found.close()
     with pytest.raises(ServerError, match="expected a directory"):
