@@ -69,9 +69,7 @@ def can_state(at: Surroundings) -> Findings:
         tx, rx = int(counters.get("tx", 0)), int(counters.get("rx", 0))
         seen = f"{name} is {state}, error counters tx {tx}, rx {rx}, {frames} frames received"
         if state == "BUS-OFF":
-            restart = (
-                "" if data.get("restart_ms") else f"`sudo ip link set {name} type can restart-ms 100` lets it recover; "
-            )
+            restart = "" if data.get("restart_ms") else f"{_restarting(name)} let it recover; "
             yield error(f"{seen}: it has left the bus", restart + BUS_ADVICE)
         elif (tx or rx) and not _runs(at, name) and _silent(at, name, frames):
             yield error(f"{seen}, none now", _without_traffic(tx, rx))
@@ -83,9 +81,12 @@ def can_state(at: Surroundings) -> Findings:
         if offs and state != "BUS-OFF":
             yield warning(f"{name} was bus-off {offs} times", BUS_ADVICE)
         if not data.get("restart_ms"):
-            yield note(
-                f"{name} does not return from bus-off by itself", f"`sudo ip link set {name} type can restart-ms 100`"
-            )
+            yield note(f"{name} does not return from bus-off by itself", _restarting(name))
+
+
+def _restarting(name: str) -> str:
+    """The commands after which a controller returns from bus-off. The kernel refuses the second one while it is up."""
+    return f"`sudo ip link set {name} down`, then `sudo ip link set {name} up type can restart-ms 100`"
 
 
 def _without_traffic(tx: int, rx: int) -> str:

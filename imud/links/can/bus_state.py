@@ -37,7 +37,10 @@ _WORDS: Final = {
 }
 _HELP: Final = {
     ControllerState.PASSIVE: "do all nodes have the same bit rate, is the bus terminated at both ends?",
-    ControllerState.BUS_OFF: "it left the bus; `ip link set {name} type can restart-ms 100` lets it recover by itself",
+    ControllerState.BUS_OFF: (
+        "it left the bus; `ip link set {name} down`, then `ip link set {name} up type can restart-ms 100` let it "
+        "recover by itself"
+    ),
 }
 
 

@@ -1,6 +1,7 @@
 """CAN interfaces by a made-up /sys and the JSON of ip(8), recorded from a controller of the lab's kernel."""
 
 import json
+import re
 from copy import deepcopy
 from typing import Any
 
@@ -111,7 +112,7 @@ def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     ("state", "severities", "words"),
     [
         ("error-active", ["ok", "note"], "can0 is ERROR-ACTIVE, error counters tx 0, rx 0, 2 frames received → "),
-        ("bus-off", ["error", "note"], "it has left the bus → `sudo ip link set can0 type can restart-ms 100` lets"),
+        ("bus-off", ["error", "note"], "it has left the bus → `sudo ip link set can0 down`, then `sudo ip"),
         ("error-passive", ["error", "warning", "note"], "2 frames received, none now → no other node acknowledges"),
     ],
 )
@@ -130,7 +131,19 @@ def test_bus_off_before_and_no_restart(mast: Machine) -> None:
     assert [severity for severity, _ in found] == ["ok", "warning", "note"]
     assert "bus-off 4 times" in found[1][1]
     interface(mast, data=controller("BUS-OFF", restart_ms=0))
-    assert "restart-ms 100` lets it recover" in mast.told(STATE)[0][1]
+    commands = "`sudo ip link set can0 down`, then `sudo ip link set can0 up type can restart-ms 100`"
+    assert f"{commands} let it recover" in mast.told(STATE)[0][1]
+    assert mast.told(STATE)[-1][1].endswith(commands)
+
+
+@pytest.mark.parametrize("file", ["docs/can.md", "docs/monitoring.md", "etc/prometheus/imud.rules.yml"])
+def test_documents_set_restart_ms_while_the_interface_is_down(file: str) -> None:
+    """Else the kernel refuses it with EBUSY (drivers/net/can/dev/netlink.c)."""
+    text = (ROOT / file).read_text()
+    commands = re.findall(r"^.*?type can .*?restart-ms", text, re.MULTILINE)
+    assert commands
+    for command in commands:
+        assert re.search(r"\bdown\b.* up type|pre-up ip|^ip link set can0 type can bitrate", command), command
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ def test_life_of_a_controller() -> None:
     assert bus.add_error_frame(0x4, frame(0x10)) == ""  # still
     assert "terminated" in bus.problem
     assert bus.add_error_frame(0x40, frame(0)).startswith("can0 is bus-off: ")
-    assert "restart-ms" in bus.problem
+    assert "`ip link set can0 down`, then `ip link set can0 up type can restart-ms 100`" in bus.problem
     assert bus.add_error_frame(0x100, frame(0)) == "can0 is error-active again"
     assert bus.problem == ""
     assert (bus.passive_count, bus.bus_off_count) == (1, 1)
