@@ -125,6 +125,17 @@ def test_packages_that_have_the_same_files_exclude_this_one_and_are_not_taken_fo
     assert all(f"`{name}`" in installed for name in (package["Package"], *OTHERS))
 
 
+def test_an_installation_by_hand_has_the_extras_and_the_units_of_the_package() -> None:
+    _, installing, removing = re.split(
+        r"^```sh$", (ROOT / "docs/install.md").read_text().partition("## By hand")[2], flags=re.M
+    )
+    (extras,) = re.findall(r"pip install '\.\[(.*)\]'", installing)
+    assert f'"imud[{extras}]==$imud"' in (DEBIAN / "build").read_text()
+    for unit in ("imud.service", "imud-web.service"):
+        assert f"systemd/{unit}" in installing
+        assert f"/etc/systemd/system/{unit}" in removing
+
+
 def test_a_late_purge_leaves_alone_what_another_package_has_at_the_same_places(tmp_path: Path) -> None:
     unit, state = tmp_path / "usr/lib/systemd/system/imud.service", tmp_path / "var/lib/imud/theirs"
     for path in (unit, state):
