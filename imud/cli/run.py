@@ -4,7 +4,7 @@ import argparse
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +15,7 @@ from imud.config import Config, DeviceConfig
 from imud.config.yaml_tree import FILE_BYTES_MAX
 from imud.contracts.device_settings import declared_values
 from imud.contracts.lines import DeviceLines
+from imud.contracts.settings import unknown_name
 from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ConfigError, ImudError, ServerError
@@ -29,6 +30,8 @@ EXIT_OUTPUT: Final = 75
 """An output that is required cannot start, for example the socket that another imud has (EX_TEMPFAIL, sysexits.h)."""
 EXIT_CONFIGURATION: Final = 78
 """The configuration cannot be used; starting again changes nothing (EX_CONFIG)."""
+EVERY_DEVICE: Final = "*"
+"""Name that stands for all devices, in `mqtt.devices`."""
 DEFAULT_FILE = Path("/etc/imud.yaml")
 
 
@@ -83,7 +86,20 @@ def check(args: argparse.Namespace) -> int:
     for device in settings.devices:
         for note in (*limits_of(device), *absent_capture(device)):
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
+    for note in strangers(settings):
+        print(f"{args.file}: note: {note}")
     return 0
+
+
+def strangers(settings: Config) -> Iterator[str]:
+    """Name the devices that outputs are configured for and that the configuration does not have."""
+    known = [*(device.name for device in settings.devices), *settings.disabled]
+    for output, part in settings.publishers.items():
+        for key in ("device", "devices"):
+            given = getattr(part, key, None)
+            for name in [given] if isinstance(given, str) else given or ():
+                if name not in (*known, EVERY_DEVICE):
+                    yield f"{output}.{key}: {unknown_name('a device', name, known)}"
 
 
 def limits_of(device: DeviceConfig) -> Sequence[str]:

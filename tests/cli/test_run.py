@@ -97,6 +97,23 @@ def test_check_notes_a_recording_that_is_not_there(tmp_path: Path, capsys: pytes
     assert capsys.readouterr().out.splitlines()[1:] == [f"{file}:3: note: b: {there}2 is not there: imud waits for it"]
 
 
+def test_check_notes_a_device_of_an_output_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A misspelled name is no mistake, since the device may come later; nothing is recorded or sent until then."""
+    file = tmp_path / "imud.yaml"
+    file.write_text(
+        "devices: {bow: {uart: {port: /dev/a}}, mast: {enabled: false, uart: {port: /dev/b}}}\n"
+        "recorder: {devices: [bow, mast, bwo]}\nnmea0183: {device: masd}\n"
+        "mqtt: {devices: {'*': {rate_hz: 1}, bow: {rate_hz: 1}, keel: {rate_hz: 1}}}\n"
+    )
+    assert main(["check", str(file)]) == 0
+    notes = [line.removeprefix(f"{file}: note: ") for line in capsys.readouterr().out.splitlines()[1:]]
+    assert notes == [
+        'recorder.devices: expected a device that imud knows, got "bwo"; did you mean bow? known: bow, mast',
+        'nmea0183.device: expected a device that imud knows, got "masd"; did you mean mast? known: bow, mast',
+        'mqtt.devices: expected a device that imud knows, got "keel"; known: bow, mast',
+    ]
+
+
 def test_check_says_what_a_device_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "imud.yaml"
     file.write_text(
