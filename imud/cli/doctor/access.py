@@ -67,9 +67,9 @@ def _refused(at: Surroundings, path: str, person: Person, gid: int, mode: int) -
 
 
 def _kind(name: str) -> str:
-    """Pattern of the nodes of the same kind, `ttyUSB*` for `ttyUSB0`; never `tty*`: /dev/tty is for all users."""
+    """Pattern of the nodes of the same kind, `ttyUSB*` for `ttyUSB0`; never one that has /dev/tty, of all users."""
     pattern = re.sub(r"[0-9].*", "*", name)
-    return name if pattern == "tty*" else pattern
+    return name if fnmatch("tty", pattern) else pattern
 
 
 def unit_rules(at: Surroundings) -> Findings:

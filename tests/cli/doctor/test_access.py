@@ -54,6 +54,7 @@ def test_a_node_of_group_root_needs_a_udev_rule(bow: Machine) -> None:
         ("ttyS0", 'SUBSYSTEM=="tty", KERNEL=="ttyS*", GROUP="dialout"'),
         ("ttymxc2", 'SUBSYSTEM=="tty", KERNEL=="ttymxc*", GROUP="dialout"'),
         ("tty7", 'SUBSYSTEM=="tty", KERNEL=="tty7", GROUP="dialout"'),
+        ("pts/5", 'SUBSYSTEM=="tty", KERNEL=="5", GROUP="dialout"'),
         ("spidev0.0", 'SUBSYSTEM=="spidev", KERNEL=="spidev*", GROUP="spi"'),
     ],
 )
