@@ -25,13 +25,26 @@ EXIT_STATUS: Final = (
     ("1", "The command ran, and the answer is no."),
     ("2", "The command could not run; the reason is on standard error."),
 )
-RUN_STATUS: Final = (
-    ("0", "Stopped by SIGTERM or SIGINT."),
-    ("1", "An internal error; the log has a traceback."),
-    ("2", "Wrong command line."),
-    ("75", "An output that is required cannot start."),
-    ("78", "The configuration cannot be used; the log has file, line and column."),
-)
+OWN_STATUS: Final = {
+    "run": (
+        ("0", "Stopped by SIGTERM or SIGINT."),
+        ("1", "An internal error; the log has a traceback."),
+        ("2", "Wrong command line."),
+        ("75", "An output that is required cannot start."),
+        ("78", "The configuration cannot be used; the log has file, line and column."),
+    ),
+    "doctor": (
+        ("0", "Nothing wrong was found in what could be checked."),
+        ("1", "A warning: what works does not work as well as it could."),
+        ("2", "An error: a device or an output does not work. Also: wrong command line."),
+    ),
+    "setup": (
+        ("0", "Samples come from all configured devices; or the plan was shown, or nothing is left to take back."),
+        ("1", "No sensor was found, a device sends no samples, or something was not changed or not taken back."),
+        ("2", "It could not run, or a change failed; the reason is on standard error."),
+    ),
+}
+"""Of the commands whose exit status says more than that of the others."""
 ENVIRONMENT: Final = (
     ("IMUD_SOCKET", f"The daemon's socket, instead of {DEFAULT_PATH}."),
     ("IMUD_SHM", "The folder of the rings of shared memory."),
@@ -201,7 +214,7 @@ def command_page(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
     yield from (".SH OPTIONS", *options(parser))
     for word, one in below.items():
         yield from (f".SS {escaped(one.prog)}", escaped(sentence(helps_of(parser)[word])), *options(one))
-    yield from (".SH EXIT STATUS", *listed(RUN_STATUS if name == "run" else EXIT_STATUS))
+    yield from (".SH EXIT STATUS", *listed(OWN_STATUS.get(name, EXIT_STATUS)))
     yield from see_also([("imud", 1), ("imud.yaml", 5)])
 
 

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from imud.cli import COMMANDS, build_parser
+from imud.cli.doctor.report import STATUS
 from tests.packaging.completions import every_parser
 from tests.packaging.manual_pages import escaped, help_of, marked, pages, sentence
 from tests.support import references
@@ -61,6 +62,15 @@ def test_a_page_names_command_section_and_summary() -> None:
     assert PAGES["imud-watch.1"].startswith('.TH "IMUD\\-WATCH" "1" ')
     assert ".SH NAME\nimud\\-watch \\- print samples as they come\n" in PAGES["imud-watch.1"]
     assert "RS\\-485" in PAGES["imud-modbus.1"]
+
+
+def test_the_exit_statuses_of_doctor_and_setup_are_their_own() -> None:
+    """Status 2 of `imud doctor` is an error that was found, not that it could not run."""
+    doctor, setup = (PAGES[f"imud-{name}.1"].partition(".SH EXIT STATUS")[2] for name in ("doctor", "setup"))
+    for severity, status in STATUS.items():
+        assert f"\\fB{status}\\fR\nA{'n' * (severity[0] in 'aeiou')} {severity}: " in doctor
+    assert "The command ran" not in doctor + setup
+    assert "not taken back" in setup
 
 
 def test_the_exit_statuses_of_the_daemon_are_those_of_its_document() -> None:
