@@ -95,7 +95,7 @@ def _configuration(at: Surroundings, wishes: Wishes, made: SetupPlan) -> None:
     names = ", ".join(wishes.devices)
     if before is not None:
         made.changes.append(FileChange(f"a copy of {path} as it is", f"{path}.{wishes.date}", before, copy_of=path))
-    then = (RELOAD,) if at.at(SYSTEMD).exists() and at.installed else ()
+    then = (RELOAD,) if at.at(SYSTEMD).exists() and at.installed and service_reads(at) else ()
     made.changes.append(FileChange(f"device{'s' if len(wishes.devices) > 1 else ''} {names}", path, after, then))
 
 
@@ -145,6 +145,12 @@ def _service(at: Surroundings, made: SetupPlan) -> None:
     if not at.installed:
         made.notes.append(f"systemd does not know {UNIT}, so nothing is started: docs/install.md has the steps")
         return
+    if not service_reads(at):
+        made.notes.append(
+            f"{UNIT} reads another configuration than {at.config_file}, so it is left as it is: "
+            f"`imud run --config {at.config_file}` runs the daemon with this one"
+        )
+        return
     if (enabled := state(at, UNIT, "is-enabled")) != "enabled":
         if enabled == "masked":
             raise ImudError(f"{UNIT} is masked: `sudo systemctl unmask {UNIT}` first")
@@ -160,6 +166,12 @@ def _service(at: Surroundings, made: SetupPlan) -> None:
         words = ("systemctl", "restart", UNIT)
         back = (("systemctl", "stop", UNIT),)
         made.changes.append(CommandChange("imud starts now", words, back, ("systemctl", "is-active", UNIT)))
+
+
+def service_reads(at: Surroundings) -> bool:
+    """Whether the service runs with the configuration that is set up; True where its command line does not say."""
+    started = at.unit_value("ExecStart")
+    return "--config" not in started or str(at.config_file) in started
 
 
 def present_names(at: Surroundings) -> list[str]:

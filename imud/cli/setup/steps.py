@@ -29,6 +29,7 @@ from imud.cli.setup.plan import (
     present_names,
     proposed_names,
     real_path,
+    service_reads,
 )
 from imud.cli.setup.samples import reasons, samples_table, wait_for_samples
 from imud.cli.setup.ways import BITRATE_DEFAULT, BITRATE_MAX, free_console, raise_can, state
@@ -235,7 +236,7 @@ class SetupSteps:
         if not self._announced:
             self._talk.say("Nothing to change.")
         names = [device.name for device in at.config.devices] if at.config else []
-        if not at.at(SYSTEMD).exists() or state(at, UNIT, "is-active") != "active":
+        if not at.at(SYSTEMD).exists() or not service_reads(at) or state(at, UNIT, "is-active") != "active":
             return DONE
         self._talk.say("Waiting for samples …")
         self._status = wait_for_samples(

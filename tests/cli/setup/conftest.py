@@ -26,6 +26,8 @@ class LivingMachine(Machine):
         self.uid = 0
         self.units: dict[str, list[str]] = {"imud.service": ["disabled", "inactive"]}
         """Of each unit whether it is enabled, and whether it is active."""
+        self.started = "/usr/bin/imud run --config /etc/imud.yaml"
+        """Command line of the service."""
         self.ran: list[str] = []
         self.failing: dict[str, str] = {}
         """What a command complains of, by its first words."""
@@ -62,7 +64,9 @@ class LivingMachine(Machine):
         enabled, active = state = self.units.get(unit, ["", "inactive"])
         if verb == "show":
             load = "loaded" if known else "not-found"
-            return CommandOutput(0, f"LoadState={load}\nUnitFileState={enabled}\nActiveState={active}\n", "")
+            lines = (f"LoadState={load}", f"UnitFileState={enabled}", f"ActiveState={active}",
+                     f"ExecStart={{ path=/usr/bin/imud ; argv[]={self.started} ; ignore_errors=no }}")  # fmt: skip
+            return CommandOutput(0, "\n".join(lines), "")
         if verb == "is-enabled":
             return CommandOutput(0 if enabled == "enabled" else 1, enabled + "\n", "")
         if verb == "is-active":

@@ -195,6 +195,21 @@ def test_a_configuration_with_a_mistake_is_not_touched(gateway: LivingMachine, s
     assert gateway.ran == []
 
 
+@pytest.mark.parametrize("activity", ["inactive", "active"])
+def test_a_service_with_another_configuration_is_left_as_it_is(
+    activity: str, gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It would not have the devices that are set up, and may have others."""
+    gateway.started = "/usr/bin/imud run --config /home/ann/bow.yaml"
+    gateway.units["imud.service"] = ["disabled", activity]
+    gateway.status = []
+    assert setup.steps().set_up(PORT, ()) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "imud.service reads another configuration than /etc/imud.yaml, so it is left as it is" in out
+    assert gateway.units["imud.service"] == ["disabled", activity]
+    assert not any("systemctl" in line for line in gateway.ran)
+
+
 def test_a_service_that_is_not_known_is_told(
     gateway: LivingMachine, setup: Setup, capsys: pytest.CaptureFixture[str]
 ) -> None:
