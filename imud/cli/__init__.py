@@ -100,7 +100,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         complain(f"imud {name}: {error}")
     except OSError as error:
         discard_output()
-        complain(f"imud {name}: {error.filename or 'standard output'}: {reason_of(error)}")
+        place = f"{error.filename or 'standard output'}: " if error.errno is not None else ""
+        complain(f"imud {name}: {place}{reason_of(error)}")
     except KeyboardInterrupt:
         return 130
     return 2

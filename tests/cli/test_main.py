@@ -53,6 +53,19 @@ def test_no_daemon_is_one_line(command: str, tmp_path: Path, capsys: pytest.Capt
     assert "is imud running?" in error
 
 
+def test_a_daemon_that_hangs_is_named_and_not_standard_output(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("imud.cli.arguments.Client", hang)
+    assert main(["status", "--socket", "/run/x.sock"]) == 2
+    assert capsys.readouterr().err == "imud status: /run/x.sock: waited in vain for hello\n"
+
+
+def hang(path: str, **_more: object) -> None:
+    """What a client does whose daemon is stopped, without the seconds of waiting."""
+    raise TimeoutError(f"{path}: waited in vain for hello")
+
+
 def test_reader_of_the_output_that_goes_away_is_no_error(tmp_path: Path) -> None:
     capture = tmp_path / "noise"
     capture.write_bytes(b"A\r\n" * 100_000)
