@@ -55,13 +55,13 @@ class SentenceOutput(Protocol):
 class TcpClient:
     """One client that reads."""
 
-    def __init__(self, sock: socket.socket, peer: str, now_ns: int) -> None:
+    def __init__(self, sock: socket.socket, peer: str) -> None:
         self.sock = sock
         self.peer = peer
         self._rest = b""
         """Of sentences that were taken in part."""
-        self.taken_ns = now_ns
-        """When it took something last."""
+        self.full_ns: int | None = None
+        """Since when it has no room for what is sent; None while it has, and while nothing is sent."""
 
     def put(self, sentences: bytes, now_ns: int) -> bool:
         """Send, or drop; return whether they were sent. Raises OSError when the connection has ended."""
@@ -69,12 +69,14 @@ class TcpClient:
             if self._rest:
                 count = self.sock.send(self._rest)
                 self._rest = self._rest[count:]
-                self.taken_ns = now_ns
+                self.full_ns = None
             if self._rest:
                 return False
             self._rest = sentences[self.sock.send(sentences) :]
-            self.taken_ns = now_ns
+            self.full_ns = None
         except BlockingIOError:
+            if self.full_ns is None:
+                self.full_ns = now_ns
             return False
         return True
 
@@ -125,7 +127,7 @@ class TcpOutput:
     def tick(self, now_ns: int) -> None:
         """Disconnect clients that take nothing."""
         for number, client in list(self._clients.items()):
-            if now_ns - client.taken_ns > STUCK_NS:
+            if client.full_ns is not None and now_ns - client.full_ns > STUCK_NS:
                 log.info(
                     "nmea0183: %s is disconnected: it has read nothing for %d s", client.peer, STUCK_NS // NS_PER_S
                 )
@@ -166,7 +168,7 @@ class TcpOutput:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         number = sock.fileno()
-        self._clients[number] = TcpClient(sock, peer, self._now_ns())
+        self._clients[number] = TcpClient(sock, peer)
         asyncio.get_running_loop().add_reader(sock, self._read, number)
 
     def _listen_again(self) -> None:

@@ -101,6 +101,22 @@ async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconne
 
 
 @in_loop
+async def test_a_client_stays_while_there_is_nothing_to_send() -> None:
+    clock = VirtualClock()
+    made = server(clock)
+    client = await connected(made)
+    made.put(ONE)
+    assert client.recv(100) == ONE
+    clock.advance(100 * STUCK_NS)  # a device that is away, or a sentence of 0.01 Hz
+    made.tick(clock.now_ns())
+    assert made.status().readers == 1
+    made.put(ONE)
+    assert client.recv(100) == ONE
+    client.close()
+    made.close()
+
+
+@in_loop
 async def test_one_client_too_many_is_refused() -> None:
     made = server(VirtualClock())
     clients = [await connected(made) for _ in range(CLIENTS_MAX)]
