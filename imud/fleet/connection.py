@@ -14,7 +14,9 @@ from typing import Any, Final, NamedTuple
 
 from imud.publishers.mqtt.access import (
     CONNECT_S,
+    LOST,
     REFUSED,
+    UNANSWERED,
     BrokerAccess,
     BrokerError,
     connection_problem,
@@ -115,7 +117,7 @@ class ReaderConnection:
         )
         self._socket = client.socket()
         if self._socket is None:
-            raise BrokerError(f"{self._broker.name}: the connection was lost")
+            raise BrokerError(f"{self._broker.name}: {LOST}")
         client.on_socket_close = self._on_socket_close
         self._number = self._socket.fileno()
         asyncio.get_running_loop().add_reader(self._number, self._read)
@@ -242,7 +244,7 @@ class ReaderConnection:
         except (OSError, ValueError) as error:
             self._problem = self._problem or connection_problem(error)
         if self._client is not None and self._client.socket() is None:
-            self._problem = self._problem or "the connection was lost"
+            self._problem = self._problem or (LOST if self._answered else UNANSWERED)
         if self._problem:
             self._forget_socket()
             self._came.set()

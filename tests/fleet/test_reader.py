@@ -275,7 +275,7 @@ def test_a_refusal_is_said_and_tried_again(tmp_path: Path) -> None:
         assert "refuses the connection: Not authorized" in fleet.problem
 
 
-@pytest.mark.parametrize("url", ["http://host", "mqtt://user:secret@host", "mqtt://", "host:1883"])
+@pytest.mark.parametrize("url", ["http://host", "mqtt://user:secret@host", "mqtt://", "host:1883", "mqtt://host:0"])
 def test_what_is_no_broker_is_refused(url: str) -> None:
     with pytest.raises(BadArgument, match="expected a URL"):
         Fleet("mqtt://host", url)

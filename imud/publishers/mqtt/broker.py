@@ -14,7 +14,16 @@ from contextlib import suppress
 from typing import Any, Final, NamedTuple, Protocol
 
 from imud.errors import ServerError
-from imud.publishers.mqtt.access import CONNECT_S, REFUSED, BrokerError, connection_problem, paho_client, properties_of
+from imud.publishers.mqtt.access import (
+    CONNECT_S,
+    LOST,
+    REFUSED,
+    UNANSWERED,
+    BrokerError,
+    connection_problem,
+    paho_client,
+    properties_of,
+)
 from imud.publishers.mqtt.settings import Broker, MqttSettings
 
 log = logging.getLogger(__name__)
@@ -25,6 +34,10 @@ LOOK_S: Final = 0.1
 """While the broker's answer is waited for, the end of the output is looked at so often: less than it waits itself."""
 PACKET_BYTES: Final = 16_384
 """The broker may send so much at once: four times the longest request."""
+PACKET_BYTES_MOST: Final = 268_435_460
+"""The longest packet that MQTT has (MQTT 5.0, section 2.1.4), where the broker does not say less."""
+OVERHEAD_BYTES: Final = 200
+"""Of a message besides topic and payload: type, lengths, number, content type, and correlation data of 128 bytes."""
 EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
 
 
@@ -121,6 +134,7 @@ class PahoConnection:
         self._answered = self._closed = self._woke = False
         self._problem = ""
         self._topics: dict[int, str] = {}
+        self._packet_bytes = PACKET_BYTES_MOST
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._bell_lock = threading.Lock()
         """Held while the bell is rung: it is closed by another thread, and its number may then be another file's."""
@@ -192,12 +206,17 @@ class PahoConnection:
         if self._is_v5:
             given = {"ContentType": content_type or None, "CorrelationData": correlation}
             properties = properties_of("PUBLISH", **{name: one for name, one in given.items() if one is not None})
+        if len(topic) + len(payload) + OVERHEAD_BYTES > self._packet_bytes:
+            self._fail(
+                f"expected messages of at most {self._packet_bytes} bytes, which is what the broker takes, got one of "
+                f"{topic} with {len(payload)}: raise the broker's limit"
+            )
         try:
             info = self._client.publish(topic, payload, qos=1, retain=retain, properties=properties)
         except (OSError, ValueError) as error:
             raise BrokerError(f"{self._broker.name}: {connection_problem(error)}") from error
         if info.rc:
-            self._fail("the connection was lost")
+            self._fail(LOST)
         self._topics[info.mid] = topic
         return int(info.mid)
 
@@ -234,7 +253,7 @@ class PahoConnection:
         """Wait for the socket once and do what paho-mqtt has to do."""
         client, sock = self._client, self._client.socket()
         if sock is None:
-            self._problem = self._problem or "the connection was lost"
+            self._problem = self._problem or (LOST if self._answered else UNANSWERED)
             return
         poll = select.poll()
         poll.register(sock.fileno(), select.POLLIN | (select.POLLOUT if client.want_write() else 0))
@@ -254,7 +273,7 @@ class PahoConnection:
         except (OSError, ValueError) as error:
             self._problem = self._problem or connection_problem(error)
         if client.socket() is None:
-            self._problem = self._problem or "the connection was lost"
+            self._problem = self._problem or (LOST if self._answered else UNANSWERED)
 
     def _fail(self, problem: str) -> None:
         self._problem = self._problem or problem
@@ -268,6 +287,7 @@ class PahoConnection:
             return
         allowed = getattr(properties, "ReceiveMaximum", IN_FLIGHT_MAX)
         self.in_flight_max = max(1, min(IN_FLIGHT_MAX, allowed))
+        self._packet_bytes = getattr(properties, "MaximumPacketSize", PACKET_BYTES_MOST)
         self._answered = True
 
     def _on_publish(self, _client: Any, _data: Any, mid: int, reason: Any, _properties: Any) -> None:

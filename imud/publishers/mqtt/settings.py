@@ -117,7 +117,7 @@ def broker_of(url: str) -> Broker | None:
     websockets = parts.scheme in ("ws", "wss")
     if parts.scheme not in PORTS or not is_host(host) or parts.query or parts.fragment or "@" in parts.netloc:
         return None
-    if parts.path not in ("", "/") and not websockets:
+    if (parts.path not in ("", "/") and not websockets) or port == 0:
         return None
     path = parts.path if websockets and parts.path not in ("", "/") else "/mqtt"
     return Broker(host, port or PORTS[parts.scheme], parts.scheme in ("mqtts", "wss"), websockets, path)

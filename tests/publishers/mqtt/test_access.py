@@ -1,14 +1,28 @@
 """How a client of a broker is made, and how its errors are described."""
 
 import ssl
+import subprocess
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from imud.publishers.mqtt.access import connection_problem, paho_client, properties_of
 from imud.publishers.mqtt.settings import Broker, MqttSettings
+from tests.publishers.mqtt.authority import Authority
 
 BROKER = Broker("127.0.0.1", 1883, tls=False, websockets=False, path="/mqtt")
+TLS_BROKER = BROKER._replace(tls=True)
+
+
+def of_tls(authority: Authority) -> MqttSettings:
+    """Files that are all good."""
+    return MqttSettings(
+        user="reader",
+        ca_file=authority["ca.pem"],
+        cert_file=authority["gateway.pem"],
+        key_file=authority["gateway.key"],
+    )
 
 
 def test_user_and_the_first_line_of_the_password_file_are_taken(tmp_path: Path) -> None:
@@ -19,11 +33,40 @@ def test_user_and_the_first_line_of_the_password_file_are_taken(tmp_path: Path) 
     assert (client.username, client.password) == ("reader", "first line")
 
 
-def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
-    path = str(tmp_path / "absent")
-    with pytest.raises(OSError, match="absent") as caught:
-        paho_client(BROKER, MqttSettings(user="reader", password_file=path), "one", is_v5=True)
-    assert connection_problem(caught.value).startswith(f"{path}: ")
+@pytest.mark.parametrize("name", ["password_file", "ca_file", "cert_file", "key_file"])
+def test_a_file_that_cannot_be_read_is_named_with_its_key(tmp_path: Path, authority: Authority, name: str) -> None:
+    path = tmp_path / "absent"
+    settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
+    with pytest.raises(ValueError, match=f"^{name} {path}: No such file or directory$"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True)
+    path.mkdir()
+    with pytest.raises(ValueError, match=f"^{name} {path}: Is a directory$"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True)
+
+
+def test_a_password_that_is_no_text_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "password"
+    path.write_bytes(b"\xff\n")
+    with pytest.raises(ValueError, match=f"^password_file {path}: expected text in UTF-8"):
+        paho_client(BROKER, MqttSettings(user="reader", password_file=str(path)), "one", is_v5=True)
+
+
+@pytest.mark.parametrize("name", ["ca_file", "cert_file", "key_file"])
+def test_a_file_that_is_no_certificate_and_no_key_is_named(tmp_path: Path, authority: Authority, name: str) -> None:
+    path = tmp_path / "garbage"
+    path.write_text("no certificate\n")
+    settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
+    with pytest.raises(ValueError, match=rf"{name} {path}.*: expected .* \(PEM\)"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True)
+
+
+def test_a_key_with_a_passphrase_is_refused_and_not_asked_for(tmp_path: Path, authority: Authority) -> None:
+    locked = tmp_path / "locked.key"
+    words = ["openssl", "rsa", "-aes256", "-passout", "pass:x", "-in", authority["gateway.key"], "-out", str(locked)]
+    subprocess.run(words, check=True, capture_output=True)
+    settings = msgspec.structs.replace(of_tls(authority), key_file=str(locked))
+    with pytest.raises(ValueError, match=r"^key_file: expected a key without a passphrase"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True)
 
 
 def test_an_error_of_tls_says_what_is_wrong_with_a_certificate() -> None:

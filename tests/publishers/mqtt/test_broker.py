@@ -102,6 +102,24 @@ def test_the_bell_is_not_closed_while_another_thread_rings_it(tmp_path: Path, mo
         connection.ring()  # nothing: the number of the descriptor may be another file's
 
 
+def test_a_message_that_is_larger_than_the_broker_takes_is_named_and_not_sent(tmp_path: Path) -> None:
+    with running_broker(tmp_path / "broker", "allow_anonymous true", "max_packet_size 2000") as broker:
+        connection = connect(f"mqtt://127.0.0.1:{broker.port}")
+        send(connection, bytes(1700))
+        with pytest.raises(BrokerError, match=r"at most 2000 bytes, .* imud/s/g/state with 2000: raise"):
+            send(connection, bytes(2000))
+        connection.close()
+
+
+def test_a_broker_that_expects_tls_ends_the_connection_without_an_answer(tmp_path: Path, authority: Authority) -> None:
+    port = free_port()
+    with (
+        running_broker(tmp_path / "broker", *authority.listener(port)),
+        pytest.raises(BrokerError, match="without an answer: look at its log, and whether its port expects TLS"),
+    ):
+        connect(f"mqtt://127.0.0.1:{port}")
+
+
 def test_user_and_password(tmp_path: Path) -> None:
     program = shutil.which("mosquitto_passwd")
     if program is None:
