@@ -20,9 +20,9 @@ from imud import __version__
 from imud import config as configuration
 from imud.config import Config, DeviceConfig
 from imud.contracts.lines import LineFactory
-from imud.contracts.publisher import Batch, DeviceLedger, Publisher, PublisherContext
+from imud.contracts.publisher import Batch, DeviceControl, DeviceLedger, Publisher, PublisherContext
 from imud.contracts.status import DeviceState, DeviceStatus
-from imud.errors import ConfigError, ServerError
+from imud.errors import CommandError, ConfigError, ServerError
 from imud.event import Event, EventKind
 from imud.host_clock import HostClock
 from imud.notify import ServiceManager
@@ -83,7 +83,7 @@ class Daemon:
         self._devices: dict[str, Device] = {}
         self._latencies = LatencyBudget()
         self._context = PublisherContext(
-            self.status, secrets.randbits(63) | 1, host.now_ns, self._devices.__getitem__, thread_time_ns, self.ledgers,
+            self.status, secrets.randbits(63) | 1, host.now_ns, self._control, thread_time_ns, self.ledgers,
             status_in_turn=self.each_status, latencies=self._latencies,
             recording=DeviceTaps(self._devices, host), utc_offset_ns=host.utc_offset_ns,
             raise_event=self._send_event, watch_line=watching(lines, host.now_ns),
@@ -213,6 +213,13 @@ class Daemon:
         return ""
 
     # --- devices and outputs ----------------------------------------------------------------------------------------
+
+    def _control(self, name: str) -> DeviceControl:
+        """A device by its name, for outputs that command it. Raises CommandError where there is none."""
+        device = self._devices.get(name)
+        if device is None:
+            raise CommandError(f"{name}: no such device")
+        return device
 
     def status(self) -> list[DeviceStatus]:
         """Return the state of every device."""

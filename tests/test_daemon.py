@@ -24,6 +24,7 @@ from imud.client import Ring
 from imud.config import Config
 from imud.contracts.publisher import Publisher
 from imud.daemon import Daemon
+from imud.errors import CommandError
 from imud.units import NS_PER_S
 from imud.utc.system_clock import KernelClock
 from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
@@ -121,6 +122,11 @@ def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch
     if found is not None:
         assert found.error_ns == 50_000
         assert abs(found.offset_ns - (time_ns() - monotonic_ns())) < NS_PER_S
+
+
+def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:
+    with pytest.raises(CommandError, match=r"^nobody: no such device$"):
+        Daemon(Config("info", "", {}, ()))._context.control("nobody")
 
 
 class EndingOutput:

@@ -26,7 +26,7 @@ from imud.errors import ImudError
 from imud.formats.fleet.commands import CommandAnswer, CommandRequest, Outcome, answer_topic, decode_request
 from imud.formats.fleet.messages import VERSION
 from imud.formats.fleet.topics import COMMAND, ROOT, parse_topic
-from imud.log import shown
+from imud.log import SAME_AS, shown
 from imud.publishers.mqtt.broker import Received
 from imud.publishers.mqtt.settings import CommandSettings
 from imud.publishers.mqtt.streams import Gateway
@@ -183,6 +183,7 @@ class CommandChannel:
         log.warning(
             "mqtt: %s: request %s for %s is refused (%s): %s",
             asked.device, asked.request.id, shown(asked.request.action), outcome, problem,
+            extra=None if outcome is Outcome.BUSY else _by_itself(asked),
         )  # fmt: skip
         self._give_answer(asked, outcome, error=problem)
 
@@ -204,12 +205,13 @@ class CommandChannel:
         request = asked.request
         self.run += 1
         log.warning(
-            "mqtt: %s: request %s: %s %s", asked.device, request.id, shown(request.action), shown(request.arguments)
-        )
+            "mqtt: %s: request %s: %s %s", asked.device, request.id, shown(request.action), shown(request.arguments),
+            extra=_by_itself(asked),
+        )  # fmt: skip
         try:
             result = await self._control(asked.device).act(request.action, request.arguments)
         except ImudError as error:
-            log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error)
+            log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error, extra=_by_itself(asked))
             self._end(asked, Outcome.FAILED, error=str(error))
         except Exception:
             log.exception("mqtt: %s: request %s ended by an internal error", asked.device, request.id)
@@ -243,3 +245,8 @@ class CommandChannel:
         payload = msgspec.json.encode(answer)
         self.answer(CommandReply(asked.topic, payload, asked.correlation))
         return payload
+
+
+def _by_itself(asked: _Asked) -> dict[str, str]:
+    """The `extra` of a message that the log does not sum up with those of other requests; the rate bounds them."""
+    return {SAME_AS: asked.request.id}

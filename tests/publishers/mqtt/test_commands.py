@@ -15,6 +15,7 @@ from imud.contracts.settings import wrong_values
 from imud.errors import BadArgument, CommandError
 from imud.formats.fleet.commands import REQUEST_BYTES, CommandAnswer, Outcome, answer_topic
 from imud.host_clock import HostClock
+from imud.log import RepeatFilter
 from imud.publishers.mqtt.broker import Received
 from imud.publishers.mqtt.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
 from imud.publishers.mqtt.publisher import MqttPublisher
@@ -257,6 +258,18 @@ def test_errors_are_answers_and_a_defect_is_one_too() -> None:
         (Outcome.FAILED, "mast: no such device"),
         (Outcome.FAILED, "an internal error; the log of imud has a traceback"),
     ]
+
+
+def test_every_request_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.handler.addFilter(RepeatFilter())
+    bench = ChannelBench(actions=["identity", "turn"])
+    for number in range(4):
+        bench.ask(number)
+        bench.ask(100 + number, "turn")
+        bench.ask(200 + number, "factory_reset")
+        bench.run(rounds=2)
+    for number in (*range(4), *range(100, 104), *range(200, 204)):
+        assert f"request r{number}" in re.findall(r"request r\d+", caplog.text)
 
 
 def test_one_runs_at_a_time_and_the_end_ends_it() -> None:
