@@ -120,7 +120,7 @@ class Fleet:
         """Why nothing comes now, one sentence; empty while the connection is there."""
         self.clocks = BootClocks()
         """What gateways said of their wall clocks."""
-        self._positions = SpoolPositions()
+        self._positions = SpoolPositions(from_begin=from_begin)
 
     @property
     def accounts(self) -> Mapping[StreamKey, StreamAccount]:

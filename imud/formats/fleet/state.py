@@ -70,8 +70,12 @@ class StreamAccount(msgspec.Struct, frozen=True):
 class SpoolPositions:
     """What gateways said last of their streams. Synchronization: one thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, from_begin: bool = False) -> None:
+        """`from_begin`: what a stream had when a state first spoke of it is to come, too; else it is not counted."""
+        self._from_begin = from_begin
         self._positions: dict[StreamKey, StreamPosition] = {}
+        self._begins: dict[StreamKey, int] = {}
+        """Where the account of a stream begins as long as nothing of it has come."""
 
     def take(self, gateway: str, state: GatewayState) -> None:
         """Note what a state says. Raises OverflowError beyond POSITIONS_MAX streams."""
@@ -80,14 +84,16 @@ class SpoolPositions:
             known = self._positions.get(key)
             if known is None and len(self._positions) >= POSITIONS_MAX:
                 raise OverflowError(f"expected at most {POSITIONS_MAX} streams in states, got one more: {key}")
+            if known is None:
+                self._begins[key] = one.begin if self._from_begin else one.last + 1
             if known is None or one.last > known.last:
                 self._positions[key] = one
 
     def accounts(self, ledger: FleetLedger) -> Mapping[StreamKey, StreamAccount]:
         """The account of every stream that a message or a state has named."""
         counts = dict(ledger.counts)
-        for key, one in self._positions.items():
-            counts.setdefault(key, StreamCounts(one.begin, one.begin - 1))
+        for key, begin in self._begins.items():
+            counts.setdefault(key, StreamCounts(begin, begin - 1))
         found = {}
         for key, count in counts.items():
             position = self._positions.get(key)

@@ -18,8 +18,21 @@ def state(last: int, boot: str = "1") -> GatewayState:
     return GatewayState(v=1, online=True, boot=boot, positions=[StreamPosition(boot, "bow", "samples", 1, last)])
 
 
-def test_a_stream_of_which_nothing_came_is_in_the_spool() -> None:
-    positions = SpoolPositions()
+def test_what_a_stream_had_before_it_was_heard_of_is_not_in_the_spool() -> None:
+    positions, ledger = SpoolPositions(), FleetLedger()
+    positions.take("gw", state(40))
+    account = positions.accounts(ledger)[KEY]
+    assert (account.sent, account.received, account.in_spool, account.balance) == (0, 0, 0, 0)
+    positions.take("gw", state(50))
+    account = positions.accounts(ledger)[KEY]
+    assert (account.sent, account.received, account.in_spool, account.balance) == (10, 0, 10, 0)
+    ledger.take(message(31, 40), Stream.SAMPLES)
+    account = positions.accounts(ledger)[KEY]
+    assert (account.sent, account.received, account.in_spool, account.balance) == (20, 10, 10, 0)
+
+
+def test_from_the_begin_a_stream_of_which_nothing_came_is_in_the_spool() -> None:
+    positions = SpoolPositions(from_begin=True)
     positions.take("gw", state(40))
     account = positions.accounts(FleetLedger())[KEY]
     assert (account.sent, account.received, account.in_spool, account.balance) == (40, 0, 40, 0)
@@ -41,7 +54,7 @@ def test_a_reboot_has_its_own_account() -> None:
     positions.take("gw", state(7, "2"))
     accounts = positions.accounts(ledger)
     assert [(accounts[KEY._replace(boot=boot)].sent, accounts[KEY._replace(boot=boot)].in_spool) for boot in "12"] == [
-        (30, 0), (7, 7)
+        (30, 0), (0, 0)
     ]  # fmt: skip
 
 
@@ -88,7 +101,7 @@ STATES = st.tuples(st.sampled_from(["1", "2"]), st.integers(1, 60))
 @given(st.lists(st.one_of(MESSAGES, STATES, st.just("restart"), st.just("killed"))))
 def test_it_closes_whatever_comes_and_however_often_the_collector_starts_anew(steps: list[object]) -> None:
     """A killed collector has what it had stored, and the last message, which was not acknowledged, comes again."""
-    ledger, positions = FleetLedger(from_begin=True), SpoolPositions()
+    ledger, positions = FleetLedger(from_begin=True), SpoolPositions(from_begin=True)
     seen: dict[str, set[int]] = {"1": set(), "2": set()}
     given_out: dict[str, list[int]] = {"1": [], "2": []}
     stored: dict[StreamKey, bytes] = {}
@@ -104,7 +117,7 @@ def test_it_closes_whatever_comes_and_however_often_the_collector_starts_anew(st
 
     for step in steps:
         if step in ("restart", "killed"):
-            ledger, positions = FleetLedger(from_begin=True), SpoolPositions()
+            ledger, positions = FleetLedger(from_begin=True), SpoolPositions(from_begin=True)
             newest.clear()
             for key, account in stored.items():
                 ledger.restore(key, msgspec.json.decode(account, type=StoredAccount))
