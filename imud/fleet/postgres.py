@@ -69,11 +69,17 @@ class PostgresStore:
         try:
             self._connection: Any = psycopg.connect(url, connect_timeout=10, application_name="imud fleet collect")
             with self._connection.transaction(), self._connection.cursor() as cursor:
-                cursor.execute(f"SET lock_timeout = '{LOCK_S}s'")
+                cursor.execute(f"SET lock_timeout = '{round(LOCK_S * 1000)}ms'")
                 cursor.execute("SELECT pg_advisory_lock(%s)", (LOCK,))
-                cursor.execute(SCHEMA)
+                _make_tables(cursor)
                 for name in (SAMPLES.name, RECORDS.name, LEDGER):
                     _make_new(cursor, name)
+        except psycopg.errors.LockNotAvailable as error:
+            self.close()
+            raise ServerError(
+                f"PostgreSQL: expected that no other collector writes to this database, got one that still does after "
+                f"{LOCK_S} s: look at application_name in pg_stat_activity"
+            ) from error
         except psycopg.Error as error:
             self.close()
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
@@ -175,6 +181,14 @@ def _copy_rows(cursor: Any, target: str, rows: Iterable[Row]) -> None:
     with cursor.copy(f"COPY {target} FROM STDIN") as copy:
         for row in rows:
             copy.write_row(row)
+
+
+def _make_tables(cursor: Any) -> None:
+    """Make the tables that are missing; where none is, that needs no right to make any."""
+    for name, statement in SCHEMA.items():
+        cursor.execute("SELECT to_regclass(%s)", (name,))
+        if cursor.fetchone()[0] is None:
+            cursor.execute(statement)
 
 
 def _make_new(cursor: Any, name: str) -> None:

@@ -65,17 +65,23 @@ RECORDS: Final = FleetTable(
     "gateway, boot, device, stream, first, last, kind, time",
 )  # fmt: skip
 LEDGER: Final = "imud_ledger"
-SCHEMA: Final = "\n".join(
-    (
-        SAMPLES.statement(),
-        RECORDS.statement(),
-        # half of each page is free, so that an account is replaced in its page, without a change of the index
-        f"CREATE TABLE IF NOT EXISTS {LEDGER} (gateway text, boot text, device text, stream text, "
-        "account jsonb NOT NULL, PRIMARY KEY (gateway, boot, device, stream)) WITH (fillfactor = 50);",
-        "CREATE TABLE IF NOT EXISTS imud_boots (gateway text, boot text, t_ns bigint NOT NULL, "
-        "utc_offset_ns bigint NOT NULL, utc_err_ns bigint, PRIMARY KEY (gateway, boot));",
+BOOTS: Final = "imud_boots"
+SCHEMA: Final = dict(
+    zip(
+        (SAMPLES.name, RECORDS.name, LEDGER, BOOTS),
+        (
+            SAMPLES.statement(),
+            RECORDS.statement(),
+            # half of each page is free, so that an account is replaced in its page, without a change of the index
+            f"CREATE TABLE IF NOT EXISTS {LEDGER} (gateway text, boot text, device text, stream text, "
+            "account jsonb NOT NULL, PRIMARY KEY (gateway, boot, device, stream)) WITH (fillfactor = 50);",
+            f"CREATE TABLE IF NOT EXISTS {BOOTS} (gateway text, boot text, t_ns bigint NOT NULL, "
+            "utc_offset_ns bigint NOT NULL, utc_err_ns bigint, PRIMARY KEY (gateway, boot));",
+        ),
+        strict=True,
     )
 )
+"""Statements that make the tables, by their names."""
 
 
 def sample_rows(batch: FleetBatch) -> Iterable[Row]:

@@ -220,6 +220,29 @@ def test_a_transaction_that_fails_leaves_nothing(database: str) -> None:
     assert query(database, "SELECT count(*) FROM imud_samples") == [(0,)]
 
 
+def test_a_user_who_may_only_write_rows_does(database: str) -> None:
+    write(database)
+    query(
+        database,
+        "DROP ROLE IF EXISTS writer; CREATE ROLE writer LOGIN; REVOKE CREATE ON SCHEMA public FROM public; "
+        "GRANT USAGE ON SCHEMA public TO public; "
+        "GRANT SELECT, INSERT, UPDATE, DELETE ON ALL TABLES IN SCHEMA public TO writer",
+    )
+    write(database.replace("user=imud", "user=writer"), samples_message(1, 5))
+    assert query(database, "SELECT count(*) FROM imud_samples") == [(5,)]
+    query(database, "DROP OWNED BY writer; DROP ROLE writer")
+
+
+def test_a_second_collector_says_that_there_is_another(database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from imud.fleet import postgres
+
+    monkeypatch.setattr(postgres, "LOCK_S", 0.1)
+    first = postgres.PostgresStore(database)
+    with pytest.raises(ServerError, match="expected that no other collector writes"):
+        postgres.PostgresStore(database)
+    first.close()
+
+
 def test_a_server_that_is_not_there_is_named() -> None:
     from imud.fleet.postgres import PostgresStore
 
