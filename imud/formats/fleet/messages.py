@@ -156,8 +156,19 @@ class FleetMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True, kw
         return None if self.clock is None else self.utc_ns - self.clock.utc_offset_ns
 
 
+class MessageHead(msgspec.Struct, frozen=True, gc=False):
+    """What a message says of itself, as `FleetMessage` does."""
+
+    gateway: str
+    boot: str
+    device: str
+    first: int
+    last: int
+
+
 _ENCODER: Final = msgspec.json.Encoder()
 _DECODER: Final = msgspec.json.Decoder(FleetMessage)
+_HEAD_DECODER: Final = msgspec.json.Decoder(MessageHead)
 
 
 def boot_text(epoch: int) -> str:
@@ -196,6 +207,21 @@ def decode_message(payload: bytes) -> FleetMessage:
     check_boot(message.boot)
     check_numbers(_numbers(message))
     return message
+
+
+def check_payload(payload: bytes) -> MessageHead:
+    """What a payload says of itself, where its JSON and its slots can be read. Raises ValueError for anything else.
+
+    It costs a third of `decode_message` at most, and does not look at values.
+    """
+    try:
+        if not payload.startswith(MAGIC):
+            return _HEAD_DECODER.decode(payload)
+        header, slots = _parts_of_slots(payload)
+        _decompressed(slots)
+        return _HEAD_DECODER.decode(header)
+    except (msgspec.DecodeError, RecursionError, zstandard.ZstdError, struct.error) as error:
+        raise ValueError(f"expected a message of a gateway, got {len(payload)} other bytes") from error
 
 
 def checked_json(payload: bytes) -> bytes:
@@ -240,18 +266,28 @@ def _numbers(message: FleetMessage) -> Iterable[int | None]:
         yield event.t_ns
 
 
-def _decode_slots(payload: bytes) -> FleetMessage:
+def _parts_of_slots(payload: bytes) -> tuple[bytes, bytes]:
+    """The header, and the frame of slots."""
     _, version, _, size = _PREFIX.unpack_from(payload)
     if version != VERSION or size > HEADER_MAX:
         raise ValueError(f"expected slots of version {VERSION}, got {version} and a header of {size} bytes")
     begin = _PREFIX.size
-    message = _DECODER.decode(checked_json(payload[begin : begin + size]))
-    frame = payload[begin + size :]
+    return payload[begin : begin + size], payload[begin + size :]
+
+
+def _decompressed(frame: bytes) -> bytes:
     if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * SLOT_BYTES:  # it decides how much is allocated
         raise ValueError(f"expected 1 to {SLOTS_MAX} slots, got {zstandard.frame_content_size(frame)} bytes")
     slots = zstandard.ZstdDecompressor().decompress(frame)
     if len(slots) % SLOT_BYTES:
         raise ValueError(f"expected slots of {SLOT_BYTES} bytes, got {len(slots)}")
+    return slots
+
+
+def _decode_slots(payload: bytes) -> FleetMessage:
+    header, frame = _parts_of_slots(payload)
+    message = _DECODER.decode(checked_json(header))
+    slots = _decompressed(frame)
     samples = [
         decode_slot(slots[at : at + SLOT_BYTES], message.device) for at in range(0, len(slots), SLOT_BYTES)
     ]  # fmt: skip

@@ -96,7 +96,7 @@ class MqttPublisher:
         brokers = [found for url in settings.brokers if (found := broker_of(url)) is not None]
         turn = BrokerTurn(brokers, settings.retry_max_s)
         self._spool = Spool(
-            directory, settings.spool_bytes, settings.spool_age_ns, newest_first=settings.newest_first
+            directory, settings.spool_bytes, settings.spool_age_ns, newest_first=settings.newest_first, gateway=gateway
         )  # fmt: skip
         if settings.commands.enabled:
             self._commands = CommandChannel(

@@ -18,7 +18,7 @@ from imud.publishers.mqtt.backoff import BrokerTurn
 from imud.publishers.mqtt.broker import BrokerConnection, Connect, Will
 from imud.publishers.mqtt.commands import CommandChannel, CommandReply
 from imud.publishers.mqtt.settings import MqttSettings
-from imud.publishers.mqtt.spool import Spooled
+from imud.publishers.mqtt.spooled import Spooled
 from imud.units import NS_PER_S
 from imud.worker import WakeEvent
 

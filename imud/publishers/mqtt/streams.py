@@ -28,7 +28,7 @@ from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream, topic_of
 from imud.formats.slot import encode_slots
 from imud.publishers.mqtt.settings import DeviceSending, Whole
-from imud.publishers.mqtt.spool import Spooled, row_of
+from imud.publishers.mqtt.spooled import Spooled, row_of
 from imud.publishers.mqtt.statistics import IntervalMaker, by_interval
 from imud.sample import Sample
 from imud.units import NS_PER_S
@@ -254,9 +254,9 @@ class DeviceStreams:
 
 def notes_of(rows: Sequence[Spooled], cause: DropCause, gateway: str) -> list[Spooled]:
     """Messages that say that others were dropped, one for each stream, in place of `rows`, whose numbers follow on."""
-    first: dict[tuple[str, str, str], Spooled] = {}
-    last: dict[tuple[str, str, str], Spooled] = {}
-    count: dict[tuple[str, str, str], int] = {}
+    first: dict[tuple[str, str], Spooled] = {}
+    last: dict[tuple[str, str], Spooled] = {}
+    count: dict[tuple[str, str], int] = {}
     for row in rows:
         first.setdefault(row.key, row)
         last[row.key] = row

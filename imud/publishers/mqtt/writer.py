@@ -25,7 +25,8 @@ from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.sender import MqttSender
 from imud.publishers.mqtt.settings import DeviceSending, MqttSettings
-from imud.publishers.mqtt.spool import Spool, Spooled, SpoolError
+from imud.publishers.mqtt.spool import Spool, SpoolError
+from imud.publishers.mqtt.spooled import Spooled
 from imud.publishers.mqtt.streams import DeviceStreams, Gateway, ReadClock, no_clock, notes_of
 from imud.units import NS_PER_S
 from imud.worker import END_LIMIT_S, StartWorker
@@ -216,6 +217,11 @@ class SpoolWriter:
             self._rows += streams.flush()
         self._due_ns = 0
         self._store(self._now_ns())
+        if self._rows:
+            log.error(
+                "mqtt: %d messages are lost with the end, because nothing can be spooled: %s",
+                len(self._rows), self.problem,
+            )  # fmt: skip
         self._spool.close()
         self.closed()
 
@@ -326,7 +332,7 @@ class SpoolWriter:
             self.lost_on_disk += lost
         acknowledged = frozenset(self._acknowledged)
         try:
-            self._spool.commit(self._rows, acknowledged, now_ns, self._stored_utc_ns(now_ns))
+            self._commit(acknowledged, now_ns)
             self.positions = self._spool.positions()
         except SpoolError as error:
             self.problem = str(error)
@@ -334,8 +340,19 @@ class SpoolWriter:
             self._make_room(acknowledged, now_ns)
             return
         self.problem = ""
-        self._rows = []
         self._acknowledged -= acknowledged
+
+    def _commit(self, acknowledged: frozenset[int], now_ns: int) -> None:
+        """Store what waits, one by one after a problem: a disk that was full may not have room for all of it at once.
+
+        Raises SpoolError.
+        """
+        utc_ns, most = self._stored_utc_ns(now_ns), 1 if self.problem else max(len(self._rows), 1)
+        self._spool.commit(self._rows[:most], acknowledged, now_ns, utc_ns)
+        del self._rows[:most]
+        while self._rows:
+            self._spool.commit(self._rows[:most], (), now_ns, utc_ns)
+            del self._rows[:most]
 
     def _stored_utc_ns(self, now_ns: int) -> int:
         """CLOCK_REALTIME, by which messages age; 0 before it was ever synchronised, when it says nothing of ages."""
@@ -347,8 +364,9 @@ class SpoolWriter:
         """Remove what was acknowledged, for which a disk can have room that has none for more."""
         if acknowledged:
             with suppress(SpoolError):
-                self._spool.commit((), acknowledged, now_ns, self._stored_utc_ns(now_ns))
+                self._spool.remove(acknowledged, now_ns, self._stored_utc_ns(now_ns))
                 self._acknowledged -= acknowledged
+                self._due_ns = now_ns + COMMIT_NS
 
     def _give(self, now_ns: int) -> int:
         """Give the sender what it has room for; return after what time more may be given, ns."""

@@ -21,7 +21,8 @@ from imud.formats.fleet.topics import Stream
 from imud.host_clock import HostClock
 from imud.publishers.mqtt.publisher import MqttPublisher
 from imud.publishers.mqtt.settings import MqttSettings
-from imud.publishers.mqtt.spool import Spool, Spooled
+from imud.publishers.mqtt.spool import Spool
+from imud.publishers.mqtt.spooled import Spooled
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.publishers.mqtt.authority import Authority

@@ -10,7 +10,7 @@ from imud.publishers.mqtt.broker import Will
 from imud.publishers.mqtt.commands import CommandReply
 from imud.publishers.mqtt.sender import OUTBOX_MAX, REPLIES_MAX, MqttSender
 from imud.publishers.mqtt.settings import Broker, MqttSettings
-from imud.publishers.mqtt.spool import Spooled
+from imud.publishers.mqtt.spooled import Spooled
 from tests.publishers.mqtt.fake_broker import LIMIT_S, FakeBroker
 from tests.support.event_loops import VirtualClock
 

@@ -1,7 +1,9 @@
 """The spool: order, room, age, a full disk, a damaged file; every number is covered by exactly one message, always."""
 
+import sqlite3
 import subprocess
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 
@@ -16,9 +18,11 @@ from imud.formats.fleet.messages import (
     encode_message,
     encode_slots_message,
 )
+from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream, topic_of
 from imud.formats.slot import encode_slots
-from imud.publishers.mqtt.spool import CLOCK_SET_NS, FILE, STEP, Spool, Spooled, SpoolError, row_of
+from imud.publishers.mqtt.spool import CLOCK_SET_NS, FILE, RESERVE_FILE, STEP, Spool, SpoolError
+from imud.publishers.mqtt.spooled import Spooled, row_of
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_S
 
@@ -268,6 +272,43 @@ def test_a_full_disk_leaves_the_spool_as_it_was(small_disk: Path) -> None:
     assert again.counts() == StreamCounts(1, 100 * number, whole=100 * number)
 
 
+def test_what_is_acknowledged_makes_room_on_a_full_disk(small_disk: Path) -> None:
+    bench = SpoolBench(small_disk)
+    number = 0
+    with suppress(SpoolError):
+        while True:
+            bench.commit(batch(100 * number + 1))
+            number += 1
+    given = bench.spool.after(1000)
+    assert len(given) == bench.spool.messages > 5
+    bench.spool.remove([row.id for row in given], bench.now_ns, UTC_NS)
+    assert bench.spool.messages == 0
+    for _ in range(300):  # from here on the file does not grow, and what waits becomes thinner
+        bench.commit(batch(100 * number + 1))
+        number += 1
+    assert bench.spool.thinned > 0
+
+
+def test_the_reserve_is_taken_again_when_the_disk_has_room(small_disk: Path) -> None:
+    reserve, other = small_disk / RESERVE_FILE, small_disk / "other"
+    bench = SpoolBench(small_disk)
+    assert reserve.stat().st_size > 100_000
+    bench.commit(batch(1))
+    with suppress(OSError), other.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(1024))
+    (row,) = bench.spool.after(1)
+    bench.spool.remove([row.id], bench.now_ns, UTC_NS)
+    assert not reserve.exists()
+    for number in range(1, 20):
+        bench.commit(batch(100 * number + 1))
+    assert not reserve.exists()
+    other.unlink()
+    for number in range(20, 26):
+        bench.commit(batch(100 * number + 1))
+    assert reserve.stat().st_size > 100_000
+
+
 def test_a_damaged_file_is_set_aside(tmp_path: Path) -> None:
     (tmp_path / FILE).write_bytes(b"This is no database at all, and it is long enough to be seen as none." * 100)
     bench = SpoolBench(tmp_path)
@@ -308,3 +349,134 @@ def test_a_payload_that_cannot_be_read_is_dropped_as_damaged(tmp_path: Path) -> 
         bench.commit(batch(100 * number + 1))
     assert bench.spool.dropped["damaged"] == 100
     assert bench.counts().dropped["damaged"] == 100
+
+
+DAMAGE = {
+    "a topic that is no text": "topic = CAST(x'696d75642f73ff' AS TEXT)",
+    "a topic with a wildcard": "topic = 'imud/site/#/bow/samples'",
+    "a payload that is a number": "payload = 17",
+    "a payload with other bytes": "payload = x'00ff'",
+    "JSON that ends early": 'payload = CAST(\'{"boot":"1"\' AS BLOB)',
+    "slots that cannot be decompressed": "payload = CAST(substr(payload, 1, length(payload) - 9) AS BLOB)",
+    "a boot that is no text": "boot = CAST(x'ff' AS TEXT)",
+    "a device that is not that of the topic": "device = 'stern'",
+    "a kind that there is not": "kind = 'other'",
+    "numbers that are not those of the payload": "first = 150",
+    "a number that is a text": "last = 'many'",
+    "a time that is a text": "stored_utc_ns = 'never'",
+}
+"""What a disk can make of a row, as SQL; SQLite gives all of it back without an error."""
+
+
+def damage(folder: Path, change: str) -> None:
+    """Change the second message behind the back of the spool."""
+    base = sqlite3.connect(folder / FILE, isolation_level=None)
+    base.execute(f"UPDATE message SET {change} WHERE id = 2")
+    base.close()
+
+
+@pytest.mark.parametrize("change", DAMAGE.values(), ids=DAMAGE)
+@pytest.mark.parametrize("kilobytes", [100_000, 20], ids=["read", "thinned"])
+def test_a_damaged_row_costs_only_itself(tmp_path: Path, change: str, kilobytes: int) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(*(batch(100 * number + 1) for number in range(10)))
+    bench.spool.close()
+    damage(tmp_path, change)
+    again = SpoolBench(tmp_path, kilobytes=kilobytes)
+    again.commit(batch(1001))
+    assert [one.last for one in again.spool.positions()] == [1100]
+    counts = again.counts()
+    assert (counts.newest, counts.whole + counts.thinned + counts.dropped.get("space", 0)) == (1100, 1000)
+    assert counts.dropped.get("damaged", 0) + counts.missing == 100
+    assert set(again.spool.dropped) <= {"damaged", "space"}
+    assert again.spool.dropped["damaged"]
+
+
+def test_a_damaged_row_that_says_its_numbers_is_a_note(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(*(batch(100 * number + 1) for number in range(3)))
+    damage(tmp_path, "payload = 17")
+    counts = bench.counts()
+    assert (counts.whole, counts.dropped, counts.missing) == (200, {"damaged": 100}, 0)
+    assert bench.spool.dropped == {"damaged": 100}
+    assert bench.spool.messages == 3
+
+
+def test_messages_behind_damaged_ones_that_are_gone_are_given(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(*(batch(100 * number + 1) for number in range(4)))
+    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
+    base.execute("UPDATE message SET topic = '' WHERE id <= 2")
+    base.close()
+    assert [row.first for row in bench.spool.after(2)] == [201, 301]
+    assert bench.spool.messages == 2
+
+
+def test_a_damaged_position_is_left_out(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(batch(1), batch(1, device="stern"))
+    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
+    base.execute("UPDATE progress SET stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT) WHERE device = 'stern'")
+    base.close()
+    bench.commit(batch(101))
+    assert [(one.device, one.last) for one in bench.spool.positions()] == [("bow", 200)]
+
+
+def test_a_file_whose_numbers_are_at_their_end_is_set_aside(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    bench.commit(batch(1))
+    bench.spool.close()
+    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
+    base.execute("UPDATE message SET id = 9223372036854775807")
+    base.close()
+    again = SpoolBench(tmp_path)
+    again.commit(batch(101))
+    assert again.spool.set_aside
+    assert [row.first for row in again.all()] == [101]
+
+
+def test_positions_are_those_of_one_name_of_the_gateway(tmp_path: Path) -> None:
+    old = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
+    old.open()
+    old.commit([batch(1)], (), 1, UTC_NS)
+    old.close()
+    new = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="other")
+    new.open()
+    assert new.positions() == []
+    row = batch(101)
+    new.commit([row._replace(topic=row.topic.replace("gw", "other"))], (), 1, UTC_NS)
+    assert [(one.begin, one.last) for one in new.positions()] == [(101, 200)]
+    new.close()
+
+
+def test_what_was_dropped_of_two_names_is_in_two_notes(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path, hours=1)
+    first, second = batch(1), batch(101)
+    bench.commit(first, second._replace(topic=second.topic.replace("gw", "other")))
+    bench.commit(utc_ns=UTC_NS + 2 * HOUR_NS)
+    assert [(row.gateway, row.first, row.last, row.kind) for row in bench.spool.after(9)] == [
+        ("gw", 1, 100, "dropped"),
+        ("other", 101, 200, "dropped"),
+    ]
+
+
+def test_positions_of_an_earlier_version_are_taken_over(tmp_path: Path) -> None:
+    base = sqlite3.connect(tmp_path / FILE, isolation_level=None)
+    base.execute("CREATE TABLE position (boot, device, stream, begin, last, stored_utc_ns)")
+    base.execute("INSERT INTO position VALUES ('1', 'bow', 'samples', 3, 17, 1)")
+    base.close()
+    for _ in range(2):
+        spool = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
+        spool.open()
+        assert spool.positions() == [StreamPosition("1", "bow", "samples", 3, 17)]
+        spool.close()
+
+
+def test_the_streams_of_as_many_devices_as_there_may_be_keep_their_begin(tmp_path: Path) -> None:
+    bench = SpoolBench(tmp_path)
+    for first in (1, 2):
+        for whole in (True, False):
+            bench.commit(*(batch(first, 1, f"device-{number}", whole=whole) for number in range(256)))
+    positions = bench.spool.positions()
+    assert len(positions) == 512
+    assert {(one.begin, one.last) for one in positions} == {(1, 2)}

@@ -9,7 +9,7 @@ from imud.formats.fleet.messages import SAMPLES_MAX, SLOTS_MAX, DropCause, Fleet
 from imud.formats.fleet.state import StreamPosition
 from imud.formats.fleet.topics import Stream
 from imud.publishers.mqtt.settings import DeviceSending, Whole
-from imud.publishers.mqtt.spool import Spooled
+from imud.publishers.mqtt.spooled import Spooled
 from imud.publishers.mqtt.streams import LATE_NS, DeviceStreams, Gateway, notes_of
 from imud.sample import Sample, Sync
 from imud.units import NS_PER_MS, NS_PER_S

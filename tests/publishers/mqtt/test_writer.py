@@ -3,6 +3,7 @@
 import threading
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -230,6 +231,36 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path) -> None:
     assert bench.writer.problem == ""
     bench.work(3)
     assert bench.counts() == StreamCounts(1, 2000, whole=2000)
+
+
+class TightSpool(Spool):
+    """A spool whose disk has no room for two messages at once."""
+
+    def commit(self, new: Any, acknowledged: Any, now_ns: int, utc_ns: int) -> None:
+        if len(new) > 1:
+            raise SpoolError("database or disk is full")
+        super().commit(new, acknowledged, now_ns, utc_ns)
+
+
+def test_a_disk_without_room_for_all_that_waits_takes_it_one_by_one(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path, spool=TightSpool(tmp_path, 100_000_000, HOUR_NS))
+    bench.put(5000)
+    bench.workers[0].work()
+    assert bench.writer.problem
+    bench.clock.advance(DISK_RETRY_NS)
+    bench.workers[0].work()
+    assert (bench.writer.problem, bench.spool.spooled) == ("", 10)
+    assert bench.counts().whole == 5000
+
+
+def test_messages_that_cannot_be_stored_at_the_end_are_in_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = WriterBench(tmp_path)
+    bench.put(1000)
+    bench.disk.fails = True
+    bench.writer.close()
+    assert "2 messages are lost with the end, because nothing can be spooled: No space left" in caplog.text
 
 
 def test_a_disk_that_fails_for_long_leaves_the_numbers(tmp_path: Path) -> None:
