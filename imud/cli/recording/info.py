@@ -1,6 +1,7 @@
 """`imud info`: what is in a recording, and whether it is whole. Nothing is decoded: it is read as fast as the disk."""
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -43,27 +44,40 @@ class DeviceContents:
     input_bytes: int = 0
     edges: int = 0
     events: int = 0
-    first: CheckRecord | None = None
-    last: CheckRecord | None = None
+    spans: list[tuple[CheckRecord, CheckRecord]] = field(default_factory=list)
+    """First and last check of each time in which numbers and ledger went on: a device that was removed and added begins
+    both anew."""
+    begins_anew: bool = False
+    """Whether the next check begins a span."""
+
+    def check(self, found: CheckRecord) -> None:
+        """Take what the live run had at one place."""
+        if self.begins_anew or not self.spans or found.seq < self.spans[-1][1].seq:
+            self.spans.append((found, found))
+            self.begins_anew = False
+        else:
+            self.spans[-1] = (self.spans[-1][0], found)
+
+    def begin_path(self, ledger: Mapping[str, int]) -> None:
+        """Take the ledger with which a codec and its clock were made."""
+        before = self.spans[-1][1].ledger if self.spans else {}
+        self.begins_anew = ledger.get("samples", 0) < before.get("samples", 0)
 
     @property
     def samples(self) -> int:
-        """Samples between the first check and the last."""
-        return self.last.seq - self.first.seq if self.first is not None and self.last is not None else 0
+        """Samples between the first check and the last of each span."""
+        return sum(last.seq - first.seq for first, last in self.spans)
 
     @property
     def rate_hz(self) -> float:
         """Samples per second between them; 0 for not known."""
-        if self.first is None or self.last is None or self.last.t_ns <= self.first.t_ns:
-            return 0.0
-        return self.samples * NS_PER_S / (self.last.t_ns - self.first.t_ns)
+        spent_ns = sum(last.t_ns - first.t_ns for first, last in self.spans)
+        return self.samples * NS_PER_S / spent_ns if spent_ns > 0 else 0.0
 
     @property
     def lost(self) -> int:
         """Samples lost between them, by every cause."""
-        if self.first is None or self.last is None:
-            return 0
-        return lost(self.last.ledger) - lost(self.first.ledger)
+        return sum(lost(last.ledger) - lost(first.ledger) for first, last in self.spans)
 
 
 class Contents:
@@ -105,10 +119,11 @@ class Contents:
             device.name, device.where, device.identity = described.name, described.where, described.identity
             device.driver = device.driver or described.driver
         elif record.kind == Kind.PATH:
-            device.driver = decode_object(record, PathRecord).driver
+            path = decode_object(record, PathRecord)
+            device.driver = path.driver
+            device.begin_path(path.ledger)
         elif record.kind == Kind.CHECK:
-            device.last = decode_object(record, CheckRecord)
-            device.first = device.first or device.last
+            device.check(decode_object(record, CheckRecord))
 
     @property
     def duration_s(self) -> float:
@@ -166,18 +181,20 @@ def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
 
 def page(report: dict[str, Any]) -> str:
     """Format it for people, in 80 columns."""
-    begun = "not known"
+    begun, duration = "not known: the block that says it and names the devices is damaged or missing", "not known"
     if report["begun_utc_ns"] is not None:
-        begun = f"{datetime.fromtimestamp(report['begun_utc_ns'] // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
+        time = datetime.fromtimestamp(report["begun_utc_ns"] // NS_PER_S, UTC)
+        begun = f"{time:%Y-%m-%d %H:%M:%S} UTC, by imud {report['imud']} on {report['host']}, file {report['file_number']}"
+        duration = f"{report['duration_s']:.1f} s"
     stored, plain = report["stored_bytes"], report["plain_bytes"]
     samples = sum(device["samples"] for device in report["devices"])
     size = f"{stored} bytes in {report['blocks']} blocks, {plain} unpacked"
     if samples:
         size += f"; {stored / samples:.1f} bytes per sample"
-    dropped = f"{report['records_dropped']} records were dropped, the disk was too slow"
+    dropped = f"{report['records_dropped']} records, the disk was too slow"
     rows = [
-        ("begun", f"{begun}, by imud {report['imud']} on {report['host']}, file {report['file_number']}"),
-        ("duration", f"{report['duration_s']:.1f} s"),
+        ("begun", begun),
+        ("duration", duration),
         ("size", size),
         ("dropped", dropped if report["records_dropped"] else "nothing"),
         ("integrity", "; ".join(report["problems"]) or "whole"),

@@ -110,7 +110,7 @@ class RecordingReader:
         if read.bytes_bad:
             found.append(f"{read.bytes_bad} bytes from byte {read.first_bad} on are damaged, and left out")
         if read.blocks_missing:
-            found.append(f"{read.blocks_missing} blocks are missing by their numbers")
+            found.append(f"blocks that are missing by their numbers: {read.blocks_missing}")
         if read.bytes_cut:
             found.append(f"the last {read.bytes_cut} bytes are a block cut short, left out")
         if self.records_unreadable:

@@ -6,6 +6,10 @@ from pathlib import Path
 import pytest
 
 from imud.cli import main
+from imud.cli.recording.info import Contents
+from imud.formats.recording.records import CheckRecord, Kind, PathRecord, encode_object, records_of
+from imud.ledger import LEDGER_FIELDS
+from imud.units import NS_PER_S
 from tests.cli.recording.recorded_daemon import run_recorded
 
 
@@ -58,3 +62,41 @@ def test_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "no recording of imud" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "none")]) == 2
     assert "No such file" in capsys.readouterr().err
+
+
+def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> None:
+    contents = Contents()
+
+    def add(kind: Kind, value: object) -> None:
+        contents.add(next(records_of(encode_object(kind, 0, value))))
+
+    def check(t_s: int, seq: int, lost: int) -> None:
+        ledger = dict.fromkeys(LEDGER_FIELDS, 0) | {"samples": seq, "lost_crc": lost}
+        add(Kind.CHECK, CheckRecord(t_s * NS_PER_S, seq, 0, 0, ledger))
+
+    check(10, 5000, 7)
+    check(12, 5200, 9)
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 5250}, b""))  # the port was opened again
+    check(14, 5400, 9)
+    check(20, 50, 1)  # added again by a reload
+    check(21, 150, 4)
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 0}, b""))  # and again, soon more than before
+    check(30, 200, 0)
+    check(32, 400, 5)
+    device = contents.devices[0]
+    assert device.samples == 400 + 100 + 200
+    assert device.lost == 2 + 3 + 5
+    assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))
+
+
+def test_a_file_whose_begin_is_damaged_says_what_is_not_known(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray(file.read_bytes())
+    data[100] ^= 1
+    (tmp_path / "damaged").write_bytes(data)
+    assert main(["info", str(tmp_path / "damaged")]) == 1
+    page = " ".join(capsys.readouterr().out.split())
+    assert "begun not known: the block that says it and names the devices is damaged or missing" in page
+    assert "duration not known" in page
+    assert "blocks that are missing by their numbers: 1" in page

@@ -60,7 +60,7 @@ def test_damage_and_missing_blocks_are_named() -> None:
     reader = RecordingReader(io.BytesIO(bytes(data)), "a.rec")
     assert len(list(reader)) == 11
     assert "are damaged" in reader.problems[0]
-    assert reader.problems[1] == "1 blocks are missing by their numbers"
+    assert reader.problems[1] == "blocks that are missing by their numbers: 1"
 
 
 @pytest.mark.parametrize("data", [b"", b"\x89imudREC", b"t_ns,accel\n" * 20])
