@@ -2,13 +2,14 @@
 
 import argparse
 import sys
+from collections import deque
 from pathlib import Path
 
 import msgspec
 
 from imud import config
 from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
-from imud.cli.recording.replay import Printer, begins_as_recording, play_recording
+from imud.cli.recording.replay import Printer, looks_like_recording, play_recording
 from imud.cli.status import block
 from imud.contracts.can import CanDriver
 from imud.contracts.status import DeviceStatus
@@ -16,6 +17,7 @@ from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ImudError
 from imud.files import open_regular
+from imud.formats.candump import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.links import LINKS
 from imud.log import STDERR, log_to
@@ -51,18 +53,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play the file to its end; the ledger goes to standard error. 1 when there was no sample in it."""
+    """Play the file to its end; the ledger goes to standard error. 1 when it has no sample, or is damaged."""
     if not args.file.is_file():
         raise ImudError(f"{args.file}: expected a recording or a capture, found none")
     with log_to(STDERR, "warning"):
-        if begins_as_recording(str(args.file)):
+        if looks_like_recording(str(args.file)):
             return play_recording(args)
         args.driver, args.speed = args.driver or DRIVER, args.speed or SPEED
         args.baud = args.baud or (0 if names_rate(args) else BAUD)
         without_times = "" if has_times(args) else NO_TIMES
         status = play(args)
     print(block(status, without_times, virtual=args.speed == "maximum"), file=sys.stderr)
-    return 0 if status.ledger["samples"] else 1
+    is_damaged = not isinstance(DRIVERS[args.driver], CanDriver) and problem_of(args)[1]
+    return 0 if status.ledger["samples"] and not is_damaged else 1
 
 
 def play(args: argparse.Namespace) -> DeviceStatus:
@@ -91,6 +94,19 @@ def names_rate(args: argparse.Namespace) -> bool:
         return False
     with open_regular(args.file) as file:
         return CaptureReader(file).baud > 0
+
+
+def problem_of(args: argparse.Namespace) -> tuple[str, bool]:
+    """Read a capture without decoding it: what is wrong with the file, and whether that is damage, not a cut end."""
+    with open_regular(args.file) as file:
+        if isinstance(DRIVERS[args.driver], CanDriver):
+            log = CandumpReader(file)
+            deque(log, maxlen=0)
+            return log.problem, False
+        reader = CaptureReader(file)
+        if reader.stamped:
+            deque(reader, maxlen=0)
+        return reader.problem, reader.is_damaged
 
 
 def check(device: config.DeviceConfig) -> None:

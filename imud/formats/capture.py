@@ -51,6 +51,8 @@ class CaptureReader:
         self._offset = 0
         self.problem = ""
         """After iterating: how the file is cut short or damaged, one sentence; empty when it is whole."""
+        self.is_damaged = False
+        """After iterating: whether it is damaged, not only cut short."""
         self._head = _read_fully(file, len(MAGIC))
         self.stamped = self._head == MAGIC
         self.details: Mapping[str, str] = self._read_details() if self.stamped else {}
@@ -97,6 +99,7 @@ class CaptureReader:
                 return
             t_ns, length = RECORD.unpack(header)
             if length > RECORD_BYTES_MAX or (newest_ns is not None and t_ns < newest_ns):
+                self.is_damaged = True
                 self.problem = (
                     f"damaged at byte {self._offset}: record of {length} bytes at {t_ns} ns; the rest is left out"
                 )

@@ -53,6 +53,24 @@ def test_capture_without_samples_is_status_1(tmp_path: Path, capsys: pytest.Capt
     assert "samples   0" in capsys.readouterr().err
 
 
+def test_a_damaged_capture_is_status_1_and_one_that_is_cut_short_is_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "stamped"
+    records = b"".join(RECORD.pack(n * 10 * NS_PER_MS, len(hi91(0))) + hi91(10 * n) for n in range(50))
+    for content, status, words in (
+        (records[:-20], 0, "are a record cut short"),
+        (records + records, 1, "damaged at byte"),  # the time goes back
+    ):
+        file.write_bytes(b"#imud-capture 1 driver=hipnuc-uart baud=115200\n" + content)
+        assert main(["replay", str(file)]) == status
+        capsys.readouterr()
+        assert main(["export", "--to", "csv", str(file)]) == status
+        printed = capsys.readouterr()
+        assert words in printed.err
+        assert len(printed.out.splitlines()) == 1 + 50 - (status == 0)
+
+
 def test_missing_capture_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(tmp_path / "none")]) == 2
     assert "none" in capsys.readouterr().err

@@ -16,7 +16,7 @@ import numpy as np
 from imud import config
 from imud.analysis.series import FloatArray, Readings
 from imud.cli.arguments import connect, statuses
-from imud.cli.recording.replay import begins_as_recording
+from imud.cli.recording.replay import looks_like_recording
 from imud.cli.replay import BAUD, DRIVER, check, configuration, has_times, serve
 from imud.contracts.publisher import Batch
 from imud.contracts.sensors.data_sheet import DataSheet
@@ -191,7 +191,7 @@ def _sensor(values: "array[float]") -> FloatArray | None:
 def take_file(args: argparse.Namespace) -> Taken:
     """Read the samples of `args.input`, a recording or a capture. Raises ImudError, OSError."""
     with log_to(STDERR, "error"):
-        taken = take_recording(args) if begins_as_recording(args.input) else take_capture(args)
+        taken = take_recording(args) if looks_like_recording(args.input) else take_capture(args)
     if taken.readings is None or not len(taken.readings.t_ns):
         raise ImudError(f"{args.input}: expected samples, found none; `imud info` or `imud decode` say what is in it")
     return taken

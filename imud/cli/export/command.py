@@ -21,7 +21,7 @@ from imud.cli.export.output import ExportFile
 from imud.cli.export.progress import Progress
 from imud.cli.export.sinks import TABLES, CsvSink, Sink
 from imud.cli.export.source import Exported, ExportFeed, export_capture, export_recording, recorded_noise, times_of
-from imud.cli.recording.replay import begins_as_recording
+from imud.cli.recording.replay import looks_like_recording
 from imud.cli.streams import complain
 from imud.contracts.sensors.deviations import Deviations
 from imud.devices import DRIVERS
@@ -100,7 +100,7 @@ def check(args: argparse.Namespace) -> None:
 def _is_recording(args: argparse.Namespace) -> bool:
     """Raises ImudError for a file that is not there, BadArgument for options of captures with a recording."""
     try:
-        found = begins_as_recording(str(args.file))
+        found = looks_like_recording(str(args.file))
     except OSError as error:
         raise ImudError(f"{args.file}: expected a recording or a capture: {reason_of(error)}") from error
     for option, default in (("option", []), ("driver", None), ("baud", None)):

@@ -130,7 +130,9 @@ def export_capture(
     device = player.device
     words = [(reader.problem, "the file: "), (player.times.value, "times: ")]
     lines = [line for text, label in words if text for line in paragraph(label, text)]
-    return Exported("\n".join([*_block(device, player.times), "", *lines]), 0 if device.ledger.samples else 1)
+    is_damaged = isinstance(reader, CaptureReader) and reader.is_damaged
+    status = 0 if device.ledger.samples and not is_damaged else 1
+    return Exported("\n".join([*_block(device, player.times), "", *lines]), status)
 
 
 def times_of(file: BinaryIO, driver: Driver) -> KnownTimes | None:

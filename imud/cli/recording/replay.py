@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Callable, Collection
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 import msgspec
 
@@ -19,12 +19,15 @@ from imud.runtime.recording.player import PlayedDevice, Player
 from imud.units import NS_PER_MS
 
 DIFFERENCES_SHOWN = 3
+LOOKED_AT_BYTES: Final = 1 << 20
+"""Of a file whose begin is damaged: a recorder's blocks hold 256 KiB at most, but for records that are larger."""
 
 
-def begins_as_recording(path: str) -> bool:
-    """Whether a file is a recording by its first bytes. Raises OSError."""
+def looks_like_recording(path: str) -> bool:
+    """Whether a file is a recording by its first bytes, or by those of a later block. Raises OSError."""
     with open_regular(path) as file:
-        return is_recording(file.read(len(MAGIC)))
+        begin = file.read(LOOKED_AT_BYTES)
+    return is_recording(begin) or MAGIC in begin
 
 
 def play_recording(args: argparse.Namespace) -> int:
@@ -108,7 +111,7 @@ def remarks(reader: RecordingReader, player: Player) -> list[str]:
     """What else is to be known of the file."""
     found = [f"the file: {problem}" for problem in reader.problems]
     if player.lost:
-        found.append(f"{player.lost} records were dropped when it was written: what they held is missing")
+        found.append(f"records that were dropped when it was written: {player.lost}; what they held is missing")
     return ["\n".join(line for words in found for line in paragraph("", words))] if found else []
 
 

@@ -78,6 +78,18 @@ def test_a_damaged_file_is_an_answer_of_no(
     assert "damaged" in capsys.readouterr().err
 
 
+def test_a_recording_whose_first_bytes_are_damaged_is_no_capture(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "damaged.imudrec"
+    file.write_bytes(bytes(8) + recorded[0].read_bytes()[8:])
+    for command in (["replay"], ["export", "--to", "csv"]):
+        assert main([*command, str(file)]) == 1
+        printed = capsys.readouterr().err
+        assert "bytes from byte 0 on are damaged" in printed
+        assert "the capture" not in printed
+
+
 def test_a_reader_that_goes_away_ends_it(recorded: Recorded) -> None:
     argv = [sys.executable, "-m", "imud", "replay", "--json", str(recorded[0])]
     read, write = os.pipe()
