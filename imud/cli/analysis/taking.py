@@ -17,7 +17,7 @@ from imud import config
 from imud.analysis.series import FloatArray, Readings
 from imud.cli.arguments import connect, statuses
 from imud.cli.recording.replay import looks_like_recording
-from imud.cli.replay import BAUD, DRIVER, check, configuration, has_times, serve
+from imud.cli.replay import BAUD, DRIVER, check, configuration, has_times, problem_of, serve
 from imud.contracts.publisher import Batch
 from imud.contracts.sensors.data_sheet import DataSheet
 from imud.contracts.status import DeviceStatus
@@ -27,10 +27,11 @@ from imud.errors import BadArgument, ImudError
 from imud.event import Event
 from imud.files import open_regular
 from imud.formats.recording.file import RecordingReader
+from imud.formats.recording.records import Kind
 from imud.ledger import LEDGER_FIELDS
 from imud.log import STDERR, log_to
 from imud.runtime import event_loop
-from imud.runtime.recording.player import Player
+from imud.runtime.recording.player import PlayedDevice, Player
 from imud.sample import Sample
 from imud.units import NS_PER_S
 
@@ -40,6 +41,7 @@ SILENCE_S: Final = 5.0
 """A live device that sends nothing for so long is named."""
 LATENCY_MS: Final = 200.0
 """Samples of a live device may come so late, several at once: an analysis costs the daemon little then."""
+LOSSES: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))
 NOTE_S: Final = 1.0
 """Time between two notes of progress."""
 _NONE3: Final = (nan, nan, nan)
@@ -90,6 +92,8 @@ class Collector:
         self.syncs: Counter[str] = Counter()
         self.by_device_time = False
         """Whether to date samples by the device's clock."""
+        self.look: Callable[[], None] = lambda: None
+        """Called after the first sample that is kept and the last that was asked for: losses are those between."""
         self._chosen = bool(name)
         self._skip_ns, self._for_ns = round(skip_s * NS_PER_S), None if for_s is None else round(for_s * NS_PER_S)
         self._begin_ns: int | None = None
@@ -158,8 +162,11 @@ class Collector:
 
     def publish(self, batch: Batch) -> None:
         """Take the samples."""
+        before = self.first, self.done
         for sample in batch.samples:
             self.add(sample)
+        if (self.first, self.done) != before:
+            self.look()
 
     def start(self) -> None:
         """No-op: there is nothing to open."""
@@ -180,6 +187,32 @@ class Collector:
         """No-op: nothing is open."""
 
 
+class LossTally:
+    """Tally of how many samples a device lost by each cause while its ledger was looked at."""
+
+    def __init__(self) -> None:
+        self.lost: Counter[str] = Counter()
+        """By the ledger's names."""
+        self._newest: Mapping[str, int] | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether the ledger was looked at."""
+        return self._newest is not None
+
+    def look(self, ledger: Mapping[str, int]) -> None:
+        """Add what was lost since the look before. A ledger with fewer samples than then has begun anew."""
+        before = self._newest if self._newest is not None else ledger
+        if ledger.get("samples", 0) < before.get("samples", 0):
+            before = {}
+        self.lost.update({name: ledger.get(name, 0) - before.get(name, 0) for name in LOSSES})
+        self._newest = ledger
+
+    def found(self) -> dict[str, int]:
+        """Return the causes by which samples were lost."""
+        return {name: count for name, count in self.lost.items() if count}
+
+
 def _sensor(values: "array[float]") -> FloatArray | None:
     found = np.array(values).reshape(-1, 3)
     return found if np.isfinite(found).any() else None
@@ -193,7 +226,12 @@ def take_file(args: argparse.Namespace) -> Taken:
     with log_to(STDERR, "error"):
         taken = take_recording(args) if looks_like_recording(args.input) else take_capture(args)
     if taken.readings is None or not len(taken.readings.t_ns):
-        raise ImudError(f"{args.input}: expected samples, found none; `imud info` or `imud decode` say what is in it")
+        after = f" of {args.device}" if args.device else ""
+        after += f" later than {args.skip:g} s after its first (--skip)" if args.skip else ""
+        raise ImudError(
+            f"{args.input}: expected samples{after}, found none; `imud info` says what is in a recording, "
+            "`imud decode` what is in a capture"
+        )
     return taken
 
 
@@ -203,42 +241,54 @@ def take_recording(args: argparse.Namespace) -> Taken:
         if getattr(args, option) != default:
             raise BadArgument(f"--{option}: expected none with a recording, which has those of the live run")
     collector = Collector(args.device or "", skip_s=args.skip or 0.0, for_s=args.duration)
-    taken, before = Taken(args.input), None
+    taken, tally = Taken(args.input), LossTally()
     with open_regular(args.input) as file:
         player = Player(collector.publish)
         reader = RecordingReader(file, args.input)
+
+        def look() -> None:
+            if (device := played(player, collector.name)) is not None and collector.first is not None:
+                tally.look(device.ledger.snapshot())
+
+        collector.look = look
         for record in reader:
+            if record.kind == Kind.PATH:  # it may begin the ledger anew
+                look()
             player.play((record,))
-            if collector.first is not None and before is None:
-                before = _ledgers(player)
+            if record.kind in (Kind.PATH, Kind.CHECK):
+                look()
             if collector.done or collector.others:
                 break
+        if not collector.done:
+            look()
     names = [device.described.name for device in player.devices.values()]
     if collector.others:
         raise BadArgument(f"{args.input}: it has {', '.join(names)}: choose one with --device")
     if args.device and args.device not in names:
-        raise BadArgument(f"--device {args.device}: expected one of the recording's, {', '.join(names)}")
-    for device in player.devices.values():
-        if device.described.name == collector.name:
-            taken.driver = device.driver.name if device.driver is not None else device.described.driver
-            taken.link, taken.identity = device.described.where, device.described.identity
-            taken.settings = device.described.settings
-            taken.notes += [f"clock: {why}" for why in device.fresh_starts[:1]]
-            taken.notes += [f"replay: {len(device.differences)} checks differ" for _ in device.differences[:1]]
+        there = ", ".join(names) or "none: the block that names them is damaged or missing"
+        raise BadArgument(f"--device {args.device}: expected one of the recording's, {there}")
+    _describe(taken, player, collector.name)
     taken.notes += list(reader.problems)
     if player.lost:
-        taken.notes.append(f"{player.lost} records were dropped when the file was written")
-    after = _ledgers(player)
-    return _finished(taken, collector, _lost((before or {}).get(collector.name, {}), after.get(collector.name, {})))
+        taken.notes.append(f"records that were dropped when the file was written: {player.lost}")
+    return _finished(taken, collector, tally.found())
 
 
-def _ledgers(player: Player) -> dict[str, dict[str, int]]:
-    return {device.described.name: device.ledger.snapshot() for device in player.devices.values()}
+def played(player: Player, name: str) -> PlayedDevice | None:
+    """Return the device of this name; None where there is none yet."""
+    return next((device for device in player.devices.values() if device.described.name == name), None)
 
 
-def _lost(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
-    causes = [name for name in LEDGER_FIELDS if name.startswith("lost_")]
-    return {name: count for name in causes if (count := after.get(name, 0) - before.get(name, 0))}
+def _describe(taken: Taken, player: Player, name: str) -> None:
+    """Note what the recording has of the device, and how it was replayed."""
+    if (device := played(player, name)) is None:
+        return
+    taken.driver = device.driver.name if device.driver is not None else device.described.driver
+    taken.link, taken.identity = device.described.where, device.described.identity
+    taken.settings = device.described.settings
+    taken.notes += [f"clock: {why}" for why in device.fresh_starts[:1]]
+    if device.differences:
+        taken.notes.append(f"replay: {len(device.differences)} of {device.checks} checks differ")
 
 
 def take_capture(args: argparse.Namespace) -> Taken:
@@ -252,11 +302,17 @@ def take_capture(args: argparse.Namespace) -> Taken:
     collector = Collector(skip_s=args.skip or 0.0, for_s=args.duration)
     collector.by_device_time = not has_times(replayed)
     daemon = Daemon(settings, extra={"collect": collector}, until_finished=True)
+    tally = LossTally()
+    collector.look = lambda: tally.look(daemon.status()[0].ledger)
     event_loop.run(serve(daemon))
+    if not collector.done:
+        collector.look()
     status = daemon.status()[0]
     taken = Taken(args.input, driver=status.driver, link=status.link, identity=status.identity)
     taken.settings = status.settings
-    finished = _finished(taken, collector, _lost({}, status.ledger))
+    if problem := problem_of(replayed)[0]:
+        taken.notes.append(problem)
+    finished = _finished(taken, collector, tally.found())
     finished.device, finished.begun_utc_ns = args.device or "capture", None
     return finished
 
@@ -281,10 +337,15 @@ def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lam
         before = status_of(statuses(asking), args.input)
         collector = Collector(args.input, skip_s=args.skip or 0.0, for_s=args.duration)
         samples = listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS)
+        tally = LossTally()
+        if not args.skip:
+            tally.look(before.ledger)
         begun = noted = monotonic()
         with suppress(KeyboardInterrupt):
             for sample in samples:
                 collector.add(sample)
+                if not tally.begun and collector.first is not None:
+                    tally.look(status_of(statuses(asking), args.input).ledger)
                 now = monotonic()
                 if now - noted >= NOTE_S:
                     noted = now
@@ -294,7 +355,9 @@ def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lam
         after = status_of(statuses(asking), args.input)
         taken = taken_of(after, args.socket)
         dropped = samples.dropped.get(args.input, 0)
-    lost = _lost(before.ledger, after.ledger)
+    if tally.begun:
+        tally.look(after.ledger)
+    lost = tally.found()
     return _finished(taken, collector, lost | ({"dropped": dropped} if dropped else {}))
 
 

@@ -71,6 +71,8 @@ class RecordingReader:
         """What the blocks take in the file, and what is in them."""
         self.ended = False
         """Whether the file has its regular end."""
+        self._is_read = False
+        """Whether the iteration came to the end of the file."""
 
     def __iter__(self) -> Iterator[Record]:
         for block in self.blocks:
@@ -87,6 +89,7 @@ class RecordingReader:
                     self._look_at(record)
                 yield record
             self.ended = found[-1].kind == Kind.END if found else self.ended
+        self._is_read = True
         if not self.blocks_read:
             raise ImudError(f"{self._name} is no recording of imud, or nothing of it is left: no whole block is in it")
 
@@ -105,7 +108,7 @@ class RecordingReader:
 
     @property
     def problems(self) -> list[str]:
-        """After iterating: what is wrong with the file, one sentence each; empty for a whole one."""
+        """After iterating: what is wrong with what was read of the file, one sentence each; empty for a whole one."""
         read, found = self.blocks, []
         if read.bytes_bad:
             found.append(f"{read.bytes_bad} bytes from byte {read.first_bad} on are damaged, and left out")
@@ -115,6 +118,6 @@ class RecordingReader:
             found.append(f"the last {read.bytes_cut} bytes are a block cut short, left out")
         if self.records_unreadable:
             found.append(f"{self.records_unreadable} blocks hold something else than records, left out")
-        if not self.ended:
+        if self._is_read and not self.ended:
             found.append("it has no regular end: imud or the machine stopped while it was written, or still writes")
         return found

@@ -15,9 +15,11 @@ from imud.cli.analysis.commands import bands_hz
 from imud.cli.output import COLUMNS
 from imud.sim.physics.motion import GRAVITY_M_S2
 from imud.sim.physics.noise import NoiseLevels
+from imud.units import NS_PER_MS
 from tests.cli.analysis.captures import frame, resting, shaken, write_capture
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
 from tests.support.daemon_process import RunningDaemon, daemon_with_module, sending_daemon
+from tests.support.files import CaptureWriter, hi91
 
 SET_HZ, TRUE_HZ, SHAKEN_HZ = 400.0, 408.0, 63.7
 SHEET = "source: a sheet\ngyro: {random_walk_deg_sqrt_h: 0.5}\naccel: {random_walk_m_s_sqrt_h: 0.001}\n"
@@ -129,6 +131,43 @@ def test_a_recording_of_two_devices(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "--driver: expected none with a recording" in capsys.readouterr().err
 
 
+def test_a_part_of_a_recording_says_nothing_of_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = run_recorded(tmp_path)[2]
+    assert main(["noise", "--json", "--device", "bow", "--for", "1s", str(file)]) == 0
+    measurement = json.loads(capsys.readouterr().out)["measurement"]
+    assert measurement["samples"] < FRAMES
+    assert measurement["notes"] == []
+
+
+# --- captures ---------------------------------------------------------------------------------------------------------
+
+
+def gappy(file: Path) -> Path:
+    """A capture of 10 s at 100 Hz, of which the seventh second is missing."""
+    with file.open("wb") as out:
+        writer = CaptureWriter(out, driver="hipnuc-uart", baud=115200)
+        for number in [*range(600), *range(700, 1000)]:
+            writer.write(hi91(10 * number), (100 + number) * 10 * NS_PER_MS)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("part", "lost"), [([], 100), (["--for", "5s"], 0), (["--skip", "7.5s"], 0), (["--skip", "2s"], 100)]
+)
+def test_losses_are_those_of_the_part_that_was_taken(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], part: list[str], lost: int
+) -> None:
+    assert main(["noise", "--json", *part, str(gappy(tmp_path / "c.capture"))]) == 0
+    assert json.loads(capsys.readouterr().out)["measurement"]["lost"] == ({"lost_gap_device": lost} if lost else {})
+
+
+def test_a_damaged_capture_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = gappy(tmp_path / "c.capture")
+    file.write_bytes(file.read_bytes() * 2)
+    assert main(["spectrum", str(file)]) == 0
+    assert "damaged at byte" in capsys.readouterr().out
+
+
 # --- what is wrong ----------------------------------------------------------------------------------------------------
 
 
@@ -149,7 +188,7 @@ def test_a_raw_capture_is_dated_by_the_device(tmp_path: Path, capsys: pytest.Cap
         (["spectrum", "-o", "a.html"], "ends in .svg or .png"),
         (["spectrum", "--resolution", "0.0001"], "resolution 0.0001 Hz: expected from"),
         (["spectrum", "--bands", "10-900"], "expected 0 to 50 Hz"),
-        (["noise", "--skip", "1h"], "expected samples, found none"),
+        (["noise", "--skip", "1h"], "expected samples later than 3600 s after its first (--skip), found none"),
         (["noise", "--sheet", "/nowhere"], "--sheet /nowhere"),
         (["noise", "-o", "/nowhere/a.svg"], "/nowhere/a.svg"),
     ],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imud.cli.analysis.taking import Collector, status_of
+from imud.cli.analysis.taking import Collector, LossTally, status_of
 from imud.contracts.publisher import Batch
 from imud.errors import BadArgument
 from imud.sample import Sample, Sync
@@ -94,3 +94,21 @@ def test_more_samples_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_device_that_is_not_there() -> None:
     with pytest.raises(BadArgument, match="bow: expected a file, or a device of the daemon"):
         status_of([], "bow")
+
+
+def test_losses_are_those_between_the_looks_although_a_ledger_begins_anew() -> None:
+    tally = LossTally()
+    tally.look({"samples": 5000, "lost_crc": 7, "lost_unknown": 1})
+    tally.look({"samples": 5100, "lost_crc": 9, "lost_unknown": 1})
+    tally.look({"samples": 0, "lost_crc": 0, "lost_unknown": 0})
+    tally.look({"samples": 100, "lost_crc": 3, "lost_unknown": 0})
+    assert tally.found() == {"lost_crc": 2 + 3}
+
+
+def test_losses_are_looked_for_when_the_first_sample_is_kept_and_when_all_are_there() -> None:
+    looks: list[int] = []
+    collector = Collector(skip_s=1.0, for_s=1.0)
+    collector.look = lambda: looks.append(len(collector))
+    for number in range(0, 60, 5):
+        collector.publish(Batch("bow", 0, [sample(number + at) for at in range(5)]))
+    assert looks == [5, 11]
