@@ -4,6 +4,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -72,6 +73,20 @@ def confirmed(what: str, risk: str, *, yes: bool) -> bool:
         return True
     print("nothing was done")
     return False
+
+
+# --- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def finite(text: str) -> float:
+    """Read a number. Raises ArgumentTypeError, also for infinity and for what is not a number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = nan
+    if not isfinite(number):
+        raise argparse.ArgumentTypeError(f"expected a number, got {text!r}")
+    return number
 
 
 # --- durations ----------------------------------------------------------------------------------------------------

@@ -10,10 +10,11 @@ from typing import Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket, connect, statuses
+from imud.cli.arguments import CliCommand, add_socket, connect, finite, statuses
 from imud.cli.output import histogram
 from imud.client import Client
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
+from imud.errors import ImudError
 from imud.sample import Sync
 from imud.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -25,6 +26,7 @@ ENOUGH: Final = 20
 """Least number of arrivals for a statement about their spread."""
 HELD_SHARE: Final = 0.5
 """An adapter that holds bytes for up to its timer spreads arrivals over most of it."""
+TOO_FEW: Final = "too few samples to say"
 LOADED_NS: Final = NS_PER_MS
 """Arrivals of a wire and an idle system spread over some ten microseconds."""
 EDGES_ENOUGH: Final = 100
@@ -37,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `imud clock`."""
     add_socket(parser)
     parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to look at (default: all)")
-    parser.add_argument("--duration", type=float, metavar="S", help="listen for S seconds, then print once and end")
+    parser.add_argument("--duration", type=finite, metavar="S", help="listen for S seconds, then print once and end")
     parser.add_argument("--json", action="store_true", help="the clocks once, as the socket sends them")
 
 
@@ -45,6 +47,8 @@ def run(args: argparse.Namespace) -> int:
     """Show the report, live until interrupted; return 1 when no sample came."""
     with connect(args) as asking:
         chosen = args.device or [status.name for status in statuses(asking)]
+        if not chosen and not args.json:
+            raise ImudError("the daemon has no device; `imud setup` finds what is attached and configures it")
         if args.json:
             clocks = {status.name: status.clock for status in statuses(asking) if status.name in chosen}
             print(msgspec.json.encode(clocks).decode())
@@ -65,7 +69,7 @@ def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | No
     With a duration it ends then, and nothing is drawn. Reports are due in silence, too.
     """
     begun = drawn = monotonic()
-    samples = client.watch(list(behind), timeout_s=REFRESH_S if duration_s is None else duration_s)
+    samples = client.watch(list(behind), timeout_s=REFRESH_S if duration_s is None else min(REFRESH_S, duration_s))
     while True:
         with suppress(TimeoutError):
             sample = next(samples)
@@ -131,6 +135,8 @@ def verdict(clock: ClockStatus, behind_ns: Sequence[int]) -> str:
         return f"the device keeps UTC itself; what the host knows of UTC limits: {error}"
     if clock.sync is Sync.EDGE:
         return f"limited by the kernel's stamps of the line: {error}"
+    if clock.sync is Sync.ARRIVAL and not clock.t_err_ns:  # no sample came yet
+        return TOO_FEW
     if clock.sync is Sync.ARRIVAL:
         return f"the device's time is not used, so arrivals are all there is: {error}; wire SOUT if it has one"
     return _of_arrivals(clock, sorted(behind_ns))
@@ -167,7 +173,7 @@ def miswired(clock: ClockStatus) -> str:
 def _of_arrivals(clock: ClockStatus, ordered: Sequence[int]) -> str:
     """Judge the link by the spread of arrivals."""
     if len(ordered) < ENOUGH:
-        return "too few samples to say"
+        return TOO_FEW
     spread_ns = ordered[int(0.99 * len(ordered))] - ordered[int(0.01 * len(ordered))]
     spread = f"arrivals spread over {spread_ns / NS_PER_MS:.1f} ms"
     if clock.hold_ns and spread_ns >= HELD_SHARE * clock.hold_ns:

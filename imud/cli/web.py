@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until a signal. Raises BadArgument without the library, and for what cannot be served safely."""
+    """Serve until a signal. Raises BadArgument without the library, and for what cannot be served, or not safely."""
     if not 0 <= args.port <= PORT_MAX:
         raise BadArgument(f"--port: expected 0 to {PORT_MAX}, got {args.port}")
     guard = guard_of(args)

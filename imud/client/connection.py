@@ -14,6 +14,7 @@ import socket
 from collections import deque
 from collections.abc import Iterable
 from contextlib import ExitStack
+from math import isfinite
 from time import monotonic
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
@@ -184,8 +185,8 @@ class Client:
         """
         wanted = None if fields is None else sorted({*fields, "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
         reply = self._answer(
-            "watch", WatchAnswer, devices=_listed(devices), fields=wanted, rate_hz=rate_hz, encoding=encoding,
-            convention=convention, latency_ms=latency_ms,
+            "watch", WatchAnswer, devices=_listed(devices), fields=wanted, rate_hz=_finite(rate_hz), encoding=encoding,
+            convention=convention, latency_ms=_finite(latency_ms),
         )  # fmt: skip
         if encoding == "binary":
             self._framed = True
@@ -213,7 +214,7 @@ class Client:
         nothing: read them all. It ends with the connection, and when `notify` is asked for the same device again, which
         gives a new one.
         """
-        self.call("notify", device=device, latency_ms=latency_ms)
+        self.call("notify", device=device, latency_ms=_finite(latency_ms))
         return self._descriptor("notify")
 
     # --- recordings -------------------------------------------------------------------------------------------------
@@ -383,6 +384,13 @@ def _listed(names: Iterable[str] | None) -> list[str] | None:
     if isinstance(names, str):
         raise TypeError(f"expected a list of names, got the string {names!r}")
     return None if names is None else list(names)
+
+
+def _finite(value: float | None) -> float | None:
+    """Raise ValueError for what JSON does not have, and would arrive as null: as if nothing was asked for."""
+    if value is not None and not isfinite(value):
+        raise ValueError(f"expected a finite number, got {value}")
+    return value
 
 
 def _connect(path: str, timeout_s: float) -> socket.socket:

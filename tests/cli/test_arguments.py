@@ -12,6 +12,24 @@ from tests.cli.test_decode import MANUAL_FRAME
 from tests.support.files import imu61x_log
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("watch", "--rate"),
+        ("watch", "--latency"),
+        ("clock", "--duration"),
+        ("demo", "--duration"),
+        ("demo", "--rate"),
+    ],
+)
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "ten"])
+def test_what_is_no_number_is_refused(words: tuple[str, str], value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([*words, value] if value != "-inf" else [words[0], f"{words[1]}={value}"])
+    assert ended.value.code == 2
+    assert f"argument {words[1]}: expected a number, got '{value}'" in capsys.readouterr().err
+
+
 @pytest.fixture
 def moved(tmp_path: Path) -> Path:
     """A device whose identifiers begin at 512."""

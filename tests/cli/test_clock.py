@@ -47,6 +47,14 @@ def test_silence_ends_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert f"bow is missing: {tmp_path}/none is not there: is the cable plugged in" in out
 
 
+def test_without_a_device_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with running_daemon(tmp_path, {}) as daemon:
+        assert main(["clock", "--socket", str(daemon.socket)]) == 2
+        assert "imud clock: the daemon has no device; `imud setup` finds" in capsys.readouterr().err
+        assert main(["clock", "--socket", str(daemon.socket), "--json"]) == 0
+        assert capsys.readouterr().out == "{}\n"
+
+
 def test_what_tells_the_time_besides_arrivals_has_rows() -> None:
     assert list(aids(device("plain"))) == []
     assert list(aids(equipped("bow"))) == [
@@ -78,6 +86,7 @@ TIMER = [2 * MS + (n * 160 % 16_000) * 1_000 for n in range(200)]
         (ClockStatus(Sync.UTC, t_err_ns=300_000), WIRE, "the host knows of UTC limits: 300.0 µs"),
         (ClockStatus(Sync.EDGE, t_err_ns=4_000), TIMER, "the kernel's stamps of the line: 4.0 µs"),
         (ClockStatus(Sync.ARRIVAL, t_err_ns=4_000), WIRE, "arrivals are all there is"),
+        (ClockStatus(Sync.ARRIVAL), [], "too few"),
         (ClockStatus(Sync.REGRESSION), WIRE[: ENOUGH - 1], "too few"),
         (ClockStatus(Sync.REGRESSION), WIRE, "arrivals spread over 0.0 ms; the constant delay"),
         (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), TIMER, "USB adapter's latency timer of 16 ms"),

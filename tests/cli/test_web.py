@@ -37,6 +37,12 @@ def test_another_address_needs_a_token() -> None:
         parsed("--reading", "token")
 
 
+@pytest.mark.parametrize("port", ["-1", "65536", "99999999999999999999"])
+def test_a_port_that_there_is_not(port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["web", "--port", port]) == 2
+    assert f"--port: expected 0 to 65535, got {port}" in capsys.readouterr().err
+
+
 def test_who_may_look(token: str) -> None:
     def can_read(*words: str) -> bool:
         guard = guard_of(build_parser(("web",)).parse_args(["web", *words]))

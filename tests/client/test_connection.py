@@ -73,6 +73,10 @@ def test_what_the_daemon_refuses_is_raised_and_the_connection_lives_on(served: D
             client.call("config.get")
         with pytest.raises(TypeError, match="list of names"):
             client.poll("imu0")
+        with pytest.raises(ValueError, match="finite number, got nan"):
+            client.watch(rate_hz=math.nan)
+        with pytest.raises(ValueError, match="finite number, got inf"):
+            client.notify("imu0", latency_ms=math.inf)
         assert len(client.devices()) == 2
 
 

@@ -19,7 +19,7 @@ from time import monotonic, sleep
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, statuses
+from imud.cli.arguments import CliCommand, finite, statuses
 from imud.cli.demo.view import View
 from imud.cli.status import block, closes
 from imud.client import Client
@@ -56,9 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bus", type=int, metavar="N", help="I2C bus that a real device hangs on: 1 for /dev/i2c-1")
     parser.add_argument("--port", metavar="NODE", help="SPI bus and chip select of a real device: /dev/spidev0.0")
     parser.add_argument("--interface", metavar="NAME", help="CAN interface of a CAN device (the first that is up)")
-    parser.add_argument("--duration", type=float, metavar="S", help="stop after S seconds (default: at Ctrl-C)")
+    parser.add_argument("--duration", type=finite, metavar="S", help="stop after S seconds (default: at Ctrl-C)")
     parser.add_argument(
-        "--rate", type=float, default=100.0, metavar="HZ", help="samples a second (default: %(default)s)"
+        "--rate", type=finite, default=100.0, metavar="HZ", help="samples a second (default: %(default)s)"
     )
     parser.add_argument("--plain", action="store_true", help="no live view, only the account at the end")
 

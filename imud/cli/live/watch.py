@@ -5,7 +5,7 @@ import sys
 from time import monotonic
 from typing import Final
 
-from imud.cli.arguments import CliCommand, add_socket, chosen_fields
+from imud.cli.arguments import CliCommand, add_socket, chosen_fields, finite
 from imud.cli.live.following import LOOK_S, DeviceNotes, keep_connected
 from imud.cli.live.formats import OUTPUTS, SampleOutput
 from imud.cli.streams import raise_if_unread
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
     parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to watch (default: all)")
     parser.add_argument(
-        "--rate", type=float, default=None, metavar="HZ",
+        "--rate", type=finite, default=None, metavar="HZ",
         help=f"at most this many samples a second each; 0: every sample (default: table {TABLE_HZ:g}, json and csv 0)",
     )  # fmt: skip
     parser.add_argument(
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="axes and angles of the samples (default: as configured)",
     )  # fmt: skip
     parser.add_argument(
-        "--latency", type=float, default=None, metavar="MS",
+        "--latency", type=finite, default=None, metavar="MS",
         help="samples may be so late, which costs less CPU (default: a period of the rate, at most 20; without one, 0)",
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=None, metavar="N", help="stop after N samples")

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from imud.cli.arguments import CliCommand, add_socket
+from imud.cli.arguments import CliCommand, add_socket, finite
 from imud.cli.doctor.surroundings import Surroundings, ask_daemon, run_command
 from imud.cli.run import DEFAULT_FILE
 from imud.cli.setup.attached import Wanted
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--control", action="store_true", help="the user that runs sudo may also change settings of modules"
     )
     parser.add_argument(
-        "--wait", type=float, default=WAIT_S, metavar="S", help="longest wait for samples (default: %(default)g s)"
+        "--wait", type=finite, default=WAIT_S, metavar="S", help="longest wait for samples (default: %(default)g s)"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object, with --yes or --dry-run")
 

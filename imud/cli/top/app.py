@@ -136,7 +136,8 @@ class TopApp(App[None]):
             return printable(self.problem, TEXT_MAX)
         devices = self.fleet.devices.values()
         well = sum(device.status.state in WELL for device in devices)
-        words = f"imud: {well} of {len(devices)} devices well, {self.fleet.clients} clients"
+        words = f"imud: {well} of {len(devices)} devices well, {self.fleet.clients} client"
+        words += "" if self.fleet.clients == 1 else "s"
         return words + ("  PAUSED" if self.paused else "")
 
     def _post(self, news: News) -> None:

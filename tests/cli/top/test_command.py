@@ -65,8 +65,8 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
 
 def test_without_a_terminal_it_says_what_to_use_instead(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top"]) == 2
-    expected = "imud top: expected a terminal; `imud status` and `imud watch` write to anything\n"
-    assert capsys.readouterr().err == expected
+    words = "expected a terminal; `imud status` and `imud watch` write to anything"
+    assert capsys.readouterr().err == f"imud top: {words}\n"
 
 
 def test_without_the_library_it_says_how_to_get_it(
