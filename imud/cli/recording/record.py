@@ -18,6 +18,7 @@ from typing import BinaryIO, Final
 
 from imud.cli.arguments import CliCommand, add_socket, connect, duration_s
 from imud.cli.recording.info import Contents
+from imud.cli.streams import discard_output
 from imud.client import Client
 from imud.errors import BadArgument, ImudError, reason_of
 from imud.formats.recording.file import RecordingReader
@@ -127,7 +128,7 @@ class Copy:
         self._moved_s = monotonic()
 
     def read(self, size: int, /) -> bytes:
-        """Return what is there, or comes next; nothing at the end. Raises ImudError, BrokenPipeError."""
+        """Return what is there, or comes next; nothing at the end. Raises ImudError."""
         while True:
             self.look()
             if select.select((self._stream,), (), (), LOOK_S)[0]:
@@ -150,8 +151,9 @@ class Copy:
             while rest:
                 rest = rest[self._out.write(rest) :]
             self._out.flush()
-        except BrokenPipeError:
-            raise
+        except BrokenPipeError:  # no `imud watch | head`: who asked for the recording does not have it
+            discard_output()
+            raise ImudError(f"{self._name}: nobody reads it any more; the recording ended before it was to") from None
         except OSError as error:
             raise ImudError(f"{self._name}: {reason_of(error)}; what was written before is whole") from None
 

@@ -116,6 +116,17 @@ def test_a_full_disk_ends_it_with_a_message(daemon: RunningDaemon) -> None:
     assert "standard output: No space left on device; what was written before is whole" in done.stderr
 
 
+def test_a_pipe_that_nobody_reads_is_no_recording(daemon: RunningDaemon) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    argv = command(daemon, "--for", "5s", "-")
+    done = subprocess.run(argv, stdout=write, stderr=subprocess.PIPE, text=True, timeout=LIMIT_S, check=False)
+    os.close(write)
+    assert done.returncode == 2
+    words = "imud record: standard output: nobody reads it any more; the recording ended before it was to\n"
+    assert done.stderr == words
+
+
 def test_a_daemon_that_stops_ends_it_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = str(stamped_capture(tmp_path / "capture"))
     played = {"driver": "hipnuc-uart", "replay": {"path": capture, "speed": "recorded", "repeat": True}}
