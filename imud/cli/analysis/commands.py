@@ -115,10 +115,7 @@ def take(args: argparse.Namespace) -> Any:
     for option, default in (("device", None), ("driver", None), ("baud", None), ("option", [])):
         if getattr(args, option) != default:
             raise BadArgument(f"--{option}: expected none with a device of the daemon; {args.input} is no file")
-    try:
-        return taking.take_live(args, taking.progress)
-    except TimeoutError:
-        raise BadArgument(f"{args.input}: it sends no samples; `imud status` says why") from None
+    return taking.take_live(args, taking.progress)
 
 
 def show(args: argparse.Namespace, report: Any, module: Any) -> int:

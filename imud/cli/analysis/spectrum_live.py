@@ -14,7 +14,7 @@ from imud.analysis.series import FloatArray
 from imud.analysis.spectrum import Spectrum
 from imud.analysis.spectrum_plots import SensorVibration
 from imud.cli.analysis.spectrum_report import SpectrumSettings, peak_lines, sensor_vibration
-from imud.cli.analysis.taking import LATENCY_MS, SILENCE_S, Collector, status_of
+from imud.cli.analysis.taking import LATENCY_MS, SILENCE_S, Collector, heard, status_of
 from imud.cli.arguments import connect, statuses
 from imud.cli.output import COLUMNS, shortened
 from imud.contracts.sensors.data_sheet import SensorName
@@ -36,7 +36,7 @@ CLEAR: Final = "\x1b[H\x1b[2J"
 
 
 def live(args: argparse.Namespace, settings: SpectrumSettings) -> int:
-    """Redraw until interrupted. Raises ImudError; TimeoutError in silence."""
+    """Redraw until interrupted. Raises ImudError."""
     name = settings.sensors[0]
     with connect(args) as asking, connect(args) as listening:
         status_of(statuses(asking), args.input)
@@ -44,7 +44,12 @@ def live(args: argparse.Namespace, settings: SpectrumSettings) -> int:
         view = LiveView(args.input, name)
         drawn_s = monotonic()
         with suppress(KeyboardInterrupt):
-            for sample in listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS):
+            samples = listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS)
+            for sample in heard(samples, args.input):
+                if sample is None:
+                    sys.stdout.write(f"{CLEAR}{args.input} sends no samples now; `imud status` says why\n")
+                    sys.stdout.flush()
+                    continue
                 collector.add(sample)
                 if monotonic() - drawn_s >= REDRAW_S:
                     drawn_s = monotonic()

@@ -4,7 +4,7 @@ import argparse
 import sys
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import nan
@@ -330,8 +330,9 @@ def _finished(taken: Taken, collector: Collector, lost: dict[str, int]) -> Taken
 def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lambda _passed_s, _count: None) -> Taken:
     """Collect the samples of the device `args.input` for `args.duration`, or until interrupted.
 
-    `note` is called about once a second with the time passed and the number of samples. Raises ImudError; TimeoutError
-    in silence.
+    A device that falls silent is waited for until `args.duration` is over by the clock; what came is kept. `note` is
+    called about once a second with the time passed and the number of samples. Raises ImudError, BadArgument where
+    nothing comes from the begin.
     """
     with connect(args) as asking, connect(args) as listening:
         before = status_of(statuses(asking), args.input)
@@ -342,7 +343,11 @@ def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lam
             tally.look(before.ledger)
         begun = noted = monotonic()
         with suppress(KeyboardInterrupt):
-            for sample in samples:
+            for sample in heard(samples, args.input):
+                if sample is None:
+                    if args.duration is not None and monotonic() - begun >= args.duration + (args.skip or 0.0):
+                        break
+                    continue
                 collector.add(sample)
                 if not tally.begun and collector.first is not None:
                     tally.look(status_of(statuses(asking), args.input).ledger)
@@ -359,6 +364,23 @@ def take_live(args: argparse.Namespace, note: Callable[[float, int], None] = lam
         tally.look(after.ledger)
     lost = tally.found()
     return _finished(taken, collector, lost | ({"dropped": dropped} if dropped else {}))
+
+
+def heard(samples: Iterator[Sample], name: str) -> Iterator[Sample | None]:
+    """Yield the samples, and None after each SILENCE_S without one. Raises BadArgument where none comes at all."""
+    silent = True
+    while True:
+        try:
+            sample = next(samples)
+        except TimeoutError:
+            if silent:
+                raise BadArgument(f"{name}: it sends no samples; `imud status` says why") from None
+            yield None
+        except StopIteration:
+            return
+        else:
+            silent = False
+            yield sample
 
 
 def status_of(found: Iterable[DeviceStatus], name: str) -> DeviceStatus:

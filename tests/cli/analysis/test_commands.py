@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from imud.cli import main
+from imud.cli.analysis import spectrum_live, taking
 from imud.cli.analysis.commands import bands_hz
 from imud.cli.output import COLUMNS
 from imud.sim.physics.motion import GRAVITY_M_S2
@@ -18,7 +19,7 @@ from imud.sim.physics.noise import NoiseLevels
 from imud.units import NS_PER_MS
 from tests.cli.analysis.captures import frame, resting, shaken, write_capture
 from tests.cli.recording.recorded_daemon import FRAMES, run_recorded
-from tests.support.daemon_process import RunningDaemon, daemon_with_module, sending_daemon
+from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon, sending_daemon
 from tests.support.files import CaptureWriter, hi91
 
 SET_HZ, TRUE_HZ, SHAKEN_HZ = 400.0, 408.0, 63.7
@@ -273,3 +274,26 @@ def test_the_noise_of_a_live_device(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert max(map(len, text.splitlines())) <= COLUMNS
     for word in ("live from", "angle random walk N", "bow, driver hipnuc-uart"):
         assert word in text, word
+
+
+def test_a_device_that_falls_silent_loses_nothing_of_before(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(taking, "SILENCE_S", 0.5)
+    with sending_daemon(tmp_path, lambda n: hi91(10 * n) if n < 400 else b"") as daemon:
+        assert main(["noise", "--json", "--for", "7s", "--socket", str(daemon.socket), "bow"]) == 0
+    measurement = json.loads(capsys.readouterr().out)["measurement"]
+    assert 100 < measurement["samples"] < 400
+
+
+@pytest.mark.parametrize("on_a_terminal", [True, False])
+def test_a_device_that_sends_nothing_at_all_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, on_a_terminal: bool
+) -> None:
+    monkeypatch.setattr(taking, "SILENCE_S", 0.2)
+    monkeypatch.setattr(spectrum_live, "SILENCE_S", 0.2)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: on_a_terminal)
+    device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
+    with running_daemon(tmp_path, {"bow": device}) as daemon:
+        assert main(["spectrum", "--socket", str(daemon.socket), "bow"]) == 2
+    assert capsys.readouterr().err == "imud spectrum: bow: it sends no samples; `imud status` says why\n"
