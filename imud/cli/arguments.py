@@ -95,9 +95,10 @@ def finite(text: str) -> float:
 def duration_s(text: str) -> float:
     """Read a duration, for example `10min`, `90s` or `2h`; a number alone is seconds. Raises ArgumentTypeError."""
     found = DURATION.fullmatch(text.strip())
-    if found is None or found[2] not in SECONDS_OF or not float(found[1]):
+    seconds = float(found[1]) * SECONDS_OF.get(found[2], 0.0) if found is not None else 0.0
+    if not seconds or not isfinite(seconds):  # so many digits that they are infinity
         raise argparse.ArgumentTypeError(f"expected a duration as 90s, 10min or 2h, got {text!r}")
-    return float(found[1]) * SECONDS_OF[found[2]]
+    return seconds
 
 
 # --- NAME=VALUE -----------------------------------------------------------------------------------------------------

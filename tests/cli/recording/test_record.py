@@ -170,7 +170,7 @@ def test_durations(text: str, seconds: float) -> None:
     assert duration_s(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "min", "0", "-1s", "1 week", "1e3", "10m", "nan"])
+@pytest.mark.parametrize("text", ["", "min", "0", "-1s", "1 week", "1e3", "10m", "nan", "9" * 400 + "s"])
 def test_what_is_no_duration(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="expected a duration as 90s, 10min or 2h"):
         duration_s(text)
