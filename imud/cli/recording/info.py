@@ -184,7 +184,9 @@ def page(report: dict[str, Any]) -> str:
     begun, duration = "not known: the block that says it and names the devices is damaged or missing", "not known"
     if report["begun_utc_ns"] is not None:
         time = datetime.fromtimestamp(report["begun_utc_ns"] // NS_PER_S, UTC)
-        begun = f"{time:%Y-%m-%d %H:%M:%S} UTC, by imud {report['imud']} on {report['host']}, file {report['file_number']}"
+        begun = (
+            f"{time:%Y-%m-%d %H:%M:%S} UTC, by imud {report['imud']} on {report['host']}, file {report['file_number']}"
+        )
         duration = f"{report['duration_s']:.1f} s"
     stored, plain = report["stored_bytes"], report["plain_bytes"]
     samples = sum(device["samples"] for device in report["devices"])
