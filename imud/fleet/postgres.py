@@ -80,6 +80,13 @@ class PostgresStore:
                 f"PostgreSQL: expected that no other collector writes to this database, got one that still does after "
                 f"{LOCK_S} s: look at application_name in pg_stat_activity"
             ) from error
+        except psycopg.ProgrammingError as error:
+            self.close()
+            if error.sqlstate is not None:  # of the server
+                raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+            raise ServerError(
+                f"PostgreSQL: the URL cannot be read: {_unquoted(error)}; it may have a password and is not shown"
+            ) from None
         except psycopg.Error as error:
             self.close()
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
@@ -198,3 +205,8 @@ def _make_new(cursor: Any, name: str) -> None:
 
 def _sentence(error: BaseException) -> str:
     return " ".join(str(error).split())
+
+
+def _unquoted(error: BaseException) -> str:
+    """The problem without the part of the URL that libpq quotes."""
+    return _sentence(error).partition('"')[0].rstrip(": ")

@@ -243,6 +243,23 @@ def test_a_second_collector_says_that_there_is_another(database: str, monkeypatc
     first.close()
 
 
+@pytest.mark.parametrize(
+    ("url", "problem"),
+    [
+        ("postgresql://u:se%cret@h/x", "invalid percent-encoded token"),
+        ("postgresql://u:secret@[::1/x", "end of string reached when looking for matching"),
+        ("postgresql://u:secret@h/x?port=1&colour=2", "invalid URI query parameter"),
+    ],
+)
+def test_a_url_that_cannot_be_read_is_not_printed(url: str, problem: str) -> None:
+    from imud.fleet.postgres import PostgresStore
+
+    with pytest.raises(ServerError, match=f"^PostgreSQL: the URL cannot be read: {problem}; it may ") as refused:
+        PostgresStore(url)
+    assert refused.value.__suppress_context__, "a traceback does not print it either"
+    assert "cret" not in str(refused.value)
+
+
 def test_a_server_that_is_not_there_is_named() -> None:
     from imud.fleet.postgres import PostgresStore
 
