@@ -86,12 +86,12 @@ def check(args: argparse.Namespace) -> int:
     for device in settings.devices:
         for note in (*limits_of(device), *absent_capture(device)):
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
-    for note in strangers(settings):
+    for note in unknown_devices(settings):
         print(f"{args.file}: note: {note}")
     return 0
 
 
-def strangers(settings: Config) -> Iterator[str]:
+def unknown_devices(settings: Config) -> Iterator[str]:
     """Name the devices that outputs are configured for and that the configuration does not have."""
     known = [*(device.name for device in settings.devices), *settings.disabled]
     for output, part in settings.publishers.items():

@@ -135,7 +135,7 @@ def look(
             )
         else:
             listen.append(name)
-    found += _strangers(at, wanted, ports)
+    found += _not_attached(at, wanted, ports)
     active = {listened for listened in listen if _node(at, listened) in {_node(at, one) for one in wanted.active}}
     reports = finders.listen(listen, active) if listen else []
     heard = [_heard(at, report, ports) for report in reports]
@@ -146,7 +146,7 @@ def look(
     return _known(at, sorted([*found, *heard], key=lambda one: one.node))
 
 
-def _strangers(at: Surroundings, wanted: Wanted, ports: Iterable[str]) -> list[Attached]:
+def _not_attached(at: Surroundings, wanted: Wanted, ports: Iterable[str]) -> list[Attached]:
     """What is named as a port or an interface and is neither: not there, or something else."""
     lines = {_node(at, path) for path, _ in wanted.rs485}
     known = {*ports, *lines, *can_interfaces(at.at("/sys"), down=True)}
