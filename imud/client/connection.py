@@ -353,9 +353,12 @@ class Client:
 
     def _object(self, body: bytes) -> dict[str, Any]:
         try:
-            return parse_object(body)
+            message = parse_object(body)
         except RpcError as error:
             raise ServerError(f"{self.path}: expected a JSON object, {error}: {body[:80]!r}") from error
+        if not isinstance(message.get("method", ""), str):
+            raise ServerError(f"{self.path}: expected a method that is text, got {body[:80]!r}")
+        return message
 
 
 def default_path() -> str:

@@ -75,6 +75,14 @@ def test_a_body_that_is_no_text_or_too_deep_is_refused_in_one_way(kind: type, bo
         decode_body(body, kind)
 
 
+@pytest.mark.parametrize("method", ["{}", "[]", "5", "null"])
+def test_a_method_that_is_no_text_is_a_server_error(method: str) -> None:
+    """client/answers: a TypeError came out of the iterators, because an object cannot be looked up among names."""
+    watched = line_of(encode_result(1, {"devices": {"bow": 0}}))
+    for use in (1, 2):  # events, samples
+        answers.run(bytes([use]) + watched + b'{"jsonrpc":"2.0","method":%s}\n' % method.encode())
+
+
 @pytest.mark.parametrize("result", [None, 5, [], {}, "x"])
 def test_an_answer_of_another_form_is_a_server_error(result: object) -> None:
     """client/answers: TypeError, KeyError and msgspec's ValidationError came out of the client's methods."""
