@@ -13,8 +13,7 @@ READ_LIMIT_S = 10.0
 TIOCGICOUNT = 0x545D
 ICOUNT = struct.Struct("=11i9i")  # cts dsr rng dcd rx tx frame overrun parity brk buf_overrun, reserved
 ALL_BYTES = bytes(range(256))
-TRIES = 3
-"""QEMU's UART lost 23 bytes once, while the host was busy."""
+SILENCE_S = 0.5
 
 
 def counters(port: serial.Serial) -> dict[str, int]:
@@ -32,25 +31,35 @@ def test_pty_carries_every_byte_both_ways(pty: PseudoTerminal) -> None:
         assert port.read(256) == ALL_BYTES
 
 
+def drain(port: serial.Serial) -> None:
+    """Read what came before: of the bytes with which the driver measures the FIFO the last can come out."""
+    port.timeout = SILENCE_S
+    while port.read(4096):
+        pass
+    port.timeout = READ_LIMIT_S
+
+
+def exchanged(first: serial.Serial, second: serial.Serial) -> dict[str, int]:
+    """Send every byte there and back; what the kernel counted at the second port. Raises AssertionError."""
+    drain(first)
+    drain(second)
+    before = counters(second)
+    first.write(ALL_BYTES)
+    assert second.read(256) == ALL_BYTES
+    second.write(ALL_BYTES)
+    assert first.read(256) == ALL_BYTES
+    after = counters(second)
+    return {name: after[name] - before[name] for name in ("rx", "tx", "frame", "overrun")}
+
+
 def test_uarts_are_wired_to_each_other(uarts: tuple[Path, Path]) -> None:
-    with (
-        serial.Serial(str(uarts[0]), 921600, timeout=READ_LIMIT_S) as first,
-        serial.Serial(str(uarts[1]), 921600, timeout=READ_LIMIT_S) as second,
-    ):
-        for _ in range(TRIES):
-            before = counters(second)
-            first.write(ALL_BYTES)
-            received = second.read(256)
-            second.write(received)
-            assert first.read(len(received)) == received
-            after = counters(second)
-            counted = {name: after[name] - before[name] for name in after}
-            if received == ALL_BYTES:
-                break
-            print(f"{len(received)} of 256 bytes came; the kernel counted {counted}")
-    assert received == ALL_BYTES
-    names = ("rx", "tx", "frame", "overrun")
-    assert {name: counted[name] for name in names} == {"rx": 256, "tx": 256, "frame": 0, "overrun": 0}
+    with serial.Serial(str(uarts[0]), 921600) as first, serial.Serial(str(uarts[1]), 921600) as second:
+        try:
+            counted = exchanged(first, second)
+        except AssertionError as error:  # the emulated UART lost 54 bytes once, on a busy host
+            print(f"once more, after {error}")
+            counted = exchanged(first, second)
+    assert counted == {"rx": 256, "tx": 256, "frame": 0, "overrun": 0}
 
 
 def test_uart_is_a_real_port(uarts: tuple[Path, Path]) -> None:
