@@ -104,6 +104,8 @@ class Ledger:
 
 
 _ALL = attrgetter(*LEDGER_FIELDS)
+LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))
+"""Losses by their cause."""
 
 
 def lost(counts: Mapping[str, int]) -> int:

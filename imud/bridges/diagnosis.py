@@ -17,7 +17,7 @@ from typing import Final
 from imud.bridges.channel import Diagnoses, Diagnosis, DiagnosisLevel, LossCounts, StampedEvent
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.event import Event, EventKind
-from imud.ledger import LEDGER_FIELDS
+from imud.ledger import LOST_FIELDS
 from imud.sample import Sample
 from imud.units import NS_PER_S
 
@@ -29,7 +29,6 @@ STALE_S: Final = 5
 """Without samples for so long, while others send, a recorded device is stale: as long as viewers wait for diagnoses."""
 RATE_LEAST: Final = 0.95
 """Of the expected rate; the alert ImudRateLow has the same bound."""
-CAUSES: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))
 
 
 LEVEL_OF: Final = {
@@ -61,7 +60,7 @@ class LiveDiagnosis:
 
     def _one(self, status: DeviceStatus, utc_ns: int) -> Diagnosis:
         level, words = LEVEL_OF[status.state], [f"{status.state}: {status.problem}".removesuffix(": ")]
-        counts = [status.ledger.get(name, 0) for name in CAUSES]
+        counts = [status.ledger.get(name, 0) for name in LOST_FIELDS]
         losing = self._losses.setdefault(status.name, _LossWarning()).is_on(counts, utc_ns)
         warnings = list(_warnings(status, losing=losing))
         if level is DiagnosisLevel.OK and warnings:
@@ -140,7 +139,7 @@ class _RecordedDevice:
         self._rate_hz: float | None = None
         self._idle_s = 0
         """Seconds of the recording without a sample."""
-        self._counts = dict.fromkeys(CAUSES, 0)
+        self._counts = dict.fromkeys(LOST_FIELDS, 0)
         self._warning = _LossWarning()
         self._losing = False
 
@@ -149,7 +148,7 @@ class _RecordedDevice:
         self._losing = self._warning.is_on(list(self._counts.values()), newest.t_ns)
 
     def losses(self, losses: LossCounts) -> None:
-        self._counts = dict(zip(CAUSES, losses.counts, strict=True))
+        self._counts = dict(zip(LOST_FIELDS, losses.counts, strict=True))
         self._losing = self._warning.is_on(losses.counts, losses.t_ns)
 
     def change(self, event: Event) -> None:
@@ -219,7 +218,7 @@ def _values(status: DeviceStatus) -> dict[str, str]:
     clock = status.clock
     numbers = {
         "rate_hz": status.rate_hz, "expected_rate_hz": status.expected_rate_hz,
-        "samples": status.ledger.get("samples", 0), **{name: status.ledger.get(name, 0) for name in CAUSES},
+        "samples": status.ledger.get("samples", 0), **{name: status.ledger.get(name, 0) for name in LOST_FIELDS},
         "t_err_ns": clock.t_err_ns, "skew_ppm": clock.skew_ppm, "residual_ns": clock.residual_ns,
         "reference_error_ns": clock.reference_error_ns, "resets": clock.resets, "connects": status.connects,
         "frames_bad_crc": status.ledger.get("frames_bad_crc", 0),

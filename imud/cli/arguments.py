@@ -89,6 +89,15 @@ def finite(text: str) -> float:
     return number
 
 
+PORT_MAX: Final = 65535
+
+
+def check_port(port: int) -> None:
+    """Check the `--port` of a server, 0 for any. Raises BadArgument."""
+    if not 0 <= port <= PORT_MAX:
+        raise BadArgument(f"--port: expected 0 to {PORT_MAX}, got {port}")
+
+
 # --- durations ----------------------------------------------------------------------------------------------------
 
 

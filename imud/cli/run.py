@@ -20,6 +20,7 @@ from imud.daemon import Daemon
 from imud.devices import DRIVERS
 from imud.errors import ConfigError, ImudError, ServerError
 from imud.log import STDERR, is_journal, log_to
+from imud.publishers.mqtt.settings import EVERY
 from imud.runtime import event_loop
 
 log = logging.getLogger(__name__)
@@ -30,8 +31,6 @@ EXIT_OUTPUT: Final = 75
 """An output that is required cannot start, for example the socket that another imud has (EX_TEMPFAIL, sysexits.h)."""
 EXIT_CONFIGURATION: Final = 78
 """The configuration cannot be used; starting again changes nothing (EX_CONFIG)."""
-EVERY_DEVICE: Final = "*"
-"""Name that stands for all devices, in `mqtt.devices`."""
 DEFAULT_FILE = Path("/etc/imud.yaml")
 
 
@@ -98,7 +97,7 @@ def unknown_devices(settings: Config) -> Iterator[str]:
         for key in ("device", "devices"):
             given = getattr(part, key, None)
             for name in [given] if isinstance(given, str) else given or ():
-                if name not in (*known, EVERY_DEVICE):
+                if name not in (*known, EVERY):
                     yield f"{output}.{key}: {unknown_name('a device', name, known)}"
 
 

@@ -8,7 +8,7 @@ import sys
 from time import time
 from typing import TYPE_CHECKING, Final
 
-from imud.cli.arguments import CliCommand, add_socket
+from imud.cli.arguments import CliCommand, add_socket, check_port
 from imud.errors import BadArgument, LinkError, reason_of
 from imud.web.guard import WebGuard, is_loopback, read_token
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 ADDRESS: Final = "127.0.0.1"
 PORT: Final = 9322
 """Beside that of the metrics."""
-PORT_MAX: Final = 65535
 STOP_S: Final = 3.0
 """How long the end waits for pages that are open."""
 
@@ -49,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal. Raises BadArgument without the library, and for what cannot be served, or not safely."""
-    if not 0 <= args.port <= PORT_MAX:
-        raise BadArgument(f"--port: expected 0 to {PORT_MAX}, got {args.port}")
+    check_port(args.port)
     guard = guard_of(args)
     try:
         from imud.web.app import WebServer

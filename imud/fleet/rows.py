@@ -66,21 +66,15 @@ RECORDS: Final = FleetTable(
 )  # fmt: skip
 LEDGER: Final = "imud_ledger"
 BOOTS: Final = "imud_boots"
-SCHEMA: Final = dict(
-    zip(
-        (SAMPLES.name, RECORDS.name, LEDGER, BOOTS),
-        (
-            SAMPLES.statement(),
-            RECORDS.statement(),
-            # half of each page is free, so that an account is replaced in its page, without a change of the index
-            f"CREATE TABLE IF NOT EXISTS {LEDGER} (gateway text, boot text, device text, stream text, "
-            "account jsonb NOT NULL, PRIMARY KEY (gateway, boot, device, stream)) WITH (fillfactor = 50);",
-            f"CREATE TABLE IF NOT EXISTS {BOOTS} (gateway text, boot text, t_ns bigint NOT NULL, "
-            "utc_offset_ns bigint NOT NULL, utc_err_ns bigint, PRIMARY KEY (gateway, boot));",
-        ),
-        strict=True,
-    )
-)
+SCHEMA: Final = {
+    SAMPLES.name: SAMPLES.statement(),
+    RECORDS.name: RECORDS.statement(),
+    # half of each page is free, so that an account is replaced in its page, without a change of the index
+    LEDGER: f"CREATE TABLE IF NOT EXISTS {LEDGER} (gateway text, boot text, device text, stream text, "
+    "account jsonb NOT NULL, PRIMARY KEY (gateway, boot, device, stream)) WITH (fillfactor = 50);",
+    BOOTS: f"CREATE TABLE IF NOT EXISTS {BOOTS} (gateway text, boot text, t_ns bigint NOT NULL, "
+    "utc_offset_ns bigint NOT NULL, utc_err_ns bigint, PRIMARY KEY (gateway, boot));",
+}
 """Statements that make the tables, by their names."""
 
 

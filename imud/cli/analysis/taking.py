@@ -28,7 +28,7 @@ from imud.event import Event
 from imud.files import open_regular
 from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import Kind
-from imud.ledger import LEDGER_FIELDS
+from imud.ledger import LOST_FIELDS
 from imud.log import STDERR, log_to
 from imud.runtime import event_loop
 from imud.runtime.recording.player import PlayedDevice, Player
@@ -41,7 +41,6 @@ SILENCE_S: Final = 5.0
 """A live device that sends nothing for so long is named."""
 LATENCY_MS: Final = 200.0
 """Samples of a live device may come so late, several at once: an analysis costs the daemon little then."""
-LOSSES: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))
 NOTE_S: Final = 1.0
 """Time between two notes of progress."""
 _NONE3: Final = (nan, nan, nan)
@@ -205,7 +204,7 @@ class LossTally:
         before = self._newest if self._newest is not None else ledger
         if ledger.get("samples", 0) < before.get("samples", 0):
             before = {}
-        self.lost.update({name: ledger.get(name, 0) - before.get(name, 0) for name in LOSSES})
+        self.lost.update({name: ledger.get(name, 0) - before.get(name, 0) for name in LOST_FIELDS})
         self._newest = ledger
 
     def found(self) -> dict[str, int]:

@@ -9,7 +9,7 @@ from typing import Final
 from imud.bridges.channel import Dialect
 from imud.bridges.json_channels import JsonDialect
 from imud.bridges.ros2_channels import Ros2Dialect
-from imud.cli.arguments import CliCommand, add_noise, add_socket, noise_by_device
+from imud.cli.arguments import CliCommand, add_noise, add_socket, check_port, noise_by_device
 from imud.cli.foxglove.origins import ViewerOrigins
 from imud.cli.foxglove.relay import Relay
 from imud.cli.streams import complain
@@ -19,7 +19,6 @@ from imud.web.guard import is_loopback
 ADDRESS: Final = "127.0.0.1"
 PORT: Final = 8765
 """Where viewers look first."""
-PORT_MAX: Final = 65535
 RATE_HZ: Final = 100.0
 """Samples a second of each device: smooth on any screen; a viewer draws 60 pictures a second."""
 DIALECTS: Final[dict[str, Callable[[], Dialect]]] = {"ros2": Ros2Dialect, "json": JsonDialect}
@@ -71,8 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until SIGINT or SIGTERM. Raises BadArgument, ServerError."""
-    if not 0 <= args.port <= PORT_MAX:
-        raise BadArgument(f"--port: expected 0 to {PORT_MAX}, got {args.port}")
+    check_port(args.port)
     if not args.rate >= 0:
         raise BadArgument(f"--rate: expected samples a second, 0 for all, got {args.rate}")
     noise = noise_by_device(args.noise)
