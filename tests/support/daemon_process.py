@@ -16,8 +16,8 @@ from imud.client import Client
 from imud.contracts.status import DeviceStatus
 from tests.support.pty_port import PtyPort
 
-LIMIT_S = 10.0
-"""Recordings and manuals that are not in the repository."""
+LIMIT_S = 60.0
+"""Deadline of a wait for another process, s. A loaded host is slow, and a wait ends as soon as its condition holds."""
 
 
 def wait_until(condition: Callable[[], object], what: str, limit_s: float = LIMIT_S) -> None:

@@ -1,0 +1,56 @@
+"""Options of all tests: the Hypothesis profiles, the time limit of `live` tests, and a check that no other test waits.
+
+A test of logic receives the time as an argument. A `live` test runs a real daemon, server or browser. It waits for a
+condition with `wait_until`.
+"""
+
+import time
+from typing import Final
+
+import pytest
+
+LIVE_TIMEOUT_S: Final = 300
+"""Time limit of a `live` test: several waits of 60 s."""
+WAIT_MAX_S: Final = 0.02
+"""Longest sleep in a test of logic. A poll of the kernel or of a thread needs a few milliseconds."""
+
+_sleep = time.sleep
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the Hypothesis profiles and load `gate`, or the profile of `--hypothesis-profile`."""
+    if not config.pluginmanager.has_plugin("hypothesispytest"):  # the lab runs without Hypothesis
+        return
+    from hypothesis import HealthCheck, settings
+
+    slow = [HealthCheck.too_slow]  # a loaded host makes the generation of inputs slow
+    settings.register_profile(
+        "gate", max_examples=30, derandomize=True, deadline=None, database=None, suppress_health_check=slow
+    )
+    settings.register_profile("thorough", max_examples=1000, deadline=None, suppress_health_check=slow)
+    settings.load_profile(config.getoption("--hypothesis-profile", None) or "gate")
+
+
+def is_live(item: pytest.Item) -> bool:
+    """Return whether a test may wait in real time: it has the marker `live`, or it runs in the lab."""
+    return item.get_closest_marker("live") is not None or item.nodeid.startswith("tests/lab/")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give `live` tests their time limit and start them first: the short tests then fill the gaps between them."""
+    for item in items:
+        if item.get_closest_marker("live"):
+            item.add_marker(pytest.mark.timeout(LIVE_TIMEOUT_S))
+    items.sort(key=lambda item: not is_live(item))
+
+
+def _refuse_to_wait(seconds: float) -> None:
+    assert seconds <= WAIT_MAX_S, f"a test without the marker `live` waits {seconds} s: pass the time as an argument"
+    _sleep(seconds)
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `time.sleep` fail in a test of logic if it waits for a fixed duration."""
+    if not is_live(request.node):
+        monkeypatch.setattr(time, "sleep", _refuse_to_wait)
