@@ -1,4 +1,5 @@
-# make demo   one simulated sensor through the real daemon          make test   everything that needs no lab
+# make demo   one simulated sensor through the real daemon          make test   everything that needs no lab, in 5 minutes
+# make test-thorough   every test and the long forms of fuzz, attack, lab, chaos, soak      make mutants   quality of the tests
 # make lab    tests on a booted kernel          make chaos  random faults on a booted kernel (ARGS="--seed N --seconds S")
 # make soak   100 devices, 20 clients, all recorded, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
 # make test-pythons   the tests on every supported Python that is here; those that are missing are named
@@ -29,6 +30,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+PROCESSES ?= 4
 LAB_OPTIONS ?= --steady
 RIG_OPTIONS ?=
 CHAOS_OPTIONS ?= --steady --limit 14400
@@ -37,17 +39,46 @@ CHAOS_OPTIONS ?= --steady --limit 14400
 
 all: check
 
-# The virtual environment is made anew when the dependencies change.
-$(VENV)/made: pyproject.toml
+PIP := $(BIN)/pip --disable-pip-version-check
+
+# Both stamps depend on pyproject.toml: a change of the dependencies installs them again.
+$(VENV)/made-runtime: pyproject.toml
+	@echo "Installing imud and its libraries into $(VENV)"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(PIP) install --editable .
 	@touch $@
 
-demo: $(VENV)/made
+$(VENV)/made: $(VENV)/made-runtime
+	@echo "Installing the tools of the tests into $(VENV), about 700 MB"
+	$(PIP) install --editable '.[dev]'
+	@touch $@
+
+demo: $(VENV)/made-runtime
 	$(BIN)/imud demo $(ARGS)
 
+# Most `live` tests wait for a process, so that four processes use two cores. One folder: ARGS=tests/links PROCESSES=0
 test: $(VENV)/made
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest -n $(PROCESSES) --dist worksteal -m "not thorough" $(ARGS)
+
+# Every test in the repository and the long form of every check, about four hours. As root, with the packages of all `-deps`.
+.PHONY: test-thorough
+test-thorough: lint
+	IMUD_ALERTS=1 $(BIN)/pytest -n $(PROCESSES) --dist worksteal --hypothesis-profile thorough
+	.ci/test-pythons
+	$(MAKE) fuzz
+	$(MAKE) mutants
+	$(MAKE) bench-instructions
+	$(MAKE) attack
+	$(MAKE) lab
+	$(MAKE) chaos ARGS="--seconds 1000"
+	$(MAKE) soak
+	$(MAKE) lab-debian
+	$(MAKE) lab-arm64
+
+# 120 small changes to imud, and which of them the tests detect (ARGS="--seed 7 --only imud/runtime")
+.PHONY: mutants
+mutants: $(VENV)/made
+	$(BIN)/python -m tests.mutants $(ARGS)
 
 .PHONY: alerts
 alerts: $(VENV)/made
