@@ -87,7 +87,7 @@ def own_imports(module: str) -> frozenset[str]:
 
 
 def part_of(module: str, parts: tuple[str, ...]) -> str | None:
-    """Return the one of `parts` that contains a module; None if none of them does."""
+    """Return the part that contains a module; None if no part contains it."""
     return next((part for part in parts if module == part or module.startswith(part + ".")), None)
 
 
