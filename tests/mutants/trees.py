@@ -1,0 +1,169 @@
+"""Copies of the tree in which pytest runs, and the test modules that a module of imud needs."""
+
+import ast
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Final
+
+from tests.mutants.changes import ROOT
+
+DOCUMENT_TESTS: Final = {"tests/test_docs.py", "tests/test_architecture.py"}
+NO_MIRROR: Final = {
+    "audit", "bench", "lab", "lab_host", "lab_debian", "fuzz", "attack", "support", "packaging", "monitoring",
+}  # fmt: skip
+
+
+def tests_in(folder: Path) -> list[str]:
+    """Return the test modules of a folder, without its subfolders and without tests of documents."""
+    return [test for path in sorted(folder.glob("test_*.py")) if (test := named(path)) not in DOCUMENT_TESTS]
+
+
+def named(path: Path) -> str:
+    """Return a path in the tree."""
+    return path.relative_to(ROOT).as_posix()
+
+
+@cache
+def tested_in() -> dict[str, str]:
+    """Return TESTED_IN of tests/test_architecture.py: test modules of modules without one of their own."""
+    for node in ast.parse((ROOT / "tests/test_architecture.py").read_bytes()).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "TESTED_IN":
+            return dict(ast.literal_eval(node.value))
+    return {}
+
+
+def importers(module: str) -> list[str]:
+    """Return the test modules that name a module."""
+    tests = [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path.parts[-2] not in NO_MIRROR]
+    return [named(path) for path in tests if module in path.read_text()]
+
+
+def stages(path: str) -> list[list[str]]:
+    """Return the test modules for a module of imud: its own, then its folder, then the folders above.
+
+    Tests of the whole daemon run for modules at the top only. Contracts have no tests of their own: their users do.
+    """
+    module = Path(path).with_suffix("")
+    dotted = ".".join(module.parts)
+    folders = [ROOT / "tests" / folder for folder in module.relative_to("imud").parents]
+    own = folders[0] / f"test_{module.name.strip('_')}.py"
+    first = [named(own)] if own.exists() else [f"tests/{tested_in()[dotted]}"] if dotted in tested_in() else []
+    found = [first, *map(tests_in, folders[:-1] or folders)]
+    if not first:
+        found.append(importers(dotted))
+    stage_of = {test: number for number, stage in reversed(list(enumerate(found))) for test in stage}
+    return [new for number, stage in enumerate(found) if (new := [test for test in stage if stage_of[test] == number])]
+
+
+@dataclass
+class Run:
+    """The result of pytest: its exit status (None after a time-out), output, failed test and duration."""
+
+    status: int | None
+    output: str
+    seconds: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether no test failed; 5 means that no test was selected."""
+        return self.status in (0, 5)
+
+    @property
+    def failed(self) -> list[str]:
+        """The identifiers of the failed tests."""
+        return re.findall(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", self.output, re.MULTILINE)
+
+
+class Tree:
+    """A copy of the tree for one job, with a virtual environment whose imud is the copy."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.root = folder / "tree"
+        files = subprocess.run(
+            ["git", "ls-files", "-coz", "--exclude-standard"], cwd=ROOT, capture_output=True, check=True
+        )
+        for name in files.stdout.decode().split("\0"):
+            if name and (ROOT / name).is_file():
+                (self.root / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
+        self.mtime = count(int(time.time()))
+        self._make_environment()
+
+    def _make_environment(self) -> None:
+        own, (packages,) = self.root / ".venv", Path(sys.prefix).glob("lib/python*/site-packages")
+        target = own / packages.relative_to(sys.prefix)
+        for folder in (own / "bin", target):
+            folder.mkdir(parents=True)
+        shutil.copy(Path(sys.prefix, "pyvenv.cfg"), own)
+        for path in Path(sys.prefix, "bin").iterdir():
+            if path.name != "imud":
+                (own / "bin" / path.name).symlink_to(path.resolve() if path.name.startswith("python") else path)
+        for path in packages.iterdir():
+            if path.name != "_editable_impl_imud.pth":
+                (target / path.name).symlink_to(path)
+        (target / "imud.pth").write_text(f"{self.root}\n")
+        self.python = str(own / "bin" / "python")
+        program = own / "bin" / "imud"
+        program.write_text(f"#!{self.python}\nimport sys\nfrom imud.cli import main\nsys.exit(main())\n")
+        program.chmod(0o755)
+        self.environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {
+            "PATH": f"{own / 'bin'}:{os.environ['PATH']}", "VIRTUAL_ENV": str(own), "COLUMNS": "400",
+            "PYTHONPATH": str(self.root), "MUTANTS_JOB": str(self.folder),
+        }  # fmt: skip
+        for environment in (self.environment, {}):  # a test may start a child without environment variables
+            command = [self.python, "-c", "import imud; print(imud.__file__)"]
+            found = subprocess.run(command, cwd="/", env=environment, capture_output=True, text=True, check=True).stdout
+            assert Path(found).is_relative_to(self.root), f"tests would import {found}, expected {self.root}"
+
+    @contextmanager
+    def changed(self, name: str, original: bytes, changed: bytes) -> Iterator[None]:
+        """Change a file for a while."""
+        self._write(name, changed)
+        try:
+            yield
+        finally:
+            self._write(name, original)
+
+    def _write(self, name: str, content: bytes) -> None:
+        """Write a file. Each version has its own mtime, so that Python never uses the bytecode of another."""
+        path = self.root / name
+        path.write_bytes(content)
+        os.utime(path, (seconds := next(self.mtime), seconds))
+
+    def pytest(self, *arguments: str, limit_s: float) -> Run:
+        """Run pytest in a process group of its own, then kill all processes that the tests left."""
+        options = ["-q", "-p", "no:cacheprovider", "-rfE", "--tb=short", f"--basetemp={self.folder / 'tmp'}"]
+        start, output = time.monotonic(), self.folder / "output"
+        with output.open("wb") as file:
+            process = subprocess.Popen(
+                [self.python, "-m", "pytest", *options, *arguments], cwd=self.root, env=self.environment,
+                stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
+            )  # fmt: skip
+            try:
+                status: int | None = process.wait(limit_s)
+            except subprocess.TimeoutExpired:
+                status = None
+            finally:
+                self._kill_children(process.pid)
+                process.wait()
+        return Run(status, output.read_text(errors="replace"), time.monotonic() - start)
+
+    def _kill_children(self, group: int) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGKILL)
+        for environ in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):  # the process ended
+                if f"MUTANTS_JOB={self.folder}\0".encode() in environ.read_bytes():
+                    os.kill(int(environ.parent.name), signal.SIGKILL)
