@@ -275,7 +275,6 @@ ELSEWHERE = (
     "audit",
     "bench",
     "lab",
-    "lab_host",
     "lab_debian",
     "include",
     "fuzz",
