@@ -1,7 +1,7 @@
 """Simulated I2C and SPI devices, served in a thread to the kernel's bus drivers.
 
-A device is a function from the transfer to the bytes the host reads; it may raise Refuse, Short or NoAnswer
-(wire.py). The transfers come from any thread or process: i2c-tools, the code under test, the test itself.
+A device is a function from the transfer to the bytes the host reads; it may raise Refuse (wire.py).
+The transfers come from any thread or process: i2c-tools, the code under test, the test itself.
 In the same process beware of fcntl.ioctl with more than 1024 bytes (33 SPI transfers or more): it keeps the
 GIL, so the thread cannot answer, and the transfer fails with ETIMEDOUT after the module's timeout_ms.
 """
@@ -36,7 +36,6 @@ class Bus(Generic[OneTransfer]):
         self._devices: dict[int, Callable[[OneTransfer], bytes]] = {}
         self._transfers: list[OneTransfer] = []
         self._failure: BaseException | None = None
-        self._late = 0
         self._thread = threading.Thread(target=self._serve, name=path.name, daemon=True)
         self._thread.start()
 
@@ -55,11 +54,6 @@ class Bus(Generic[OneTransfer]):
         """All transfers so far, oldest first, those to absent devices included."""
         with self._lock:
             return list(self._transfers)
-
-    @property
-    def late(self) -> int:
-        """Answers that came after the module's time-out."""
-        return self._late
 
     def close(self) -> None:
         """Takes the simulator off the bus (every transfer then fails with ENXIO); may be called twice."""
@@ -94,20 +88,16 @@ class Bus(Generic[OneTransfer]):
             except BlockingIOError:
                 continue  # the host gave up between poll and read
             transfer = cast(OneTransfer, wire.parse(request))
-            answer = self._answer(transfer)
-            if answer is not None:
-                self._write(answer)
+            self._write(self._answer(transfer))
 
     def _write(self, answer: bytes) -> None:
         try:
             os.write(self._file, answer)
         except OSError as error:
-            if error.errno == errno.ESTALE:
-                self._late += 1
-            else:
+            if error.errno != errno.ESTALE:  # the host has given up meanwhile
                 self._failure = error
 
-    def _answer(self, transfer: OneTransfer) -> bytes | None:
+    def _answer(self, transfer: OneTransfer) -> bytes:
         with self._lock:
             self._transfers.append(transfer)
             device = self._devices.get(self._select_of(transfer))
@@ -115,10 +105,6 @@ class Bus(Generic[OneTransfer]):
             return _served(transfer, device)
         except wire.Refuse as refusal:
             return wire.refusal(transfer, refusal.number)
-        except wire.Short as short:
-            return wire.short(transfer, short.done, short.data)
-        except wire.NoAnswer:
-            return None
         except Exception as error:  # noqa: BLE001 - a mistake in a test's device must fail that test, not hang it
             self._failure = error
             return wire.refusal(transfer, errno.EIO)

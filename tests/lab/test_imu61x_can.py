@@ -10,7 +10,6 @@ from collections.abc import Awaitable, Callable
 from time import monotonic, monotonic_ns
 from typing import Any
 
-import can
 import pytest
 
 from imud.config import DeviceConfig
@@ -19,8 +18,7 @@ from imud.devices.imu61x.can.codec import Imu61xCanSettings, encode_set
 from imud.event import Event, EventKind
 from imud.formats.can import pack_frame
 from imud.host_clock import HostClock
-from imud.links.can.frame_reader import FrameReader
-from imud.links.can.link import SocketCanSettings, pack_filters
+from imud.links.can.link import SocketCanSettings
 from imud.runtime.device_factory import DeviceFactory
 from imud.sample import Sample
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
@@ -343,33 +341,6 @@ def test_bus_off_of_a_real_controller_and_its_restart(
     assert ledger.frames_ignored == 3
     news = [event.message.partition(":")[0] for event in rig.events if event.kind is EventKind.LINK]
     assert news == ["can0 is bus-off", "can0 is error-active again"]
-
-
-def test_receive_path_against_python_can(vcan: CanInterface) -> None:
-    """CPU per frame of the receiving call alone, on the same bus in one run; ratios only mean something here."""
-    count, rounds = 60, 10
-    ours = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
-    far = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-    with ours, far, can.Bus(vcan.name, interface="socketcan") as bus:
-        far.bind((vcan.name,))
-        ours.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters([]) or struct.pack("=II", 0, 0))
-        ours.bind((vcan.name,))
-        reader = FrameReader(ours, lambda classes, data: False)
-        taken_ns = [0, 0]
-        for _ in range(rounds):
-            for number in range(count):
-                far.send(pack_frame(0x100 + number, False, bytes(8)))
-            begin_ns = monotonic_ns()
-            frames = reader.read()
-            middle_ns = monotonic_ns()
-            messages = [bus.recv(0) for _ in range(count)]
-            taken_ns[0] += middle_ns - begin_ns
-            taken_ns[1] += monotonic_ns() - middle_ns
-            assert [f.can_id for f in frames] == [m.arbitration_id for m in messages if m]
-    per_frame = [taken / count / rounds / 1000 for taken in taken_ns]
-    print(f"\nCAN receive, µs per frame: imud {per_frame[0]:.1f}, python-can {per_frame[1]:.1f}, "
-          f"ratio {per_frame[1] / per_frame[0]:.1f}")  # fmt: skip
-    assert per_frame[1] > 3 * per_frame[0]
 
 
 def test_the_simulator_as_a_process_of_its_own(vcan: CanInterface) -> None:

@@ -29,20 +29,6 @@ class Refuse(Exception):
         self.number = number
 
 
-class Short(Exception):
-    """Raised by a simulated device: the transfer ends early, without an error."""
-
-    def __init__(self, done: int, data: bytes = b"") -> None:
-        """`done`: I2C segments or SPI bytes that were transferred; `data`: the bytes read until then."""
-        super().__init__(done)
-        self.done = done
-        self.data = data
-
-
-class NoAnswer(Exception):
-    """Raised by a simulated device: the host waits until the module's time-out (ETIMEDOUT)."""
-
-
 @dataclass(frozen=True, slots=True)
 class I2cSegment:
     """One I2C message; between two of a transfer is a repeated start."""
@@ -90,10 +76,6 @@ class SpiSegment:
     speed_hz: int
     bits_per_word: int
     cs_change: bool
-    delay_ns: int
-    word_delay_ns: int
-    cs_change_delay_ns: int
-    sends: bool
     reads: bool
 
 
@@ -176,15 +158,11 @@ def _i2c_segments(request: bytes, count: int) -> tuple[I2cSegment, ...]:
 def _spi_segments(request: bytes, count: int) -> tuple[SpiSegment, ...]:
     segments, at = [], REQUEST.size
     for _ in range(count):
-        length, speed_hz, delay_ns, word_ns, change_ns, bits, change, sends, reads = SPI_SEGMENT.unpack_from(
-            request, at
-        )
+        length, speed_hz, _, _, _, bits, change, sends, reads = SPI_SEGMENT.unpack_from(request, at)
         at += SPI_SEGMENT.size
         mosi = swapped(request[at : at + length], bits) if sends else bytes(length)
         at += length if sends else 0
-        segments.append(
-            SpiSegment(mosi, speed_hz, bits, bool(change), delay_ns, word_ns, change_ns, bool(sends), bool(reads))
-        )
+        segments.append(SpiSegment(mosi, speed_hz, bits, bool(change), bool(reads)))
     return tuple(segments)
 
 
@@ -193,12 +171,6 @@ def answer(transfer: Transfer, data: bytes) -> bytes:
     payload = transfer.payload(data)
     assert len(payload) == transfer.read_length, f"device gave {len(payload)} bytes, host reads {transfer.read_length}"
     return ANSWER.pack(transfer.id, 0, transfer.whole, len(payload)) + payload
-
-
-def short(transfer: Transfer, done: int, data: bytes) -> bytes:
-    """The answer of a transfer that ended early."""
-    payload = transfer.payload(data)
-    return ANSWER.pack(transfer.id, 0, done, len(payload)) + payload
 
 
 def refusal(transfer: Transfer, number: int) -> bytes:
