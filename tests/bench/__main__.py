@@ -27,12 +27,6 @@ LAB_PARTS: Final = ("can",)
 OUTPUT = Path("build/bench.json")
 
 
-def show(row: Row) -> str:
-    """One line of the printed table."""
-    mark = {True: "reached", False: "NOT REACHED", None: ""}[row.reached]
-    return f"{row.name:64} {row.value:12.3f} {row.unit:12} {row.reach:10} {mark}".rstrip()
-
-
 def measure(parts: Iterable[str], quick: bool) -> list[Row]:
     """Run the parts in order, printing each row as it is known."""
     rows: list[Row] = []
@@ -40,7 +34,7 @@ def measure(parts: Iterable[str], quick: bool) -> list[Row]:
         print(f"# {part}", flush=True)
         begun_s = monotonic()
         for row in import_module(f"tests.bench.{part}").rows(quick=quick):
-            print(show(row), flush=True)
+            print(row, flush=True)
             rows.append(row)
         print(f"# {part} took {monotonic() - begun_s:.0f} s", flush=True)
     return rows

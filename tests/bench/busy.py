@@ -9,12 +9,13 @@ figures are to be imud's. What is left is the kernel's own, and is measured firs
 that only waits for a timer of 1 kHz (in the preemption mode `none` a write to disk goes on for milliseconds); the mode
 is printed, as far as it can be known.
 
-Needs root. `python -m tests.bench busy`, or more rounds: `python -m tests.bench.busy 6`.
+It needs root. `python -m tests.bench.busy [ROUNDS]` prints a line for each setting and round. `--short` plays 2 s of
+each.
 """
 
+import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -24,8 +25,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import sleep
 
-from tests.bench.rig import CORES, Load, Process, configuration, wait_for
-from tests.bench.rows import Row, at_most
+from tests.bench.rig import CORES, Load, Process, configuration, start_readers, start_writer, wait_for
 
 HOG = "while True: pass"
 TIMER = """
@@ -49,7 +49,6 @@ while True:
 LOCK = "import ctypes; ctypes.CDLL(None).mlockall(3)"
 DAEMON = "import os, runpy; os.setsid(); runpy.run_module('imud', run_name='__main__')"
 FIFO_OF_OTHERS = 40
-GOAL_US = 1000.0
 ROUNDS = 3
 
 
@@ -92,37 +91,6 @@ class Seen:
     lost: int
 
 
-def rows(*, quick: bool = False) -> Iterator[Row]:
-    """Median over the rounds of p50 and p99, and the worst of all, for each setting."""
-    floor, table = measure(1 if quick else ROUNDS, 4.0 if quick else 10.0)
-    yield Row("busy machine, a timer of 1 kHz alone, fifo: latency p99", floor.p99_us, "us")
-    yield Row("busy machine, a timer of 1 kHz alone, fifo: latency max", floor.max_us, "us")
-    for setting in SETTINGS:
-        seen = table[setting]
-        p99_us = statistics.median(one.p99_us for one in seen)
-        name = f"busy machine, 1 kHz, {setting.name}"
-        yield Row(f"{name}: latency p50", statistics.median(one.p50_us for one in seen), "us")
-        limited = setting.policy != os.SCHED_OTHER
-        yield (
-            at_most(f"{name}: latency p99", p99_us, "us", GOAL_US)
-            if limited
-            else Row(f"{name}: latency p99", p99_us, "us")
-        )
-        yield Row(f"{name}: latency max", max(one.max_us for one in seen), "us")
-        yield Row(f"{name}: samples lost", float(sum(one.lost for one in seen)), "samples")
-
-
-def measure(rounds: int, seconds: float) -> tuple[Seen, dict[Setting, list[Seen]]]:
-    """Run the timer, then all settings in turns."""
-    table: dict[Setting, list[Seen]] = {setting: [] for setting in SETTINGS}
-    with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
-        floor = timer(seconds)
-        for number in range(rounds):
-            for setting in SETTINGS if number % 2 == 0 else reversed(SETTINGS):
-                table[setting].append(run(setting, Load(seconds=seconds)))
-    return floor, table
-
-
 @contextmanager
 def busy(folder: Path) -> Iterator[None]:
     """Every core has a program that computes, and one more writes to `folder`."""
@@ -149,19 +117,14 @@ def run(setting: Setting, load: Load) -> Seen:
     """One run of writer, daemon and reader under one setting."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-busy-") as name, ExitStack() as stack:
         folder = Path(name)
-        (folder / "times").write_bytes(bytes(8 * load.frames))
-        argv = ["--rate", str(load.rate_hz), "--frames", str(load.frames), "--times", str(folder / "times")]
-        writer = stack.enter_context(Process(set(CORES), "-m", "tests.bench.writer", *argv))
+        writer = start_writer(stack, folder, load, cores=set(CORES))
         ports = writer.line().split()
         file = configuration(folder, ports, replace(load, shm=True))
         command = f"{LOCK}; {DAEMON}" if setting.lock else DAEMON
         server = stack.enter_context(Process(set(CORES), "-c", command, "run", "-c", str(file)))
         wait_for(folder / "s")
         sleep(1.0)
-        argv = ["--socket", str(folder / "s"), "--times", str(folder / "times"), "--frames", str(load.frames)]
-        argv += ["--skip", str(int(load.warm_s * load.rate_hz))]
-        reader = stack.enter_context(Process(set(CORES), "-m", "tests.bench.readers", *argv))
-        reader.line()
+        reader = start_readers(stack, folder, load, set(CORES))
         for other in (writer, reader):
             os.sched_setscheduler(other.popen.pid, os.SCHED_FIFO, os.sched_param(FIFO_OF_OTHERS))
         apply(setting, server.popen.pid)
@@ -220,14 +183,18 @@ def preemption() -> str:
 
 
 def main() -> None:
-    """Run as `python -m tests.bench.busy [ROUNDS]`: one line per setting and round."""
+    """Print the latency with each setting."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.busy")
+    parser.add_argument("rounds", nargs="?", type=int, default=ROUNDS)
+    parser.add_argument("--short", action="store_true")
+    args = parser.parse_args()
+    seconds = 2.0 if args.short else 8.0
     print(preemption())
     with tempfile.TemporaryDirectory(dir="/var/tmp", prefix="imud-busy-") as name, busy(Path(name)):
-        print(f"{'a timer alone, fifo':32} {timer(8.0)}", flush=True)
-        for number in range(int(sys.argv[1]) if len(sys.argv) > 1 else ROUNDS):
+        print(f"{'a timer alone, fifo':32} {timer(seconds)}", flush=True)
+        for number in range(args.rounds):
             for setting in SETTINGS if number % 2 == 0 else reversed(SETTINGS):
-                seen = run(setting, Load(seconds=8.0))
-                print(f"{setting.name:32} {seen}", flush=True)
+                print(f"{setting.name:32} {run(setting, Load(seconds=seconds))}", flush=True)
 
 
 if __name__ == "__main__":

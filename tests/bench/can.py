@@ -1,7 +1,7 @@
 """CPU per received CAN frame, our receive path against python-can's own `recv`, on the same bus in one run.
 
 It needs a virtual CAN bus and the right to make one. Where this kernel has none, the lab's measures (`make lab-deps`);
-there the CPU is emulated and the ratio alone means something. Run by itself: python -m tests.bench.can
+there the CPU is emulated and the ratio alone means something.
 """
 
 import shlex

@@ -2,7 +2,6 @@
 
 Four CANopen nodes with six TPDOs, four J1939 nodes with four PGNs, one IMU61x, with the codecs, clocks and paths of the
 daemon; each has a socket of the loop device in place of the bus, and the system call that reads one reads those, too.
-Run by itself: python -m tests.bench.can_devices
 """
 
 import socket
@@ -120,8 +119,3 @@ def rows(*, quick: bool = False) -> list[Row]:
         found.append(Row(f"nine CAN devices, {words}: CPU per sample", each_us, "us"))
         found.append(at_most(f"nine CAN devices at {RATE_HZ:g} Hz, {words}: of a CPU", share, "", CPU_SHARE_MOST))
     return found
-
-
-if __name__ == "__main__":
-    for row in rows():
-        print(row.name, round(row.value, 3), row.unit)

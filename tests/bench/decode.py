@@ -1,10 +1,8 @@
 """Cost of decoding HI91 and AHRS frames to SI values, against the floor: check value and `struct.unpack_from` alone.
 
-    python -m tests.bench.decode
-
-Prints ns per frame, best of many short runs taken in turns, so that all see the same machine. The streams are fed in
-reads of 4096 bytes (a busy port or a replay) and frame by frame (a quiet port at 1 kHz); `noisy` has one damaged frame
-in ten, and garbage, cut frames and text between others.
+Figures are ns per frame, best of many short runs taken in turns, so that all see the same machine. The codec reads the
+streams in blocks of 4096 bytes (a busy port or a replay) and frame by frame (a quiet port at 1 kHz); `noisy` has one
+damaged frame in ten, and garbage, cut frames and text between others.
 """
 
 import binascii
@@ -151,13 +149,3 @@ def rows(*, quick: bool = False) -> list[Row]:
             "decode AHRS, one frame per read / floor", best["ahrs single"] / best["ahrs floor"], "x", AHRS_SINGLE_RATIO
         ),
     ]
-
-
-def main() -> None:
-    """Print the rows."""
-    for row in rows():
-        print(f"{row.name:<40} {row.value:>10.3f} {row.unit:10} {row.reach} {row.reached if row.reach else ''}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""How long detection takes, in virtual time, at every baud rate and random phases. Run: python -m tests.bench.detect
+"""How long detection takes, in virtual time, at every baud rate and random phases.
 
 Neither driver nor rate is given: every search tries all families. The device sends at 100 Hz (at 9600 baud as often as
 the line carries); the line is modelled bit by bit, so that wrong rates deliver the garbage that they would. `quick`
@@ -123,8 +123,3 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
             yield Row(f"detect {family.driver.name} cold, {name}, p50", quantiles(times_s, n=2)[0], "s")
             yield Row(f"detect {family.driver.name} cold, {name}, p95", quantiles(times_s, n=20)[-1], "s")
     yield at_most("detect: searches without or with a false result", failed, "", 0)
-
-
-if __name__ == "__main__":
-    for row in rows():
-        print(f"{row.name:64} {row.value:8.3f} {row.unit:4} {row.reach}")

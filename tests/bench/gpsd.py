@@ -5,7 +5,6 @@ imud HI91 frames, over its UNIX socket. Each client gets each sample at once; a 
 samples for 10 ms, which gpsd cannot. The sentences come in UDP datagrams: on a pseudo-terminal gpsd 3.22 stands still
 after the first read without bytes, until another descriptor wakes it. Needs gpsd (`make bench-deps`); without it there
 are no rows.
-Run by itself: python -m tests.bench.gpsd
 """
 
 import json
@@ -20,7 +19,7 @@ from pathlib import Path
 from statistics import median
 from time import monotonic, sleep
 
-from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Load, Process, measure_cpu, run
+from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Load, Process, measure_cpu, run, start_writer
 from tests.bench.rows import Row, at_most
 from tests.support.surroundings import free_port
 
@@ -53,14 +52,9 @@ def start_gpsd(stack: ExitStack, program: str, port: int, input_port: int) -> in
 def gpsd_us(program: str, load: Load) -> float:
     """CPU time of gpsd per sample, µs. Raises RuntimeError where the first client did not get the samples."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
-        times = Path(name) / "times"
-        times.write_bytes(bytes(8 * load.frames))
         port, input_port = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM)
         pid = start_gpsd(stack, program, port, input_port)
-        arguments = ["--rate", str(load.rate_hz), "--frames", str(load.frames), "--times", str(times)]
-        writer = stack.enter_context(
-            Process(REST_CORES, "-m", "tests.bench.writer", *arguments, "--udp", str(input_port))
-        )
+        writer = start_writer(stack, Path(name), load, "--udp", str(input_port))
         writer.line()
         arguments = ["--gpsd", str(port), "--clients", str(load.clients)]
         readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *arguments))
@@ -98,10 +92,3 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
     ):
         ratio = median(a / b for a, b in zip(ours, theirs, strict=True))
         yield at_most(f"{name}: imud / gpsd{words}", ratio, "x", most)
-
-
-if __name__ == "__main__":
-    from tests.bench.__main__ import show
-
-    for row in rows():
-        print(show(row))

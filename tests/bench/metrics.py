@@ -1,11 +1,10 @@
 """Cost of one scrape: CPU of rendering, and how long it keeps a busy event loop from its next turn.
 
 The stall is measured where it hurts: a loop in the main thread turns without a break while another thread renders,
-and the longest time between two turns is noted. `python -m tests.bench.metrics`.
+and the longest time between two turns is noted.
 """
 
 import asyncio
-import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -113,8 +112,3 @@ def rows(quick: bool = False) -> Iterator[Row]:
     yield Row(f"metrics: motion of a device, {SAMPLES_MAX} samples, CPU", motion_ms(slots, repeats), "ms")
     moving = asyncio.run(stalls_ms(partial(motion_of, slots, 0, lambda _: pause()), repeats))
     yield from stall_rows("metrics: loop stall, motion of a device", moving, STALL_MS_MAX)
-
-
-if __name__ == "__main__":
-    for row in rows("--quick" in sys.argv):
-        print(f"{row.name:64} {row.value:12.3f} {row.unit:6} {row.reach} {row.reached}")

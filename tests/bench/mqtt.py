@@ -1,9 +1,9 @@
 """Cost of the output `mqtt`: CPU of the daemon at 1 kHz with and without it, whatever the broker does, and its wear.
 
-`python -m tests.bench.mqtt [--quick]`. Brokers: Debian's mosquitto; nobody at the port; mosquitto that refuses the
-user; a peer that accepts, and reads 1 kB a second; mosquitto that is stopped with SIGSTOP. Each round runs the load
-without the output right before and after each load with it; the ratio is to the mean of both, and the median of the
-rounds counts. All samples are sent as slots, and statistics of 1 Hz.
+Brokers: Debian's mosquitto; nobody at the port; mosquitto that refuses the user; a peer that accepts, and reads 1 kB a
+second; mosquitto that is stopped with SIGSTOP. Each round runs the load without the output right before and after each
+load with it; the ratio is to the mean of both, and the median of the rounds counts. All samples are sent as slots, and
+statistics of 1 Hz.
 
 The event loop's thread is what samples wait for; the whole daemon has the two threads of the output as well, which run
 beside it where there is a second core. Bytes written are `write_bytes` of /proc/PID/io, on the file system of the
@@ -11,7 +11,6 @@ working directory.
 """
 
 import socket
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -162,7 +161,3 @@ def _serve_slowly(listener: socket.socket, ended: threading.Event) -> None:
 BROKERS: Final[Mapping[str, Place]] = {
     "present": present, "gone": gone, "refusing": refusing, "slow": slow, "stopped": stopped,
 }  # fmt: skip
-
-if __name__ == "__main__":
-    for row in rows(quick="--quick" in sys.argv):
-        print(f"{row.name:70} {row.value:12.3f} {row.unit:8} {row.reach} {row.reached}", flush=True)

@@ -1,7 +1,8 @@
-"""A process with N socket clients. The first one checks every sample and measures its latency; the rest only receive.
+"""A process with N socket clients, which prints `ready`, reads until the server or standard input closes, then figures.
 
-Prints `ready`, reads until the server closes or standard input does, prints one JSON line of figures. With `--stuck`
-one more client subscribes and never reads.
+The first client checks every sample and measures its latency; the others only receive. With `--stuck` one more client
+subscribes and never reads. With `--devices` every client checks its samples, watches each fifth device, and every other
+client gets JSON. The figures are a line of JSON.
 """
 
 import argparse
@@ -12,6 +13,9 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import msgspec
 
@@ -19,122 +23,146 @@ from imud.formats.slot import SLOT_BYTES
 from tests.bench.writer import FIRST_PA
 
 LENGTH = struct.Struct("<I")
-SEQ_AND_PRESSURE = struct.Struct("<Q192xd")
+SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")
+"""Members of a slot."""
 CHUNK = 1 << 18
+PARTS = 5
+"""With `--devices` every client watches each PARTS-th device."""
 
 
-class Latency:
-    """What the first client saw: samples, gaps in `seq`, time from the write into the pty to the receive."""
+class Seen:
+    """Samples of a client, gaps in `seq`, and times from the write into the pty to the receive."""
 
-    def __init__(self, times: mmap.mmap | None, skip: int) -> None:
+    def __init__(self, times: mmap.mmap | None = None, skip: int = 0) -> None:
         self.times = times
         self.skip = skip
         self.latencies_ns: list[int] = []
         self.samples = 0
         self.gaps = 0
-        self.last: dict[object, int] = {}
+        self.newest: dict[object, int] = {}
 
-    def add(self, device: object, seq: int, index: int, now_ns: int) -> None:
-        """One sample: `index` is the writer's number of the frame."""
+    def add(self, device: object, seq: int, pressure_pa: float, now_ns: int) -> None:
+        """Count one sample; its pressure has the writer's number of the frame."""
         self.samples += 1
-        last = self.last.get(device)
-        if last is not None:
-            self.gaps += seq - last - 1
-        self.last[device] = seq
-        if self.times is not None and index >= self.skip:
+        self.gaps += seq - self.newest.get(device, seq - 1) - 1
+        self.newest[device] = seq
+        if self.times is not None and (index := int(pressure_pa) - FIRST_PA) >= self.skip:
             self.latencies_ns.append(now_ns - struct.unpack_from("<q", self.times, 8 * index)[0])
 
 
-def count_binary(buffer: bytearray, seen: Latency, now_ns: int) -> None:
-    """Take whole length-prefixed messages off the front of `buffer`."""
+Take = Callable[[bytearray, Seen, int], None]
+"""Removes whole messages from the front of a buffer and counts their samples."""
+
+
+def take_binary(buffer: bytearray, seen: Seen, now_ns: int) -> None:
+    """Take length-prefixed messages."""
     at = 0
-    while len(buffer) - at >= 4:
+    while len(buffer) - at >= LENGTH.size:
         (length,) = LENGTH.unpack_from(buffer, at)
-        if len(buffer) - at - 4 < length:
+        body = at + LENGTH.size
+        if len(buffer) - body < length:
             break
-        body = at + 4
-        if buffer[body] != 0x7B or length == SLOT_BYTES:
+        if length % SLOT_BYTES == 0:  # anything else is a notification
             for slot in range(body, body + length, SLOT_BYTES):
-                seq, pressure = SEQ_AND_PRESSURE.unpack_from(buffer, slot)
-                seen.add(struct.unpack_from("<H", buffer, slot + 60)[0], seq, int(pressure) - FIRST_PA, now_ns)
+                seq, device, pressure_pa = SEQ_DEVICE_AND_PRESSURE.unpack_from(buffer, slot)
+                seen.add(device, seq, pressure_pa, now_ns)
         at = body + length
     del buffer[:at]
 
 
-def count_json(buffer: bytearray, seen: Latency, now_ns: int) -> None:
-    """Take whole lines off the front of `buffer`."""
+def take_json(buffer: bytearray, seen: Seen, now_ns: int) -> None:
+    """Take lines."""
     end = buffer.rfind(b"\n") + 1
     for line in bytes(buffer[:end]).splitlines():
         params = msgspec.json.decode(line).get("params", {})
         if "seq" in params:
-            seen.add(params["device"], params["seq"], int(params["pressure_pa"]) - FIRST_PA, now_ns)
+            seen.add(params["device"], params["seq"], params.get("pressure_pa") or 0.0, now_ns)
     del buffer[:end]
 
 
-def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> tuple[socket.socket, bytes]:
-    """Connect and ask for samples, as `wanted`; returns the socket and the bytes that came after the reply."""
+def take_attitudes(buffer: bytearray, seen: Seen, now_ns: int) -> None:
+    """Take lines of gpsd."""
+    end = buffer.rfind(b"\n") + 1
+    for _ in range(buffer.count(b'"class":"ATT"', 0, end)):
+        seen.add("gpsd", seen.samples, 0.0, now_ns)
+    del buffer[:end]
+
+
+TAKES: dict[str, Take] = {"binary": take_binary, "json": take_json}
+
+
+class Client(NamedTuple):
+    """A connection that is subscribed."""
+
+    socket: socket.socket
+    buffer: bytearray
+    """Received bytes that were not taken yet."""
+
+
+def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> Client:
+    """Connect and ask for samples, as `wanted`."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     if bare:
-        return sock, b""
+        return Client(sock, bytearray())
     request = {"jsonrpc": "2.0", "id": 1, "method": "watch", "params": {"encoding": encoding, **wanted}}
     sock.sendall(json.dumps(request).encode() + b"\n")
     got = b""
     while got.count(b"\n") < 2:  # hello, then the reply
         got += sock.recv(CHUNK)
-    reply = got.split(b"\n", 2)
-    assert b'"error"' not in reply[1], reply[1]
-    return sock, reply[2]
+    _, reply, rest = got.split(b"\n", 2)
+    assert b'"error"' not in reply, reply
+    return Client(sock, bytearray(rest))
 
 
-def count_attitudes(buffer: bytearray, seen: Latency, now_ns: int) -> None:
-    """Take whole lines of gpsd off the front of `buffer`."""
-    end = buffer.rfind(b"\n") + 1
-    for _ in range(buffer.count(b'"class":"ATT"', 0, end)):
-        seen.add("gpsd", seen.samples, 0, now_ns)
-    del buffer[:end]
-
-
-def subscribe_to_gpsd(port: int) -> tuple[socket.socket, bytes]:
-    """Connect to gpsd and ask for all its reports; returns the socket and the bytes that came after the answer."""
+def subscribe_to_gpsd(port: int) -> Client:
+    """Connect to gpsd and ask for all its reports."""
     sock = socket.create_connection(("127.0.0.1", port))
     sock.sendall(b'?WATCH={"enable":true,"json":true};\n')
     got = b""
     while b'"class":"WATCH"' not in got or not got.endswith(b"\n"):
         got += sock.recv(CHUNK)
-    return sock, b""
+    return Client(sock, bytearray())
 
 
-def receive(socks: list[tuple[socket.socket, bytes]], on_bytes: object, seen: Latency, until_ns: int) -> None:
-    """Receive on all sockets until they end, standard input closes or it is `until_ns`."""
-    assert callable(on_bytes)
-    first = socks[0][0]
-    buffer = bytearray(socks[0][1])
+def receive(clients: list[Client], takes: list[tuple[Take, Seen]], seconds: float) -> None:
+    """Receive for so long, or until a socket or standard input ends; the first clients count with `takes`."""
     poll = select.epoll()
-    by_fd = {sock.fileno(): sock for sock, _ in socks}
-    for fd, sock in by_fd.items():
-        sock.setblocking(False)
+    by_fd = {client.socket.fileno(): (client, number) for number, client in enumerate(clients)}
+    for fd, (client, _) in by_fd.items():
+        client.socket.setblocking(False)
         poll.register(fd, select.EPOLLIN)
     poll.register(sys.stdin.fileno(), select.EPOLLIN)
     scratch = bytearray(CHUNK)
     now_ns = time.monotonic_ns
+    until_ns = now_ns() + int(seconds * 1e9)
     while now_ns() < until_ns:
         for fd, _ in poll.poll(1.0):
-            found = by_fd.get(fd)
-            if found is None:
+            if fd not in by_fd:
                 return
-            count = found.recv_into(scratch)
+            client, number = by_fd[fd]
+            count = client.socket.recv_into(scratch)
             if count == 0:
                 return
-            if found is first:
+            if number < len(takes):
                 t_ns = now_ns()
-                buffer += memoryview(scratch)[:count]
-                on_bytes(buffer, seen, t_ns)
+                client.buffer.extend(memoryview(scratch)[:count])
+                take, seen = takes[number]
+                take(client.buffer, seen, t_ns)
 
 
 def percentile(ordered: list[int], share: float) -> float:
     """The value below which `share` of the values lie; NaN of none."""
     return float(ordered[min(len(ordered) - 1, int(share * len(ordered)))]) if ordered else float("nan")
+
+
+def figures(seen: list[Seen]) -> dict[str, float]:
+    """Return the figures of the clients that counted, and the latencies of the first."""
+    ordered = sorted(seen[0].latencies_ns)
+    shares = {"p50_us": 0.5, "p99_us": 0.99}
+    found = {name: percentile(ordered, share) / 1e3 for name, share in shares.items()}
+    found["max_us"] = ordered[-1] / 1e3 if ordered else 0.0
+    return found | {"samples": sum(one.samples for one in seen), "gaps": sum(one.gaps for one in seen)}
 
 
 def main() -> None:
@@ -143,7 +171,7 @@ def main() -> None:
     parser.add_argument("--socket", default="")
     parser.add_argument("--gpsd", type=int, metavar="PORT", help="clients of gpsd instead")
     parser.add_argument("--clients", type=int, default=1)
-    parser.add_argument("--encoding", choices=["json", "binary"], default="binary")
+    parser.add_argument("--encoding", choices=list(TAKES), default="binary")
     parser.add_argument("--bare", action="store_true")
     parser.add_argument("--stuck", action="store_true")
     parser.add_argument("--watch", type=json.loads, default={}, help="more parameters of `watch`, as JSON")
@@ -151,27 +179,30 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=0)
     parser.add_argument("--skip", type=int, default=0, help="frames at the beginning whose latency does not count")
     parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument("--devices", nargs="+", default=[])
     args = parser.parse_args()
     times = None
     if args.times:
         with open(args.times, "rb") as file:
             times = mmap.mmap(file.fileno(), 8 * args.frames, access=mmap.ACCESS_READ)
-    seen = Latency(times, args.skip)
-    stuck = subscribe(args.socket, args.encoding, args.bare, args.watch) if args.stuck else None
+    ask = partial(subscribe, args.socket, bare=args.bare)
+    stuck = ask(args.encoding, wanted=args.watch) if args.stuck else None
+    takes: list[tuple[Take, Seen]] = [(TAKES[args.encoding], Seen(times, args.skip))]
     if args.gpsd:
-        socks = [subscribe_to_gpsd(args.gpsd) for _ in range(args.clients)]
+        clients = [subscribe_to_gpsd(args.gpsd) for _ in range(args.clients)]
+        takes = [(take_attitudes, Seen())]
+    elif args.devices:
+        kinds = [list(TAKES)[number % 2] for number in range(args.clients)]
+        wanted = [{"devices": args.devices[number % PARTS :: PARTS]} for number in range(args.clients)]
+        clients = [ask(kind, wanted=one) for kind, one in zip(kinds, wanted, strict=True)]
+        takes = [(TAKES[kind], Seen()) for kind in kinds]
     else:
-        socks = [subscribe(args.socket, args.encoding, args.bare, args.watch) for _ in range(args.clients)]
+        clients = [ask(args.encoding, wanted=args.watch) for _ in range(args.clients)]
     print("ready", flush=True)
-    on_bytes = count_attitudes if args.gpsd else count_binary if args.encoding == "binary" else count_json
-    receive(socks, on_bytes, seen, time.monotonic_ns() + int(args.seconds * 1e9))
-    ordered = sorted(seen.latencies_ns)
-    shares = {"p50_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}
-    figures = {name: percentile(ordered, share) / 1e3 for name, share in shares.items()}
-    figures |= {"max_us": ordered[-1] / 1e3 if ordered else 0.0, "samples": seen.samples, "gaps": seen.gaps}
-    print(json.dumps(figures), flush=True)
+    receive(clients, takes, args.seconds)
+    print(json.dumps(figures([seen for _, seen in takes])), flush=True)
     if stuck is not None:
-        stuck[0].close()
+        stuck.socket.close()
 
 
 if __name__ == "__main__":

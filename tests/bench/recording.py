@@ -167,4 +167,4 @@ devices:
 
 if __name__ == "__main__":
     for row in chosen_rows(sys.argv[1:]):
-        print(f"{row.name:64} {row.value:12.3f} {row.unit:6} {row.reach} {row.reached}")
+        print(row, flush=True)

@@ -143,4 +143,4 @@ def live_rows(seconds: float = SECONDS) -> Iterator[Row]:
 
 if __name__ == "__main__":
     for row in live_rows(float(sys.argv[1]) if len(sys.argv) > 1 else SECONDS):
-        print(f"{row.name:64} {row.value:12.3f} {row.unit:6} {row.reach} {row.reached}")
+        print(row, flush=True)

@@ -208,7 +208,15 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
     return server
 
 
-def start_readers(stack: ExitStack, folder: Path, load: Load) -> Process:
+def start_writer(stack: ExitStack, folder: Path, load: Load, *options: str, cores: set[int] = REST_CORES) -> Process:
+    """The process that writes frames; its first line has the ports."""
+    (folder / "times").write_bytes(bytes(8 * load.frames))
+    args = ["--devices", str(load.devices), "--rate", str(load.rate_hz), "--frames", str(load.frames)]
+    args += ["--phases", str(load.phases), "--apart", str(load.apart), "--times", str(folder / "times"), *options]
+    return stack.enter_context(Process(cores, "-m", "tests.bench.writer", *args))
+
+
+def start_readers(stack: ExitStack, folder: Path, load: Load, cores: set[int] = REST_CORES) -> Process:
     """The client process, subscribed."""
     args = ["--socket", str(folder / "s"), "--clients", str(load.clients), "--encoding", load.encoding]
     args += ["--times", str(folder / "times"), "--frames", str(load.frames)]
@@ -216,7 +224,7 @@ def start_readers(stack: ExitStack, folder: Path, load: Load) -> Process:
     wanted = {"rate_hz": load.client_hz, "latency_ms": load.latency_ms}
     args += ["--watch", json.dumps({name: value for name, value in wanted.items() if value is not None})]
     args += ["--bare"] * load.bare + ["--stuck"] * load.stuck
-    readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *args))
+    readers = stack.enter_context(Process(cores, "-m", "tests.bench.readers", *args))
     readers.line()
     return readers
 
@@ -249,17 +257,9 @@ def run(load: Load) -> Outcome:
     """One measurement from start to end."""
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
         folder = Path(name)
-        (folder / "times").write_bytes(bytes(8 * load.frames))
         if load.sout:
             os.mkfifo(folder / "edges")
-        writer = stack.enter_context(
-            Process(
-                REST_CORES, "-m", "tests.bench.writer", "--devices", str(load.devices), "--rate", str(load.rate_hz),
-                "--frames", str(load.frames), "--phases", str(load.phases), "--times", str(folder / "times"),
-                "--apart", str(load.apart),
-                *(["--edges", str(folder / "edges")] if load.sout else []),
-            )
-        )  # fmt: skip
+        writer = start_writer(stack, folder, load, *(["--edges", str(folder / "edges")] if load.sout else []))
         ports = writer.line().split()
         server = start_server(stack, folder, ports, load)
         readers = start_readers(stack, folder, load)

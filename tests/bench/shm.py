@@ -1,6 +1,6 @@
 """Shared memory: what one sample costs the writer, and the Python and the C reader.
 
-`python -m tests.bench.shm` prints it. Batches of one sample, as at 1 kHz: nothing is shared between samples.
+Batches of one sample, as at 1 kHz: nothing is shared between samples.
 """
 
 import shutil
@@ -104,8 +104,3 @@ def _c_reader_ns(folder: Path) -> float:
     subprocess.run(["cc", "-O2", f"-I{INCLUDE}", str(source), "-o", str(program)], check=True)
     done = subprocess.run([str(program), str(folder / "imud.bench")], capture_output=True, text=True, check=True)
     return float(done.stdout)
-
-
-if __name__ == "__main__":
-    for row in rows():
-        print(f"{row.name:60} {row.value:10.0f} {row.unit}")

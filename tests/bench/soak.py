@@ -290,6 +290,7 @@ def watch_for(watched: Watched, recordings: Recordings, readers: Process, second
             watched.minute(elapsed, elapsed - minute)
             minute = elapsed
         sleep(max(min(next_scrape, seconds) - (monotonic() - begin), 0.01))
+    readers.popen.send_signal(SIGCONT)  # a short run ends before its time
     watched.scrape(elapsed)
     watched.minute(elapsed, elapsed - minute)
 
@@ -315,8 +316,8 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
         wait_for(folder / "s")
         wait_open(folder / "s", fleet)
         names = list(ask_all(folder / "s")[0])
-        argv = ["--socket", str(folder / "s"), "--clients", str(CLIENTS), *names]
-        readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.fleet_readers", *argv))
+        argv = ["--socket", str(folder / "s"), "--clients", str(CLIENTS), "--devices", *names]
+        readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *argv))
         readers.line()
         watched, recordings = Watched(server.popen.pid, folder / "s", metrics_port), Recordings(folder / "recordings")
         begin = ask_line(folder / "s", line)
@@ -339,8 +340,9 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
     if any(a > b for a, b in zip(watched.usage[-1], watched.usage[0], strict=True)):
         found.append(f"descriptors and threads {watched.usage[-1]}, in the beginning {watched.usage[0]}")
     taken, refused = (sum(column) for column in zip(*counts, strict=True))
-    print(f"frames taken by ptys {taken}, refused {refused}; clients {figures}, dropped {dropped}; "
-          f"scrapes {len(watched.points)}, unanswered {watched.unanswered}; {recorded}; {words}")  # fmt: skip
+    seen = f"clients {figures['samples']} samples, {figures['gaps']} missing, dropped {dropped}"
+    scrapes = f"scrapes {len(watched.points)}, unanswered {watched.unanswered}"
+    print(f"frames taken by ptys {taken}, refused {refused}; {seen}; {scrapes}; {recorded}; {words}")
     print("\n".join(found or ["passed"]))
     return 1 if found else 0
 

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic, sleep
 
-from tests.bench.rig import REST_CORES, Load, Process, ask, rss_mb, start_readers, start_server
+from tests.bench.rig import Load, ask, rss_mb, start_readers, start_server, start_writer
 
 SLOPE_LIMIT_MB_PER_H = 2.0
 SETTLE_S = 20.0
@@ -25,18 +25,7 @@ def run_single(seconds: float, encoding: str) -> int:
     load = Load(clients=10, seconds=seconds, encoding=encoding, stuck=True)
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-soak-") as name, ExitStack() as stack:
         folder = Path(name)
-        (folder / "times").write_bytes(bytes(8 * load.frames))
-        argv = [
-            "-m",
-            "tests.bench.writer",
-            "--rate",
-            "1000",
-            "--frames",
-            str(load.frames),
-            "--times",
-            str(folder / "times"),
-        ]
-        writer = stack.enter_context(Process(REST_CORES, *argv))
+        writer = start_writer(stack, folder, load)
         server = start_server(stack, folder, writer.line().split(), load)
         readers = start_readers(stack, folder, load)
         writer.say("go")

@@ -2,8 +2,6 @@
 
 Real UNIX sockets, in one process: publish ten batches of one sample (timed), then empty the clients' sockets (not
 timed), so that the figures hold the daemon's own work and the kernel's part of `send`, and no waking of readers.
-
-`python -m tests.bench.socket` prints the rows.
 """
 
 import asyncio
@@ -135,10 +133,3 @@ def rows(quick: bool = False) -> list[Row]:
         cost_ns, _ = asyncio.run(measure(directory, 100, "json", 10.0, 50))
         found.append(Row("socket: publish, json, 100 clients at 10 Hz each", cost_ns, "ns/sample"))
     return found
-
-
-if __name__ == "__main__":
-    from tests.bench.__main__ import show
-
-    for row in rows():
-        print(show(row))

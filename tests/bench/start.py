@@ -2,7 +2,7 @@
 
 What waits is a person or a script in a loop, so that it is the time that passes, a new process each, the median of ten.
 The CPU time of the same starts is beside it, which other programs disturb less, and the interpreter alone: nothing in
-Python is faster. `python -m tests.bench.start`.
+Python is faster.
 """
 
 import os
@@ -70,8 +70,3 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         stack.callback(os.close, far)
         start_server(stack, folder, [os.ttyname(far)], Load())
         yield from start_rows("imud status, one device", *ask, status=NOT_STREAMING)
-
-
-if __name__ == "__main__":
-    for row in rows():
-        print(f"{row.name:40} {row.value:8.1f} {row.unit} {row.reach}")

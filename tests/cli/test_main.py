@@ -95,7 +95,7 @@ def test_help_of_all_imports_no_command() -> None:
 )
 def test_what_is_called_often_imports_nothing_heavy(arguments: list[str], foreign: set[str]) -> None:
     """Of other packages msgspec alone, and nothing of asyncio, TLS, HTTP or what drivers promise: each takes as long to
-    import as the command needs (`python -m tests.bench.start`)."""
+    import as the command needs (`make bench ARGS=start`)."""
     program = (
         "import sys\nbefore = set(sys.modules)\nfrom imud.cli import main\ntry:\n"
         f"    main({arguments!r})\nexcept SystemExit:\n    pass\nprint()\nprint(*sys.modules.keys() - before)"
