@@ -13,30 +13,21 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from random import Random
 from time import monotonic
-from typing import Final, NamedTuple
+from typing import Final
 
-from imud import config
-from imud.daemon import Daemon
-from imud.runtime import event_loop
-from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
-from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.imu61x.settings import Imu61xSettings
 from imud.sim.imu61x.uart import Imu61xModule
-from imud.sim.simulator import StreamModule
-from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.captures import BAUD, BEGIN_NS, Source, hi91_module, record
 from tests.bench.rows import Row, at_most
-from tests.support.files import CaptureWriter
 
 SECONDS: Final = 3600
 QUICK_SECONDS: Final = 120
 RATE_HZ: Final = 400
 LIMIT_S: Final = 20.0
 """For an hour at RATE_HZ."""
-BEGIN_NS: Final = 86_400 * NS_PER_S
 FORMATS: Final = {
     "CSV": ("--to", "csv"),
     "MCAP, JSON": ("--to", "mcap", "--schema", "json"),
@@ -44,24 +35,13 @@ FORMATS: Final = {
 }
 
 
-class Source(NamedTuple):
-    """A simulated device."""
-
-    driver: str
-    baud: int
-    rate_hz: int
-    make: Callable[[], StreamModule]
-
-
+IMU61X: Final = Imu61xSettings(baud=BAUD, rate_hz=RATE_HZ)
 SOURCES: Final = {
     "IMU61X": Source(
-        "imu61x-uart", 921_600, RATE_HZ, lambda: Imu61xModule(BEGIN_NS, Imu61xSettings(baud=921_600, rate_hz=RATE_HZ))
+        "imu61x-uart", RATE_HZ, lambda: Imu61xModule(BEGIN_NS, Imu61xSettings(baud=BAUD, rate_hz=RATE_HZ))
     ),
-    "HI91": Source(
-        "hipnuc-uart", 921_600, 500,
-        lambda: HipnucModule(BEGIN_NS, ModuleSettings(baud=921_600, hi91=Output(period_ms=2)), HipnucHardware()),
-    ),
-}  # fmt: skip
+    "HI91": Source("hipnuc-uart", 500, lambda: hi91_module(500)),
+}
 
 
 def rows(*, quick: bool = False, folder: Path | None = None) -> Iterator[Row]:
@@ -75,35 +55,6 @@ def rows(*, quick: bool = False, folder: Path | None = None) -> Iterator[Row]:
             if not recording.exists():
                 record(source, samples // source.rate_hz, Path(scratch)).rename(recording)
             yield from export_rows(name, recording, samples, Path(scratch), None if quick else LIMIT_S)
-
-
-def record(source: Source, seconds: int, folder: Path) -> Path:
-    """Have a daemon record a module for so long by its stamps; return the file."""
-    capture, recordings = folder / "capture", folder / f"{source.driver}-recordings"
-    write_capture(source, seconds, capture)
-    text = f"""
-recorder: {{enabled: true, directory: {recordings}, file_mb: 1000}}
-socket: {{enabled: false}}
-shm: {{enabled: false}}
-metrics: {{enabled: false}}
-devices:
-  bow: {{driver: {source.driver}, replay: {{path: {capture}, speed: maximum}}}}
-"""
-    event_loop.run(Daemon(config.parse(text, "imud.yaml"), until_finished=True).run())
-    capture.unlink()
-    (made,) = recordings.iterdir()
-    return made
-
-
-def write_capture(source: Source, seconds: int, path: Path) -> None:
-    """Write what the module sends through a port that hands bytes over up to 0.25 ms late."""
-    random, module = Random(1), source.make()
-    with path.open("wb") as out:
-        writer = CaptureWriter(out, driver=source.driver, baud=source.baud)
-        for second in range(seconds):
-            for burst in module.advance(BEGIN_NS + (second + 1) * NS_PER_S):
-                if burst.data:
-                    writer.write(burst.data, burst.due_ns + random.randrange(NS_PER_MS // 4))
 
 
 def export_rows(name: str, recording: Path, samples: int, folder: Path, limit_s: float | None) -> Iterator[Row]:

@@ -19,26 +19,21 @@ from time import thread_time_ns
 
 import msgspec
 
-from imud import config
 from imud.contracts.publisher import Batch
-from imud.daemon import Daemon
 from imud.event import Event
 from imud.formats.recording import records
 from imud.formats.recording.file import BlockGatherer, RecordingReader
-from imud.runtime import event_loop
 from imud.runtime.recording.player import Player
-from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
-from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.units import NS_PER_MS, NS_PER_S
+from tests.bench.captures import BEGIN_NS, Source, hi91_module, record
 from tests.bench.rig import Load, run
 from tests.bench.rows import Row, at_most
-from tests.support.files import CaptureWriter
 
 RATIO_LIMIT = 1.15
 SIZE_SECONDS = 60
 REPLAY_SECONDS = 600
 REPLAY_QUICK_SECONDS = 30
-BEGIN_NS = 86_400 * NS_PER_S
+HI91_1_KHZ = Source("hipnuc-uart", 1000, lambda: hi91_module(1000))
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
@@ -64,12 +59,7 @@ def chosen_rows(words: list[str]) -> Iterator[Row]:
 def size_rows() -> Iterator[Row]:
     """Bytes per sample of a module that moves, at the rates that the daemon's blocks have: one a second."""
     for rate_hz in (100, 1000):
-        random, module = (
-            Random(1),
-            HipnucModule(
-                BEGIN_NS, ModuleSettings(baud=921_600, hi91=Output(period_ms=1000 // rate_hz)), HipnucHardware()
-            ),
-        )
+        random, module = Random(1), hi91_module(rate_hz)
         gatherer, stored, plain, samples, spent_ns = BlockGatherer(), 0, 0, 0, 0
         for second in range(SIZE_SECONDS):
             made: list[bytes] = []
@@ -122,35 +112,11 @@ class Digest:
     def close(self) -> None: ...
 
 
-def moving_capture(file: Path, seconds: int) -> None:
-    """A module at 1 kHz that moves, behind a port that hands its bytes over up to 0.25 ms late."""
-    random = Random(1)
-    module = HipnucModule(BEGIN_NS, ModuleSettings(baud=921_600, hi91=Output(period_ms=1)), HipnucHardware())
-    with file.open("wb") as out:
-        writer = CaptureWriter(out, driver="hipnuc-uart", baud=921600)
-        for second in range(seconds):
-            for burst in module.advance(BEGIN_NS + (second + 1) * NS_PER_S):
-                if burst.data:
-                    writer.write(burst.data, burst.due_ns + random.randrange(NS_PER_MS // 4))
-
-
 def replay_rows(seconds: int) -> Iterator[Row]:
     """Run a daemon that records, replay what it wrote, and compare."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        moving_capture(folder / "capture", seconds)
-        text = f"""
-recorder: {{enabled: true, directory: {folder / "recordings"}, file_mb: 1000}}
-socket: {{enabled: false}}
-shm: {{enabled: false}}
-metrics: {{enabled: false}}
-devices:
-  bow: {{driver: hipnuc-uart, replay: {{path: {folder / "capture"}, speed: maximum}}}}
-"""
         live, again = Digest(), Digest()
-        daemon = Daemon(config.parse(text, "imud.yaml"), extra={"live": live}, until_finished=True)
-        event_loop.run(daemon.run())
-        (file,) = (folder / "recordings").iterdir()
+        file = record(HI91_1_KHZ, seconds, Path(name), extra={"live": live})
         player = Player(again.publish)
         with file.open("rb") as opened:
             reader = RecordingReader(opened, file.name)

@@ -21,7 +21,7 @@ from imud.contracts.status import DeviceStatus
 CORES = sorted(os.sched_getaffinity(0))
 SERVER_CORE = {CORES[-1]}
 REST_CORES = set(CORES[:-1]) or SERVER_CORE
-START_LIMIT_S = 20.0
+START_LIMIT_S = 120.0
 END_S = 0.2
 """The measurement of CPU time ends this long before the last frame: the writer keeps its deadlines, this process may
 wake late."""

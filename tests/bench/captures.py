@@ -1,0 +1,63 @@
+"""Captures of simulated modules that move, and a daemon that plays a capture and records it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any, Final, NamedTuple
+
+from imud import config
+from imud.daemon import Daemon
+from imud.runtime import event_loop
+from imud.sim.hipnuc.uart.settings import HipnucHardware, ModuleSettings, Output
+from imud.sim.hipnuc.uart.simulator import HipnucModule
+from imud.sim.simulator import StreamModule
+from imud.units import NS_PER_MS, NS_PER_S
+from tests.support.files import CaptureWriter
+
+BEGIN_NS: Final = 86_400 * NS_PER_S
+BAUD: Final = 921_600
+
+
+class Source(NamedTuple):
+    """A simulated device."""
+
+    driver: str
+    rate_hz: int
+    make: Callable[[], StreamModule]
+
+
+def hi91_module(rate_hz: int) -> HipnucModule:
+    """Make a HiPNUC module that sends HI91 frames."""
+    return HipnucModule(BEGIN_NS, ModuleSettings(baud=BAUD, hi91=Output(period_ms=1000 // rate_hz)), HipnucHardware())
+
+
+def write_capture(source: Source, seconds: int, path: Path) -> None:
+    """Write what the module sends through a port that hands bytes over up to 0.25 ms late."""
+    random, module = Random(1), source.make()
+    with path.open("wb") as out:
+        writer = CaptureWriter(out, driver=source.driver, baud=BAUD)
+        for second in range(seconds):
+            for burst in module.advance(BEGIN_NS + (second + 1) * NS_PER_S):
+                if burst.data:
+                    writer.write(burst.data, burst.due_ns + random.randrange(NS_PER_MS // 4))
+
+
+def record(source: Source, seconds: int, folder: Path, **more: Any) -> Path:
+    """Let a daemon record a module for this time of its time stamps. Return the recording.
+
+    `more` are further arguments of the daemon.
+    """
+    capture, recordings = folder / "capture", folder / f"{source.driver}-recordings"
+    write_capture(source, seconds, capture)
+    text = f"""
+recorder: {{enabled: true, directory: {recordings}, file_mb: 1000}}
+socket: {{enabled: false}}
+shm: {{enabled: false}}
+metrics: {{enabled: false}}
+devices:
+  bow: {{driver: {source.driver}, replay: {{path: {capture}, speed: maximum}}}}
+"""
+    event_loop.run(Daemon(config.parse(text, "imud.yaml"), until_finished=True, **more).run())
+    capture.unlink()
+    (made,) = recordings.iterdir()
+    return made
