@@ -46,11 +46,16 @@ class Diagnosis(msgspec.Struct, frozen=True):
             (check.name, found.seen) for check in self.checks for found in check.findings if found.severity == severity
         ]
 
-    def has(self, check: str, severity: str, seen: str, advice: str = "") -> None:
-        """See that the check has a finding of this severity with these words, and these in its next step."""
+    def advice(self, check: str, severity: str, seen: str, advice: str = "") -> str:
+        """Return the advice of the first finding with these words. AssertionError if there is none."""
         found = [one for each in self.checks if each.name == check for one in each.findings]
         fitting = [one for one in found if one.severity == severity and seen in one.seen and advice in one.advice]
         assert fitting, f"{check}: no {severity} with {seen!r} and the step {advice!r} among {found}"
+        return fitting[0].advice
+
+    def has(self, check: str, severity: str, seen: str, advice: str = "") -> None:
+        """Check that the check has a finding with this severity and these words, also in its advice."""
+        self.advice(check, severity, seen, advice)
 
 
 def diagnose(config: Path, socket: Path, *prefix: str) -> Diagnosis:
