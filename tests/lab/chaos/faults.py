@@ -105,6 +105,16 @@ def _round(random: Random, faults: list[Fault]) -> list[Planned]:
     return planned
 
 
+def plan_each_once(seed: int, faults: list[Fault]) -> list[Planned]:
+    """Return one round in which every kind of fault happens once, as early as its resources allow."""
+    random, free_s, planned = Random(seed), dict[str, float](), list[Planned]()
+    for fault in random.sample(faults, len(faults)):
+        begin_s = max(free_s.get(resource, random.uniform(0.0, EVERY_S)) for resource in fault.resources)
+        planned.append(Planned(begin_s, fault, random.uniform(fault.shortest_s, fault.longest_s)))
+        free_s |= dict.fromkeys(fault.resources, begin_s + planned[-1].lasts_s + PAUSE_S)
+    return sorted(planned, key=lambda item: item.begin_s)
+
+
 def play(
     planned: list[Planned],
     begin: Callable[[Planned], None],
