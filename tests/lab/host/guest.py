@@ -31,7 +31,7 @@ class Limits:
     """How long the runner waits for what."""
 
     total_s: float = 1200.0
-    boot_s: float = 120.0
+    boot_s: float = 300.0
     """From the start to the first sign of life; it is about 5 s on an idle machine."""
     silence_s: float = 60.0
     """Between two signs of life; the guest gives one every 5 s."""
