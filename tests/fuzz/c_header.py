@@ -15,7 +15,7 @@ TARGET: Final = "c-header"
 SOURCE: Final = ROOT / "tests/fuzz/ring.c"
 INCLUDE: Final = ROOT / "imud/include"
 INPUT_BYTES_MAX: Final = 512
-INPUT_S_MAX: Final = 10
+INPUT_S_MAX: Final = 120
 _PROGRAM: Final = "c-header-fuzzer"
 _BASE: Final = "ring.base"
 
