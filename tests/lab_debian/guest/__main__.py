@@ -1,8 +1,9 @@
-"""The guest's program: `python3 -m tests.lab_debian.guest ARCHITECTURE [GROUP...]` runs its checks, or groups of them.
+"""The guest's program: `python3 -m tests.lab_debian.guest [--short] ARCHITECTURE [GROUP...]` runs checks, or groups.
 
 Exit status: 0 all passed, 1 some failed.
 """
 
+import argparse
 import sys
 from collections.abc import Callable
 from typing import TypeAlias
@@ -51,10 +52,16 @@ RUNS = {
 
 def main(arguments: list[str]) -> int:
     """The program."""
-    architecture, *groups = arguments
+    parser = argparse.ArgumentParser()
+    parser.add_argument("architecture", choices=list(RUNS))
+    parser.add_argument("groups", nargs="*", metavar="GROUP")
+    parser.add_argument("--short", action="store_true")
+    options = parser.parse_args(arguments)
     checks = Checks(SHARE / "results.json")
     host = Host()
-    for name in ("installation", *(groups or RUNS[architecture])):
+    if options.short:
+        replug.ROUNDS = replug.ROUNDS_SHORT
+    for name in ("installation", *(options.groups or RUNS[options.architecture])):
         checks.begin(name)
         try:
             GROUPS[name](checks, host)

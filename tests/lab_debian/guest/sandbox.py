@@ -146,11 +146,11 @@ def refused(who: str, result: str) -> None:
         raise Failed(f"{who}: {result or 'could'}")
 
 
-def present_nodes(checks: Checks, folder: Path = Path("/dev"), machine: str = "") -> list[str]:
+def present_nodes(checks: Checks) -> list[str]:
     """One node of each kind that this machine is promised to have; a check that fails for each that is not there."""
     found = []
-    for pattern in buses.NODES[machine or platform.machine()]:
-        nodes = sorted(str(path) for path in folder.glob(pattern))
+    for pattern in buses.NODES[platform.machine()]:
+        nodes = sorted(str(path) for path in Path("/dev").glob(pattern))
         if not nodes:
             with checks(f"/dev/{pattern} is there"):
                 raise Failed("the rig has none: was its driver loaded (README.md, What the guest has)?")

@@ -39,6 +39,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--arm64", action="store_true", help="arm64, with unit tests, instead of amd64")
     options.add_argument("--suite", choices=[release.suite for release in AMD64], help="only this release")
     options.add_argument("--build-only", action="store_true", help="make images and packages, do not boot")
+    options.add_argument("--short", action="store_true", help="the adapter is plugged in again twice, not ten times")
     options.add_argument("--package", type=Path, metavar="DEB", help="install this package instead of building one")
     options.add_argument("--exec", metavar="COMMAND", help="run this shell command in the guest instead of the checks")
     options.add_argument("--venv", type=Path, default=ROOT / ".venv", help="default: .venv")
@@ -66,7 +67,8 @@ def program(options: argparse.Namespace, release: Release, groups: list[str]) ->
     """What the guest runs: the command, or the groups of checks, all that are for its architecture if none is named."""
     if options.exec:
         return f"{options.exec}\n"
-    return f"exec python3 -B -m tests.lab_debian.guest {' '.join([release.architecture, *groups])}\n"
+    words = [release.architecture, *(["--short"] if options.short else []), *groups]
+    return f"exec python3 -B -m tests.lab_debian.guest {' '.join(words)}\n"
 
 
 @contextlib.contextmanager
