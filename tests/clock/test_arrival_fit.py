@@ -44,7 +44,7 @@ def test_it_is_young_but_not_wild() -> None:
     assert fit.slope_error > 1e-5
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_point_is_under_the_hull_however_it_was_made(seed: int) -> None:
     """Corners are points, the slopes between them rise, and a hull that was extended is that of all points at once."""
     random = Random(seed)
@@ -141,7 +141,7 @@ def test_bounds_hold_for_every_line_that_fits() -> None:
     found = feasible_lines(ceiling, floor, 100.0)
     assert found is not None
     seen = []
-    for _ in range(20_000):
+    for _ in range(5000):
         slope, at_end = random.uniform(-0.4, 0.4), random.uniform(-40, 40)
         if all(at_end + slope * (x - 100) <= y for x, y in ceiling) and all(
             at_end + slope * (x - 100) >= y for x, y in floor
@@ -149,6 +149,6 @@ def test_bounds_hold_for_every_line_that_fits() -> None:
             seen.append(at_end)
             assert found.slope_lowest <= slope <= found.slope_highest
             assert found.lowest_ns <= at_end <= found.highest_ns
-    assert len(seen) > 100
+    assert len(seen) > 25
     assert max(seen) > found.highest_ns - 2
     assert min(seen) < found.lowest_ns + 2

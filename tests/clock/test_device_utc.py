@@ -39,7 +39,7 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 0.0, seed: i
 )
 @pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
 def test_a_device_that_turns_to_utc_is_recognised(profile: ArrivalProfile, turn_ms: int, seed: int) -> None:
-    dated, clock = run_utc(model(profile, seed=seed), 60, turn_ms=turn_ms)
+    dated, clock = run_utc(model(profile, seed=seed), 45, turn_ms=turn_ms)
     assert clock.status().resets == 0
     assert clock.status().reference_error_ns == REFERENCE.error_ns
     assert syncs(dated[1500:]) == {Sync.UTC}
@@ -50,7 +50,7 @@ def test_a_device_that_turns_to_utc_is_recognised(profile: ArrivalProfile, turn_
     assert max(t.sample.t_err_ns for t in after(dated, 30)) < NS_PER_MS
 
 
-@pytest.mark.parametrize("ppm", [-50_000.0, -50.0, 50_000.0])
+@pytest.mark.parametrize("ppm", [-50_000.0, 50.0])
 def test_what_the_crystal_did_before_the_turn_is_forgotten(ppm: float) -> None:
     """At the crystal's old rate time ran 0.8 s away until the new fit counted, 16 s after the turn."""
     dated, clock = run_utc(model(USB_16MS, 100, ppm), 32, turn_ms=UNIX)

@@ -129,7 +129,7 @@ class Dated:
         self.states.append(self.clock.status())
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))])
 @pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: trial.name)
 def test_a_run_is_dated_as_its_messages_one_by_one(trial: Trial, seed: int) -> None:
     random = Random(f"{trial.name} {seed}")

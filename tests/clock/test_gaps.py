@@ -5,6 +5,7 @@ reported as one of unknown size.
 """
 
 from dataclasses import dataclass, field, replace
+from itertools import product
 from random import Random
 from typing import Final
 
@@ -20,7 +21,8 @@ READ_BYTES: Final = 4095
 BEGIN_NS: Final = 1_000 * NS_PER_S
 N_TTY: Final = 4096
 FLIP_BUFFER: Final = 65536
-STALLS: Final = 25
+STALLS: Final = 8
+SEEDS: Final = (1, pytest.param(2, marks=pytest.mark.thorough), pytest.param(3, marks=pytest.mark.thorough))
 
 
 @dataclass(frozen=True)
@@ -145,54 +147,49 @@ def reader(device: Device, kept_bytes: int, seed: int) -> tuple[Reader, list[int
 
 HI91 = Device(1000, NS_PER_MS, 1 << 32)
 HI91_400 = Device(400, NS_PER_MS, 1 << 32)
-IMU61X = Device(1000, NS_PER_US, 1 << 32)
-IMU61X_WRAPS = Device(1000, NS_PER_US, 1 << 24)
+IMU61X = Device(200, NS_PER_US, 1 << 32)
+IMU61X_WRAPS = Device(200, NS_PER_US, 1 << 24)
 NUMBERED = Device(200, 0, 1 << 16)
 NUMBERED_SHORT = Device(200, 0, 256)
 UNCOUNTED = Device(100, -1, 1 << 32)
-UNCOUNTED_FAST = Device(1000, -1, 1 << 32)
+UNCOUNTED_FAST = Device(400, -1, 1 << 32)
 HI92, HI92_400, HI92_FAST = (Device(rate_hz, -1, 1 << 32, stamp_modulus=8192) for rate_hz in (100, 400, 1000))
 COUNTED = [HI91, HI91_400, IMU61X, IMU61X_WRAPS, NUMBERED, NUMBERED_SHORT]
+STAMPED = [HI92, HI92_400, HI92_FAST]
 
 
-@pytest.mark.parametrize("kept_bytes", [N_TTY, FLIP_BUFFER])
-@pytest.mark.parametrize("device", COUNTED)
-def test_losses_over_stalls_are_those_of_the_device(device: Device, kept_bytes: int) -> None:
-    one, unknown = reader(device, kept_bytes, 1)
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(
+    ("device", "kept_bytes"),
+    [*product(COUNTED + STAMPED, [N_TTY]), *product([HI91_400, NUMBERED, HI92_400], [FLIP_BUFFER])],
+)
+def test_losses_over_stalls_are_those_of_the_device(device: Device, kept_bytes: int, seed: int) -> None:
+    """Stalls are shorter than a turn of the counter or stamp."""
+    one, unknown = reader(device, kept_bytes, seed)
+    longest_s = 7 if device.stamp_modulus else 10
     for _ in range(STALLS):
-        one.stall(int(one.random.choice([0.05, 0.2, 0.7, 1, 2, 5, 10]) * NS_PER_S))
+        one.stall(int(one.random.choice([0.05, 0.2, 0.7, 1, 2, 5, longest_s]) * NS_PER_S))
         one.run(int(one.random.choice([0.01, 0.1, 0.3, 1.5]) * NS_PER_S))
     assert one.finish() == one.missed
     assert not unknown
+    assert not device.stamp_modulus or one.clock.status().resets == 0
 
 
-@pytest.mark.parametrize("kept_bytes", [N_TTY, FLIP_BUFFER])
-@pytest.mark.parametrize("device", [HI92, HI92_400, HI92_FAST])
-def test_losses_over_stalls_shorter_than_a_turn_are_those_of_the_stamps(device: Device, kept_bytes: int) -> None:
-    one, unknown = reader(device, kept_bytes, 1)
-    for _ in range(STALLS):
-        one.stall(int(one.random.choice([0.05, 0.2, 0.7, 1, 2, 5, 7]) * NS_PER_S))
-        one.run(int(one.random.choice([0.01, 0.1, 0.3, 1.5]) * NS_PER_S))
-    assert one.finish() == one.missed
-    assert not unknown
-    assert one.clock.status().resets == 0
-
-
-@pytest.mark.parametrize("device", [HI92, HI92_400, HI92_FAST, replace(HI92_FAST, pulses=True)])
+@pytest.mark.parametrize("device", [HI92, replace(HI92_400, pulses=True)])
 def test_losses_over_longer_stalls_are_right_within_one_where_messages_are_on_time_again(device: Device) -> None:
     one, _ = reader(device, N_TTY, 1)
-    for _ in range(10):
+    for _ in range(5):
         one.stall(int(one.random.choice([1, 5, 10, 20]) * NS_PER_S))
         one.run(3 * NS_PER_S)
-    assert abs(one.finish() - one.missed) <= 10
+    assert abs(one.finish() - one.missed) <= 5
 
 
-@pytest.mark.parametrize("kept_bytes", [N_TTY, FLIP_BUFFER])
-@pytest.mark.parametrize("device", COUNTED)
-def test_losses_under_starvation_are_those_of_the_device(device: Device, kept_bytes: int) -> None:
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("device", "kept_bytes"), [*product(COUNTED, [N_TTY]), (NUMBERED, FLIP_BUFFER)])
+def test_losses_under_starvation_are_those_of_the_device(device: Device, kept_bytes: int, seed: int) -> None:
     """Every message is late for up to 20 s, and the fit with them; then the host catches up."""
-    one, unknown = reader(device, kept_bytes, 1)
-    for _ in range(10):
+    one, unknown = reader(device, kept_bytes, seed)
+    for _ in range(4):
         one.starve(int(one.random.uniform(1, 20) * NS_PER_S), int(one.random.uniform(0.05, 0.7) * NS_PER_S))
         if one.random.random() < 0.5:
             one.stall(0)
@@ -203,8 +200,9 @@ def test_losses_under_starvation_are_those_of_the_device(device: Device, kept_by
     assert not unknown
 
 
-@pytest.mark.parametrize("stall_s", [0.2, 2.0, 10.0])
-@pytest.mark.parametrize("device", [UNCOUNTED, UNCOUNTED_FAST])
+@pytest.mark.parametrize(
+    ("device", "stall_s"), [(UNCOUNTED, 0.2), (UNCOUNTED, 2.0), (UNCOUNTED, 10.0), (UNCOUNTED_FAST, 2.0)]
+)
 def test_losses_of_a_device_without_counter_are_seen_by_its_pace(device: Device, stall_s: float) -> None:
     one, unknown = reader(device, N_TTY, 2)
     one.run(20 * NS_PER_S)
@@ -224,7 +222,7 @@ def test_what_the_pace_cannot_show_is_unknown(device: Device) -> None:
     assert unknown or abs(one.finish() - one.missed) <= STALLS
 
 
-@pytest.mark.parametrize("samples", range(1, 9))
+@pytest.mark.parametrize("samples", [1, 2, 4, 5, 8])
 @pytest.mark.parametrize("away_ms", [100, 250, 1500])
 def test_a_restart_before_the_rate_is_known_is_one_gap(samples: int, away_ms: int) -> None:
     unknown: list[int] = []
@@ -246,7 +244,7 @@ def paced(pace: ArrivalPace, begin_ns: int, messages: int, late_ns: int = 0) -> 
     return sum(missed for missed, _ in found), sum(not certain for _, certain in found)
 
 
-@pytest.mark.parametrize("waited_ms", [0, 1, 18, 300])
+@pytest.mark.parametrize("waited_ms", [0, 18, 300])
 def test_a_first_message_that_waited_costs_nothing_that_is_known_of_the_pace(waited_ms: int) -> None:
     pace = ArrivalPace()
     pace.begin(BEGIN_NS)
@@ -259,7 +257,7 @@ def test_a_first_message_that_waited_costs_nothing_that_is_known_of_the_pace(wai
     assert paced(pace, begin_ns + 33_010 * NS_PER_MS, 300) == (3000, 0), "an outage of 30 s is counted exactly"
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_pace_is_known_within_80_messages_whatever_they_wait_up_to_a_twentieth_of_their_period(seed: int) -> None:
     random, pace, period_ns = Random(seed), ArrivalPace(1 << 16), 100 * NS_PER_MS
     pace.begin(BEGIN_NS + int(random.uniform(0, 0.05) * period_ns))
@@ -292,7 +290,7 @@ def test_a_window_that_waited_as_a_whole_costs_nothing_that_is_known_of_the_pace
     assert pace.period_ns == pytest.approx(step_ns, rel=1e-4)
 
 
-@pytest.mark.parametrize("late_ms", [4, 6, 30, 45])
+@pytest.mark.parametrize("late_ms", [4, 45])
 @pytest.mark.parametrize("missing_from", [(240,), (170, 201), (180, 215)])
 def test_messages_that_stay_late_by_the_same_are_of_the_same_rate(late_ms: int, missing_from: tuple[int, ...]) -> None:
     """As of a sender that was started anew, or whose own timer slept for too long; seven or more are missing then."""
@@ -318,10 +316,10 @@ def test_messages_that_are_off_in_every_window_are_of_another_rate(period_ms: fl
     assert pace.period_ns == pytest.approx(period_ms * NS_PER_MS, rel=2e-3)
 
 
-@pytest.mark.parametrize("device", COUNTED)
+@pytest.mark.parametrize("device", COUNTED[1:])
 def test_a_counter_that_ran_on_while_the_link_was_away_counts(device: Device) -> None:
     one, unknown = reader(device, N_TTY, 3)
-    one.run(60 * NS_PER_S)
+    one.run(10 * NS_PER_S)
     one.kept_bytes = 0
     one.stall(10 * NS_PER_S)
     one.kept_bytes = N_TTY

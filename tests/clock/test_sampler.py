@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.clock import SampleClock
@@ -24,36 +24,6 @@ def far(samples: Sequence[Sample], points: Sequence[Point]) -> int:
     return max(abs(s.t_ns - BEGIN_NS - ms * NS_PER_MS) for s, (_, ms) in zip(samples, points, strict=True))
 
 
-@settings(derandomize=True, max_examples=80, deadline=None)
-@given(
-    st.lists(
-        st.tuples(
-            st.one_of(st.none(), st.integers(0, 999), st.integers(0, 20)),
-            st.one_of(st.integers(0, 3), st.integers(0, 50 * NS_PER_MS), st.integers(0, 100 * NS_PER_S)),
-            st.integers(0, 4096),
-        ),
-        max_size=80,
-    ),
-    st.sampled_from([0, 1_085, 86_805]),
-    st.sampled_from([0, NS_PER_MS, 16 * NS_PER_MS]),
-)
-def test_any_input_gives_rising_stamps_before_arrival(
-    steps: list[tuple[int | None, int, int]], byte_ns: int, hold_ns: int
-) -> None:
-    clock = make_clock(tick_modulus=1000, byte_ns=byte_ns, hold_ns=hold_ns)
-    t_rx_ns = BEGIN_NS
-    samples = []
-    for ticks, wait_ns, trailing in steps:
-        t_rx_ns += wait_ns
-        samples.append(clock.sample(message(ticks, trailing), t_rx_ns, 0))
-        assert clock.missed >= 0
-        assert samples[-1].t_rx_ns - t_rx_ns <= len(samples)
-    assert rises(samples)
-    assert all(0 < s.t_err_ns < 1 << 32 for s in samples)
-    assert [s.seq for s in samples] == list(range(1, len(samples) + 1))
-
-
-@settings(derandomize=True, max_examples=40, deadline=None)
 @given(st.lists(st.sampled_from([1, 2, 3, 10, 11, 500, 990, 999]), min_size=20, max_size=150), st.integers(0, 999))
 def test_a_believable_device_never_resets(steps: list[int], first: int) -> None:
     clock = make_clock(tick_modulus=1000)
@@ -372,10 +342,10 @@ def test_what_is_lifted_is_part_of_the_error() -> None:
 def test_messages_that_waited_are_dated_by_the_fit(hold_ns: int) -> None:
     """Nine of ten are read up to 9 ms late, behind an adapter with a timer and without one."""
     clock = make_clock(hold_ns=hold_ns)
-    feed(clock, steady(0, 0, 60_000, 1))
+    feed(clock, steady(0, 0, 20_000, 1))
     before = clock.status()
     offs = []
-    for number in range(60_000, 90_000):
+    for number in range(20_000, 30_000):
         read_ms = number // 10 * 10 + 10 if number % 10 else number
         clock.waited_ns = 10 * NS_PER_MS if number % 10 else 0
         sample = clock.sample(message(number), BEGIN_NS + (read_ms + 1) * NS_PER_MS, 0)
@@ -387,10 +357,10 @@ def test_messages_that_waited_are_dated_by_the_fit(hold_ns: int) -> None:
 def test_messages_that_waited_do_not_hold_the_fit_back() -> None:
     """A crystal slows by 50 ppm: one message of ten shows it, and the others could all be on the old line."""
     clock = make_clock()
-    feed(clock, steady(0, 0, 60_000, 1))
+    feed(clock, steady(0, 0, 20_000, 1))
     off_ns = 0
-    for number in range(60_000, 120_000):
-        true_ns = BEGIN_NS + number * NS_PER_MS + (number - 60_000) * 50
+    for number in range(20_000, 50_000):
+        true_ns = BEGIN_NS + number * NS_PER_MS + (number - 20_000) * 50
         late_ms = (10 - number % 10) if number % 10 else 0
         clock.waited_ns = 10 * NS_PER_MS if late_ms else 0
         off_ns = clock.sample(message(number), true_ns + (late_ms + 1) * NS_PER_MS, 0).t_ns - true_ns

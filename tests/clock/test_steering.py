@@ -4,7 +4,7 @@ from itertools import pairwise
 from math import sqrt
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.clock import SampleClock
@@ -73,8 +73,11 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: C
     return ArrivalModel(profile, rate_hz, seed, crystal or Crystal(50.0), BAUD_OF_RATE[rate_hz])
 
 
-@pytest.mark.parametrize("profile", [BARE_UART, USB_16MS, LOADED], ids=lambda p: p.name)
-@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 3)])
+@pytest.mark.parametrize(
+    ("profile", "rate_hz", "seconds"),
+    [(BARE_UART, 1000, 2), (USB_16MS, 100, 10), (LOADED, 100, 10), (LOADED, 1000, 3)],
+    ids=lambda value: getattr(value, "name", None),
+)
 def test_every_pair_is_right_under_loss_on_either_side(profile: ArrivalProfile, rate_hz: int, seconds: int) -> None:
     dated = run_sout(model(profile, rate_hz, 3), seconds, HALF_LOST)
     paired = [t for t in dated if t.sample.edge_seq is not None]
@@ -102,7 +105,7 @@ def test_rising_edges_alone_are_enough(rate_hz: int, seconds: int) -> None:
     assert share_honest(dated) >= 0.95
 
 
-@pytest.mark.parametrize("crystal", [Crystal(-50_000.0), Crystal(50_000.0), Crystal(20.0, 0.1)], ids=str)
+@pytest.mark.parametrize("crystal", [Crystal(-50_000.0), Crystal(20.0, 0.1)], ids=["-5 %", "drifting"])
 def test_with_edges_only_their_own_jitter_is_left(crystal: Crystal) -> None:
     """Simulated stamps are late by 3 µs and an exponential law of 4 µs."""
     dated = after(run_sout(model(USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5)
@@ -243,7 +246,6 @@ STEP = st.tuples(
 )
 
 
-@settings(derandomize=True, max_examples=60, deadline=None)
 @given(
     st.lists(STEP, max_size=80), st.sampled_from([0, 1_085, 86_805]), st.sampled_from([0, NS_PER_MS, 16 * NS_PER_MS])
 )
@@ -261,8 +263,11 @@ def test_any_input_gives_rising_stamps_before_arrival(
                 give(clock, "edges", t_rx_ns + shift_ns // 16, 2 * tick)
             m = Measurement(82, trailing, tick % 1000 if ticks is not None else None, pps_age_ms=abs(shift_ns) % 9000)
             samples.append(clock.sample(m, t_rx_ns, 0))
+            assert clock.missed >= 0
+            assert samples[-1].t_rx_ns - t_rx_ns <= len(samples)
     assert rises(samples)
     assert all(0 < s.t_err_ns < 1 << 32 for s in samples)
+    assert [s.seq for s in samples] == list(range(1, len(samples) + 1))
     clock.status()
 
 
