@@ -2,7 +2,6 @@
 
 import os
 import re
-import select
 import shlex
 import shutil
 import subprocess
@@ -18,10 +17,9 @@ from imud import config
 from imud.cli import COMMANDS, build_parser
 from imud.devices import DRIVERS
 from tests.support import pictures, references
-from tests.support.daemon_process import LIMIT_S, running_daemon
-from tests.test_daemon import cable, device
+from tests.support.daemon_process import LIMIT_S, sending_daemon
+from tests.support.files import ROOT, hi91
 
-ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
@@ -40,10 +38,6 @@ def examples(*languages: str) -> list[Example]:
     return [example for example in found if example.language in languages]
 
 
-def name(example: Example) -> str:
-    return f"{example.page.name}:{example.text.splitlines()[0][:40]}"
-
-
 def imud_lines() -> Iterator[list[str]]:
     """Every `imud …` command line of the shell examples, without comments and without where its output goes."""
     for example in examples("sh"):
@@ -53,67 +47,65 @@ def imud_lines() -> Iterator[list[str]]:
                 yield words[1 : words.index(">")] if ">" in words else words[1:]
 
 
+def test_links_lead_somewhere() -> None:
+    targets = [(page, target) for page in PAGES for target in LINK.findall(page.read_text()) if "://" not in target]
+    assert [(page.name, target) for page, target in targets if not (page.parent / target).exists()] == []
+
+
+def test_command_lines_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
+    parser, refused = build_parser(), []
+    for words in imud_lines():
+        try:
+            parser.parse_args(words)
+        except SystemExit:
+            refused.append((words, capsys.readouterr().err))
+    assert not refused
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
-    for target in LINK.findall(page.read_text()):
-        if "://" not in target:
-            assert (page.parent / target).exists(), target
+def test_configurations_are_good(page: Path) -> None:
+    for example in examples("yaml"):
+        if example.page == page and not example.text.startswith("# "):
+            config.parse(example.text, f"{page.name}:{example.text.splitlines()[0]}")
 
 
-@pytest.mark.parametrize("words", list(imud_lines()), ids=" ".join)
-def test_command_lines_are_accepted(words: list[str]) -> None:
-    build_parser().parse_args(words)
-
-
-@pytest.mark.parametrize("example", [e for e in examples("yaml") if not e.text.startswith("# ")], ids=name)
-def test_configurations_are_good(example: Example) -> None:
-    config.parse(example.text, example.page.name)
-
-
-@pytest.mark.parametrize("example", [e for e in examples("python") if e.page.name == "README.md"], ids=name)
-def test_python_reads_from_a_running_daemon(example: Example, tmp_path: Path) -> None:
+@pytest.mark.live
+def test_examples_read_from_a_running_daemon(tmp_path: Path) -> None:
+    texts = [e.text for e in examples("python") if e.page.name == "README.md"]
+    commands = [[sys.executable, "-u", "-c", text] for text in texts]
+    assert len(commands) == 2
+    if shutil.which("cc") is not None:
+        commands.append([compiled_reader(tmp_path)])
     places = {"IMUD_SOCKET": str(tmp_path / "imud.sock"), "IMUD_SHM": str(tmp_path)}
-    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
-        daemon.wait_for("bow", "searching")
-        port.send(1)
-        daemon.wait_for("bow", "running")
-        argv = [sys.executable, "-u", "-c", example.text]
-        with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=os.environ | places) as process:
-            assert process.stdout is not None
-            feeding = True
-            while feeding:  # until the example prints its first line
-                port.send(1)
-                feeding = not select.select([process.stdout], [], [], 0.02)[0]
-            line = process.stdout.readline()
-            process.kill()
-    assert "9.8" in line, line
+    with sending_daemon(tmp_path, lambda number: hi91(10 * number)):
+        for command in commands:
+            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | places) as process:
+                assert process.stdout is not None
+                line = process.stdout.readline()
+                process.kill()
+            assert "9.8" in line, line
+    assert len(commands) == 2 or re.fullmatch(r"\d+ ns: 9\.800000 m/s2\n", line)
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
-def test_c_reads_from_a_running_daemon(tmp_path: Path) -> None:
+def compiled_reader(folder: Path) -> str:
+    """Compile the example in C as the page says; return the path of the program."""
     (example,) = examples("c")
-    source = tmp_path / "reader.c"
-    source.write_text(example.text.replace('"bow")', f'"{tmp_path}/imud.bow")'))
-    (tmp_path / "imud").symlink_to(ROOT / "imud")
+    (folder / "reader.c").write_text(example.text.replace('"bow")', f'"{folder}/imud.bow")'))
+    (folder / "imud").symlink_to(ROOT / "imud")
     lines = [line for block in examples("sh") for line in block.text.splitlines()]
     (compile_line,) = [line for line in lines if line.startswith("cc ")]
-    argv = [*shlex.split(compile_line), "-Werror"]
-    subprocess.run(argv, check=True, timeout=LIMIT_S, cwd=tmp_path)
+    subprocess.run([*shlex.split(compile_line), "-Werror"], check=True, timeout=LIMIT_S, cwd=folder)
     assert "./reader" in lines
-    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
-        daemon.wait_for("bow", "searching")
-        port.send(1)
-        daemon.wait_for("bow", "running")
-        done = subprocess.run([tmp_path / "reader"], capture_output=True, text=True, timeout=LIMIT_S, check=True)
-    assert re.fullmatch(r"\d+ ns: 9\.800000 m/s2\n", done.stdout)
+    return str(folder / "reader")
 
 
-@pytest.mark.parametrize("file", sorted(pictures.FOLDER.glob("*.svg")), ids=lambda file: file.name)
-def test_pictures_are_well_formed_and_shown(file: Path) -> None:
-    root = ElementTree.parse(file).getroot()
-    assert root.tag.endswith("svg")
-    assert root[0].text
-    assert any(f"pictures/{file.name})" in page.read_text() for page in PAGES)
+def test_pictures_are_well_formed_and_shown() -> None:
+    pages = "".join(page.read_text() for page in PAGES)
+    for file in pictures.FOLDER.glob("*.svg"):
+        root = ElementTree.parse(file).getroot()
+        assert root.tag.endswith("svg"), file
+        assert root[0].text, file
+        assert f"pictures/{file.name})" in pages, file
 
 
 def test_the_picture_of_time_stamps_shows_what_the_readme_says() -> None:

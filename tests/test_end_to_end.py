@@ -6,6 +6,8 @@ import pty
 import struct
 import tty
 from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import chain
 from math import radians
 from pathlib import Path
 
@@ -27,21 +29,26 @@ from imud.sample import Sample
 from imud.sim.hipnuc.uart.settings import HipnucHardware
 from imud.sim.hipnuc.uart.simulator import HipnucModule
 from imud.sim.physics.motion import FIELD_ENU_T, Still
-from tests.support.daemon_process import running_daemon, wait_until
+from tests.support.daemon_process import LIMIT_S, running_daemon, wait_until
 from tests.support.files import SHARED
 
 RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
 G = 9.8
 
 
-@pytest.fixture
-def port() -> Iterator[tuple[int, str]]:
-    """The master of a raw pty, and the path of its slave, which stays open."""
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    yield master, os.ttyname(slave)
-    os.close(master)
-    os.close(slave)
+@contextmanager
+def raw_ports(count: int) -> Iterator[list[tuple[int, str]]]:
+    """Masters of raw ptys, and the paths of their slaves, which stay open."""
+    pairs = [pty.openpty() for _ in range(count)]
+    for _, slave in pairs:
+        tty.setraw(slave)
+    yield [(master, os.ttyname(slave)) for master, slave in pairs]
+    for descriptor in chain(*pairs):
+        os.close(descriptor)
+
+
+def device(path: str, **more: object) -> dict[str, object]:
+    return {"driver": "hipnuc-uart", "identify": False, "uart": {"port": path, "baud": 921600}, **more}
 
 
 def f32(value: float) -> float:
@@ -88,17 +95,20 @@ def check(sample: Sample, row: Row) -> None:
     assert sample.pps_age_ms == round(float(row["pps_sync_stamp"]) * 1000)
 
 
+@pytest.mark.live
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recording {RECORDING} is not on this machine")
-def test_every_row_of_a_real_recording_arrives_on_both_ways(port: tuple[int, str], tmp_path: Path) -> None:
+def test_every_row_of_a_real_recording_arrives_on_both_ways(tmp_path: Path) -> None:
     with RECORDING.open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 1000
-    master, path = port
-    device = {"driver": "hipnuc-uart", "identify": False, "uart": {"port": path, "baud": 921600}}
-    with running_daemon(tmp_path, {"bow": device}) as daemon, daemon.client() as client:
+    with (
+        raw_ports(1) as [(master, path)],
+        running_daemon(tmp_path, {"bow": device(path)}) as daemon,
+        daemon.client() as client,
+    ):
         daemon.wait_for("bow", "searching")
         with Ring(tmp_path / "imud.bow") as ring:
-            watch = client.watch(timeout_s=10)
+            watch = client.watch(timeout_s=LIMIT_S)
             for row in rows:
                 os.write(master, frame(row))
             by_socket = [next(watch) for _ in rows]
@@ -126,47 +136,47 @@ IN_NED = (radians(5.0), radians(10.0), radians(60.0))
 """The same in ned-frd, by hand: right side down by 5°, nose up by 10°, 60° clockwise from north."""
 MOUNTINGS: dict[str, tuple[dict[str, object], Matrix3]] = {
     # what stands in the configuration; rows: the axis of the sensor that points forward, left, up
-    "on its side": ({"axes": {"x": "y", "y": "z", "z": "x"}}, ((0, 1, 0), (0, 0, 1), (1, 0, 0))),
-    "upside down": ({"quat_wxyz": [0, 1, 0, 0]}, ((1, 0, 0), (0, -1, 0), (0, 0, -1))),
-    "turned 90° to the left": ({"euler": {"yaw_deg": 90}}, ((0, -1, 0), (1, 0, 0), (0, 0, 1))),
+    "side": ({"axes": {"x": "y", "y": "z", "z": "x"}}, ((0, 1, 0), (0, 0, 1), (1, 0, 0))),
+    "upside_down": ({"quat_wxyz": [0, 1, 0, 0]}, ((1, 0, 0), (0, -1, 0), (0, 0, -1))),
+    "turned_left": ({"euler": {"yaw_deg": 90}}, ((0, -1, 0), (1, 0, 0), (0, 0, 1))),
 }
 
 
-@pytest.mark.parametrize("name", MOUNTINGS)
-def test_a_simulated_module_in_a_body_of_known_attitude(port: tuple[int, str], tmp_path: Path, name: str) -> None:
+@pytest.mark.live
+def test_simulated_modules_in_bodies_of_known_attitude(tmp_path: Path) -> None:
     """The ring and a plain client get enu-flu; a binary one and `poll` ask for ned-frd. Everything is turned once."""
-    keys, mounting = MOUNTINGS[name]
     body = matrix_from_quat(quat_from_euler_zyx(BODY))
-    sensor = quat_from_matrix(matrix_product(body, mounting))
-    module = HipnucModule(0, None, HipnucHardware(motion=Still(*euler312_from_quat(sensor)), skew_ppm=0))
-    data = b"".join(burst.data for burst in module.advance(int(1.5e9)))
     up_m_s2 = (body[2][0] * G, body[2][1] * G, body[2][2] * G)
     field_t = matrix_times(transposed(body), FIELD_ENU_T)
-    master, path = port
-    device = {
-        "driver": "hipnuc-uart", "identify": False, "uart": {"port": path, "baud": 921600}, "frame": keys,
-    }  # fmt: skip
-    with running_daemon(tmp_path, {"bow": device}) as daemon, daemon.client() as plain, daemon.client() as other:
-        daemon.wait_for("bow", "searching")
-        with Ring(tmp_path / "imud.bow") as ring:
-            as_configured = plain.watch(timeout_s=10, encoding="json")
-            asked = other.watch(timeout_s=10, convention="ned-frd")
-            os.write(master, data)
-            first, down = next(as_configured), next(asked)
-            wait_until(lambda: ring.newest_seq >= 90, "the ring has what was sent")
-            by_shm = ring.read().samples[0]
-            (polled,) = other.poll(convention="ned-frd")
-        schema = plain.schema()["devices"]["bow"]
-        status = daemon.statuses()["bow"]
-    for one in (first, by_shm):
-        assert one.euler_rad == pytest.approx(BODY, abs=1e-5)
-        assert one.accel_m_s2 == pytest.approx(up_m_s2, abs=1e-4)
-        assert one.mag_t == pytest.approx(field_t, abs=1e-10)
-    for one in (down, polled):
-        assert one.euler_rad == pytest.approx(IN_NED, abs=1e-5)
-        assert one.accel_m_s2 == pytest.approx((up_m_s2[0], -up_m_s2[1], -up_m_s2[2]), abs=1e-4)
-        assert one.mag_t == pytest.approx((field_t[0], -field_t[1], -field_t[2]), abs=1e-10)
-    assert (schema["convention"], schema["navigation_frame"]) == ("enu-flu", "ENU")
-    assert schema["frame"] == "body: x forward, y left, z up (FLU)"
-    assert status.frame is not None
-    assert (status.frame.problem, status.euler_convention) == ("", schema["euler_convention"])
+    with raw_ports(len(MOUNTINGS)) as ports:
+        devices = {
+            name: device(path, frame=keys)
+            for (name, (keys, _)), (_, path) in zip(MOUNTINGS.items(), ports, strict=True)
+        }
+        with running_daemon(tmp_path, devices) as daemon, daemon.client() as plain, daemon.client() as other:
+            for (name, (_, mounting)), (master, _) in zip(MOUNTINGS.items(), ports, strict=True):
+                daemon.wait_for(name, "searching")
+                sensor = quat_from_matrix(matrix_product(body, mounting))
+                module = HipnucModule(0, None, HipnucHardware(motion=Still(*euler312_from_quat(sensor)), skew_ppm=0))
+                as_configured = plain.watch([name], timeout_s=LIMIT_S, encoding="json")
+                asked = other.watch([name], timeout_s=LIMIT_S, convention="ned-frd")
+                os.write(master, b"".join(burst.data for burst in module.advance(int(1.5e9))))
+                first, down = next(as_configured), next(asked)
+                with Ring(tmp_path / f"imud.{name}") as ring:
+                    wait_until(lambda: ring.newest_seq >= 90, "the ring has what was sent")
+                    by_shm = ring.read().samples[0]
+                (polled,) = other.poll([name], convention="ned-frd")
+                schema = plain.schema()["devices"][name]
+                status = daemon.statuses()[name]
+                for one in (first, by_shm):
+                    assert one.euler_rad == pytest.approx(BODY, abs=1e-5)
+                    assert one.accel_m_s2 == pytest.approx(up_m_s2, abs=1e-4)
+                    assert one.mag_t == pytest.approx(field_t, abs=1e-10)
+                for one in (down, polled):
+                    assert one.euler_rad == pytest.approx(IN_NED, abs=1e-5)
+                    assert one.accel_m_s2 == pytest.approx((up_m_s2[0], -up_m_s2[1], -up_m_s2[2]), abs=1e-4)
+                    assert one.mag_t == pytest.approx((field_t[0], -field_t[1], -field_t[2]), abs=1e-10)
+                assert (schema["convention"], schema["navigation_frame"]) == ("enu-flu", "ENU")
+                assert schema["frame"] == "body: x forward, y left, z up (FLU)"
+                assert status.frame is not None
+                assert (status.frame.problem, status.euler_convention) == ("", schema["euler_convention"])

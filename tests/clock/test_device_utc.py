@@ -34,7 +34,7 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 0.0, seed: i
 
 @pytest.mark.parametrize(
     ("profile", "turn_ms", "seed"),
-    [(BARE_UART, UNIX, 1), (USB_16MS, UNIX, 1), (USB_16MS_PACKET, DAY, 3)],
+    [pytest.param(BARE_UART, UNIX, 1, marks=pytest.mark.thorough), (USB_16MS, UNIX, 1), (USB_16MS_PACKET, DAY, 3)],
     ids=lambda v: getattr(v, "name", v),
 )
 @pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
@@ -70,7 +70,7 @@ def test_a_turn_before_anything_is_known_gives_the_time_itself() -> None:
 
 def test_samples_that_hardly_drift_through_the_milliseconds_of_utc() -> None:
     """Device time and UTC are each within a tick, and both stay at their ends for seconds."""
-    dated, _ = run_utc(model(USB_16MS_PACKET, 200, -50.0, 2002), 30, turn_ms=UNIX, turn_at=0.06)
+    dated, _ = run_utc(model(USB_16MS_PACKET, 200, -50.0, 2002), 15, turn_ms=UNIX, turn_at=0.06)
     assert share_honest(dated) >= 0.95
 
 
@@ -136,7 +136,7 @@ def test_a_reference_that_goes_away_is_no_step() -> None:
     assert clock.status().reference_error_ns == 0
 
 
-@pytest.mark.parametrize(("rate_hz", "ppm", "seconds"), [(1, 0.0, 100), (1, 50.0, 100), (100, 50_000.0, 40)])
+@pytest.mark.parametrize(("rate_hz", "ppm", "seconds"), [(1, 0.0, 100), (1, 50.0, 100), (100, 50_000.0, 25)])
 @pytest.mark.manual("B 1.2.1 pulse per second")
 def test_a_pulse_per_second_is_better_than_a_slow_adapter(rate_hz: int, ppm: float, seconds: int) -> None:
     dated = run_pps(model(USB_16MS_PACKET, rate_hz, ppm), seconds)
@@ -162,7 +162,7 @@ def test_losing_and_regaining_the_pulse_makes_no_step() -> None:
     assert share_honest(dated) >= 0.95
 
 
-@pytest.mark.parametrize(("rate_hz", "ppm"), [(100, 0.0), (200, 50_000.0), (1000, -50.0)])
+@pytest.mark.parametrize(("rate_hz", "ppm"), [(100, 50_000.0), (1000, -50.0)])
 @pytest.mark.manual("B 1.2.1 delay of the answer")
 def test_triggers_find_their_answers(rate_hz: int, ppm: float) -> None:
     dated, clock, missed = run_triggers(model(BARE_UART, rate_hz, ppm), 5, 0.95)

@@ -240,7 +240,7 @@ def counted(arrivals: Iterator[Arrival], host: SteeredHost) -> tuple[list[DatedA
     return dated, missed, len(unknown)
 
 
-@pytest.mark.parametrize("away_s", [2, 3600])
+@pytest.mark.parametrize("away_s", [2, pytest.param(3600, marks=pytest.mark.thorough)])
 def test_after_a_suspend_time_goes_on_right(away_s: int) -> None:
     """CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop; the device's clock runs on. The gap is counted by its `Device`."""
 

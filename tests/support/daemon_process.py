@@ -25,7 +25,7 @@ def wait_until(condition: Callable[[], object], what: str, limit_s: float = LIMI
     end = monotonic() + limit_s
     while not condition():
         assert monotonic() < end, f"not within {limit_s} s: {what}"
-        sleep(0.002)
+        sleep(0.005)
 
 
 class RunningDaemon:

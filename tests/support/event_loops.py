@@ -31,7 +31,7 @@ def in_loop(test: Callable[P, Coroutine[None, None, None]]) -> Callable[P, None]
     return run
 
 
-DESCRIPTOR_LIMIT_S = 10.0
+DESCRIPTOR_LIMIT_S = 50.0
 """How long, in real time, a loop that waits for nothing but descriptors may wait."""
 
 

@@ -80,7 +80,7 @@ def read_until(descriptor: int, end: bytes) -> bytes:
     """What can be read, up to some text."""
     data = b""
     while end not in data:
-        assert select.select([descriptor], [], [], 10)[0], data[-200:]
+        assert select.select([descriptor], [], [], 60)[0], data[-200:]
         data += os.read(descriptor, 65536)
     return data
 
