@@ -97,7 +97,7 @@ def client(number: int, encoding: str = "json", sent: int = 0, dropped: int = 0,
     return ClientStatus(number, 100 + number, 1000, False, encoding, sent, dropped, queue, queue * 256)
 
 
-LIMIT_S = 5.0
+LIMIT_S = 60.0
 
 
 async def ask(port: int, path: str = "/metrics", method: str = "GET", headers: str = "") -> tuple[str, str, str]:

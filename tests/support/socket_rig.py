@@ -47,7 +47,7 @@ CHECKER = MessageChecker()
 
 EPOCH = 4886718345
 NOW_NS = 80_000_123_456_789
-LIMIT_S = 10.0
+LIMIT_S = 60.0
 DEVICES = {"imu0": 0, "imu1": 1}
 
 
