@@ -4,7 +4,7 @@ import csv
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.attitude import (
@@ -27,7 +27,6 @@ from tests.support.files import SHARED
 RECORDING = SHARED / "data" / "hi91-static-100hz.csv"
 HALF = math.sqrt(0.5)
 
-quick = settings(max_examples=60, derandomize=True, deadline=None, database=None)
 component = st.floats(-1, 1)
 quats = (
     st.tuples(component, component, component, component).filter(lambda q: math.hypot(*q) > 1e-3).map(quat_normalized)
@@ -82,7 +81,6 @@ def test_the_matrix_turns_body_to_navigation() -> None:
     assert turned(matrix_from_euler312((0, math.pi / 2, 0)), (0, 1, 0)) == pytest.approx((0, 0, 1), abs=1e-15)
 
 
-@quick
 @given(quats)
 def test_quaternion_to_matrix_and_back(quat: Quaternion) -> None:
     matrix = matrix_from_quat(quat)
@@ -92,13 +90,11 @@ def test_quaternion_to_matrix_and_back(quat: Quaternion) -> None:
     assert angle_between(quat, back) < 1e-7
 
 
-@quick
 @given(quats)
 def test_quaternion_to_euler_and_back(quat: Quaternion) -> None:
     assert angle_between(quat, quat_from_euler312(euler312_from_quat(quat))) < 1e-7
 
 
-@quick
 @given(angles, steep, angles)
 def test_euler_to_quaternion_and_back_is_the_same_rotation(roll: float, pitch: float, yaw: float) -> None:
     """Straight up and down the angles are not unique, the rotation is."""
@@ -112,7 +108,6 @@ def test_euler_to_quaternion_and_back_is_the_same_rotation(roll: float, pitch: f
         ) < 1e-9  # fmt: skip
 
 
-@quick
 @given(st.floats(-3, 3), st.floats(-0.5, 0.5), st.floats(-3, 3))
 @pytest.mark.manual("B 9.1 angles of a quaternion")
 def test_the_manual_formula_gives_the_same(roll: float, pitch: float, yaw: float) -> None:
@@ -193,7 +188,6 @@ def test_zyx_turns_about_the_axes(euler_deg: Vector3, quat: Quaternion) -> None:
     assert quat_from_euler_zyx((roll, pitch, yaw)) == pytest.approx(quat, abs=1e-15)
 
 
-@quick
 @given(roll=angles, pitch=st.floats(-1.57, 1.57), yaw=angles)
 def test_zyx_is_the_product_of_its_turns(roll: float, pitch: float, yaw: float) -> None:
     """Against the same turns written as 312 turns about one axis each, multiplied as matrices."""
@@ -214,7 +208,6 @@ def vector(values: tuple[float, ...]) -> Vector3:
     return (x, y, z)
 
 
-@quick
 @given(roll=angles, pitch=steep, yaw=angles)
 def test_zyx_and_back_is_the_same_rotation(roll: float, pitch: float, yaw: float) -> None:
     quat = quat_from_euler_zyx((roll, pitch, yaw))
@@ -222,7 +215,6 @@ def test_zyx_and_back_is_the_same_rotation(roll: float, pitch: float, yaw: float
     assert abs(sum(a * b for a, b in zip(quat, again, strict=True))) == pytest.approx(1, abs=1e-12)
 
 
-@quick
 @given(roll=angles, pitch=st.floats(-1.5, 1.5), yaw=angles)
 def test_zyx_angles_come_back(roll: float, pitch: float, yaw: float) -> None:
     found = euler_zyx_from_matrix(matrix_from_quat(quat_from_euler_zyx((roll, pitch, yaw))))
@@ -238,7 +230,6 @@ def test_zyx_straight_up_and_down_all_of_the_turn_is_yaw(sign: int) -> None:
     assert yaw == pytest.approx(1.0 - sign * 0.3, abs=1e-7)
 
 
-@quick
 @given(angles, steep, angles, st.sampled_from([1e-170, 1e-3, 1.0, -2.0, 1e170]))
 def test_zyx_angles_of_a_quaternion_of_any_length_are_those_of_its_matrix(
     roll: float, pitch: float, yaw: float, length: float

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Meta
 
@@ -327,7 +327,6 @@ def refused(content: bytes) -> list[str]:
     return []
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.text("ab\n\x1b\u2028.", max_size=5) | st.sampled_from(["auto", "acme-uart", "x"]),

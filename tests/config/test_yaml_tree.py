@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.config.yaml_tree import DEPTH_MAX, FILE_BYTES_MAX, SourcePosition, path_text, plain, read_yaml
@@ -159,7 +159,6 @@ PLAIN_DATA = st.recursive(
 )
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
 @given(data=PLAIN_DATA)
 def test_json_reads_as_itself(data: Any) -> None:
     """JSON is YAML: the command line makes configurations by msgspec, and they are read unchanged."""
@@ -168,7 +167,6 @@ def test_json_reads_as_itself(data: Any) -> None:
     assert tree.data == data
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
 @given(content=st.binary(max_size=200) | st.text(alphabet="ab:- \n\t[]{},&*!'\"#|>?%@1.~", max_size=80).map(str.encode))
 def test_whatever_comes_there_is_data_or_a_problem(content: bytes) -> None:
     tree = read_yaml(content)

@@ -8,6 +8,7 @@ from imud.contracts.codec import ReplyFrame
 from imud.contracts.session import (
     LATE_WINDOW_NS,
     REPLY_MESSAGES_MAX,
+    Outcome,
     Rejection,
     Reply,
     Request,
@@ -100,76 +101,44 @@ def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: Session, l
     assert strays(ledger) == (0, 3)
 
 
-def test_late_reply_with_nothing_outstanding(session: Session, ledger: Ledger) -> None:
-    session.start(command("ask", "a"), 0)
+Step = Request | str | ReplyFrame
+"""A request that is started, or a message that the device sends."""
+
+
+@pytest.mark.parametrize(
+    ("first", "wait_ns", "steps", "outcomes", "late_and_unsolicited"),
+    [
+        (["a"], 1, ["a=1", "OK", "OK"], [], (1, 1)),  # with nothing outstanding
+        ([], 1, ["ERR"], [], (1, 0)),  # a late refusal is late too
+        (["a"], LATE_WINDOW_NS + 1, ["OK"], [], (0, 1)),  # after the window nothing is late
+        # not even where the next one is answered by OK alone: the lines before it show whose OK it is
+        (["a"], 0, [command("set"), "a=1", "a=2", "OK", "OK"], [Reply(("OK",))], (1, 0)),
+        # the rest of a reply that timed out in the middle
+        (["a", "a=1"], 0, [command("set"), "OK", "ERR"], [Rejection(("ERR",))], (1, 0)),
+        # the OK of a command that timed out comes after the question
+        ([], 0, [command("ask", "a"), "OK", "a=1", "OK"], [Reply(("a=1", "OK"))], (1, 0)),
+        # lines that were late long ago do not cost a fresh reply
+        (["a", "a=1"], LATE_WINDOW_NS + 1, [command("set"), "OK"], [Reply(("OK",))], (0, 0)),
+        (["a"], 0, [command("ask", "a"), "a=1", "OK"], [Reply(("a=1", "OK"))], (0, 0)),  # the same question again
+    ],
+)
+def test_a_late_reply_does_not_answer_the_next_request(
+    session: Session, ledger: Ledger, first: list[str], wait_ns: int, steps: list[Step], outcomes: list[Outcome],
+    late_and_unsolicited: tuple[int, int],
+) -> None:  # fmt: skip
+    """`first`: the part of the first request, and the lines that come in time; it then times out."""
+    session.start(command("first", *first[:1]), 0)
+    for line in first[1:]:
+        session.on_message(line, 5)
     session.on_time(TIMEOUT_NS)
-    for line in ("a=1", "OK"):
-        assert session.on_message(line, TIMEOUT_NS + 1) is None
-    assert strays(ledger) == (1, 0)
-    session.on_message("OK", TIMEOUT_NS + 2)
-    assert strays(ledger) == (1, 1)
-
-
-def test_late_refusal_is_late_too(session: Session, ledger: Ledger) -> None:
-    session.start(command("set"), 0)
-    session.on_time(TIMEOUT_NS)
-    session.on_message("ERR", TIMEOUT_NS + 1)
-    assert strays(ledger) == (1, 0)
-
-
-def test_after_the_window_nothing_is_late(session: Session, ledger: Ledger) -> None:
-    session.start(command("ask", "a"), 0)
-    session.on_time(TIMEOUT_NS)
-    session.on_message("OK", TIMEOUT_NS + LATE_WINDOW_NS + 1)
-    assert strays(ledger) == (0, 1)
-
-
-def test_late_reply_does_not_answer_the_next_request(session: Session, ledger: Ledger) -> None:
-    """Not even where the next one is answered by OK alone: the lines before it say whose OK it is."""
-    session.start(command("ask", "a"), 0)
-    session.on_time(TIMEOUT_NS)
-    session.start(command("set"), TIMEOUT_NS)
-    assert [session.on_message(line, TIMEOUT_NS + 1) for line in ("a=1", "a=2", "OK")] == [None] * 3
-    assert strays(ledger) == (1, 0)
-    assert session.on_message("OK", TIMEOUT_NS + 2) == Reply(("OK",))
-
-
-def test_rest_of_a_reply_that_timed_out_in_the_middle(session: Session, ledger: Ledger) -> None:
-    session.start(command("ask", "a"), 0)
-    session.on_message("a=1", 5)
-    session.on_time(TIMEOUT_NS)
-    session.start(command("set"), TIMEOUT_NS)
-    assert session.on_message("OK", TIMEOUT_NS + 1) is None
-    assert strays(ledger) == (1, 0)
-    assert session.on_message("ERR", TIMEOUT_NS + 2) == Rejection(("ERR",))
-
-
-def test_a_report_does_not_end_before_its_lines(session: Session, ledger: Ledger) -> None:
-    """The OK of a command that timed out comes after the question."""
-    session.start(command("set"), 0)
-    session.on_time(TIMEOUT_NS)
-    session.start(command("ask", "a"), TIMEOUT_NS)
-    assert session.on_message("OK", TIMEOUT_NS + 1) is None
-    assert session.on_message("a=1", TIMEOUT_NS + 2) is None
-    assert session.on_message("OK", TIMEOUT_NS + 2) == Reply(("a=1", "OK"))
-    assert strays(ledger) == (1, 0)
-
-
-def test_lines_that_were_late_long_ago_do_not_cost_a_fresh_reply(session: Session) -> None:
-    session.start(command("ask", "a"), 0)
-    session.on_message("a=1", 5)
-    session.on_time(TIMEOUT_NS)
-    later = TIMEOUT_NS + LATE_WINDOW_NS + 1
-    session.start(command("set"), later)
-    assert session.on_message("OK", later + 1) == Reply(("OK",))
-
-
-def test_the_same_question_again_takes_the_late_reply(session: Session) -> None:
-    session.start(command("ask", "a"), 0)
-    session.on_time(TIMEOUT_NS)
-    session.start(command("ask", "a"), TIMEOUT_NS)
-    session.on_message("a=1", TIMEOUT_NS + 1)
-    assert session.on_message("OK", TIMEOUT_NS + 1) == Reply(("a=1", "OK"))
+    found, at_ns = [], TIMEOUT_NS + wait_ns
+    for step in steps:
+        if isinstance(step, Request):
+            session.start(step, at_ns)
+        elif (outcome := session.on_message(step, at_ns)) is not None:
+            found.append(outcome)
+    assert found == outcomes
+    assert strays(ledger) == late_and_unsolicited
 
 
 def test_cancel_forgets_the_request(session: Session, ledger: Ledger) -> None:

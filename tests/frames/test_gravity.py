@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from math import cos, radians, sin
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -26,7 +26,6 @@ from tests.support.files import SHARED
 
 G = 9.80665
 TICK_NS = NS_PER_S // 10
-quick = settings(max_examples=100, derandomize=True, deadline=None, database=None)
 FRD = DeviceAxes(order=EulerOrder.ZYX, has_north=False, z_down=True)
 
 
@@ -61,7 +60,6 @@ def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -
     return check.finding
 
 
-@quick
 @given(st.floats(-179, 179), st.floats(-89, 89), st.floats(-180, 180))
 def test_nothing_is_found_in_any_attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> None:
     assert found(FLU_LEVEL, zyx(roll_deg, pitch_deg, yaw_deg)) is None

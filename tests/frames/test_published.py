@@ -3,7 +3,7 @@
 from math import cos, hypot, isnan, nan, pi, radians, sin, sqrt
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -26,7 +26,6 @@ from imud.sample import Quaternion, Sample, Sync, Vector3
 
 G = 9.8
 HALF = sqrt(0.5)
-quick = settings(max_examples=100, derandomize=True, deadline=None, database=None)
 ENU, NED = Convention.ENU_FLU, Convention.NED_FRD
 
 
@@ -347,7 +346,6 @@ FRAMES = st.builds(
 )
 
 
-@quick
 @given(FRAMES, VECTORS, VECTORS, VECTORS, QUATS)
 def test_lengths_and_the_direction_of_gravity_are_kept(
     published: PublishedFrame, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
@@ -373,7 +371,6 @@ def _triple(a: Vector3, b: Vector3, c: Vector3) -> float:
     return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 
 
-@quick
 @given(st.none() | MOUNTINGS, DEVICES, VECTORS, QUATS)
 def test_what_a_client_asks_for_is_what_the_device_would_be_configured_to(
     settings: FrameSettings | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
@@ -399,7 +396,6 @@ def test_what_a_client_asks_for_is_what_the_device_would_be_configured_to(
         assert same_rotation(again.quat_wxyz, direct[configured].quat_wxyz or (0, 0, 0, 0))
 
 
-@quick
 @given(st.sampled_from([ENU, NED]), st.none() | st.floats(-30, 30), DEVICES, VECTORS, QUATS)
 def test_a_client_of_a_device_without_convention(
     asked: Convention, declination_deg: float | None, device: DeviceAxes, accel: Vector3, quat: Quaternion
@@ -418,7 +414,6 @@ ANY = st.floats(allow_nan=True, allow_infinity=True)
 ANY3 = st.none() | st.tuples(ANY, ANY, ANY)
 
 
-@quick
 @given(FRAMES, ANY3, ANY3, st.none() | st.tuples(ANY, ANY, ANY, ANY))
 def test_no_value_of_a_device_raises(
     published: PublishedFrame, vector: Vector3 | None, euler: Vector3 | None, quat: Quaternion | None
