@@ -178,26 +178,19 @@ def test_at_a_tick_per_sample_two_may_share_one() -> None:
     assert learner.period_ticks == pytest.approx(0.9999, abs=3e-5)
 
 
-def test_a_slower_rate_is_adopted() -> None:
+def test_another_rate_is_adopted() -> None:
     learner = PeriodLearner()
-    seen = [learner.add_step(step) for step in [10] * 20 + [20] * 20]
-    assert sum(seen) <= 11
+    assert sum(learner.add_step(step) for step in [10] * 20 + [20] * 20) <= 11
     assert learner.period_ticks == 20
     assert learner.add_step(40) == 1
-
-
-def test_a_faster_rate_costs_nothing() -> None:
-    learner = PeriodLearner()
+    learner = PeriodLearner()  # a faster rate costs nothing
     assert sum(learner.add_step(step) for step in [10] * 20 + [1] * 20) == 0
     assert learner.period_ticks == 1
     assert learner.add_step(10) == 9
 
 
-def test_losses_among_good_steps_do_not_change_the_period() -> None:
+def test_losses_among_good_steps_do_not_change_the_period_and_repeats_are_ignored() -> None:
     assert sum(missing([1] * 10 + [2, 1, 3, 1] * 500)) == 500 * 3
-
-
-def test_repeats_are_ignored() -> None:
     learner = PeriodLearner()
     assert sum(learner.add_step(step) for step in [10, 0] * 50) == 0
     assert learner.period_ticks == 10
@@ -364,15 +357,11 @@ def test_messages_that_pause_are_no_correction() -> None:
 @pytest.mark.parametrize("set_ms", [-2_000, 2_000])
 def test_a_counter_that_moves_far_began_anew(set_ms: int) -> None:
     clock = make_clock()
-    feed(clock, steady(100_000, 0, 1000) + steady(110_000 + set_ms, 10_000, 500))
+    feed(clock, steady(100_000, 0, 1000))
+    feed(clock, [(110_030, 10_000)])
+    assert clock.missed == 0, "samples that were never missing are not counted missing"
+    feed(clock, steady(110_010 + set_ms, 10_010, 500))
     assert clock.status().resets == 1
-
-
-def test_samples_that_were_never_missing_are_not_counted_missing() -> None:
-    clock = make_clock()
-    feed(clock, steady(0, 0, 1000))
-    feed(clock, [(10_030, 10_000)])
-    assert clock.missed == 0
 
 
 def test_until_an_arrival_confirms_it_the_correction_is_doubted() -> None:
@@ -413,20 +402,20 @@ def numbered(clock: SampleClock, index: int, t_ns: int, wait_ns: int = 2 * NS_PE
     return clock.sample(Measurement(40, 0, index % 65536), t_ns + wait_ns, 0, t_ns)
 
 
-def test_missing_samples_are_counted_through_the_wrap() -> None:
-    made, missed = numbering_clock(), []
-    for index in (65530, 65531, 65532, 65535, 65536, 65540, 65541):
+@pytest.mark.parametrize(
+    ("indices", "missed"),
+    [
+        ((65530, 65531, 65532, 65535, 65536, 65540, 65541), [0, 0, 0, 2, 0, 3, 0]),  # through the wrap
+        ((1, 2, 3, 4, 1004), [0, 0, 0, 0, 999]),  # a long gap is believed when time agrees
+    ],
+)
+def test_missing_samples_are_counted(indices: tuple[int, ...], missed: list[int]) -> None:
+    made, found = numbering_clock(), []
+    for index in indices:
         numbered(made, index, index * PERIOD_NS)
-        missed.append(made.missed)
-    assert missed == [0, 0, 0, 2, 0, 3, 0]
+        found.append(made.missed)
+    assert found == missed
     assert made.status().resets == 0
-
-
-def test_a_long_gap_is_believed_when_time_agrees() -> None:
-    made = numbering_clock()
-    for index in (1, 2, 3, 4, 1004):
-        numbered(made, index, index * PERIOD_NS)
-    assert made.missed == 999
 
 
 def test_a_counter_that_began_anew_is_no_loss() -> None:
