@@ -37,22 +37,18 @@ class RunningDaemon:
         self.socket = folder / "imud.sock"
 
     def client(self) -> Client:
-        """A new connection."""
         return Client(self.socket)
 
     def statuses(self) -> dict[str, DeviceStatus]:
-        """Every device's state by name."""
         with self.client() as client:
             devices = msgspec.convert(client.status()["devices"], list[DeviceStatus])
         return {device.name: device for device in devices}
 
     def wait_for(self, device: str, state: str) -> DeviceStatus:
-        """Wait until a device is in a state."""
         wait_until(lambda: self.statuses()[device].state == state, f"{device} is {state}")
         return self.statuses()[device]
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal."""
         self.process.send_signal(number)
 
 

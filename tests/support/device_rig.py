@@ -53,17 +53,14 @@ class DeviceRig:
 
     @property
     def ledger(self) -> Ledger:
-        """Its ledger."""
         return self.device.ledger
 
     @property
     def kinds(self) -> list[EventKind]:
-        """Kinds of the events so far."""
         return [event.kind for event in self.events]
 
     @property
     def state(self) -> DeviceState:
-        """State now."""
         return self.device.state
 
     def is_in(self, state: DeviceState) -> bool:
@@ -72,18 +69,15 @@ class DeviceRig:
 
     @property
     def problem(self) -> str:
-        """What is wrong now."""
         return self.device.status().problem
 
     @property
     def link(self) -> MemoryLink:
-        """Its link of bytes inside the process."""
         assert isinstance(self.device.link, MemoryLink)
         return self.device.link
 
     @property
     def can_link(self) -> MemoryCanLink:
-        """Its CAN link inside the process."""
         assert isinstance(self.device.link, MemoryCanLink)
         return self.device.link
 
@@ -171,7 +165,6 @@ class DeviceRigs:
         return rig
 
     def record(self, rig: DeviceRig) -> None:
-        """Record what a device delivers from now on; again for one that is recorded: describe it as it is now."""
         self._host_tap.begin(rig.recorded.append)
         rig.device.record(rig.recorded.append)
 
@@ -230,7 +223,6 @@ def check_replay(rig: DeviceRig) -> PlayedDevice:
 
 
 def device_config(name: str, driver: str, link: str, settings: dict[str, Any], **options: Any) -> DeviceConfig:
-    """A device of the configuration."""
     row = DRIVERS.get(driver)
     made = msgspec.convert(options, row.settings) if row is not None and options else None
     return DeviceConfig(name, driver, made, True, link, msgspec.convert(settings, LINKS[link].settings))

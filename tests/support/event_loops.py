@@ -22,7 +22,6 @@ P = ParamSpec("P")
 
 
 def in_loop(test: Callable[P, Coroutine[None, None, None]]) -> Callable[P, None]:
-    """Runs a test in an event loop of its own."""
 
     @wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -45,21 +44,17 @@ class VirtualClock:
         self._now_ns = begin_ns
 
     def now_ns(self) -> int:
-        """As `time.monotonic_ns`."""
         return self._now_ns
 
     def advance(self, duration_ns: int) -> None:
-        """So much time passes: something took it."""
         assert duration_ns >= 0
         self._now_ns += duration_ns
 
     def realtime_ns(self) -> int:
-        """As `time.time_ns`."""
         return self._now_ns + UTC_AHEAD_NS
 
     @property
     def host(self) -> HostClock:
-        """Both clocks of the host."""
         return HostClock(self.now_ns, self.realtime_ns, self.now_ns)
 
 
@@ -90,7 +85,6 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._clock = clock
 
     def time(self) -> float:
-        """As the clock says."""
         return self._clock.now_ns() / NS_PER_S
 
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:  # noqa: ASYNC109
@@ -107,20 +101,17 @@ class LoopWorker:
         self._next: asyncio.Handle | None = self._loop.call_soon(self._run)
 
     def ring(self) -> None:
-        """There is something new to do."""
         if self._next is not None:
             self._next.cancel()
             self._next = self._loop.call_soon(self._run)
 
     def watch(self, _fd: int, _callback: Callable[[], None]) -> bool:
-        """There are no descriptors in virtual time."""
         return False
 
     def unwatch(self, _fd: int) -> None:
         """Nothing is watched."""
 
     def end(self) -> bool:
-        """No more; may be called twice."""
         if self._next is not None:
             self._next.cancel()
             self._next = None
@@ -137,7 +128,6 @@ class LoopWorker:
 
 
 def virtual_buses(clock: VirtualClock) -> PolledBuses:
-    """Buses without threads, in virtual time."""
     return PolledBuses(clock.now_ns, LoopWorker)
 
 

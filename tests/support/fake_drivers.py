@@ -47,7 +47,6 @@ _LINE = re.compile(rb"[\x20-\x7e]{2,60}\r\n")
 
 
 def fake_frame(payload: bytes) -> bytes:
-    """A valid frame."""
     head = SYNC + struct.pack("<H", len(payload))
     return head + struct.pack("<H", binascii.crc_hqx(payload, binascii.crc_hqx(head, 0))) + payload
 
@@ -60,17 +59,14 @@ class FakeCodec:
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Events in the order of their ends."""
         self.ledger.bytes_in += len(data)
         self._pending += data
         return self._decode(flushing=False)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Frames inside a longer one that never came."""
         return self._decode(flushing=True)
 
     def reset(self) -> None:
-        """Forget what is pending."""
         self._pending.clear()
 
     def _decode(self, *, flushing: bool) -> list[CodecEvent]:
@@ -171,7 +167,6 @@ class FakeCanCodec:
         self._can_id = BASE + settings.node
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """One frame."""
         self.ledger.bytes_in += len(data)
         if can_id != self._can_id or extended:
             self.ledger.bytes_skipped += len(data)
@@ -185,7 +180,6 @@ class FakeCanCodec:
         return (Measurement(len(data), 0, data[0], temperature_c=20.0),)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Nothing waits."""
         return ()
 
     def reset(self) -> None:
@@ -259,7 +253,6 @@ class LinesCodec:
         self._pending = b""
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """What the lines that became complete say."""
         *lines, self._pending = (self._pending + data).split(b"\r\n")
         ledger = self.ledger
         ledger.bytes_in += len(data)
@@ -276,11 +269,9 @@ class LinesCodec:
         return TextLine(line)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Nothing waits."""
         return ()
 
     def reset(self) -> None:
-        """Forget the beginning of a line."""
         self.ledger.bytes_skipped += len(self._pending)
         self.ledger.bytes_pending = 0
         self._pending = b""
@@ -314,13 +305,11 @@ class FakeModule(MemoryLink):
         self._boot_ns = now_ns()
 
     def restart(self) -> None:
-        """What is not in flash is lost."""
         self.set = dict(self.flash)
         self.mounting = self.set["mounting"]
         self._boot_ns = self._now_ns()
 
     def sample(self) -> None:
-        """Send a sample."""
         self._send(f"S {(self._now_ns() - self._boot_ns) // 1_000_000}")
 
     def write(self, data: bytes) -> None:
@@ -377,7 +366,6 @@ class FakeModule(MemoryLink):
 
 
 def _send_command(line: str) -> RequestScript[Mapping[str, str]]:
-    """Send a command, and return the values of its answer."""
     outcome = yield replace(_query(line.encode() + b"\r\n", line.partition(" ")[0]), messages_min=1)
     if isinstance(outcome, Silence):
         raise NoReply(f"{line}: expected OK, got nothing")

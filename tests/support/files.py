@@ -109,7 +109,6 @@ HI91_BYTES = 82
 
 
 def hi91(ms: int, accel_z_m_s2: float = 9.8) -> bytes:
-    """The frame at `ms` of device time."""
     return encode_hi91(
         system_time_ms=ms,
         accel_m_s2=(0.0, 0.0, accel_z_m_s2),

@@ -88,12 +88,10 @@ def equipped(name: str, number: int = 0, **changes: object) -> DeviceStatus:
 
 
 def views(*names: str) -> dict[str, RingView]:
-    """Rings with all that there can be in one."""
     return {name: RingView(True, MOTION) for name in names}
 
 
 def client(number: int, encoding: str = "json", sent: int = 0, dropped: int = 0, queue: int = 0) -> ClientStatus:
-    """A client that watches."""
     return ClientStatus(number, 100 + number, 1000, False, encoding, sent, dropped, queue, queue * 256)
 
 

@@ -44,20 +44,16 @@ class PolledBusBench:
         monkeypatch.setattr("imud.links.i2c.LINK", LinkType("i2c", I2cSettings, make_polled=self._make_i2c))
 
     def registers(self, **more: Any) -> Imu61xRegisters:
-        """A device in the time of the bench."""
         return Imu61xRegisters(self.clock.now_ns, **more)
 
     def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[DeviceRig]]:
-        """Devices at work."""
         host = HostClock(self._time, self.clock.realtime_ns, self._time)
         return running(*configs, rigs=DeviceRigs(host, lines=self.lines.maker, start_worker=LoopWorker))
 
     def run(self, body: Coroutine[Any, Any, None]) -> None:
-        """The body of a test, to its end."""
         run_virtually(self.clock, body)
 
     def on_spi(self, rate_hz: float = RATE_HZ, **options: Any) -> DeviceConfig:
-        """A device on the SPI bus, as configured."""
         return device_config("imu", "imu61x-spi", "spi", {"port": str(self.node), "rate_hz": rate_hz}, **options)
 
     def _time(self) -> int:
@@ -88,14 +84,11 @@ class _ReadyI2c(I2cLink):
     """Its node need not be waited for."""
 
     def absence(self) -> str:
-        """It is there."""
         return ""
 
     async def wait_present(self) -> None:
-        """It is there."""
         await asyncio.sleep(0)
 
 
 def on_i2c(name: str = "imu", driver: str = "imu61x-i2c", **more: Any) -> DeviceConfig:
-    """A device on the I2C bus, as configured."""
     return device_config(name, driver, "i2c", {"bus": 1, "rate_hz": RATE_HZ, **more})

@@ -46,11 +46,9 @@ class PtyPort:
         """The near end, held open so that the port has a holder between a close and the next open."""
 
     def send(self, data: bytes) -> None:
-        """Bytes for the link."""
         assert os.write(self.master, data) == len(data)
 
     def received(self) -> bytes:
-        """Bytes that the link sent and that have come so far."""
         try:
             return os.read(self.master, 65536)
         except BlockingIOError:
@@ -67,7 +65,6 @@ class PtyPort:
         return size
 
     def unplug(self) -> None:
-        """Hang up; may be called twice."""
         for name in ("master", "slave"):
             fd = getattr(self, name)
             if fd >= 0:
@@ -101,12 +98,10 @@ BAUD = 921600
 
 
 def serial_of(number: int) -> bytes:
-    """Some serial number."""
     return (0xA000_0000_0000_0000 + number).to_bytes(8, "big")
 
 
 def slave(address: int, *, baud: int = BAUD, serial: int = 0, **more: object) -> Slave:
-    """A module; its serial number ends with its first address."""
     assert address in SLAVES
     return Slave(serial_of(serial or address), SlaveSettings(address, baud), **more)  # type: ignore[arg-type]  # passed on
 
@@ -172,16 +167,13 @@ class ModbusBench:
 
     @property
     def slave(self) -> Slave:
-        """The first module."""
         return self.line.slaves[0]
 
     @property
     def target(self) -> Target:
-        """What actions and settings get."""
         return Target(HipnucModbusSettings(), self.baud, places=tuple(dict.fromkeys((self.at, 7))))
 
     def run(self, script: TransferScript[T]) -> T:
-        """Run a transfer script to its end; return its value, raise what it raises."""
         return _run_transfers(script, self)
 
     def transfer(self, transfer: Transfer) -> bytes:

@@ -41,27 +41,22 @@ class Board:
         self.publisher.add_device(DEVICE, 3)
 
     def status(self) -> DeviceStatus:
-        """What the pipeline would say of the device."""
         return DeviceStatus(
             DEVICE, 3, self.driver, "", DeviceState.RUNNING, "", {}, {}, 0.0, 0.0, 0, ClockStatus(),
             self.ledger.snapshot(), KernelCounters(), (), 0, None, None, 1,
         )  # fmt: skip
 
     def publish(self, numbers: Iterable[int]) -> None:
-        """Publish the samples of these sequence numbers as one batch."""
         self.publish_samples([make_sample(seq) for seq in numbers])
 
     def publish_samples(self, samples: Sequence[Sample]) -> None:
-        """Publish these samples as one batch."""
         self.publisher.publish(Batch(DEVICE, 3, samples))
 
     def tick(self, later_ns: int = 100_000_000) -> None:
-        """Let time pass, and tick."""
         self.now_ns += later_ns
         self.publisher.tick(self.now_ns)
 
     def word(self, name: str, size_bytes: int = 8) -> int:
-        """A number of the header, as it is in the file."""
         return int.from_bytes(self.path.read_bytes()[OFFSETS[name] :][:size_bytes], "little")
 
     def die(self) -> None:

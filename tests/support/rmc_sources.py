@@ -24,7 +24,6 @@ class Sentences:
         return [sentence for sentence, _ in self.got]
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        """Return when the condition holds, looked at after each sentence."""
         async with asyncio.timeout(LIMIT_S):
             while not condition():
                 self._arrived.clear()

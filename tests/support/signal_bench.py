@@ -46,22 +46,18 @@ class SignalBench:
         self.events: list[Event] = []
 
     def input(self, key: str) -> MemoryInput:
-        """The device's end of an input, once it was made."""
         return self.memory.inputs[f"{DEVICE} {key}"]
 
     def output(self, key: str) -> MemoryOutput:
-        """The device's end of an output, once it was made."""
         return self.memory.outputs[f"{DEVICE} {key}"]
 
     def start_worker(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> HandWorker:
-        """As `StartWorker`."""
         self.workers.append(HandWorker(name, work, failed))
         return self.workers[-1]
 
     def raise_event(
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
-        """As `RaiseEvent`."""
         self.events.append(Event(now_ns, DEVICE, kind, message, dict(detail)))
 
     def messages(self, kind: EventKind | None = None) -> list[str]:

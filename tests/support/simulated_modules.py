@@ -52,7 +52,6 @@ AT_REST = Still(radians(2), radians(-3), radians(40))
 
 
 def run_script(script: RequestScript[T], ask: Callable[[Request], Outcome]) -> T:
-    """Run a request script to its end with the outcomes of `ask`; return its value, raise what it raises."""
     try:
         request = next(script)
         while True:
@@ -66,17 +65,11 @@ class SerialModule(Protocol):
     """A simulated module behind a UART."""
 
     @property
-    def baud(self) -> int:
-        """Its rate now."""
-        ...
+    def baud(self) -> int: ...
 
-    def advance(self, now_ns: int) -> list[Burst]:
-        """What it sent up to now."""
-        ...
+    def advance(self, now_ns: int) -> list[Burst]: ...
 
-    def receive(self, data: bytes, now_ns: int) -> None:
-        """What it hears."""
-        ...
+    def receive(self, data: bytes, now_ns: int) -> None: ...
 
 
 M = TypeVar("M", bound=SerialModule)
@@ -111,12 +104,10 @@ class SerialLine(Generic[M]):
         return events
 
     def send(self, data: bytes) -> None:
-        """Send bytes at the line's rate."""
         if self.connected and data:
             self.module.receive(heard(data, self.baud, self.module.baud), self.now_ns)
 
     def ask(self, request: Request) -> Outcome:
-        """One request to its outcome."""
         if request.baud:
             self.baud = request.baud
         if request.payload:
@@ -134,7 +125,6 @@ class SerialLine(Generic[M]):
                     return outcome
 
     def run(self, script: RequestScript[T]) -> T:
-        """Run a request script to its end; return its value, raise what it raises."""
         return run_script(script, self.ask)
 
 
@@ -181,11 +171,9 @@ class HipnucUartBench:
         return self.module.advance(self.now_ns)
 
     def frames(self, duration_ms: float) -> list[Hi91]:
-        """Let time pass; return the HI91 frames."""
         return [unpack_hi91(burst.data) for burst in self.wait(duration_ms) if burst.sample_ns is not None]
 
     def ask(self, command: str, duration_ms: float = 30.0) -> list[str]:
-        """Send a command; return the lines of text that came."""
         self.module.receive(command.encode() + b"\r\n", self.now_ns)
         return self.text(duration_ms)
 
@@ -196,13 +184,11 @@ class HipnucUartBench:
         return text.decode("ascii").split("\r\n")[:-1]
 
     def reboot(self) -> None:
-        """Switch off and on, and wait until it has booted."""
         self.module.reboot(self.now_ns)
         self.wait(self.module.hardware.boot_ms)
 
 
 def hardware_of(behaviour: Behaviour, **hardware: Any) -> HipnucHardware:
-    """A module at rest of a variant."""
     return replace(HIPNUC_STILL, behaviour=behaviour, **hardware)
 
 
@@ -215,7 +201,6 @@ class HipnucLine(SerialLine[HipnucModule]):
         self.wait(hardware.boot_ms)
 
     def act(self, name: str, *, fixed_baud: int = 0, **arguments: Any) -> Any:
-        """Carry out an action of the driver; return its answer, raise what it raises."""
         action = ACTIONS[name]
         return self.run(action.script(Target(None, self.baud, fixed_baud), action.arguments(arguments)))
 
@@ -252,11 +237,9 @@ class CanBench:
         self._also: tuple[CanFilter, ...] = ()
 
     def target(self, bit_rate: int = 500_000, others_bit_s: float = 0.0) -> Target:
-        """What actions and settings get."""
         return Target(self.settings, bit_rate, other_bits_per_s=others_bit_s)
 
     def run(self, duration_ns: int) -> Outcome | None:
-        """Let time pass, up to the end of the outstanding request."""
         end_ns = self.now_ns + duration_ns
         while self.now_ns < end_ns:
             self.now_ns += CAN_STEP_NS
@@ -283,23 +266,19 @@ class CanBench:
         return None
 
     def send(self, can_id: int, data: bytes, *, extended: bool = False) -> None:
-        """A frame of the host."""
         self.sent.append((can_id, data))
         for module in self.bus:
             module.receive(can_id, extended, data, self.now_ns)
 
     def run_script(self, script: RequestScript[T]) -> T:
-        """Run a request script to its end."""
         return run_script(script, self._ask)
 
     def act(self, name: str, **given: object) -> object:
-        """Run an action of the driver."""
         action = self.driver.actions[name]
         result: object = self.run_script(action.script(self.target(), action.arguments(given)))
         return result
 
     def present(self) -> dict[str, Any]:
-        """The module's settings, read by the driver."""
         assert self.driver.device_settings is not None
         return self.run_script(self.driver.device_settings.read(self.target()))
 
@@ -386,11 +365,9 @@ class Imu61xBench(SerialLine[Imu61xModule]):
         self.wait(hardware.boot_ms)
 
     def samples(self, duration_ms: float) -> list[Measurement]:
-        """Let time pass; return the measurements."""
         return [event for event in self.wait(duration_ms) if isinstance(event, Measurement)]
 
     def restart(self) -> None:
-        """Switch off and on, and wait until it has booted."""
         self.module.reboot(self.now_ns)
         self.wait(self.module.hardware.boot_ms + 1)
 
@@ -406,7 +383,6 @@ def imu61x_hardware(**more: object) -> Imu61xHardware:
 
 
 def imu61x_bench(settings: Imu61xSettings | None = None, **more: object) -> Imu61xBench:
-    """A bench with a device of `imu61x_hardware`."""
     return Imu61xBench(settings, imu61x_hardware(**more))
 
 
@@ -415,7 +391,6 @@ every_variant = pytest.mark.parametrize("variant", VARIANTS)
 
 
 def variant_bench(variant: str, settings: Imu61xSettings | None = None, **more: object) -> Imu61xBench:
-    """A bench with a device that behaves as the variant of this name."""
     return imu61x_bench(settings, behaviour=VARIANTS[variant], **more)
 
 
@@ -425,10 +400,8 @@ def done(variant: str) -> int:
 
 
 def over_i2c(device: Imu61xRegisters, transfer: Transfer) -> bytes:
-    """One transfer on I2C; returns what is read."""
     return device.i2c([*transfer.sends, transfer.read_bytes] if transfer.read_bytes else [*transfer.sends])
 
 
 def over_spi(device: Imu61xRegisters, transfer: Transfer) -> bytes:
-    """One transfer on SPI in mode 0; returns what is read."""
     return b"".join(device.spi(transfer.sends, 0))

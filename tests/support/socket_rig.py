@@ -52,7 +52,6 @@ DEVICES = {"imu0": 0, "imu1": 1}
 
 
 def sample(device: str = "imu0", seq: int = 1, period_ns: int = 1_000_000) -> Sample:
-    """Sample number `seq` of a device that sends every `period_ns`."""
     t_ns = 80_000_000_000_000 + seq * period_ns
     return Sample(
         device=device,
@@ -70,13 +69,11 @@ def sample(device: str = "imu0", seq: int = 1, period_ns: int = 1_000_000) -> Sa
 
 
 def batch(device: str = "imu0", first: int = 1, count: int = 1, period_ns: int = 1_000_000) -> Batch:
-    """Samples number `first` and on."""
     samples = [sample(device, seq, period_ns) for seq in range(first, first + count)]
     return Batch(device, DEVICES.get(device, 9), samples)
 
 
 def device_status(name: str, device_id: int) -> DeviceStatus:
-    """A running device."""
     return DeviceStatus(
         name=name,
         device_id=device_id,
@@ -154,7 +151,6 @@ class FakeControl:
         self._device = device
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action."""
         if name == "wait":
             await done_late.wait()
             return {"waited": self._device}
@@ -166,7 +162,6 @@ class FakeControl:
         return None
 
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
-        """Run a calibration."""
         if kind == "wait":
             await done_late.wait()
         if kind not in CALIBRATIONS:
@@ -175,7 +170,6 @@ class FakeControl:
         return CalibrationResult(kind, True, "", "", (check,), save, Kept.BY_SAVE)
 
     def stop_calibration(self) -> bool:
-        """Nothing runs."""
         return False
 
     async def settings_report(self, *, fresh: bool) -> SettingsReport:
@@ -267,15 +261,12 @@ class Daemon:
         return self.start(called).result(LIMIT_S)
 
     def start(self, work: Callable[[SocketServer], Coroutine[Any, Any, T]]) -> Future[T]:
-        """Start `work(server)` in the loop's thread."""
         return asyncio.run_coroutine_threadsafe(work(self.server), self._loop)
 
     def stop(self) -> None:
-        """End the server; to be called from another thread."""
         self._loop.call_soon_threadsafe(self._stop.set)
 
     async def stopped(self) -> None:
-        """Wait for `stop`."""
         await self._stop.wait()
 
 
@@ -315,7 +306,6 @@ class Peer:
 
     @classmethod
     async def connect(cls, server: SocketServer) -> Self:
-        """Connect; the hello is still to come."""
         sock = socket.socket(socket.AF_UNIX)
         sock.setblocking(False)
         await asyncio.get_running_loop().sock_connect(sock, server.hub.path)
@@ -323,13 +313,11 @@ class Peer:
 
     @classmethod
     async def greeted(cls, server: SocketServer) -> Self:
-        """Connect and read the hello."""
         peer = await cls.connect(server)
         assert (await peer.message())["method"] == "hello"
         return peer
 
     async def send(self, data: bytes) -> None:
-        """Send bytes as they are."""
         for line in data.splitlines():
             with suppress(ValueError, TypeError, KeyError, RecursionError):
                 request = json.loads(line)
@@ -348,7 +336,6 @@ class Peer:
         return reply
 
     async def result(self, method: str, **params: object) -> Any:
-        """Send a request that must go well."""
         reply = await self.ask(method, **params)
         assert "error" not in reply, reply
         return reply["result"]
@@ -359,7 +346,6 @@ class Peer:
         return error["code"], error["message"]
 
     async def message(self) -> dict[str, Any]:
-        """The next JSON object."""
         body = await self.body()
         value = json.loads(body, parse_constant=_refuse)
         assert isinstance(value, dict)
@@ -367,7 +353,6 @@ class Peer:
         return value
 
     async def messages(self, count: int) -> Sequence[dict[str, Any]]:
-        """The next JSON objects."""
         return [await self.message() for _ in range(count)]
 
     async def body(self) -> bytes:
@@ -387,7 +372,6 @@ class Peer:
             return True
 
     def close(self) -> None:
-        """Disconnect."""
         self.sock.close()
 
     def _take(self) -> bytes | None:

@@ -149,11 +149,9 @@ class Machine:
         self.outputs["systemctl show"] = CommandOutput(0, "\n".join(("LoadState=loaded", *lines)), "")
 
     def prints(self, command: str, text: str, status: int = 0, complaint: str = "") -> None:
-        """What a command prints whose words begin so."""
         self.outputs[command] = CommandOutput(status, text, complaint)
 
     def run(self, words: Sequence[str]) -> CommandOutput:
-        """Give the output of a command; FileNotFoundError where none was given."""
         line = " ".join(words)
         for begin, output in self.outputs.items():
             if line.startswith(begin):
@@ -163,13 +161,11 @@ class Machine:
         raise FileNotFoundError(2, "No such file or directory", words[0])
 
     def fetch(self, address: str, port: int, path: str) -> str:
-        """Give a page; ConnectionRefusedError where none was given."""
         if (address, port, path) not in self.pages:
             raise ConnectionRefusedError(111, "Connection refused")
         return self.pages[address, port, path]
 
     def ask(self) -> list[DeviceStatus]:
-        """Give the status, or raise why there is none."""
         if isinstance(self.status, Exception):
             raise self.status
         return self.status
@@ -179,7 +175,6 @@ class Machine:
         self.on_pause()
 
     def surroundings(self) -> Surroundings:
-        """The machine as the checks see it."""
         times_s = iter(self.sync_s)
         return Surroundings(
             Path("/etc/imud.yaml"), self.ask, root=self.root, run=self.run, fetch=self.fetch,
@@ -188,9 +183,7 @@ class Machine:
         )  # fmt: skip
 
     def find(self, check: DoctorCheck) -> list[DoctorFinding]:
-        """Run one check."""
         return list(check.run(self.surroundings()))
 
     def told(self, check: DoctorCheck) -> list[tuple[str, str]]:
-        """Run one check; severity and text of each finding."""
         return [(str(finding.severity), f"{finding.seen} → {finding.advice}") for finding in self.find(check)]

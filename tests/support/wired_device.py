@@ -99,18 +99,15 @@ class WiredDevice:
 
     @property
     def samples(self) -> list[Sample]:
-        """All that came."""
         return self.rig.samples
 
     @property
     def events(self) -> list[Event]:
-        """All that were raised."""
         return self.rig.events
 
     # --- what a story may do -----------------------------------------------------------------------------------------
 
     async def wait(self, seconds: float) -> list[Sample]:
-        """Let time pass; returns the samples that came."""
         before = len(self.samples)
         await asyncio.sleep(seconds)
         return self.samples[before:]
@@ -126,7 +123,6 @@ class WiredDevice:
         self.module.receive(command.encode() + b"\r\n", self.clock.now_ns())
 
     def line(self, key: str) -> MemoryInput:
-        """The host's end of a wire."""
         return self.memory.inputs[f"bow {key}"]
 
     def pulse_per_second(self, t_ns: int) -> None:
@@ -151,7 +147,6 @@ class WiredDevice:
         return self._pulses[pin]
 
     def of_kind(self, kind: EventKind) -> list[Event]:
-        """Events so far."""
         return [event for event in self.events if event.kind is kind]
 
     # --- the machinery -----------------------------------------------------------------------------------------------
@@ -227,7 +222,6 @@ class LinkedModule(MemoryLink):
             self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
 
     async def carry(self) -> None:
-        """Bring what the module sends, as it leaves the wire."""
         while True:
             baud = self.module.baud
             for burst in self.module.advance(self.clock.now_ns()):
@@ -258,25 +252,20 @@ class LinkedDevice:
 
     @property
     def problem(self) -> str:
-        """What is wrong now."""
         return self.rig.problem
 
     @property
     def messages(self) -> list[str]:
-        """Texts of the events so far."""
         return [event.message for event in self.events]
 
     async def until(self, condition: Callable[[], object], what: str = "", limit_s: float = 30.0) -> None:
-        """Let time pass until it holds."""
         await self.rig.until(condition, what or str(self.link.sent_at[-5:]), limit_s, step_s=0.01)
 
     async def wait(self, seconds: float) -> None:
-        """Let time pass."""
         end_ns = self.clock.now_ns() + int(seconds * 1e9)
         await self.until(lambda: self.clock.now_ns() >= end_ns, limit_s=seconds + 1)
 
     async def act(self, name: str, **arguments: Any) -> object:
-        """Carry out an action; the device looks at its state meanwhile."""
         acting = asyncio.ensure_future(self.device.act(name, arguments))
         await self.until(acting.done, f"the end of {name}", 60)
         return acting.result()
@@ -325,7 +314,6 @@ class Imu61xLine(MemoryLink):
         self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
 
     async def carry(self) -> None:
-        """What the device sends, as it leaves the wire."""
         while True:
             baud = self.module.baud
             for burst in self.module.advance(self.clock.now_ns()):
