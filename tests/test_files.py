@@ -34,7 +34,6 @@ def link_to(target: str) -> Callable[[Path], None]:
         (link_to("/dev/stdin/none"), "Not a directory|No such file"),
     ],
 )
-@pytest.mark.timeout(5)
 def test_what_is_no_file_is_refused_at_once(make: Callable[[Path], None], words: str, tmp_path: Path) -> None:
     make(tmp_path / "it")
     with pytest.raises(OSError, match=words):

@@ -26,27 +26,24 @@ def test_the_first_message_is_dated_by_its_arrival() -> None:
     assert times.error_ns > FIRST_SPREAD_NS
 
 
+def off_ns(times: ArrivalTime, late_ns: int, number: int | None = None, *, alone: bool = True) -> int:
+    """How long before `late_ns`, ns, a message that arrives then is dated."""
+    return late_ns - times.date(number, late_ns, 82, alone=alone, triggered=False, is_first=False)
+
+
 def test_a_late_message_is_dated_by_the_pace_of_those_before_unless_others_carry_time() -> None:
-    late_ns = BEGIN_NS + 100 * PERIOD_NS + 4 * NS_PER_MS
     for alone in (True, False):
         times = ArrivalTime(DELAY, 0, lambda: None)
         fed(times, 100, alone=alone)
-        off_ns = late_ns - times.date(None, late_ns, 82, alone=alone, triggered=False, is_first=False)
-        assert (off_ns > 3 * NS_PER_MS) is alone
+        late_ns = BEGIN_NS + 100 * PERIOD_NS + 4 * NS_PER_MS
+        assert (off_ns(times, late_ns, alone=alone) > 3 * NS_PER_MS) is alone
+        times.restart()  # the link was away: the pace is learned anew
+        assert off_ns(times, late_ns + 400 * PERIOD_NS, alone=alone) == DELAY.floor_ns // 2
 
 
 def test_a_number_counts_what_is_missing() -> None:
     times = ArrivalTime(DELAY, 256, lambda: None)
     fed(times, 100, numbered=True)
-    at_ns = BEGIN_NS + 102 * PERIOD_NS
-    t_ns = times.date(102, at_ns + 5 * NS_PER_MS, 82, alone=True, triggered=False, is_first=False)
+    late_ns = BEGIN_NS + 102 * PERIOD_NS + 5 * NS_PER_MS
+    assert abs(off_ns(times, late_ns, 102) - 5 * NS_PER_MS) < NS_PER_MS
     assert times.missed == 2
-    assert abs(t_ns - at_ns) < NS_PER_MS
-
-
-def test_after_the_link_was_away_the_pace_is_learned_anew() -> None:
-    times = ArrivalTime(DELAY, 0, lambda: None)
-    fed(times, 100)
-    times.restart()
-    later_ns = BEGIN_NS + 500 * PERIOD_NS + 4 * NS_PER_MS
-    assert times.date(None, later_ns, 82, alone=True, triggered=False, is_first=False) == later_ns - DELAY.floor_ns // 2

@@ -1,5 +1,7 @@
 """Edges paired with samples by device time, whichever side loses; pulses decoded from edges."""
 
+import pytest
+
 from imud.clock.edge_pairing import MISSES_MOST, QUEUE_MOST, WRONG_MOST, EdgePairing, PulseDecoder, rising_edges
 from imud.contracts.lines import Edge
 from imud.units import NS_PER_MS
@@ -7,19 +9,19 @@ from imud.units import NS_PER_MS
 # --- pulses -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_pulse_is_its_rising_edge() -> None:
-    assert PulseDecoder(80_000).decode([Edge(1000, True, 1), Edge(81_000, False, 2)]) == [(1000, 1)]
-
-
-def test_the_halves_of_a_pulse_may_come_apart() -> None:
-    pulses = PulseDecoder(80_000)
-    assert pulses.decode([Edge(1000, True, 1)]) == [(1000, 1)]
-    assert pulses.decode([Edge(81_000, False, 2), Edge(500_000, True, 3)]) == [(500_000, 3)]
-
-
-def test_a_falling_edge_alone_is_counted_back() -> None:
-    pulses = PulseDecoder(80_000)
-    assert pulses.decode([Edge(1000, True, 1), Edge(581_000, False, 4)]) == [(1000, 1), (501_000, 3)]
+@pytest.mark.parametrize(
+    ("reads", "pulses"),
+    [
+        ([[Edge(1000, True, 1), Edge(81_000, False, 2)]], [(1000, 1)]),  # a pulse is its rising edge
+        # the halves of a pulse may come apart
+        ([[Edge(1000, True, 1)], [Edge(81_000, False, 2), Edge(500_000, True, 3)]], [(1000, 1), (500_000, 3)]),
+        # a falling edge alone is counted back
+        ([[Edge(1000, True, 1), Edge(581_000, False, 4)]], [(1000, 1), (501_000, 3)]),
+    ],
+)
+def test_pulses(reads: list[list[Edge]], pulses: list[tuple[int, int]]) -> None:
+    decoder = PulseDecoder(80_000)
+    assert [pulse for edges in reads for pulse in decoder.decode(edges)] == pulses
 
 
 def test_only_rising_edges() -> None:
@@ -78,20 +80,13 @@ def test_what_is_near_but_not_near_enough_is_counted_on_both_sides() -> None:
     assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
 
 
-def test_it_begins_only_when_most_agree() -> None:
+@pytest.mark.parametrize(("apart_ns", "error_ns"), [(NS_PER_MS, ERROR_NS), (0, 0.5 * PERIOD_NS)])
+def test_it_begins_only_when_most_agree_and_the_fit_is_sure(apart_ns: int, error_ns: float) -> None:
     pairing = EdgePairing(LEAD_NS)
     for i in range(30):
-        pairing.add_events([(i * PERIOD_NS + (i % 4) * NS_PER_MS, i)])
-        assert not pair(pairing, i)
-    assert not pairing.running
-
-
-def test_an_unsure_fit_begins_nothing() -> None:
-    pairing = EdgePairing(LEAD_NS)
-    for i in range(30):
-        pairing.add_events([(i * PERIOD_NS, i)])
         at = i * PERIOD_NS
-        pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, 0.5 * PERIOD_NS, float(PERIOD_NS), 1.0)
+        pairing.add_events([(at + (i % 4) * apart_ns, i)])
+        assert not pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, error_ns, float(PERIOD_NS), 1.0)
     assert not pairing.running
 
 

@@ -244,11 +244,17 @@ def paced(pace: ArrivalPace, begin_ns: int, messages: int, late_ns: int = 0) -> 
     return sum(missed for missed, _ in found), sum(not certain for _, certain in found)
 
 
-@pytest.mark.parametrize("waited_ms", [0, 18, 300])
-def test_a_first_message_that_waited_costs_nothing_that_is_known_of_the_pace(waited_ms: int) -> None:
+def known_pace() -> ArrivalPace:
+    """The pace of 100 Hz after a minute."""
     pace = ArrivalPace()
     pace.begin(BEGIN_NS)
     assert paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000) == (0, 0)
+    return pace
+
+
+@pytest.mark.parametrize("waited_ms", [0, 18, 300])
+def test_a_first_message_that_waited_costs_nothing_that_is_known_of_the_pace(waited_ms: int) -> None:
+    pace = known_pace()
     period_ns = pace.period_ns
     begin_ns = BEGIN_NS + 100 * NS_PER_S
     pace.begin(begin_ns + waited_ms * NS_PER_MS)
@@ -269,9 +275,7 @@ def test_the_pace_is_known_within_80_messages_whatever_they_wait_up_to_a_twentie
 
 
 def test_messages_that_are_early_once_show_a_wrong_phase_and_no_other_rate() -> None:
-    pace = ArrivalPace()
-    pace.begin(BEGIN_NS)
-    paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000)
+    pace = known_pace()
     period_ns = pace.period_ns
     begin_ns = BEGIN_NS + 60_010 * NS_PER_MS
     assert paced(pace, begin_ns, 300, late_ns=-18 * NS_PER_MS) == (0, 1), "more than half a period is not sure"
@@ -308,38 +312,28 @@ def test_messages_that_stay_late_by_the_same_are_of_the_same_rate(late_ms: int, 
 
 @pytest.mark.parametrize("period_ms", [5, 9.9, 10.1])
 def test_messages_that_are_off_in_every_window_are_of_another_rate(period_ms: float) -> None:
-    pace = ArrivalPace()
-    pace.begin(BEGIN_NS)
-    paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000)
+    pace = known_pace()
     for index in range(2000):
         pace.add_arrival(BEGIN_NS + 60 * NS_PER_S + int((index + 1) * period_ms * NS_PER_MS))
     assert pace.period_ns == pytest.approx(period_ms * NS_PER_MS, rel=2e-3)
 
 
-@pytest.mark.parametrize("device", COUNTED[1:])
-def test_a_counter_that_ran_on_while_the_link_was_away_counts(device: Device) -> None:
+@pytest.mark.parametrize(
+    ("device", "restarts"),
+    [*product(COUNTED[1:], [False]), *product([*COUNTED[:-1], UNCOUNTED], [True])],
+)
+def test_what_a_counter_shows_after_the_link_was_away(device: Device, restarts: bool) -> None:
+    """It ran on, and counts what is missing; or it began anew, and leaves a gap of unknown size."""
     one, unknown = reader(device, N_TTY, 3)
-    one.run(10 * NS_PER_S)
+    one.run(0 if restarts else 10 * NS_PER_S)
+    one.device = replace(device, first=device.first + 777_777_777 * restarts)
     one.kept_bytes = 0
-    one.stall(10 * NS_PER_S)
-    one.kept_bytes = N_TTY
-    one.clock.restart()
-    one.run(NS_PER_S)
-    assert one.finish() == one.missed
-    assert not unknown
-
-
-@pytest.mark.parametrize("device", [*COUNTED[:-1], UNCOUNTED])
-def test_a_device_that_began_anew_leaves_a_gap_of_unknown_size(device: Device) -> None:
-    one, unknown = reader(device, N_TTY, 3)
-    one.device = replace(device, first=device.first + 777_777_777)
-    one.kept_bytes = 0
-    one.stall(3 * NS_PER_S)
+    one.stall((3 if restarts else 10) * NS_PER_S)
     one.kept_bytes = N_TTY
     one.clock.restart()
     one.run(3 * NS_PER_S)
-    assert len(unknown) == 1
-    assert one.missed == 0
+    assert len(unknown) == restarts
+    assert one.missed == (0 if restarts else one.finish())
 
 
 def test_a_counter_that_jumps_between_two_samples_leaves_no_gap() -> None:

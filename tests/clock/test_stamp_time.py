@@ -24,15 +24,18 @@ def ticks_of(stamps: list[int], step_ms: int = 10) -> list[int | None]:
     return found
 
 
-def test_the_turn_of_a_real_module() -> None:
-    """8190 is followed by 8 at 100 Hz, as recorded."""
-    assert ticks_of([8170, 8180, 8190, 8, 18]) == [None, 8180, 8190, 8200, 8210]
-
-
-def test_a_pulse_per_second_is_no_loss_of_seven_seconds() -> None:
-    stamps = [(950 + 10 * i) % 1000 + (i >= 5) * 2 for i in range(9)]
-    assert stamps == [950, 960, 970, 980, 990, 2, 12, 22, 32]
-    assert ticks_of(stamps) == [None, 960, 970, 980, 990, 1002, 1012, 1022, 1032]
+@pytest.mark.parametrize(
+    ("stamps", "ticks"),
+    [
+        ([8170, 8180, 8190, 8, 18], [8180, 8190, 8200, 8210]),  # the turn of a real module at 100 Hz, as recorded
+        # a pulse per second is no loss of seven seconds
+        ([950, 960, 970, 980, 990, 2, 12, 22, 32], [960, 970, 980, 990, 1002, 1012, 1022, 1032]),
+        ([0] * 50, [None] * 49),  # messages that follow a trigger each have no time
+        ([4711] * 50, [None] * 49),
+    ],
+)
+def test_ticks_of_stamps(stamps: list[int], ticks: list[int | None]) -> None:
+    assert ticks_of(stamps) == [None, *ticks]
 
 
 def test_pulses_that_stay_away_and_come_again() -> None:
@@ -67,11 +70,6 @@ def test_turns_that_were_missed_are_added_when_messages_come_on_time() -> None:
     assert found[300] == 23_000 - 2 * MODULUS
     assert found[-100:] == truth[-100:]
     assert sum(b - a > 10 for a, b in pairwise(found[1:]) if a is not None and b is not None) == 2
-
-
-@pytest.mark.parametrize("stamp", [0, 4711])
-def test_messages_that_follow_a_trigger_each_have_no_time(stamp: int) -> None:
-    assert ticks_of([stamp] * 50) == [None] * 50
 
 
 def test_triggers_after_timed_output_end_the_time() -> None:

@@ -45,19 +45,13 @@ from tests.support.clock_feed import BEGIN_NS, make_clock, message, rises
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("age_ns", "rate"), [(0, SLEW_SETTLING), (SETTLED_AFTER_NS + 1, SLEW)])
-def test_the_rate_is_bounded(sign: int, age_ns: int, rate: float) -> None:
+def test_the_rate_of_a_slew_is_bounded_and_it_ends_at_nothing(sign: int, age_ns: int, rate: float) -> None:
     slew = Slew()
     slew.set(sign * 10.0 * NS_PER_S)
     before = slew.left_ns
-    after = slew.advance(10 * NS_PER_MS, age_ns)
-    assert before - after == pytest.approx(sign * rate * 10 * NS_PER_MS)
-
-
-def test_it_ends_at_nothing() -> None:
-    slew = Slew()
-    slew.set(-3.0)
-    assert slew.advance(NS_PER_S, SETTLED_AFTER_NS + 1) == 0.0
-    assert slew.left_ns == 0.0
+    assert before - slew.advance(10 * NS_PER_MS, age_ns) == pytest.approx(sign * rate * 10 * NS_PER_MS)
+    slew.set(sign * 3.0)
+    assert slew.advance(NS_PER_S, age_ns) == slew.left_ns == 0.0
 
 
 # --- edges ------------------------------------------------------------------------------------------------------------
@@ -78,30 +72,26 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: C
     [(BARE_UART, 1000, 2), (USB_16MS, 100, 10), (LOADED, 100, 10), (LOADED, 1000, 3)],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_every_pair_is_right_under_loss_on_either_side(profile: ArrivalProfile, rate_hz: int, seconds: int) -> None:
-    dated = run_sout(model(profile, rate_hz, 3), seconds, HALF_LOST)
-    paired = [t for t in dated if t.sample.edge_seq is not None]
-    assert len(paired) > 0.6 * len(dated)
-    assert all(t.sample.edge_seq == t.number for t in paired)
-    assert rises(t.sample for t in dated)
-    assert share_honest(dated) >= 0.95
-
-
-@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 10), (1000, 4)])
-def test_rising_edges_alone_are_enough(rate_hz: int, seconds: int) -> None:
-    """The kernel is asked for no others; they are numbered by themselves."""
-    m = model(USB_16MS, rate_hz, 5)
-    reads = [
-        read._replace(
-            edges=[Edge(e.t_ns, True, (e.number + 1) // 2) for e in read.edges if e.rising],
-            numbers=[(number + 1) // 2 for number in read.numbers],
-        )
-        for read in simulate_reads(m.run(rate_hz * seconds), 5, HALF_LOST)
-    ]
+@pytest.mark.parametrize("rising_only", [False, True])
+def test_every_pair_is_right_under_loss_on_either_side(
+    profile: ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
+) -> None:
+    """Where the kernel is asked for rising edges only, they are numbered by themselves."""
+    m = model(profile, rate_hz, 3)
+    reads = simulate_reads(m.run(rate_hz * seconds), 3, HALF_LOST)
+    if rising_only:
+        reads = [
+            read._replace(
+                edges=[Edge(e.t_ns, True, (e.number + 1) // 2) for e in read.edges if e.rising],
+                numbers=[(number + 1) // 2 for number in read.numbers],
+            )
+            for read in reads
+        ]
     dated = with_sout(sout_clock(m), reads)
     paired = [t for t in dated if t.sample.edge_seq is not None]
     assert len(paired) > 0.6 * len(dated)
     assert all(t.sample.edge_seq == t.number for t in paired)
+    assert rises(t.sample for t in dated)
     assert share_honest(dated) >= 0.95
 
 
@@ -186,11 +176,14 @@ def test_a_restarted_device_is_paired_again() -> None:
     assert share_honest(dated) >= 0.95
 
 
-def test_a_lost_rising_edge_is_counted_back() -> None:
+def test_a_lost_rising_edge_is_counted_back_and_the_offset_of_the_edge_is_configured() -> None:
     dated = after(run_sout(model(BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
     unpaired = sum(t.sample.edge_seq is None for t in dated)
     assert 0 < unpaired < 0.07 * len(dated)  # both edges lost: 4 %
     assert all(t.sample.edge_seq in (None, t.number) for t in dated)
+    here = run_sout(model(BARE_UART), 10, LineFaults())
+    there = run_sout(model(BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
+    assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
 
 
 def test_what_was_lost_is_counted() -> None:
@@ -206,37 +199,20 @@ def test_what_was_lost_is_counted() -> None:
     assert 0 <= len(dated) - paired - status.samples_unpaired < 100
 
 
-def test_the_offset_of_the_edge_is_configured() -> None:
-    here = run_sout(model(BARE_UART), 10, LineFaults())
-    there = run_sout(model(BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
-    assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
-
-
-def frames_with_bit(clock: SampleClock, *, every: int, knows: bool) -> list[int | None]:
-    """100 Hz, a pulse and bit 12 for each n-th frame only; the numbers of the pulses that samples got."""
+@pytest.mark.parametrize(("every", "bit"), [(5, 0x1000), (1, 0)], ids=["bit", "never set"])
+def test_the_status_bit_says_which_frames_have_a_pulse_unless_it_is_never_set(every: int, bit: int) -> None:
+    """100 Hz, a pulse and bit 12 for each n-th frame only."""
+    bits = TimeBits(sync_out=0x1000)
+    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=10_850, hold_ns=0, bits=bits)
     numbers = []
     for i in range(2000):
-        at = BEGIN_NS + 10 * i * NS_PER_MS
-        pulse = i % every == 0
+        at, pulse = BEGIN_NS + 10 * i * NS_PER_MS, i % every == 0
         if pulse:
             clock.aiding.on_sout_edges([Edge(at, True, 2 * i + 1), Edge(at + 80_000, False, 2 * i + 2)])
-        m = Measurement(82, 0, 10 * i, status=0x1000 if pulse and knows else 0)
+        m = Measurement(82, 0, 10 * i, status=bit if pulse else 0)
         numbers.append(clock.sample(m, at + 2 * NS_PER_MS, 0).edge_seq)
-    return numbers
-
-
-def test_the_status_bit_says_which_frames_have_a_pulse() -> None:
-    bits = TimeBits(sync_out=0x1000)
-    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=10_850, hold_ns=0, bits=bits)
-    numbers = frames_with_bit(clock, every=5, knows=True)
-    assert numbers[1000::5] == list(range(2001, 4000, 10))
+    assert numbers[1000::every] == list(range(2001, 4001, 2 * every))
     assert clock.status().samples_unpaired == 0
-
-
-def test_a_bit_that_is_never_set_says_nothing() -> None:
-    bits = TimeBits(sync_out=0x1000)
-    clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=10_850, hold_ns=0, bits=bits)
-    assert frames_with_bit(clock, every=1, knows=False)[1000:] == list(range(2001, 4001, 2))
 
 
 STEP = st.tuples(

@@ -68,12 +68,8 @@ def test_defaults() -> None:
     assert (reset.active_low, reset.hold_ms, reset.wait_s, reset.open_drain) == (True, 10.0, 3.0, False)
     assert DividedSettings(line="D").divisor == 8
     assert not TriggerSettings(line="S").active_low
-
-
-@pytest.mark.parametrize("keys", ["driver: hipnuc-uart, uart: {port: x}", hipnuc("")])
-def test_none(keys: str) -> None:
-    (device,) = parse(keys)
-    assert device.lines is None
+    for keys in ("driver: hipnuc-uart, uart: {port: x}", hipnuc("")):
+        assert parse(keys)[0].lines is None
 
 
 @pytest.mark.parametrize(
@@ -136,10 +132,7 @@ def test_one_wire_under_two_keys(one: str, other: str) -> None:
 )
 def test_two_wires(one: str, other: str) -> None:
     assert parse(hipnuc(f"sout: {{{one}}}, pps: {{{other}}}"))
-
-
-def test_a_disabled_device_has_no_wire() -> None:
-    assert parse(hipnuc("sout: {line: A}"), hipnuc("sout: {line: A}", "z") + ", enabled: false")
+    assert parse(hipnuc(f"sout: {{{one}}}"), hipnuc(f"sout: {{{one}}}", "z") + ", enabled: false"), "has no wire"
 
 
 def test_a_changed_line_is_a_changed_device() -> None:
@@ -160,88 +153,63 @@ def test_the_shipped_examples_show_the_defaults() -> None:
     from tests.config.test_reading import SHIPPED, uncommented
 
     devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
-    shown = {}
-    for device in devices:
-        for name, schema in LINE_SCHEMAS.items() if device.lines else ():
-            settings = getattr(device.lines, name)
-            if settings is not None:
-                shown[name] = settings
-                assert settings == schema(line=settings.line, chip=settings.chip)
+    lines = [device.lines for device in devices if device.lines]
+    shown = {name: made for one in lines for name in LINE_SCHEMAS if (made := getattr(one, name)) is not None}
     assert set(shown) == set(LINE_SCHEMAS)
+    for name, made in shown.items():
+        assert made == LINE_SCHEMAS[name](line=made.line, chip=made.chip)
 
 
 # --- the source of RMC sentences --------------------------------------------------------------------------------------
 
 
-def rmc_device(rmc: str, keys: str = "driver: hipnuc-uart, uart: {port: x}") -> str:
-    return f"devices:\n  bow: {{{keys}, rmc: {rmc}}}\n"
-
-
-def read_rmc(text: str) -> RmcSettings | None:
-    return config.parse(text, "f").devices[0].rmc
-
-
-def rmc_errors(text: str) -> str:
-    with pytest.raises(ConfigError) as caught:
-        config.parse(text, "f")
-    return str(caught.value)
-
-
-def test_each_rmc_source() -> None:
-    assert read_rmc(rmc_device("{source: gpsd}")) == RmcSettings(source="gpsd")
-    assert read_rmc(rmc_device("{source: system, rate_hz: 5, error_ms: 10}")) == RmcSettings(
-        source="system", rate_hz=5, error_ms=10.0
-    )
-    nmea = RmcSettings(source="nmea", port="/dev/ttyUSB1", baud=38400)
-    assert read_rmc(rmc_device("{source: nmea, port: /dev/ttyUSB1, baud: 38400}")) == nmea
-    assert read_rmc("devices:\n  bow: {driver: hipnuc-uart, uart: {port: x}}\n") is None
+HIPNUC = "driver: hipnuc-uart, uart: {port: x}"
 
 
 @pytest.mark.parametrize(
-    ("rmc", "said"),
+    ("keys", "rmc"),
     [
-        ("{}", "expected the key source"),
-        ("{source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
-        ("{source: nmea}", "expected the key port beside source nmea"),
-        ("{source: gpsd, rate_hz: 11}", "f:2:"),
-        ("{source: gpsd, rate_hz: 0}", "rate_hz"),
-        ("{source: gpsd, tcp_port: 0}", "tcp_port"),
-        ("{source: gpsd, error_ms: .nan}", "error_ms"),
-        ("{source: gpsd, speed: 1}", "speed"),
+        (HIPNUC, None),
+        (HIPNUC + ", rmc: {source: gpsd}", RmcSettings(source="gpsd")),
+        (
+            HIPNUC + ", rmc: {source: system, rate_hz: 5, error_ms: 10}",
+            RmcSettings(source="system", rate_hz=5, error_ms=10.0),
+        ),
+        (
+            HIPNUC + ", rmc: {source: nmea, port: /dev/ttyUSB1, baud: 38400}",
+            RmcSettings(source="nmea", port="/dev/ttyUSB1", baud=38400),
+        ),
+        (hipnuc("pps: {line: GPIO17}") + ", rmc: {source: gpsd}", RmcSettings(source="gpsd")),
     ],
 )
-def test_what_is_wrong_is_said(rmc: str, said: str) -> None:
-    assert said in rmc_errors(rmc_device(rmc))
+def test_each_rmc_source(keys: str, rmc: RmcSettings | None) -> None:
+    assert parse(keys)[0].rmc == rmc
 
 
 @pytest.mark.parametrize(
-    "keys",
+    ("keys", "said"),
     [
-        "driver: imu61x-uart, uart: {port: x}",
-        "driver: hipnuc-uart, replay: {path: x}",
-        "uart: {port: x}",
+        (HIPNUC + ", rmc: {}", "expected the key source"),
+        (HIPNUC + ", rmc: {source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
+        (HIPNUC + ", rmc: {source: nmea}", "expected the key port beside source nmea"),
+        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 11}", "rate_hz"),
+        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 0}", "rate_hz"),
+        (HIPNUC + ", rmc: {source: gpsd, tcp_port: 0}", "tcp_port"),
+        (HIPNUC + ", rmc: {source: gpsd, error_ms: .nan}", "error_ms"),
+        (HIPNUC + ", rmc: {source: gpsd, speed: 1}", "speed"),
+        ("driver: imu61x-uart, uart: {port: x}, rmc: {source: gpsd}", "expected rmc only beside"),
+        ("driver: hipnuc-uart, replay: {path: x}, rmc: {source: gpsd}", "expected rmc only beside"),
+        ("uart: {port: x}, rmc: {source: gpsd}", "expected rmc only beside"),
+        # a device that imud triggers has no pulse per second
+        (hipnuc("sin: {line: GPIO17}") + ", rmc: {source: gpsd}", "by lines.sin (line 2): leave one of them out"),
     ],
 )
-def test_devices_that_take_no_sentences(keys: str) -> None:
-    assert "expected rmc only beside" in rmc_errors(rmc_device("{source: gpsd}", keys))
-
-
-def test_a_device_that_imud_triggers_has_no_pulse_per_second() -> None:
-    text = """devices:
-  bow:
-    driver: hipnuc-uart
-    uart: {port: x}
-    lines:
-      sin: {line: GPIO17}
-    rmc: {source: gpsd}
-"""
-    said = rmc_errors(text)
-    assert "f:7:" in said
-    assert "by lines.sin (line 6): leave one of them out" in said
-    assert read_rmc(text.replace("sin:", "pps:")) == RmcSettings(source="gpsd")
+def test_what_is_wrong_with_an_rmc_source(keys: str, said: str) -> None:
+    (found,) = errors(keys)
+    assert found.startswith("2:")
+    assert said in found
 
 
 def test_every_source_has_its_row() -> None:
     assert set(RMC_SOURCES) == set(RmcSettings.__annotations__["source"].__args__)
-    for name in RMC_SOURCES:
-        assert callable(RMC_SOURCES[name])
+    assert all(callable(RMC_SOURCES[name]) for name in RMC_SOURCES)

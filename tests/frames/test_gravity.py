@@ -1,7 +1,7 @@
 """The check of gravity at rest: silent for right conventions and in motion, a cause for each mistake."""
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import cos, radians, sin
 
 import pytest
@@ -20,12 +20,15 @@ from imud.attitude import (
 from imud.frames.conventions import FLU_LEVEL, RFU_ENU, DeviceAxes, EulerOrder
 from imud.frames.gravity import SAMPLES_MIN, WINDOW_NS, Contradiction, Finding, GravityCheck, nearest_axis
 from imud.frames.mounting import matrix_from_axes
-from imud.sample import Sample, Sync, Vector3
+from imud.sample import Quaternion, Sample, Sync, Vector3
 from imud.units import NS_PER_S
 from tests.support.files import SHARED
 
 G = 9.80665
 TICK_NS = NS_PER_S // 10
+LEANING = ((30, 0), (0, 30), (25, -35))
+"""Roll and pitch."""
+OBLIQUE = (0.5 * G, 0.6 * G, (1 - 0.25 - 0.36) ** 0.5 * G)
 FRD = DeviceAxes(order=EulerOrder.ZYX, has_north=False, z_down=True)
 
 
@@ -60,6 +63,17 @@ def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -
     return check.finding
 
 
+def contradiction(
+    device: DeviceAxes, sample: Sample, kind: Contradiction, words: str, mounting: Matrix3 | None = None
+) -> Finding:
+    """The finding of a window of rest, which must be of this kind and say these words."""
+    finding = found(device, sample, mounting)
+    assert finding is not None
+    assert finding.kind is kind
+    assert words in finding.message
+    return finding
+
+
 @given(st.floats(-179, 179), st.floats(-89, 89), st.floats(-180, 180))
 def test_nothing_is_found_in_any_attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> None:
     assert found(FLU_LEVEL, zyx(roll_deg, pitch_deg, yaw_deg)) is None
@@ -73,76 +87,50 @@ def test_the_z_axis_points_down(member: str, roll: float, pitch: float) -> None:
     """Seen from one of the two members; the other one is absent."""
     one = zyx(roll, pitch, z_down=True)
     one = replace(one, quat_wxyz=None) if member == "euler_rad" else replace(one, euler_rad=None)
-    finding = found(FLU_LEVEL, one)
-    assert finding is not None
-    assert finding.kind is Contradiction.Z_AXIS
-    assert "set frame: {z_down: true}" in finding.message
+    finding = contradiction(FLU_LEVEL, one, Contradiction.Z_AXIS, "set frame: {z_down: true}")
     assert member in finding.message
     assert finding.angle_deg == pytest.approx(180)
 
 
-def test_z_down_is_said_of_a_device_whose_z_axis_points_up() -> None:
-    finding = found(FRD, zyx(10, 5))
-    assert finding is not None
-    assert (finding.kind, "take z_down out of frame" in finding.message) == (Contradiction.Z_AXIS, True)
+def seen_as(said: Sample, true: Sample) -> Sample:
+    """A sample with the attitude of one and the acceleration of another."""
+    return replace(said, accel_m_s2=true.accel_m_s2)
 
 
-def test_the_words_name_the_axes() -> None:
-    finding = found(FLU_LEVEL, zyx(0, 0, z_down=True))
-    assert finding is not None
-    assert finding.message == (
-        "at rest the acceleration says that up is -z of the sensor, quat_wxyz says +z, 180° away: its z axis points "
-        "the other way; set frame: {z_down: true} (docs/frames.md)"
-    )
+def turned(sample: Sample, convert: Callable[[Vector3], Quaternion]) -> Sample:
+    """A sample whose quaternion is made of its angles in another order."""
+    assert sample.euler_rad is not None
+    return replace(sample, quat_wxyz=convert(sample.euler_rad))
 
 
-@pytest.mark.parametrize(("roll", "pitch"), [(30, 0), (0, 30), (25, -35)])
-def test_the_angles_turn_about_other_axes(roll: float, pitch: float) -> None:
-    """A device with ZXY that is taken for one with ZYX, and the reverse."""
-    said = zxy(roll, pitch)
-    assert said.euler_rad is not None
-    finding = found(FLU_LEVEL, replace(said, quat_wxyz=quat_from_euler_zyx(said.euler_rad)))
-    assert finding is not None
-    assert (finding.kind, "{euler_order: zxy}" in finding.message) == (Contradiction.ORDER, True)
-    said = zyx(roll, pitch)
-    assert said.euler_rad is not None
-    finding = found(RFU_ENU, replace(said, quat_wxyz=quat_from_euler312(said.euler_rad)))
-    assert finding is not None
-    assert (finding.kind, "{euler_order: zyx}" in finding.message) == (Contradiction.ORDER, True)
+ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
 
 
 @pytest.mark.parametrize(
-    ("wrong", "words"),
-    [((-1, 1), "roll has the opposite sign"), ((1, -1), "pitch has the opposite sign"),
-     ((-1, -1), "roll and pitch have the opposite sign")],
+    ("device", "sample", "kind", "words"),
+    [
+        (FRD, zyx(10, 5), Contradiction.Z_AXIS, "take z_down out of frame"),
+        (
+            FLU_LEVEL, zyx(0, 0, z_down=True), Contradiction.Z_AXIS,
+            "at rest the acceleration says that up is -z of the sensor, quat_wxyz says +z, 180° away: its z axis "
+            "points the other way; set frame: {z_down: true} (docs/frames.md)",
+        ),
+        # a device with ZXY that is taken for one with ZYX, and the reverse
+        *((FLU_LEVEL, turned(zxy(*at), quat_from_euler_zyx), ORDER, "{euler_order: zxy}") for at in LEANING),
+        *((RFU_ENU, turned(zyx(*at), quat_from_euler312), ORDER, "{euler_order: zyx}") for at in LEANING),
+        *(
+            (device, seen_as(make(30 * roll, 40 * pitch), make(30, 40)), SIGN, f"{angles} the opposite sign")
+            for device, make in ((FLU_LEVEL, zyx), (RFU_ENU, zxy))
+            for roll, pitch, angles in ((-1, 1, "roll has"), (1, -1, "pitch has"), (-1, -1, "roll and pitch have"))
+        ),
+        (FLU_LEVEL, seen_as(zyx(20, 60), zyx(60, 20)), ORDER, "roll and pitch are exchanged"),
+        (FLU_LEVEL, replace(zyx(0, 0), accel_m_s2=OBLIQUE), Contradiction.ATTITUDE, "(+0.50, +0.60, +0.62)"),
+        # the angles contradict beside a quaternion that agrees
+        (FLU_LEVEL, replace(zyx(0, 0), euler_rad=(radians(30), 0.0, 0.0)), Contradiction.ATTITUDE, "euler_rad says"),
+    ],
 )  # fmt: skip
-@pytest.mark.parametrize("device", [FLU_LEVEL, RFU_ENU], ids=["zyx", "zxy"])
-def test_an_angle_has_the_opposite_sign(device: DeviceAxes, wrong: tuple[int, int], words: str) -> None:
-    right, said = [
-        (zyx if device is FLU_LEVEL else zxy)(30 * roll, 40 * pitch) for roll, pitch in ((1, 1), wrong)
-    ]  # fmt: skip
-    finding = found(device, replace(said, accel_m_s2=right.accel_m_s2))
-    assert finding is not None
-    assert (finding.kind, words in finding.message) == (Contradiction.SIGN, True), finding.message
-
-
-def test_roll_and_pitch_are_exchanged() -> None:
-    finding = found(FLU_LEVEL, replace(zyx(20, 60), accel_m_s2=zyx(60, 20).accel_m_s2))
-    assert finding is not None
-    assert "roll and pitch are exchanged" in finding.message
-
-
-def test_no_simple_cause_is_said_to_be_none() -> None:
-    finding = found(FLU_LEVEL, replace(zyx(0, 0), accel_m_s2=(0.5 * G, 0.6 * G, (1 - 0.25 - 0.36) ** 0.5 * G)))
-    assert finding is not None
-    assert finding.kind is Contradiction.ATTITUDE
-    assert "(+0.50, +0.60, +0.62)" in finding.message
-
-
-def test_euler_angles_that_contradict_are_found_beside_a_quaternion_that_agrees() -> None:
-    finding = found(FLU_LEVEL, replace(zyx(0, 0), euler_rad=(radians(30), 0.0, 0.0)))
-    assert finding is not None
-    assert "euler_rad says" in finding.message
+def test_a_contradiction_has_its_cause(device: DeviceAxes, sample: Sample, kind: Contradiction, words: str) -> None:
+    contradiction(device, sample, kind, words)
 
 
 # --- the mounting -----------------------------------------------------------------------------------------------------
@@ -160,10 +148,8 @@ def test_euler_angles_that_contradict_are_found_beside_a_quaternion_that_agrees(
     ],
 )
 def test_a_body_that_does_not_stand_level(axes: tuple[str, str, str], sample: Sample, side: str) -> None:
-    finding = found(FLU_LEVEL, sample, matrix_from_axes(*axes))
-    assert finding is not None
-    assert finding.kind is Contradiction.MOUNTING
-    assert f"makes the {side} of the body" in finding.message
+    words = f"makes the {side} of the body"
+    finding = contradiction(FLU_LEVEL, sample, Contradiction.MOUNTING, words, matrix_from_axes(*axes))
     up = nearest_axis(sample.accel_m_s2 or (0, 0, 0))
     assert f"axes needs z: {up};" in finding.message
     assert found(FLU_LEVEL, sample) is None, "without a mounting nothing is known of a body"
@@ -183,13 +169,10 @@ def test_a_right_mounting(axes: tuple[str, str, str], sample: Sample) -> None:
 
 def test_a_mounting_between_two_axes_names_none() -> None:
     tilted = replace(zyx(0, 0), accel_m_s2=(0, -0.6 * G, -0.8 * G), quat_wxyz=None, euler_rad=None)
-    finding = found(FLU_LEVEL, tilted, matrix_from_axes("x", "y", "z"))
-    assert finding is not None
-    assert "up is the sensor's -z axis" in finding.message
+    straight = matrix_from_axes("x", "y", "z")
+    contradiction(FLU_LEVEL, tilted, Contradiction.MOUNTING, "up is the sensor's -z axis", straight)
     between = replace(tilted, accel_m_s2=(0.57735 * G, -0.57735 * G, -0.57735 * G))
-    finding = found(FLU_LEVEL, between, matrix_from_axes("x", "y", "z"))
-    assert finding is not None
-    assert "correct the mounting" in finding.message
+    contradiction(FLU_LEVEL, between, Contradiction.MOUNTING, "correct the mounting", straight)
 
 
 # --- rest and motion --------------------------------------------------------------------------------------------------
@@ -218,16 +201,12 @@ def test_a_bias_of_gyroscope_and_accelerometer_is_rest() -> None:
     assert judged(biased) == 1
 
 
-def test_one_sample_in_motion_begins_anew() -> None:
+def test_one_sample_in_motion_and_a_pause_begin_anew() -> None:
     samples = list(ticks(WRONG, 9.9))
     samples[49] = replace(samples[49], gyro_rad_s=(1.0, 0, 0))
     assert judged(iter(samples)) == 0, "4.9 s before it and 5 s after it"
-    assert judged(iter(list(ticks(WRONG, 10.3)))) == 2
-
-
-def test_a_pause_begins_anew() -> None:
-    early, late = list(ticks(WRONG, 4)), list(ticks(WRONG, 4, start=80))
-    assert judged(iter([*early, *late])) == 0
+    assert judged(ticks(WRONG, 10.3)) == 2
+    assert judged(iter([*ticks(WRONG, 4), *ticks(WRONG, 4, start=80)])) == 0
 
 
 def test_the_same_sample_counts_once() -> None:
@@ -296,6 +275,4 @@ def test_a_real_module_agrees_with_its_driver() -> None:
     assert judged(iter(samples)) == 0
     for one in (samples[0], samples[-1]):
         assert found(RFU_ENU, one) is None
-        finding = found(DeviceAxes(z_down=True), one)
-        assert finding is not None
-        assert finding.kind is Contradiction.Z_AXIS
+        contradiction(DeviceAxes(z_down=True), one, Contradiction.Z_AXIS, "")

@@ -91,22 +91,24 @@ LEVEL_NORTH = sample((0, 0, G), (0, 0, 0), (1, 0, 0, 0), gyro=(0.1, 0.2, 0.3), m
 """It turns to the front (x right, down at the front by 0.1 …), the field points north and down."""
 
 
-def test_a_hipnuc_module_in_enu_flu() -> None:
-    made = turned(LEVEL_NORTH, frame(convention=ENU, device=RFU_ENU))
-    assert made.accel_m_s2 == (0, 0, G)
-    assert made.gyro_rad_s == (0.2, -0.1, 0.3), "its y axis is the front, its x axis points right"
-    assert made.mag_t == (30e-6, 0, -20e-6), "north is to the front"
-    assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 90)), "the front is 90° counter-clockwise from east"
-    assert same_rotation(made.quat_wxyz, (HALF, 0, 0, HALF))
+ENU_TURN, NED_TURN = (HALF, 0.0, 0.0, HALF), (1.0, 0.0, 0.0, 0.0)
 
 
-def test_a_hipnuc_module_in_ned_frd() -> None:
-    made = turned(LEVEL_NORTH, frame(convention=NED, device=RFU_ENU))
-    assert made.accel_m_s2 == (0, 0, -G)
-    assert made.gyro_rad_s == (0.2, 0.1, -0.3)
-    assert made.mag_t == (30e-6, 0, 20e-6)
-    assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 0), abs=1e-12)
-    assert same_rotation(made.quat_wxyz, (1, 0, 0, 0))
+@pytest.mark.parametrize(
+    ("convention", "accel", "gyro", "mag", "euler", "quat"),
+    [
+        # its y axis is the front, its x axis points right; the front is 90° counter-clockwise from east
+        (ENU, (0, 0, G), (0.2, -0.1, 0.3), (30e-6, 0, -20e-6), (0, 0, 90), ENU_TURN),
+        (NED, (0, 0, -G), (0.2, 0.1, -0.3), (30e-6, 0, 20e-6), (0, 0, 0), NED_TURN),
+    ],
+)
+def test_a_hipnuc_module_in_both_conventions(
+    convention: Convention, accel: Vector3, gyro: Vector3, mag: Vector3, euler: Vector3, quat: Quaternion
+) -> None:
+    made = turned(LEVEL_NORTH, frame(convention=convention, device=RFU_ENU))
+    assert (made.accel_m_s2, made.gyro_rad_s, made.mag_t) == (accel, gyro, mag)
+    assert degrees_of(made.euler_rad) == pytest.approx(euler, abs=1e-12)
+    assert same_rotation(made.quat_wxyz, quat)
 
 
 @pytest.mark.parametrize(("convention", "expected"), [(ENU, (10, -30, 0)), (NED, (10, 30, 90))])
