@@ -2,46 +2,18 @@
 
 # ruff: noqa: E501 - a row of the table has the whole message
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import pytest
-from msgspec import Meta
 
 from imud import config
 from imud.config import Config, Tables, differences
-from imud.contracts.claims import Claim
 from imud.contracts.device_settings import OnDifference, declared_values
-from imud.contracts.driver import Driver
-from imud.contracts.settings import Settings
 from imud.errors import ConfigError
+from tests.config.test_reading import FakeRow, PortSettings
 from tests.support.fake_drivers import FAKE_DRIVER, FAKE_MODULE_DRIVER
 
-
-class WireSettings(Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    port: str
-    baud: Annotated[int, Meta(ge=50)] | Literal["auto"] = "auto"
-
-
-@dataclass(frozen=True)
-class Wire:
-    settings: type[Settings] = WireSettings
-    searchable: bool = True
-
-    def bus_of(self, _settings: Any) -> str:
-        return ""
-
-    def claims(self, settings: WireSettings) -> list[Claim]:
-        return [Claim(place=settings.port, key="port")]
-
-    def problem(self, _settings: Any, _frames: bool) -> str:
-        return ""
-
-    def fits(self, _driver: Driver) -> bool:
-        return True
-
-
-TABLES = Tables({"fake-module": FAKE_MODULE_DRIVER, "fake-uart": FAKE_DRIVER}, {"wire": Wire()}, {})
+TABLES = Tables({"fake-module": FAKE_MODULE_DRIVER, "fake-uart": FAKE_DRIVER}, {"wire": FakeRow(PortSettings)}, {})
 HEAD = "devices:\n  bow:\n    driver: {driver}\n    wire: {{port: x, baud: {baud}}}\n"
 
 
@@ -90,9 +62,8 @@ def test_errors_with_their_place(given: dict[str, Any], error: str) -> None:
 
 
 def test_what_may_be_declared_where_imud_searches() -> None:
-    assert parse("settings: {baud: 921600}", baud="auto").devices[0].declared is not None
-    assert parse("settings: {baud: 115200}").devices[0].declared is not None
-    parse("settings: {output: {a: 1000, b: 500}}", baud="auto")  # no rate is known to judge by
+    for values, baud in (("baud: 921600", "auto"), ("baud: 115200", "115200"), ("output: {a: 1000, b: 500}", "auto")):
+        assert parse(f"settings: {{{values}}}", baud=baud).devices[0].declared is not None
 
 
 def test_a_change_of_settings_is_a_change_of_the_device() -> None:

@@ -72,6 +72,8 @@ def test_every_way() -> None:
         ("frame: {axes: z_up}", "expected keys and values"),
         ("frame: {level_pitch_deg: 90}", "from -45 to 45"),
         ("frame: {quat_wxyz: [1, 0, 0]}", "quat_wxyz"),
+        ("frame: {euler: {yaw_deg: 360.5}}", "devices.bow.frame.euler.yaw_deg: expected a number from -360 to 360"),
+        ("frame: {euler: {yaw_deg: -360.5}}", "from -360 to 360"),
         ("declination_deg: 181", "from -180 to 180"),
     ],
 )  # fmt: skip

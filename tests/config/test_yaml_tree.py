@@ -107,27 +107,21 @@ def test_refused_with_its_place(text: str, line: int, column: int, path: str, sa
     assert says in got[3]
 
 
-def test_not_utf8() -> None:
+def test_columns_count_characters_and_a_byte_order_mark_is_no_text() -> None:
     assert only_problem(b"a: 1\nb: caf\xe9\n") == (2, 7, "", "expected UTF-8 text, got byte 0xe9")
     assert only_problem(b"\xef\xbb\xbf\xe9")[:2] == (1, 1)
-
-
-def test_columns_count_characters_and_bom_is_no_text() -> None:
     tree = read_yaml("\ufeffñandú: [é, no]\n".encode())
     assert [(p.mark.line, p.mark.column) for p in tree.problems] == [(1, 12)]
     assert "ñandú" in (tree.data if isinstance(tree.data, dict) else {})
 
 
-def test_second_of_two_equal_keys_brings_no_more_problems_and_no_data() -> None:
-    tree = read_yaml(b"a: {x: 1, y: 1}\na: {x: 2, z: no}\n")
-    assert [path_text(p.path) for p in tree.problems] == ["a", "a.(again).z"]
-    assert tree.data == {"a": {"x": 1, "y": 1}}
-
-
-def test_all_problems_are_found() -> None:
+def test_all_problems_are_found_and_the_second_of_two_equal_keys_has_no_data() -> None:
     tree = read_yaml(b"a: no\nb: .nan\nc: 1:20\nc: 2\n")
     assert [p.mark.line for p in tree.problems] == [1, 2, 3, 4]
     assert tree.complete
+    tree = read_yaml(b"a: {x: 1, y: 1}\na: {x: 2, z: no}\n")
+    assert [path_text(p.path) for p in tree.problems] == ["a", "a.(again).z"]
+    assert tree.data == {"a": {"x": 1, "y": 1}}
 
 
 @pytest.mark.parametrize("opening", ["[", "{a: ", "- ", "? "])
@@ -138,13 +132,10 @@ def test_deep_nesting_is_refused_and_does_not_overflow(opening: str) -> None:
     assert len(tree.problems) == 1
 
 
-def test_nesting_up_to_the_limit() -> None:
+def test_limits_of_nesting_and_size() -> None:
     at_limit = "[" * DEPTH_MAX + "]" * DEPTH_MAX
     assert read_yaml(at_limit.encode()).problems == []
     assert "levels of nesting" in only_problem(f"[{at_limit}]")[3]
-
-
-def test_size_limit() -> None:
     filler = b"#" + b"x" * (FILE_BYTES_MAX - len(b"#\na: 1\n")) + b"\na: 1\n"
     assert len(filler) == FILE_BYTES_MAX
     assert read_yaml(filler).data == {"a": 1}
