@@ -47,12 +47,17 @@ def test_reason_of(error: Exception, words: str) -> None:
 def foreign_texts() -> Iterator[tuple[str, str, int]]:
     """File, function and line of each place where a foreign error becomes part of a text as it is."""
     for path in sorted((ROOT / "imud").rglob("*.py")):
-        tree = ast.parse(path.read_text())
-        for function in ast.walk(tree):
-            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
-                for handler in (node for node in ast.walk(function) if isinstance(node, ast.ExceptHandler)):
-                    for line in _texts_of(handler):
-                        yield path.relative_to(ROOT).as_posix(), function.name, line
+        text = path.read_text()
+        nodes = list(ast.walk(ast.parse(text))) if "except" in text else []
+        functions = [node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+        for handler in (node for node in nodes if isinstance(node, ast.ExceptHandler)):
+            for line in _texts_of(handler):
+                inner = max((one for one in functions if one.lineno < line <= (one.end_lineno or 0)), key=_line_of)
+                yield path.relative_to(ROOT).as_posix(), inner.name, line
+
+
+def _line_of(node: ast.stmt) -> int:
+    return node.lineno
 
 
 def _texts_of(handler: ast.ExceptHandler) -> Iterator[int]:

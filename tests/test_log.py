@@ -7,7 +7,6 @@ import select
 import sys
 import threading
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -291,30 +290,19 @@ def test_the_journal_adds_the_time_itself(journal: bool, monkeypatch: pytest.Mon
     assert not is_journal(-1)
 
 
-def no_reader() -> int:
+@pytest.mark.parametrize("kind", ["no reader", "full disk", "closed"])
+def test_messages_that_cannot_be_written_are_counted(kind: str) -> None:
     reader, descriptor = os.pipe()
     os.close(reader)
-    return descriptor
-
-
-def full_disk() -> int:
-    return os.open("/dev/full", os.O_WRONLY)
-
-
-def closed() -> int:
-    descriptor = os.open("/dev/null", os.O_WRONLY)
-    os.close(descriptor)
-    return descriptor
-
-
-@pytest.mark.parametrize("make", [no_reader, full_disk, closed])
-def test_messages_that_cannot_be_written_are_counted(make: Callable[[], int]) -> None:
-    descriptor = make()
+    if kind == "full disk":
+        os.dup2(os.open("/dev/full", os.O_WRONLY), descriptor)
+    elif kind == "closed":
+        os.close(descriptor)
     with log_to(descriptor, "info") as writer:
         log.warning("one")
         log.warning("two")
         wait_until(lambda: writer.dropped == 2, "both are counted")
-    if make is not closed:
+    if kind != "closed":
         os.close(descriptor)
 
 

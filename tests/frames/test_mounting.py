@@ -1,5 +1,7 @@
 """The rotation sensor → body of each way to give it, against values computed by hand."""
 
+from contextlib import suppress
+from itertools import product
 from math import cos, radians, sin, sqrt
 
 import pytest
@@ -61,39 +63,32 @@ def test_an_angle_that_is_no_quarter() -> None:
 
 
 def test_every_choice_of_axes_is_a_rotation_or_is_refused() -> None:
-    good = 0
-    for x in AXES:
-        for y in AXES:
-            for z in AXES:
-                try:
-                    matrix = matrix_from_axes(x, y, z)
-                except ValueError:
-                    continue
-                good += 1
-                assert is_rotation(matrix)
-    assert good == 24, "of 216; a cube can be laid down in 24 ways"
+    matrices = []
+    for axes in product(AXES, repeat=3):
+        with suppress(ValueError):
+            matrices.append(matrix_from_axes(*axes))
+    assert all(is_rotation(matrix) for matrix in matrices)
+    assert len(matrices) == 24, "of 216; a cube can be laid down in 24 ways"
 
 
-def test_a_mirror_image_is_refused_with_the_axis_that_would_be_right() -> None:
-    with pytest.raises(ValueError, match=r"right-handed .* mirror image .*with these x and y, z is -z$"):
-        matrix_from_axes("y", "x", "z")
-    with pytest.raises(ValueError, match=r"z is y$"):
-        matrix_from_axes("x", "-z", "-y")
-
-
-def test_axes_along_one_axis_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"three different axes of the sensor, got x forward and -x left"):
-        matrix_from_axes("x", "-x", "z")
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [
+        (("y", "x", "z"), r"right-handed .* mirror image .*with these x and y, z is -z$"),
+        (("x", "-z", "-y"), r"z is y$"),
+        (("x", "-x", "z"), r"three different axes of the sensor, got x forward and -x left"),
+    ],
+)
+def test_axes_that_no_sensor_can_have_are_refused(axes: tuple[str, str, str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        matrix_from_axes(*axes)
 
 
 @pytest.mark.parametrize("quat", [(1.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (float("nan"), 0.0, 0.0, 0.0)])
 def test_a_quaternion_that_is_no_rotation_is_refused(quat: tuple[float, float, float, float]) -> None:
     with pytest.raises(ValueError, match="of length 1"):
         matrix_from_mounting_quat(quat)
-
-
-def test_four_digits_of_a_quaternion_are_enough() -> None:
-    assert is_rotation(matrix_from_mounting_quat((0.7071, 0.7071, 0.0, 0.0)))
+    assert is_rotation(matrix_from_mounting_quat((0.7071, 0.7071, 0.0, 0.0))), "four digits are enough"
 
 
 def test_levelling_takes_away_what_was_read() -> None:

@@ -187,15 +187,6 @@ def test_a_mounting_is_taken_away(
     assert same_rotation(made.quat_wxyz, wanted)
 
 
-def test_a_hipnuc_module_that_lies_upside_down() -> None:
-    """Its y axis still points forward; its x axis points to the left, its z axis down. It says roll 180°."""
-    one = sample((0, 0, -G), (180, 0, 0), gyro=(0.1, 0.2, 0.3))
-    made = turned(one, frame(FrameSettings(axes=MountingAxes(x="y", y="x", z="-z")), NED, device=RFU_ENU))
-    assert made.accel_m_s2 == (0, 0, -G), "specific force points up, z down"
-    assert made.gyro_rad_s == (0.2, -0.1, 0.3)
-    assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 0), abs=1e-9)
-
-
 def test_a_module_in_any_mounting_shows_the_same_as_one_that_is_mounted_straight() -> None:
     """A body with two modules of different axes and mountings: both show the attitude of the body."""
     attitude = quat_from_euler_zyx((0.2, -0.4, 2.0))
@@ -257,26 +248,36 @@ def test_what_the_heading_counts_from() -> None:
 # --- what the device is -----------------------------------------------------------------------------------------------
 
 
-def test_z_down() -> None:
-    """A device whose own axes are front, right, down and whose angles are those of aircraft."""
-    one = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
-    settings = FrameSettings(z_down=True)
-    up = turned(one, frame(settings))
-    assert up.accel_m_s2 == (0.5, -0.25, G)
-    assert up.gyro_rad_s == (1, -2, -3)
-    assert degrees_of(up.euler_rad) == pytest.approx((10, -20, -30)), "as the vendor's driver publishes them"
-    down = turned(one, frame(settings, NED))
-    assert (down.accel_m_s2, down.gyro_rad_s) == (one.accel_m_s2, one.gyro_rad_s)
-    assert degrees_of(down.euler_rad) == pytest.approx((10, 20, 30))
+UPSIDE_DOWN = MountingAxes(x="y", y="x", z="-z")
+Z_DOWN = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
+"""From a device whose own axes are front, right, down and whose angles are those of aircraft."""
 
 
-def test_z_down_and_turned() -> None:
-    """Such a device, turned 90° to the left in the body: `axes` are those of the device, z down."""
-    settings = FrameSettings(z_down=True, axes=MountingAxes(x="y", y="x", z="-z"))
-    # its x axis points left, its y axis (right of that) to the front; the body is level, its front at 20° to the left
-    made = turned(sample((0, 0, -G), (0, 0, -110)), frame(settings))
-    assert made.accel_m_s2 == (0, 0, G)
-    assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 20), abs=1e-9)
+@pytest.mark.parametrize(
+    ("one", "published", "accel", "gyro", "euler"),
+    [
+        # as the vendor's driver publishes them
+        (Z_DOWN, frame(FrameSettings(z_down=True)), (0.5, -0.25, G), (1, -2, -3), (10, -20, -30)),
+        (Z_DOWN, frame(FrameSettings(z_down=True), NED), (0.5, 0.25, -G), (1, 2, 3), (10, 20, 30)),
+        # turned 90° to the left in the body: its x axis points left, its y axis (right of that) to the front; the body
+        # is level, its front at 20° to the left. `axes` are those of the device, z down
+        (
+            sample((0, 0, -G), (0, 0, -110), gyro=(1, 2, 3)), frame(FrameSettings(z_down=True, axes=UPSIDE_DOWN)),
+            (0, 0, G), (2, 1, -3), (0, 0, 20),
+        ),
+        # a HiPNUC module upside down: its y axis still points forward, its x axis to the left, its z axis down
+        (
+            sample((0, 0, -G), (180, 0, 0), gyro=(0.1, 0.2, 0.3)),
+            frame(FrameSettings(axes=UPSIDE_DOWN), NED, device=RFU_ENU), (0, 0, -G), (0.2, -0.1, 0.3), (0, 0, 0),
+        ),
+    ],
+)  # fmt: skip
+def test_a_device_whose_z_axis_points_down(
+    one: Sample, published: PublishedFrame, accel: Vector3, gyro: Vector3, euler: Vector3
+) -> None:
+    made = turned(one, published)
+    assert (made.accel_m_s2, made.gyro_rad_s) == (accel, gyro)
+    assert degrees_of(made.euler_rad) == pytest.approx(euler, abs=1e-9)
 
 
 def test_another_order_of_angles() -> None:
@@ -315,7 +316,9 @@ def test_angles_in_part(said: Vector3, settings: FrameSettings | None, expected:
     assert made.euler_rad is None if expected is None else known(made.euler_rad) == expected
 
 
-def test_a_quaternion_without_direction_gives_way_to_the_angles() -> None:
+def test_a_quaternion_counts_more_than_the_angles_unless_it_has_no_direction() -> None:
+    made = turned(sample(euler_deg=(0, 0, 30), quat=(HALF, 0, 0, HALF)), frame(convention=ENU))
+    assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 90))
     made = turned(sample(euler_deg=(0, 0, 30), quat=(0, 0, 0, 0)), frame(convention=ENU))
     assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 30))
     assert turned(sample(quat=(0, 0, 0, 0)), frame(convention=ENU)).quat_wxyz is None
