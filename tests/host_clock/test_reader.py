@@ -52,7 +52,9 @@ class Host:
 
 def test_the_first_reading_measures_and_what_is_kept_costs_two_calls() -> None:
     host = Host()
+    begun = host.calls
     first, calls = host.offset_ns(), host.calls
+    assert calls - begun == 2 + 4 + 2, "one reading is tight enough; two calls look for a suspend"
     assert abs(first - AHEAD_NS) <= host.clock.error_ns <= 2 * CALL_NS
     for number in range(1, 100):
         host.sleep(NS_PER_MS)
@@ -175,15 +177,15 @@ def test_without_the_raw_clock_the_monotonic_one_stands_in(monkeypatch: pytest.M
     monkeypatch.setattr(time, "clock_gettime_ns", refuse)
     clock = HostClock()
     assert not clock.is_steering_seen
-    assert abs(clock.utc_offset_ns() - (time.time_ns() - time.monotonic_ns())) < NS_PER_S
-    assert abs(clock.steady.steady_ns(time.monotonic_ns()) - time.monotonic_ns()) < NS_PER_S
+    assert abs(clock.utc_offset_ns() - (time.time_ns() - time.monotonic_ns())) < 60 * NS_PER_S
+    assert abs(clock.steady.steady_ns(time.monotonic_ns()) - time.monotonic_ns()) < 60 * NS_PER_S
 
 
 def test_the_real_clocks() -> None:
     clock = HostClock()
     before_ns = time.time_ns()
     utc_ns = clock.now_ns() + clock.utc_offset_ns()
-    assert before_ns - NS_PER_MS < utc_ns < time.time_ns() + NS_PER_S
+    assert before_ns - NS_PER_MS < utc_ns < time.time_ns() + 60 * NS_PER_S
     steady = []
     for _ in range(10):
         clock.utc_offset_ns()

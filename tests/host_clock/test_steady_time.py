@@ -114,6 +114,23 @@ def test_memory_is_bounded_and_what_is_left_stays_right() -> None:
         steady_ns = last_ns - back_ns
         assert steady.monotonic_ns(steady_ns) == pytest.approx(BEGIN_NS + (steady_ns - BEGIN_NS) * (1 + FAST), abs=2)
     assert steady.monotonic_ns(BEGIN_NS) > BEGIN_NS  # no longer known
+    steady = slewed(FAST, PAIRS_MOST + 1, NS_PER_MS)  # half of the pairs just went
+    oldest_ns = BEGIN_NS + (PAIRS_MOST // 2) * NS_PER_MS
+    assert steady.monotonic_ns(oldest_ns) == pytest.approx(BEGIN_NS + (oldest_ns - BEGIN_NS) * (1 + FAST), abs=2)
+
+
+def test_the_rate_is_that_of_the_last_two_seconds() -> None:
+    assert slewed(FAST, 2).rate == pytest.approx(FAST, rel=1e-6)
+    steady = slewed(0.0, 3001, NS_PER_MS)
+    for ms in range(1, 2001):
+        steady.add_pair(
+            BEGIN_NS + 3 * NS_PER_S + int(ms * NS_PER_MS * (1 + FAST)), RAW_NS + 3 * NS_PER_S + ms * NS_PER_MS
+        )
+    assert steady.rate == pytest.approx(FAST, rel=1e-6)
+    steady.add_pair(
+        BEGIN_NS + 5 * NS_PER_S + int(2 * NS_PER_S * FAST) + 400 * NS_PER_MS, RAW_NS + 5 * NS_PER_S + 400 * NS_PER_MS
+    )
+    assert steady.rate == pytest.approx(FAST * 0.8, rel=1e-3)
 
 
 def test_a_clock_that_is_read_faster_than_it_ticks() -> None:
