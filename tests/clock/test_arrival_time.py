@@ -27,7 +27,7 @@ def test_the_first_message_is_dated_by_its_arrival() -> None:
 
 
 def off_ns(times: ArrivalTime, late_ns: int, number: int | None = None, *, alone: bool = True) -> int:
-    """How long before `late_ns`, ns, a message that arrives then is dated."""
+    """Return the time from the time stamp of a message to its arrival at `late_ns`, ns."""
     return late_ns - times.date(number, late_ns, 82, alone=alone, triggered=False, is_first=False)
 
 
@@ -37,7 +37,7 @@ def test_a_late_message_is_dated_by_the_pace_of_those_before_unless_others_carry
         fed(times, 100, alone=alone)
         late_ns = BEGIN_NS + 100 * PERIOD_NS + 4 * NS_PER_MS
         assert (off_ns(times, late_ns, alone=alone) > 3 * NS_PER_MS) is alone
-        times.restart()  # the link was away: the pace is learned anew
+        times.restart()  # the link was away: the pace is learned again
         assert off_ns(times, late_ns + 400 * PERIOD_NS, alone=alone) == DELAY.floor_ns // 2
 
 

@@ -76,7 +76,7 @@ def test_samples_that_hardly_drift_through_the_milliseconds_of_utc() -> None:
 
 @pytest.mark.parametrize("error_ns", [REFERENCE.error_ns, 10 * NS_PER_S])
 def test_gps_time_is_refused(error_ns: int) -> None:
-    """18 s off is refused even by a host that is hardly sure of the time."""
+    """A host refuses a time that is 18 s off, even if the error of its own time is 10 s."""
     unsure = UtcReference(UTC_OFFSET_NS, error_ns)
     dated, clock = run_utc(model(BARE_UART), 25, turn_ms=UNIX, ahead_ns=18 * NS_PER_S, reference=unsure)
     assert Sync.UTC not in syncs(dated)

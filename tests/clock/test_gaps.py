@@ -323,7 +323,7 @@ def test_messages_that_are_off_in_every_window_are_of_another_rate(period_ms: fl
     [*product(COUNTED[1:], [False]), *product([*COUNTED[:-1], UNCOUNTED], [True])],
 )
 def test_what_a_counter_shows_after_the_link_was_away(device: Device, restarts: bool) -> None:
-    """It ran on, and counts what is missing; or it began anew, and leaves a gap of unknown size."""
+    """A counter that continued counts the lost samples. A counter that restarted leaves a gap of unknown size."""
     one, unknown = reader(device, N_TTY, 3)
     one.run(0 if restarts else 10 * NS_PER_S)
     one.device = replace(device, first=device.first + 777_777_777 * restarts)

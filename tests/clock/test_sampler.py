@@ -54,9 +54,9 @@ def test_it_comes_from_arrival_to_regression() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "resets"),
     [
-        (steady(100_000, 0, 300), steady(7, 3500, 300), 1),  # the counter began anew
+        (steady(100_000, 0, 300), steady(7, 3500, 300), 1),  # the counter restarted
         (steady(0, 0, 500), steady(3_605_000, 5000, 500), 1),  # the host was suspended for an hour
-        # 40 ms in the future is impossible, and is no reason to believe in a new minimum, nor in a restart
+        # 40 ms in the future is impossible; the clock accepts neither a new minimum nor a restart
         (steady(0, 0, 1000), steady(10_040, 10_000, 500), 0),
         (steady(0, 0, 500), steady(305_000, 305_000, 100), 0),  # silent for five minutes
     ],
@@ -80,7 +80,7 @@ def test_what_a_jump_of_the_counter_means(before: list[Point], after: list[Point
     [
         # reboot at 3 s, silent for a minute, counter at 5 s: forward, believable alone, and 58 s late
         (steady(0, 0, 300), steady(5000, 63_000, 500), 150),
-        (steady(0, 0, 2000), steady(20_000, 20_040, 3000), 2500),  # the clock stood still
+        (steady(0, 0, 2000), steady(20_000, 20_040, 3000), 2500),  # the clock of the device stopped for 20 s
     ],
 )
 def test_a_counter_that_is_late_for_good_began_anew(before: list[Point], after: list[Point], settled: int) -> None:
@@ -90,7 +90,7 @@ def test_a_counter_that_is_late_for_good_began_anew(before: list[Point], after: 
     assert clock.status().resets == 1
     assert rises(samples)
     assert far(samples[settled:], after[settled:]) < NEAR_NS
-    # 58 s of doubt, and the error says so as far as 32 bits go
+    # the error of 58 s is above the maximum of 32 bits
     assert (max(sample.t_err_ns for sample in samples) == 0xFFFF_FFFF) == (settled == 150)
 
 
@@ -242,7 +242,7 @@ def test_time_is_that_of_the_poll() -> None:
     assert (sample.t_ns, sample.t_err_ns, sample.t_rx_ns, sample.utc_ns) == (1_000_000, 300, 1_200_000, 5_001_000_000)
     assert (sample.seq, sample.sync, sample.t_dev_ns) == (1, Sync.ARRIVAL, None)
     assert polled_clock().sample_polled(FRAME, 1, 2**40, 2, 0).t_err_ns == 2**32 - 1, "the largest that fits"
-    other = polled_clock()  # another clock of the device goes on where this one ended
+    other = polled_clock()  # another clock of the device continues from this clock
     other.continue_from(one)
     sample = other.sample_polled(FRAME, 500, 1, 1_000_001, 0)
     assert (sample.seq, sample.t_ns) == (2, 1_000_001)

@@ -28,7 +28,7 @@ def ticks_of(stamps: list[int], step_ms: int = 10) -> list[int | None]:
     ("stamps", "ticks"),
     [
         ([8170, 8180, 8190, 8, 18], [8180, 8190, 8200, 8210]),  # the turn of a real module at 100 Hz, as recorded
-        # a pulse per second is no loss of seven seconds
+        # a pulse per second does not look like seven lost seconds
         ([950, 960, 970, 980, 990, 2, 12, 22, 32], [960, 970, 980, 990, 1002, 1012, 1022, 1032]),
         ([0] * 50, [None] * 49),  # messages that follow a trigger each have no time
         ([4711] * 50, [None] * 49),

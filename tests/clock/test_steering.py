@@ -76,7 +76,7 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: C
 def test_every_pair_is_right_under_loss_on_either_side(
     profile: ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
 ) -> None:
-    """Where the kernel is asked for rising edges only, they are numbered by themselves."""
+    """The kernel reports and numbers all edges, or the rising edges only."""
     m = model(profile, rate_hz, 3)
     reads = simulate_reads(m.run(rate_hz * seconds), 3, HALF_LOST)
     if rising_only:

@@ -15,7 +15,7 @@ RISKS = {
     "factory_reset": Risk.RESET, "address": Risk.CONNECTION, "baud": Risk.CONNECTION, "bitrate": Risk.CONNECTION,
     "node": Risk.CONNECTION,
 }  # fmt: skip
-"""Of actions by these names, whatever the driver."""
+"""Risk of the actions with these names, of every driver."""
 
 
 @pytest.mark.parametrize("driver", DRIVERS)

@@ -111,7 +111,7 @@ Step = Request | str | ReplyFrame
         (["a"], 1, ["a=1", "OK", "OK"], [], (1, 1)),  # with nothing outstanding
         ([], 1, ["ERR"], [], (1, 0)),  # a late refusal is late too
         (["a"], LATE_WINDOW_NS + 1, ["OK"], [], (0, 1)),  # after the window nothing is late
-        # not even where the next one is answered by OK alone: the lines before it show whose OK it is
+        # the reply to the next request is OK alone: the lines before an OK show its request
         (["a"], 0, [command("set"), "a=1", "a=2", "OK", "OK"], [Reply(("OK",))], (1, 0)),
         # the rest of a reply that timed out in the middle
         (["a", "a=1"], 0, [command("set"), "OK", "ERR"], [Rejection(("ERR",))], (1, 0)),

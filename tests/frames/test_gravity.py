@@ -125,7 +125,7 @@ ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
         ),
         (FLU_LEVEL, seen_as(zyx(20, 60), zyx(60, 20)), ORDER, "roll and pitch are exchanged"),
         (FLU_LEVEL, replace(zyx(0, 0), accel_m_s2=OBLIQUE), Contradiction.ATTITUDE, "(+0.50, +0.60, +0.62)"),
-        # the angles contradict beside a quaternion that agrees
+        # the quaternion agrees, the angles do not
         (FLU_LEVEL, replace(zyx(0, 0), euler_rad=(radians(30), 0.0, 0.0)), Contradiction.ATTITUDE, "euler_rad says"),
     ],
 )  # fmt: skip

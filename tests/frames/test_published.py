@@ -250,7 +250,7 @@ def test_what_the_heading_counts_from() -> None:
 
 UPSIDE_DOWN = MountingAxes(x="y", y="x", z="-z")
 Z_DOWN = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
-"""From a device whose own axes are front, right, down and whose angles are those of aircraft."""
+"""Sample of a device with the axes front, right, down and with the angles of an aircraft."""
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ Z_DOWN = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
         (Z_DOWN, frame(FrameSettings(z_down=True)), (0.5, -0.25, G), (1, -2, -3), (10, -20, -30)),
         (Z_DOWN, frame(FrameSettings(z_down=True), NED), (0.5, 0.25, -G), (1, 2, 3), (10, 20, 30)),
         # turned 90° to the left in the body: its x axis points left, its y axis (right of that) to the front; the body
-        # is level, its front at 20° to the left. `axes` are those of the device, z down
+        # is level, its front at 20° to the left. `axes` names axes of the device, z down
         (
             sample((0, 0, -G), (0, 0, -110), gyro=(1, 2, 3)), frame(FrameSettings(z_down=True, axes=UPSIDE_DOWN)),
             (0, 0, G), (2, 1, -3), (0, 0, 20),

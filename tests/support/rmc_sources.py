@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from imud.utc.source import OnSentence
 
-LIMIT_S = 10.0
+LIMIT_S = 60.0
 
 
 class Sentences:
