@@ -319,8 +319,7 @@ def test_messages_that_are_off_in_every_window_are_of_another_rate(period_ms: fl
 
 
 @pytest.mark.parametrize(
-    ("device", "restarts"),
-    [*product(COUNTED[1:], [False]), *product([*COUNTED[:-1], UNCOUNTED], [True])],
+    ("device", "restarts"), [*product(COUNTED[1:], [False]), *product([*COUNTED[:-1], UNCOUNTED], [True])]
 )
 def test_what_a_counter_shows_after_the_link_was_away(device: Device, restarts: bool) -> None:
     """A counter that continued counts the lost samples. A counter that restarted leaves a gap of unknown size."""

@@ -12,11 +12,7 @@ from imud.devices import DRIVERS
 from imud.links import LINKS
 from imud.publishers import PUBLISHERS
 
-TABLES: list[tuple[Table[Any], type]] = [
-    (DRIVERS, Driver),
-    (LINKS, LinkType),
-    (PUBLISHERS, PublisherType),
-]
+TABLES: list[tuple[Table[Any], type]] = [(DRIVERS, Driver), (LINKS, LinkType), (PUBLISHERS, PublisherType)]
 
 
 @pytest.mark.parametrize(("table", "kind"), TABLES, ids=lambda value: getattr(value, "kind", ""))

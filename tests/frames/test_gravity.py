@@ -9,14 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from imud.attitude import (
-    Matrix3,
-    matrix_from_quat,
-    matrix_times,
-    quat_from_euler312,
-    quat_from_euler_zyx,
-    transposed,
-)
+from imud.attitude import Matrix3, matrix_from_quat, matrix_times, quat_from_euler312, quat_from_euler_zyx, transposed
 from imud.frames.conventions import FLU_LEVEL, RFU_ENU, DeviceAxes, EulerOrder
 from imud.frames.gravity import SAMPLES_MIN, WINDOW_NS, Contradiction, Finding, GravityCheck, nearest_axis
 from imud.frames.mounting import matrix_from_axes
