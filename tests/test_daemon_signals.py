@@ -122,7 +122,12 @@ async def test_requests_during_a_reload_are_one_more_of_the_file_as_it_is_then(
     request("loud")
     await done.wait()
     assert target.applied[2].startswith(f"{file}:1:12: log_level: ")
-    assert told == ["RELOADING=1\nMONOTONIC_USEC=5", "READY=1"] * 3
+    done.clear()
+    monkeypatch.setattr("imud.reload.configuration.load", lambda _file, pause: pause() or 1 // 0)
+    request("info")
+    await done.wait()
+    assert target.applied[3].startswith(f"{file}: ZeroDivisionError: ")
+    assert told == ["RELOADING=1\nMONOTONIC_USEC=5", "READY=1"] * 4
     await reloader.close()
     await reloader.close()
 

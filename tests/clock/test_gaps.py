@@ -222,6 +222,17 @@ def test_what_the_pace_cannot_show_is_unknown(device: Device) -> None:
     assert unknown or abs(one.finish() - one.missed) <= STALLS
 
 
+def test_a_gap_that_is_long_for_a_young_pace_is_counted_and_unknown() -> None:
+    unknown: list[int] = []
+    clock, random, missed = make_clock(UNCOUNTED, unknown), Random(1), 0
+    for index in (*range(400), *range(60_000, 60_400)):
+        wait_ns = int(random.random() * NS_PER_MS)
+        clock.sample(Measurement(FRAME_BYTES, 0, None), BEGIN_NS + index * 10 * NS_PER_MS + wait_ns, 0)
+        missed += clock.missed
+    assert len(unknown) == 1
+    assert missed == pytest.approx(59_600, abs=20)
+
+
 @pytest.mark.parametrize("samples", [1, 2, 4, 5, 8])
 @pytest.mark.parametrize("away_ms", [100, 250, 1500])
 def test_a_restart_before_the_rate_is_known_is_one_gap(samples: int, away_ms: int) -> None:

@@ -15,6 +15,7 @@ from tests.support.clock_feed import BEGIN_NS, Point, feed, make_clock, message,
 # --- samples that arrive ----------------------------------------------------------------------------------------------
 
 
+FRAME = Measurement(28, 0, None, (0.0, 0.0, 9.8))
 NEAR_NS = 2 * NS_PER_MS
 """Messages are read 1 ms after they were measured and take 0.9 ms on the wire."""
 
@@ -115,6 +116,13 @@ def test_a_repeated_stamp_still_rises() -> None:
     assert rises(samples)
     assert clock.missed == 0
     assert clock.status().resets == 0
+
+
+def test_an_arrival_without_room_for_more_samples_is_lifted() -> None:
+    clock = make_clock()
+    clock.sample_polled(FRAME, BEGIN_NS, 1, BEGIN_NS, 0)
+    samples = [clock.sample(message(None), BEGIN_NS, 0) for _ in range(2)]
+    assert [(s.t_ns, s.t_rx_ns) for s in samples] == [(BEGIN_NS + 1,) * 2, (BEGIN_NS + 2,) * 2]
 
 
 def test_a_stuck_counter_falls_back_to_arrival() -> None:
@@ -227,9 +235,6 @@ def test_messages_with_and_without_device_time_mix() -> None:
 
 
 # --- polled samples ---------------------------------------------------------------------------------------------------
-
-
-FRAME = Measurement(28, 0, None, (0.0, 0.0, 9.8))
 
 
 def polled_clock() -> SampleClock:
