@@ -1,10 +1,10 @@
 """What every CAN codec must do, from its row in DRIVERS alone: foreign, missing, repeated and random frames."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud import devices
@@ -17,14 +17,17 @@ from imud.sample import Measurement
 from tests.support.codec_invariants import feed_frames as feed_checked
 from tests.support.codec_invariants import finite
 
-quick = settings(max_examples=40, derandomize=True, deadline=None, database=None)
 DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), CanDriver)}
 every_driver = pytest.mark.parametrize("name", list(DRIVERS))
-seeds = st.integers(0, 2**32)
 PERIOD_NS = 10_000_000
 FRAME_NS = 250_000
 LEARNING_SETS = 10
 """Some devices' samples are known only by what they sent before."""
+
+
+def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
+    """Calls a test with every driver and with seeds."""
+    return every_driver(given(seed=st.integers(0, 2**32))(test))
 
 
 def make(driver: CanDriver) -> CanCodec:
@@ -70,9 +73,7 @@ def sets(driver: CanDriver, random: Random, count: int) -> list[Sequence[CanFram
     return [timed(driver, random, LEARNING_SETS + number) for number in range(count)]
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_frames_of_a_sample_make_one(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     groups = sets(driver, random, 8)
@@ -86,9 +87,7 @@ def test_frames_of_a_sample_make_one(name: str, seed: int) -> None:
     assert codec.ledger.bytes_in_good_frames == codec.ledger.bytes_in
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_frames_of_others_change_nothing(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     own = [frame for group in sets(driver, random, 6) for frame in group]
@@ -104,9 +103,7 @@ def test_frames_of_others_change_nothing(name: str, seed: int) -> None:
     assert codec.ledger.bytes_skipped == skipped
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_missing_frames_cost_their_samples_only(name: str, seed: int) -> None:
     """Values are never mixed: each measurement is one of those that the whole sets give."""
     driver, random = DRIVERS[name], Random(seed)
@@ -122,9 +119,7 @@ def test_missing_frames_cost_their_samples_only(name: str, seed: int) -> None:
     assert found == intact
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_repeated_frames_cost_nothing(name: str, seed: int) -> None:
     """A receiver may get a frame twice when the sender saw an error in its last bits (ISO 11898-1)."""
     driver, random = DRIVERS[name], Random(seed)
@@ -134,9 +129,7 @@ def test_repeated_frames_cost_nothing(name: str, seed: int) -> None:
     assert found == measurements(feed_checked(make(driver), own))
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     frames: list[CanFrame] = []
@@ -161,9 +154,7 @@ def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
     assert all(finite(event, partial) for event in measurements(events))
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_reset_never_mixes_what_was_before_with_what_comes(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     before, after = sets(driver, random, 2)

@@ -1,11 +1,12 @@
 """Every polled driver by its row in DRIVERS alone: damage is reported, nothing raises, ledgers close."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from random import Random
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.contracts.driver import of_kind
@@ -21,9 +22,12 @@ NAMES = [driver.name for driver in of_kind(DRIVERS.values(), PolledDriver)]
 TRANSFERS_MAX = 20
 """No script has more transfers, whatever is answered."""
 
-quick = settings(max_examples=60, derandomize=True, deadline=None, database=None)
 every_driver = pytest.mark.parametrize("name", NAMES)
-seeds = st.integers(0, 2**32)
+
+
+def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
+    """Calls a test with every driver and with seeds."""
+    return every_driver(given(seed=st.integers(0, 2**32))(test))
 
 
 def row(name: str) -> PolledDriver:
@@ -36,9 +40,7 @@ def make(driver: PolledDriver) -> PolledCodec:
     return driver.make_codec(Ledger(), driver.settings())
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_good_frames_make_one_measurement_each(name: str, seed: int) -> None:
     driver, random = row(name), Random(seed)
     codec = make(driver)
@@ -49,9 +51,7 @@ def test_good_frames_make_one_measurement_each(name: str, seed: int) -> None:
     assert codec.ledger.frames_in_samples == codec.ledger.frames_good == 5
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_damage_never_passes_silently(name: str, seed: int) -> None:
     """One wrong bit, one wrong byte, or a run of them: the same measurement, or none and an event that says so."""
     driver, random = row(name), Random(seed)
@@ -72,7 +72,6 @@ def test_damage_never_passes_silently(name: str, seed: int) -> None:
 
 
 @every_driver
-@quick
 @given(data=st.binary(max_size=120), poll=st.integers(0, 2), repeat=st.booleans())
 def test_any_bytes_of_any_length_raise_nothing(name: str, data: bytes, poll: int, repeat: bool) -> None:
     codec = make(row(name))
@@ -95,9 +94,7 @@ def test_a_line_that_no_device_drives_is_a_device_that_vanished(name: str, line:
     assert codec.ledger.frames_bad() == 0
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_the_same_bytes_again_are_counted_and_no_sample(name: str, seed: int) -> None:
     driver = row(name)
     codec = make(driver)
@@ -109,9 +106,7 @@ def test_the_same_bytes_again_are_counted_and_no_sample(name: str, seed: int) ->
     assert len(decode_polled(codec, 0, data)) == 1
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_scripts_end_whatever_is_answered(name: str, seed: int) -> None:
     """With noise and failures in any order they return, or raise what they may, and never go on without end."""
     driver, random = row(name), Random(seed)

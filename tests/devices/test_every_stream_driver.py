@@ -1,10 +1,10 @@
 """What every stream codec must do, from its row in DRIVERS alone: any split, damage and noise, a ledger that closes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud import devices
@@ -18,10 +18,13 @@ from tests.support.codec_invariants import feed_stream as feed_checked
 IDLE = 2000
 """So many zero bytes complete any frame that is only claimed."""
 
-quick = settings(max_examples=40, derandomize=True, deadline=None, database=None)
 DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), StreamDriver)}
 every_driver = pytest.mark.parametrize("name", list(DRIVERS))
-seeds = st.integers(0, 2**32)
+
+
+def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
+    """Calls a test with every driver and with seeds."""
+    return every_driver(given(seed=st.integers(0, 2**32))(test))
 
 
 def make(driver: StreamDriver) -> StreamCodec:
@@ -51,9 +54,7 @@ def noise(driver: StreamDriver, random: Random) -> bytes:
     return random.choice(kinds)
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_frames_back_to_back_all_come_out(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     frames = [driver.example_frame(random) for _ in range(12)]
@@ -65,9 +66,7 @@ def test_frames_back_to_back_all_come_out(name: str, seed: int) -> None:
     assert codec.ledger.bytes_in_good_frames == codec.ledger.bytes_in
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_any_split_gives_the_same_events(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     stream = b"".join(random.choice((driver.example_frame, lambda r: noise(driver, r)))(random) for _ in range(15))
@@ -78,9 +77,7 @@ def test_any_split_gives_the_same_events(name: str, seed: int) -> None:
     assert whole.ledger.snapshot() == single.ledger.snapshot() == parts.ledger.snapshot()
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_a_cut_frame_costs_only_itself(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     before, after, lost = ([driver.example_frame(random) for _ in range(n)] for n in (3, 8, 1))
@@ -90,9 +87,7 @@ def test_a_cut_frame_costs_only_itself(name: str, seed: int) -> None:
     assert measurements(events) == measurements(expected)
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_noise_never_costs_an_intact_frame(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     stream, expected = b"", list[CodecEvent]()
@@ -110,8 +105,7 @@ def contains_in_order(found: Sequence[CodecEvent], wanted: Sequence[CodecEvent])
 
 
 @every_driver
-@quick
-@given(data=st.binary(max_size=600), seed=seeds)
+@given(data=st.binary(max_size=600), seed=st.integers(0, 2**32))
 def test_random_bytes_never_raise(name: str, data: bytes, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     sync = driver.example_frame(random)[:2]
@@ -121,9 +115,7 @@ def test_random_bytes_never_raise(name: str, data: bytes, seed: int) -> None:
     assert codec.ledger.closes()
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_flush_delivers_what_waits_inside_a_longer_frame(name: str, seed: int) -> None:
     """A header that claims more than comes hides the frames behind it until the line is idle."""
     driver, random = DRIVERS[name], Random(seed)
@@ -138,9 +130,7 @@ def test_flush_delivers_what_waits_inside_a_longer_frame(name: str, seed: int) -
         assert codec.ledger.closes()
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_flush_destroys_nothing(name: str, seed: int) -> None:
     """A frame that pauses in the middle still comes, however often the line counts as idle meanwhile."""
     driver, random = DRIVERS[name], Random(seed)
@@ -155,9 +145,7 @@ def test_flush_destroys_nothing(name: str, seed: int) -> None:
     assert untimed(events) == expected
 
 
-@every_driver
-@quick
-@given(seed=seeds)
+@every_driver_and_seed
 def test_reset_skips_what_is_pending_and_starts_anew(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
     frame = driver.example_frame(random)

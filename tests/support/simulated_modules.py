@@ -242,7 +242,9 @@ class CanBench:
     def run(self, duration_ns: int) -> Outcome | None:
         end_ns = self.now_ns + duration_ns
         while self.now_ns < end_ns:
-            self.now_ns += CAN_STEP_NS
+            next_ns = (end_ns, self.session.deadline_ns, *(module.next_ns() for module in self.bus))
+            rest_ns = min(t_ns for t_ns in next_ns if t_ns is not None) - self.now_ns
+            self.now_ns += max(-(-rest_ns // CAN_STEP_NS), 1) * CAN_STEP_NS
             frames, *beside = [module.advance(self.now_ns) for module in self.bus]
             self.heard += [(frame.can_id, frame.data) for frame in frames]
             for frame in [*frames, *(frame for sent in beside for frame in sent)]:

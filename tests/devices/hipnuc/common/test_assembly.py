@@ -5,7 +5,7 @@ from random import Random
 from typing import NamedTuple
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.devices.hipnuc.common.assembly import Assembly
@@ -310,7 +310,6 @@ def test_frames_without_times_are_put_together_by_their_order() -> None:
     assert made == list(range(5, 30))
 
 
-@settings(max_examples=60, derandomize=True, deadline=None, database=None)
 @given(seed=st.integers(0, 2**32), kinds=st.sampled_from([EQUAL, MIXED, LEADING, {1: 1, 6: 20}, {1: 1, 2: 2, 3: 4}]))
 def test_periods_are_never_mixed(seed: int, kinds: dict[int, int]) -> None:
     """Any loss, of single frames and of runs, at any time, learning included; each sample is of one burst (`feed`)."""
@@ -332,7 +331,6 @@ def test_periods_are_never_mixed(seed: int, kinds: dict[int, int]) -> None:
         assert rig.ledger.lost_gap_device == 0
 
 
-@settings(max_examples=25, derandomize=True, deadline=None, database=None)
 @given(seed=st.integers(0, 2**32))
 def test_any_frames_at_any_time_keep_the_ledger_closed(seed: int) -> None:
     random = Random(seed)
