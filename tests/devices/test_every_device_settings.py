@@ -92,7 +92,7 @@ def test_tables_can_do_what_their_settings_need(name: str) -> None:
 
 
 @every_setting
-def test_every_setting_describes_itself(driver: str, name: str) -> None:
+def test_every_setting_describes_itself_and_can_be_declared(driver: str, name: str) -> None:
     one = info_of(driver, name)
     assert name == name.lower()
     assert name.isidentifier()
@@ -102,10 +102,6 @@ def test_every_setting_describes_itself(driver: str, name: str) -> None:
     assert "keys and values" not in one.values
     if name.endswith(("_ms", "_hz", "_deg", "_deg_s")):
         assert one.unit, "a setting with a unit in its name says it"
-
-
-@every_setting
-def test_examples_are_declared_read_back_from_yaml_and_planned(driver: str, name: str) -> None:
     table = table_of(driver)
     setting = table.table[name]
     for value in examples(driver, name):
@@ -161,6 +157,7 @@ def simulated_device(driver: str, port: Path) -> dict[str, Any]:
     return {"driver": driver, LINK_OF[driver]: link[LINK_OF[driver]]}
 
 
+@pytest.mark.live
 @pytest.mark.parametrize("name", [name for name in SIMULATORS if name in TABLES])
 def test_a_simulated_module_takes_every_setting_and_tells_it(name: str, tmp_path: Path) -> None:
     """One after the other, to the one value and to the other; what cannot go together is refused in words."""
@@ -184,7 +181,7 @@ def test_a_simulated_module_takes_every_setting_and_tells_it(name: str, tmp_path
             for one in settable:
                 taken = [value for value in examples(name, one) if takes(client, one, value)]
                 assert taken, f"none of {examples(name, one)} for {one}"
-                wait_until(lambda: daemon.statuses()["bow"].state in ("running", "silent"), "it is there", 30)
+                wait_until(lambda: daemon.statuses()["bow"].state in ("running", "silent"), "it is there")
 
 
 def takes(client: Client, name: str, value: Any) -> bool:

@@ -32,9 +32,5 @@ def test_rows_are_complete(name: str) -> None:
     assert driver.euler_convention
     assert driver.tick_ns >= 0
     assert driver.tick_modulus > 1
-
-
-@every_driver
-def test_examples_differ_and_are_the_same_for_a_seed(name: str) -> None:
     example = example_of(DRIVERS[name])
     assert example(Random(5)) == example(Random(5)) != example(Random(6))

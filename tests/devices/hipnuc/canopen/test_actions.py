@@ -38,6 +38,8 @@ ROWS: list[tuple[str, dict[str, object], str]] = [
     ("transmission", {"tpdo": 1, "by": "sync"}, "2F 00 18 02 01 00 00 00"),
     ("transmission", {"tpdo": 4, "by": "timer"}, "2F 03 18 02 FF 00 00 00"),
     ("direction", {"x_reversed": True, "y_reversed": False}, "23 9E 20 00 01 00 00 00"),
+    ("direction", {"x_reversed": False, "y_reversed": False}, "23 9E 20 00 00 00 00 00"),
+    ("transmission", {"tpdo": 1, "by": "timer"}, "2F 00 18 02 FF 00 00 00"),
     ("zero", {"zero": "here"}, "23 A5 20 00 02 00 00 00"),
     ("zero", {"zero": "cancel"}, "23 A5 20 00 05 00 00 00"),
 ]
@@ -45,6 +47,15 @@ ROWS: list[tuple[str, dict[str, object], str]] = [
 
 @pytest.mark.parametrize(("name", "given", "data"), ROWS)
 @pytest.mark.parametrize("node", [8, 127])
+@pytest.mark.manual(
+    "B 5.4.1 node number",
+    "B 5.4.1 save",
+    "B 5.4.1 restart",
+    "B 5.4.1 factory settings",
+    "B 5.4.1 bit rate",
+    "B 5.4.1 zero of the inclinometer",
+    "B 5.4.2 transmission type",
+)
 def test_commands_of_the_manual_go_to_the_node_of_the_settings(
     name: str, given: dict[str, object], data: str, node: int
 ) -> None:
@@ -62,9 +73,6 @@ def test_network_management(command: str, code: int) -> None:
     bench = CanopenBench(NodeSettings(node=5))
     bench.run_script(begun("nmt", 5, command=command))
     assert (0, bytes([code, 5])) in bench.sent
-
-
-def test_every_action_is_tried_here() -> None:
     assert {name for name, _, _ in ROWS} | {"nmt"} == set(DRIVER.actions)
 
 

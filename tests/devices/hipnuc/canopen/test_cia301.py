@@ -52,19 +52,16 @@ def test_what_is_no_confirmation(other: ReplyFrame | str) -> None:
     assert not request.is_part(other)
 
 
-def test_read_frames_of_every_size() -> None:
+def test_frames_of_every_size() -> None:
     assert read_frame(0x1018, 4) == bytes.fromhex("40 18 10 04 00 00 00 00")
     values = {"4F": b"\1", "4B": b"\1\2", "47": b"\1\2\3", "43": b"\1\2\3\4", "42": b"\1\2\3\4", "41": None, "40": None}
     assert {cs: value_of(bytes.fromhex(cs) + bytes(3) + b"\1\2\3\4") for cs in values} == values
+    for size, command in ((1, 0x2F), (2, 0x2B), (3, 0x27), (4, 0x23)):
+        _, data = unpack(next(write_object(8, 0x1800, 5, 10, size)).payload)
+        assert data == bytes([command, 0x00, 0x18, 5, 10, 0, 0, 0])
 
 
-@pytest.mark.parametrize(("size", "command"), [(1, 0x2F), (2, 0x2B), (3, 0x27), (4, 0x23)])
-def test_write_commands_by_size(size: int, command: int) -> None:
-    _, data = unpack(next(write_object(8, 0x1800, 5, 10, size)).payload)
-    assert data == bytes([command, 0x00, 0x18, 5, 10, 0, 0, 0])
-
-
-def test_abort_tells_its_reason() -> None:
+def test_aborts_silence_and_values_in_segments() -> None:
     conversation = read_object(8, 0x2345, 1)
     request = next(conversation)
     refused = frame("80 45 23 01 00 00 02 06")
@@ -74,16 +71,10 @@ def test_abort_tells_its_reason() -> None:
     assert caught.value.code == 0x0602_0000
     assert abort_text(0x1234) == "unknown abort code"
     assert len(ABORT_TEXTS) == 31
-
-
-def test_silence_is_no_reply() -> None:
     conversation = read_object(8, 0x1000, 0)
     next(conversation)
     with pytest.raises(NoReply, match=r"node 8, read 0x1000\.0"):
         conversation.send(Silence(()))
-
-
-def test_a_value_in_segments_is_aborted_and_not_read() -> None:
     conversation = read_object(8, 0x1008, 0)
     request = next(conversation)
     announced = frame("41 08 10 00 0A 00 00 00")

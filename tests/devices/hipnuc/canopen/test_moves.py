@@ -58,28 +58,21 @@ def test_a_number_that_is_heard_on_the_bus_is_refused_and_nothing_is_written(ben
         bench.run_script(moves.change_node(bench.settings, 12))
     assert all(data[0] == 0x40 for can_id, data in bench.sent)
     assert bench.settings.node == 8
+    bench.run_script(moves.change_node(bench.settings, 8))
+    assert bench.settings.node == bench.module.node == 8
 
 
-def test_a_number_of_a_node_that_only_answers_is_refused_too() -> None:
+def test_which_frames_make_a_number_taken() -> None:
+    """Also SDO replies, but not 0x600 + node and 0x200 + node, which are sent to a node."""
     bench = CanopenBench(NodeSettings(node=8), others=(12,))
     bench.others[0].objects.settings = NodeSettings(node=12, periods_ms=QUIET.periods_ms)
     bench.run(100_000_000)
     with pytest.raises(BadArgument, match=r"frame 0x58C of it"):
         bench.run_script(moves.change_node(bench.settings, 12))
-
-
-def test_requests_of_another_host_make_no_number_taken() -> None:
-    """0x600 + node and 0x200 + node are sent to a node, not by one."""
     request = next(moves.change_node(HipnucCanopenSettings(node=8), 12))
     assert {wanted.can_id for wanted in request.also} == {
         0x08C, 0x18C, 0x28C, 0x38C, 0x48C, 0x58C, 0x68C, 0x70C, 0x78C,
     }  # fmt: skip
-
-
-def test_the_number_it_has_already_is_written_all_the_same(bench: CanopenBench) -> None:
-    bench.run(500_000_000)
-    bench.run_script(moves.change_node(bench.settings, 8))
-    assert bench.settings.node == bench.module.node == 8
 
 
 def test_a_refused_number_says_why() -> None:
@@ -105,24 +98,21 @@ def test_a_node_that_is_heard_nowhere_is_told_to_go_back() -> None:
     assert data == bytes.fromhex("23 A0 20 00 08 00 00 00")
 
 
-def test_a_restart_is_followed_by_nmt_too(bench: CanopenBench) -> None:
-    bench.run(500_000_000)
+def test_a_restart_is_followed_by_nmt_too() -> None:
+    bench = CanopenBench(NodeSettings(node=8), boot_ms=300)
     bench.run_script(moves.change_node(bench.settings, 9))
     bench.run_script(session.save(bench.settings.node))
     assert bench.run_script(moves.reset(bench.settings, BUS, NmtCommand.RESET_NODE)) == "restarted, as node 9"
     assert bench.settings.node == bench.module.node == 9
 
 
-def test_a_restart_with_another_bit_rate_is_told() -> None:
+def test_a_restart_that_loses_the_node_is_told() -> None:
     bench = CanopenBench(NodeSettings(node=8), boot_ms=300)
     bench.run(500_000_000)
     bench.run_script(session.set_bit_rate(8, 250_000))
     bench.module.hardware = bench.module.hardware.__class__(boot_ms=60_000)  # what it sends then is not understood
     result = bench.run_script(moves.restart(bench.settings, BUS))
     assert result == "restarted; it has 250000 bit/s now, which this bus has not"
-
-
-def test_a_node_that_does_not_come_back_is_told() -> None:
     bench = CanopenBench(NodeSettings(node=8), boot_ms=60_000)
     bench.now_ns += 70_000_000_000
     with pytest.raises(NoReply, match="nothing is heard of node 8 after the restart"):

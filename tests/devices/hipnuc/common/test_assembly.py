@@ -83,7 +83,7 @@ def whole(kinds: Mapping[int, int], burst: int) -> tuple[int, ...]:
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING, {4: 1}, {1: 3, 2: 1, 4: 3, 6: 7}])
-@pytest.mark.parametrize("begin", [0, 1, 2, 3])
+@pytest.mark.parametrize("begin", [0, 2])
 def test_every_burst_becomes_one_sample_once_learnt(kinds: dict[int, int], begin: int) -> None:
     rig = AssemblyBench()
     frames = stream(kinds, range(200))[begin:]
@@ -140,7 +140,7 @@ def test_the_end_of_one_burst_and_the_beginning_of_another_are_not_joined(cut: i
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING])
-@pytest.mark.parametrize("lost", [1, 2, 7, 100])
+@pytest.mark.parametrize("lost", [1, 2, 100])
 def test_bursts_that_are_lost_whole_are_counted(kinds: dict[int, int], lost: int) -> None:
     rig = learnt(kinds)
     made = rig.feed(without(stream(kinds, range(40, 300)), lambda f: 61 <= f.burst < 61 + lost))
@@ -157,7 +157,7 @@ def test_more_than_a_second_is_silence_and_not_loss() -> None:
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING])
-@pytest.mark.parametrize("stall_ns", [4 * MS, 7_300_000, 8 * MS, 12_400_000, 60 * MS, 700 * MS, 1500 * MS])
+@pytest.mark.parametrize("stall_ns", [4 * MS, 7_300_000, 60 * MS, 1500 * MS])
 def test_a_stall_between_two_bursts_costs_nothing(kinds: dict[int, int], stall_ns: int) -> None:
     """All that was sent meanwhile comes at once when the stall ends."""
     rig = learnt(kinds)
@@ -184,14 +184,15 @@ def test_frames_that_come_twice_cost_nothing(kinds: dict[int, int]) -> None:
     assert rig.ledger.lost_gap_device == 0
 
 
-def test_a_kind_that_is_switched_off_is_given_up_after_ten_of_its_periods() -> None:
+def test_kinds_that_are_switched_off() -> None:
     rig = learnt(EQUAL)
     made = rig.feed(stream({1: 1, 3: 1}, range(40, 80)))
     assert made == list(range(50, 80))
     assert rig.ledger.lost_gap_device == 10
-
-
-def test_a_slower_kind_that_is_switched_off_costs_nothing_and_may_come_back() -> None:
+    rig = learnt(EQUAL)
+    made = rig.feed(stream({2: 1, 3: 1}, range(40, 80)))
+    assert made == list(range(made[0], 80))
+    assert made[0] <= 60
     rig = learnt(MIXED)
     off, on = stream({1: 1, 2: 1, 3: 2}, range(40, 300)), stream(MIXED, range(300, 400))
     assert rig.feed(off) == list(range(40, 300))
@@ -199,13 +200,6 @@ def test_a_slower_kind_that_is_switched_off_costs_nothing_and_may_come_back() ->
     assert rig.feed([*head, last]) == [300]
     assert rig.feed(on[4:]) == list(range(301, 400))
     assert rig.kinds_of(380) == (1, 2, 3, 6)
-
-
-def test_the_beginning_kind_may_be_switched_off() -> None:
-    rig = learnt(EQUAL)
-    made = rig.feed(stream({2: 1, 3: 1}, range(40, 80)))
-    assert made == list(range(made[0], 80))
-    assert made[0] <= 60
 
 
 @pytest.mark.parametrize("new", [{4: 1}, {4: 2}, {6: 10}])
@@ -247,8 +241,23 @@ def test_another_rate_of_some_is_learnt(before: dict[int, int], after: dict[int,
     assert settled == [(burst, whole(after, burst)) for burst in range(150, 300)]
 
 
-def test_a_kind_that_does_not_divide_the_rate_stays_out() -> None:
-    """20 ms and 50 ms: every other time it comes between two bursts."""
+def test_order_alone_keeps_two_bursts_apart() -> None:
+    """Without times: 1 and 3 of a burst, then 2 and 3 of the next; 2 stands before the 3 that is held."""
+    rig = AssemblyBench()
+    rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
+    frames = without(stream(EQUAL, range(30, 40)), lambda f: (f.burst, f.kind) in ((32, 2), (33, 1)))
+    assert rig.feed(frame._replace(t_ns=0) for frame in frames) == [30, 31, *range(34, 40)]
+    rig = AssemblyBench()
+    made = rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
+    assert made == list(range(5, 30))
+
+
+def test_kinds_that_stay_out() -> None:
+    """Kinds that are not asked for; and one of 50 ms beside 20 ms, which comes between two bursts every other time."""
+    rig = AssemblyBench({1, 3})
+    made = rig.feed(stream(MIXED, range(60)))
+    assert made == list(range(made[0], 60))
+    assert all(names == tuple(k for k in whole(MIXED, b) if k in (1, 3)) for b, names in rig.made if b > 12)
     frames = sorted(
         [*stream({1: 1, 2: 1}, range(200), 20 * MS), *stream({6: 1}, range(80), 50 * MS)], key=lambda frame: frame.t_ns
     )
@@ -256,21 +265,6 @@ def test_a_kind_that_does_not_divide_the_rate_stays_out() -> None:
     rig.feed(frames)
     assert all(names == (1, 2) for _, names in rig.made)
     assert len(rig.made) >= 190
-
-
-def test_order_alone_keeps_two_bursts_apart() -> None:
-    """Without times: 1 and 3 of a burst, then 2 and 3 of the next; 2 stands before the 3 that is held."""
-    rig = AssemblyBench()
-    rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
-    frames = without(stream(EQUAL, range(30, 40)), lambda f: (f.burst, f.kind) in ((32, 2), (33, 1)))
-    assert rig.feed(frame._replace(t_ns=0) for frame in frames) == [30, 31, *range(34, 40)]
-
-
-def test_only_the_kinds_that_are_asked_for() -> None:
-    rig = AssemblyBench({1, 3})
-    made = rig.feed(stream(MIXED, range(60)))
-    assert made == list(range(made[0], 60))
-    assert all(names == tuple(k for k in whole(MIXED, b) if k in (1, 3)) for b, names in rig.made if b > 12)
 
 
 def test_reset_gives_up_what_is_held() -> None:
@@ -286,28 +280,19 @@ def test_reset_gives_up_what_is_held() -> None:
 
 
 def test_learning_is_not_misled_by_loss() -> None:
+    """A slower kind is not taken for a fast one either, though whole bursts between its first ones are lost."""
     rig = AssemblyBench()
     frames = without(stream(EQUAL, range(30)), lambda f: f.burst in (2, 4) and f.kind == 2)
     made = rig.feed(frames)
     assert made == list(range(made[0], 30))
     assert made[0] <= 12
     assert all(names == (1, 2, 3) for burst, names in rig.made if burst > made[0] + 7)
-
-
-def test_a_slower_kind_does_not_become_a_fast_one_by_loss() -> None:
-    """Whole bursts are lost between its first ones, so that it seems to be in every burst."""
     rig = AssemblyBench()
     lost = {(7, 1), (9, 1), (10, 1), (14, 1), (19, 1)}
     rig.feed(frame for frame in stream({1: 1, 2: 2}, range(1, 80)) if (frame.burst, frame.kind) not in lost)
     assert [made for made in rig.made if made[0] >= 25] == [
         (burst, whole({1: 1, 2: 2}, burst)) for burst in range(25, 80)
     ]
-
-
-def test_frames_without_times_are_put_together_by_their_order() -> None:
-    rig = AssemblyBench()
-    made = rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
-    assert made == list(range(5, 30))
 
 
 @given(seed=st.integers(0, 2**32), kinds=st.sampled_from([EQUAL, MIXED, LEADING, {1: 1, 6: 20}, {1: 1, 2: 2, 3: 4}]))

@@ -55,20 +55,20 @@ def test_an_address_that_is_heard_on_the_bus_is_refused_and_nothing_is_written(b
         bench.run_script(moves.change_address(bench.settings, 12))
     assert not [data for can_id, data in bench.sent if data[2] == 6]
     assert bench.settings.address == 8
-
-
-def test_the_address_it_has_already_is_written_all_the_same(bench: J1939Bench) -> None:
     bench.run_script(moves.change_address(bench.settings, 8))
     assert bench.settings.address == 8
 
 
-def test_a_refused_address_says_so() -> None:
+def test_refusals_are_told() -> None:
     bench = J1939Bench(variant=J1939Variant(refuses=frozenset({session.ADDRESS})))
     with pytest.raises(Rejected, match="status 1"):
         bench.run_script(moves.change_address(bench.settings, 9))
     bench = J1939Bench(variant=J1939Variant(ignores=frozenset({session.ADDRESS})))
     with pytest.raises(Rejected, match="the module has 8"):
         bench.run_script(moves.change_address(bench.settings, 9))
+    bench = J1939Bench(variant=J1939Variant(refuses=frozenset({session.CONTROL})))
+    with pytest.raises(Rejected, match="restart: the module refused"):
+        bench.run_script(moves.restart(bench.settings, BUS))
 
 
 def test_a_module_that_is_heard_nowhere_is_told_to_go_back() -> None:
@@ -84,21 +84,12 @@ def test_a_module_that_is_heard_nowhere_is_told_to_go_back() -> None:
     assert int.from_bytes(sent[-1][:4], "little") & 0x1FFF_FFFF == 0x0CEF0955
 
 
-def test_a_refused_restart_is_told() -> None:
-    bench = J1939Bench(variant=J1939Variant(refuses=frozenset({session.CONTROL})))
-    with pytest.raises(Rejected, match="restart: the module refused"):
-        bench.run_script(moves.restart(bench.settings, BUS))
-
-
-def test_a_restart_with_another_bit_rate_is_told() -> None:
+def test_a_restart_that_loses_the_module_is_told() -> None:
     bench = J1939Bench(boot_ms=300)
     bench.run(500_000_000)
     bench.run_script(session.set_bitrate(bench.settings.peer, 250_000))
     bench.module.hardware = bench.module.hardware.__class__(boot_ms=60_000)  # what it sends then is not understood
     assert "it has 250000 bit/s now" in bench.run_script(moves.restart(bench.settings, BUS))
-
-
-def test_a_module_that_does_not_come_back_is_told() -> None:
     bench = J1939Bench(boot_ms=60_000)
     bench.now_ns += 70_000_000_000
     with pytest.raises(NoReply, match="nothing is heard of address 8 after the restart"):

@@ -46,19 +46,18 @@ def test_what_is_sent(name: str, given: dict[str, object], sent: str) -> None:
     assert next(request.hex() for _, request in bench.sent if request[0] == 6) == sent
 
 
-def test_without_an_address_nothing_can_be_followed() -> None:
+def test_actions_without_an_address_and_reading_by_name() -> None:
     action = DRIVER.actions["address"]
     with pytest.raises(BadArgument, match="expected the address of the module"):
         action.script(Target(HipnucModbusSettings(), 0), action.arguments({"address": 9}))
-
-
-def test_registers_are_read_by_name() -> None:
     bench = ModbusBench(module(7))
     assert act(bench, "read", register="MD_ID") == (7,)
     assert act(bench, "read", register="sn") == (0xA000, 0, 0, 7)
     for name in ("CTRL", "nothing"):
         with pytest.raises(BadArgument, match="HEADING_MODE"):
             act(bench, "read", register=name)
+    assert all(action.help for action in DRIVER.actions.values())
+    assert [str(one) for one in parameters_of(DRIVER.actions["attitude_mode"])] != []
 
 
 @pytest.mark.parametrize(
@@ -79,8 +78,3 @@ def test_what_a_module_cannot_take_is_not_sent(name: str, given: dict[str, objec
     with pytest.raises(BadArgument, match=names):
         act(bench, name, **given)
     assert bench.sent == []
-
-
-def test_all_are_described() -> None:
-    assert all(action.help for action in DRIVER.actions.values())
-    assert [str(one) for one in parameters_of(DRIVER.actions["attitude_mode"])] != []

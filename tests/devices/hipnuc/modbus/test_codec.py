@@ -107,7 +107,7 @@ def test_a_module_without_barometer_has_no_pressure(counts: int, pressure_pa: fl
     assert m.pressure_pa == pressure_pa
 
 
-@pytest.mark.manual("B 4.2 temperature and pressure")
+@pytest.mark.manual("B 4.2 temperature and pressure", "B 4 defaults")
 def test_block_of_newer_firmware() -> None:
     """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
     words = "0000 0000 0800 0000 0000 0000 0000 0000 0000" + "0000 0000" * 3 + "09D0 009A9C14" + "2710 0000 0000 0000"
@@ -120,9 +120,16 @@ def test_block_of_newer_firmware() -> None:
     assert m.quat_wxyz == (1, 0, 0, 0)
     assert m.mag_t is None
     assert m.incli_rad is None
+    data = block()
+    for inner in (b"\x04" + data[2:-2], b"\x03\x33" + data[3:-2]):
+        (event,) = codec().decode(0, framed(9, inner))
+        assert isinstance(event, BadFrame)
+        assert event.reason is BadReason.CONTENT
+    assert DRIVER.targets[0] == 0x50
+    assert sorted(DRIVER.targets) == list(range(1, 248))
 
 
-def test_firmware_without_uptime_is_read_without_it_from_then_on() -> None:
+def test_the_block_of_the_manual_is_read_where_there_is_no_longer_one() -> None:
     made = codec()
     assert made.polls[0].transfer == READ_BLOCK
     (event,) = made.decode(0, EXCEPTION)
@@ -137,6 +144,35 @@ def test_firmware_without_uptime_is_read_without_it_from_then_on() -> None:
     assert isinstance(bad, BadFrame)
     assert made.ledger.closes()
 
+    made = codec()
+    assert made.on_silence(0) == made.on_silence(1) == ()
+    (event,) = made.on_silence(0)
+    assert isinstance(event, Vanished)
+    made.reset()
+    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    assert [made.on_silence(0) for _ in range(5)] == [()] * 5
+    made.reset()
+    assert made.polls[0].transfer == READ_BLOCK
+
+    made = codec()
+    measured(made, block())
+    busy = framed(0x50, b"\x83\x06")
+    assert list(made.decode(0, busy)) == [BadFrame(BadReason.CONTENT, busy)]
+    assert [made.on_silence(0) for _ in range(5)] == [()] * 5
+    assert made.polls[0].transfer == READ_BLOCK
+    assert made.ledger.frames_bad_content == 1
+
+    made = codec()
+    made.decode(0, EXCEPTION)
+    made.reset()
+    first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
+    made.decode(1, first)
+    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    (event,) = made.decode(1, second)
+    assert isinstance(event, Vanished)
+    made.reset()
+    assert made.polls[0].transfer == READ_BLOCK
+
 
 @pytest.mark.parametrize("code", [1, 3, 4, 6, 0x0A])
 def test_any_exception_to_the_first_reading_leads_to_the_block_of_the_manual(code: int) -> None:
@@ -150,49 +186,6 @@ def test_any_exception_to_the_first_reading_leads_to_the_block_of_the_manual(cod
     made.reset()  # identified again: it may have been busy the first time
     assert made.polls[0].transfer == READ_BLOCK
     assert made.ledger.closes()
-
-
-def test_no_answer_to_the_first_readings_leads_to_the_block_of_the_manual() -> None:
-    made = codec()
-    assert made.on_silence(0) == made.on_silence(1) == ()
-    (event,) = made.on_silence(0)
-    assert isinstance(event, Vanished)
-    made.reset()
-    assert made.polls[0].transfer == READ_SHORT_BLOCK
-    assert [made.on_silence(0) for _ in range(5)] == [()] * 5
-    made.reset()
-    assert made.polls[0].transfer == READ_BLOCK
-
-
-def test_a_module_that_has_answered_the_longer_block_keeps_it() -> None:
-    made = codec()
-    measured(made, block())
-    busy = framed(0x50, b"\x83\x06")
-    assert list(made.decode(0, busy)) == [BadFrame(BadReason.CONTENT, busy)]
-    assert [made.on_silence(0) for _ in range(5)] == [()] * 5
-    assert made.polls[0].transfer == READ_BLOCK
-    assert made.ledger.frames_bad_content == 1
-
-
-def test_another_module_is_asked_for_the_longer_block_again() -> None:
-    made = codec()
-    made.decode(0, EXCEPTION)
-    made.reset()
-    first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
-    made.decode(1, first)
-    assert made.polls[0].transfer == READ_SHORT_BLOCK
-    (event,) = made.decode(1, second)
-    assert isinstance(event, Vanished)
-    made.reset()
-    assert made.polls[0].transfer == READ_BLOCK
-
-
-def test_reply_of_another_function_or_count_is_no_block() -> None:
-    data = block()
-    for inner in (b"\x04" + data[2:-2], b"\x03\x33" + data[3:-2]):
-        (event,) = codec().decode(0, framed(9, inner))
-        assert isinstance(event, BadFrame)
-        assert event.reason is BadReason.CONTENT
 
 
 @pytest.mark.parametrize("per_lsb", [QUAT_OLD_PER_LSB, QUAT_PER_LSB])
@@ -251,7 +244,7 @@ def test_status_is_read_beside_the_block() -> None:
     assert made.ledger.closes()
 
 
-def test_another_module_in_its_place_is_noticed() -> None:
+def test_identity_is_watched_and_settings_are_read() -> None:
     made = codec()
     first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
     assert made.polls[1].transfer == READ_SERIAL
@@ -262,16 +255,10 @@ def test_another_module_in_its_place_is_noticed() -> None:
     made.reset()
     assert made.decode(1, second) == ()
     assert made.ledger.closes()
-
-
-def test_probe_refuses_what_is_no_module() -> None:
     for name in (b"\x00" * 16, b"\xff" * 16, b"AB\x01" + b"\x00" * 13):
         reply = framed(3, registers_reply(name + bytes(24)))
         with pytest.raises(DeviceRefused, match="name of a product"):
             run_transfer_script(probe(HipnucModbusSettings()), lambda _, reply=reply: reply)  # type: ignore[misc]  # bound now
-
-
-def test_settings_are_read_and_nothing_is_written() -> None:
     asked: list[Transfer] = []
 
     def answer(transfer: Transfer) -> bytes:
@@ -281,9 +268,3 @@ def test_settings_are_read_and_nothing_is_written() -> None:
     found = run_transfer_script(set_up(HipnucModbusSettings()), answer)
     assert found == {"baud": "921600", "id": "7", "heading_mode": "nine axes"}
     assert [transfer.sends[0][0] for transfer in asked] == [3]
-
-
-@pytest.mark.manual("B 4 defaults")
-def test_targets_begin_with_the_factory_address() -> None:
-    assert DRIVER.targets[0] == 0x50
-    assert sorted(DRIVER.targets) == list(range(1, 248))

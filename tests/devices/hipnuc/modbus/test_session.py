@@ -89,23 +89,29 @@ def test_an_address_that_another_module_has_is_refused_before_anything_is_writte
         bench.run(change_address(7, 12))
     assert not any(request[0] == 6 for _, request in bench.sent)
     assert bench.at == 7
+    assert bench.run(change_address(7, 7)) is Written.VERIFIED
+    assert bench.at == 7
 
 
-def test_two_at_an_address_are_taken_as_well() -> None:
+def test_addresses_that_are_taken_or_not_accepted() -> None:
     bench = ModbusBench(module(7), module(12, serial=0x0F), module(12, serial=0xF0))
     with pytest.raises(BadArgument, match="address 12 is taken: something answers"):
         bench.run(change_address(7, 12))
-
-
-def test_one_lost_request_makes_no_address_free() -> None:
     bench = ModbusBench(module(7), module(12, mute=2))
     with pytest.raises(BadArgument, match="taken"):
         bench.run(change_address(7, 12))
-
-
-def test_the_address_it_has_already_is_written_all_the_same(bench: ModbusBench) -> None:
-    assert bench.run(change_address(7, 7)) is Written.VERIFIED
-    assert bench.at == 7
+    with pytest.raises(BadArgument, match=r"1 … 128, got 129"):
+        ModbusBench().run(change_address(7, 129))
+    bench = ModbusBench(module(7), module(80))
+    with pytest.raises(BadArgument, match="address 80 is taken"):
+        bench.run(factory_reset((7,), BAUD))
+    assert not any(request[0] == 6 for _, request in bench.sent)
+    bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"MD_ID"}))))
+    with pytest.raises(DeviceRefused, match="wrote 9, the module has 7"):
+        bench.run(change_address(7, 9))
+    bench = ModbusBench(module(7, variant=SlaveVariant(refuses=frozenset({"MD_ID"}))))
+    with pytest.raises(DeviceRefused, match="the value is not allowed"):
+        bench.run(change_address(7, 9))
 
 
 def test_a_module_that_is_heard_nowhere_is_sent_back() -> None:
@@ -122,20 +128,6 @@ def test_a_module_that_is_heard_nowhere_is_sent_back() -> None:
         run_transfer_script(script, transfer)
     assert bench.sent[-1] == (9, bytes.fromhex("0600050007"))
     assert bench.slave.address == 9 or bench.slave.settings.slave == 7
-
-
-def test_an_address_that_did_not_take_is_told() -> None:
-    bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"MD_ID"}))))
-    with pytest.raises(DeviceRefused, match="wrote 9, the module has 7"):
-        bench.run(change_address(7, 9))
-    bench = ModbusBench(module(7, variant=SlaveVariant(refuses=frozenset({"MD_ID"}))))
-    with pytest.raises(DeviceRefused, match="the value is not allowed"):
-        bench.run(change_address(7, 9))
-
-
-def test_addresses_beyond_the_register_go_by_serial_number_only() -> None:
-    with pytest.raises(BadArgument, match=r"1 … 128, got 129"):
-        ModbusBench().run(change_address(7, 129))
 
 
 @pytest.mark.manual("B 4.3.1 restart")
@@ -167,39 +159,32 @@ def test_factory_settings_and_where_the_module_is_then(bench: ModbusBench) -> No
     assert bench.at == 80
 
 
-def test_no_factory_reset_onto_the_address_of_another_module() -> None:
-    bench = ModbusBench(module(7), module(80))
-    with pytest.raises(BadArgument, match="address 80 is taken"):
-        bench.run(factory_reset((7,), BAUD))
-    assert not any(request[0] == 6 for _, request in bench.sent)
-
-
-def test_after_a_factory_reset_on_a_line_of_another_rate_it_is_not_waited_for() -> None:
-    made = module(7)
-    made.settings = made.flash = replace(made.settings, baud=9600)
-    made.baud = 9600
-    bench = ModbusBench(made, baud=9600)
-    assert "115200 baud and address 80" in bench.run(factory_reset((7,), 9600))
-
-
 def test_mounting_and_level_are_confirmed_only(bench: ModbusBench) -> None:
     assert bench.run(set_mounting(LineMounting.X_UP)) is Written.UNVERIFIED
     bench.run(auto_level(LevelReset.AUTOMATIC))
     assert [request.hex() for _, request in bench.sent] == ["0600a60003", "0600a50003"]
 
 
-def test_a_value_that_did_not_take_is_told() -> None:
+def test_modules_that_do_not_answer_as_expected() -> None:
     bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"HEADING_MODE"}))))
     with pytest.raises(DeviceRefused, match="wrote 1, the module has 0"):
         bench.run(set_heading_mode(NINE))
 
-
-def test_a_register_that_cannot_be_read_is_written_and_not_verified() -> None:
     def answer(transfer: Transfer) -> bytes:
         request = transfer.sends[0]
         return framed(7, request if request[0] == 6 else b"\x83\x02")
 
     assert run_transfer_script(set_heading_mode(NINE), answer) is Written.UNVERIFIED
+
+    bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=60_000)))
+    with pytest.raises(NoReply, match="does not answer at address 7 after its restart"):
+        restarted(bench)
+
+    made = module(7)
+    made.settings = made.flash = replace(made.settings, baud=9600)
+    made.baud = 9600
+    bench = ModbusBench(made, baud=9600)
+    assert "115200 baud and address 80" in bench.run(factory_reset((7,), 9600))
 
 
 @pytest.mark.parametrize(
@@ -209,12 +194,6 @@ def test_a_module_that_is_not_there_is_told(begin: Callable[[], TransferScript[A
     bench = ModbusBench(module(7, dead=True))
     with pytest.raises((TransferError, NoReply)):
         bench.run(begin())
-
-
-def test_a_module_that_does_not_come_back_is_told() -> None:
-    bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=60_000)))
-    with pytest.raises(NoReply, match="does not answer at address 7 after its restart"):
-        restarted(bench)
 
 
 @pytest.mark.parametrize("name", ["CTRL", "MD_ID", "HEADING_MODE"])

@@ -37,9 +37,22 @@ def present(bench: ModbusBench) -> dict[str, Any]:
     return found
 
 
-def test_the_driver_has_them() -> None:
+def test_the_table_has_effects_and_types() -> None:
     assert DRIVER.device_settings is SETTINGS
     assert set(VALUES) == set(SETTINGS.table)
+    effects = {name: (one.effect, one.connection) for name, one in SETTINGS.table.items()}
+    assert effects == {
+        "mode": (Effect.AT_ONCE, False),
+        "mounting": (Effect.AFTER_RESTART, False),
+        "baud": (Effect.AFTER_RESTART, True),
+        "address": (Effect.AT_ONCE, True),
+    }
+    for name, values in VALUES.items():
+        for value in values:
+            assert msgspec.convert(value, SETTINGS.table[name].type) == value
+    for name, wrong in (("mode", 9), ("mounting", "z_up"), ("baud", 12345), ("address", 129), ("address", 0)):
+        with pytest.raises(msgspec.ValidationError):
+            msgspec.convert(wrong, SETTINGS.table[name].type)
 
 
 def test_present_values_are_read_and_nothing_is_written(bench: ModbusBench) -> None:
@@ -64,42 +77,17 @@ def test_a_setting_written_saved_and_restarted_is_what_is_read(bench: ModbusBenc
             assert written is Written.UNVERIFIED
 
 
-def test_values_are_those_of_the_type() -> None:
-    for name, values in VALUES.items():
-        for value in values:
-            assert msgspec.convert(value, SETTINGS.table[name].type) == value
-    for name, wrong in (("mode", 9), ("mounting", "z_up"), ("baud", 12345), ("address", 129), ("address", 0)):
-        with pytest.raises(msgspec.ValidationError):
-            msgspec.convert(wrong, SETTINGS.table[name].type)
-
-
-def test_a_rate_that_the_line_has_not_is_refused() -> None:
+def test_values_that_are_refused_left_out_or_ignored() -> None:
     bench = ModbusBench()
     SETTINGS.check(bench.target, {"baud": 115200, "mode": "9-axis"})
     SETTINGS.check(bench.target, {})
     with pytest.raises(BadArgument, match="expected 115200, the rate of the line, got 9600"):
         SETTINGS.check(bench.target, {"baud": 9600})
-
-
-def test_what_a_module_does_not_tell_is_left_out() -> None:
     bench = ModbusBench(module(7, dead=True))
     assert present(bench) == {}
     strange = ModbusBench(module(7))
     strange.slave.settings = strange.slave.settings.__class__(7, 115200, 5)
     assert present(strange) == {"baud": 115200, "address": 7}
-
-
-def test_effects_are_those_of_the_manual() -> None:
-    effects = {name: (one.effect, one.connection) for name, one in SETTINGS.table.items()}
-    assert effects == {
-        "mode": (Effect.AT_ONCE, False),
-        "mounting": (Effect.AFTER_RESTART, False),
-        "baud": (Effect.AFTER_RESTART, True),
-        "address": (Effect.AT_ONCE, True),
-    }
-
-
-def test_a_module_that_ignores_a_value_is_no_success() -> None:
     for name in ("mode", "address"):
         register = {"mode": "HEADING_MODE", "address": "MD_ID"}[name]
         bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({register}))))

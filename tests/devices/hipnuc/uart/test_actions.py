@@ -84,35 +84,26 @@ HALF_TURN = "a number from -180 to 180"
     [
         ("output", {"message": "HI91", "rate_hz": 500}, "expected at most 100 Hz"),  # more than 115200 baud carry
         ("output", {"message": "HI91", "rate_hz": 300}, RATES),
-        ("output", {"message": "HI91", "rate_hz": -1}, RATES),
         ("output", {"message": "HI93", "rate_hz": 1}, 'one of "HI91", "HI92"'),
-        ("output", {"message": None, "rate_hz": 10}, 'one of "HI91", "HI92"'),
         ("output_on_mark", {"message": None}, 'one of "HI91", "HI92"'),
         ("output_once", {"message": None}, 'one of "HI91", "HI92"'),
         ("mode", {"axes": 7}, "one of 6, 9"),
-        ("mode", {"axes": None}, "one of 6, 9"),
         ("level", {"level": None}, '"automatic", "cancel", "relative"'),
         ("mounting", {"turned": [1.0] * 8}, "or a list of 9, each of it a number"),
-        ("mounting", {"turned": [1.0] * 10}, "or a list of 9, each of it a number"),
         ("mounting", {"turned": [2, 0, 0, 0, 1, 0, 0, 0, 1]}, "expected a rotation"),
         ("magnetic_calibration", {"enabled": None}, "true or false"),
-        ("yaw", {"angle_deg": 181}, HALF_TURN),
         ("yaw", {"angle_deg": 180.1}, HALF_TURN),
         ("yaw", {"angle_deg": math.nan}, HALF_TURN),
-        ("yaw", {"angle_deg": -math.inf}, HALF_TURN),
         ("yaw", {"angle_deg": True}, HALF_TURN),
         ("yaw", {"angle_deg": 5, "relative": None}, "true or false"),
         ("pin", {"function": "sin", "pin": 10}, "a whole number from 1 to 9"),
         ("pin", {"function": "sin", "pin": 0}, "a whole number from 1 to 9"),
         ("pin", {"function": None, "pin": 1}, '"sin", "sout"'),
         ("alarm", {"axis": "X", "min_deg": 5, "max_deg": -5}, "expected the minimum below the maximum"),
-        ("alarm", {"axis": "X", "min_deg": -5, "max_deg": math.inf}, HALF_TURN),
         ("alarm", {"axis": None, "min_deg": -5, "max_deg": 5}, 'one of "X", "Y"'),
         ("sout_divider", {"divisor": 0}, "from 1 to 64"),
         ("sout_divider", {"divisor": 65}, "from 1 to 64"),
-        ("sout_divider", {"divisor": True}, "from 1 to 64"),
         ("baud", {"baud": 1200}, "one of 9600, 115200, 230400, 256000, 460800, 921600"),
-        ("baud", {"baud": 57600}, "one of 9600, 115200, 230400, 256000, 460800, 921600"),
     ],
 )
 @pytest.mark.manual("B 2.2.4 YAW range", "B 2.2.4 divider")
@@ -126,9 +117,6 @@ def test_refusal_and_silence() -> None:
         sent("save", [Rejection(("ERR 3",))])
     with pytest.raises(NoReply, match="SAVECONFIG: expected OK, got nothing"):
         sent("save", [Silence(())])
-
-
-def test_a_module_that_is_lost_says_so() -> None:
     left: list[Outcome] = [OK, OK, *([Silence(())] * 7)]
     with pytest.raises(NoReply, match="expected an answer at 115200 or 921600 baud"):
         sent("baud", left, baud=921600)
@@ -137,9 +125,6 @@ def test_a_module_that_is_lost_says_so() -> None:
 def test_output_reads_what_else_is_sent_and_then_sets_it() -> None:
     requests, _ = sent("output", [Reply(("LOG HI92 ONTIME 0.1", "OK")), OK], message="HI91", rate_hz=100)
     assert [request.name for request in requests] == ["LOG COMCONFIG", "LOG HI91 ONTIME 0.01"]
-
-
-def test_output_is_set_where_the_module_does_not_tell_what_it_sends() -> None:
     requests, _ = sent("output", [Silence(()), OK], message="HI91", rate_hz=50)
     assert requests[-1].name == "LOG HI91 ONTIME 0.02"
 

@@ -38,7 +38,6 @@ PRINTED = [
     (c.mounting(c.Mounting.LEVEL), "CONFIG IMU URFR 1,0,0,0,1,0,0,0,1"),
     (c.mounting(((0.8, -0.6, 0), (0.6, 0.8, 0), (0, 0, 1))), "CONFIG IMU URFR 0.8,-0.6,0,0.6,0.8,0,0,0,1"),
     (c.magnetic_calibration(True), "CONFIG IMU EN_MCAL 1"),
-    (c.magnetic_calibration(False), "CONFIG IMU EN_MCAL 0"),
     (c.pin_function(c.PinFunction.LED, 2), "CONFIG PMUX3 IO2"),
     (c.pin_function(c.PinFunction.SOUT_DIV, 9), "CONFIG PMUX4 IO9"),
     (c.alarm(c.AlarmAxis.Y, -5, 5, True), "CONFIG PMUX5 Y,-5,5,0,1"),
@@ -49,12 +48,7 @@ PRINTED = [
     (c.log_ontime(H91, 100), "LOG HI91 ONTIME 0.01"),
     (c.log_ontime(H92, 20), "LOG HI92 ONTIME 0.05"),
     (c.log_ontime(H91, 0), "LOG HI91 ONTIME 0"),
-    (c.log_ontime(H91, 1), "LOG HI91 ONTIME 1"),
-    (c.log_ontime(H91, 500), "LOG HI91 ONTIME 0.002"),
-    (c.log_ontime(H91, 250), "LOG HI91 ONTIME 0.004"),
     (c.log_ontime(H91, 1000), "LOG HI91 ONTIME 0.001"),
-    (c.log_ontime(H91, 25), "LOG HI91 ONTIME 0.04"),
-    (c.log_ontime(H92, 125), "LOG HI92 ONTIME 0.008"),
     (c.log_onmark(H91), "LOG HI91 ONMARK 1"),
     (c.log_once(H91), "LOG HI91 ONMARK ONCE"),
     (c.ask(c.Query.VERSION), "LOG VERSION"),
@@ -96,20 +90,11 @@ def test_bad_arguments_are_refused_with_what_was_expected(make: Callable[[], obj
     assert "expected" in str(caught.value)
 
 
-@pytest.mark.manual("B 2.2.1 REBOOT")
-def test_reboot_is_silent_and_only_that() -> None:
-    assert [text for request, text in PRINTED if request.silent] == ["REBOOT"]
-
-
-@pytest.mark.parametrize("baud", c.BAUD_RATES)
-@pytest.mark.manual("B 3.7 rates by baud rate")
-def test_every_rate_of_table_3_7_is_a_rate_and_fits_through_the_line(baud: int) -> None:
-    for message, frame_bytes in ((H91, 82), (H92, 54)):
+@pytest.mark.manual("B 3.7 rates by baud rate", "B 2.2.1 REBOOT")
+def test_table_3_7_and_the_silent_command() -> None:
+    for baud, message, frame_bytes in [(baud, *one) for baud in c.BAUD_RATES for one in ((H91, 82), (H92, 54))]:
         rate = c.max_rate_hz(message, baud)
         assert rate in c.RATES_HZ
         assert rate * frame_bytes * 10 <= baud
-
-
-@pytest.mark.manual("B 3.7 rates by baud rate")
-def test_table_3_7_distinguishes_the_messages() -> None:
     assert (c.max_rate_hz(H91, 115200), c.max_rate_hz(H92, 115200)) == (100, 200)
+    assert [text for request, text in PRINTED if request.silent] == ["REBOOT"]

@@ -13,9 +13,6 @@ def test_version() -> None:
     assert (version.product, version.build, version.uuid) == ("HI14R3", "Oct 15 2024", "043995698D6E1708")
     assert (version.app_ver, version.bl_ver) == (156, 109)
     assert version.report.other == ()
-
-
-def test_version_of_another_firmware_is_read_as_far_as_it_goes() -> None:
     version = r.parse_version(("PNAME: CH0", "* boot ok *", "APP_VER=beta", "COLOUR=red", "PNAME=again", "OK"))
     assert (version.product, version.uuid, version.app_ver) == ("CH0", "", None)
     assert version.report.values == {"PNAME": "CH0", "APP_VER": "beta", "COLOUR": "red"}
@@ -28,6 +25,15 @@ def test_usrconfig_with_the_comment_of_the_manual() -> None:
     assert config.att_mode == 1
     assert config.report.values == {"ATT_MODE": "1", "URFR": "1,0,0"}
     assert r.parse_usrconfig(("OK",)).att_mode is None
+    assert r.is_end("OK")
+    assert not r.is_end("OKAY")
+    assert r.is_rejection("ERR")
+    assert r.is_rejection("ERROR: no such command")
+    assert not r.is_rejection("ERR_COUNT=3")
+    assert all(map(r.is_version_line, VERSION[:-1]))
+    assert not any(map(r.is_setting_line, VERSION[:-1]))
+    assert r.is_setting_line("ATT_MODE: 0")
+    assert not r.is_version_line("ATT_MODE: 0")
 
 
 @pytest.mark.manual("B 2.2.5 COMCONFIG")
@@ -45,15 +51,3 @@ def test_comconfig_finds_periods_however_they_are_written() -> None:
 @pytest.mark.manual("B 8.1.1 result")
 def test_magconfig(line: str, bias_ut: tuple[float, float, float] | None) -> None:
     assert r.parse_magconfig((line, "OK")).bias_ut == bias_ut
-
-
-def test_line_kinds() -> None:
-    assert r.is_end("OK")
-    assert not r.is_end("OKAY")
-    assert r.is_rejection("ERR")
-    assert r.is_rejection("ERROR: no such command")
-    assert not r.is_rejection("ERR_COUNT=3")
-    assert all(map(r.is_version_line, VERSION[:-1]))
-    assert not any(map(r.is_setting_line, VERSION[:-1]))
-    assert r.is_setting_line("ATT_MODE: 0")
-    assert not r.is_version_line("ATT_MODE: 0")

@@ -6,7 +6,7 @@ from typing import TypeVar
 import pytest
 
 from imud.contracts.session import Outcome, Rejection, Reply, Request, RequestScript, Session, Silence
-from imud.devices.hipnuc.uart.commands import BAUD_RATES, OutputMessage, Query, ask, log_ontime
+from imud.devices.hipnuc.uart.commands import OutputMessage, Query, ask, log_ontime
 from imud.devices.hipnuc.uart.session import advice, identify, read_settings, wake
 from imud.errors import BadArgument, NoReply, Rejected
 from imud.ledger import Ledger
@@ -28,7 +28,7 @@ def hold(script: RequestScript[T], answer: Callable[[str], Outcome]) -> T:
 
 
 @pytest.mark.manual("B 2.2.5 VERSION")
-def test_identity() -> None:
+def test_identity_and_refusal() -> None:
     asked: list[str] = []
 
     def answer(name: str) -> Outcome:
@@ -40,10 +40,9 @@ def test_identity() -> None:
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
     assert identity.details is not None
     assert identity.details["APP_VER"] == "156"
-
-
-def test_identity_without_a_version() -> None:
     assert hold(identify(), lambda _: Reply(("PNAME=CH0", "OK"))).firmware == ""
+    with pytest.raises(Rejected, match="ERR 3"):
+        hold(identify(), lambda _: Rejection(("ERR 3",)))
 
 
 @pytest.mark.parametrize("lines", [(), ("PNAME=HI14R3",)])
@@ -58,11 +57,6 @@ def test_an_answer_that_lost_its_product_is_asked_for_again(lines: Sequence[str]
         hold(identify(), lambda _: Reply(tuple(lines)))
 
 
-def test_refusal() -> None:
-    with pytest.raises(Rejected, match="ERR 3"):
-        hold(identify(), lambda _: Rejection(("ERR 3",)))
-
-
 def test_settings_are_one_flat_mapping() -> None:
     assert hold(read_settings(), lambda name: Reply(REPLIES[name])) == {
         "ATT_MODE": "0",
@@ -70,9 +64,6 @@ def test_settings_are_one_flat_mapping() -> None:
         "COMCONFIG 1": "LOG HI91 ONTIME 0.01",
         "MB": "14.14, -2.08, -8.75",
     }
-
-
-def test_a_module_without_magnetometer_may_keep_silent_about_it() -> None:
     settings = hold(read_settings(), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n]))
     assert "ATT_MODE" in settings
     assert "MB" not in settings
@@ -95,9 +86,6 @@ def test_a_late_version_is_not_taken_for_the_settings() -> None:
     assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
     assert session.on_message("ATT_MODE: 0", 10**9 + 2) is None
     assert session.on_message("OK", 10**9 + 2) == Reply(("ATT_MODE: 0", "OK"))
-
-
-def test_the_late_ok_of_a_command_does_not_end_a_report() -> None:
     ledger = Ledger()
     session = Session(ledger)
     session.start(log_ontime(OutputMessage.HI91, 100), 0)
@@ -125,17 +113,12 @@ def test_another_baud_rate_is_followed_and_saved(behaviour: Behaviour, baud: int
     assert line.run(identify()).product == "HI14R3"
 
 
-@every_variant
 @pytest.mark.manual("B 2.2.3 a wrong rate")
-def test_a_module_that_refuses_another_rate_stays_reachable(behaviour: Behaviour) -> None:
-    refusing = Behaviour(flash_ms=behaviour.flash_ms, quiet_ms=behaviour.quiet_ms, refuses=("SERIALCONFIG",))
-    line = HipnucLine(hardware=hardware_of(refusing))
+def test_a_module_that_refuses_or_does_not_know_another_rate_stays_reachable() -> None:
+    line = HipnucLine(hardware=hardware_of(Behaviour(refuses=("SERIALCONFIG",))))
     with pytest.raises(Rejected, match="SERIALCONFIG 921600: the module refused: ERR"):
         line.act("baud", baud=921600)
     assert line.run(identify()).product == "HI14R3"
-
-
-def test_a_module_that_does_not_know_the_command_is_found_at_its_old_rate() -> None:
     line = HipnucLine(hardware=hardware_of(Behaviour(ignores=("SERIALCONFIG",))))
     with pytest.raises(NoReply, match="stays at 115200 baud"):
         line.act("baud", baud=921600)
@@ -178,7 +161,7 @@ def test_a_baud_rate_that_does_not_carry_the_present_output_is_refused(
     assert line.asked == ["LOG COMCONFIG"]
 
 
-@pytest.mark.manual("B 2.2.5 output and line")
+@pytest.mark.manual("B 2.2.5 output and line", "B 2.2.5 ONTIME")
 def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None:
     """100 Hz of HI91 take 82000 bit/s of 115200; HI92 takes 540 bit per frame: 95 % leave 50 Hz and not 100."""
     line = HipnucLine()
@@ -187,20 +170,16 @@ def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None
     assert "LOG HI92 ONTIME 0.01" not in line.asked
     line.act("output", message="HI92", rate_hz=50)
     assert line.module.settings.hi92 == Output(20)
-
-
-@pytest.mark.manual("B 2.2.5 ONTIME")
-def test_a_period_of_the_rule_and_so_on_is_accepted() -> None:
     line = HipnucLine()
     line.act("output", message="HI91", rate_hz=25)
     assert line.module.settings.hi91 == Output(40)
 
 
 @every_variant
-@pytest.mark.parametrize("baud", BAUD_RATES)
+@pytest.mark.parametrize("baud", [9600, 115200, 921600])
 @pytest.mark.manual("B 2.2.7 FRESET")
 def test_a_factory_reset_is_in_force_and_followed(behaviour: Behaviour, baud: int) -> None:
-    line = HipnucLine(ModuleSettings(baud=baud, att_mode=1, hi91=Output(200)), hardware_of(behaviour))
+    line = HipnucLine(ModuleSettings(baud=baud, att_mode=1, hi91=Output(1000)), hardware_of(behaviour))
     answer = line.act("factory_reset", fixed_baud=baud)
     assert answer["baud"] == line.baud == line.module.baud == 115200
     assert ("configuration" in answer) is (baud != 115200)
@@ -215,14 +194,6 @@ def test_a_factory_reset_that_is_refused_or_unknown_changes_nothing() -> None:
     with pytest.raises(NoReply, match="FRESET: expected OK, got nothing"):
         line.act("factory_reset")
     assert (line.baud, line.module.settings) == (921600, before)
-
-
-def test_a_rate_that_was_not_saved_is_followed_back_over_a_restart() -> None:
-    line = HipnucLine(hardware=hardware_of(Behaviour(rate_change=RateChange.AFTER_ANSWER)))
-    line.run(_send(line, "SERIALCONFIG 460800"))
-    line.baud = 460800
-    assert line.act("restart").product == "HI14R3"
-    assert line.baud == line.module.baud == 115200
 
 
 def _send(line: HipnucLine, command: str) -> RequestScript[None]:
@@ -271,6 +242,11 @@ def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSett
     assert line.module.settings == settings
 
 
-def test_advice_is_given_where_the_configuration_fixes_another_rate() -> None:
+def test_advice_and_a_rate_that_was_not_saved() -> None:
     assert advice(921600, 0) == advice(921600, 921600) == ""
     assert advice(921600, 115200).startswith("change `baud: 115200` in the configuration to 921600 or auto")
+    line = HipnucLine(hardware=hardware_of(Behaviour(rate_change=RateChange.AFTER_ANSWER)))
+    line.run(_send(line, "SERIALCONFIG 460800"))
+    line.baud = 460800
+    assert line.act("restart").product == "HI14R3"
+    assert line.baud == line.module.baud == 115200
