@@ -27,7 +27,8 @@ LEARNING_SETS = 10
 
 def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
     """Calls a test with every driver and with seeds."""
-    return every_driver(given(seed=st.integers(0, 2**32))(test))
+    seeded: Callable[..., None] = every_driver(given(seed=st.integers(0, 2**32))(test))
+    return seeded
 
 
 def make(driver: CanDriver) -> CanCodec:

@@ -27,7 +27,8 @@ every_driver = pytest.mark.parametrize("name", NAMES)
 
 def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:
     """Calls a test with every driver and with seeds."""
-    return every_driver(given(seed=st.integers(0, 2**32))(test))
+    seeded: Callable[..., None] = every_driver(given(seed=st.integers(0, 2**32))(test))
+    return seeded
 
 
 def row(name: str) -> PolledDriver:

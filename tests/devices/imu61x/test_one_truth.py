@@ -33,8 +33,8 @@ from tests.support.simulated_modules import over_i2c, over_spi
 EPOCH_NS = 5_000_000_000
 """Zero of the motion, the same for all devices."""
 STEP_NS = 10_000_000
-INSTANTS = [EPOCH_NS + 500_000_000 + n * STEP_NS for n in range(1, 401)]
-"""4 s of motion from 510 ms after power-on, where all have booted."""
+INSTANTS = [EPOCH_NS + 500_000_000 + n * STEP_NS for n in range(1, 201)]
+"""2 s of motion from 510 ms after power-on, where all have booted."""
 MOTION = swing(9.80665)
 
 G, DEG = 9.80665, 0.017453292519943295
@@ -181,7 +181,7 @@ def test_any_two_formats_agree_within_both_of_their_resolutions(read: dict[str, 
             assert value <= allowed * ROUNDING, (field, instant_ns - EPOCH_NS)
 
 
-def test_the_motion_is_one_that_would_show_a_mistake() -> None:
+def test_the_motion_is_one_that_would_show_a_mistake(read: dict[str, Read]) -> None:
     """Every axis moves and every value differs from the others, within the ranges that the resolutions are for."""
     truths = [MOTION.at((instant_ns - EPOCH_NS) / 1e9) for instant_ns in INSTANTS]
     for axis in range(3):
@@ -192,8 +192,5 @@ def test_the_motion_is_one_that_would_show_a_mistake() -> None:
         assert max(map(abs, accel)) < 2 * G
         assert max(map(abs, gyro)) < 128 * DEG
         assert max(abs(truth.euler_rad[axis]) for truth in truths) < 128 * DEG
-
-
-def test_angles_agree_where_they_are_carried(read: dict[str, Read]) -> None:
     with_angles = {name for name in read if read[name][INSTANTS[0]].euler_rad is not None}
     assert with_angles == {"uart", "spi extended", "can"}

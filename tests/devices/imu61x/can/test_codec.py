@@ -51,8 +51,10 @@ def indices(events: list[CodecEvent]) -> list[int | None]:
     return [event.dev_ticks for event in events if isinstance(event, Measurement)]
 
 
-@pytest.mark.manual("A 4.2 frame 101", "A 4.2 frame 102", "A 4.2 frame 103", "A 4.2 frame 104", "A 4.2 frame 105")
-def test_golden_set_in_si_units() -> None:
+@pytest.mark.manual(
+    "A 4.2 frame 101", "A 4.2 frame 102", "A 4.2 frame 103", "A 4.2 frame 104", "A 4.2 frame 105", "A 4.1 frames"
+)
+def test_golden_set_in_si_units_and_back() -> None:
     (measured,) = feed(make(), GOLDEN)
     assert isinstance(measured, Measurement)
     assert measured.euler_rad == pytest.approx((0.0261799388, -0.0349065850, 1.5707963268), abs=1e-9)
@@ -63,10 +65,18 @@ def test_golden_set_in_si_units() -> None:
     assert measured.size_bytes == 40
     # half angles 0.75°, -1°, 45°: w = 0.70710678 (0.99984770 · 0.99991433 - 0.01745241 · 0.01308960) and so on
     assert measured.quat_wxyz == pytest.approx((0.7067770, 0.0215940, -0.0030853, 0.7071000), abs=1e-7)
-
-
-@pytest.mark.manual("A 4.2 frame 105")
-def test_index_wraps() -> None:
+    made = encode_set(
+        index=65535,
+        accel_m_s2=(9.80665, 2.4516625, -9.80665),
+        gyro_rad_s=(math.radians(10), math.radians(-20), math.radians(0.5)),
+        euler_rad=(math.radians(1.5), math.radians(-2), math.radians(90)),
+        temperature_c=25.0,
+    )
+    assert made == GOLDEN
+    codec = make()
+    for can_id, data in GOLDEN:
+        assert not codec.feed_frame(can_id, True, data, 0)
+    assert codec.ledger.bytes_skipped == 40
     codec = make()
     found = [indices(feed(codec, sample(index))) for index in (65534, 65535, 65536, 65537)]
     assert found == [[65534], [65535], [0], [1]]
@@ -81,17 +91,6 @@ def test_temperature_is_in_hundredths(raw: str, expected: float) -> None:
     assert measured.temperature_c == pytest.approx(expected)
 
 
-def test_encode_gives_the_golden_frames() -> None:
-    made = encode_set(
-        index=65535,
-        accel_m_s2=(9.80665, 2.4516625, -9.80665),
-        gyro_rad_s=(math.radians(10), math.radians(-20), math.radians(0.5)),
-        euler_rad=(math.radians(1.5), math.radians(-2), math.radians(90)),
-        temperature_c=25.0,
-    )
-    assert made == GOLDEN
-
-
 def test_base_identifier_moves_all_five() -> None:
     moved = [(can_id - 101 + 600, data) for can_id, data in GOLDEN]
     assert indices(feed(make(600), moved)) == [65535]
@@ -103,7 +102,7 @@ def test_base_identifier_moves_all_five() -> None:
         msgspec.convert({"base_id": 2044}, Imu61xCanSettings)
 
 
-def test_incomplete_set_comes_to_nothing_and_is_ignored() -> None:
+def test_incomplete_mixed_and_disordered_sets() -> None:
     for missing in range(5):
         codec = make()
         frames = sample(7)
@@ -112,8 +111,14 @@ def test_incomplete_set_comes_to_nothing_and_is_ignored() -> None:
         assert codec.ledger.frames_ignored == 4
         assert codec.ledger.frames_in_samples == 5
 
+    codec = make()
+    first, second = sample(1, 1.0), sample(2, 2.0)
+    events = feed(codec, first[:4] + second[1:])  # the first one's 105 and the second one's 101 are lost
+    assert events == []
+    late = sample(9, 3.0)
+    events = feed(codec, second[2:4] + late[:2] + late[4:])  # joined inside a set, then 105, 103 and 104 lost
+    assert events == []
 
-def test_other_order_counts_only_while_index_goes_on() -> None:
     codec = make()
     mixed = [sample(4)[n] for n in (2, 0, 3, 1, 4)]
     assert indices(feed(codec, mixed)) == []  # nothing is known before
@@ -122,16 +127,6 @@ def test_other_order_counts_only_while_index_goes_on() -> None:
     mixed = [sample(7)[n] for n in (2, 0, 3, 1, 4)]
     assert indices(feed(codec, mixed)) == []
     assert codec.ledger.frames_ignored == 10
-
-
-def test_two_sets_without_the_105_between_them_are_not_mixed() -> None:
-    codec = make()
-    first, second = sample(1, 1.0), sample(2, 2.0)
-    events = feed(codec, first[:4] + second[1:])  # the first one's 105 and the second one's 101 are lost
-    assert events == []
-    late = sample(9, 3.0)
-    events = feed(codec, second[2:4] + late[:2] + late[4:])  # joined inside a set, then 105, 103 and 104 lost
-    assert events == []
 
 
 PERIOD_NS = 10_000_000
@@ -170,24 +165,20 @@ def test_frames_of_two_samples_in_order_are_told_by_time(cut: int) -> None:
     assert timed(codec, 78) == [78]
 
 
-def test_whole_set_after_a_gap_counts_though_its_index_does_not_follow() -> None:
+def test_time_tells_whole_sets_from_mixed_ones() -> None:
+    """At 100 Hz, on a bus that is nearly full, before a period is known, and after a pause or at another rate."""
     codec = learned()
     assert [timed(codec, index) for index in (17, 18, 400, 401)] == [[17], [18], [400], [401]]
     # the last frame 4.9 ms late: 5.9 ms are less than 1 ms + half of 10 ms
     assert timed(codec, 410, "1234") + timed(codec, 410, "5", late_ns=4_900_000) == [410]
     assert timed(codec, 420, "1234") + timed(codec, 420, "5", late_ns=5_100_000) == []
 
-
-def test_bus_that_is_nearly_full_is_told_by_time_as_well() -> None:
-    """Sets of 1 ms every 1.25 ms: a mixture takes 2.25 ms, the limit is 1.625 ms."""
     period_ns = 1_250_000
     codec = learned(period_ns)
     assert timed(codec, 15, period_ns=period_ns) == [15]
     assert timed(codec, 16, "123", period_ns=period_ns) + timed(codec, 17, "45", period_ns=period_ns) == []
     assert timed(codec, 19, period_ns=period_ns) == [19]
 
-
-def test_before_anything_is_learned_a_set_in_order_counts() -> None:
     codec = make()
     assert timed(codec, 1, "123") + timed(codec, 2, "45") == [2]
     assert [timed(codec, index) for index in range(3, 10)] == [[index] for index in range(3, 10)]
@@ -195,8 +186,6 @@ def test_before_anything_is_learned_a_set_in_order_counts() -> None:
     timed(codec, 13)
     assert timed(codec, 14, "123") + timed(codec, 15, "45") == []
 
-
-def test_what_was_learned_follows_a_faster_rate_and_not_a_pause() -> None:
     codec = make()
     for index in range(1, 20):
         timed(codec, index)
@@ -216,8 +205,6 @@ def test_wrong_length_is_a_bad_frame() -> None:
     assert events == [BadFrame(BadReason.LENGTH, b"\1\2\3")]
     assert (codec.ledger.frames_bad_length, codec.ledger.bytes_in_bad_frames) == (1, 3)
 
-
-def test_values_that_are_not_finite_are_left_out_and_told() -> None:
     frames = sample(1)
     frames[1] = (102, struct.pack("<2f", math.nan, 1.0))
     frames[4] = (105, struct.pack("<fhH", math.inf, 2500, 1))
@@ -230,11 +217,3 @@ def test_values_that_are_not_finite_are_left_out_and_told() -> None:
     assert measured.gyro_rad_s is not None
     assert codec.ledger.frames_not_finite == 2
     assert codec.ledger.frames_in_samples == 5
-
-
-@pytest.mark.manual("A 4.1 frames")
-def test_extended_identifiers_are_not_ours() -> None:
-    codec = make()
-    for can_id, data in GOLDEN:
-        assert not codec.feed_frame(can_id, True, data, 0)
-    assert codec.ledger.bytes_skipped == 40

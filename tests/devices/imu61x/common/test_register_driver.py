@@ -49,10 +49,6 @@ def test_filters_are_set_and_answered(driver: PolledDriver, settings: RegisterSe
     assert (answer["accel_filter"], answer["gyro_filter"]) == ("10 Hz", "47 Hz")
     wires.act(driver, settings, gyro_filter=0)
     assert wires.device.filter == 0x40
-
-
-@pytest.mark.parametrize(("driver", "settings"), BUSES)
-def test_nothing_given_writes_nothing(driver: PolledDriver, settings: RegisterSettings) -> None:
     wires = Wires()
     wires.act(driver, settings)
     assert wires.transfers == (1 if driver is I2C else 2)  # the register; on SPI a burst as well
@@ -71,10 +67,6 @@ def test_what_the_configuration_says_stays(driver: PolledDriver) -> None:
     assert wires.transfers == 0
     wires.act(driver, settings, gyro_filter=3, accel_filter=4)  # type: ignore[arg-type]  # the same
     assert wires.device.filter == 0x43
-
-
-@pytest.mark.parametrize("driver", [I2C, SPI])
-def test_filters_by_name_in_options_and_arguments(driver: PolledDriver) -> None:
     settings = msgspec.convert({"gyro_filter": "5 Hz"}, driver.settings)
     wires = Wires()
     wires.act(driver, settings, gyro_filter=3, accel_filter="average 16")  # type: ignore[arg-type]  # the driver's own
@@ -113,10 +105,6 @@ def test_each_filter_is_a_setting_of_its_own(driver: PolledDriver, settings: Reg
         assert wires.device.filter == control
         assert one.agrees(value, read_table(wires, driver, target)[name])
     assert not table.table["gyro_filter"].agrees("10 Hz", "5 Hz")
-
-
-@pytest.mark.parametrize(("driver", "settings"), BUSES)
-def test_reading_the_settings_changes_nothing(driver: PolledDriver, settings: RegisterSettings) -> None:
     wires = Wires()
     wires.device.filter, wires.device.extended = 0x12, 1
     found = read_table(wires, driver, Target(settings, 0))

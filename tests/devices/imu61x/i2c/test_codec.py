@@ -33,12 +33,28 @@ def test_burst_in_si() -> None:
 
 
 @pytest.mark.manual("A 3.3.1 CRC")
-def test_crc_covers_all_28_bytes() -> None:
+def test_damaged_stale_absent_and_foreign_bytes() -> None:
     for at in range(32):
         damaged = GOLDEN[:at] + bytes([GOLDEN[at] ^ 0x80]) + GOLDEN[at + 1 :]
         made = codec()
         assert made.decode(0, damaged) == (BadFrame(BadReason.CRC, damaged),)
         assert made.ledger.closes()
+
+    made = codec()
+    made.decode(0, GOLDEN)
+    assert made.decode(0, GOLDEN) == ()
+    assert made.stale == 1
+    for data in (b"\xff" * 32, b"\x00" * 32, b"", GOLDEN[:31]):
+        assert isinstance(made.decode(0, data)[0], Vanished)
+    assert made.ledger.closes()
+
+    made = codec(gyro_filter=3)
+    assert made.decode(1, b"\x00\x00IMU612") == ()
+    assert made.decode(2, b"\xb3") == ()
+    assert made.ledger.frames_in_replies == 2
+    for poll, data in ((1, b"\x00\x00IMU61C"), (2, b"\xbb"), (1, b""), (2, b"")):
+        assert isinstance(made.decode(poll, data)[0], Vanished)
+    assert made.ledger.closes()
 
 
 def test_infinite_value_is_left_out_and_told() -> None:
@@ -49,23 +65,3 @@ def test_infinite_value_is_left_out_and_told() -> None:
     assert isinstance(m, Measurement)
     assert m.gyro_rad_s is None
     assert m.accel_m_s2 == (0, 0, G)
-
-
-def test_stale_absent_and_short() -> None:
-    made = codec()
-    made.decode(0, GOLDEN)
-    assert made.decode(0, GOLDEN) == ()
-    assert made.stale == 1
-    for data in (b"\xff" * 32, b"\x00" * 32, b"", GOLDEN[:31]):
-        assert isinstance(made.decode(0, data)[0], Vanished)
-    assert made.ledger.closes()
-
-
-def test_identity_and_filter_are_watched() -> None:
-    made = codec(gyro_filter=3)
-    assert made.decode(1, b"\x00\x00IMU612") == ()
-    assert made.decode(2, b"\xb3") == ()
-    assert made.ledger.frames_in_replies == 2
-    for poll, data in ((1, b"\x00\x00IMU61C"), (2, b"\xbb"), (1, b""), (2, b"")):
-        assert isinstance(made.decode(poll, data)[0], Vanished)
-    assert made.ledger.closes()

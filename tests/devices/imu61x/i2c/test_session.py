@@ -36,8 +36,5 @@ def test_set_up_writes_reads_back_and_leaves_alone() -> None:
     log.clear()
     run_transfer_script(set_up(RegisterSettings()), transfer)
     assert len(log) == 1
-
-
-def test_filter_that_does_not_take_is_refused() -> None:
     with pytest.raises(DeviceRefused, match="wrote 0x4b, read back 0xbb"):
         run_transfer_script(set_up(RegisterSettings(accel_filter=4)), lambda one: b"\xbb" * one.read_bytes)

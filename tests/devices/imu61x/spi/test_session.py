@@ -33,16 +33,15 @@ class Wire:
         return data
 
 
-@pytest.mark.manual("A 2.4 PROD_ID", "A 2.4.3 reading")
-def test_probe_names_the_product_and_closes_the_window() -> None:
+@pytest.mark.manual(
+    "A 2.4 PROD_ID", "A 2.4.3 reading", "A 2.4 BURST_CTRL", "A 2.4 FILTER_CTRL", "A 2.4.2 write and read"
+)
+def test_probe_and_set_up() -> None:
     wire = Wire()
     assert run_transfer_script(probe(SpiDeviceSettings()), wire.transfer).product == "IMU614"
     assert wire.device.window == 0
     assert len(wire.sent) == 1
 
-
-@pytest.mark.manual("A 2.4 BURST_CTRL", "A 2.4 FILTER_CTRL", "A 2.4.2 write and read")
-def test_set_up_writes_what_differs_only() -> None:
     wire = Wire()
     words = run_transfer_script(set_up(SpiDeviceSettings()), wire.transfer)
     assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
@@ -54,6 +53,17 @@ def test_set_up_writes_what_differs_only() -> None:
     assert wire.sent[5] == "fe01 8d01 fe00 7e00 7e00"
     assert len(wire.sent) == 7
     assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
+
+    wire = Wire()
+    wire.device.extended = 1
+    flips = iter([0, 0, 1, 0, 0])  # the first burst after it was selected
+
+    def transfer(one: Transfer) -> bytes:
+        wire.device.faults.flips = next(flips)
+        return wire.transfer(one)
+
+    assert run_transfer_script(set_up(SpiDeviceSettings()), transfer)["burst"] == "standard"
+    assert wire.device.extended == 0
 
 
 @pytest.mark.parametrize("fail_at", [0, 1, 2])
@@ -89,19 +99,6 @@ def test_kind_of_burst_wherever_it_reads_back(
         assert words["burst"] == burst
         assert wire.device.extended == (burst == "extended")
     assert wire.device.window == 0
-
-
-def test_one_damaged_burst_is_no_refusal() -> None:
-    wire = Wire()
-    wire.device.extended = 1
-    flips = iter([0, 0, 1, 0, 0])  # the first burst after it was selected
-
-    def transfer(one: Transfer) -> bytes:
-        wire.device.faults.flips = next(flips)
-        return wire.transfer(one)
-
-    assert run_transfer_script(set_up(SpiDeviceSettings()), transfer)["burst"] == "standard"
-    assert wire.device.extended == 0
 
 
 @pytest.mark.parametrize(

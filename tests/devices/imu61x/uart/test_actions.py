@@ -1,6 +1,6 @@
 """Actions of an IMU61x on a UART, against the simulated device."""
 
-from math import inf, nan
+from math import nan
 from typing import Any
 
 import pytest
@@ -66,8 +66,8 @@ def test_every_order_to_a_device_that_refuses_is_an_error(name: str) -> None:
     assert len(far.samples(100)) >= 15
 
 
-@pytest.mark.manual("A 1.6 CMD 3 stream", "A 1.6 CMD 3 command")
-def test_stop_and_start() -> None:
+@pytest.mark.manual("A 1.6 CMD 3 stream", "A 1.6 CMD 3 command", "A 1.6 CMD 14, 3")
+def test_answers_of_actions() -> None:
     far = imu61x_bench()
     answer = act(far, "stop_streaming")
     assert answer["output_mode"] == "command"
@@ -75,6 +75,30 @@ def test_stop_and_start() -> None:
     assert not far.samples(50)
     act(far, "start_streaming")
     assert far.samples(50)
+
+    far = imu61x_bench()
+    assert act(far, "baud", baud=460800) == BaudChange(460800, saved=True)
+    assert far.baud == far.module.baud == 460800
+
+    far = imu61x_bench()
+    assert act(far, "status")["model_number"] == 614
+    assert act(far, "settings")["output_rate_hz"] == "100"
+    assert set(act(far, "sample_once")) > {"accel_m_s2", "gyro_rad_s"}
+
+    far = imu61x_bench()
+    for name in ("calibrate_gyro", "calibrate_installation"):
+        assert len(act(far, name)) == 3
+
+    far = imu61x_bench(result_done=4)
+    act(far, "save", Imu61xUartSettings(result_done=4))
+    with pytest.raises(CommandError, match=r"options\.result_done"):
+        act(far, "save")
+
+    far = imu61x_bench(uptime_us=20_000_000)
+    act(far, "baud", baud=921600)
+    assert getattr(act(far, "restart"), "product", "") == "IMU61x"
+    act(far, "factory_reset")
+    assert far.baud == far.module.baud == 115200
 
 
 @pytest.mark.manual("A 1.6 CMD 14, 21", "A 1.6 CMD 14, 27", "A 1.6 CMD 14, 30", "A 1.6 CMD 14, 31")
@@ -104,13 +128,15 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
     with pytest.raises(BadArgument, match="lower the output rate first"):
         act(far, "baud", baud=115200)
     assert len(far.samples(100)) >= 35
-
-
-@pytest.mark.manual("A 1.6 CMD 14, 3")
-def test_baud_is_followed() -> None:
-    far = imu61x_bench()
-    assert act(far, "baud", baud=460800) == BaudChange(460800, saved=True)
-    assert far.baud == far.module.baud == 460800
+    assert "10 = 40 Hz, 11 = 47 Hz, 12 = average 4" in ACTIONS["filter"].help
+    for name, words in (
+        ("stop_streaming", "cuts off"),
+        ("baud", "`uart.baud`"),
+        ("factory_reset", "`uart.baud`"),
+        ("i2c_address", "`i2c.address`"),
+        ("bus", "loses the device"),
+    ):
+        assert words in ACTIONS[name].help
 
 
 @pytest.mark.parametrize("name", ["baud", "factory_reset"])
@@ -124,72 +150,24 @@ def test_a_fixed_rate_in_the_configuration_is_to_be_changed(name: str) -> None:
     assert far.run(back.script(Target(None, 115200, 921600), back.arguments({"baud": 921600}))).configuration == ""
 
 
-def test_questions_have_names_and_units() -> None:
-    far = imu61x_bench()
-    assert act(far, "status")["model_number"] == 614
-    assert act(far, "settings")["output_rate_hz"] == "100"
-    assert set(act(far, "sample_once")) > {"accel_m_s2", "gyro_rad_s"}
-
-
-def test_calibrations_answer_three_numbers() -> None:
-    far = imu61x_bench()
-    for name in ("calibrate_gyro", "calibrate_installation"):
-        assert len(act(far, name)) == 3
-
-
-def test_options_give_the_codes() -> None:
-    far = imu61x_bench(result_done=4)
-    act(far, "save", Imu61xUartSettings(result_done=4))
-    with pytest.raises(CommandError, match=r"options\.result_done"):
-        act(far, "save")
-
-
-def test_what_may_be_cut_off_is_said_in_the_help() -> None:
-    assert "10 = 40 Hz, 11 = 47 Hz, 12 = average 4" in ACTIONS["filter"].help
-    for name, words in (
-        ("stop_streaming", "cuts off"),
-        ("baud", "`uart.baud`"),
-        ("factory_reset", "`uart.baud`"),
-        ("i2c_address", "`i2c.address`"),
-        ("bus", "loses the device"),
-    ):
-        assert words in ACTIONS[name].help
-
-
-def test_restart_and_factory_reset_keep_contact() -> None:
-    far = imu61x_bench(uptime_us=20_000_000)
-    act(far, "baud", baud=921600)
-    assert getattr(act(far, "restart"), "product", "") == "IMU61x"
-    act(far, "factory_reset")
-    assert far.baud == far.module.baud == 115200
-
-
 @pytest.mark.parametrize(
     ("name", "arguments", "named"),
     [
         ("baud", {"baud": 9600}, "one of 115200, 230400, 460800, 921600, 1500000"),
         ("baud", {"baud": True}, "baud"),
         ("rate", {"rate_hz": 0}, "one of 1, 10, 50, 100, 200, 400"),
-        ("rate", {"rate_hz": 33}, "rate_hz"),
-        ("rate", {"rate_hz": 99}, "rate_hz"),
         ("rate", {"rate_hz": 100.5}, "rate_hz"),
         ("bus", {"bus": 1}, '"spi"'),
-        ("bus", {"bus": "can"}, '"spi"'),
         ("i2c_address", {"address": 0x1C}, "address"),
-        ("i2c_address", {"address": 0x20}, "one of 24, 25, 26, 27"),
-        ("i2c_address", {"address": 0x50}, "address"),
         ("i2c_address", {"address": "0x1c"}, "address"),
         ("i2c_address", {"address": "18"}, "address"),
         ("filter", {"accel_filter": 16, "gyro_filter": 0}, "accel_filter"),
         ("filter", {"accel_filter": "9 Hz", "gyro_filter": 0}, '"0.2 Hz", "1 Hz", "2 Hz", "5 Hz", "10 Hz", "15 Hz"'),
-        ("filter", {"accel_filter": 0, "gyro_filter": 16}, "gyro_filter"),
         ("filter", {"accel_filter": -1, "gyro_filter": 0}, "accel_filter"),
         ("filter", {"accel_filter": 0, "gyro_filter": True}, "gyro_filter"),
         ("heading", {"heading_deg": -0.1}, "from 0 to 360"),
         ("heading", {"heading_deg": 360.1}, "from 0 to 360"),
-        ("heading", {"heading_deg": 361}, "from 0 to 360"),
         ("heading", {"heading_deg": nan}, "from 0 to 360"),
-        ("heading", {"heading_deg": inf}, "from 0 to 360"),
         ("heading", {"heading_deg": True}, "from 0 to 360"),
         ("heading", {"heading_deg": "90"}, "from 0 to 360"),
     ],

@@ -57,35 +57,24 @@ def test_without_an_acknowledgement_it_is_not_known_whether_it_began(
 ) -> None:
     with pytest.raises(NoReply, match="though the device answers: whether it is done is not known"):
         imu61x_bench(acknowledges=False).run(script())
-
-
-@pytest.mark.parametrize("script", ACKNOWLEDGING)
-def test_a_refusal_is_an_error(script: Callable[[], RequestScript[object]]) -> None:
     refuses = frozenset({Command.CALIBRATE_GYRO, Command.CALIBRATE_INSTALLATION})
     with pytest.raises(Rejected, match=r"calibration: expected result 0 \(done\), got 2"):
         imu61x_bench(refuses=refuses).run(script())
 
 
-def test_gyro_calibration_of_a_moving_device_is_refused() -> None:
+def test_results_and_codes_of_calibrations() -> None:
     far = imu61x_bench(motion=swing())
     with pytest.raises(Rejected, match=r"gyro calibration: expected result 0 \(done\), got 2"):
         far.run(calibrating.calibrate_gyro())
 
-
-def test_one_option_says_which_result_means_done() -> None:
     with pytest.raises(Rejected, match=r"expected result 0 .*got 1: it refused, or `options.result_done`"):
         imu61x_bench(result_done=1).run(calibrating.calibrate_gyro())
 
-
-def test_codes_of_the_calibration_status_are_an_option_too() -> None:
-    """The simulated device says 1 while it calibrates: taken for rest, the calibration is over at once."""
     far = imu61x_bench(noise=Noise(3))
     assert far.run(calibrating.calibrate_gyro(rest=1)) == (0, 0, 0)
     with pytest.raises(NoReply, match=r"within 60 s, got calibration status 0 \(`options.calibration_done`: 7\)"):
         imu61x_bench().run(calibrating.calibrate_installation(rest=7))
 
-
-def test_offsets_that_are_found_again_end_by_time_where_the_device_does_not_tell() -> None:
     far = imu61x_bench(Imu61xSettings(gyro_off_deg_s=(0.0, 0.0, 0.0)), reports_calibration=False, noise=None)
     begun_ns = far.now_ns
     assert far.run(calibrating.calibrate_gyro()) == (0, 0, 0)

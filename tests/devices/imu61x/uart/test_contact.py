@@ -46,6 +46,9 @@ def test_result_is_judged_by_the_option() -> None:
         far.run(contact.ordered(commands.reset_heading(0), 0))
     far = imu61x_bench(Imu61xSettings(mode=OutputMode.COMMAND), acknowledges=False)
     assert far.run(contact.ordered(commands.reset_heading(0), 0)) is False
+    assert Imu61xUartSettings() == Imu61xUartSettings(result_done=0, calibration_done=0)
+    assert contact.result_of(Silence(())) is None
+    assert contact.result_of(Reply(("text",))) is None
 
 
 def test_a_device_that_never_answers_again_is_no_reply() -> None:
@@ -58,12 +61,3 @@ def test_a_device_that_never_answers_again_is_no_reply() -> None:
             asked += 1
     assert asked == contact.SETTLE_TRIES
     assert request.name == "status"
-
-
-def test_options_are_codes_of_the_device() -> None:
-    assert Imu61xUartSettings() == Imu61xUartSettings(result_done=0, calibration_done=0)
-
-
-def test_result_of_outcomes_without_one() -> None:
-    assert contact.result_of(Silence(())) is None
-    assert contact.result_of(Reply(("text",))) is None

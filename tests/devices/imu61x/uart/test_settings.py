@@ -99,7 +99,7 @@ def test_a_refusing_device_is_an_error(name: str) -> None:
     assert read(far) == FACTORY
 
 
-def test_rate_and_baud_must_go_together_either_way() -> None:
+def test_what_goes_together_and_what_can_be_declared() -> None:
     present = Target(None, 115200)
     SETTINGS.check(present, {"output_rate_hz": 200})
     SETTINGS.check(present, {"output_rate_hz": 400, "baud": 230400})
@@ -109,26 +109,18 @@ def test_rate_and_baud_must_go_together_either_way() -> None:
         with pytest.raises(BadArgument, match=words):
             SETTINGS.check(present, values)
 
-
-def test_a_declaration_takes_what_can_be_written_only() -> None:
     declared = msgspec.convert({"output_rate_hz": 50, "i2c_address": "0x19"}, SETTINGS.declarable)
     assert getattr(declared, "output_rate_hz") == 50  # noqa: B009  # a field that is made at run time
     for wrong in ({"gyro_offset_deg_s": [0, 0, 0]}, {"output_rate_hz": 33}, {"i2c_address": "0x1c"}, {"baud": 9600}):
         with pytest.raises(msgspec.ValidationError):
             msgspec.convert(wrong, SETTINGS.declarable)
 
-
-def test_what_cuts_the_connection_comes_last() -> None:
     assert [name for name, one in SETTINGS.table.items() if one.connection] == [list(SETTINGS.table)[-1]] == ["baud"]
 
+    told = {Parameter.FILTER: 300.0, Parameter.BUS_MODE: 7.0, Parameter.I2C_ADDRESS: 0.5, Parameter.AHRS_RATE: 33.0}
+    assert settings_of(told) == {"output_rate_hz": 33}
+    assert settings_of({Parameter.BAUD: float("nan")}) == {}
 
-def test_reading_leaves_a_silent_device_silent() -> None:
     far = imu61x_bench(Imu61xSettings(mode=OutputMode.COMMAND))
     assert read(far)["output_mode"] == "command"
     assert far.module.settings.mode is OutputMode.COMMAND
-
-
-def test_values_for_which_the_manual_has_no_words_are_left_out() -> None:
-    values = {Parameter.FILTER: 300.0, Parameter.BUS_MODE: 7.0, Parameter.I2C_ADDRESS: 0.5, Parameter.AHRS_RATE: 33.0}
-    assert settings_of(values) == {"output_rate_hz": 33}
-    assert settings_of({Parameter.BAUD: float("nan")}) == {}
