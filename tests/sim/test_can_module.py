@@ -103,8 +103,5 @@ def test_nodes_are_told_apart_and_sent_in_one_go() -> None:
         can_id, size, data = RAW_FRAME.unpack(frame)
         events += codec.feed_frame(can_id, False, data[:size], 0)
     assert [type(event) for event in events] == [Measurement]
-
-
-def test_a_node_that_cannot_be_is_refused() -> None:
     with pytest.raises(ValueError, match="node 2045: expected"):
         CAN_SIMULATORS["imu61x-can"].make(SimulatorOptions(node=2045), 0)

@@ -20,8 +20,5 @@ def test_every_option_of_the_sensor_arrives() -> None:
 def test_noise_is_that_of_the_seed() -> None:
     sensor = SensorHardware(**sensor_of(SimulatorOptions(seed=3)))
     assert sensor.reading(0.5) == Noise(3).add(swing().at(0.5), 0.5) != swing().at(0.5)
-
-
-def test_a_motion_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ValueError, match="motion 'dance': expected"):
         sensor_of(SimulatorOptions(motion="dance"))

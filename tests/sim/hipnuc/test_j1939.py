@@ -113,23 +113,19 @@ def test_values_are_the_truth_of_the_sample_instant() -> None:
         assert measurement.pressure_pa == pytest.approx(truth.pressure_pa, abs=0.0051)
 
 
-def test_four_modules_on_a_bus() -> None:
+def test_four_modules_crystal_wire_and_the_next_frame() -> None:
     modules = [made(node=node, rate_hz=100.0) for node in (1, 8, 9, 128)]
     frames = CanModules(modules).advance(BEGIN_NS + SECOND_NS)
     for module in modules:
         found = decoded(frames, module.settings.address)
         assert len(found) >= 94
 
-
-def test_crystal_and_wire() -> None:
     module = made(baud=250_000, skew_ppm=1000.0)
     frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != session.CLAIMED]
     assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(frames[:4])] == [560_000] * 3  # 140 bits
     assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
     assert module.counters() == {"samples_sent": 101, "frames_sent": 405, "requests": 0}
 
-
-def test_next_ns_is_when_something_is_sent() -> None:
     module = made(message="all")
     now_ns, seen = BEGIN_NS, 0
     for _ in range(60):
@@ -244,20 +240,16 @@ def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:
     assert not [f for f in module.advance(BEGIN_NS + 80 * MS) if f.can_id == 0x18EEFF08]
 
 
-def test_name_and_firmware_are_in_registers() -> None:
+def test_registers_replies_and_a_single_message() -> None:
     bench = J1939Host(made())
     assert bench.talk(lambda peer: session.read(peer, 0x78)) == 169
     assert bench.talk(lambda peer: session.read(peer, 0x70)) == 0x4849  # "HI"
 
-
-def test_replies_go_to_the_one_address() -> None:
     bench = J1939Host(made(), host=0x20)
     assert bench.talk(lambda peer: session.read(peer, session.ADDRESS)) == 8
     replies = [f for f in bench.heard if split(f.can_id).pgn == session.CONFIGURE]
     assert {split(f.can_id).destination for f in replies} == {0x55}
 
-
-def test_a_message_is_sent_once() -> None:
     bench = J1939Host(made())
     bench.talk(lambda peer: session.send_once(peer, 0xFF46))
     assert pgns(bench.heard)[0xFF46] == 1

@@ -44,5 +44,5 @@ def test_a_module_that_is_turned() -> None:
 def test_not_in_six_axes_and_not_when_switched_off() -> None:
     for settings in (ModuleSettings(att_mode=0), ModuleSettings(att_mode=1, mag_calibration=False)):
         bench = HipnucUartBench(settings, HipnucHardware(motion=tumble(), hard_iron_t=HARD_IRON_T))
-        bench.wait(60_000)
+        bench.wait(30_000)
         assert "MB=0.00, 0.00, 0.00" in bench.ask("LOG MAGCONFIG")

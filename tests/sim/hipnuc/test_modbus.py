@@ -48,14 +48,12 @@ def here(address: int, **more: Any) -> Slave:
     return slave(address, baud=BAUD, **more)
 
 
-def test_every_byte_takes_its_time_in_both_directions() -> None:
+def test_time_of_bytes_pieces_and_echo() -> None:
     rig = ModbusMaster(here(1, processing_ns=100_000))
     (burst,) = rig.bursts(framed(1, READ_BLOCK))
     assert burst.due_ns == BEGIN_NS + 8 * BYTE_NS + GAP_NS + 100_000 + 57 * BYTE_NS
     assert burst.sample_ns == BEGIN_NS + 8 * BYTE_NS + GAP_NS + 100_000
 
-
-def test_reply_in_pieces_comes_no_sooner() -> None:
     rig = ModbusMaster(here(1, processing_ns=0), chunk_bytes=1)
     bursts = rig.bursts(framed(1, READ_BLOCK))
     assert [len(burst.data) for burst in bursts] == [1] * 57
@@ -63,8 +61,6 @@ def test_reply_in_pieces_comes_no_sooner() -> None:
     assert [burst.due_ns for burst in bursts] == [begin_ns + n * BYTE_NS for n in range(1, 58)]
     assert is_whole(b"".join(burst.data for burst in bursts))
 
-
-def test_echo_comes_before_the_reply() -> None:
     rig = ModbusMaster(here(1), echo=True)
     frame = framed(1, READ_BLOCK)
     echo, reply = rig.bursts(frame)
@@ -97,19 +93,26 @@ def test_values_are_the_truth_of_that_instant() -> None:
         assert (m.dev_ticks is None) == (firmware == 152)
 
 
-def test_only_who_is_meant_answers_and_only_to_whole_frames() -> None:
+def test_who_answers_and_which_replies_are_whole() -> None:
     rig = ModbusMaster(here(1), here(2), here(3, dead=True))
     assert rig.ask(2, READ_BLOCK)[0] == 2
     assert rig.ask(3, READ_BLOCK) == rig.ask(4, READ_BLOCK) == rig.ask(0, READ_BLOCK) == b""
     assert rig.bursts(framed(1, READ_BLOCK)[:-1] + b"\x00") == []
     assert rig.line.counters() == {"requests": 4, "damaged": 1, "answered": 1}
 
-
-def test_two_of_the_same_address_spoil_each_other() -> None:
     rig = ModbusMaster(slave(1, baud=BAUD, serial=0x0F), slave(1, baud=BAUD, serial=0xF0))
     reply = rig.ask(1, read_registers(0x7F, 4).sends[0])
     assert len(reply) == 13
     assert not is_whole(reply)
+
+    rig = ModbusMaster(here(1, bad_crc=1, mute=1))
+    assert rig.ask(1, READ_BLOCK) == b""
+    assert not is_whole(rig.ask(1, READ_BLOCK))
+    assert is_whole(rig.ask(1, READ_BLOCK))
+
+    rig = ModbusMaster(here(1), slave(2, baud=9600))
+    assert not is_whole(rig.ask(2, READ_BLOCK))
+    assert is_whole(rig.ask(1, READ_BLOCK))
 
 
 def test_ids_by_serial_number_and_by_chance() -> None:
@@ -133,19 +136,6 @@ def test_exceptions() -> None:
     ):
         reply = rig.ask(1, request)
         assert reply == framed(1, bytes([request[0] | 0x80, code]))
-
-
-def test_wrong_crc_and_silence_on_demand() -> None:
-    rig = ModbusMaster(here(1, bad_crc=1, mute=1))
-    assert rig.ask(1, READ_BLOCK) == b""
-    assert not is_whole(rig.ask(1, READ_BLOCK))
-    assert is_whole(rig.ask(1, READ_BLOCK))
-
-
-def test_module_of_another_rate_is_not_understood() -> None:
-    rig = ModbusMaster(here(1), slave(2, baud=9600))
-    assert not is_whole(rig.ask(2, READ_BLOCK))
-    assert is_whole(rig.ask(1, READ_BLOCK))
 
 
 def test_line_from_the_common_options() -> None:

@@ -44,6 +44,11 @@ def test_values_are_the_truth_of_the_sample_instant() -> None:
         assert measurement.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-5)
         assert measurement.euler_rad == pytest.approx(euler_zyx_from_quat(truth.quat_wxyz), abs=1e-6)
         assert measurement.temperature_c == pytest.approx(truth.temperature_c, abs=0.005001)
+    module = Imu61xCanModule(BEGIN_NS, Imu61xCanHardware(boot_ms=0, index=500))
+    run(module, BEGIN_NS + SECOND_NS)
+    module.reboot(BEGIN_NS + SECOND_NS)
+    measured = decoded(module.advance(BEGIN_NS + SECOND_NS + SECOND_NS // 10))
+    assert measured[0].dev_ticks == 0
 
 
 def test_frames_take_their_time_on_the_wire_and_the_crystal_runs_fast() -> None:
@@ -54,9 +59,6 @@ def test_frames_take_their_time_on_the_wire_and_the_crystal_runs_fast() -> None:
     assert one[0].sample_ns is not None
     assert one[0].due_ns - one[0].sample_ns == 125_000 + 480_000
     assert module.counters() == {"samples_sent": 201, "frames_sent": 1005}
-
-
-def test_next_ns_is_when_something_is_sent() -> None:
     module = Imu61xCanModule(BEGIN_NS)
     now_ns, seen = BEGIN_NS, 0
     for _ in range(50):
@@ -66,14 +68,6 @@ def test_next_ns_is_when_something_is_sent() -> None:
         now_ns = due_ns
         seen += len(module.advance(now_ns))
     assert seen == 50
-
-
-def test_a_reboot_starts_the_index_anew() -> None:
-    module = Imu61xCanModule(BEGIN_NS, Imu61xCanHardware(boot_ms=0, index=500))
-    run(module, BEGIN_NS + SECOND_NS)
-    module.reboot(BEGIN_NS + SECOND_NS)
-    measured = decoded(module.advance(BEGIN_NS + SECOND_NS + SECOND_NS // 10))
-    assert measured[0].dev_ticks == 0
 
 
 @pytest.mark.parametrize("options", [{"rate_hz": 0.5}, {"rate_hz": 401}, {"message": "x"}, {"motion": "none"}])

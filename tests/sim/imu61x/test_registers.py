@@ -41,8 +41,8 @@ def test_answer_comes_with_the_second_word_after_it_even_in_another_transaction(
     assert spoken(one, 0x7E00) == [1]
 
 
-@pytest.mark.manual("A 2.4 WIN_CTRL")
-def test_windows_hide_each_other() -> None:
+@pytest.mark.manual("A 2.4 WIN_CTRL", "A 2.4.1 reading", "A 2.1 mode")
+def test_windows_bursts_modes_and_a_restart() -> None:
     one, _ = device()
     assert spoken(one, 0x0600, 0x6C00, 0, 0)[2:] == [0, 0]  # configuration is not in window 0
     assert spoken(one, 0xFE01, 0x0600, 0x0E00, 0, 0)[3:] == [0xBB, 0]  # values are not in window 1
@@ -50,15 +50,27 @@ def test_windows_hide_each_other() -> None:
     spoken(one, 0x8644, 0x8D01)
     assert (one.filter, one.extended) == (0xBB, 0)  # writes to window 1 need it open
 
-
-@pytest.mark.manual("A 2.4.1 reading")
-def test_burst_ends_with_its_selection() -> None:
     one, _ = device()
     whole = one.spi(spi.READ_STANDARD.sends)[0]
     assert len(whole) == 32
     cut = b"".join(one.spi([spi.READ_STANDARD.sends[0][:8], bytes(24)]))
     assert cut[:8] == whole[:8] or cut[4:8] == whole[4:8]
     assert cut[12:] == bytes(len(cut) - 12)
+
+    one, _ = device(modes=frozenset({3}))
+    right = b"".join(one.spi(READ_STATE.sends, 3))
+    wrong = b"".join(one.spi(READ_STATE.sends, 0))
+    assert State(right).product_id == b"\x00\x00IMU614"
+    assert State(wrong).product_id != b"\x00\x00IMU614"
+
+    one, _ = device()
+    spoken(one, 0xFE01, 0x8644, 0x8D01)
+    assert (one.filter, one.extended, one.window) == (0x44, 1, 1)
+    one.restart()
+    assert (one.filter, one.extended, one.window) == (0xBB, 0, 0)
+
+    one, _ = device(behaviour=RegisterBehaviour(window_bits=0xA5FE))
+    assert spoken(one, 0xFE01, 0x7E00, 0xFE00, 0x7E00, 0, 0)[3::2] == [0xA5FF, 0xA5FE]
 
 
 def test_registers_are_latched_and_renewed_in_steps() -> None:
@@ -76,15 +88,6 @@ def test_registers_are_latched_and_renewed_in_steps() -> None:
     assert one.latched_ns == 20 * MS
 
 
-@pytest.mark.manual("A 2.1 mode")
-def test_wrong_mode_shifts_the_bits() -> None:
-    one, _ = device(modes=frozenset({3}))
-    right = b"".join(one.spi(READ_STATE.sends, 3))
-    wrong = b"".join(one.spi(READ_STATE.sends, 0))
-    assert State(right).product_id == b"\x00\x00IMU614"
-    assert State(wrong).product_id != b"\x00\x00IMU614"
-
-
 def test_faults_are_what_they_say() -> None:
     one, _ = device()
     good = one.i2c([b"\x6a", 8])
@@ -100,14 +103,6 @@ def test_faults_are_what_they_say() -> None:
         one.i2c([b"\x6a", 8])
 
 
-def test_restart_forgets_what_was_set() -> None:
-    one, _ = device()
-    spoken(one, 0xFE01, 0x8644, 0x8D01)
-    assert (one.filter, one.extended, one.window) == (0x44, 1, 1)
-    one.restart()
-    assert (one.filter, one.extended, one.window) == (0xBB, 0, 0)
-
-
 @pytest.mark.parametrize(
     ("behaviour", "low", "high"),
     [
@@ -119,8 +114,3 @@ def test_restart_forgets_what_was_set() -> None:
 def test_burst_ctrl_reads_back_where_the_variant_has_it(behaviour: RegisterBehaviour, low: int, high: int) -> None:
     one, _ = device(behaviour=behaviour)
     assert spoken(one, 0xFE01, 0x8D01, 0x0C00, 0x0D00, 0x7E00, 0x7E00)[4:] == [low, high]
-
-
-def test_undefined_bits_of_the_window() -> None:
-    one, _ = device(behaviour=RegisterBehaviour(window_bits=0xA5FE))
-    assert spoken(one, 0xFE01, 0x7E00, 0xFE00, 0x7E00, 0, 0)[3::2] == [0xA5FF, 0xA5FE]

@@ -74,13 +74,6 @@ def test_it_streams_at_every_rate_of_the_manual(rate_hz: int) -> None:
     assert far.module.frames_dropped == 0
 
 
-def test_what_does_not_fit_the_wire_is_not_sent() -> None:
-    """Table 3 note 1: no more than 200 Hz at 115200; the wire carries 213."""
-    far = imu61x_bench(Imu61xSettings(rate_hz=400))
-    assert len(far.samples(2000)) == pytest.approx(2 * 213, abs=4)
-    assert far.module.frames_dropped > 300
-
-
 def test_the_physics_of_the_truth_come_out() -> None:
     """The rotation of the frame turns the specific force of the truth as the truth's own quaternion does."""
     hardware = replace(IMU61X_STILL, motion=swing())
@@ -96,17 +89,6 @@ def test_the_physics_of_the_truth_come_out() -> None:
         assert quat is not None
         for row, wanted in zip(matrix_from_quat(quat), matrix_from_quat(truth.quat_wxyz), strict=True):
             assert row == pytest.approx(wanted, abs=1e-6)
-
-
-@pytest.mark.manual("A 1.3 timer")
-def test_the_timer_runs_fast_and_wraps() -> None:
-    far = imu61x_bench(skew_ppm=1000.0, uptime_us=2**32 - 600_000)
-    samples = far.samples(400)
-    ticks = [sample.dev_ticks or 0 for sample in samples]
-    assert any(b < a for a, b in pairwise(ticks))
-    begin_ns = far.now_ns
-    assert len(far.samples(10_000)) == pytest.approx(1001, abs=1)
-    assert far.now_ns - begin_ns == 10 * NS_PER_S
 
 
 @pytest.mark.manual("A 1 command mode")
@@ -127,13 +109,25 @@ def test_command_mode_is_silent_but_for_replies() -> None:
     assert len(far.samples(1000)) in (99, 100)
 
 
-def test_a_device_that_listens_in_command_mode_only() -> None:
+@pytest.mark.manual("A 1.3 timer")
+def test_listening_in_command_mode_the_full_wire_and_the_timer() -> None:
+    """Table 3 note 1: no more than 200 Hz at 115200; the wire carries 213."""
     far = imu61x_bench(answers_while_streaming=False)
     far.send(c.ask_status().payload + c.factory_reset().payload)
     assert not any(isinstance(event, ReplyFrame) for event in far.wait(500))
+    far = imu61x_bench(Imu61xSettings(rate_hz=400))
+    assert len(far.samples(2000)) == pytest.approx(2 * 213, abs=4)
+    assert far.module.frames_dropped > 300
+    far = imu61x_bench(skew_ppm=1000.0, uptime_us=2**32 - 600_000)
+    samples = far.samples(400)
+    ticks = [sample.dev_ticks or 0 for sample in samples]
+    assert any(b < a for a, b in pairwise(ticks))
+    begin_ns = far.now_ns
+    assert len(far.samples(10_000)) == pytest.approx(1001, abs=1)
+    assert far.now_ns - begin_ns == 10 * NS_PER_S
 
 
-def test_ram_is_lost_at_power_off_and_flash_is_not() -> None:
+def test_what_power_off_restart_and_factory_reset_change() -> None:
     far = imu61x_bench()
     assert acknowledged(far, c.set_rate(50)) == 0
     far.restart()
@@ -143,16 +137,12 @@ def test_ram_is_lost_at_power_off_and_flash_is_not() -> None:
     far.restart()
     assert parameter(far, Parameter.AHRS_RATE) == 50
 
-
-def test_the_mode_is_saved_too() -> None:
     far = imu61x_bench()
     acknowledged(far, c.output_mode(c.OutputMode.COMMAND))
     acknowledged(far, c.save())
     far.restart()
     assert far.samples(1000) == []
 
-
-def test_restart_is_acknowledged_and_then_silent_while_it_boots() -> None:
     far = imu61x_bench()
     assert acknowledged(far, c.restart()) == 0
     assert far.wait(far.module.hardware.boot_ms - 20) == []
@@ -160,6 +150,12 @@ def test_restart_is_acknowledged_and_then_silent_while_it_boots() -> None:
     assert len(samples) >= 15
     assert samples[0].dev_ticks is not None
     assert samples[0].dev_ticks <= 520_000
+
+    far = imu61x_bench(Imu61xSettings(rate_hz=50), reset_acts_at_start=True)
+    assert acknowledged(far, c.factory_reset()) == 0
+    assert (far.module.settings.rate_hz, far.module.flash.rate_hz) == (50, 100)
+    far.restart()
+    assert far.module.settings.rate_hz == 100
 
 
 def test_values_that_it_does_not_have() -> None:
@@ -170,9 +166,6 @@ def test_values_that_it_does_not_have() -> None:
     for index, value in ((27, 4.0), (30, 0x1C), (31, 256.0), (31, 0.5), (8, 0.0), (99, 1.0), (27, float("nan"))):
         with pytest.raises(ParameterRefused):
             changed(settings, index, value)
-
-
-def test_every_parameter_of_the_manual_can_be_asked_and_no_other() -> None:
     for which in Parameter:
         Imu61xSettings().value(which)
     with pytest.raises(ParameterRefused):
@@ -182,18 +175,14 @@ def test_every_parameter_of_the_manual_can_be_asked_and_no_other() -> None:
     (reply,) = far.wait(50)
     assert isinstance(reply, ReplyFrame)
     assert parse_acknowledgement(reply) == Acknowledgement(6, 2)
+    for unknown_mode in (2.0, 0.0, float("nan")):
+        far.send(c.encode_command(c.Command.OUTPUT_MODE, unknown_mode))
+        (reply,) = far.wait(50)
+        assert isinstance(reply, ReplyFrame)
+        assert parse_acknowledgement(reply) == Acknowledgement(3, 2)
 
 
-@pytest.mark.parametrize("param1", [2.0, 0.0, float("nan")])
-def test_an_unknown_mode_is_refused(param1: float) -> None:
-    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
-    far.send(c.encode_command(c.Command.OUTPUT_MODE, param1))
-    (reply,) = far.wait(50)
-    assert isinstance(reply, ReplyFrame)
-    assert parse_acknowledgement(reply) == Acknowledgement(3, 2)
-
-
-def test_the_acknowledgement_of_a_new_rate_comes_at_the_old_one() -> None:
+def test_commands_at_another_rate_or_damaged() -> None:
     far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     assert acknowledged(far, c.set_baud(921600)) == 0
     far.wait(10)
@@ -201,16 +190,12 @@ def test_the_acknowledgement_of_a_new_rate_comes_at_the_old_one() -> None:
     far.baud = 921600
     assert parameter(far, Parameter.BAUD) == 921600
 
-
-def test_what_is_sent_at_another_rate_is_not_understood() -> None:
     far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     far.baud = 460800
     far.send(c.factory_reset().payload)
     far.baud = 115200
     assert far.wait(100) == []
 
-
-def test_damaged_and_unknown_commands_are_not_answered() -> None:
     far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     damaged = bytearray(c.ask_status().payload)
     damaged[12] ^= 1
@@ -244,7 +229,7 @@ def heard(far: Imu61xBench, request: Request, duration_ms: float) -> list[tuple[
     return found
 
 
-def test_slow_flash_answers_late_and_sends_nothing_meanwhile() -> None:
+def test_behaviour_of_the_variants() -> None:
     far = imu61x_bench(flash_ms=2000)
     far.send(c.save().payload)
     assert len(far.samples(1990)) <= 1  # the frame that was on its way
@@ -252,8 +237,6 @@ def test_slow_flash_answers_late_and_sends_nothing_meanwhile() -> None:
     assert (at_ms < 30, result) == (True, 0)  # the status request was not heard
     assert len(far.samples(500)) >= 48
 
-
-def test_quiet_after_an_answer() -> None:
     far = imu61x_bench(quiet_ms=700)
     ((at_ms, _),) = heard(far, c.reset_heading(0), 20)
     assert at_ms < 10
@@ -261,32 +244,18 @@ def test_quiet_after_an_answer() -> None:
     assert [event for event in far.wait(650) if not isinstance(event, Measurement)] == []
     assert far.samples(200)
 
-
-def test_acknowledgement_at_the_begin_or_at_the_end_of_a_calibration() -> None:
     for at_end, expected_ms in ((False, 0), (True, 3000)):
         far = imu61x_bench(acknowledges_at_end=at_end)
         ((at_ms, result),) = heard(far, c.calibrate_gyro(), 3500)
         assert at_ms == pytest.approx(expected_ms, abs=20)
         assert result == 0
 
-
-def test_codes_and_refusals_are_those_of_the_variant() -> None:
     far = imu61x_bench(result_done=1, result_refused=0, refuses=frozenset({c.Command.SAVE}))
     assert [result for _, result in heard(far, c.reset_heading(0), 20)] == [1]
     assert [result for _, result in heard(far, c.save(), 20)] == [0]
     far = imu61x_bench(ignores=frozenset({c.Command.SAVE}))
     assert heard(far, c.save(), 20) == []
 
-
-def test_factory_reset_at_the_next_start_changes_flash_only() -> None:
-    far = imu61x_bench(Imu61xSettings(rate_hz=50), reset_acts_at_start=True)
-    assert acknowledged(far, c.factory_reset()) == 0
-    assert (far.module.settings.rate_hz, far.module.flash.rate_hz) == (50, 100)
-    far.restart()
-    assert far.module.settings.rate_hz == 100
-
-
-def test_short_status_has_no_calibration_status() -> None:
     assert calibration_status(imu61x_bench(reports_calibration=False)) is None
 
 
@@ -323,9 +292,6 @@ def test_power_off_cuts_the_frame_on_the_wire() -> None:
     cut = b"".join(burst.data for burst in module.advance(now_ns))
     assert 0 < len(cut) < 54
     assert cut == bytes.fromhex("AA5502002C00")[: len(cut)] or cut.startswith(bytes.fromhex("AA5502002C00"))
-
-
-def test_next_ns_says_when_there_is_something() -> None:
     module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
     now_ns = BEGIN_NS
     for _ in range(20):

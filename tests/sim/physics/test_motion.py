@@ -18,7 +18,7 @@ from imud.sim.physics.motion import (
     swing,
 )
 
-TIMES_S = [0.0, 0.37, 1.9, 12.34, 59.1, 1000.25]
+TIMES_S = [0.0, 1.9, 1000.25]
 
 
 def times(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -108,19 +108,13 @@ def test_axes_have_the_signs_of_chapter_9(roll_deg: float, pitch_deg: float, for
     assert truth.accel_m_s2 == pytest.approx(force, abs=1e-12)
 
 
-def test_yaw_is_counter_clockwise() -> None:
+def test_yaw_is_counter_clockwise_and_pitch_below_ninety_degrees() -> None:
     truth = Still(0.0, 0.0, radians(90), field_enu_t=(0.0, 1.0, 0.0)).at(0.0)
     assert truth.mag_t == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)  # facing west, north is on the right
-
-
-def test_the_same_time_gives_the_same_truth() -> None:
     motion = swing()
     first = motion.at(1.25)
     motion.at(7.0)
     assert motion.at(1.25) == first
-
-
-def test_pitch_is_kept_from_ninety_degrees() -> None:
     with pytest.raises(ValueError, match="90°"):
         Swing(pitch=(Sine(1.0, 0.1), Sine(0.6, 0.2)))
     assert max(abs(degrees(asin(sin(swing().at(t / 10).euler_rad[1])))) for t in range(600)) < 30

@@ -12,29 +12,22 @@ A = quat_from_euler312((0.3, -0.5, 2.0))
 B = quat_from_euler312((-1.0, 0.2, -0.7))
 
 
-def test_product_is_the_product_of_the_matrices() -> None:
+def test_products_and_rotations_agree_with_matrices() -> None:
     a, b, ab = matrix_from_quat(A), matrix_from_quat(B), matrix_from_quat(quat_product(A, B))
     for i in range(3):
         for j in range(3):
             assert ab[i][j] == pytest.approx(sum(a[i][k] * b[k][j] for k in range(3)), abs=1e-12)
 
-
-def test_turned_back_is_the_transposed_matrix() -> None:
     v, matrix = (1.0, -2.0, 0.5), matrix_from_quat(A)
     expected = [sum(matrix[k][i] * v[k] for k in range(3)) for i in range(3)]
     assert turned_back(A, v) == pytest.approx(expected, abs=1e-12)
 
-
-def test_without_turns_nothing_changes() -> None:
     truth = swing().at(1.0)
     assert not MountingRotation().active
     assert MountingRotation().turned(truth) is truth
 
-
-def test_nearly_orthonormal_matrices_become_rotations() -> None:
-    rounded = tuple(tuple(round(value, 3) for value in row) for row in matrix_from_quat(A))
-    (a, b, c) = rounded
-    q = frame_of(((a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2])))
+    rows = [[round(value, 3) for value in row] for row in matrix]
+    q = frame_of(((*rows[0],), (*rows[1],), (*rows[2],)))  # type: ignore[arg-type]  # three numbers each
     assert q == pytest.approx(A, abs=2e-3)
     assert sum(part * part for part in q) == pytest.approx(1.0, abs=1e-12)
 
@@ -54,8 +47,6 @@ def test_heading_turns_about_the_vertical_and_leaves_vectors() -> None:
     assert turned.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-12)
     assert turned.mag_t == pytest.approx(truth.mag_t, abs=1e-18)
 
-
-def test_level_turns_the_accelerometer_only_where_told() -> None:
     truth = Still(0.05, 0.02, 0.5).at(0.0)
     level = level_of(truth.quat_wxyz)
     assert MountingRotation(level=level).turned(truth).accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-12)

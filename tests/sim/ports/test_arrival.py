@@ -28,7 +28,7 @@ def one_way(a: Arrival) -> int:
 
 
 @pytest.mark.parametrize("profile", PROFILES, ids=lambda p: p.name)
-@pytest.mark.parametrize("rate_hz", [1, 100, 1000])
+@pytest.mark.parametrize("rate_hz", [1, 1000])
 def test_nothing_arrives_before_it_was_sent(profile: ArrivalProfile, rate_hz: float) -> None:
     got = arrivals(profile, rate_hz)
     assert len(got) == 2000
@@ -42,11 +42,10 @@ def test_the_same_seed_gives_the_same(profile: ArrivalProfile) -> None:
     assert arrivals(profile, count=200) != arrivals(profile, count=200, seed=2)
 
 
-def test_perfect_is_the_wire_alone() -> None:
+def test_wires_timers_and_packets() -> None:
+    """At 115200 baud 82 bytes take 7.1 ms; at 200 Hz each frame waits for the ones before it."""
     assert {one_way(a) // 2 for a in arrivals(PERFECT)} <= {-1, 0}
 
-
-def test_a_timer_delivers_bursts() -> None:
     got = arrivals(USB_16MS, 1000)
     reads = {a.t_rx_ns for a in got}
     assert 115 <= len(reads) <= 130
@@ -54,17 +53,16 @@ def test_a_timer_delivers_bursts() -> None:
     waits = [a.t_rx_ns - a.t_ns for a in got]
     assert 13 * NS_PER_MS < max(waits) < 30 * NS_PER_MS
 
-
-def test_messages_of_a_read_trail_each_other() -> None:
     for a, b in pairwise(arrivals(USB_16MS, 1000)):
         if a.t_rx_ns == b.t_rx_ns:
             assert a.trailing_bytes - b.trailing_bytes == 82
         else:
             assert a.trailing_bytes < 82
 
-
-def test_full_packets_do_not_wait() -> None:
     assert len({a.t_rx_ns for a in arrivals(USB_16MS_PACKET, 1000)}) > 1900
+
+    got = list(ArrivalModel(PERFECT, 200, 1, baud=115_200).run(400))
+    assert got[-1].t_rx_ns - got[-1].t_ns > NS_PER_S // 2
 
 
 @pytest.mark.parametrize(("skew_ppm", "drift"), [(0.0, 0.0), (50_000.0, 0.0), (-50_000.0, 0.0), (0.0, 0.1)])
@@ -74,9 +72,3 @@ def test_the_crystal_runs_as_told(skew_ppm: float, drift: float) -> None:
     assert ratio == pytest.approx(1 + skew_ppm * 1e-6, abs=5e-6 if drift else 1e-9)
     rates = [(b.dev_ns - a.dev_ns) / (b.t_ns - a.t_ns) for a, b in pairwise(got)]
     assert max(rates) - min(rates) == pytest.approx(10e-6 if drift else 0, abs=1e-6)
-
-
-def test_a_slow_wire_queues() -> None:
-    """82 bytes take 7.1 ms at 115200 baud; at 200 Hz each message waits for the ones before it."""
-    got = list(ArrivalModel(PERFECT, 200, 1, baud=115_200).run(400))
-    assert got[-1].t_rx_ns - got[-1].t_ns > NS_PER_S // 2

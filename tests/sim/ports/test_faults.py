@@ -52,13 +52,14 @@ def test_length_tells_the_kind(kind: FaultKind, least: int, most: int) -> None:
         assert least <= change <= most or (kind is FaultKind.CUT and len(before.data) > 82 and change < 0)
 
 
-def test_flip_changes_one_bit() -> None:
+def test_flips_wrong_rates_delays_and_unplugging() -> None:
     for before, after in passed(Faults(3, FaultRates(flip=1.0)), 50):
         assert after
         assert sum((a ^ b).bit_count() for a, b in zip(before.data, after.data, strict=True)) == 1
 
+    faults = Faults(2, FaultRates(wrong_baud=1.0), baud=115_200)
+    assert all(after is None or after.data != before.data for before, after in passed(faults, 100))
 
-def test_delays_keep_the_order_and_their_bound() -> None:
     faults = Faults(3, FaultRates(delay=0.5, delay_ns=25 * NS_PER_MS))
     pairs = passed(faults)
     times = [after.due_ns for _, after in pairs if after]
@@ -66,8 +67,6 @@ def test_delays_keep_the_order_and_their_bound() -> None:
     assert all(after and after.due_ns >= before.due_ns for before, after in pairs)
     assert faults.bursts_hit == 0
 
-
-def test_unplugged_means_nothing_arrives_for_a_while() -> None:
     faults = Faults(3, FaultRates(unplug=0.02, unplug_ns=55 * NS_PER_MS))
     pairs = passed(faults)
     first = faults.log[0].burst
@@ -89,7 +88,16 @@ def test_the_ledger_of_a_codec_tells_the_same() -> None:
     assert measured >= untouched
 
 
-def test_seed_decides() -> None:
+@pytest.mark.parametrize("text", ["flop=0.1", "flip", "flip=often", "flip=1.5", "flip=-1", "flip=nan"])
+def test_bad_rates_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="fault"):
+        rates_from(text)
+
+
+def test_rates_from_text_and_faults_from_the_seed() -> None:
+    assert rates_from("flip=0.5,delay=0.1,delay_ns=7") == FaultRates(flip=0.5, delay=0.1, delay_ns=7)
+    assert not rates_from("").any()
+    assert rates_from("cut=0.1").any()
     rates = FaultRates(flip=0.1, cut=0.1, delay=0.1)
 
     def run(seed: int) -> list[Fault]:
@@ -99,20 +107,3 @@ def test_seed_decides() -> None:
 
     assert run(1) == run(1)
     assert run(1) != run(2)
-
-
-def test_wrong_baud_is_never_the_right_one() -> None:
-    faults = Faults(2, FaultRates(wrong_baud=1.0), baud=115_200)
-    assert all(after is None or after.data != before.data for before, after in passed(faults, 100))
-
-
-@pytest.mark.parametrize("text", ["flop=0.1", "flip", "flip=often", "flip=1.5", "flip=-1", "flip=nan"])
-def test_bad_rates_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="fault"):
-        rates_from(text)
-
-
-def test_rates_from_text() -> None:
-    assert rates_from("flip=0.5,delay=0.1,delay_ns=7") == FaultRates(flip=0.5, delay=0.1, delay_ns=7)
-    assert not rates_from("").any()
-    assert rates_from("cut=0.1").any()

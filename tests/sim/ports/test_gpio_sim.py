@@ -23,17 +23,14 @@ def test_pull_files_are_written_as_the_kernel_wants(tmp_path: Path) -> None:
     for file in files.values():
         file.close()
         file.close()
+    with pytest.raises(FileNotFoundError):
+        PullFile(tmp_path / "missing" / "pull")
 
 
 @pytest.mark.parametrize("text", ["led=/tmp/x", "sout", "sout=", "=x"])
 def test_other_pins_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected NAME=PATH with one of sout, sout_div, alarm"):
         pull_files(text)
-
-
-def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        PullFile(tmp_path / "missing" / "pull")
 
 
 class Marked:

@@ -10,9 +10,33 @@ from imud.sim.ports.lines import MemoryInput, MemoryLines, MemoryOutput
 from tests.support.event_loops import in_loop
 
 
-def test_they_are_lines() -> None:
+def test_lines_and_levels() -> None:
     lines: tuple[InputLine, OutputLine] = (MemoryInput(), MemoryOutput())
     assert [line.title for line in lines] == ["memory line", "memory line"]
+
+    line = MemoryInput("bow alarm")
+    line.edge(1, True)
+    with pytest.raises(LinkError, match="bow alarm is not open"):
+        line.level()
+    line.open()
+    assert line.level()
+    line.edge(2, False)
+    assert not line.level()
+
+    for busy in (MemoryInput(), MemoryOutput()):
+        busy.open_error = LinkBusy("gpiomon has it")
+        with pytest.raises(LinkBusy):
+            busy.open()
+        assert not busy.is_open
+
+    memory = MemoryLines(now_ns=lambda: 5)
+    made = memory.maker.make_input(InputSettings(line="A"), "bow sout", True)
+    assert made is memory.inputs["bow sout"]
+    assert memory.maker.make_input(InputSettings(line="A"), "bow sout", True) is made
+    output = memory.maker.make_output(OutputSettings(line="B"), "bow sin")
+    output.open()
+    output.set(True)
+    assert memory.outputs["bow sin"].history == [(5, True)]
 
 
 @in_loop
@@ -56,17 +80,6 @@ async def test_edges_before_start_come_with_the_next_round() -> None:
     assert found == [Edge(10, True, 1)]
 
 
-def test_level() -> None:
-    line = MemoryInput("bow alarm")
-    line.edge(1, True)
-    with pytest.raises(LinkError, match="bow alarm is not open"):
-        line.level()
-    line.open()
-    assert line.level()
-    line.edge(2, False)
-    assert not line.level()
-
-
 @in_loop
 async def test_the_end() -> None:
     line, ends = MemoryInput(), list[LinkError]()
@@ -77,14 +90,6 @@ async def test_the_end() -> None:
     line.vanish(gone)
     assert ends == [gone]
     assert not line.is_open
-
-
-def test_open_fails() -> None:
-    for line in (MemoryInput(), MemoryOutput()):
-        line.open_error = LinkBusy("gpiomon has it")
-        with pytest.raises(LinkBusy):
-            line.open()
-        assert not line.is_open
 
 
 def test_output() -> None:
@@ -106,17 +111,6 @@ def test_output() -> None:
     with pytest.raises(LinkMissing):
         line.set(True)
     assert not line.active
-
-
-def test_lines_by_purpose() -> None:
-    lines = MemoryLines(now_ns=lambda: 5)
-    made = lines.maker.make_input(InputSettings(line="A"), "bow sout", True)
-    assert made is lines.inputs["bow sout"]
-    assert lines.maker.make_input(InputSettings(line="A"), "bow sout", True) is made
-    output = lines.maker.make_output(OutputSettings(line="B"), "bow sin")
-    output.open()
-    output.set(True)
-    assert lines.outputs["bow sin"].history == [(5, True)]
 
 
 async def _rounds() -> None:

@@ -21,7 +21,7 @@ class Line:
         self.edges.append((t_ns, rising))
 
 
-def run(faults: PinFaults | None, steps: int = 20_000, step_ns: int = 50_000) -> tuple[Line, Pins, HipnucUartBench]:
+def run(faults: PinFaults | None, steps: int = 5000, step_ns: int = 200_000) -> tuple[Line, Pins, HipnucUartBench]:
     bench, line = HipnucUartBench(FAST), Line()
     bench.module.pins(bench.now_ns)
     pins = Pins(bench.module, {Pin.SOUT: line}, faults)
@@ -37,6 +37,15 @@ def test_every_edge_comes_once_in_order() -> None:
     assert len(line.edges) == pytest.approx(2000, abs=3) == pins.edges
     assert all(after[0] > before[0] and after[1] is not before[1] for before, after in pairwise(line.edges))
     assert pins.summary() == {"pin_edges": pins.edges}
+    memory_line = MemoryInput()
+    memory_line.open()
+    bench = HipnucUartBench(FAST)
+    pins = Pins(bench.module, {Pin.SOUT: memory_line.edge})
+    for _ in range(100):
+        bench.now_ns += NS_PER_MS
+        pins.step(bench.now_ns)
+    assert pins.edges == pytest.approx(200, abs=2)
+    assert not memory_line.level()
 
 
 def test_next_ns_names_the_next_edge_even_one_that_a_fault_made() -> None:
@@ -66,20 +75,26 @@ def test_lost_pulses_lose_both_edges_and_are_known() -> None:
     assert pins.summary()["pin_fault_lose_pulse"] == faults.counts["lose_pulse"]
 
 
-def test_single_edges_can_be_lost() -> None:
+def test_single_edges_lost_extra_pulses_and_lost_frames() -> None:
     faults = PinFaults(2, PinFaultRates(lose_edge=0.1))
     line, _, _ = run(faults)
     assert 150 <= faults.counts["lose_edge"] <= 250
     assert len(line.edges) == pytest.approx(2000 - faults.counts["lose_edge"], abs=3)
     assert any(after[1] is before[1] for before, after in pairwise(line.edges))
 
-
-def test_extra_pulses_stand_between_the_others() -> None:
     faults = PinFaults(3, PinFaultRates(extra=0.1))
     line, _, _ = run(faults)
     assert 70 <= faults.counts["extra"] <= 130
     assert len(line.edges) == pytest.approx(2000 + 2 * faults.counts["extra"], abs=4)
     assert all(after[0] >= before[0] for before, after in pairwise(line.edges))
+
+    frame_faults = Faults(4, FaultRates(lose=0.1))
+    bursts = HipnucUartBench(FAST).wait(1000.0)
+    arrived = [burst for burst in map(frame_faults.pass_on, bursts) if burst]
+    assert 70 <= frame_faults.counts[FaultKind.LOSE] <= 130
+    assert len(arrived) == len(bursts) - frame_faults.counts[FaultKind.LOSE]
+    assert set(arrived) <= set(bursts)
+    assert frame_faults.bursts_hit == frame_faults.counts[FaultKind.LOSE]
 
 
 def test_same_seed_same_faults() -> None:
@@ -92,25 +107,3 @@ def test_same_seed_same_faults() -> None:
 def test_probabilities_are_probabilities(value: float) -> None:
     with pytest.raises(ValueError, match="expected a probability"):
         PinFaultRates(lose_pulse=value)
-
-
-def test_frames_can_be_lost_whole() -> None:
-    faults = Faults(4, FaultRates(lose=0.1))
-    bursts = HipnucUartBench(FAST).wait(1000.0)
-    arrived = [burst for burst in map(faults.pass_on, bursts) if burst]
-    assert 70 <= faults.counts[FaultKind.LOSE] <= 130
-    assert len(arrived) == len(bursts) - faults.counts[FaultKind.LOSE]
-    assert set(arrived) <= set(bursts)
-    assert faults.bursts_hit == faults.counts[FaultKind.LOSE]
-
-
-def test_memory_lines_take_them_as_they_are() -> None:
-    line = MemoryInput()
-    line.open()
-    bench = HipnucUartBench(FAST)
-    pins = Pins(bench.module, {Pin.SOUT: line.edge})
-    for _ in range(100):
-        bench.now_ns += NS_PER_MS
-        pins.step(bench.now_ns)
-    assert pins.edges == pytest.approx(200, abs=2)
-    assert not line.level()

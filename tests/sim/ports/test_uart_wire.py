@@ -14,16 +14,17 @@ DATA = bytes(range(256)) * 2
 RATES = DRIVER.baud_rates
 
 
-@pytest.mark.parametrize("baud", RATES)
-def test_equal_rates_hear_all(baud: int) -> None:
-    assert heard(DATA, baud, baud) == DATA
-    assert heard(DATA, baud, round(baud * 1.02)) == DATA
-
-
-def test_sampling_of_bits_is_right_where_rates_are_nearly_equal() -> None:
+def test_what_ends_at_equal_near_and_other_rates_hear() -> None:
+    for baud in RATES:
+        assert heard(DATA, baud, baud) == heard(DATA, baud, round(baud * 1.02)) == DATA
     assert heard(DATA, 104_000, 100_000) == DATA  # past the shortcut: 4 % is still within half a bit at bit 10
     assert heard(DATA, 100_000, 104_000) == DATA
     assert heard(DATA, 115_200, 100_000) != DATA
+    assert heard(DATA, 115_200, 0) == b""
+    assert heard(DATA, 0, 115_200) == b""
+    assert heard(b"", 9600, 115_200) == b""
+    assert len(heard(DATA, 921_600, 9600)) < len(DATA) / 20
+    assert len(heard(DATA, 9600, 115_200)) > len(DATA)
 
 
 @pytest.mark.parametrize(
@@ -39,7 +40,7 @@ def test_garbage_by_hand(data: bytes, sent: int, listening: int, expected: bytes
     assert heard(data, sent, listening) == expected
 
 
-@pytest.mark.parametrize("sent", RATES)
+@pytest.mark.parametrize("sent", [9600, 115_200, 921_600])
 @pytest.mark.parametrize("listening", RATES)
 def test_no_frame_survives_a_wrong_rate(sent: int, listening: int) -> None:
     random, ledger = Random(f"{sent} {listening}"), Ledger()
@@ -53,17 +54,6 @@ def test_no_frame_survives_a_wrong_rate(sent: int, listening: int) -> None:
     assert bool(events) == (sent == listening)
 
 
-def test_a_port_without_a_rate_hears_nothing() -> None:
-    assert heard(DATA, 115_200, 0) == b""
-    assert heard(DATA, 0, 115_200) == b""
-    assert heard(b"", 9600, 115_200) == b""
-
-
-def test_slow_listener_gets_less_fast_listener_more() -> None:
-    assert len(heard(DATA, 921_600, 9600)) < len(DATA) / 20
-    assert len(heard(DATA, 9600, 115_200)) > len(DATA)
-
-
 # --- transmitter -----------------------------------------------------------------------------------------------------
 
 
@@ -71,7 +61,7 @@ def transmitter() -> Transmitter:
     return Transmitter(1000, 20, free_ns=1000)
 
 
-def test_wire_time_and_order() -> None:
+def test_wire_time_buffer_and_power_loss() -> None:
     wire = transmitter()
     wire.send(0, b"abc")
     wire.send(5, b"de", sample_ns=4, device_ms=1)
@@ -81,21 +71,15 @@ def test_wire_time_and_order() -> None:
     assert wire.sent(10**12) == [(1000 + 5 * BYTE_NS, b"de", 4, 1)]
     assert wire.next_ns() is None
 
-
-def test_an_idle_wire_starts_when_the_burst_is_ready() -> None:
     wire = transmitter()
     assert wire.due_ns(10**9, 2) == 10**9 + 2 * BYTE_NS
 
-
-def test_buffer_has_an_end() -> None:
     wire = transmitter()
     wire.send(1000, bytes(15))
     assert wire.fits(1000, 5)
     assert not wire.fits(1000, 6)
     assert wire.fits(1000 + BYTE_NS, 6)
 
-
-def test_power_loss_cuts_the_burst_on_the_wire() -> None:
     wire = transmitter()
     for data in (b"whole", b"broken", b"never"):
         wire.send(1000, data)
@@ -103,8 +87,6 @@ def test_power_loss_cuts_the_burst_on_the_wire() -> None:
     assert [burst.data for burst in through] == [b"whole", b"br"]
     assert wire.sent(10**12) == []
 
-
-def test_power_loss_before_the_first_bit_leaves_nothing() -> None:
     wire = transmitter()
     wire.send(1000, b"never")
     assert wire.stopped(500) == []

@@ -48,7 +48,7 @@ def test_when_a_factory_reset_acts(effect: ResetEffect, rate: int, mode: int, an
     assert bench.module.baud == 115_200
 
 
-def test_slow_flash_answers_late_and_sends_no_frames_meanwhile() -> None:
+def test_slow_flash_quiet_refusals_and_all_variants() -> None:
     bench = bench_of(flash_ms=2000)
     bench.wait(50.0)
     bench.module.receive(b"SAVECONFIG\r\n", bench.now_ns)
@@ -57,22 +57,16 @@ def test_slow_flash_answers_late_and_sends_no_frames_meanwhile() -> None:
     assert bench.frames(500.0)
     assert bench.ask("LOG ENABLE") == ["OK"]
 
-
-def test_quiet_after_an_answer() -> None:
     bench = bench_of(quiet_ms=300)
     assert bench.ask("LOG ENABLE") == ["OK"]
     assert bench.frames(240.0) == []
     assert bench.frames(500.0)
 
-
-def test_refused_and_unknown_commands() -> None:
     bench = bench_of(refuses=("CONFIG ATT",), ignores=("LOG MAGCONFIG",))
     assert bench.ask("CONFIG ATT MODE 1") == ["ERR"]
     assert bench.module.settings.att_mode == 0
     assert bench.ask("LOG MAGCONFIG") == []
     assert bench.ask("LOG ENABLE") == ["OK"]
 
-
-def test_the_variants_cover_every_choice() -> None:
     assert {variant.rate_change for variant in VARIANTS.values()} == set(RateChange)
     assert {variant.factory_reset for variant in VARIANTS.values()} == set(ResetEffect)

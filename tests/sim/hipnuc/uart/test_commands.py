@@ -14,7 +14,7 @@ from tests.support.simulated_modules import FAST, HIPNUC_STILL, HipnucUartBench
 VERSION = ["PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK"]
 
 
-def test_the_vendors_probe_finds_it() -> None:
+def test_the_vendors_probe_split_long_and_early_commands() -> None:
     bench = HipnucUartBench()
     for _ in range(3):
         assert bench.ask("LOG DISABLE") == ["OK"]
@@ -22,6 +22,23 @@ def test_the_vendors_probe_finds_it() -> None:
     assert bench.ask("LOG VERSION") == VERSION
     assert bench.ask("LOG ENABLE") == ["OK"]
     assert len(bench.frames(100.0)) == 10
+
+    bench = HipnucUartBench()
+    for byte in b"LOG VERSION\r\n":
+        bench.module.receive(bytes([byte]), bench.now_ns)
+    assert bench.text(30.0) == VERSION
+
+    identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    fits, too_long = ("CONFIG IMU URFR " + ",".join(f"{n:.{digits}f}" for n in identity) for digits in (9, 10))
+    assert len(fits) <= 128 < len(too_long)
+    assert HipnucUartBench().ask(fits) == ["OK"]
+    assert HipnucUartBench().ask(too_long) == []
+
+    bench = HipnucUartBench()
+    bench.module.receive(b"REBOOT\r\nLOG VERSION\r\n", bench.now_ns)
+    assert bench.ask("LOG VERSION", 800.0) == []
+    bench.reboot()
+    assert bench.ask("LOG VERSION") == VERSION
 
 
 def test_replies_stand_between_whole_frames() -> None:
@@ -63,30 +80,7 @@ def test_unknown_commands_get_no_reply(line: str) -> None:
     assert bench.module.settings == ModuleSettings()
 
 
-def test_a_line_above_128_bytes_is_no_command() -> None:
-    identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    fits, too_long = ("CONFIG IMU URFR " + ",".join(f"{n:.{digits}f}" for n in identity) for digits in (9, 10))
-    assert len(fits) <= 128 < len(too_long)
-    assert HipnucUartBench().ask(fits) == ["OK"]
-    assert HipnucUartBench().ask(too_long) == []
-
-
-def test_commands_split_anyhow_are_the_same() -> None:
-    bench = HipnucUartBench()
-    for byte in b"LOG VERSION\r\n":
-        bench.module.receive(bytes([byte]), bench.now_ns)
-    assert bench.text(30.0) == VERSION
-
-
-def test_a_booting_module_hears_nothing() -> None:
-    bench = HipnucUartBench()
-    bench.module.receive(b"REBOOT\r\nLOG VERSION\r\n", bench.now_ns)
-    assert bench.ask("LOG VERSION", 800.0) == []
-    bench.reboot()
-    assert bench.ask("LOG VERSION") == VERSION
-
-
-def test_reboot_forgets_what_was_not_saved_and_restarts_time() -> None:
+def test_reboot_baud_rate_and_factory_reset() -> None:
     bench = HipnucUartBench()
     assert bench.ask("LOG HI91 ONTIME 0.02") == ["OK"]
     assert bench.ask("SAVECONFIG") == ["OK"]
@@ -97,8 +91,6 @@ def test_reboot_forgets_what_was_not_saved_and_restarts_time() -> None:
     assert len(frames) == pytest.approx(50, abs=1)
     assert frames[0].system_time_ms == 520
 
-
-def test_reboot_cuts_the_frame_on_the_wire() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=9600, hi91=Output(100)), HipnucHardware(skew_ppm=0, processing_ns=0))
     bench.wait(100.0 + 41.5 * 10 / 9.6)
     bench.module.receive(b"REBOOT\r\n", bench.now_ns)
@@ -106,8 +98,6 @@ def test_reboot_cuts_the_frame_on_the_wire() -> None:
     assert len(burst.data) == 41
     assert burst.sample_ns is None
 
-
-def test_baud_changes_after_save_and_reboot_only() -> None:
     bench = HipnucUartBench()
     assert bench.ask("SERIALCONFIG 921600") == ["OK"]
     assert bench.module.baud == 115_200
@@ -120,8 +110,6 @@ def test_baud_changes_after_save_and_reboot_only() -> None:
     bench.reboot()
     assert bench.module.baud == 921_600
 
-
-def test_factory_reset_restores_everything() -> None:
     bench = HipnucUartBench(FAST)
     assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
     assert bench.ask("FRESET") == ["OK"]
@@ -160,8 +148,8 @@ def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: command
     assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude turned with the axes: force still points up
 
 
-@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5")
-def test_relative_level_zeroes_roll_and_pitch_and_can_be_cancelled() -> None:
+@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5", "B 2.2.4 ATT RST 3")
+def test_levels() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
     assert bench.ask("CONFIG ATT RST 2") == ["OK"]
@@ -171,17 +159,12 @@ def test_relative_level_zeroes_roll_and_pitch_and_can_be_cancelled() -> None:
     assert bench.ask("CONFIG ATT RST 5") == ["OK"]
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
 
-
-@pytest.mark.manual("B 2.2.4 ATT RST 3")
-def test_automatic_level_turns_the_accelerometer_too() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.ask("CONFIG ATT RST 3") == ["OK"]
     frame = bench.frames(20.0)[-1]
     assert frame.euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
     assert frame.accel_g == pytest.approx((0.0, 0.0, 1.0), abs=1e-5)
 
-
-def test_automatic_level_upside_down_and_too_steep() -> None:
     steep = HipnucUartBench(hardware=HipnucHardware(motion=Still(radians(2), radians(6), 0.0)))
     assert steep.ask("CONFIG ATT RST 3") == ["ERR"]
     assert steep.frames(20.0)[-1].euler_deg[1] == pytest.approx(6.0, abs=1e-4)
@@ -191,8 +174,6 @@ def test_automatic_level_upside_down_and_too_steep() -> None:
     assert abs(roll) == pytest.approx(180.0, abs=1e-4)
     assert pitch == pytest.approx(0.0, abs=1e-4)
 
-
-def test_level_survives_a_reboot_if_saved() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     bench.ask("CONFIG ATT RST 2")
     bench.ask("SAVECONFIG")

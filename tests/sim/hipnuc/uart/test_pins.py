@@ -43,30 +43,24 @@ def test_each_frame_has_its_pulse_right_before_it(settings: ModuleSettings) -> N
         assert rise.due_ns >= (burst.sample_ns or 0)
 
 
-def test_frames_that_do_not_fit_the_wire_have_no_pulse() -> None:
+def test_which_frames_have_a_pulse_and_how_long_it_is() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=115_200, hi91=Output(1)))
     _, edges = run(bench, 1000.0)
     assert bench.module.frames_dropped > 800
     assert len(pulses(edges, Pin.SOUT)) == pytest.approx(bench.module.frames_sent, abs=6)  # those in the buffer
 
-
-def test_both_messages_have_a_pulse_each() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(10), hi92=Output(10)))
     bursts, edges = run(bench, 1000.0)
     assert len(bursts) == pytest.approx(200, abs=2)
     for burst, (_, fall) in zip(bursts, pulses(edges, Pin.SOUT), strict=True):
         assert fall.due_ns == burst.due_ns - len(burst.data) * 10 * NS_PER_S // 921_600
 
-
-def test_text_has_no_pulse() -> None:
     bench = HipnucUartBench()
     bench.ask("UNLOGALL")
     bench.module.pins(bench.now_ns)
     assert bench.ask("LOG VERSION")[-1] == "OK"
     assert bench.module.pins(bench.now_ns) == []
 
-
-def test_the_pulse_is_no_longer_than_the_time_it_has() -> None:
     _, edges = run(HipnucUartBench(hardware=HipnucHardware(processing_ns=30_000, skew_ppm=0)), 100.0)
     for rise, fall in pulses(edges, Pin.SOUT):
         assert fall.due_ns - rise.due_ns == 30_000
@@ -97,16 +91,10 @@ def test_next_pin_ns_never_misses_an_edge() -> None:
     assert len(edges) > 200
 
 
-def test_pins_that_nobody_watches_cost_no_memory() -> None:
-    bench = HipnucUartBench(FAST)
-    bench.wait(10_000.0)
-    assert len(bench.module.pins(bench.now_ns)) <= 8192
-
-
 # --- SOUT_DIV ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("divider", [1, 4, 8, 64])
+@pytest.mark.parametrize("divider", [1, 8, 64])
 @pytest.mark.manual("B 2.2.4 divider")
 def test_every_nth_pulse_is_repeated(divider: int) -> None:
     bench = HipnucUartBench()
@@ -120,7 +108,8 @@ def test_every_nth_pulse_is_repeated(divider: int) -> None:
     assert {sout.index(after) - sout.index(before) for before, after in pairwise(divided)} == {divider}
 
 
-def test_a_new_divider_counts_anew() -> None:
+@pytest.mark.manual("B 2.2.4 PMUX4 SOUT_DIV")
+def test_dividers_and_pins_that_nobody_watches() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     bench.wait(45.0)  # within eight pulses
     bench.module.pins(bench.now_ns)
@@ -128,13 +117,14 @@ def test_a_new_divider_counts_anew() -> None:
     rises = [rise.due_ns for rise, _ in pulses(run(bench, 1000.0)[1], Pin.SOUT_DIV)]
     assert rises[0] - bench.now_ns + 1000 * NS_PER_MS == pytest.approx(20 * 10 * NS_PER_MS, abs=10 * NS_PER_MS)
 
-
-@pytest.mark.manual("B 2.2.4 PMUX4 SOUT_DIV")
-def test_the_factory_divides_by_eight() -> None:
     _, edges = run(HipnucUartBench(), 1000.0)
     periods = [(b.due_ns - a.due_ns) / NS_PER_MS for (a, _), (b, _) in pairwise(pulses(edges, Pin.SOUT_DIV))]
     assert periods == pytest.approx([80.0] * len(periods), rel=1e-4)  # manual, PMUX4
     assert len(periods) >= 11
+
+    bench = HipnucUartBench(FAST)
+    bench.wait(10_000.0)
+    assert len(bench.module.pins(bench.now_ns)) <= 8192
 
 
 # --- ALARM ------------------------------------------------------------------------------------------------------------
@@ -179,12 +169,6 @@ def test_alarm_ends_when_it_is_turned_off() -> None:
     run(bench, 100.0)
     assert bench.ask("CONFIG PMUX5 Y,-1,1,0,0") == ["OK"]
     assert [edge.rising for edge in bench.module.pins(bench.now_ns) if edge.pin is Pin.ALARM] == [False]
-
-
-# --- power ------------------------------------------------------------------------------------------------------------
-
-
-def test_without_power_all_pins_are_low_and_nothing_comes() -> None:
     bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
     edges = run(bench, 105.0)[1]
     rise_ns = edges[-1].due_ns + 10 * NS_PER_MS  # no skew: SOUT falls every 10 ms, so here it is high or about to be
@@ -199,6 +183,9 @@ def test_without_power_all_pins_are_low_and_nothing_comes() -> None:
     assert all(edge.pin is not Pin.SOUT for edge in run(bench, 499.0)[1])  # still booting
 
 
+# --- power ------------------------------------------------------------------------------------------------------------
+
+
 # --- SIN --------------------------------------------------------------------------------------------------------------
 
 
@@ -206,7 +193,7 @@ def test_without_power_all_pins_are_low_and_nothing_comes() -> None:
 def test_a_trigger_is_answered_125_us_later_on_average() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(on_mark=True)))
     delays, wire_ns = [], 82 * 10 * NS_PER_S // 921_600
-    for _ in range(1000):
+    for _ in range(300):
         marked_ns = bench.now_ns
         bench.module.mark(marked_ns)
         (burst,), edges = run(bench, 10.0)
@@ -214,7 +201,7 @@ def test_a_trigger_is_answered_125_us_later_on_average() -> None:
         assert burst.sample_ns == pulse[0].sample_ns == marked_ns
         assert burst.due_ns - wire_ns == pulse[1].due_ns == pulse[0].due_ns + HIGH_NS
         delays.append(pulse[1].due_ns - marked_ns)
-    assert sum(delays) / len(delays) == pytest.approx(125_000, abs=1000)
+    assert sum(delays) / len(delays) == pytest.approx(125_000, abs=2000)
     assert 20_000 < max(delays) - min(delays) <= 30_000
 
 
@@ -224,9 +211,6 @@ def test_the_pps_stamp_is_cut_off_to_whole_ms() -> None:
     bench.module.mark(bench.now_ns)
     frame = bench.frames(3.0)[-1]
     assert frame.word_1_2 == 1  # sampled 2 ms later, less 0.7: 0.3, 1.3, 2.3 …
-
-
-def test_a_booting_module_sees_no_pulse() -> None:
     bench = HipnucUartBench(FAST, HIPNUC_STILL)
     bench.module.reboot(bench.now_ns)
     bench.wait(100.0)

@@ -45,7 +45,8 @@ def test_every_mounting_of_the_host_is_understood(mounting: Mounting) -> None:
     assert settings.urfr == tuple(float(value) for row in mounting.value for value in row)
 
 
-def test_every_rate_of_the_host_is_understood() -> None:
+@pytest.mark.manual("B 2.2.4 pins by firmware", "B 1.2.2 timed output off")
+def test_rates_pins_unlogall_and_reports() -> None:
     for message in OutputMessage:
         for rate_hz in (0, *RATES_HZ):
             settings = changed(FACTORY, commands.log_ontime(message, rate_hz).name, 156)
@@ -56,6 +57,18 @@ def test_every_rate_of_the_host_is_understood() -> None:
         settings = changed(FACTORY, commands.serial_config(baud).name, 156)
         assert settings
         assert settings.baud == baud
+
+    assert changed(FACTORY, "CONFIG PMUX3 IO2", 154) is None
+    assert changed(FACTORY, "CONFIG PMUX3 IO2", 155) is not None
+
+    settings = replace(FACTORY, hi92=Output(on_mark=True))
+    assert changed(settings, "UNLOGALL", 156) == replace(settings, hi91=Output())
+
+    settings = replace(FACTORY, hi92=Output(on_mark=True))
+    assert settings.port_lines() == ["BAUD: 115200", "LOG HI91 ONTIME 0.01", "LOG HI92 ONMARK 1"]
+    lines = settings.user_lines()
+    assert lines[:3] == ["ATT_MODE: 0", "URFR: 1,0,0,0,1,0,0,0,1", "EN_MCAL: 1"]
+    assert "ALARM_Y: -5,5,0,0" in lines
 
 
 @pytest.mark.parametrize(
@@ -95,23 +108,3 @@ def test_bad_values_are_refused(line: str) -> None:
 @pytest.mark.parametrize("line", ["LOG HI91 ONMARK ONCE", "LOG VERSION", "CONFIG PMUX6 IO1", "CONFIG PMUX5 Z,0,1,0,1"])
 def test_other_commands_are_not_for_it(line: str) -> None:
     assert changed(FACTORY, line, 156) is None
-
-
-@pytest.mark.manual("B 2.2.4 pins by firmware")
-def test_pins_need_newer_firmware() -> None:
-    assert changed(FACTORY, "CONFIG PMUX3 IO2", 154) is None
-    assert changed(FACTORY, "CONFIG PMUX3 IO2", 155) is not None
-
-
-@pytest.mark.manual("B 1.2.2 timed output off")
-def test_unlogall_keeps_triggered_messages() -> None:
-    settings = replace(FACTORY, hi92=Output(on_mark=True))
-    assert changed(settings, "UNLOGALL", 156) == replace(settings, hi91=Output())
-
-
-def test_reports() -> None:
-    settings = replace(FACTORY, hi92=Output(on_mark=True))
-    assert settings.port_lines() == ["BAUD: 115200", "LOG HI91 ONTIME 0.01", "LOG HI92 ONMARK 1"]
-    lines = settings.user_lines()
-    assert lines[:3] == ["ATT_MODE: 0", "URFR: 1,0,0,0,1,0,0,0,1", "EN_MCAL: 1"]
-    assert "ALARM_Y: -5,5,0,0" in lines

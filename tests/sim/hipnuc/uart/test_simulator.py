@@ -26,23 +26,44 @@ T = TypeVar("T")
 
 
 @pytest.mark.manual("B 3.2 factory output")
-def test_factory_output_is_hi91_at_100_hz() -> None:
+def test_frames_and_their_times() -> None:
     frames = HipnucUartBench().frames(1000.0)
     assert len(frames) == pytest.approx(100, abs=1)
     assert {after.system_time_ms - before.system_time_ms for before, after in pairwise(frames)} == {10}
 
-
-def test_it_is_silent_while_booting_and_its_time_starts_near_zero() -> None:
     module = HipnucModule(BEGIN_NS)
     assert module.advance(BEGIN_NS + 500 * NS_PER_MS) == []
     assert unpack_hi91(module.advance(BEGIN_NS + 520 * NS_PER_MS)[0].data).system_time_ms == 510
 
+    (frame, *_) = HipnucUartBench(hardware=HIPNUC_STILL).frames(20.0)
+    assert hypot(*frame.accel_g) == pytest.approx(1.0, abs=1e-6)
+    assert frame.gyro_deg_s == (0.0, 0.0, 0.0)
 
-@pytest.mark.parametrize("skew_ppm", [-50_000.0, -80.0, 0.0, 123.4, 50_000.0])
+    settings = ModuleSettings(baud=115_200)
+    for burst in HipnucUartBench(settings, HipnucHardware(processing_ns=125_000)).wait(50.0):
+        assert burst.sample_ns
+        assert burst.due_ns - burst.sample_ns == 125_000 + 82 * 10 * NS_PER_S // 115_200
+
+    bench = HipnucUartBench(FAST)
+    for _ in range(50):
+        next_ns = bench.module.next_ns()
+        assert next_ns is not None
+        assert bench.module.advance(next_ns - 1) == []
+        assert len(bench.module.advance(next_ns)) == 1
+
+    coarse, fine = HipnucUartBench(FAST), HipnucUartBench(FAST)
+    assert coarse.wait(60.0) == [burst for _ in range(240) for burst in fine.wait(0.25)]
+
+    bench = HipnucUartBench(ModuleSettings(hi91=Output(20), hi92=Output(50)))
+    sizes = [len(burst.data) for burst in bench.wait(1000.0)]
+    assert (sizes.count(82), sizes.count(54)) == pytest.approx((50, 20), abs=1)
+
+
+@pytest.mark.parametrize("skew_ppm", [-50_000.0, 0.0, 123.4])
 def test_samples_stand_on_milliseconds_of_its_own_crystal(skew_ppm: float) -> None:
     bench = HipnucUartBench(FAST, HipnucHardware(skew_ppm=skew_ppm, processing_ns=0))
-    bursts = bench.wait(2000.0)
-    assert len(bursts) == pytest.approx(2000 * (1 + skew_ppm / 1e6), abs=2)
+    bursts = bench.wait(1000.0)
+    assert len(bursts) == pytest.approx(1000 * (1 + skew_ppm / 1e6), abs=2)
     for burst in bursts:
         assert burst.sample_ns
         assert burst.device_ms == unpack_hi91(burst.data).system_time_ms
@@ -50,7 +71,7 @@ def test_samples_stand_on_milliseconds_of_its_own_crystal(skew_ppm: float) -> No
         assert true_ms == pytest.approx(burst.device_ms, abs=2e-6)
 
 
-@pytest.mark.parametrize("skew_ppm", [-333.3, 20.0, 50_000.0])
+@pytest.mark.parametrize("skew_ppm", [-333.3, 50_000.0])
 def test_settings_changed_at_the_instant_of_a_sample_repeat_none(skew_ppm: float) -> None:
     bench = HipnucUartBench(FAST, HipnucHardware(skew_ppm=skew_ppm))
     instants = [burst.sample_ns or 0 for burst in bench.wait(200.0)][50:]
@@ -75,33 +96,6 @@ def test_frame_carries_the_truth_of_its_instant() -> None:
         assert frame.temperature_c == round(truth.temperature_c)
 
 
-def test_at_rest_it_reads_one_g() -> None:
-    (frame, *_) = HipnucUartBench(hardware=HIPNUC_STILL).frames(20.0)
-    assert hypot(*frame.accel_g) == pytest.approx(1.0, abs=1e-6)
-    assert frame.gyro_deg_s == (0.0, 0.0, 0.0)
-
-
-def test_frame_leaves_after_processing_and_wire_time() -> None:
-    settings = ModuleSettings(baud=115_200)
-    for burst in HipnucUartBench(settings, HipnucHardware(processing_ns=125_000)).wait(50.0):
-        assert burst.sample_ns
-        assert burst.due_ns - burst.sample_ns == 125_000 + 82 * 10 * NS_PER_S // 115_200
-
-
-def test_next_ns_is_exactly_when_something_comes() -> None:
-    bench = HipnucUartBench(FAST)
-    for _ in range(50):
-        next_ns = bench.module.next_ns()
-        assert next_ns is not None
-        assert bench.module.advance(next_ns - 1) == []
-        assert len(bench.module.advance(next_ns)) == 1
-
-
-def test_any_steps_give_the_same_bytes() -> None:
-    coarse, fine = HipnucUartBench(FAST), HipnucUartBench(FAST)
-    assert coarse.wait(60.0) == [burst for _ in range(240) for burst in fine.wait(0.25)]
-
-
 def test_what_does_not_fit_the_wire_is_never_sent() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=115_200, hi91=Output(1)))
     bursts = bench.wait(1000.0)
@@ -112,20 +106,6 @@ def test_what_does_not_fit_the_wire_is_never_sent() -> None:
     assert bench.module.counters()["frames_dropped"] > 800
 
 
-def test_both_messages_share_the_wire() -> None:
-    bench = HipnucUartBench(ModuleSettings(hi91=Output(20), hi92=Output(50)))
-    sizes = [len(burst.data) for burst in bench.wait(1000.0)]
-    assert (sizes.count(82), sizes.count(54)) == pytest.approx((50, 20), abs=1)
-
-
-@pytest.mark.manual("B 3.3.1 system_time")
-def test_system_time_wraps_at_32_bits() -> None:
-    frames = HipnucUartBench(hardware=HipnucHardware(uptime_ms=2**32 - 700)).frames(1000.0)
-    times = [frame.system_time_ms for frame in frames]
-    assert times[0] > 2**32 - 250
-    assert times[-1] < 1000
-
-
 @pytest.mark.parametrize(("uptime_ms", "first"), [(0, 510), (8192 * 3 - 505, 3)])
 def test_pps_stamp_free_runs_and_wraps_at_8192(uptime_ms: int, first: int) -> None:
     frames = HipnucUartBench(hardware=HipnucHardware(uptime_ms=uptime_ms, skew_ppm=0)).frames(9000.0)
@@ -134,7 +114,8 @@ def test_pps_stamp_free_runs_and_wraps_at_8192(uptime_ms: int, first: int) -> No
     assert min(frame.word_1_2 for frame in frames) < 10
 
 
-def test_newer_firmware_sends_main_status_instead() -> None:
+@pytest.mark.manual("B 3.3.1 system_time")
+def test_main_status_noise_and_the_end_of_32_bits() -> None:
     bench = HipnucUartBench(hardware=HipnucHardware(motion=Still(), firmware=169, skew_ppm=0))
     early, late = bench.frames(20.0)[0], bench.frames(6000.0)[-1]
     assert early.word_1_2 == 1 << 3 | 1 << 7 | 1 << 9 | 1 << 11 | 1 << 12
@@ -143,13 +124,16 @@ def test_newer_firmware_sends_main_status_instead() -> None:
     assert bench.frames(20.0)[0].word_1_2 & 1 << 10
     assert not HipnucUartBench(hardware=HipnucHardware(firmware=169)).frames(20.0)[0].word_1_2 & 1 << 9
 
-
-def test_noise_is_added_to_vectors_only() -> None:
     clean = HipnucUartBench(hardware=HIPNUC_STILL).frames(50.0)
     noisy = HipnucUartBench(hardware=HipnucHardware(motion=HIPNUC_STILL.motion, skew_ppm=0, noise=Noise(1))).frames(
         50.0
     )
     assert all(a.accel_g != b.accel_g and a.quat_wxyz == b.quat_wxyz for a, b in zip(clean, noisy, strict=True))
+
+    frames = HipnucUartBench(hardware=HipnucHardware(uptime_ms=2**32 - 700)).frames(1000.0)
+    times = [frame.system_time_ms for frame in frames]
+    assert times[0] > 2**32 - 250
+    assert times[-1] < 1000
 
 
 # --- the pulse input --------------------------------------------------------------------------------------------------
@@ -203,12 +187,9 @@ def converse(bench: HipnucUartBench, script: RequestScript[T]) -> T:
     return value
 
 
-def test_identity_is_read_amid_frames() -> None:
+def test_identity_and_settings_are_read_amid_frames() -> None:
     identity = converse(HipnucUartBench(FAST), DRIVER.identify())
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
-
-
-def test_settings_are_read_amid_frames() -> None:
     settings = converse(HipnucUartBench(FAST), DRIVER.read_settings())
     assert settings["ATT_MODE"] == "0"
     assert settings["BAUD"] == "921600"

@@ -65,7 +65,7 @@ def still(skew_ppm: float = 20.0, **values: object) -> HipnucHardware:
     return HipnucHardware(motion=Still(), skew_ppm=skew_ppm, **values)  # type: ignore[arg-type]  # named by the caller
 
 
-def test_time_becomes_utc_at_once_cut_off_to_ms() -> None:
+def test_time_becomes_utc_at_once_until_a_reboot() -> None:
     receiver = Receiver(still())
     receiver.go(3)
     assert all(frame.system_time_ms < 10_000 for _, frame in receiver.frames)
@@ -76,12 +76,21 @@ def test_time_becomes_utc_at_once_cut_off_to_ms() -> None:
     assert len(jumps) == 1
     assert times[-1] == pytest.approx((UTC_S + 7) * 1000 % 2**32, abs=11)
 
-
-def test_ms_of_the_day_is_the_other_choice() -> None:
     receiver = Receiver(still(utc_epoch="day"))
     receiver.go(6)
     assert all(-0.05 <= error < 1.05 for error in receiver.error_ms(86_400_000))
     assert receiver.frames[-1][1].system_time_ms < 86_400_000
+
+    receiver = Receiver(still(utc_epoch="day"))
+    receiver.go(8)
+    for _, frame in receiver.last(1):
+        assert frame.word_1_2 == frame.system_time_ms % 1000
+
+    receiver = Receiver(still())
+    receiver.go(6)
+    receiver.module.reboot(receiver.begin_ns)
+    receiver.go(1, says=None)
+    assert receiver.frames[-1][1].system_time_ms < 2000
 
 
 def test_midnight_and_the_end_of_32_bits_only_wrap() -> None:
@@ -165,8 +174,6 @@ def test_one_wrong_sentence_changes_nothing_and_a_lasting_change_is_followed() -
     receiver.go(3, says=5)
     assert all(-5000.05 <= error < -4998.95 for error in receiver.error_ms())
 
-
-def test_disturbances_on_the_pulse_line_are_not_seconds() -> None:
     receiver = Receiver(still())
     receiver.go(6)
     for _ in range(5):
@@ -175,18 +182,3 @@ def test_disturbances_on_the_pulse_line_are_not_seconds() -> None:
         receiver.module.mark(receiver.begin_ns + 700 * NS_PER_MS)
         receiver.go(1, pulse=False, says=None)
     assert all(-0.05 <= error < 1.05 for error in receiver.error_ms(seconds=5))
-
-
-def test_a_reboot_forgets_utc() -> None:
-    receiver = Receiver(still())
-    receiver.go(6)
-    receiver.module.reboot(receiver.begin_ns)
-    receiver.go(1, says=None)
-    assert receiver.frames[-1][1].system_time_ms < 2000
-
-
-def test_the_pps_stamp_agrees_with_utc() -> None:
-    receiver = Receiver(still(utc_epoch="day"))
-    receiver.go(8)
-    for _, frame in receiver.last(1):
-        assert frame.word_1_2 == frame.system_time_ms % 1000
