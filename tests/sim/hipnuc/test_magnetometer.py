@@ -29,7 +29,7 @@ def test_one_turn_about_each_axis_is_enough() -> None:
     assert magnetometer.measured((1e-6, 2e-6, 3e-6)) == pytest.approx((1e-6, 2e-6, 3e-6))
 
 
-@pytest.mark.manual("B 8.1.3 in the background")
+@pytest.mark.manual("B 8.1.3 in the background", "B 8.2 EN_MCAL")
 def test_a_module_that_is_turned() -> None:
     hardware = HipnucHardware(motion=tumble(), hard_iron_t=HARD_IRON_T)
     bench = HipnucUartBench(ModuleSettings(att_mode=1), hardware)
@@ -38,10 +38,6 @@ def test_a_module_that_is_turned() -> None:
     assert "MB=14.14, -2.08, -8.75" in bench.ask("LOG MAGCONFIG")
     bench.reboot()
     assert "MB=14.14, -2.08, -8.75" in bench.ask("LOG MAGCONFIG")  # it has saved it by itself
-
-
-@pytest.mark.manual("B 8.2 EN_MCAL")
-def test_not_in_six_axes_and_not_when_switched_off() -> None:
     for settings in (ModuleSettings(att_mode=0), ModuleSettings(att_mode=1, mag_calibration=False)):
         bench = HipnucUartBench(settings, HipnucHardware(motion=tumble(), hard_iron_t=HARD_IRON_T))
         bench.wait(30_000)

@@ -71,6 +71,18 @@ def test_windows_bursts_modes_and_a_restart() -> None:
 
     one, _ = device(behaviour=RegisterBehaviour(window_bits=0xA5FE))
     assert spoken(one, 0xFE01, 0x7E00, 0xFE00, 0x7E00, 0, 0)[3::2] == [0xA5FF, 0xA5FE]
+    one, _ = device()
+    good = one.i2c([b"\x6a", 8])
+    one.faults.flips = 1
+    flipped = one.i2c([b"\x6a", 8])
+    assert sum((a ^ b).bit_count() for a, b in zip(good, flipped, strict=True)) == 1
+    assert one.i2c([b"\x6a", 8]) == good
+    one.faults.line = 0xFF
+    assert one.i2c([b"\x6a", 8]) == b"\xff" * 8
+    assert one.spi([b"\x00\x00"]) == [b"\xff\xff"]
+    one.faults.error = errno.ENXIO
+    with pytest.raises(OSError, match="ENXIO"):
+        one.i2c([b"\x6a", 8])
 
 
 def test_registers_are_latched_and_renewed_in_steps() -> None:
@@ -86,21 +98,6 @@ def test_registers_are_latched_and_renewed_in_steps() -> None:
     clock.now = 90 * MS
     one.i2c([b"\x12", 32])
     assert one.latched_ns == 20 * MS
-
-
-def test_faults_are_what_they_say() -> None:
-    one, _ = device()
-    good = one.i2c([b"\x6a", 8])
-    one.faults.flips = 1
-    flipped = one.i2c([b"\x6a", 8])
-    assert sum((a ^ b).bit_count() for a, b in zip(good, flipped, strict=True)) == 1
-    assert one.i2c([b"\x6a", 8]) == good
-    one.faults.line = 0xFF
-    assert one.i2c([b"\x6a", 8]) == b"\xff" * 8
-    assert one.spi([b"\x00\x00"]) == [b"\xff\xff"]
-    one.faults.error = errno.ENXIO
-    with pytest.raises(OSError, match="ENXIO"):
-        one.i2c([b"\x6a", 8])
 
 
 @pytest.mark.parametrize(

@@ -150,17 +150,6 @@ def test_a_silent_module_notices_soon_that_a_program_opened_the_port(rig: Plugge
     assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # from now on select reports its bytes
 
 
-def test_faults_wait_while_the_cable_is_out(tmp_path: Path) -> None:
-    rig = PluggedPort(tmp_path / "tty", faults=Faults(1, FaultRates(flip=0.5)))
-    rig.run(100)
-    assert rig.port.summary()["fault_flip"] > 0
-    rig.port.unplug(rig.now_ns, NS_PER_S)
-    before = rig.port.summary()["fault_flip"]
-    rig.run(900)
-    assert rig.port.summary()["fault_flip"] == before
-    rig.port.close()
-
-
 def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: PluggedPort) -> None:
     rig.open(115_200)
     os.write(rig.fd, b"LOG DISABLE\r\n")
@@ -168,19 +157,6 @@ def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: PluggedPort) ->
     rig.run(50)
     rig.open()
     assert rig.run(100) == b""
-
-
-def test_a_reader_that_stops_blocks_nothing(tmp_path: Path) -> None:
-    rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)))
-    rig.open(921_600)
-    rig.read = lambda: b""  # type: ignore[method-assign]  # a program that never reads
-    rig.run(2000)
-    counted = rig.port.summary()
-    assert counted["bytes_lost_full"] > 50_000
-    total = counted["bytes_lost_full"] + counted["bytes_written"] + counted["bytes_unheard"]
-    assert total == pytest.approx(2000 * 82, abs=5 * 82)
-    rig.close()
-    rig.port.close()
 
 
 def test_unplugging_takes_the_node_away_and_brings_it_back(rig: PluggedPort) -> None:
@@ -213,7 +189,7 @@ def test_an_exclusive_program_is_no_obstacle(rig: PluggedPort) -> None:
     assert frames_of(rig.run(100)) == pytest.approx(10, abs=1)
 
 
-def test_a_latency_timer_hands_over_in_batches(tmp_path: Path) -> None:
+def test_adapters_with_a_timer_and_a_reader_that_stops(tmp_path: Path) -> None:
     rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
     rig.open(921_600)
     rig.run(500)
@@ -226,14 +202,23 @@ def test_a_latency_timer_hands_over_in_batches(tmp_path: Path) -> None:
     rig.close()
     rig.port.close()
 
-
-def test_what_the_adapter_held_is_lost_with_the_cable(tmp_path: Path) -> None:
     rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
     rig.open(921_600)
     rig.run(16 * 3 + 10)
     rig.port.step(rig.now_ns)
     rig.port.unplug(rig.now_ns, NS_PER_S)
     assert rig.port.summary()["bytes_unheard"] == pytest.approx(10 * 82, abs=82)
+    rig.close()
+    rig.port.close()
+
+    rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)))
+    rig.open(921_600)
+    rig.read = lambda: b""  # type: ignore[method-assign]  # a program that never reads
+    rig.run(2000)
+    counted = rig.port.summary()
+    assert counted["bytes_lost_full"] > 50_000
+    total = counted["bytes_lost_full"] + counted["bytes_written"] + counted["bytes_unheard"]
+    assert total == pytest.approx(2000 * 82, abs=5 * 82)
     rig.close()
     rig.port.close()
 
@@ -251,7 +236,7 @@ def test_the_truth_log_tells_when_each_frame_was_measured(rig: PluggedPort) -> N
     assert len(rows) == pytest.approx(29, abs=1)
 
 
-def test_faults_lie_between_module_and_reader(tmp_path: Path) -> None:
+def test_faults_of_the_line_and_of_the_cable(tmp_path: Path) -> None:
     faults = Faults(4, FaultRates(flip=0.2))
     rig = PluggedPort(tmp_path / "tty", faults=faults)
     rig.open(115_200)
@@ -264,8 +249,15 @@ def test_faults_lie_between_module_and_reader(tmp_path: Path) -> None:
     rig.close()
     rig.port.close()
 
+    rig = PluggedPort(tmp_path / "tty", faults=Faults(1, FaultRates(flip=0.5)))
+    rig.run(100)
+    assert rig.port.summary()["fault_flip"] > 0
+    rig.port.unplug(rig.now_ns, NS_PER_S)
+    before = rig.port.summary()["fault_flip"]
+    rig.run(900)
+    assert rig.port.summary()["fault_flip"] == before
+    rig.port.close()
 
-def test_a_fault_can_pull_the_cable(tmp_path: Path) -> None:
     faults = Faults(4, FaultRates(unplug=0.05, unplug_ns=100 * NS_PER_MS))
     rig = PluggedPort(tmp_path / "tty", faults=faults)
     seen = set()

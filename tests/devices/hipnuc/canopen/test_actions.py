@@ -101,6 +101,7 @@ def test_arguments_that_cannot_be_send_nothing(name: str, given: dict[str, objec
         next(begun(name, **given))
 
 
+@pytest.mark.manual("B 5.4.1 node number")
 def test_the_module_obeys() -> None:
     bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms))
     bench.run_script(begun("direction", x_reversed=False, y_reversed=True))
@@ -111,10 +112,6 @@ def test_the_module_obeys() -> None:
     assert not bench.module.objects.settings.invert_x
     assert bench.run_script(begun("nmt", command="reset_node")) == "restarted, as node 8"
     assert not bench.module.objects.settings.invert_y  # nothing was saved
-
-
-@pytest.mark.manual("B 5.4.1 node number")
-def test_a_new_node_number_is_in_force_after_saving_and_restarting() -> None:
     bench = CanopenBench()
     bench.run_script(begun("node", node=9))
     assert bench.module.node == 8

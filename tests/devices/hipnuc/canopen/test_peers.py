@@ -258,15 +258,6 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
     assert settings["209A.0"] == "3"
     assert "20A0.0" not in settings  # never set there: no data available
 
-
-def test_their_long_strings_are_left_alone(local: canopen.LocalNode, host: Host) -> None:
-    local.set_data(0x1008, 0, b"a name of many letters")
-    identity = run_script(session.identify(NODE), host.ask)
-    assert identity.product == ""
-    assert identity.serial_number == "0x00000014"
-
-
-def test_their_abort_codes_are_told_in_words(local: canopen.LocalNode, host: Host) -> None:
     assert local.id == NODE
     with pytest.raises(cia301.Aborted, match="object does not exist"):
         run_script(cia301.read_object(NODE, 0x3000, 0), host.ask)
@@ -275,6 +266,12 @@ def test_their_abort_codes_are_told_in_words(local: canopen.LocalNode, host: Hos
     host.limit_s = 0
     with pytest.raises(NoReply):
         run_script(session.identify(NODE + 1), host.ask)
+    host.limit_s = LIMIT_S
+
+    local.set_data(0x1008, 0, b"a name of many letters")
+    identity = run_script(session.identify(NODE), host.ask)
+    assert identity.product == ""
+    assert identity.serial_number == "0x00000014"
 
 
 def test_their_node_obeys_our_nmt_and_its_heartbeat_is_heard(local: canopen.LocalNode, host: Host) -> None:

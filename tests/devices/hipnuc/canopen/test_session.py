@@ -18,6 +18,9 @@ PERIODS = {0: "00", 5: "05", 10: "0A", 20: "14", 50: "32", 100: "64"}
 
 
 def test_a_restart_a_slow_save_and_a_refused_write() -> None:
+    for period_ms in (1, 4):
+        with pytest.raises(BadArgument, match="expected 0 or 5 … 1000"):
+            next(session.set_tpdo_period(8, 1, period_ms))
     assert unpack(session.restart_request(8).payload) == (0x608, bytes.fromhex("23 00 20 00 FF 00 00 00"))
     bench = CanopenBench(variant=NodeVariant(flash_ms=1900))
     bench.run_script(session.save(8))
@@ -35,21 +38,15 @@ def test_rate_commands_of_the_manual(tpdo: TpdoNumber) -> None:
         assert unpack(next(session.set_tpdo_period(8, tpdo, period_ms)).payload) == (0x608, bytes.fromhex(text))
 
 
-@pytest.mark.parametrize("invert", [False, True])
 @pytest.mark.manual("B 5.4.1 signs of the inclinometer")
-def test_the_sign_of_y_has_its_own_object(invert: bool) -> None:
-    bench = CanopenBench()
-    bench.run_script(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
-    assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
+def test_the_sign_of_y_has_its_own_object() -> None:
+    for invert in (False, True):
+        bench = CanopenBench()
+        bench.run_script(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
+        assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
 
 
-@pytest.mark.parametrize("period_ms", [1, 4])
-def test_a_period_below_the_shortest_is_not_sent(period_ms: int) -> None:
-    with pytest.raises(BadArgument, match="expected 0 or 5 … 1000"):
-        next(session.set_tpdo_period(8, 1, period_ms))
-
-
-def test_identify() -> None:
+def test_identify_and_read_settings() -> None:
     bench = CanopenBench()
     identity = bench.run_script(session.identify(8))
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14", "0x17080042", "0x0000009C")
@@ -66,8 +63,6 @@ def test_identify() -> None:
     with pytest.raises(NoReply, match="node 9"):
         CanopenBench().run_script(session.identify(9))
 
-
-def test_read_settings() -> None:
     settings = CanopenBench(NodeSettings()).run_script(session.read_settings(8))
     assert settings["1800.2"] == "255"
     assert settings["1804.5"] == "50"
@@ -76,8 +71,6 @@ def test_read_settings() -> None:
     assert settings["209A.0"] == "2"
     assert len(settings) == 17
 
-
-def test_what_a_node_does_not_know_is_left_out() -> None:
     asked: list[tuple[int, int]] = []
 
     def refuse(request: Request) -> Outcome:
@@ -115,10 +108,3 @@ def test_a_node_that_cannot_be_read_has_taken_what_it_confirmed(reads: Literal["
     assert bench.module.objects.settings.periods_ms[7] == 20
     assert bench.run_script(session.set_inclinometer_signs(8, invert_x=True, invert_y=False)) is Written.UNVERIFIED
     assert bench.run_script(session.set_bit_rate(8, 250_000)) is Written.UNVERIFIED_PENDING
-
-
-@pytest.mark.parametrize("command", NmtCommand)
-def test_nmt_commands(command: NmtCommand) -> None:
-    bench = CanopenBench()
-    bench.run_script(session.nmt(8, command))
-    assert bench.sent[-1] == (0x000, bytes([command.value, 8]))

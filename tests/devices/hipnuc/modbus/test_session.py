@@ -43,6 +43,7 @@ def restarted(bench: ModbusBench) -> str:
     return bench.run(restart((bench.at, 7), BAUD))
 
 
+@pytest.mark.manual("B 4.3.1 save")
 def test_what_is_written_is_read_back_and_saved_only_when_told(bench: ModbusBench) -> None:
     assert bench.run(set_heading_mode(NINE)) is Written.VERIFIED
     assert [request[0] for _, request in bench.sent] == [6, 3]
@@ -54,10 +55,6 @@ def test_what_is_written_is_read_back_and_saved_only_when_told(bench: ModbusBenc
     restarted(bench)
     assert bench.slave.settings.heading_mode == 1
     assert bench.slave.writes_to_flash == 1
-
-
-@pytest.mark.manual("B 4.3.1 save")
-def test_a_save_may_take_two_seconds(bench: ModbusBench) -> None:
     before_ns = bench.now_ns
     bench.run(save())
     assert bench.now_ns - before_ns >= bench.slave.variant.flash_ms * 1_000_000
@@ -78,12 +75,6 @@ def test_a_module_is_followed_to_another_address(bench: ModbusBench) -> None:
     assert bench.run(read(BY_NAME["MD_ID"])) == (9,)
 
 
-def test_an_unsaved_address_is_left_at_a_restart(bench: ModbusBench) -> None:
-    bench.run(change_address(7, 9))
-    assert restarted(bench) == "restarted, at address 7"
-    assert bench.at == bench.slave.address == 7
-
-
 def test_an_address_that_another_module_has_is_refused_before_anything_is_written(bench: ModbusBench) -> None:
     with pytest.raises(BadArgument, match="address 12 is taken: the module with serial number A00000000000000C"):
         bench.run(change_address(7, 12))
@@ -91,6 +82,9 @@ def test_an_address_that_another_module_has_is_refused_before_anything_is_writte
     assert bench.at == 7
     assert bench.run(change_address(7, 7)) is Written.VERIFIED
     assert bench.at == 7
+    bench.run(change_address(7, 9))
+    assert restarted(bench) == "restarted, at address 7"
+    assert bench.at == bench.slave.address == 7
 
 
 def test_addresses_that_are_taken_or_not_accepted() -> None:
@@ -152,17 +146,14 @@ def test_code_nine_is_256000(bench: ModbusBench) -> None:
 
 
 @pytest.mark.manual("B 4.3.1 factory settings")
-def test_factory_settings_and_where_the_module_is_then(bench: ModbusBench) -> None:
+def test_mounting_level_and_factory_settings(bench: ModbusBench) -> None:
+    assert bench.run(set_mounting(LineMounting.X_UP)) is Written.UNVERIFIED
+    bench.run(auto_level(LevelReset.AUTOMATIC))
+    assert [request.hex() for _, request in bench.sent] == ["0600a60003", "0600a50003"]
     bench.run(set_heading_mode(NINE))
     assert bench.run(factory_reset((7,), BAUD)) == "restarted, at address 80"
     assert bench.slave.settings == SlaveSettings()
     assert bench.at == 80
-
-
-def test_mounting_and_level_are_confirmed_only(bench: ModbusBench) -> None:
-    assert bench.run(set_mounting(LineMounting.X_UP)) is Written.UNVERIFIED
-    bench.run(auto_level(LevelReset.AUTOMATIC))
-    assert [request.hex() for _, request in bench.sent] == ["0600a60003", "0600a50003"]
 
 
 def test_modules_that_do_not_answer_as_expected() -> None:

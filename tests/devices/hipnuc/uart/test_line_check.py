@@ -4,14 +4,7 @@ import pytest
 
 from imud import config
 from imud.config.schema import TABLES
-from imud.contracts.lines import (
-    DeviceLines,
-    DividedSettings,
-    InputSettings,
-    PpsSettings,
-    SoutSettings,
-    TriggerSettings,
-)
+from imud.contracts.lines import DeviceLines, DividedSettings, InputSettings, PpsSettings, SoutSettings, TriggerSettings
 from imud.devices.hipnuc.uart.line_check import declared_line_differences, line_differences, message_limits
 from imud.devices.hipnuc.uart.session import read_settings
 from imud.errors import ConfigError

@@ -1,6 +1,6 @@
 """Conversations with a HiPNUC module: who it is, how it is set, and no reply, refusals and late replies told apart."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeVar
 
 import pytest
@@ -45,16 +45,18 @@ def test_identity_and_refusal() -> None:
         hold(identify(), lambda _: Rejection(("ERR 3",)))
 
 
-@pytest.mark.parametrize("lines", [(), ("PNAME=HI14R3",)])
-def test_no_reply(lines: Sequence[str]) -> None:
-    with pytest.raises(NoReply, match="LOG VERSION: expected lines up to OK"):
-        hold(identify(), lambda _: Silence(tuple(lines)))
-
-
-@pytest.mark.parametrize("lines", [("OK",), ("NAME=HI14R3", "UUID=043995698D6E1708", "OK")])
-def test_an_answer_that_lost_its_product_is_asked_for_again(lines: Sequence[str]) -> None:
-    with pytest.raises(NoReply, match=r"LOG VERSION: expected PNAME=.* bytes were lost"):
-        hold(identify(), lambda _: Reply(tuple(lines)))
+@pytest.mark.parametrize(
+    ("outcome", "words"),
+    [
+        (Silence(()), "LOG VERSION: expected lines up to OK"),
+        (Silence(("PNAME=HI14R3",)), "LOG VERSION: expected lines up to OK"),
+        (Reply(("OK",)), "LOG VERSION: expected PNAME=.* bytes were lost"),
+        (Reply(("NAME=HI14R3", "UUID=043995698D6E1708", "OK")), "LOG VERSION: expected PNAME=.* bytes were lost"),
+    ],
+)
+def test_no_reply_and_one_that_lost_its_product(outcome: Outcome, words: str) -> None:
+    with pytest.raises(NoReply, match=words):
+        hold(identify(), lambda _: outcome)
 
 
 def test_settings_are_one_flat_mapping() -> None:
@@ -67,12 +69,9 @@ def test_settings_are_one_flat_mapping() -> None:
     settings = hold(read_settings(), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n]))
     assert "ATT_MODE" in settings
     assert "MB" not in settings
-
-
-@pytest.mark.parametrize("silent", ["LOG USRCONFIG", "LOG COMCONFIG"])
-def test_settings_without_a_reply(silent: str) -> None:
-    with pytest.raises(NoReply, match=silent):
-        hold(read_settings(), lambda name: Silence(()) if name == silent else Reply(REPLIES[name]))
+    for silent in ("LOG USRCONFIG", "LOG COMCONFIG"):
+        with pytest.raises(NoReply, match=silent):
+            hold(read_settings(), lambda n, silent=silent: Silence(()) if n == silent else Reply(REPLIES[n]))  # type: ignore[misc]  # bound now
 
 
 def test_a_late_version_is_not_taken_for_the_settings() -> None:

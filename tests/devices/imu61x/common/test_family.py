@@ -29,14 +29,28 @@ def test_crc_is_the_reflected_polynomial_from_one_without_inversion(data: bytes)
     assert crc32(data) == crc32_bit_by_bit(data)
 
 
-@pytest.mark.manual("A 1.2 CRC")
-def test_crc_of_a_command_that_a_device_obeyed() -> None:
+@pytest.mark.manual("A 1.2 CRC", "A 1.3 acceleration", "A 2.4.2 codes", "A 2.4.2 default", "A 2.4.2 layout")
+def test_crc_gravity_products_and_filters() -> None:
+    """The manual writes 0x44 for 10 Hz and 0xBB for 47 Hz, accelerometer in the high half."""
     assert crc32(bytes.fromhex("55AA 0300 1800 0000803F") + bytes(20)) == 0xE88ED852
-
-
-def test_crc_check_value() -> None:
     assert crc32(b"123456789") == 0x3A8639CB
     assert crc32(memoryview(b"123456789")) == 0x3A8639CB
+    assert M_S2_PER_G == 9.80665
+    with pytest.raises(ValueError, match="IMU612"):
+        product_id_of("IMU613")
+    assert len(PRODUCTS) == 5
+    for data in (b"", bytes(8), b"\xff" * 8, b"\x00\x00IMU613", b"\x00\x00IMU614\x00", b"IMU61400"):
+        assert product_of(data) is None
+    assert FILTERS[4] == "10 Hz"
+    assert FILTERS[0xB] == "47 Hz"
+    assert len(FILTERS) == 16
+    assert filter_control(4, 4) == 0x44
+    assert filter_control(0xB, 1) == 0xB1
+    assert filter_codes(0xB1) == (0xB, 1)
+    assert filter_codes(0xFFB1) == (0xB, 1)
+    for codes in ((-1, 0), (16, 0), (0, 16), (0, -1)):
+        with pytest.raises(ValueError, match="0 … 15"):
+            filter_control(*codes)
 
 
 @pytest.mark.parametrize(
@@ -53,38 +67,3 @@ def test_crc_check_value() -> None:
 def test_product_ids_of_tables_22_and_28(product_id: str, product: str) -> None:
     assert product_of(bytes.fromhex(product_id)) == product
     assert product_id_of(product) == bytes.fromhex(product_id)
-
-
-@pytest.mark.parametrize("data", [b"", bytes(8), b"\xff" * 8, b"\x00\x00IMU613", b"\x00\x00IMU614\x00", b"IMU61400"])
-def test_other_ids_are_no_product(data: bytes) -> None:
-    assert product_of(data) is None
-
-
-def test_an_unknown_product_has_no_id() -> None:
-    with pytest.raises(ValueError, match="IMU612"):
-        product_id_of("IMU613")
-    assert len(PRODUCTS) == 5
-
-
-@pytest.mark.manual("A 2.4.2 codes", "A 2.4.2 default")
-def test_filters() -> None:
-    """The manual writes 0x44 for 10 Hz and 0xBB for 47 Hz, accelerometer in the high half."""
-    assert FILTERS[4] == "10 Hz"
-    assert FILTERS[0xB] == "47 Hz"
-    assert len(FILTERS) == 16
-    assert filter_control(4, 4) == 0x44
-    assert filter_control(0xB, 1) == 0xB1
-    assert filter_codes(0xB1) == (0xB, 1)
-    assert filter_codes(0xFFB1) == (0xB, 1)
-
-
-@pytest.mark.parametrize("codes", [(-1, 0), (16, 0), (0, 16), (0, -1)])
-@pytest.mark.manual("A 2.4.2 layout")
-def test_filter_codes_have_four_bits(codes: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match="0 … 15"):
-        filter_control(*codes)
-
-
-@pytest.mark.manual("A 1.3 acceleration")
-def test_g_is_standard_gravity() -> None:
-    assert M_S2_PER_G == 9.80665

@@ -140,7 +140,7 @@ def test_a_run_ends_before_a_frame_that_is_damaged_or_not_finite() -> None:
     assert split.ledger.closes()
 
 
-def test_a_run_goes_on_past_frames_whose_timer_or_large_values_look_like_infinity() -> None:
+def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
     """High bytes 0x7F and 0xFF, in which NaN and infinity are looked for: of the timer, and of finite 2e38."""
     late = [with_crc(AHRS_HEX.replace("78563412", f"785634{high}")) for high in ("7F", "FF")]
     large = with_crc(AHRS_HEX.replace("00001242", struct.pack("<f", -2e38).hex()))
@@ -153,8 +153,6 @@ def test_a_run_goes_on_past_frames_whose_timer_or_large_values_look_like_infinit
         assert run.ledger.frames_not_finite == alone.ledger.frames_not_finite == 0
         assert run.ledger.closes()
 
-
-def test_the_quaternion_is_that_of_the_attitude_module_to_the_last_bit() -> None:
     random = Random(5)
     frames = [
         encode_ahrs(
@@ -167,6 +165,15 @@ def test_the_quaternion_is_that_of_the_attitude_module_to_the_last_bit() -> None
         assert isinstance(event, Measurement)
         assert event.euler_rad is not None
         assert event.quat_wxyz == quat_from_euler_zyx(event.euler_rad)
+
+    broken = encode_frame(DEVICE_SYNC, AHRS_FRAME, GOLDEN[6:46] + struct.pack("<f", nan))
+    _, measurement = codec().feed(broken)
+    whole = only(codec().feed(GOLDEN))
+    assert isinstance(measurement, Measurement)
+    assert measurement.temperature_c is None
+    for name in ("dev_ticks", "size_bytes", "accel_m_s2", "gyro_rad_s", "euler_rad"):
+        assert getattr(measurement, name) == getattr(whole, name)
+    assert measurement.quat_wxyz == pytest.approx(whole.quat_wxyz, abs=1e-15)
 
 
 @pytest.mark.parametrize("value", [nan, inf, -inf])
@@ -193,17 +200,6 @@ def test_what_is_not_finite_is_left_out_and_told(place: int, missing: set[str], 
     ledger = tested.ledger
     assert (ledger.frames_not_finite, ledger.frames_good, ledger.frames_bad()) == (1, 1, 0)
     assert ledger.closes()
-
-
-def test_what_is_finite_is_the_same_beside_what_is_not() -> None:
-    broken = encode_frame(DEVICE_SYNC, AHRS_FRAME, GOLDEN[6:46] + struct.pack("<f", nan))
-    _, measurement = codec().feed(broken)
-    whole = only(codec().feed(GOLDEN))
-    assert isinstance(measurement, Measurement)
-    assert measurement.temperature_c is None
-    for name in ("dev_ticks", "size_bytes", "accel_m_s2", "gyro_rad_s", "euler_rad"):
-        assert getattr(measurement, name) == getattr(whole, name)
-    assert measurement.quat_wxyz == pytest.approx(whole.quat_wxyz, abs=1e-15)
 
 
 @pytest.mark.manual("A 1.2 ID and length", "A 1.2 headers")

@@ -36,6 +36,7 @@ def streams(far: Imu61xBench) -> bool:
     "A 1.5 parameter 31",
     "A 1 stream mode",
     "A 1 command mode",
+    "A 1.4 status members",
 )
 def test_identity_settings_and_modes(variant: str) -> None:
     far = variant_bench(variant)
@@ -68,18 +69,11 @@ def test_identity_settings_and_modes(variant: str) -> None:
     far.run(session.start_streaming(done=done(variant)))
     assert streams(far)
 
-
-@every_variant
-def test_a_device_in_command_mode_stays_there(variant: str) -> None:
     far = variant_bench(variant, QUIET)
     assert far.run(session.identify()).serial_number
     assert far.module.settings.mode is OutputMode.COMMAND
     assert far.samples(1000) == []
 
-
-@every_variant
-@pytest.mark.manual("A 1.4 status members")
-def test_status_has_names(variant: str) -> None:
     words = variant_bench(variant).run(session.device_status())
     head = {
         "serial_number": "003200473133510D33383736",
@@ -209,12 +203,7 @@ def test_an_order_without_an_acknowledgement_is_not_known_to_be_done(command: Co
 
 @pytest.mark.parametrize(
     ("parameter", "value"),
-    [
-        (Parameter.BAUD, 115200),
-        (Parameter.GYRO_X_OFF, 0),
-        (Parameter.BUS_MODE, 1),
-        (Parameter.AHRS_RATE, BusMode.SPI),
-    ],
+    [(Parameter.BAUD, 115200), (Parameter.GYRO_X_OFF, 0), (Parameter.BUS_MODE, 1), (Parameter.AHRS_RATE, BusMode.SPI)],
 )
 def test_what_cannot_be_set_is_refused_before_anything_is_sent(parameter: Parameter, value: int | BusMode) -> None:
     far = imu61x_bench()

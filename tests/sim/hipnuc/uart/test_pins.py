@@ -71,13 +71,10 @@ def test_edges_come_in_order_whatever_the_steps() -> None:
     settings = ModuleSettings(hi91=Output(5), hi92=Output(7), baud=921_600, alarm_x=AlarmSetting(-1, 1, True))
     whole = run(HipnucUartBench(settings), 500.0)[1]
     bench = HipnucUartBench(settings)
-    steps = [edge for _ in range(5000) for edge in run(bench, 0.1)[1]]
+    steps = [edge for _ in range(2500) for edge in run(bench, 0.2)[1]]
     assert steps == whole
     assert all(after.due_ns >= before.due_ns for before, after in pairwise(whole))
     assert {edge.pin for edge in whole} == set(Pin)
-
-
-def test_next_pin_ns_never_misses_an_edge() -> None:
     bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-3, 3, True)))
     edges: list[PinEdge] = []
     while bench.now_ns < BEGIN_NS + 1500 * NS_PER_MS:

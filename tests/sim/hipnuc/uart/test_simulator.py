@@ -94,9 +94,6 @@ def test_frame_carries_the_truth_of_its_instant() -> None:
         assert frame.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-6)
         assert frame.pressure_pa == pytest.approx(truth.pressure_pa, abs=0.01)
         assert frame.temperature_c == round(truth.temperature_c)
-
-
-def test_what_does_not_fit_the_wire_is_never_sent() -> None:
     bench = HipnucUartBench(ModuleSettings(baud=115_200, hi91=Output(1)))
     bursts = bench.wait(1000.0)
     assert len(bursts) == pytest.approx(115_200 / 820, abs=2)
@@ -139,16 +136,13 @@ def test_main_status_noise_and_the_end_of_32_bits() -> None:
 # --- the pulse input --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.manual("B 2.2.5 ONMARK 1")
 def test_a_pulse_restarts_the_pps_stamp() -> None:
     bench = HipnucUartBench(hardware=HipnucHardware(skew_ppm=0))
     bench.wait(125.0)
     bench.module.mark(bench.now_ns)
     frame = bench.frames(40.0)[-1]
     assert frame.word_1_2 == frame.system_time_ms - 625
-
-
-@pytest.mark.manual("B 2.2.5 ONMARK 1")
-def test_marked_messages_come_with_the_pulse_and_once() -> None:
     bench = HipnucUartBench()
     assert bench.ask("UNLOGALL") == ["OK"]
     assert bench.ask("LOG HI91 ONMARK 1") == ["OK"]
@@ -193,6 +187,10 @@ def test_identity_and_settings_are_read_amid_frames() -> None:
     settings = converse(HipnucUartBench(FAST), DRIVER.read_settings())
     assert settings["ATT_MODE"] == "0"
     assert settings["BAUD"] == "921600"
+    module = SIMULATORS["hipnuc-uart"].make(SimulatorOptions(), BEGIN_NS)
+    assert module.baud == 115_200
+    assert module.epoch_ns == BEGIN_NS
+    assert SIMULATORS["hipnuc-uart"].name in SIMULATORS
 
 
 @pytest.mark.parametrize("message", ["HI91", "HI92"])
@@ -214,22 +212,9 @@ def test_codec_reads_every_frame(message: str) -> None:
 # --- making -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_row_makes_a_module() -> None:
-    module = SIMULATORS["hipnuc-uart"].make(SimulatorOptions(), BEGIN_NS)
-    assert module.baud == 115_200
-    assert module.epoch_ns == BEGIN_NS
-    assert SIMULATORS["hipnuc-uart"].name in SIMULATORS
-
-
 @pytest.mark.parametrize(
     ("rate_hz", "message", "baud"),
-    [
-        (1, "", 115_200),
-        (100, "hi91", 115_200),
-        (200, "HI92", 115_200),
-        (200, "HI91", 230_400),
-        (1000, "", 921_600),
-    ],
+    [(1, "", 115_200), (100, "hi91", 115_200), (200, "HI92", 115_200), (200, "HI91", 230_400), (1000, "", 921_600)],
 )
 def test_baud_follows_from_the_rate(rate_hz: float, message: str, baud: int) -> None:
     assert make(SimulatorOptions(rate_hz=rate_hz, message=message), 0).baud == baud

@@ -93,13 +93,43 @@ def test_time_becomes_utc_at_once_until_a_reboot() -> None:
     assert receiver.frames[-1][1].system_time_ms < 2000
 
 
-def test_midnight_and_the_end_of_32_bits_only_wrap() -> None:
+@pytest.mark.manual("B 1.2.1 RMC sentences")
+def test_midnight_many_sentences_the_status_bit_and_lost_pulses() -> None:
     for epoch, modulus, begin_s in (("day", 86_400_000, 1_795_046_400 - 8), ("unix", 2**32, 1_799_678_000)):
         receiver = Receiver(still(utc_epoch=epoch))
         receiver.second = begin_s - begin_s * 1000 % modulus // 1000 + modulus // 1000 - 8
         receiver.go(16)
         assert all(-0.05 <= error < 1.05 for error in receiver.error_ms(modulus))
         assert receiver.frames[-1][1].system_time_ms < 10_000
+
+    receiver = Receiver(still())
+    for _ in range(6):
+        receiver.module.mark(receiver.begin_ns)
+        for tenth in range(10):
+            utc_ns = receiver.second * NS_PER_S + tenth * 100 * NS_PER_MS
+            receiver.sentence(build(utc_ns), 100 * tenth + 60)
+        receiver.go(1, pulse=False, says=None)
+    assert all(-0.05 <= error < 1.05 for error in receiver.error_ms())
+
+    receiver = Receiver(still(firmware=169))
+    receiver.go(6)
+    statuses = [frame.word_1_2 for _, frame in receiver.frames]
+    assert statuses[0] & NO_UTC
+    assert not statuses[-1] & NO_UTC
+    receiver.go(4, pulse=False)
+    assert receiver.frames[-1][1].word_1_2 & NO_UTC
+    receiver.go(1)
+    assert not receiver.frames[-1][1].word_1_2 & NO_UTC
+
+    receiver = Receiver(still(skew_ppm=100.0))
+    receiver.go(6)
+    receiver.go(100, pulse=False, says=None)
+    drifted = receiver.error_ms()
+    assert min(drifted) < -9  # 100 ppm over 100 s
+    receiver.go(2, says=None)
+    assert all(-0.2 <= error < 1.2 for error in receiver.error_ms())
+    times = [frame.system_time_ms for _, frame in receiver.last(102)]
+    assert all(abs(after - before) <= 20 for before, after in pairwise(times))
 
 
 @pytest.mark.parametrize(("pulse", "says"), [(False, 0), (True, None)], ids=["without pulses", "without sentences"])
@@ -127,42 +157,6 @@ def test_bad_sentences_say_nothing(spoil: Callable[[int], bytes]) -> None:
         receiver.sentence(spoil(receiver.second * NS_PER_S), 150)
         receiver.go(1, pulse=False, says=None)
     assert receiver.frames[-1][1].system_time_ms < 10_000
-
-
-@pytest.mark.manual("B 1.2.1 RMC sentences")
-def test_ten_sentences_a_second_name_the_same_pulse() -> None:
-    receiver = Receiver(still())
-    for _ in range(6):
-        receiver.module.mark(receiver.begin_ns)
-        for tenth in range(10):
-            utc_ns = receiver.second * NS_PER_S + tenth * 100 * NS_PER_MS
-            receiver.sentence(build(utc_ns), 100 * tenth + 60)
-        receiver.go(1, pulse=False, says=None)
-    assert all(-0.05 <= error < 1.05 for error in receiver.error_ms())
-
-
-def test_status_bit_11_follows() -> None:
-    receiver = Receiver(still(firmware=169))
-    receiver.go(6)
-    statuses = [frame.word_1_2 for _, frame in receiver.frames]
-    assert statuses[0] & NO_UTC
-    assert not statuses[-1] & NO_UTC
-    receiver.go(4, pulse=False)
-    assert receiver.frames[-1][1].word_1_2 & NO_UTC
-    receiver.go(1)
-    assert not receiver.frames[-1][1].word_1_2 & NO_UTC
-
-
-def test_without_pulses_time_runs_on_and_comes_back_without_a_jump() -> None:
-    receiver = Receiver(still(skew_ppm=100.0))
-    receiver.go(6)
-    receiver.go(100, pulse=False, says=None)
-    drifted = receiver.error_ms()
-    assert min(drifted) < -9  # 100 ppm over 100 s
-    receiver.go(2, says=None)
-    assert all(-0.2 <= error < 1.2 for error in receiver.error_ms())
-    times = [frame.system_time_ms for _, frame in receiver.last(102)]
-    assert all(abs(after - before) <= 20 for before, after in pairwise(times))
 
 
 def test_one_wrong_sentence_changes_nothing_and_a_lasting_change_is_followed() -> None:
