@@ -7,8 +7,9 @@ import pytest
 from imud.contracts.codec import ReplyFrame
 from imud.contracts.device_settings import Written
 from imud.contracts.session import Outcome, Rejection, Reply, Request
-from imud.devices.hipnuc.canopen import cia301, session
+from imud.devices.hipnuc.canopen import cia301, moves, session
 from imud.devices.hipnuc.canopen.cia301 import Aborted, NmtCommand, TpdoNumber
+from imud.devices.hipnuc.canopen.codec import HipnucCanopenSettings
 from imud.errors import BadArgument, DeviceRefused, NoReply
 from imud.sim.hipnuc.canopen import NodeSettings, NodeVariant
 from tests.support.simulated_modules import QUIET, CanopenBench, run_script, unpack
@@ -108,3 +109,24 @@ def test_a_node_that_cannot_be_read_has_taken_what_it_confirmed(reads: Literal["
     assert bench.module.objects.settings.periods_ms[7] == 20
     assert bench.run_script(session.set_inclinometer_signs(8, invert_x=True, invert_y=False)) is Written.UNVERIFIED
     assert bench.run_script(session.set_bit_rate(8, 250_000)) is Written.UNVERIFIED_PENDING
+
+
+def test_which_frames_make_a_number_taken() -> None:
+    """Also SDO replies, but not 0x600 + node and 0x200 + node, which are sent to a node."""
+    bench = CanopenBench(NodeSettings(node=8), others=(12,))
+    bench.others[0].objects.settings = NodeSettings(node=12, periods_ms=QUIET.periods_ms)
+    bench.run(100_000_000)
+    with pytest.raises(BadArgument, match=r"frame 0x58C of it"):
+        bench.run_script(moves.change_node(bench.settings, 12))
+    request = next(moves.change_node(HipnucCanopenSettings(node=8), 12))
+    assert {wanted.can_id for wanted in request.also} == {
+        0x08C, 0x18C, 0x28C, 0x38C, 0x48C, 0x58C, 0x68C, 0x70C, 0x78C,
+    }  # fmt: skip
+
+
+def test_a_restart_is_followed_by_nmt_too() -> None:
+    bench = CanopenBench(NodeSettings(node=8), boot_ms=300)
+    bench.run_script(moves.change_node(bench.settings, 9))
+    bench.run_script(session.save(bench.settings.node))
+    assert bench.run_script(moves.reset(bench.settings, 500_000, NmtCommand.RESET_NODE)) == "restarted, as node 9"
+    assert bench.settings.node == bench.module.node == 9

@@ -103,6 +103,8 @@ def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: 
 
 
 def test_silence_and_values_that_did_not_take_are_told() -> None:
+    with pytest.raises(Rejected, match="restart: the module refused"):
+        J1939Bench(variant=J1939Variant(refuses=frozenset({session.CONTROL}))).act("restart")
     begins: list[Callable[[], RequestScript[object]]] = [
         lambda: session.save(PEER),
         lambda: session.zero(PEER, Zero.HERE),
