@@ -49,7 +49,7 @@ class Parrot:
         self._due_ns = now_ns
 
 
-def test_they_are_one_module() -> None:
+def test_several_modules_are_one_and_are_told_apart() -> None:
     first, second = Parrot(1, 20), Parrot(2, 10)
     both = CanModules([first, second])
     assert both.next_ns() == 10
@@ -66,25 +66,6 @@ def test_they_are_one_module() -> None:
     with pytest.raises(ValueError, match="at least one"):
         CanModules([])
 
-
-@pytest.mark.parametrize("bitrate", [0, 500_000])
-def test_frames_of_one_instant_leave_together_where_there_is_no_bit_rate(bitrate: int) -> None:
-    wire = FrameWire(bitrate, 0)
-    for number in range(5):
-        wire.send(1000, number, False, bytes(8))
-    assert len(wire.sent(1000)) == (5 if bitrate == 0 else 0)
-    assert len(wire.sent(1000 + 5 * 240_000)) == (0 if bitrate == 0 else 5)
-
-
-@pytest.mark.parametrize(("extended", "bits"), [(False, 120), (True, 140)])
-def test_a_frame_takes_its_time(extended: bool, bits: int) -> None:
-    """47 or 67 bits around the data, 64 of data, some stuff bits."""
-    wire = FrameWire(500_000, 0)
-    wire.send(1000, 1, extended, bytes(8))
-    assert wire.next_ns() == 1000 + bits * 2000
-
-
-def test_nodes_are_told_apart_and_sent_in_one_go() -> None:
     made = [
         CAN_SIMULATORS["imu61x-can"].make(SimulatorOptions(boot_ms=0, node=node, at_once=True), 0) for node in (0, 201)
     ]
@@ -105,3 +86,20 @@ def test_nodes_are_told_apart_and_sent_in_one_go() -> None:
     assert [type(event) for event in events] == [Measurement]
     with pytest.raises(ValueError, match="node 2045: expected"):
         CAN_SIMULATORS["imu61x-can"].make(SimulatorOptions(node=2045), 0)
+
+
+@pytest.mark.parametrize("bitrate", [0, 500_000])
+def test_frames_of_one_instant_leave_together_where_there_is_no_bit_rate(bitrate: int) -> None:
+    wire = FrameWire(bitrate, 0)
+    for number in range(5):
+        wire.send(1000, number, False, bytes(8))
+    assert len(wire.sent(1000)) == (5 if bitrate == 0 else 0)
+    assert len(wire.sent(1000 + 5 * 240_000)) == (0 if bitrate == 0 else 5)
+
+
+@pytest.mark.parametrize(("extended", "bits"), [(False, 120), (True, 140)])
+def test_a_frame_takes_its_time(extended: bool, bits: int) -> None:
+    """47 or 67 bits around the data, 64 of data, some stuff bits."""
+    wire = FrameWire(500_000, 0)
+    wire.send(1000, 1, extended, bytes(8))
+    assert wire.next_ns() == 1000 + bits * 2000

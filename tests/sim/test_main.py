@@ -120,6 +120,8 @@ def test_unplug_closes_the_port_and_a_new_one_appears(start: Start) -> None:
     assert json.loads(process.stdout.readline())["unplugs"] == 1
     process.communicate("", timeout=LIMIT_S)  # the end of stdin ends it
     assert process.returncode == 0
+    assert pin_rates("") == PinFaultRates()
+    assert pin_rates("lose_pulse=0.1,extra=0.02") == PinFaultRates(lose_pulse=0.1, extra=0.02)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -241,8 +243,3 @@ def test_a_rise_on_sin_is_answered(start: Start, tmp_path: Path) -> None:
         while select.select([fd], [], [], 0.05)[0]:
             os.read(fd, 4096)
     os.close(fd)
-
-
-def test_rates_of_pins_by_name() -> None:
-    assert pin_rates("") == PinFaultRates()
-    assert pin_rates("lose_pulse=0.1,extra=0.02") == PinFaultRates(lose_pulse=0.1, extra=0.02)

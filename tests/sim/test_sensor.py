@@ -15,9 +15,6 @@ def test_every_option_of_the_sensor_arrives() -> None:
     assert (sensor.skew_ppm, sensor.boot_ms, sensor.processing_ns) == (-35.0, 7, 11)
     assert sensor.noise is None
     assert sensor.reading(1.25) == swing(9.7).at(1.25)
-
-
-def test_noise_is_that_of_the_seed() -> None:
     sensor = SensorHardware(**sensor_of(SimulatorOptions(seed=3)))
     assert sensor.reading(0.5) == Noise(3).add(swing().at(0.5), 0.5) != swing().at(0.5)
     with pytest.raises(ValueError, match="motion 'dance': expected"):

@@ -97,8 +97,6 @@ def test_sync_sends_what_is_of_type_1() -> None:
     bench.run(35 * MS)
     assert sum(can_id == 0x188 for can_id, _ in bench.heard) >= 3
 
-
-def test_nmt_states() -> None:
     bench = CanopenBench(NodeSettings())
     bench.run_script(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
     bench.run(20 * MS)

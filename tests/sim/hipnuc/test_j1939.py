@@ -137,8 +137,8 @@ def test_four_modules_crystal_wire_and_the_next_frame() -> None:
     assert seen >= 60
 
 
-@pytest.mark.manual("B 6.2.2 intervals")
-def test_an_interval_is_set_and_read_back() -> None:
+@pytest.mark.manual("B 6.2.2 intervals", "B 6.2.2 bit rate", "B 6.2.2 address")
+def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     bench = J1939Host(made())
     bench.talk(lambda peer: session.set_interval(peer, 0xFF37, 20))
     bench.talk(lambda peer: session.set_interval(peer, 0xFF4A, 500))  # switched on by it
@@ -151,6 +151,34 @@ def test_an_interval_is_set_and_read_back() -> None:
     assert settings["interval_ms_FF37"] == "20"
     assert settings["address"] == "8"
     assert settings["bitrate"] == "500000"
+
+    bench = J1939Host(made(boot_ms=200))
+    bench.wait(300 * MS)
+    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
+    bench.talk(restarted)
+    assert bench.module.settings.intervals_ms[0xFF34] == 10
+    assert pgns(bench.wait(190 * MS)) == {}
+    bench.wait(100 * MS)
+    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
+    bench.talk(session.save)
+    bench.talk(restarted)
+    assert bench.module.settings.intervals_ms[0xFF34] == 50
+    bench.wait(300 * MS)
+    bench.talk(session.factory_reset)
+    bench.talk(restarted)
+    assert bench.module.settings == J1939Settings()
+
+    bench = J1939Host(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
+    bench.talk(lambda peer: session.set_address(peer, 20))
+    bench.talk(lambda peer: session.set_bitrate(peer, 125_000))
+    assert {split(f.can_id).source for f in bench.wait(SECOND_NS)} == {8}
+    bench.talk(session.save)
+    bench.talk(restarted)
+    bench.wait(100 * MS)
+    frames = bench.wait(SECOND_NS)
+    assert {split(f.can_id).source for f in frames} == {20}
+    assert frames[1].due_ns - frames[0].due_ns == 1_120_000
+    assert bench.talk(session.identify, address=20) is not None
 
 
 def written_and_read(peer: J1939Node, register: int, value: int) -> RequestScript[int]:
@@ -178,39 +206,6 @@ def test_values_out_of_range_do_not_take() -> None:
     bench.module.receive(0x0CEF0855, True, bytes.fromhex("34010600640000"), bench.now_ns)
     bench.module.receive(0x0CFF3408, True, bytes.fromhex("3401060064000000"), bench.now_ns)
     assert bench.module.requests == before
-
-
-def test_what_is_not_saved_is_lost_at_a_restart() -> None:
-    bench = J1939Host(made(boot_ms=200))
-    bench.wait(300 * MS)
-    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
-    bench.talk(restarted)
-    assert bench.module.settings.intervals_ms[0xFF34] == 10
-    assert pgns(bench.wait(190 * MS)) == {}
-    bench.wait(100 * MS)
-    bench.talk(lambda peer: session.set_interval(peer, 0xFF34, 50))
-    bench.talk(session.save)
-    bench.talk(restarted)
-    assert bench.module.settings.intervals_ms[0xFF34] == 50
-    bench.wait(300 * MS)
-    bench.talk(session.factory_reset)
-    bench.talk(restarted)
-    assert bench.module.settings == J1939Settings()
-
-
-@pytest.mark.manual("B 6.2.2 bit rate", "B 6.2.2 address")
-def test_address_and_bit_rate_change_at_the_restart() -> None:
-    bench = J1939Host(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
-    bench.talk(lambda peer: session.set_address(peer, 20))
-    bench.talk(lambda peer: session.set_bitrate(peer, 125_000))
-    assert {split(f.can_id).source for f in bench.wait(SECOND_NS)} == {8}
-    bench.talk(session.save)
-    bench.talk(restarted)
-    bench.wait(100 * MS)
-    frames = bench.wait(SECOND_NS)
-    assert {split(f.can_id).source for f in frames} == {20}
-    assert frames[1].due_ns - frames[0].due_ns == 1_120_000
-    assert bench.talk(session.identify, address=20) is not None
 
 
 @pytest.mark.manual("B 6.2.2 restart")

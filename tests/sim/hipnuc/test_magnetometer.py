@@ -15,6 +15,7 @@ HARD_IRON_T: Vector3 = (14.14e-6, -2.08e-6, -8.75e-6)
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 
 
+@pytest.mark.manual("B 8.1.3 in the background", "B 8.2 EN_MCAL")
 def test_one_turn_about_each_axis_is_enough() -> None:
     magnetometer = SelfCalibration(HARD_IRON_T, ZERO)
     assert magnetometer.measured((1e-6, 2e-6, 3e-6)) == pytest.approx((15.14e-6, -0.08e-6, -5.75e-6))
@@ -28,9 +29,6 @@ def test_one_turn_about_each_axis_is_enough() -> None:
     assert (magnetometer.state, magnetometer.progress) == (CALIBRATED, 1.0)
     assert magnetometer.measured((1e-6, 2e-6, 3e-6)) == pytest.approx((1e-6, 2e-6, 3e-6))
 
-
-@pytest.mark.manual("B 8.1.3 in the background", "B 8.2 EN_MCAL")
-def test_a_module_that_is_turned() -> None:
     hardware = HipnucHardware(motion=tumble(), hard_iron_t=HARD_IRON_T)
     bench = HipnucUartBench(ModuleSettings(att_mode=1), hardware)
     assert "MB=0.00, 0.00, 0.00" in bench.ask("LOG MAGCONFIG")

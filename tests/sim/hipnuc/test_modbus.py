@@ -115,7 +115,7 @@ def test_who_answers_and_which_replies_are_whole() -> None:
     assert is_whole(rig.ask(1, READ_BLOCK))
 
 
-def test_ids_by_serial_number_and_by_chance() -> None:
+def test_ids_exceptions_and_common_options() -> None:
     rig = ModbusMaster(slave(80, baud=BAUD, serial=1), slave(80, baud=BAUD, serial=2))
     assert rig.ask(0, set_id_by_serial(serial_of(2).hex(), 99).sends[0]) == b""
     assert [one.settings.slave for one in rig.line.slaves] == [80, 99]
@@ -124,8 +124,6 @@ def test_ids_by_serial_number_and_by_chance() -> None:
     rig.line.reboot(rig.now_ns)
     assert [one.settings.slave for one in rig.line.slaves] == [80, 80]
 
-
-def test_exceptions() -> None:
     rig = ModbusMaster(here(1))
     for request, code in (
         (read_registers(0x34, 27).sends[0], 2),
@@ -137,8 +135,6 @@ def test_exceptions() -> None:
         reply = rig.ask(1, request)
         assert reply == framed(1, bytes([request[0] | 0x80, code]))
 
-
-def test_line_from_the_common_options() -> None:
     line = make(SimulatorOptions(message="1,22,247", baud=9600, noise="none"), BEGIN_NS)
     assert [one.settings.slave for one in line.slaves] == [1, 22, 247]
     assert len({one.serial for one in line.slaves}) == 3

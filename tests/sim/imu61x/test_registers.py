@@ -40,6 +40,19 @@ def test_answer_comes_with_the_second_word_after_it_even_in_another_transaction(
     assert spoken(one, 0x7E00, 0x7E00) == [0x5536, 0x3138]
     assert spoken(one, 0x7E00) == [1]
 
+    one, clock = device(update_ns=10 * MS)
+    clock.now = 19 * MS
+    before = one.i2c([b"\x12", 32])
+    assert one.latched_ns == 10 * MS
+    clock.now = 19 * MS + 999_999
+    assert one.i2c([b"\x12", 32]) == before
+    clock.now = 20 * MS
+    assert one.i2c([b"\x12", 32]) != before
+    one.faults.frozen = True
+    clock.now = 90 * MS
+    one.i2c([b"\x12", 32])
+    assert one.latched_ns == 20 * MS
+
 
 @pytest.mark.manual("A 2.4 WIN_CTRL", "A 2.4.1 reading", "A 2.1 mode")
 def test_windows_bursts_modes_and_a_restart() -> None:
@@ -83,21 +96,6 @@ def test_windows_bursts_modes_and_a_restart() -> None:
     one.faults.error = errno.ENXIO
     with pytest.raises(OSError, match="ENXIO"):
         one.i2c([b"\x6a", 8])
-
-
-def test_registers_are_latched_and_renewed_in_steps() -> None:
-    one, clock = device(update_ns=10 * MS)
-    clock.now = 19 * MS
-    before = one.i2c([b"\x12", 32])
-    assert one.latched_ns == 10 * MS
-    clock.now = 19 * MS + 999_999
-    assert one.i2c([b"\x12", 32]) == before
-    clock.now = 20 * MS
-    assert one.i2c([b"\x12", 32]) != before
-    one.faults.frozen = True
-    clock.now = 90 * MS
-    one.i2c([b"\x12", 32])
-    assert one.latched_ns == 20 * MS
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def parameter(far: Imu61xBench, which: Parameter) -> float:
 
 
 def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
-    """Taken apart without the codec: 312 roll 2° about Y, pitch -3° about X, yaw 40° at rest."""
+    """The frame is taken apart without the codec: 312 roll 2° about Y, pitch -3° about X, yaw 40° at rest."""
     module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
     (burst,) = module.advance(BEGIN_NS + 517_000_000)
     data = burst.data
@@ -61,21 +61,6 @@ def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
     assert (gx, gy, gz) == (0, 0, 0)
     assert 30 < temp < 40
 
-
-@pytest.mark.parametrize("rate_hz", c.RATES_HZ)
-@pytest.mark.manual("A 1 stream mode", "A 1.6 CMD 14, 21")
-def test_it_streams_at_every_rate_of_the_manual(rate_hz: int) -> None:
-    far = imu61x_bench(Imu61xSettings(baud=230400, rate_hz=rate_hz))
-    far.wait(1000 - far.module.hardware.boot_ms)
-    samples = far.samples(2000)
-    assert len(samples) == pytest.approx(2 * rate_hz, abs=1)
-    ticks = [sample.dev_ticks for sample in samples]
-    assert {b - a for a, b in pairwise(ticks) if a is not None and b is not None} == {1_000_000 // rate_hz}
-    assert far.module.frames_dropped == 0
-
-
-def test_the_physics_of_the_truth_come_out() -> None:
-    """The rotation of the frame turns the specific force of the truth as the truth's own quaternion does."""
     hardware = replace(IMU61X_STILL, motion=swing())
     far = Imu61xBench(hardware=hardware)
     assert far.samples(40)
@@ -89,6 +74,18 @@ def test_the_physics_of_the_truth_come_out() -> None:
         assert quat is not None
         for row, wanted in zip(matrix_from_quat(quat), matrix_from_quat(truth.quat_wxyz), strict=True):
             assert row == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("rate_hz", c.RATES_HZ)
+@pytest.mark.manual("A 1 stream mode", "A 1.6 CMD 14, 21")
+def test_it_streams_at_every_rate_of_the_manual(rate_hz: int) -> None:
+    far = imu61x_bench(Imu61xSettings(baud=230400, rate_hz=rate_hz))
+    far.wait(1000 - far.module.hardware.boot_ms)
+    samples = far.samples(2000)
+    assert len(samples) == pytest.approx(2 * rate_hz, abs=1)
+    ticks = [sample.dev_ticks for sample in samples]
+    assert {b - a for a, b in pairwise(ticks) if a is not None and b is not None} == {1_000_000 // rate_hz}
+    assert far.module.frames_dropped == 0
 
 
 @pytest.mark.manual("A 1 command mode")
@@ -158,30 +155,6 @@ def test_what_power_off_restart_and_factory_reset_change() -> None:
     assert far.module.settings.rate_hz == 100
 
 
-def test_values_that_it_does_not_have() -> None:
-    """Table 12 names the defaults for rate and baud; other values are refused."""
-    settings = Imu61xSettings(baud=921600, rate_hz=400)
-    assert changed(settings, 3, 9600.0).baud == 115200
-    assert changed(settings, 21, 77.0).rate_hz == 100
-    for index, value in ((27, 4.0), (30, 0x1C), (31, 256.0), (31, 0.5), (8, 0.0), (99, 1.0), (27, float("nan"))):
-        with pytest.raises(ParameterRefused):
-            changed(settings, index, value)
-    for which in Parameter:
-        Imu61xSettings().value(which)
-    with pytest.raises(ParameterRefused):
-        Imu61xSettings().value(4)
-    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
-    far.send(c.encode_command(c.Command.READ_PARAMETER, 0.0, 4))
-    (reply,) = far.wait(50)
-    assert isinstance(reply, ReplyFrame)
-    assert parse_acknowledgement(reply) == Acknowledgement(6, 2)
-    for unknown_mode in (2.0, 0.0, float("nan")):
-        far.send(c.encode_command(c.Command.OUTPUT_MODE, unknown_mode))
-        (reply,) = far.wait(50)
-        assert isinstance(reply, ReplyFrame)
-        assert parse_acknowledgement(reply) == Acknowledgement(3, 2)
-
-
 def test_commands_at_another_rate_or_damaged() -> None:
     far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     assert acknowledged(far, c.set_baud(921600)) == 0
@@ -205,6 +178,27 @@ def test_commands_at_another_rate_or_damaged() -> None:
     far.send(whole[:10])
     far.send(whole[10:])
     assert len(far.wait(100)) == 1
+
+    settings = Imu61xSettings(baud=921600, rate_hz=400)
+    assert changed(settings, 3, 9600.0).baud == 115200
+    assert changed(settings, 21, 77.0).rate_hz == 100
+    for index, value in ((27, 4.0), (30, 0x1C), (31, 256.0), (31, 0.5), (8, 0.0), (99, 1.0), (27, float("nan"))):
+        with pytest.raises(ParameterRefused):
+            changed(settings, index, value)
+    for which in Parameter:
+        Imu61xSettings().value(which)
+    with pytest.raises(ParameterRefused):
+        Imu61xSettings().value(4)
+    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
+    far.send(c.encode_command(c.Command.READ_PARAMETER, 0.0, 4))
+    (reply,) = far.wait(50)
+    assert isinstance(reply, ReplyFrame)
+    assert parse_acknowledgement(reply) == Acknowledgement(6, 2)
+    for unknown_mode in (2.0, 0.0, float("nan")):
+        far.send(c.encode_command(c.Command.OUTPUT_MODE, unknown_mode))
+        (reply,) = far.wait(50)
+        assert isinstance(reply, ReplyFrame)
+        assert parse_acknowledgement(reply) == Acknowledgement(3, 2)
 
 
 def calibration_status(far: Imu61xBench) -> int | None:
@@ -271,8 +265,6 @@ def test_installation_calibration_takes_its_time() -> None:
     assert calibration_status(far) == 0
     assert parameter(far, Parameter.INSTALL_X_OFF) == pytest.approx(-2.998, abs=0.01)
 
-
-def test_heading_is_relative_and_wraps() -> None:
     far = imu61x_bench()
     assert acknowledged(far, c.reset_heading(270)) == 0
     euler = far.samples(50)[-1].euler_rad

@@ -61,6 +61,10 @@ def test_next_ns_names_the_next_edge_even_one_that_a_fault_made() -> None:
         seen = len(line.edges)
     assert seen > 100
 
+    rates = PinFaultRates(lose_pulse=0.1, lose_edge=0.05, extra=0.05)
+    assert run(PinFaults(7, rates))[0].edges == run(PinFaults(7, rates))[0].edges
+    assert run(PinFaults(7, rates))[0].edges != run(PinFaults(8, rates))[0].edges
+
 
 def test_lost_pulses_lose_both_edges_and_are_known() -> None:
     faults = PinFaults(1, PinFaultRates(lose_pulse=0.1))
@@ -95,12 +99,6 @@ def test_single_edges_lost_extra_pulses_and_lost_frames() -> None:
     assert len(arrived) == len(bursts) - frame_faults.counts[FaultKind.LOSE]
     assert set(arrived) <= set(bursts)
     assert frame_faults.bursts_hit == frame_faults.counts[FaultKind.LOSE]
-
-
-def test_same_seed_same_faults() -> None:
-    rates = PinFaultRates(lose_pulse=0.1, lose_edge=0.05, extra=0.05)
-    assert run(PinFaults(7, rates))[0].edges == run(PinFaults(7, rates))[0].edges
-    assert run(PinFaults(7, rates))[0].edges != run(PinFaults(8, rates))[0].edges
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])

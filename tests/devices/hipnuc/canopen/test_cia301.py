@@ -33,6 +33,13 @@ def test_write_and_its_confirmation() -> None:
     with pytest.raises(StopIteration):
         conversation.send(Reply((done,)))
 
+    assert read_frame(0x1018, 4) == bytes.fromhex("40 18 10 04 00 00 00 00")
+    values = {"4F": b"\1", "4B": b"\1\2", "47": b"\1\2\3", "43": b"\1\2\3\4", "42": b"\1\2\3\4", "41": None, "40": None}
+    assert {cs: value_of(bytes.fromhex(cs) + bytes(3) + b"\1\2\3\4") for cs in values} == values
+    for size, command in ((1, 0x2F), (2, 0x2B), (3, 0x27), (4, 0x23)):
+        _, data = unpack(next(write_object(8, 0x1800, 5, 10, size)).payload)
+        assert data == bytes([command, 0x00, 0x18, 5, 10, 0, 0, 0])
+
 
 @pytest.mark.parametrize(
     "other",
@@ -50,15 +57,6 @@ def test_what_is_no_confirmation(other: ReplyFrame | str) -> None:
     assert not request.is_end(other)
     assert not request.is_rejection(other)
     assert not request.is_part(other)
-
-
-def test_frames_of_every_size() -> None:
-    assert read_frame(0x1018, 4) == bytes.fromhex("40 18 10 04 00 00 00 00")
-    values = {"4F": b"\1", "4B": b"\1\2", "47": b"\1\2\3", "43": b"\1\2\3\4", "42": b"\1\2\3\4", "41": None, "40": None}
-    assert {cs: value_of(bytes.fromhex(cs) + bytes(3) + b"\1\2\3\4") for cs in values} == values
-    for size, command in ((1, 0x2F), (2, 0x2B), (3, 0x27), (4, 0x23)):
-        _, data = unpack(next(write_object(8, 0x1800, 5, 10, size)).payload)
-        assert data == bytes([command, 0x00, 0x18, 5, 10, 0, 0, 0])
 
 
 def test_aborts_silence_and_values_in_segments() -> None:

@@ -96,7 +96,7 @@ def test_every_burst_becomes_one_sample_once_learnt(kinds: dict[int, int], begin
     assert rig.assembly.period_ns == pytest.approx(PERIOD_NS, rel=1e-3)
 
 
-def test_a_sample_is_made_with_its_last_frame() -> None:
+def test_samples_are_complete_after_silence_and_after_a_reset() -> None:
     rig = learnt(MIXED)
     for burst in range(40, 61):
         *head, last = stream(MIXED, [burst])
@@ -104,6 +104,21 @@ def test_a_sample_is_made_with_its_last_frame() -> None:
         assert rig.ledger.frames_pending == len(head)
         assert rig.feed([last]) == [burst]
         assert rig.ledger.frames_pending == 0
+
+    rig = learnt(MIXED)
+    made = rig.feed(without(stream(MIXED, range(40, 400)), lambda f: 61 <= f.burst < 270))
+    assert made == [*range(40, 61), *range(270, 400)]
+    assert rig.ledger.lost_gap_device == 0
+
+    rig = learnt(EQUAL)
+    first, second = stream(EQUAL, [40]), stream(EQUAL, [41])
+    rig.feed(first[:2])
+    rig.assembly.reset()
+    assert rig.ledger.frames_pending == 0
+    assert rig.ledger.closes()
+    assert rig.feed(first[2:] + second) == [41]
+    assert rig.ledger.lost_gap_device == 1
+    assert rig.ledger.closes()
 
 
 @pytest.mark.parametrize("kind", EQUAL)
@@ -149,13 +164,6 @@ def test_bursts_that_are_lost_whole_are_counted(kinds: dict[int, int], lost: int
     assert all(names == whole(kinds, burst) for burst, names in rig.made if burst >= 61 + lost + 4)
 
 
-def test_more_than_a_second_is_silence_and_not_loss() -> None:
-    rig = learnt(MIXED)
-    made = rig.feed(without(stream(MIXED, range(40, 400)), lambda f: 61 <= f.burst < 270))
-    assert made == [*range(40, 61), *range(270, 400)]
-    assert rig.ledger.lost_gap_device == 0
-
-
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING])
 @pytest.mark.parametrize("stall_ns", [4 * MS, 7_300_000, 60 * MS, 1500 * MS])
 def test_a_stall_between_two_bursts_costs_nothing(kinds: dict[int, int], stall_ns: int) -> None:
@@ -184,7 +192,8 @@ def test_frames_that_come_twice_cost_nothing(kinds: dict[int, int]) -> None:
     assert rig.ledger.lost_gap_device == 0
 
 
-def test_kinds_that_are_switched_off() -> None:
+def test_kinds_that_are_switched_off_or_stay_out() -> None:
+    """Also kinds that are not asked for, and one of 50 ms beside 20 ms, which comes between bursts every other time."""
     rig = learnt(EQUAL)
     made = rig.feed(stream({1: 1, 3: 1}, range(40, 80)))
     assert made == list(range(50, 80))
@@ -200,6 +209,18 @@ def test_kinds_that_are_switched_off() -> None:
     assert rig.feed([*head, last]) == [300]
     assert rig.feed(on[4:]) == list(range(301, 400))
     assert rig.kinds_of(380) == (1, 2, 3, 6)
+
+    rig = AssemblyBench({1, 3})
+    made = rig.feed(stream(MIXED, range(60)))
+    assert made == list(range(made[0], 60))
+    assert all(names == tuple(k for k in whole(MIXED, b) if k in (1, 3)) for b, names in rig.made if b > 12)
+    frames = sorted(
+        [*stream({1: 1, 2: 1}, range(200), 20 * MS), *stream({6: 1}, range(80), 50 * MS)], key=lambda frame: frame.t_ns
+    )
+    rig = AssemblyBench()
+    rig.feed(frames)
+    assert all(names == (1, 2) for _, names in rig.made)
+    assert len(rig.made) >= 190
 
 
 @pytest.mark.parametrize("new", [{4: 1}, {4: 2}, {6: 10}])
@@ -241,7 +262,7 @@ def test_another_rate_of_some_is_learnt(before: dict[int, int], after: dict[int,
     assert settled == [(burst, whole(after, burst)) for burst in range(150, 300)]
 
 
-def test_order_alone_keeps_two_bursts_apart() -> None:
+def test_order_alone_and_learning_under_loss() -> None:
     """Without times: 1 and 3 of a burst, then 2 and 3 of the next; 2 stands before the 3 that is held."""
     rig = AssemblyBench()
     rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
@@ -251,36 +272,6 @@ def test_order_alone_keeps_two_bursts_apart() -> None:
     made = rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
     assert made == list(range(5, 30))
 
-
-def test_kinds_that_stay_out() -> None:
-    """Kinds that are not asked for; and one of 50 ms beside 20 ms, which comes between two bursts every other time."""
-    rig = AssemblyBench({1, 3})
-    made = rig.feed(stream(MIXED, range(60)))
-    assert made == list(range(made[0], 60))
-    assert all(names == tuple(k for k in whole(MIXED, b) if k in (1, 3)) for b, names in rig.made if b > 12)
-    frames = sorted(
-        [*stream({1: 1, 2: 1}, range(200), 20 * MS), *stream({6: 1}, range(80), 50 * MS)], key=lambda frame: frame.t_ns
-    )
-    rig = AssemblyBench()
-    rig.feed(frames)
-    assert all(names == (1, 2) for _, names in rig.made)
-    assert len(rig.made) >= 190
-
-
-def test_reset_gives_up_what_is_held() -> None:
-    rig = learnt(EQUAL)
-    first, second = stream(EQUAL, [40]), stream(EQUAL, [41])
-    rig.feed(first[:2])
-    rig.assembly.reset()
-    assert rig.ledger.frames_pending == 0
-    assert rig.ledger.closes()
-    assert rig.feed(first[2:] + second) == [41]
-    assert rig.ledger.lost_gap_device == 1
-    assert rig.ledger.closes()
-
-
-def test_learning_is_not_misled_by_loss() -> None:
-    """A slower kind is not taken for a fast one either, though whole bursts between its first ones are lost."""
     rig = AssemblyBench()
     frames = without(stream(EQUAL, range(30)), lambda f: f.burst in (2, 4) and f.kind == 2)
     made = rig.feed(frames)

@@ -14,22 +14,13 @@ def lost(*times_ms: float) -> int:
 
 
 @pytest.mark.parametrize(
-    "times_ms",
-    [
-        (5, 10),
-        (9.4, 13.2, 15),  # the second one is held up less, but still late
-        (12, 12.1, 15),
-        (38, 38.1, 38.2, 38.3, 38.4, 38.5, 38.6, 40),
-        (5, 11.2, 15, 19, 25),
-    ],
-)
-def test_what_is_made_up_for_is_no_loss(times_ms: tuple[float, ...]) -> None:
-    assert lost(*times_ms) == 0
-
-
-@pytest.mark.parametrize(
     ("times_ms", "expected"),
     [
+        ((5, 10), 0),
+        ((9.4, 13.2, 15), 0),  # the second one is held up less, but still late
+        ((12, 12.1, 15), 0),
+        ((38, 38.1, 38.2, 38.3, 38.4, 38.5, 38.6, 40), 0),
+        ((5, 11.2, 15, 19, 25), 0),
         ((10,), 1),
         ((5, 20), 2),
         ((10, 20), 2),

@@ -251,7 +251,7 @@ def test_a_burst_makes_a_sample_whatever_its_priority() -> None:
     assert codec.ledger.frames_ignored == before + 1
 
 
-def test_several_modules_on_a_bus_are_not_mixed() -> None:
+def test_samples_of_several_modules_slow_messages_and_loss() -> None:
     codecs = {address: make(address=address) for address in (8, 9, 128, 1)}
     found: dict[int, list[int]] = {address: [] for address in codecs}
     for n in range(20):
@@ -264,19 +264,6 @@ def test_several_modules_on_a_bus_are_not_mixed() -> None:
         assert values == [1000 * address + n for n in range(20 - len(values), 20)]
         assert len(values) >= 15
 
-
-def test_only_the_listed_messages_count() -> None:
-    codec = learned(pgns=["FF34", "FF3D"])
-    (sample,) = feed(codec, burst(5), 100 * MS)
-    assert isinstance(sample, Measurement)
-    assert sample.gyro_rad_s is None
-    assert sample.size_bytes == 16
-    assert [f.can_id >> 8 for f in DRIVER.filters(HipnucJ1939Settings(pgns=("FF34", "FF3D")))] == [
-        0xFF2F, 0xFF34, 0xFF3D, 0xEF55,
-    ]  # fmt: skip
-
-
-def test_slower_messages_are_in_the_samples_they_came_with() -> None:
     codec = make()
     slow = messages.TEMPERATURE, messages.pack_temperature(21.5, 100_000)
     events: list[CodecEvent] = []
@@ -289,8 +276,6 @@ def test_slower_messages_are_in_the_samples_they_came_with() -> None:
     assert warm[-1] == 90
     assert codec.ledger.lost() == 0
 
-
-def test_a_missing_message_costs_its_sample_only() -> None:
     for missing in range(4):
         codec = learned()
         frames = burst(50)
@@ -299,7 +284,7 @@ def test_a_missing_message_costs_its_sample_only() -> None:
         assert counts(feed(codec, burst(51), 110 * MS)) == [51]
 
 
-def test_frames_of_another_kind() -> None:
+def test_which_frames_count() -> None:
     codec = make()
     assert codec.feed_frame(0x0CFF3408, True, b"\1\2\3", 0) == (BadFrame(BadReason.LENGTH, b"\1\2\3"),)
     skipped = [(0x0CFF3508, True), (0x0CFF3409, True), (0x0CEF0855, True), (0x0DFF3408, True), (0x0CFF3408, False)]
@@ -317,8 +302,15 @@ def test_frames_of_another_kind() -> None:
         assert codec.ledger.frames_in_replies == len(destinations)
         assert not codec.feed_frame(join(J1939Id(6, 0xEF00, 8, 0x21)), True, reply, 0)
 
+    codec = learned(pgns=["FF34", "FF3D"])
+    (sample,) = feed(codec, burst(5), 100 * MS)
+    assert isinstance(sample, Measurement)
+    assert sample.gyro_rad_s is None
+    assert sample.size_bytes == 16
+    assert [f.can_id >> 8 for f in DRIVER.filters(HipnucJ1939Settings(pgns=("FF34", "FF3D")))] == [
+        0xFF2F, 0xFF34, 0xFF3D, 0xEF55,
+    ]  # fmt: skip
 
-def test_who_it_is() -> None:
     assert DRIVER.node_of(0x18FF3D05, True, bytes(8)) == 5
     for can_id, extended, size in [
         (0x0CFF3405, False, 8), (0x0CFF3405, True, 6), (0x0CFF2F05, True, 8), (0x0CEF5505, True, 8),

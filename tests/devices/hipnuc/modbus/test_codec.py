@@ -71,18 +71,25 @@ def measured(made: HipnucModbusCodec, data: bytes) -> Measurement:
     return event
 
 
-@pytest.mark.manual("B 4.2 identity", "B 4.4 example")
-def test_identity_of_the_manual() -> None:
+@pytest.mark.manual(
+    "B 4.2 identity",
+    "B 4.4 example",
+    "B 4.2 acceleration",
+    "B 4.2 angular rate",
+    "B 4.2 magnetic field",
+    "B 4.2 angles",
+    "B 4.5 example",
+    "B 4.2 temperature and pressure",
+    "B 4 defaults",
+)
+def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
+    """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
     identity = run_transfer_script(probe(HipnucModbusSettings()), lambda _: IDENTITY)
     assert identity.product == "HI14R2N-485-000"
     assert identity.firmware == "1.5.2"
     assert identity.serial_number == "047D955F8D2A1708"
     assert identity.details == {"BL_VERSION": "107"}
 
-
-@pytest.mark.manual("B 4.2 acceleration", "B 4.2 angular rate", "B 4.2 magnetic field", "B 4.2 angles", "B 4.5 example")
-def test_sensors_of_the_manual() -> None:
-    """Values computed from its integers: -255, 944, 1616 times 0.00048828 G of 9.8 m/s², and so on."""
     m = measured(short(), SENSORS)
     assert m.size_bytes == 53
     assert m.dev_ticks is None
@@ -95,21 +102,6 @@ def test_sensors_of_the_manual() -> None:
     assert m.temperature_c is None
     assert m.pressure_pa is None
 
-
-@pytest.mark.parametrize(
-    ("counts", "pressure_pa"), [(0, None), (99_900, None), (100_000, 1_000), (12_000_000, 120_000), (12_000_001, None)]
-)
-def test_a_module_without_barometer_has_no_pressure(counts: int, pressure_pa: float | None) -> None:
-    """99,900 counts of 0.01 Pa are the placeholder 999 in Pa."""
-    words = "0000" * 9 + "0000 0000" * 3 + "09D0" + counts.to_bytes(4, "big").hex() + "2710 0000 0000 0000"
-    m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
-    assert m.temperature_c == pytest.approx(25.12)
-    assert m.pressure_pa == pressure_pa
-
-
-@pytest.mark.manual("B 4.2 temperature and pressure", "B 4 defaults")
-def test_block_of_newer_firmware() -> None:
-    """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
     words = "0000 0000 0800 0000 0000 0000 0000 0000 0000" + "0000 0000" * 3 + "09D0 009A9C14" + "2710 0000 0000 0000"
     m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
     assert m.size_bytes == 57
@@ -127,6 +119,17 @@ def test_block_of_newer_firmware() -> None:
         assert event.reason is BadReason.CONTENT
     assert DRIVER.targets[0] == 0x50
     assert sorted(DRIVER.targets) == list(range(1, 248))
+
+
+@pytest.mark.parametrize(
+    ("counts", "pressure_pa"), [(0, None), (99_900, None), (100_000, 1_000), (12_000_000, 120_000), (12_000_001, None)]
+)
+def test_a_module_without_barometer_has_no_pressure(counts: int, pressure_pa: float | None) -> None:
+    """99,900 counts of 0.01 Pa are the placeholder 999 in Pa."""
+    words = "0000" * 9 + "0000 0000" * 3 + "09D0" + counts.to_bytes(4, "big").hex() + "2710 0000 0000 0000"
+    m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
+    assert m.temperature_c == pytest.approx(25.12)
+    assert m.pressure_pa == pressure_pa
 
 
 def test_the_block_of_the_manual_is_read_where_there_is_no_longer_one() -> None:
@@ -220,15 +223,13 @@ def test_axes_of_the_inclinometer(
 
 
 def test_axes_of_the_inclinometer_are_kept_or_configured() -> None:
+    """MAIN_STATUS, register 0x09: bits 3 and 9 are 0x0208."""
     made = codec()
     measured(made, block(incli=(-100, 1)))
     assert measured(made, block(incli=(16384, 0), pitch_deg=5, uptime_ms=6)).incli_rad == (radians(90), 0)
     assert measured(codec(inclinometer="single"), block(incli=(8192, 0))).incli_rad == (radians(90), 0)
     assert measured(codec(inclinometer="dual"), block(incli=(0, 0))).incli_rad == (0, 0)
 
-
-def test_status_is_read_beside_the_block() -> None:
-    """MAIN_STATUS, register 0x09: bits 3 and 9 are 0x0208."""
     made = codec()
     assert [poll.transfer.sends[0].hex() for poll in made.polls] == ["030034001a", "03007f0004", "0300090001"]
     assert made.polls[2].every_ns == 1_000_000_000

@@ -69,12 +69,29 @@ def test_printed_requests(printed: str, asked: object) -> None:
     assert transfer.read_bytes == {3: 5 + 2 * transfer.sends[0][-1], 6: 8}[transfer.sends[0][0]]
 
 
-@pytest.mark.manual("B 4.6 address by serial number", "B 4.6 random addresses")
+@pytest.mark.manual("B 4.6 address by serial number", "B 4.6 random addresses", "B 4.1.1 read")
 def test_requests_to_all() -> None:
     """Section 4.6: sub-command, length of what follows, then the data. No reply is expected."""
     by_serial = set_id_by_serial("047D955F8D2A1708", 0x22)
     assert by_serial == Transfer((bytes.fromhex("50 0031 000A 047D955F8D2A1708 0022"),), 0)
     assert randomise_ids(1, 247) == Transfer((bytes.fromhex("50 0030 0006 0001 00F7 FFFF"),), 0)
+
+    good = framed(7, registers_reply(b"\x00\x01\xff\xfe"))
+    assert registers_of(good, 2) == (1, 0xFFFE)
+    write = write_register(6, 1)
+    check_written(framed(7, write.sends[0]), write)
+    for reply, why in (
+        (framed(7, b"\x83\x02"), "exception 2: there is no such register"),
+        (good[:-1], "damaged"),
+        (good[:-1] + b"\x00", "damaged"),
+        (framed(7, b"\x04\x04\x00\x01\xff\xfe"), "function 0x03"),
+        (framed(7, b"\x03\x05\x00\x01\xff\xfe"), "the reply says 5"),
+        (b"", "damaged"),
+    ):
+        with pytest.raises(DeviceRefused, match=why):
+            registers_of(reply, 2)
+    with pytest.raises(DeviceRefused, match="to be confirmed"):
+        check_written(framed(7, write_register(6, 0).sends[0]), write)
 
 
 @pytest.mark.parametrize(
@@ -99,26 +116,6 @@ def test_what_cannot_be_asked(begin: object, names: str) -> None:
     with pytest.raises(BadArgument) as refused:
         begin()
     assert names in str(refused.value)
-
-
-@pytest.mark.manual("B 4.1.1 read")
-def test_replies_are_read_or_refused_with_the_reason() -> None:
-    good = framed(7, registers_reply(b"\x00\x01\xff\xfe"))
-    assert registers_of(good, 2) == (1, 0xFFFE)
-    write = write_register(6, 1)
-    check_written(framed(7, write.sends[0]), write)
-    for reply, why in (
-        (framed(7, b"\x83\x02"), "exception 2: there is no such register"),
-        (good[:-1], "damaged"),
-        (good[:-1] + b"\x00", "damaged"),
-        (framed(7, b"\x04\x04\x00\x01\xff\xfe"), "function 0x03"),
-        (framed(7, b"\x03\x05\x00\x01\xff\xfe"), "the reply says 5"),
-        (b"", "damaged"),
-    ):
-        with pytest.raises(DeviceRefused, match=why):
-            registers_of(reply, 2)
-    with pytest.raises(DeviceRefused, match="to be confirmed"):
-        check_written(framed(7, write_register(6, 0).sends[0]), write)
 
 
 @pytest.mark.manual("B 4.2 registers")

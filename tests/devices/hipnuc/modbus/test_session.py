@@ -87,7 +87,7 @@ def test_an_address_that_another_module_has_is_refused_before_anything_is_writte
     assert bench.at == bench.slave.address == 7
 
 
-def test_addresses_that_are_taken_or_not_accepted() -> None:
+def test_addresses_that_are_taken_not_accepted_or_lost() -> None:
     bench = ModbusBench(module(7), module(12, serial=0x0F), module(12, serial=0xF0))
     with pytest.raises(BadArgument, match="address 12 is taken: something answers"):
         bench.run(change_address(7, 12))
@@ -107,8 +107,6 @@ def test_addresses_that_are_taken_or_not_accepted() -> None:
     with pytest.raises(DeviceRefused, match="the value is not allowed"):
         bench.run(change_address(7, 9))
 
-
-def test_a_module_that_is_heard_nowhere_is_sent_back() -> None:
     bench = ModbusBench(module(7))
     script = change_address(7, 9)
 
@@ -178,20 +176,22 @@ def test_modules_that_do_not_answer_as_expected() -> None:
     assert "115200 baud and address 80" in bench.run(factory_reset((7,), 9600))
 
 
-@pytest.mark.parametrize(
-    "begin", [lambda: restart((7,), BAUD), lambda: set_baud(9600), lambda: change_address(7, 9), save]
-)
-def test_a_module_that_is_not_there_is_told(begin: Callable[[], TransferScript[Any]]) -> None:
+def test_absence_and_refusals_are_always_told() -> None:
     bench = ModbusBench(module(7, dead=True))
-    with pytest.raises((TransferError, NoReply)):
-        bench.run(begin())
+    begins: list[Callable[[], TransferScript[Any]]] = [
+        lambda: restart((7,), BAUD),
+        lambda: set_baud(9600),
+        lambda: change_address(7, 9),
+        save,
+    ]
+    for begin in begins:
+        with pytest.raises((TransferError, NoReply)):
+            bench.run(begin())
 
-
-@pytest.mark.parametrize("name", ["CTRL", "MD_ID", "HEADING_MODE"])
-def test_a_refusal_is_always_told(name: str) -> None:
     scripts: dict[str, Callable[[], TransferScript[Any]]] = {
         "CTRL": lambda: restart((7,), BAUD), "MD_ID": lambda: set_id(9), "HEADING_MODE": lambda: set_heading_mode(NINE),
     }  # fmt: skip
-    bench = ModbusBench(module(7, variant=SlaveVariant(refuses=frozenset({name}))))
-    with pytest.raises(DeviceRefused, match="the value is not allowed"):
-        bench.run(scripts[name]())
+    for name, script in scripts.items():
+        bench = ModbusBench(module(7, variant=SlaveVariant(refuses=frozenset({name}))))
+        with pytest.raises(DeviceRefused, match="the value is not allowed"):
+            bench.run(script())

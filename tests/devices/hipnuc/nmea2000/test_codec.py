@@ -72,6 +72,7 @@ def test_heading_is_clockwise_from_north(counts: int, yaw_rad: float) -> None:
 
 
 def test_rate_of_turn_and_attitude() -> None:
+    """y of the sensor is the bow: heading 90°, pitch 30° takes it east and up."""
     # 3200000 · 3.125e-8 = 0.1 rad/s to starboard
     found = measured((RATE_OF_TURN, "05 00d43000 ffffff"))
     assert found.gyro_rad_s == pytest.approx((math.nan, math.nan, -0.1), nan_ok=True)
@@ -83,9 +84,6 @@ def test_rate_of_turn_and_attitude() -> None:
     assert found.quat_wxyz == pytest.approx((0.877368, -0.001584, 0.017956, -0.479480), abs=3e-6)
     assert found.size_bytes == 8
 
-
-def test_the_bow_turned_east_and_up_points_there() -> None:
-    """y of the sensor is the bow: heading 90°, pitch 30° takes it east and up."""
     rows = [(HEADING, messages.pack_heading(0, -math.pi / 2, Reference.TRUE)),
             (ATTITUDE, messages.pack_attitude(0, (0.0, math.pi / 6, 0.0)))]  # fmt: skip
     w, x, y, z = messages.measurement_of(rows).quat_wxyz or (0, 0, 0, 0)
@@ -218,7 +216,7 @@ def test_a_burst_makes_a_sample_and_other_frames_do_not() -> None:
     assert DRIVER.node_title(5) == "source 5"
 
 
-def test_frames_of_different_sids_are_never_mixed() -> None:
+def test_sids_and_senders_are_never_mixed() -> None:
     codec = learned()
     lost_before = codec.ledger.lost()
     first, second = burst(50), burst(51)
@@ -233,8 +231,6 @@ def test_frames_of_different_sids_are_never_mixed() -> None:
     assert {f.can_id & 0xFF for f in DRIVER.filters(HipnucNmea2000Settings(source=36))} == {36}
     assert all(f.mask & 0xFF == 0 for f in DRIVER.filters(HipnucNmea2000Settings()))
 
-
-def test_a_sender_without_sids_or_with_wrong_ones_is_taken_by_time_and_order() -> None:
     codec = make()
     found = [value for n in range(20) for value in feed(codec, burst(n, sids=(255, 255, 255)), n * 100 * MS)]
     assert found == list(range(20 - len(found), 20))
@@ -247,8 +243,6 @@ def test_a_sender_without_sids_or_with_wrong_ones_is_taken_by_time_and_order() -
         assert feed(codec, burst(n), n * 100 * MS) == [n]
     assert feed(codec, burst(99, sids=(1, 2, 2)), (40 + SID_DOUBTS) * 100 * MS) == []
 
-
-def test_the_first_sender_is_kept_until_it_is_silent() -> None:
     codec = learned()
     assert feed(codec, burst(1, source=36), 1000 * MS) == []
     assert codec.ledger.bytes_skipped == 24

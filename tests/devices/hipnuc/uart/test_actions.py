@@ -112,7 +112,8 @@ def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any], messag
         sent(name, [], **arguments)
 
 
-def test_refusal_and_silence() -> None:
+@pytest.mark.manual("B 2.2.1 REBOOT")
+def test_refusal_silence_output_and_restart() -> None:
     with pytest.raises(Rejected, match="ERR 3"):
         sent("save", [Rejection(("ERR 3",))])
     with pytest.raises(NoReply, match="SAVECONFIG: expected OK, got nothing"):
@@ -121,16 +122,11 @@ def test_refusal_and_silence() -> None:
     with pytest.raises(NoReply, match="expected an answer at 115200 or 921600 baud"):
         sent("baud", left, baud=921600)
 
-
-def test_output_reads_what_else_is_sent_and_then_sets_it() -> None:
     requests, _ = sent("output", [Reply(("LOG HI92 ONTIME 0.1", "OK")), OK], message="HI91", rate_hz=100)
     assert [request.name for request in requests] == ["LOG COMCONFIG", "LOG HI91 ONTIME 0.01"]
     requests, _ = sent("output", [Silence(()), OK], message="HI91", rate_hz=50)
     assert requests[-1].name == "LOG HI91 ONTIME 0.02"
 
-
-@pytest.mark.manual("B 2.2.1 REBOOT")
-def test_restart_waits_until_it_answers() -> None:
     requests, value = sent("restart", [Reply(()), Silence(()), Silence(()), Silence(()), VERSION])
     assert requests[0].silent
     assert getattr(value, "product", "") == "HI14R3"

@@ -171,7 +171,8 @@ def test_hand_made_hi92() -> None:
 # --- the word, sub-packets ----------------------------------------------------------
 
 
-def test_word_is_pps_until_the_firmware_says_otherwise() -> None:
+@pytest.mark.manual("B 3.1 sub-packets")
+def test_the_word_and_sub_packets() -> None:
     codec = make()
     frame = hi91(word_1_2=0x0208)
     assert one(codec.feed(frame)).pps_age_ms == 0x0208
@@ -184,18 +185,6 @@ def test_word_is_pps_until_the_firmware_says_otherwise() -> None:
     DRIVER.apply_identity(codec, Identity())
     assert one(codec.feed(frame)).status == 0x0208
 
-
-@pytest.mark.parametrize(("word", "version"), [("pps", "200"), ("status", "100")])
-def test_a_configured_word_stays(word: str, version: str) -> None:
-    codec = make(hi91_word=word)
-    DRIVER.apply_identity(codec, Identity(details={"APP_VER": version}))
-    for frame in (hi91(word_1_2=7), framed(hi91(word_1_2=7)[6:] + b"\x77")):
-        m = one(codec.feed(frame))
-        assert (m.status, m.pps_age_ms) == ((None, 7) if word == "pps" else (7, None))
-
-
-@pytest.mark.manual("B 3.1 sub-packets")
-def test_two_sub_packets_are_two_measurements_of_one_frame() -> None:
     codec = make()
     frame = framed(MANUAL_HI91[6:] + HI92_PAYLOAD)
     first, second = codec.feed(frame + b"\x00\x00\x00")
@@ -208,6 +197,15 @@ def test_two_sub_packets_are_two_measurements_of_one_frame() -> None:
     assert codec.feed(framed(b"\x77" + MANUAL_HI91[6:])) == []
     assert (codec.ledger.unknown_tags, codec.ledger.frames_ignored, codec.ledger.frames_bad()) == (1, 1, 0)
     assert codec.ledger.closes()
+
+
+@pytest.mark.parametrize(("word", "version"), [("pps", "200"), ("status", "100")])
+def test_a_configured_word_stays(word: str, version: str) -> None:
+    codec = make(hi91_word=word)
+    DRIVER.apply_identity(codec, Identity(details={"APP_VER": version}))
+    for frame in (hi91(word_1_2=7), framed(hi91(word_1_2=7)[6:] + b"\x77")):
+        m = one(codec.feed(frame))
+        assert (m.status, m.pps_age_ms) == ((None, 7) if word == "pps" else (7, None))
 
 
 @pytest.mark.parametrize("payload", [MANUAL_HI91[6:-1], HI92_PAYLOAD[:-1], HI92_PAYLOAD + b"\x91"])
@@ -233,16 +231,15 @@ def test_an_impossible_length_costs_the_sync_word_only(length: int) -> None:
     assert codec.ledger.bytes_in_bad_frames == 4
 
 
-@pytest.mark.parametrize("length", [1, 512])
-@pytest.mark.manual("B 3.1 length")
-def test_the_shortest_and_the_longest_payload_are_taken(length: int) -> None:
-    codec = make()
-    assert codec.feed(framed(b"\x77" * length)) == []
-    assert codec.ledger.frames_ignored == 1
-
-
 @pytest.mark.manual("B 3.4 CRC")
-def test_every_single_bit_error_is_found_and_costs_one_frame() -> None:
+def test_lengths_of_payloads_and_every_single_bit_error() -> None:
+    for payload in (b"", bytes(513)):
+        with pytest.raises(ValueError, match=r"expected 1 … 512"):
+            encode_frame(payload)
+    for length in (1, 512):
+        codec = make()
+        assert codec.feed(framed(b"\x77" * length)) == []
+        assert codec.ledger.frames_ignored == 1
     for bit in range(0, 8 * len(MANUAL_HI91), 3):
         damaged = bytearray(MANUAL_HI91)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -321,6 +318,13 @@ def test_not_finite_values_are_left_out_and_told() -> None:
             assert (codec.ledger.frames_good, codec.ledger.frames_not_finite, codec.ledger.frames_bad()) == (3, 1, 0)
             assert codec.ledger.closes()
 
+    for top in (0x7F, 0xFF):
+        assert one(make().feed(hi91(top << 24))).dev_ticks == top << 24
+    body = OLD_MANUAL[6:].ljust(76, b"\0")
+    m = one(make().feed(framed(body)))
+    assert (m.temperature_c, m.pressure_pa) == (None, None)
+    assert m.dev_ticks == 0x0004BBBD
+
 
 OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453FF2C53D3FDDA9CDBC54A6D5BC5E4CBEBD")
 """Beginning of a frame in the vendor's older manual; bytes 7 … 13: reserved, 0x3B, -4.2e-25 as a float."""
@@ -351,15 +355,6 @@ def test_no_barometer_no_pressure(
     for event in events:
         assert isinstance(event, Measurement)
         assert (event.temperature_c, event.pressure_pa) == expected
-
-
-def test_very_late_system_time_is_no_damage() -> None:
-    for top in (0x7F, 0xFF):
-        assert one(make().feed(hi91(top << 24))).dev_ticks == top << 24
-    body = OLD_MANUAL[6:].ljust(76, b"\0")
-    m = one(make().feed(framed(body)))
-    assert (m.temperature_c, m.pressure_pa) == (None, None)
-    assert m.dev_ticks == 0x0004BBBD
 
 
 # --- text ---------------------------------------------------------------------------
@@ -422,12 +417,6 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     codec = replace(DRIVER, name="other").make_codec(Ledger(), HipnucSettings(hi91_word="status"))
     assert one(codec.feed(hi91(word_1_2=3))).status == 3
     assert DRIVER.example_frame(Random(0))
-
-
-@pytest.mark.parametrize("payload", [b"", bytes(513)])
-def test_payloads_out_of_range_are_not_encoded(payload: bytes) -> None:
-    with pytest.raises(ValueError, match=r"expected 1 … 512"):
-        encode_frame(payload)
 
 
 def test_damaged_frames_among_lines() -> None:

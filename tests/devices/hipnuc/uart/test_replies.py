@@ -7,8 +7,8 @@ from imud.devices.hipnuc.uart import replies as r
 VERSION = ("PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK")
 
 
-@pytest.mark.manual("B 2.2.5 VERSION")
-def test_version() -> None:
+@pytest.mark.manual("B 2.2.5 VERSION", "B 2.2.5 USRCONFIG", "B 2.2.5 COMCONFIG")
+def test_reports_of_the_module() -> None:
     version = r.parse_version(VERSION)
     assert (version.product, version.build, version.uuid) == ("HI14R3", "Oct 15 2024", "043995698D6E1708")
     assert (version.app_ver, version.bl_ver) == (156, 109)
@@ -18,9 +18,6 @@ def test_version() -> None:
     assert version.report.values == {"PNAME": "CH0", "APP_VER": "beta", "COLOUR": "red"}
     assert version.report.other == ("* boot ok *", "PNAME=again")
 
-
-@pytest.mark.manual("B 2.2.5 USRCONFIG")
-def test_usrconfig_with_the_comment_of_the_manual() -> None:
     config = r.parse_usrconfig(("ATT_MODE: 1 /* 0:6, 1:9 */", "URFR=1,0,0", "OK"))
     assert config.att_mode == 1
     assert config.report.values == {"ATT_MODE": "1", "URFR": "1,0,0"}
@@ -35,13 +32,10 @@ def test_usrconfig_with_the_comment_of_the_manual() -> None:
     assert r.is_setting_line("ATT_MODE: 0")
     assert not r.is_version_line("ATT_MODE: 0")
 
-
-@pytest.mark.manual("B 2.2.5 COMCONFIG")
-def test_comconfig_finds_periods_however_they_are_written() -> None:
-    config = r.parse_comconfig(("BAUD=115200", "LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0", "OK"))
-    assert config.periods_s == {"HI91": 0.01, "HI92": 0.0}
-    assert config.report.values == {"BAUD": "115200"}
-    assert config.report.other == ("LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0")
+    port = r.parse_comconfig(("BAUD=115200", "LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0", "OK"))
+    assert port.periods_s == {"HI91": 0.01, "HI92": 0.0}
+    assert port.report.values == {"BAUD": "115200"}
+    assert port.report.other == ("LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0")
 
 
 @pytest.mark.parametrize(

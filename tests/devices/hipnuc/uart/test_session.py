@@ -28,7 +28,7 @@ def hold(script: RequestScript[T], answer: Callable[[str], Outcome]) -> T:
 
 
 @pytest.mark.manual("B 2.2.5 VERSION")
-def test_identity_and_refusal() -> None:
+def test_identity_refusal_and_flat_settings() -> None:
     asked: list[str] = []
 
     def answer(name: str) -> Outcome:
@@ -44,6 +44,19 @@ def test_identity_and_refusal() -> None:
     with pytest.raises(Rejected, match="ERR 3"):
         hold(identify(), lambda _: Rejection(("ERR 3",)))
 
+    assert hold(read_settings(), lambda name: Reply(REPLIES[name])) == {
+        "ATT_MODE": "0",
+        "BAUD": "115200",
+        "COMCONFIG 1": "LOG HI91 ONTIME 0.01",
+        "MB": "14.14, -2.08, -8.75",
+    }
+    settings = hold(read_settings(), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n]))
+    assert "ATT_MODE" in settings
+    assert "MB" not in settings
+    for silent in ("LOG USRCONFIG", "LOG COMCONFIG"):
+        with pytest.raises(NoReply, match=silent):
+            hold(read_settings(), lambda n, silent=silent: Silence(()) if n == silent else Reply(REPLIES[n]))  # type: ignore[misc]  # bound now
+
 
 @pytest.mark.parametrize(
     ("outcome", "words"),
@@ -57,21 +70,6 @@ def test_identity_and_refusal() -> None:
 def test_no_reply_and_one_that_lost_its_product(outcome: Outcome, words: str) -> None:
     with pytest.raises(NoReply, match=words):
         hold(identify(), lambda _: outcome)
-
-
-def test_settings_are_one_flat_mapping() -> None:
-    assert hold(read_settings(), lambda name: Reply(REPLIES[name])) == {
-        "ATT_MODE": "0",
-        "BAUD": "115200",
-        "COMCONFIG 1": "LOG HI91 ONTIME 0.01",
-        "MB": "14.14, -2.08, -8.75",
-    }
-    settings = hold(read_settings(), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n]))
-    assert "ATT_MODE" in settings
-    assert "MB" not in settings
-    for silent in ("LOG USRCONFIG", "LOG COMCONFIG"):
-        with pytest.raises(NoReply, match=silent):
-            hold(read_settings(), lambda n, silent=silent: Silence(()) if n == silent else Reply(REPLIES[n]))  # type: ignore[misc]  # bound now
 
 
 def test_a_late_version_is_not_taken_for_the_settings() -> None:
@@ -194,6 +192,14 @@ def test_a_factory_reset_that_is_refused_or_unknown_changes_nothing() -> None:
         line.act("factory_reset")
     assert (line.baud, line.module.settings) == (921600, before)
 
+    assert advice(921600, 0) == advice(921600, 921600) == ""
+    assert advice(921600, 115200).startswith("change `baud: 115200` in the configuration to 921600 or auto")
+    line = HipnucLine(hardware=hardware_of(Behaviour(rate_change=RateChange.AFTER_ANSWER)))
+    line.run(_send(line, "SERIALCONFIG 460800"))
+    line.baud = 460800
+    assert line.act("restart").product == "HI14R3"
+    assert line.baud == line.module.baud == 115200
+
 
 def _send(line: HipnucLine, command: str) -> RequestScript[None]:
     line.module.receive(command.encode() + b"\r\n", line.now_ns)
@@ -239,13 +245,3 @@ def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSett
     assert line.run(wake()) is woken
     assert ("LOG ENABLE" in line.asked) is (woken is True)
     assert line.module.settings == settings
-
-
-def test_advice_and_a_rate_that_was_not_saved() -> None:
-    assert advice(921600, 0) == advice(921600, 921600) == ""
-    assert advice(921600, 115200).startswith("change `baud: 115200` in the configuration to 921600 or auto")
-    line = HipnucLine(hardware=hardware_of(Behaviour(rate_change=RateChange.AFTER_ANSWER)))
-    line.run(_send(line, "SERIALCONFIG 460800"))
-    line.baud = 460800
-    assert line.act("restart").product == "HI14R3"
-    assert line.baud == line.module.baud == 115200

@@ -47,6 +47,15 @@ def test_a_module_as_delivered_and_the_table() -> None:
         assert (info.extra_json_schema or {})["description"]
     assert [name for name, setting in TABLE.items() if setting.effect is Effect.AFTER_RESTART] == ["mounting"]
     assert [name for name, setting in TABLE.items() if setting.connection] == ["baud"] == [*TABLE][-1:]
+    line = HipnucLine()
+    setting = TABLE["output_enabled"]
+    assert setting.write is not None
+    assert not setting.readable
+    line.run(setting.write(Target(None, 115200), False))
+    line.wait(50)
+    assert line.wait(200) == []
+    line.run(setting.write(Target(None, 115200), True))
+    assert len(line.wait(200)) == pytest.approx(20, abs=2)
 
 
 def test_the_same_in_words_with_units() -> None:
@@ -126,18 +135,6 @@ def test_written_read_back_saved_and_kept_over_a_restart(
     assert {field: getattr(line.module.settings, field) for field in changed} == changed
 
 
-def test_output_enabled_is_written_and_not_told() -> None:
-    line = HipnucLine()
-    setting = TABLE["output_enabled"]
-    assert setting.write is not None
-    assert not setting.readable
-    line.run(setting.write(Target(None, 115200), False))
-    line.wait(50)
-    assert line.wait(200) == []
-    line.run(setting.write(Target(None, 115200), True))
-    assert len(line.wait(200)) == pytest.approx(20, abs=2)
-
-
 @pytest.mark.parametrize(
     ("values", "words"),
     [
@@ -154,18 +151,15 @@ def test_what_does_not_go_together_is_refused(values: dict[str, Any], words: str
         SETTINGS.check(Target(None, 115200), values)
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
+def test_what_goes_together_is_not() -> None:
+    for values in (
         DELIVERED,
         {"output": {"hi91": 1000}, "baud": 921600},
         {"output": {"hi91": "on_mark", "hi92": 200}},
         {"output": {"hi91": 100, "hi92": 50}},
         {},
-    ],
-)
-def test_what_goes_together_is_not(values: dict[str, Any]) -> None:
-    SETTINGS.check(Target(None, 115200), values)
+    ):
+        SETTINGS.check(Target(None, 115200), values)
 
 
 @pytest.mark.parametrize(

@@ -81,17 +81,6 @@ def test_golden_set_in_si_units_and_back() -> None:
     found = [indices(feed(codec, sample(index))) for index in (65534, 65535, 65536, 65537)]
     assert found == [[65534], [65535], [0], [1]]
 
-
-@pytest.mark.parametrize(("raw", "expected"), [("0000", 0.0), ("9cff", -1.0), ("ff7f", 327.67), ("0080", -327.68)])
-@pytest.mark.manual("A 4.2 temperature")
-def test_temperature_is_in_hundredths(raw: str, expected: float) -> None:
-    frames = [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")]
-    (measured,) = feed(make(), frames)
-    assert isinstance(measured, Measurement)
-    assert measured.temperature_c == pytest.approx(expected)
-
-
-def test_base_identifier_moves_all_five() -> None:
     moved = [(can_id - 101 + 600, data) for can_id, data in GOLDEN]
     assert indices(feed(make(600), moved)) == [65535]
     assert feed(make(600), GOLDEN) == []
@@ -100,6 +89,15 @@ def test_base_identifier_moves_all_five() -> None:
     assert not any(f.matches(605, False) or f.matches(600, True) for f in wanted)
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"base_id": 2044}, Imu61xCanSettings)
+
+
+@pytest.mark.parametrize(("raw", "expected"), [("0000", 0.0), ("9cff", -1.0), ("ff7f", 327.67), ("0080", -327.68)])
+@pytest.mark.manual("A 4.2 temperature")
+def test_temperature_is_in_hundredths(raw: str, expected: float) -> None:
+    frames = [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")]
+    (measured,) = feed(make(), frames)
+    assert isinstance(measured, Measurement)
+    assert measured.temperature_c == pytest.approx(expected)
 
 
 def test_incomplete_mixed_and_disordered_sets() -> None:

@@ -94,7 +94,13 @@ def test_identity_settings_and_modes(variant: str) -> None:
     assert words == (head if variant == "short status" else head | rest)
 
 
-def test_words_of_unusual_values_and_questions_only() -> None:
+def test_modes_at_any_rate_words_of_unusual_values_and_questions_only() -> None:
+    for rate_hz in (1, 400):
+        far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=rate_hz))
+        far.run(session.stop_streaming())
+        assert far.samples(1500) == []
+        far.run(session.start_streaming())
+        assert far.samples(2500)
     words = session.status_words(replace(STATUS, system_status=0x8000_0001, imu_health=bytes([1]) + bytes(31)))
     assert words["system_status_bits"] == "0x80000001"
     assert words["imu_health_bits"] == "01" + "00" * 31
@@ -164,15 +170,6 @@ def test_streaming_is_started_again_when_the_answer_fails() -> None:
 
 
 # --- modes and saving -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rate_hz", [1, 400])
-def test_modes_are_seen_at_any_rate(rate_hz: int) -> None:
-    far = imu61x_bench(Imu61xSettings(baud=921600, rate_hz=rate_hz))
-    far.run(session.stop_streaming())
-    assert far.samples(1500) == []
-    far.run(session.start_streaming())
-    assert far.samples(2500)
 
 
 ORDERS: dict[Command, Callable[[], RequestScript[object]]] = {

@@ -52,6 +52,12 @@ def test_replies_stand_between_whole_frames() -> None:
     ends = [burst.due_ns - len(burst.data) * 10 * NS_PER_S // 921_600 for burst in bursts]
     assert all(start >= before.due_ns - 1 for start, before in zip(ends[1:], bursts, strict=False))
 
+    bench = HipnucUartBench(hardware=HipnucHardware(mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
+    assert bench.ask("LOG MAGCONFIG") == ["MB=14.14, -2.08, -8.75", "OK"]
+    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 0"
+    assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
+    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 1"
+
 
 @pytest.mark.parametrize(
     "line",
@@ -120,14 +126,6 @@ def test_reboot_baud_rate_and_factory_reset() -> None:
     assert len(bench.frames(1000.0)) == pytest.approx(100, abs=1)
 
 
-def test_magconfig_and_usrconfig_have_the_manuals_form() -> None:
-    bench = HipnucUartBench(hardware=HipnucHardware(mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
-    assert bench.ask("LOG MAGCONFIG") == ["MB=14.14, -2.08, -8.75", "OK"]
-    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 0"
-    assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
-    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 1"
-
-
 # --- attitude ---------------------------------------------------------------------------------------------------------
 
 
@@ -148,8 +146,8 @@ def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: command
     assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude turned with the axes: force still points up
 
 
-@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5", "B 2.2.4 ATT RST 3")
-def test_levels() -> None:
+@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5", "B 2.2.4 ATT RST 3", "B 2.2.4 YAW 1", "B 2.2.4 YAW 0")
+def test_levels_and_yaw() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
     assert bench.ask("CONFIG ATT RST 2") == ["OK"]
@@ -180,9 +178,6 @@ def test_levels() -> None:
     bench.reboot()
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
 
-
-@pytest.mark.manual("B 2.2.4 YAW 1", "B 2.2.4 YAW 0")
-def test_yaw_absolute_and_relative_is_lost_at_reboot() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     for command, yaw_deg in (("CONFIG YAW 1 16", 16.0), ("CONFIG YAW 0 1.5", 17.5), ("CONFIG YAW 1 -170", -170.0)):
         assert bench.ask(command) == ["OK"]

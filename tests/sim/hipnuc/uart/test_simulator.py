@@ -111,8 +111,8 @@ def test_pps_stamp_free_runs_and_wraps_at_8192(uptime_ms: int, first: int) -> No
     assert min(frame.word_1_2 for frame in frames) < 10
 
 
-@pytest.mark.manual("B 3.3.1 system_time")
-def test_main_status_noise_and_the_end_of_32_bits() -> None:
+@pytest.mark.manual("B 3.3.1 system_time", "B 2.2.5 ONMARK 1")
+def test_main_status_noise_the_end_of_32_bits_and_pulses() -> None:
     bench = HipnucUartBench(hardware=HipnucHardware(motion=Still(), firmware=169, skew_ppm=0))
     early, late = bench.frames(20.0)[0], bench.frames(6000.0)[-1]
     assert early.word_1_2 == 1 << 3 | 1 << 7 | 1 << 9 | 1 << 11 | 1 << 12
@@ -132,12 +132,6 @@ def test_main_status_noise_and_the_end_of_32_bits() -> None:
     assert times[0] > 2**32 - 250
     assert times[-1] < 1000
 
-
-# --- the pulse input --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.manual("B 2.2.5 ONMARK 1")
-def test_a_pulse_restarts_the_pps_stamp() -> None:
     bench = HipnucUartBench(hardware=HipnucHardware(skew_ppm=0))
     bench.wait(125.0)
     bench.module.mark(bench.now_ns)
@@ -157,6 +151,9 @@ def test_a_pulse_restarts_the_pps_stamp() -> None:
     kinds = [burst.sample_ns is None for burst in bench.wait(30.0)]
     assert sorted(kinds) == [False, True]
     assert bench.wait(1000.0) == []
+
+
+# --- the pulse input --------------------------------------------------------------------------------------------------
 
 
 # --- with the codec and its conversations -----------------------------------------------------------------------------
