@@ -263,9 +263,6 @@ def test_a_number_that_is_none_is_not_looked_for(
         run_script(script, lambda _request: Silence(()))
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
-
-
 @both
 def test_the_table_has_order_effects_and_types(protocol: Protocol) -> None:
     table = protocol.settings.table

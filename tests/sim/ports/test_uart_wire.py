@@ -54,9 +54,6 @@ def test_no_frame_survives_a_wrong_rate(sent: int, listening: int) -> None:
     assert bool(events) == (sent == listening)
 
 
-# --- transmitter -----------------------------------------------------------------------------------------------------
-
-
 def transmitter() -> Transmitter:
     return Transmitter(1000, 20, free_ns=1000)
 

@@ -178,8 +178,6 @@ def test_settings_that_it_cannot_have(bad: dict[str, object]) -> None:
         make(**bad)
 
 
-# --- the vendor's DBC file gives equal values for every signal --------------------------------------------------------
-
 SIZES = {0x188: 6, 0x288: 6, 0x388: 6, 0x488: 8, 0x688: 4, 0x788: 8}
 BURSTS = 60
 G_M_S2 = 9.8

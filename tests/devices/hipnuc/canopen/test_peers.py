@@ -86,9 +86,6 @@ def network(request: pytest.FixtureRequest) -> Iterator[canopen.Network]:
     network.disconnect()
 
 
-# --- its client, our module -------------------------------------------------------------------------------------------
-
-
 class Pump(threading.Thread):
     """The simulated module on a bus, in real time."""
 
@@ -173,9 +170,6 @@ def test_their_client_hears_our_tpdos(remote: canopen.RemoteNode, network: canop
     network.subscribe(0x788, lambda can_id, data, timestamp: got.set())
     remote.sdo[0x1805][5].raw = 10
     assert got.wait(LIMIT_S)
-
-
-# --- their node, our driver -------------------------------------------------------------------------------------------
 
 
 class Host:

@@ -18,7 +18,6 @@ from tests.support.files import shared
 
 MS = 1_000_000
 NONE = bytes([0xFF]) * 8
-ONE_G = "0008"  # 2048 counts
 
 
 def measured(pgn: int, data: str) -> Measurement:
@@ -61,9 +60,6 @@ def learned(**options: object) -> HipnucJ1939Codec:
     for n in range(10):
         feed(codec, burst(n), n * 10 * MS)
     return codec
-
-
-# --- values ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.manual("B 6.1.1 FF34", "B 6.1.2 FF37", "B 6.1.3 FF3D", "B 6.1.5 FF4A")
@@ -225,9 +221,6 @@ def compare(ours: Measurement, theirs: dict[str, float]) -> int:
         there = theirs[name] % 360 if name == "Yaw_360" else theirs[name]
         assert value == pytest.approx(there, rel=1e-9, abs=1e-9), name
     return len(values)
-
-
-# --- frames ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.manual("B 6 identifiers")

@@ -57,9 +57,6 @@ def learned(**options: object) -> HipnucNmea2000Codec:
     return codec
 
 
-# --- values ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("counts", "yaw_rad"),
     [(0, 0.0), (1, -0.0001), (15708, -1.5708), (31415, -3.1415), (31416, 3.141585307), (62831, 0.000085307)],
@@ -122,9 +119,6 @@ def test_the_next_lower_values_are_values() -> None:
     euler = measured((ATTITUDE, "05 fc7f fc7f 0080 ff")).euler_rad
     assert euler == pytest.approx((-3.2768, 3.2764, -3.2764 + math.tau))
     assert measured((HEADING, "05 983a ff7f ff7f fe")).euler_rad is None
-
-
-# --- the independent library ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.manual("B 7 NMEA 2000")
@@ -194,9 +188,6 @@ def test_the_library_and_we_agree_on_absent_values() -> None:
             theirs = message.get_field_by_id(name).value
             ours = getattr(messages.measurement_of([(pgn, data)]), field)
             assert (theirs is None) is (ours is None), (pgn, hex(last))
-
-
-# --- frames ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_burst_makes_a_sample_and_other_frames_do_not() -> None:

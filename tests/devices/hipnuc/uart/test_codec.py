@@ -16,6 +16,7 @@ from imud.contracts.codec import BadFrame, BadReason, CodecEvent, TextLine
 from imud.contracts.driver import Identity
 from imud.devices.hipnuc.uart.codec import HEADER, HipnucCodec, HipnucSettings, encode_frame, encode_hi91, encode_hi92
 from imud.devices.hipnuc.uart.driver import DRIVER
+from imud.devices.hipnuc.uart.packets import HI91, HI92, PPS_STAMP_MODULUS_MS
 from imud.ledger import Ledger
 from imud.sample import Measurement
 
@@ -76,9 +77,6 @@ def reasons(events: Sequence[CodecEvent]) -> list[BadReason]:
 
 def hi91(system_time_ms: int = 0, **values: Any) -> bytes:
     return encode_hi91(system_time_ms=system_time_ms, **(LEVEL | values))
-
-
-# --- golden frames ------------------------------------------------------------------
 
 
 def check_manual_values(m: Measurement) -> None:
@@ -168,9 +166,6 @@ def test_hand_made_hi92() -> None:
     assert encode_hi92(pps_stamp_ms=1000, status=0x1234, **values) == framed(HI92_PAYLOAD)
 
 
-# --- the word, sub-packets ----------------------------------------------------------
-
-
 @pytest.mark.manual("B 3.1 sub-packets")
 def test_the_word_and_sub_packets() -> None:
     codec = make()
@@ -215,9 +210,6 @@ def test_a_sub_packet_cut_off_makes_the_frame_bad(payload: bytes) -> None:
     assert codec.feed(frame) == [BadFrame(BadReason.CONTENT, frame)]
     assert (codec.ledger.frames_bad_content, codec.ledger.bytes_in_bad_frames) == (1, len(frame))
     assert codec.ledger.closes()
-
-
-# --- damage -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length", [0, 513, 0xFFFF])
@@ -357,9 +349,6 @@ def test_no_barometer_no_pressure(
         assert (event.temperature_c, event.pressure_pa) == expected
 
 
-# --- text ---------------------------------------------------------------------------
-
-
 def texts(data: bytes) -> list[str]:
     return [event.text for event in make().feed(data) if isinstance(event, TextLine)]
 
@@ -393,9 +382,6 @@ def test_lines_of_text() -> None:
         events = [event for byte in end for event in codec.feed(bytes([byte]))]
         assert events == [TextLine("y"), TextLine("z")]
         assert codec.ledger.closes()
-
-
-# --- encoding -----------------------------------------------------------------------
 
 
 @pytest.mark.manual("B 3.4 CRC")
@@ -457,3 +443,9 @@ def test_what_looks_like_a_line_inside_a_damaged_frame_is_none(text: bytes, step
     assert (ledger.frames_in_replies, ledger.frames_in_samples) == (1, 1)
     assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames) == (82, 4 + 82)
     assert ledger.closes()
+
+
+@pytest.mark.manual("B 3.3.1 size", "B 3.3.2 size", "B 3.3.1 pps_sync_stamp")
+def test_sizes_and_the_pps_stamp_that_runs_free() -> None:
+    assert (HI91.size, HI92.size) == (76, 48)
+    assert (8190 + 10) % PPS_STAMP_MODULUS_MS == 8

@@ -93,8 +93,6 @@ def test_a_late_version_is_not_taken_for_the_settings() -> None:
     assert ledger.replies_late == 1
 
 
-# --- on the simulated module, in every way that the manual can be read ----------------------------------------------
-
 every_variant = pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
 
 

@@ -80,9 +80,6 @@ def test_filters_that_there_are_not_are_answered_with_the_table(code: object) ->
         I2C.actions["filter"].arguments({"accel_filter": code})
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
-
-
 def read_table(wires: Wires, driver: PolledDriver, target: Target) -> Mapping[str, object]:
     assert driver.device_settings is not None
     found = run_transfer_script(driver.device_settings.read(target), wires.over(driver))

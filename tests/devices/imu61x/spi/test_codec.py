@@ -9,7 +9,9 @@ import pytest
 from imud.contracts.codec import BadFrame, BadReason
 from imud.contracts.polling import PolledEvent, Vanished
 from imud.devices.imu61x.common.registers import temperature_c
+from imud.devices.imu61x.spi import bursts, words
 from imud.devices.imu61x.spi import codec as spi
+from imud.devices.imu61x.spi.bursts import BurstKind, burst_problem
 from imud.devices.imu61x.spi.session import SpiDeviceSettings
 from imud.devices.imu61x.spi.words import READ_STATE
 from imud.ledger import Ledger
@@ -32,12 +34,12 @@ def codec(burst: str = "standard", **more: object) -> spi.Imu61xSpiCodec:
     return spi.Imu61xSpiCodec(Ledger(), SpiDeviceSettings(burst=burst, **more))  # type: ignore[arg-type]  # passed on as given
 
 
-def words(data: bytes) -> tuple[int, ...]:
+def words_of(data: bytes) -> tuple[int, ...]:
     return struct.unpack(f">{len(data) // 2}H", data)
 
 
 def with_sum(values: bytes, total: int | None = None) -> bytes:
-    total = sum(words(values)) if total is None else total
+    total = sum(words_of(values)) if total is None else total
     return values + struct.pack(">HH", total & 0xFFFF, total >> 16)
 
 
@@ -100,7 +102,7 @@ def extended(*values: float, status: int = 0x01020304) -> bytes:
 @pytest.mark.manual("A 2.4.1 extended burst")
 def test_extended_burst_in_si() -> None:
     data = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
-    assert words(data)[:6] == (0x0000, 0x3F80, 0, 0, 0x0000, 0xBF80)  # 1.0 = 0x3F800000, low word first
+    assert words_of(data)[:6] == (0x0000, 0x3F80, 0, 0, 0x0000, 0xBF80)  # 1.0 = 0x3F800000, low word first
     m = one(codec("extended").decode(0, PIPELINE + data))
     assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S))
     assert m.accel_m_s2 == pytest.approx((0, G / 2, G))
@@ -181,3 +183,48 @@ def test_state_that_changed_by_itself_is_noticed() -> None:
     assert stuck[-2:] == b"\xa5\xfe"
     (event,) = made.decode(1, stuck[:-1] + b"\xff")
     assert event == Vanished("WIN_CTRL is 1, expected 0")
+
+
+def test_words_of_the_manual_and_their_answers() -> None:
+    """2.4.4: 0xFE01 opens window 1. 2.4.2: 0x8644 sets both filters to 10 Hz, 0x0600 reads them back."""
+    assert words.OPEN == 0xFE01
+    assert words.write(0x06, 0x44) == 0x8644
+    assert words.read(0x06) == 0x0600
+    assert [one.hex() for one in words.READ_STATE.sends] == [
+        "fe01", "6a00", "6c00", "6e00", "7000", "0600", "0c00", "0d00", "fe00", "7e00", "7e00", "7e00"
+    ]  # fmt: skip
+    assert words.answers(bytes.fromhex("aaaa bbbb 0001 fffe")) == (1, 0xFFFE)
+    assert words.answers(b"\x01\x02\x03\x04\x05") == ()
+
+
+@pytest.mark.manual("A 2.3 read and write", "A 2.4.1 reading", "A 2.4.2 write and read")
+def test_transfers_on_the_wire() -> None:
+    assert bursts.READ_STANDARD.sends == (b"\x80\x00" + bytes(30),)
+    assert bursts.READ_EXTENDED.sends == (b"\x80\x00" + bytes(50),)
+    assert [one.hex() for one in bursts.READ_TEMPERATURE.sends] == ["0e00", "1000", "7e00", "7e00"]
+    assert [bursts.READ_REGISTERS.sends[n].hex() for n in (0, 13)] == ["0e00", "2800"]
+
+
+STANDARD = bursts.encode_standard(accel_m_s2=(0.1, -0.2, 9.8), gyro_rad_s=(0.1, 0.2, 0.3))
+EXTENDED = bursts.encode_extended(
+    accel_m_s2=(0.1, -0.2, 9.8), gyro_rad_s=(0.1, 0.2, 0.3), temperature_c=25.0, euler_rad=(0.1, 0.2, 0.3)
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "frame", "why"),
+    [
+        ("standard", STANDARD, ""),
+        ("extended", EXTENDED, ""),
+        ("standard", EXTENDED[:28], "its check value does not match"),
+        ("extended", STANDARD + bytes(20), "its check value does not match"),
+        ("standard", bytes(28), "only 0x00"),
+        ("extended", b"\xff" * 48, "only 0xFF"),
+        ("standard", STANDARD[:-1], "expected 28 bytes, got 27"),
+        ("extended", b"", "expected 48 bytes, got 0"),
+    ],
+)
+def test_which_bytes_are_a_burst_of_a_kind(kind: BurstKind, frame: bytes, why: str) -> None:
+    found = burst_problem(kind, PIPELINE + frame, 32)
+    assert found.startswith(why)
+    assert bool(found) is bool(why)

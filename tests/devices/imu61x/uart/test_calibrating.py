@@ -5,14 +5,18 @@ from math import radians
 
 import pytest
 
+from imud.contracts.action import Target
+from imud.contracts.control.calibration import Kept
 from imud.contracts.session import RequestScript
 from imud.devices.imu61x.uart import calibrating
+from imud.devices.imu61x.uart.calibrations import CALIBRATIONS
 from imud.devices.imu61x.uart.commands import Command
 from imud.errors import NoReply, Rejected
 from imud.sim.imu61x.settings import Imu61xSettings
+from imud.sim.imu61x.uart import Imu61xHardware
 from imud.sim.physics.motion import Still, swing
 from imud.sim.physics.noise import Noise
-from tests.support.simulated_modules import done, every_variant, imu61x_bench, variant_bench
+from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, variant_bench
 
 ACKNOWLEDGING = [calibrating.calibrate_gyro, calibrating.calibrate_installation]
 
@@ -95,3 +99,16 @@ def test_installation_calibration_without_end(reports: bool, monkeypatch: pytest
 def test_state_of_the_installation_calibration_as_sent(variant: str) -> None:
     far = variant_bench(variant)
     assert far.run(calibrating.installation_status()) == done(variant)
+
+
+TARGET = Target(None, 115200)
+
+
+@pytest.mark.parametrize("kind", CALIBRATIONS)
+def test_it_runs_to_its_end_and_is_saved(kind: str) -> None:
+    calibration = CALIBRATIONS[kind]
+    bench = Imu61xBench(hardware=Imu61xHardware(motion=Still()))
+    bench.run(calibration.begin(TARGET))
+    if calibration.kept is Kept.BY_SAVE:
+        assert calibration.save is not None
+        bench.run(calibration.save(TARGET))

@@ -21,9 +21,6 @@ def streams(far: Imu61xBench) -> bool:
     return len(far.samples(100)) >= 5
 
 
-# --- restart ----------------------------------------------------------------------------------------------------------
-
-
 @every_variant
 @pytest.mark.manual("A 1.6 CMD 9")
 def test_restart_loses_what_was_not_saved_and_begins_the_timer_again(variant: str) -> None:
@@ -67,9 +64,6 @@ def test_a_young_timer_and_one_that_turns_over_soon_are_waited_for(uptime_us: in
     still = imu61x_bench(uptime_us=uptime_us, ignores=frozenset({Command.RESTART}))
     with pytest.raises(Rejected, match="timer that begins again"):
         still.run(following.restart())
-
-
-# --- baud rate --------------------------------------------------------------------------------------------------------
 
 
 @every_variant
@@ -152,9 +146,6 @@ def test_nothing_is_changed_without_contact(change: Callable[[], RequestScript[o
     assert "factory reset" not in far.asked
     assert not any(name.startswith("set parameter") for name in far.asked)
     assert streams(far)
-
-
-# --- factory reset ----------------------------------------------------------------------------------------------------
 
 
 @every_variant

@@ -24,9 +24,6 @@ def streams(far: Imu61xBench) -> bool:
     return len(far.samples(100)) >= 5
 
 
-# --- identity and status ----------------------------------------------------------------------------------------------
-
-
 @every_variant
 @pytest.mark.manual(
     "A 1.4 serial number",
@@ -169,9 +166,6 @@ def test_streaming_is_started_again_when_the_answer_fails() -> None:
     assert streams(far)
 
 
-# --- modes and saving -------------------------------------------------------------------------------------------------
-
-
 ORDERS: dict[Command, Callable[[], RequestScript[object]]] = {
     Command.OUTPUT_MODE: session.stop_streaming,
     Command.SAVE: session.save,
@@ -193,9 +187,6 @@ def test_an_order_without_an_acknowledgement_is_not_known_to_be_done(command: Co
     far = imu61x_bench(acknowledges=False)
     with pytest.raises(NoReply, match="though the device answers: whether it is done is not known"):
         far.run(ORDERS[command]())
-
-
-# --- parameters and heading -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

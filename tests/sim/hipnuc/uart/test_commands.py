@@ -126,9 +126,6 @@ def test_reboot_baud_rate_and_factory_reset() -> None:
     assert len(bench.frames(1000.0)) == pytest.approx(100, abs=1)
 
 
-# --- attitude ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mounting", commands.Mounting)
 @pytest.mark.manual("B 2.2.4 URFR")
 def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: commands.Mounting) -> None:

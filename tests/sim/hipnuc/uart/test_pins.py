@@ -88,9 +88,6 @@ def test_edges_come_in_order_whatever_the_steps() -> None:
     assert len(edges) > 200
 
 
-# --- SOUT_DIV ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("divider", [1, 8, 64])
 @pytest.mark.manual("B 2.2.4 divider")
 def test_every_nth_pulse_is_repeated(divider: int) -> None:
@@ -122,9 +119,6 @@ def test_dividers_and_pins_that_nobody_watches() -> None:
     bench = HipnucUartBench(FAST)
     bench.wait(10_000.0)
     assert len(bench.module.pins(bench.now_ns)) <= 8192
-
-
-# --- ALARM ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.manual("B 2.2.4 alarm level")
@@ -176,12 +170,6 @@ def test_which_angle_alarms(alarm_x: AlarmSetting, alarm_y: AlarmSetting, expect
     hardware = HipnucHardware(motion=Still(radians(2), radians(7), 0.0))
     _, edges = run(HipnucUartBench(ModuleSettings(alarm_x=alarm_x, alarm_y=alarm_y), hardware), 100.0)
     assert [edge.rising for edge in edges if edge.pin is Pin.ALARM] == [True] * expected
-
-
-# --- power ------------------------------------------------------------------------------------------------------------
-
-
-# --- SIN --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.manual("B 1.2.1 delay of the answer", "B 2.2.4 PMUX1 SIN")

@@ -22,8 +22,6 @@ from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, Hipnuc
 
 T = TypeVar("T")
 
-# --- frames and time --------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.manual("B 3.2 factory output")
 def test_frames_and_their_times() -> None:
@@ -153,12 +151,6 @@ def test_main_status_noise_the_end_of_32_bits_and_pulses() -> None:
     assert bench.wait(1000.0) == []
 
 
-# --- the pulse input --------------------------------------------------------------------------------------------------
-
-
-# --- with the codec and its conversations -----------------------------------------------------------------------------
-
-
 def converse(bench: HipnucUartBench, script: RequestScript[T]) -> T:
     """Run a request script against the module, frames in between."""
     ledger = Ledger()
@@ -204,9 +196,6 @@ def test_codec_reads_every_frame(message: str) -> None:
         assert event.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-4)
     assert ledger.frames_good == pytest.approx(499, abs=1)
     assert ledger.closes()
-
-
-# --- making -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
