@@ -50,7 +50,7 @@ def test_what_is_missing_is_told() -> None:
 
 def test_the_report_names_all() -> None:
     text = "\n".join(report(marks()))
-    assert "test  devices/hipnuc/uart/test_codec.py::test_manual_hi91_in_one_read" in text
+    assert "test  devices/hipnuc/uart/test_codec.py::test_manual_hi91" in text
     assert "described by hipnuc-uart: action mode (axes)" in text
     assert re.fullmatch(
         r"Forsense IMU61x: \d+ of \d+ items have code and a test, \d+ left with a reason", count("A", {})

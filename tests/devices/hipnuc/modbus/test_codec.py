@@ -56,9 +56,10 @@ def block(
     incli: tuple[int, int] = (0, 0),
     pitch_deg: float = 0.0,
     uptime_ms: int = 5,
+    mag_t: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> bytes:
     data = pack_block(
-        accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), mag_t=(0, 0, 0), euler_rad=(0, radians(pitch_deg), 0),
+        accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), mag_t=mag_t, euler_rad=(0, radians(pitch_deg), 0),
         quat_wxyz=quat, temperature_c=0, pressure_pa=0, uptime_ms=uptime_ms, incli_counts=incli, quat_per_lsb=per_lsb,
     )  # fmt: skip
     return framed(9, registers_reply(data))
@@ -229,6 +230,8 @@ def test_axes_of_the_inclinometer_are_kept_or_configured() -> None:
     assert measured(made, block(incli=(16384, 0), pitch_deg=5, uptime_ms=6)).incli_rad == (radians(90), 0)
     assert measured(codec(inclinometer="single"), block(incli=(8192, 0))).incli_rad == (radians(90), 0)
     assert measured(codec(inclinometer="dual"), block(incli=(0, 0))).incli_rad == (0, 0)
+    for mag_t in ((3e-5, 0.0, 0.0), (0.0, 3e-5, 0.0), (0.0, 0.0, 3e-5)):  # one axis is enough for a field
+        assert measured(codec(), block(mag_t=mag_t)).mag_t == pytest.approx(mag_t, abs=2e-8)
 
     made = codec()
     assert [poll.transfer.sends[0].hex() for poll in made.polls] == ["030034001a", "03007f0004", "0300090001"]

@@ -76,6 +76,7 @@ def test_each_setting_is_written_and_reads_back(variant: str, name: str, value: 
 
 
 @every_variant
+@pytest.mark.manual("A 1.6 CMD 5")
 def test_what_is_saved_is_there_after_a_restart(variant: str) -> None:
     far = variant_bench(variant, uptime_us=20_000_000)
     assert SETTINGS.save is not None
