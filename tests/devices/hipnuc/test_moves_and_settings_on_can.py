@@ -47,7 +47,7 @@ class Protocol(NamedTuple):
     values: Mapping[str, tuple[object, ...]]
     """Values of every setting, in the order of the table."""
     of_each_form: tuple[str, ...]
-    """Settings of which one of each form is enough."""
+    """Settings that every kind of module must take; the other settings have the same forms."""
     delivered: Mapping[str, object]
     wrong: Mapping[str, object]
     settings: DeviceSettings
@@ -224,7 +224,7 @@ def test_a_restart_that_loses_the_module_is_told(protocol: Protocol) -> None:
     bench = protocol.make(boot_ms=300)
     bench.run(BOOTED_NS)
     bench.act("bitrate", bitrate=250_000)
-    bench.module.hardware = type(bench.module.hardware)(boot_ms=60_000)  # what it sends then is not understood
+    bench.module.hardware = type(bench.module.hardware)(boot_ms=60_000)  # the host does not understand its frames then
     assert bench.act("restart") == "restarted; it has 250000 bit/s now, which this bus has not"
     bench = protocol.make(boot_ms=60_000)
     bench.now_ns += 70_000_000_000

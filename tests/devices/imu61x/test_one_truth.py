@@ -54,7 +54,7 @@ HALF_STEPS = {
     # temperature 1 / 263.4 / 65536 = 5.7931e-8 °C, half is 2.8965e-8
     "spi registers": {"accel_m_s2": 1.4965e-8, "gyro_rad_s": 2.1306e-9, "temperature_c": 2.8966e-8},
 }
-"""Half a step of each value that a format carries, in SI."""
+"""Maximum error of each value that a format carries, half a step, in SI."""
 ROUNDING = 1 + 1e-6
 """Arithmetic of 64-bit floats on the way, and the last digit of the numbers above."""
 

@@ -43,7 +43,7 @@ def test_the_same_seed_gives_the_same(profile: ArrivalProfile) -> None:
 
 
 def test_wires_timers_and_packets() -> None:
-    """At 115200 baud 82 bytes take 7.1 ms; at 200 Hz each frame waits for the ones before it."""
+    """At 115200 baud 82 bytes take 7.1 ms, so that at 200 Hz each frame waits for the previous frames."""
     assert {one_way(a) // 2 for a in arrivals(PERFECT)} <= {-1, 0}
 
     got = arrivals(USB_16MS, 1000)

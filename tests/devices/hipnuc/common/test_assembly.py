@@ -193,7 +193,7 @@ def test_frames_that_come_twice_cost_nothing(kinds: dict[int, int]) -> None:
 
 
 def test_kinds_that_are_switched_off_or_stay_out() -> None:
-    """Also kinds that are not asked for, and one of 50 ms beside 20 ms, which comes between bursts every other time."""
+    """Kinds that are not selected stay out too, and a kind of 50 ms next to a period of 20 ms, between bursts."""
     rig = learnt(EQUAL)
     made = rig.feed(stream({1: 1, 3: 1}, range(40, 80)))
     assert made == list(range(50, 80))
