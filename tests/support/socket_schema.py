@@ -1,0 +1,178 @@
+"""The JSON Schema of every message of the UNIX socket, made from the types, and a checker of messages.
+
+docs/socket.schema.json is open, as the protocol is: members that a reader does not know are allowed. `MessageChecker`
+is closed: a message of a server of the tests may only have what is described.
+"""
+
+import json
+from copy import deepcopy
+from importlib.util import find_spec
+from typing import Any, Final
+
+import msgspec
+
+from imud.formats.jsonrpc import Code, is_big
+from imud.publishers.socket.encoding import ALWAYS_FIELDS
+from imud.publishers.socket.messages import NOTIFICATIONS
+from imud.publishers.socket.rpc import METHODS
+
+DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
+DIGITS: Final = "^-?[0-9]+$"
+OPEN_ENUMS: Final = ("EventKind",)
+"""Choices to which later versions may add; readers must accept others."""
+ID: Final = {"type": ["string", "number", "null"]}
+
+Schema = dict[str, Any]
+
+
+def socket_document() -> Schema:
+    """The whole schema: requests, replies and notifications by name in `$defs`, and any of them at the top."""
+    requests = {name: method.params for name, method in METHODS.items()}
+    results = {name: method.result for name, method in METHODS.items()}
+    incoming, described = _components(list(requests.values()))
+    outgoing, more = _components([*results.values(), *NOTIFICATIONS.values()])
+    for part in more.values():
+        _as_sent(part)
+    for part in outgoing:
+        _as_sent(part)
+    _finish(more)
+    messages = {
+        **{f"request.{name}": _request(name, one) for name, one in zip(requests, incoming, strict=True)},
+        **{f"reply.{name}": _reply(one) for name, one in zip(results, outgoing, strict=False)},
+        "reply.error": _error(),
+        **{
+            f"notification.{name}": _notification(name, one)
+            for name, one in zip(NOTIFICATIONS, outgoing[len(results) :], strict=True)
+        },
+    }
+    return {
+        "$schema": DIALECT,
+        "title": "Messages of imud's UNIX socket",
+        "description": "One message per line; docs/socket.md says what they mean. Members that a reader does not know "
+        "are to be ignored.",
+        "anyOf": [{"$ref": f"#/$defs/{name}"} for name in messages],
+        "$defs": {**messages, **dict(sorted({**described, **more}.items()))},
+    }
+
+
+def socket_schema() -> str:
+    """The file as it stands in docs/."""
+    return json.dumps(socket_document(), indent=1, ensure_ascii=False) + "\n"
+
+
+class MessageChecker:
+    """Checks messages by the closed schema. Without the package jsonschema it checks nothing."""
+
+    def __init__(self) -> None:
+        self.checked: dict[str, int] = {}
+        """How many messages were checked, by name."""
+        self._whole = socket_document()
+        _close(self._whole)
+        self._validators: dict[str, Any] = {}
+
+    @property
+    def able(self) -> bool:
+        """Whether messages can be checked here."""
+        return find_spec("jsonschema") is not None
+
+    def check(self, name: str, message: object) -> None:
+        """Raise AssertionError unless `message` is what `$defs` has under this name."""
+        if not self.able:
+            return
+        validator = self._validators.get(name)
+        if validator is None:
+            from jsonschema import Draft202012Validator
+
+            schema = {"$ref": f"#/$defs/{name}", "$defs": self._whole["$defs"]}
+            validator = self._validators[name] = Draft202012Validator(schema)
+        self.checked[name] = self.checked.get(name, 0) + 1
+        errors = [f"{error.json_path}: {error.message}" for error in validator.iter_errors(message)]
+        assert not errors, f"{name}: {errors[:3]}"
+
+    def check_sent(self, message: dict[str, Any], method: str | None) -> None:
+        """Check a message of the server; `method` is that of the request with its id, None where that is unknown."""
+        if message.get("method") in NOTIFICATIONS:
+            self.check(f"notification.{message['method']}", message)
+        elif "error" in message:
+            self.check("reply.error", message)
+        elif method is not None:
+            self.check(f"reply.{method}", message)
+
+
+def _components(types: list[Any]) -> tuple[list[Schema], dict[str, Schema]]:
+    schemas, components = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
+    return [deepcopy(dict(one)) for one in schemas], {name: deepcopy(dict(one)) for name, one in components.items()}
+
+
+def _request(name: str, params: Schema) -> Schema:
+    required = ["jsonrpc", "method"]
+    if METHODS[name].params.__struct_fields__ and any(
+        field.required for field in msgspec.structs.fields(METHODS[name].params)
+    ):
+        required.append("params")
+    properties = {"jsonrpc": {"const": "2.0"}, "id": ID, "method": {"const": name}, "params": params}
+    return {"type": "object", "properties": properties, "required": required}
+
+
+def _reply(result: Schema) -> Schema:
+    properties = {"jsonrpc": {"const": "2.0"}, "id": ID, "result": result}
+    return {"type": "object", "properties": properties, "required": ["jsonrpc", "id", "result"]}
+
+
+def _error() -> Schema:
+    codes = {"type": "integer", "examples": [int(code) for code in Code]}
+    error = {"type": "object", "properties": {"code": codes, "message": {"type": "string"}}}
+    error["required"] = ["code", "message"]
+    properties = {"jsonrpc": {"const": "2.0"}, "id": ID, "error": error}
+    return {"type": "object", "properties": properties, "required": ["jsonrpc", "id", "error"]}
+
+
+def _notification(name: str, params: Schema) -> Schema:
+    properties = {"jsonrpc": {"const": "2.0"}, "method": {"const": name}, "params": params}
+    return {"type": "object", "properties": properties, "required": ["jsonrpc", "method", "params"]}
+
+
+def _as_sent(schema: Any) -> None:
+    """What the encoder does: NaN is null, and members that may exceed 53 bits can be text."""
+    if isinstance(schema, list):
+        for one in schema:
+            _as_sent(one)
+    if not isinstance(schema, dict):
+        return
+    for name, one in schema.get("properties", {}).items():
+        if is_big(name):
+            _allow_text(one)
+    if schema.get("type") == "number":
+        schema["type"] = ["number", "null"]
+    for one in schema.values():
+        _as_sent(one)
+
+
+def _allow_text(schema: Schema) -> None:
+    for one in [schema, *schema.get("anyOf", [])]:
+        if one.get("type") == "integer":
+            one |= {"type": ["integer", "string"], "pattern": DIGITS}
+
+
+def _finish(components: dict[str, Schema]) -> None:
+    """What types cannot say: a selection of fields, the number of drops, and choices that may grow."""
+    sample = components["Sample"]
+    sample["required"] = list(ALWAYS_FIELDS)
+    sample["properties"]["dropped"] = {
+        "type": "integer", "minimum": 1, "description": "samples of this device dropped right before this one",
+    }  # fmt: skip
+    for name in OPEN_ENUMS:
+        components[name]["examples"] = components[name].pop("enum")
+        components[name]["type"] = "string"
+
+
+def _close(schema: Any) -> None:
+    """Allow no members but the described ones."""
+    if isinstance(schema, dict):
+        if "properties" in schema:
+            schema.setdefault("additionalProperties", False)
+        for one in schema.values():
+            _close(one)
+    elif isinstance(schema, list):
+        for one in schema:
+            _close(one)
