@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
+from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.rights import Guard, Rights
 from tests.support import socket_rig
-from tests.support.socket_rig import Peer, run, serving, until
+from tests.support.socket_rig import Peer, in_server, run, serving, until
 
 
 @pytest.fixture(autouse=True)
@@ -22,22 +23,18 @@ def request(number: int, name: str, **arguments: Any) -> bytes:
     return json.dumps({"jsonrpc": "2.0", "id": number, "method": "command", "params": params}).encode() + b"\n"
 
 
-def test_other_requests_are_answered_before_a_late_reply(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.send(request(70, "wait"))
-            assert len(await peer.result("devices")) == 2
-            await peer.send(request(71, "wait"))
-            refused = await peer.message()
-            assert (refused["id"], refused["error"]["code"]) == (71, -32004)
-            socket_rig.done_late.set()
-            assert await peer.message() == {"jsonrpc": "2.0", "id": 70, "result": {"waited": "imu0"}}
-            await peer.send(request(72, "output", message="HI91", rate_hz=5))
-            assert (await peer.message())["result"] is None
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_other_requests_are_answered_before_a_late_reply(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.send(request(70, "wait"))
+    assert len(await peer.result("devices")) == 2
+    await peer.send(request(71, "wait"))
+    refused = await peer.message()
+    assert (refused["id"], refused["error"]["code"]) == (71, -32004)
+    socket_rig.done_late.set()
+    assert await peer.message() == {"jsonrpc": "2.0", "id": 70, "result": {"waited": "imu0"}}
+    await peer.send(request(72, "output", message="HI91", rate_hz=5))
+    assert (await peer.message())["result"] is None
 
 
 @pytest.mark.parametrize(
@@ -49,47 +46,43 @@ def test_other_requests_are_answered_before_a_late_reply(tmp_path: Path) -> None
         ("output", {"message": "HI91", "rate_hz": 1, "speed": 2}, 'expected an argument that imud knows, got "speed"'),
     ],
 )
-def test_what_fails_says_why(tmp_path: Path, name: str, arguments: dict[str, Any], words: str) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.send(request(1, name, **arguments))
-            error = (await peer.message())["error"]
-            assert error["code"] == -32005
-            assert words in error["message"]
-            assert not server.hub.busy(next(iter(server.hub.connections.values())))
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_what_fails_says_why(server: SocketServer, name: str, arguments: dict[str, Any], words: str) -> None:
+    peer = await Peer.greeted(server)
+    await peer.send(request(1, name, **arguments))
+    error = (await peer.message())["error"]
+    assert error["code"] == -32005
+    assert words in error["message"]
+    assert not server.hub.busy(next(iter(server.hub.connections.values())))
 
 
-def test_reading_is_not_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@in_server(control_group="imud-test-control")
+async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
+    peer = await Peer.greeted(server)
+    assert (await peer.result("actions", device="imu0"))[0]["name"] == "output"
+    code, message = await peer.error("command", device="imu0", name="output")
+    assert code == -32001
+    assert message.startswith("command: expected root or a member of group 'imud-test-control', which does not")
+    assert "`sudo groupadd --system imud-test-control` makes it" in message
+    # what a device was last told is for readers, everything else needs control
+    found = await peer.result("settings.get", device="imu0")
+    assert found["settings"][0]["actual"] == "6-axis"
+    for method, more in (("settings.get", {"fresh": True}), ("settings.plan", {}), ("settings.apply", {})):
+        code, message = await peer.error(method, device="imu0", **more)
+        assert code == -32001
+        assert message.startswith(f"{method}: ")
+        assert "expected root or a member of group 'imud-test-control'" in message
 
-    async def body() -> None:
-        async with serving(tmp_path, control_group="imud-test-control") as server:
-            peer = await Peer.greeted(server)
-            assert (await peer.result("actions", device="imu0"))[0]["name"] == "output"
-            code, message = await peer.error("command", device="imu0", name="output")
-            assert code == -32001
-            assert message.startswith("command: expected root or a member of group 'imud-test-control', which does not")
-            assert "`sudo groupadd --system imud-test-control` makes it" in message
-            peer.close()
 
-    run(body)
-
-
-def test_a_group_that_exists_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@in_server(control_group="root")
+async def test_a_group_that_exists_is_named(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
-
-    async def body() -> None:
-        async with serving(tmp_path, control_group="root") as server:
-            peer = await Peer.greeted(server)
-            _, message = await peer.error("command", device="imu0", name="output")
-            assert message == "command: expected root or a member of group 'root'"
-            peer.close()
-
-    run(body)
+    peer = await Peer.greeted(server)
+    assert await peer.error("command", device="imu0", name="output") == (
+        -32001,
+        "command: expected root or a member of group 'root'",
+    )
 
 
 def test_it_goes_on_when_the_client_leaves_and_ends_with_the_server(tmp_path: Path) -> None:
@@ -107,62 +100,33 @@ def test_it_goes_on_when_the_client_leaves_and_ends_with_the_server(tmp_path: Pa
     run(body)
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
+@in_server()
+async def test_settings_are_planned_and_applied_as_asked_for(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    assert (await peer.result("settings.get", device="imu0", fresh=True))["status"]["read_ns"] > 80 * 10**12
+    plan = await peer.result("settings.plan", device="imu0", settings={"output": {"hi91": 5}}, save=True)
+    assert plan["steps"][0]["value"] == {"hi91": 5}
+    assert plan["save"] is True
+    done = await peer.result("settings.apply", device="imu0", settings=None)
+    assert (done["steps"][0]["name"], done["saved"]) == ("mode", False)
+    code, message = await peer.error("settings.apply", device="imu0", settings=[1])
+    assert code == -32602
+    assert "settings: expected keys" in message
+    code, _message = await peer.error("settings.apply", device="imu7")
+    assert code == -32602
 
 
-def test_settings_as_told_last_are_for_readers_and_all_else_needs_control(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
-
-    async def body() -> None:
-        async with serving(tmp_path, control_group="imud-test-control") as server:
-            peer = await Peer.greeted(server)
-            found = await peer.result("settings.get", device="imu0")
-            assert found["settings"][0]["actual"] == "6-axis"
-            for method, more in (("settings.get", {"fresh": True}), ("settings.plan", {}), ("settings.apply", {})):
-                code, message = await peer.error(method, device="imu0", **more)
-                assert code == -32001
-                assert message.startswith("settings.")
-                assert "expected root or a member of group 'imud-test-control'" in message
-            peer.close()
-
-    run(body)
-
-
-def test_settings_are_planned_and_applied_as_asked_for(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            assert (await peer.result("settings.get", device="imu0", fresh=True))["status"]["read_ns"] > 80 * 10**12
-            plan = await peer.result("settings.plan", device="imu0", settings={"output": {"hi91": 5}}, save=True)
-            assert plan["steps"][0]["value"] == {"hi91": 5}
-            assert plan["save"] is True
-            done = await peer.result("settings.apply", device="imu0", settings=None)
-            assert (done["steps"][0]["name"], done["saved"]) == ("mode", False)
-            code, message = await peer.error("settings.apply", device="imu0", settings=[1])
-            assert code == -32602
-            assert "settings: expected keys" in message
-            code, _message = await peer.error("settings.apply", device="imu7")
-            assert code == -32602
-            peer.close()
-
-    run(body)
-
-
-def test_one_change_at_a_time(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            params = {"device": "imu0", "settings": {"wait": 1}}
-            line = {"jsonrpc": "2.0", "id": 90, "method": "settings.apply", "params": params}
-            await peer.send(json.dumps(line).encode() + b"\n")
-            for method in ("settings.plan", "settings.apply", "command"):
-                more = {"name": "output"} if method == "command" else {}
-                code, message = await peer.error(method, device="imu0", **more)
-                assert (code, "the one before is not done yet" in message) == (-32004, True)
-            socket_rig.done_late.set()
-            assert (await peer.message())["id"] == 90
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_one_change_at_a_time(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    params = {"device": "imu0", "settings": {"wait": 1}}
+    line = {"jsonrpc": "2.0", "id": 90, "method": "settings.apply", "params": params}
+    await peer.send(json.dumps(line).encode() + b"\n")
+    for method, more in (
+        ("settings.plan", {}), ("settings.apply", {}), ("settings.get", {"fresh": True}),
+        ("command", {"name": "output"}), ("calibrate", {"kind": "heading"}),
+    ):  # fmt: skip
+        code, message = await peer.error(method, device="imu0", **more)
+        assert (code, "the one before is not done yet" in message) == (-32004, True)
+    socket_rig.done_late.set()
+    assert (await peer.message())["id"] == 90

@@ -23,7 +23,7 @@ from imud.publishers.socket.outbox import Limits
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.publishers.socket.rpc import METHODS, RATE_MAX_HZ, RATE_MIN_HZ
 from tests.support.files import ROOT
-from tests.support.socket_rig import LIMIT_S, NOW_NS, Peer, batch, daemon, run, serving, until
+from tests.support.socket_rig import LIMIT_S, NOW_NS, Peer, batch, daemon, in_server, until
 
 DOCUMENT = (ROOT / "docs" / "socket.md").read_text()
 ANYTHING = "…"
@@ -62,26 +62,21 @@ def happen(server: SocketServer, shown: dict[str, Any], published: list[int]) ->
         server.event(Event(NOW_NS, "imu0", EventKind.DOWN, "the adapter was pulled out", {"errno": 5}))
 
 
-def test_examples(tmp_path: Path) -> None:
+@in_server()
+async def test_examples(server: SocketServer) -> None:
     lines = [line for block in blocks("json") for line in block.splitlines()]
     published: list[int] = []
-
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.connect(server)
-            for line in lines:
-                arrow, text = line[0], line[2:]
-                if arrow == "→":
-                    if '"poll"' in text:
-                        server.publish(batch("imu0", 1))
-                    await peer.send(text.encode() + b"\n")
-                else:
-                    assert arrow == "←"
-                    happen(server, json.loads(text), published)
-                    assert_like(await peer.message(), json.loads(text))
-            peer.close()
-
-    run(body)
+    peer = await Peer.connect(server)
+    for line in lines:
+        arrow, text = line[0], line[2:]
+        if arrow == "→":
+            if '"poll"' in text:
+                server.publish(batch("imu0", 1))
+            await peer.send(text.encode() + b"\n")
+        else:
+            assert arrow == "←"
+            happen(server, json.loads(text), published)
+            assert_like(await peer.message(), json.loads(text))
     asked = {json.loads(line[2:])["method"] for line in lines if line.startswith("→ {")}
     assert asked == set(METHODS)
     assert published == [2]
@@ -142,9 +137,5 @@ def test_every_member_of_status_is_explained() -> None:
         assert set(part.__struct_encode_fields__) <= named, part.__name__
 
 
-def test_every_state_of_settings_and_outcome_of_a_step_is_named() -> None:
-    assert all(f"`{word}`" in DOCUMENT for word in (*SettingsState, *StepOutcome))
-
-
-def test_every_kind_of_event_is_named() -> None:
-    assert all(f"`{kind}`" in DOCUMENT for kind in EventKind)
+def test_every_state_of_settings_outcome_of_a_step_and_kind_of_event_is_named() -> None:
+    assert all(f"`{word}`" in DOCUMENT for word in (*SettingsState, *StepOutcome, *EventKind))

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Sequence
 from math import radians, sqrt
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,8 +14,9 @@ from imud.frames.conventions import RFU_ENU, Convention
 from imud.frames.published import PublishedFrame, as_sent
 from imud.frames.settings import FrameSettings, MountingAxes, published_frame
 from imud.publishers.socket.encoding import BinaryEncoding, ConvertedEncoding, JsonEncoding
+from imud.publishers.socket.publisher import SocketServer
 from imud.sample import Sample
-from tests.support.socket_rig import Peer, run, sample, serving
+from tests.support.socket_rig import Peer, in_server, sample
 
 HALF = sqrt(0.5)
 SENT = replace(
@@ -80,90 +80,72 @@ FRAMES = {
 
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("convention", ["enu-flu", "ned-frd"])
-def test_a_client_gets_what_it_asks_for_whatever_is_configured(tmp_path: Path, name: str, convention: str) -> None:
+@in_server()
+async def test_a_client_gets_what_it_asks_for_whatever_is_configured(
+    server: SocketServer, name: str, convention: str
+) -> None:
     """As JSON, as binary slots, and from `poll`."""
-
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            lines, frames = await Peer.greeted(server), await Peer.greeted(server)
-            assert (await lines.result("watch", convention=convention))["convention"] == convention
-            assert (await frames.result("watch", encoding="binary", convention=convention))["convention"] == convention
-            frames.framed = True
-            one, frame = FRAMES[name]
-            server.publish(published([one], frame))
-            assert_is((await lines.message())["params"], convention)
-            slot = await frames.body()
-            assert len(slot) == SLOT_BYTES
-            assert_is(members_of(decode_slot(slot, "imu0")), convention)
-            polled = await lines.result("poll", convention=convention)
-            assert polled["convention"] == convention
-            assert_is(polled["samples"][0], convention)
-            lines.close()
-            frames.close()
-
-    run(body)
+    lines, frames = await Peer.greeted(server), await Peer.greeted(server)
+    assert (await lines.result("watch", convention=convention))["convention"] == convention
+    assert (await frames.result("watch", encoding="binary", convention=convention))["convention"] == convention
+    frames.framed = True
+    one, frame = FRAMES[name]
+    server.publish(published([one], frame))
+    assert_is((await lines.message())["params"], convention)
+    slot = await frames.body()
+    assert len(slot) == SLOT_BYTES
+    assert_is(members_of(decode_slot(slot, "imu0")), convention)
+    polled = await lines.result("poll", convention=convention)
+    assert polled["convention"] == convention
+    assert_is(polled["samples"][0], convention)
 
 
-def test_clients_side_by_side(tmp_path: Path) -> None:
+@in_server()
+async def test_clients_side_by_side(server: SocketServer) -> None:
     """Each has its own convention, fields and form; one that asks for none gets what is published."""
-
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            plain, down, few = [await Peer.greeted(server) for _ in range(3)]
-            assert "convention" not in await plain.result("watch")
-            await down.result("watch", convention="ned-frd")
-            await few.result("watch", convention="enu-flu", fields=["accel_m_s2"], rate_hz=1000)
-            server.publish(published([SENT]))
-            assert_is((await plain.message())["params"], None)
-            assert_is((await down.message())["params"], "ned-frd")
-            some = (await few.message())["params"]
-            assert some == {"device": "imu0", "seq": 1, "t_ns": SENT.t_ns, "accel_m_s2": [9.75, -0.125, -0.5]}
-            assert_is((await plain.result("poll"))["samples"][0], None)
-            # another watch without a convention replaces the one with
-            await down.result("watch")
-            server.publish(published([SENT]))
-            assert_is((await down.message())["params"], None)
-            for peer in (plain, down, few):
-                peer.close()
-
-    run(body)
+    plain, down, few = [await Peer.greeted(server) for _ in range(3)]
+    assert "convention" not in await plain.result("watch")
+    await down.result("watch", convention="ned-frd")
+    await few.result("watch", convention="enu-flu", fields=["accel_m_s2"], rate_hz=1000)
+    server.publish(published([SENT]))
+    assert_is((await plain.message())["params"], None)
+    assert_is((await down.message())["params"], "ned-frd")
+    some = (await few.message())["params"]
+    assert some == {"device": "imu0", "seq": 1, "t_ns": SENT.t_ns, "accel_m_s2": [9.75, -0.125, -0.5]}
+    assert_is((await plain.result("poll"))["samples"][0], None)
+    # another watch without a convention replaces the one with
+    await down.result("watch")
+    server.publish(published([SENT]))
+    assert_is((await down.message())["params"], None)
 
 
-def test_an_unknown_convention_is_refused(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            for method in ("watch", "poll"):
-                code, message = await peer.error(method, convention="enu")
-                assert code == -32602
-                assert "enu" in message
-                assert (await peer.result(method, convention=None)).get("convention") is None
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_an_unknown_convention_is_refused(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    for method in ("watch", "poll"):
+        code, message = await peer.error(method, convention="enu")
+        assert code == -32602
+        assert "enu" in message
+        assert (await peer.result(method, convention=None)).get("convention") is None
 
 
-def test_schema_and_status_say_what_a_client_gets(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            known = (await peer.result("schema"))["devices"]["imu0"]
-            assert known["frame"] == "sensor: x right, y forward, z up, right-handed"
-            assert (known["convention"], known["heading"], known["declination_deg"]) == ("device", "magnetic", None)
-            assert known["conventions"]["ned-frd"] == {
-                "frame": "body: x forward, y right, z down (FRD)",
-                "euler_convention": "ZYX: yaw about Z, then pitch about Y, then roll about X; yaw clockwise from above",
-                "navigation_frame": "NED",
-            }
-            assert known["conventions"]["enu-flu"]["navigation_frame"] == "ENU"
-            (status, _) = (await peer.result("status"))["devices"]
-            assert status["frame"]["problem"] == ""
-            assert {name: status["frame"][name] for name in known.keys() & status["frame"].keys()} == {
-                name: known[name] for name in known.keys() & status["frame"].keys()
-            }
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_schema_and_status_say_what_a_client_gets(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    known = (await peer.result("schema"))["devices"]["imu0"]
+    assert known["frame"] == "sensor: x right, y forward, z up, right-handed"
+    assert (known["convention"], known["heading"], known["declination_deg"]) == ("device", "magnetic", None)
+    assert known["conventions"]["ned-frd"] == {
+        "frame": "body: x forward, y right, z down (FRD)",
+        "euler_convention": "ZYX: yaw about Z, then pitch about Y, then roll about X; yaw clockwise from above",
+        "navigation_frame": "NED",
+    }
+    assert known["conventions"]["enu-flu"]["navigation_frame"] == "ENU"
+    (status, _) = (await peer.result("status"))["devices"]
+    assert status["frame"]["problem"] == ""
+    assert {name: status["frame"][name] for name in known.keys() & status["frame"].keys()} == {
+        name: known[name] for name in known.keys() & status["frame"].keys()
+    }
 
 
 # --- the encoding itself ----------------------------------------------------------------------------------------------
@@ -196,18 +178,15 @@ def test_losses_are_reported_with_converted_samples() -> None:
     assert binary.encode(batch) == BinaryEncoding().encode(batch.converted(Convention.NED_FRD))
 
 
-def test_a_slow_reader_gets_converted_samples_from_its_queue(tmp_path: Path) -> None:
+@in_server()
+async def test_a_slow_reader_gets_converted_samples_from_its_queue(server: SocketServer) -> None:
     """What is encoded later than it is published has the convention, too."""
-
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.result("watch", convention="ned-frd", fields=["accel_m_s2"])
-            for _ in range(2000):  # more than the socket takes at once
-                server.publish(published([SENT]))
-            await asyncio.sleep(0)
-            for message in await peer.messages(2000):
-                assert message["params"]["accel_m_s2"] == [9.75, 0.125, 0.5]
-            peer.close()
-
-    run(body)
+    peer = await Peer.greeted(server)
+    await peer.result("watch", convention="ned-frd", fields=["accel_m_s2"])
+    count = 0
+    while server.hub.clients()[0].queue_samples < 3:
+        server.publish(published([SENT]))
+        count += 1
+    await asyncio.sleep(0)
+    for message in await peer.messages(count):
+        assert message["params"]["accel_m_s2"] == [9.75, 0.125, 0.5]

@@ -1,7 +1,7 @@
 """What latency the clients of the socket ask for, and that they ask no more when they leave."""
 
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection
+from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,10 @@ import pytest
 
 from imud.publishers.socket.publisher import SocketServer
 from tests.publishers.socket.test_waker import notified
-from tests.support.socket_rig import Peer, batch, run, serving, until
+from tests.support.socket_rig import Peer, batch, in_context, serving, until
 
 Asked = dict[str, tuple[float, tuple[str, ...] | None]]
+Scene = tuple[SocketServer, Asked, Peer]
 
 
 class Latencies:
@@ -29,24 +30,12 @@ class Latencies:
 
 
 @asynccontextmanager
-async def listening(directory: Path) -> AsyncIterator[tuple[SocketServer, Asked]]:
-    """A server, and what its clients ask for at any time."""
+async def listening(directory: Path) -> AsyncIterator[tuple[SocketServer, Asked, Peer]]:
+    """A server, what its clients ask for at any time, and one client."""
     latencies = Latencies()
     async with serving(directory, latencies=latencies) as server:
-        yield server, latencies.asked
+        yield server, latencies.asked, await Peer.greeted(server)
     assert latencies.asked == {}
-
-
-def play(directory: Path, story: Callable[[SocketServer, Asked, Peer], Awaitable[None]]) -> None:
-    """A story with one client."""
-
-    async def body() -> None:
-        async with listening(directory) as (server, asked):
-            peer = await Peer.greeted(server)
-            await story(server, asked, peer)
-            peer.close()
-
-    run(body)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +45,7 @@ def play(directory: Path, story: Callable[[SocketServer, Asked, Peer], Awaitable
         ({"rate_hz": 0}, 0.0),
         ({"rate_hz": 1000}, 1.0),
         ({"rate_hz": 100}, 10.0),
-        ({"rate_hz": 50}, 20.0),
+        ({"rate_hz": 40}, 20.0),
         ({"rate_hz": 1}, 20.0),
         ({"rate_hz": 1, "latency_ms": 0}, 0.0),
         ({"latency_ms": 7.5}, 7.5),
@@ -64,60 +53,55 @@ def play(directory: Path, story: Callable[[SocketServer, Asked, Peer], Awaitable
         ({"rate_hz": 10, "latency_ms": None}, 20.0),
     ],
 )
-def test_a_watch_asks_for_what_is_given_or_goes_with_its_rate(
-    tmp_path: Path, params: dict[str, Any], latency_ms: float
+@in_context("scene", listening)
+async def test_a_watch_asks_for_what_is_given_or_goes_with_its_rate(
+    scene: Scene, params: dict[str, Any], latency_ms: float
 ) -> None:
-    async def story(_server: SocketServer, asked: Asked, peer: Peer) -> None:
-        reply = await peer.ask("watch", **params)
-        assert reply["result"]["latency_ms"] == latency_ms
-        assert asked == {"client 1": (latency_ms, None)}
-
-    play(tmp_path, story)
+    _server, asked, peer = scene
+    reply = await peer.ask("watch", **params)
+    assert reply["result"]["latency_ms"] == latency_ms
+    assert asked == {"client 1": (latency_ms, None)}
 
 
 @pytest.mark.parametrize("latency_ms", [-0.001, 60_001, 1e300])
 @pytest.mark.parametrize("method", ["watch", "notify"])
-def test_what_is_no_latency_is_refused(tmp_path: Path, method: str, latency_ms: float) -> None:
-    async def story(_server: SocketServer, asked: Asked, peer: Peer) -> None:
-        devices = {"devices": ["imu0"]} if method == "watch" else {"device": "imu0"}
-        _code, message = await peer.error(method, latency_ms=latency_ms, **devices)
-        assert message.startswith("latency_ms: expected 0 (at once) … 60000")
-        assert asked == {}
-
-    play(tmp_path, story)
-
-
-def test_another_watch_replaces_what_was_asked_and_unwatch_ends_it(tmp_path: Path) -> None:
-    async def story(_server: SocketServer, asked: Asked, peer: Peer) -> None:
-        await peer.ask("watch", latency_ms=5)
-        await peer.ask("watch", latency_ms=9, devices=["imu1"])
-        assert asked == {"client 1": (9.0, ("imu1",))}
-        await peer.ask("unwatch")
-        assert asked == {}
-
-    play(tmp_path, story)
+@in_context("scene", listening)
+async def test_what_is_no_latency_is_refused(scene: Scene, method: str, latency_ms: float) -> None:
+    _server, asked, peer = scene
+    devices = {"devices": ["imu0"]} if method == "watch" else {"device": "imu0"}
+    _code, message = await peer.error(method, latency_ms=latency_ms, **devices)
+    assert message.startswith("latency_ms: expected 0 (at once) … 60000")
+    assert asked == {}
 
 
-def test_who_leaves_asks_for_nothing_any_more(tmp_path: Path) -> None:
-    async def story(server: SocketServer, asked: Asked, peer: Peer) -> None:
-        other = await Peer.greeted(server)
-        fd = await notified(peer)
-        await other.ask("watch", latency_ms=3)
-        assert asked == {"client 1, notify imu0": (0.0, ("imu0",)), "client 2": (3.0, None)}
-        peer.close()
-        await until(lambda: len(server.hub.connections) == 1)
-        assert asked == {"client 2": (3.0, None)}
-        os.close(fd)
-        other.close()
-
-    play(tmp_path, story)
+@in_context("scene", listening)
+async def test_another_watch_replaces_what_was_asked_and_unwatch_ends_it(scene: Scene) -> None:
+    _server, asked, peer = scene
+    await peer.ask("watch", latency_ms=5)
+    await peer.ask("watch", latency_ms=9, devices=["imu1"])
+    assert asked == {"client 1": (9.0, ("imu1",))}
+    await peer.ask("unwatch")
+    assert asked == {}
 
 
-def test_a_descriptor_that_is_closed_asks_for_nothing_any_more(tmp_path: Path) -> None:
-    async def story(server: SocketServer, asked: Asked, peer: Peer) -> None:
-        os.close(await notified(peer))
-        assert len(asked) == 1
-        server.publish(batch("imu0"))
-        await until(lambda: not asked)
+@in_context("scene", listening)
+async def test_who_leaves_asks_for_nothing_any_more(scene: Scene) -> None:
+    server, asked, peer = scene
+    other = await Peer.greeted(server)
+    fd = await notified(peer)
+    await other.ask("watch", latency_ms=3)
+    assert asked == {"client 1, notify imu0": (0.0, ("imu0",)), "client 2": (3.0, None)}
+    peer.close()
+    await until(lambda: len(server.hub.connections) == 1)
+    assert asked == {"client 2": (3.0, None)}
+    os.close(fd)
+    other.close()
 
-    play(tmp_path, story)
+
+@in_context("scene", listening)
+async def test_a_descriptor_that_is_closed_asks_for_nothing_any_more(scene: Scene) -> None:
+    server, asked, peer = scene
+    os.close(await notified(peer))
+    assert len(asked) == 1
+    server.publish(batch("imu0"))
+    await until(lambda: not asked)

@@ -11,88 +11,78 @@ import pytest
 from imud.errors import ServerError
 from imud.publishers.socket.listener import PATH_MAX_BYTES, SOCKET_MODE, Listener
 from imud.publishers.socket.publisher import SocketServer, SocketSettings
-from tests.support.socket_rig import Peer, context, run, serving
+from tests.support.socket_rig import Peer, alone, context, in_server, serving
 
 
-def test_a_stale_socket_is_replaced_and_a_live_one_left_alone(tmp_path: Path) -> None:
-    async def body() -> None:
-        with socket.socket(socket.AF_UNIX) as dead:
-            dead.bind(str(tmp_path / "imud.sock"))
-        async with serving(tmp_path) as server:
-            second = SocketServer(SocketSettings(path=server.hub.path), context())
-            with pytest.raises(ServerError, match="another daemon serves"):
-                second.start()
-            second.close()
-            peer = await Peer.greeted(server)  # the first is unharmed
-            peer.close()
-
-    run(body)
+@alone()
+async def test_a_stale_socket_is_replaced_and_a_live_one_left_alone(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(tmp_path / "imud.sock"))
+    async with serving(tmp_path) as server:
+        second = SocketServer(SocketSettings(path=server.hub.path), context())
+        with pytest.raises(ServerError, match="another daemon serves"):
+            second.start()
+        second.close()
+        await Peer.greeted(server)  # the first is unharmed
 
 
-def test_close_leaves_a_socket_alone_that_is_another_daemon_s(tmp_path: Path) -> None:
-    async def body() -> None:
-        path = tmp_path / "imud.sock"
-        server = SocketServer(SocketSettings(path=str(path)), context())
-        server.start()
-        path.unlink()
-        successor = SocketServer(SocketSettings(path=str(path)), context())
-        successor.start()
-        server.close()
-        server.close()
-        assert path.is_socket()
-        peer = await Peer.greeted(successor)
-        peer.close()
-        successor.close()
-        assert not path.exists()
-
-    run(body)
+@alone()
+async def test_close_leaves_a_socket_alone_that_is_another_daemon_s(tmp_path: Path) -> None:
+    path = tmp_path / "imud.sock"
+    server = SocketServer(SocketSettings(path=str(path)), context())
+    server.start()
+    path.unlink()
+    successor = SocketServer(SocketSettings(path=str(path)), context())
+    successor.start()
+    server.close()
+    server.close()
+    assert path.is_socket()
+    await Peer.greeted(successor)
+    successor.close()
+    assert not path.exists()
 
 
-def test_the_directory_is_made_or_the_error_says_what_to_do(tmp_path: Path) -> None:
-    async def body() -> None:
-        server = SocketServer(SocketSettings(path=str(tmp_path / "run" / "imud" / "s")), context())
-        server.start()
-        assert (tmp_path / "run" / "imud").stat().st_mode & 0o777 == 0o755
-        server.close()
-        (tmp_path / "file").touch()
-        for path, words in (
-            (tmp_path / "file" / "s", "cannot make the directory"),
-            (tmp_path / "file", "another kind of file"),
-        ):
-            blocked = SocketServer(SocketSettings(path=str(path)), context())
-            with pytest.raises(ServerError, match=words):
-                blocked.start()
-            blocked.close()
-        assert (tmp_path / "file").is_file()
-        with pytest.raises(ServerError, match=f"at most {PATH_MAX_BYTES} bytes"):
-            Listener(tmp_path / ("x" * 120), "imud", "imud-control")
-
-    run(body)
+@alone()
+async def test_the_directory_is_made_or_the_error_says_what_to_do(tmp_path: Path) -> None:
+    server = SocketServer(SocketSettings(path=str(tmp_path / "run" / "imud" / "s")), context())
+    server.start()
+    assert (tmp_path / "run" / "imud").stat().st_mode & 0o777 == 0o755
+    server.close()
+    (tmp_path / "file").touch()
+    for path, words in (
+        (tmp_path / "file" / "s", "cannot make the directory"),
+        (tmp_path / "file", "another kind of file"),
+    ):
+        blocked = SocketServer(SocketSettings(path=str(path)), context())
+        with pytest.raises(ServerError, match=words):
+            blocked.start()
+        blocked.close()
+    assert (tmp_path / "file").is_file()
+    with pytest.raises(ServerError, match=f"at most {PATH_MAX_BYTES} bytes"):
+        Listener(tmp_path / ("x" * 120), "imud", "imud-control")
 
 
-def test_a_failed_start_leaves_nothing_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_sock: socket.socket, _backlog: int) -> None:
+@pytest.mark.parametrize("step", ["chmod", "listen", "rename"])
+@alone()
+async def test_a_failed_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+    def refuse(*_: object, **_names: object) -> None:
         raise OSError(12, "Cannot allocate memory")
 
-    async def body() -> None:
-        path = tmp_path / "imud.sock"
-        server = SocketServer(SocketSettings(path=str(path)), context())
-        with monkeypatch.context() as patch:
-            patch.setattr(socket.socket, "listen", refuse)
-            with pytest.raises(ServerError, match="Cannot allocate memory"):
-                server.start()
-        assert not os.listdir(tmp_path)
-        server.close()
+    owner = {"chmod": os, "listen": socket.socket, "rename": Path}[step]
+    descriptors = len(os.listdir("/proc/self/fd"))
+    server = SocketServer(SocketSettings(path=str(tmp_path / "imud.sock")), context())
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, step, refuse)
+        with pytest.raises(ServerError, match="Cannot allocate memory"):
+            server.start()
+    assert not os.listdir(tmp_path)
+    assert len(os.listdir("/proc/self/fd")) == descriptors
+    server.close()
 
-    run(body)
 
-
-def test_a_missing_group_is_a_warning_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def body() -> None:
-        async with serving(tmp_path, group="no-such-group-here", control_group="root") as server:
-            assert os.stat(server.hub.path).st_mode & 0o777 == 0o660
-
-    run(body)
+@in_server(group="no-such-group-here", control_group="root")
+async def test_a_missing_group_is_a_warning_only(server: SocketServer, caplog: pytest.LogCaptureFixture) -> None:
+    assert os.stat(server.hub.path).st_mode & 0o777 == 0o660
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "no group 'no-such-group-here' (socket.group)" in caplog.text
     assert "`sudo groupadd --system no-such-group-here` makes it" in caplog.text

@@ -13,12 +13,12 @@ import pytest
 from imud.event import Event, EventKind
 from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.publishers.socket.messages import NOTIFICATIONS
+from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.rpc import METHODS
-from tests.support import references
-from tests.support.daemon_process import LIMIT_S, running_daemon
-from tests.support.files import ROOT
-from tests.support.socket_rig import CHECKER, EPOCH, NOW_NS, Peer, batch, run, serving
-from tests.test_daemon import cable, device
+from tests.support.daemon_process import LIMIT_S, sending_daemon
+from tests.support.files import ROOT, hi91
+from tests.support.socket_rig import CHECKER, EPOCH, NOW_NS, Peer, batch, in_server
+from tests.support.socket_schema import socket_document, socket_schema
 
 needs_jsonschema = pytest.mark.skipif(not CHECKER.able, reason="the package jsonschema is not installed")
 UTC_NS = 1_790_000_000_000_000_000 + 1_000_000
@@ -26,14 +26,14 @@ UTC_NS = 1_790_000_000_000_000_000 + 1_000_000
 
 def test_the_file_in_docs_is_of_these_types() -> None:
     current = (ROOT / "docs" / "socket.schema.json").read_text()
-    assert current == references.socket_schema(), "run python -m tests.support.references"
+    assert current == socket_schema(), "run python -m tests.support.references"
 
 
 @needs_jsonschema
 def test_it_is_a_schema_and_finds_what_is_wrong() -> None:
     from jsonschema import Draft202012Validator
 
-    whole = references.socket_document()
+    whole = socket_document()
     Draft202012Validator.check_schema(whole)
     good = {"jsonrpc": "2.0", "method": "device", "params": {"device": "a", "device_id": 1}}
     CHECKER.check("notification.device", good)
@@ -67,134 +67,112 @@ def test_the_requests_of_the_document_are_of_these_types() -> None:
         CHECKER.check(f"request.{request['method']}", request)
 
 
-def test_parameters_that_may_be_left_out_may_be_null(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            nothing: dict[str, Any] = {"devices": None, "fields": None, "convention": None}
-            assert (await peer.result("watch", **nothing, rate_hz=None, encoding=None))["encoding"] == "json"
-            assert (await peer.result("poll", **nothing))["samples"] == []
-            assert await peer.result("events", devices=None, enable=None) == {"enable": True}
-            assert (await peer.result("options", big_numbers=None))["big_numbers"] == "number"
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_parameters_that_may_be_left_out_may_be_null(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    nothing: dict[str, Any] = {"devices": None, "fields": None, "convention": None}
+    assert (await peer.result("watch", **nothing, rate_hz=None, encoding=None))["encoding"] == "json"
+    assert (await peer.result("poll", **nothing))["samples"] == []
+    assert await peer.result("events", devices=None, enable=None) == {"enable": True}
+    assert (await peer.result("options", big_numbers=None))["big_numbers"] == "number"
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_every_parameter_that_has_a_default_may_be_null(name: str) -> None:
-    fields = msgspec.structs.fields(METHODS[name].params)
-    assert [one.name for one in fields if not one.required and NoneType not in get_args(one.type)] == []
+def test_every_parameter_that_has_a_default_may_be_null() -> None:
+    fields = [(name, one) for name, method in METHODS.items() for one in msgspec.structs.fields(method.params)]
+    assert [(name, one.name) for name, one in fields if not one.required and NoneType not in get_args(one.type)] == []
 
 
-def test_big_numbers_are_text_where_that_is_asked_for(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            plain, text = await Peer.greeted(server), await Peer.greeted(server)
-            assert await text.result("options", big_numbers="string") == {
-                "big_numbers": "string", "epoch": str(EPOCH),
-            }  # fmt: skip
-            assert (await plain.result("options"))["epoch"] == EPOCH
-            for peer in (plain, text):
-                await peer.result("watch")
-                await peer.result("events")
-            server.publish(batch("imu0", 1))
-            server.event(Event(NOW_NS, "imu0", EventKind.MARK, "a pulse", {"t_ns": 5, "edge_seq": 3}))
-            sample, event = (await plain.message())["params"], (await plain.message())["params"]
-            assert (sample["utc_ns"], sample["seq"], event["t_ns"], event["detail"]["t_ns"]) == (UTC_NS, 1, NOW_NS, 5)
-            sample, event = (await text.message())["params"], (await text.message())["params"]
-            assert (sample["utc_ns"], sample["t_ns"], sample["seq"]) == (str(UTC_NS), "80000001000000", 1)
-            assert sample["accel_m_s2"] == [0.125, -0.5, 9.75]
-            assert (event["t_ns"], event["detail"]) == (str(NOW_NS), {"t_ns": "5", "edge_seq": 3})
-            status = await text.result("status")
-            assert status["now_ns"] == str(NOW_NS)
-            assert status["devices"][0]["clock"]["offset_ns"] == "0"
-            assert (await text.result("schema"))["slot"]["present_bits"]["t_dev_ns"] == 1
-            assert (await text.result("poll", fields=["utc_ns"]))["samples"][0]["utc_ns"] == str(UTC_NS)
-            assert (await plain.result("poll"))["samples"][0]["utc_ns"] == UTC_NS
-            await text.result("options", big_numbers="number")
-            assert (await text.result("poll"))["now_ns"] == NOW_NS
-            plain.close()
-            text.close()
-
-    run(body)
+@in_server()
+async def test_big_numbers_are_text_where_that_is_asked_for(server: SocketServer) -> None:
+    plain, text = await Peer.greeted(server), await Peer.greeted(server)
+    assert await text.result("options", big_numbers="string") == {
+        "big_numbers": "string", "epoch": str(EPOCH),
+    }  # fmt: skip
+    assert (await plain.result("options"))["epoch"] == EPOCH
+    for peer in (plain, text):
+        await peer.result("watch")
+        await peer.result("events")
+    server.publish(batch("imu0", 1))
+    server.event(Event(NOW_NS, "imu0", EventKind.MARK, "a pulse", {"t_ns": 5, "edge_seq": 3}))
+    sample, event = (await plain.message())["params"], (await plain.message())["params"]
+    assert (sample["utc_ns"], sample["seq"], event["t_ns"], event["detail"]["t_ns"]) == (UTC_NS, 1, NOW_NS, 5)
+    sample, event = (await text.message())["params"], (await text.message())["params"]
+    assert (sample["utc_ns"], sample["t_ns"], sample["seq"]) == (str(UTC_NS), "80000001000000", 1)
+    assert sample["accel_m_s2"] == [0.125, -0.5, 9.75]
+    assert (event["t_ns"], event["detail"]) == (str(NOW_NS), {"t_ns": "5", "edge_seq": 3})
+    status = await text.result("status")
+    assert status["now_ns"] == str(NOW_NS)
+    assert status["devices"][0]["clock"]["offset_ns"] == "0"
+    assert (await text.result("schema"))["slot"]["present_bits"]["t_dev_ns"] == 1
+    assert (await text.result("poll", fields=["utc_ns"]))["samples"][0]["utc_ns"] == str(UTC_NS)
+    assert (await plain.result("poll"))["samples"][0]["utc_ns"] == UTC_NS
+    await text.result("options", big_numbers="number")
+    assert (await text.result("poll"))["now_ns"] == NOW_NS
 
 
-def test_clients_that_watch_a_device_are_told_that_it_left(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            everything, one, other = [await Peer.greeted(server) for _ in range(3)]
-            await everything.result("watch")
-            await one.result("watch", devices=["imu0"])
-            await other.result("watch", devices=["imu1"])
-            server.remove_device("imu0")
-            server.remove_device("imu0")
-            left = {"jsonrpc": "2.0", "method": "device_removed", "params": {"device": "imu0", "device_id": 0}}
-            assert await everything.message() == await one.message() == left
-            assert len(await other.result("devices")) == 2
-            server.add_device("imu0", 4)
-            assert (await everything.message())["params"] == {"device": "imu0", "device_id": 4}
-            server.publish(batch("imu0", 1))
-            assert (await one.message())["method"] == "sample"
-            for peer in (everything, one, other):
-                peer.close()
-
-    run(body)
+@in_server()
+async def test_clients_that_watch_a_device_are_told_that_it_left(server: SocketServer) -> None:
+    everything, one, other = [await Peer.greeted(server) for _ in range(3)]
+    await everything.result("watch")
+    await one.result("watch", devices=["imu0"])
+    await other.result("watch", devices=["imu1"])
+    server.remove_device("imu0")
+    server.remove_device("imu0")
+    left = {"jsonrpc": "2.0", "method": "device_removed", "params": {"device": "imu0", "device_id": 0}}
+    assert await everything.message() == await one.message() == left
+    assert len(await other.result("devices")) == 2
+    server.add_device("imu0", 4)
+    assert (await everything.message())["params"] == {"device": "imu0", "device_id": 4}
+    server.publish(batch("imu0", 1))
+    assert (await one.message())["method"] == "sample"
 
 
-def test_the_path_of_the_ring_is_with_the_device(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            shm = ShmPublisher(ShmSettings(directory=str(tmp_path), slots=64), server.hub.context)
-            shm.start()
-            shm.add_device("imu0", 0)
-            peer = await Peer.greeted(server)
-            assert [one["ring"] for one in await peer.result("devices")] == [f"{tmp_path}/imud.imu0", None]
-            shm.close()
-            assert [one["ring"] for one in await peer.result("devices")] == [None, None]
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_the_path_of_the_ring_is_with_the_device(server: SocketServer, tmp_path: Path) -> None:
+    shm = ShmPublisher(ShmSettings(directory=str(tmp_path), slots=64), server.hub.context)
+    shm.start()
+    shm.add_device("imu0", 0)
+    peer = await Peer.greeted(server)
+    assert [one["ring"] for one in await peer.result("devices")] == [f"{tmp_path}/imud.imu0", None]
+    shm.close()
+    assert [one["ring"] for one in await peer.result("devices")] == [None, None]
 
 
-def test_a_last_line_without_newline_is_dropped(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"unwatch"}\n{"jsonrpc":"2.0","id":2,"method":"unwatch"}')
-            peer.sock.shutdown(socket.SHUT_WR)
-            assert (await peer.message())["id"] == 1
-            assert await peer.ended()
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_a_last_line_without_newline_is_dropped(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"unwatch"}\n{"jsonrpc":"2.0","id":2,"method":"unwatch"}')
+    peer.sock.shutdown(socket.SHUT_WR)
+    assert (await peer.message())["id"] == 1
+    assert await peer.ended()
 
 
 @needs_jsonschema
+@pytest.mark.live
 def test_every_message_of_a_real_daemon_is_of_these_types(tmp_path: Path) -> None:
     """All methods that change nothing, and notifications; the device sends some samples meanwhile."""
-    with cable(tmp_path) as port, running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
-        daemon.wait_for("bow", "searching")
-        port.send(1)
-        daemon.wait_for("bow", "running")
-        with socket.socket(socket.AF_UNIX) as sock, sock.makefile("rwb") as lines:
-            sock.settimeout(LIMIT_S)
-            sock.connect(str(daemon.socket))
-            asked: dict[int, tuple[str, dict[str, Any]]] = {1: ("events", {}), 2: ("watch", {"rate_hz": None})}
-            plain = ["devices", "status", "schema", "poll"]
-            asked |= {number: (name, {}) for number, name in enumerate([*plain, "unwatch"], start=3)}
-            asked |= {10: ("actions", {"device": "bow"}), 11: ("calibrations", {"device": "bow"})}
-            asked |= {12: ("options", {"big_numbers": "string"})}
-            asked |= {number: (name, {}) for number, name in enumerate(plain, start=13)}
-            asked |= {20: ("notify", {"device": "no such device"})}
-            for number, (method, params) in asked.items():
-                request = {"jsonrpc": "2.0", "id": number, "method": method, "params": params}
-                lines.write(json.dumps(request).encode() + b"\n")
-            lines.flush()
-            seen = set()
-            while 20 not in seen:
-                message = json.loads(lines.readline())
-                number = message.get("id")
-                CHECKER.check_sent(message, asked[number][0] if number in asked else None)
-                seen.add(number)
-            assert set(asked) <= seen
+    with (
+        sending_daemon(tmp_path, lambda number: hi91(10 * number)) as daemon,
+        socket.socket(socket.AF_UNIX) as sock,
+        sock.makefile("rwb") as lines,
+    ):
+        sock.settimeout(LIMIT_S)
+        sock.connect(str(daemon.socket))
+        asked: dict[int, tuple[str, dict[str, Any]]] = {1: ("events", {}), 2: ("watch", {"rate_hz": None})}
+        plain = ["devices", "status", "schema", "poll"]
+        asked |= {number: (name, {}) for number, name in enumerate([*plain, "unwatch"], start=3)}
+        asked |= {10: ("actions", {"device": "bow"}), 11: ("calibrations", {"device": "bow"})}
+        asked |= {12: ("options", {"big_numbers": "string"})}
+        asked |= {number: (name, {}) for number, name in enumerate(plain, start=13)}
+        asked |= {20: ("notify", {"device": "no such device"})}
+        for number, (method, params) in asked.items():
+            request = {"jsonrpc": "2.0", "id": number, "method": method, "params": params}
+            lines.write(json.dumps(request).encode() + b"\n")
+        lines.flush()
+        seen = set()
+        while 20 not in seen:
+            message = json.loads(lines.readline())
+            number = message.get("id")
+            CHECKER.check_sent(message, asked[number][0] if number in asked else None)
+            seen.add(number)
+        assert set(asked) <= seen

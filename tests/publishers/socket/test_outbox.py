@@ -8,19 +8,18 @@ import socket
 import sys
 import tracemalloc
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
-from imud.publishers.socket.connection import Connection
+from imud.publishers.socket.connection import LINGER_TICKS, Connection
 from imud.publishers.socket.encoding import BinaryEncoding, JsonEncoding
 from imud.publishers.socket.outbox import Delivery, Limits, Outbox, Pool
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.waker import BYTE
-from tests.support.socket_rig import Peer, batch, run, serving, until
+from tests.support.socket_rig import Peer, batch, in_server, run, until
 
 
 async def read_samples(peer: Peer, last: dict[str, int]) -> list[tuple[str, int, dict[str, int]]]:
@@ -70,35 +69,31 @@ def assert_accounted(seen: list[tuple[str, int, dict[str, int]]], devices: tuple
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
-def test_a_client_that_does_not_read_loses_the_oldest_and_slows_nobody(tmp_path: Path, encoding: str) -> None:
-    total = 3000
-
-    async def body() -> None:
-        async with serving(tmp_path, queue_samples=100) as server:
-            slow, fast = await Peer.greeted(server), await Peer.greeted(server)
-            for peer in (slow, fast):
-                await peer.result("watch", encoding=encoding)
-                peer.framed = encoding == "binary"
-            for seq in range(1, total + 1, 2):
-                server.publish(batch("imu0", seq, 2))
-                server.publish(batch("imu1", seq, 2))
-                got = [await read_one(fast) for _ in range(4)]
-                assert got == [("imu0", seq), ("imu0", seq + 1), ("imu1", seq), ("imu1", seq + 1)]
-            first, second = sorted(server.hub.clients(), key=lambda client: client.number)
-            assert first.queue_samples == 100
-            assert first.queue_bytes < 200_000
-            assert first.dropped > total  # of 2 × total
-            assert (second.dropped, second.sent, second.queue_samples) == (0, 2 * total, 0)
-            seen = await read_samples(slow, {"imu0": total, "imu1": total})
-            dropped = assert_accounted(seen, ("imu0", "imu1"))
-            assert sum(dropped.values()) == first.dropped
-            assert sum(bool(reported) for _, _, reported in seen) == 1  # one loss, reported at once
-            server.publish(batch("imu0", total + 1))  # the writer is gone again, the queue empty
-            assert [await read_one(peer) for peer in (slow, fast)] == [("imu0", total + 1)] * 2
-            slow.close()
-            fast.close()
-
-    run(body)
+@in_server(queue_samples=100)
+async def test_a_client_that_does_not_read_loses_the_oldest_and_slows_nobody(
+    server: SocketServer, encoding: str
+) -> None:
+    total = 1000
+    slow, fast = await Peer.greeted(server), await Peer.greeted(server)
+    for peer in (slow, fast):
+        await peer.result("watch", encoding=encoding)
+        peer.framed = encoding == "binary"
+    for seq in range(1, total + 1, 2):
+        server.publish(batch("imu0", seq, 2))
+        server.publish(batch("imu1", seq, 2))
+        got = [await read_one(fast) for _ in range(4)]
+        assert got == [("imu0", seq), ("imu0", seq + 1), ("imu1", seq), ("imu1", seq + 1)]
+    first, second = sorted(server.hub.clients(), key=lambda client: client.number)
+    assert first.queue_samples == 100
+    assert first.queue_bytes < 200_000
+    assert first.dropped > total  # of 2 × total
+    assert (second.dropped, second.sent, second.queue_samples) == (0, 2 * total, 0)
+    seen = await read_samples(slow, {"imu0": total, "imu1": total})
+    dropped = assert_accounted(seen, ("imu0", "imu1"))
+    assert sum(dropped.values()) == first.dropped
+    assert sum(bool(reported) for _, _, reported in seen) == 1  # one loss, reported at once
+    server.publish(batch("imu0", total + 1))  # the writer is gone again, the queue empty
+    assert [await read_one(peer) for peer in (slow, fast)] == [("imu0", total + 1)] * 2
 
 
 async def read_one(peer: Peer) -> tuple[str, int]:
@@ -113,144 +108,119 @@ async def read_one(peer: Peer) -> tuple[str, int]:
     return params["device"], params["seq"]
 
 
-def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path, queue_bytes=8192) as server:
-            peer = await Peer.greeted(server)
-            await peer.result("watch")
-            for seq in range(1, 2001):
-                server.publish(batch("imu0", seq))
-            (client,) = server.hub.clients()
-            assert 0 < client.queue_samples < 40
-            # a message that was sent in part is no part of the bound
-            assert client.queue_bytes <= 8192 + 1000
-            assert_accounted(await read_samples(peer, {"imu0": 2000}), ("imu0",))
-            peer.close()
-
-    run(body)
+@in_server(queue_bytes=8192)
+async def test_the_queue_is_bounded_in_bytes_too(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch")
+    for seq in range(1, 1001):
+        server.publish(batch("imu0", seq))
+    (client,) = server.hub.clients()
+    assert 0 < client.queue_samples < 40
+    # a message that was sent in part is no part of the bound
+    assert client.queue_bytes <= 8192 + 1000
+    assert_accounted(await read_samples(peer, {"imu0": 1000}), ("imu0",))
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_any_pattern_of_reading_accounts_for_every_sample(tmp_path: Path, seed: int) -> None:
+@pytest.mark.parametrize("seed", range(3))
+@in_server(queue_samples=50)
+async def test_any_pattern_of_reading_accounts_for_every_sample(server: SocketServer, seed: int) -> None:
     """Publishing and reading a little, in any order: the order is kept, nothing is unaccounted for."""
     rng = random.Random(seed)
-
-    async def body() -> None:
-        async with serving(tmp_path, queue_samples=50) as server:
-            peer = await Peer.greeted(server)
-            encoding = rng.choice(["json", "binary"])
-            await peer.result("watch", encoding=encoding)
-            peer.framed = encoding == "binary"
-            seq = 0
-            loop = asyncio.get_running_loop()
-            for _ in range(60):
-                count = rng.choice([1, 1, 2, 40])
-                server.publish(batch("imu0", seq + 1, count))
-                seq += count
-                if rng.random() < 0.3:
-                    peer.buffer += await loop.sock_recv(peer.sock, rng.choice([1, 100, 70_000]))
-                if rng.random() < 0.2:
-                    await asyncio.sleep(0)
-            assert_accounted(await read_samples(peer, {"imu0": seq}), ("imu0",))
-            assert len(await peer.result("devices")) == 2
-            peer.close()
-
-    run(body)
+    peer = await Peer.greeted(server)
+    encoding = rng.choice(["json", "binary"])
+    await peer.result("watch", encoding=encoding)
+    peer.framed = encoding == "binary"
+    seq = 0
+    loop = asyncio.get_running_loop()
+    for _ in range(60):
+        count = rng.choice([1, 1, 2, 40])
+        server.publish(batch("imu0", seq + 1, count))
+        seq += count
+        if rng.random() < 0.3:
+            peer.buffer += await loop.sock_recv(peer.sock, rng.choice([1, 100, 70_000]))
+        if rng.random() < 0.2:
+            await asyncio.sleep(0)
+    assert_accounted(await read_samples(peer, {"imu0": seq}), ("imu0",))
+    assert len(await peer.result("devices")) == 2
 
 
-def test_replies_keep_their_place_and_are_never_dropped(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path, queue_samples=5) as server:
-            peer = await Peer.greeted(server)
-            await peer.result("watch")
-            seq = 0
-            while (queue := server.hub.clients()[0].queue_samples) < 5:
-                seq += 1
-                server.publish(batch("imu0", seq))
-            assert queue == 5
-            for number in range(20):
-                await peer.send(b'{"jsonrpc":"2.0","id":%d,"method":"unheard-of"}\n' % number)
-            (connection,) = server.hub.connections.values()
-            await until(lambda: connection.outbox.queue_replies == 20)
-            for _ in range(20):
-                seq += 1
-                server.publish(batch("imu0", seq))
-            ids: list[int] = []
-            seqs: list[int] = []
-            dropped = 0
-            while not seqs or seqs[-1] != seq:
-                message = await peer.message()
-                if "id" in message:
-                    ids.append(message["id"])
-                else:
-                    seqs.append(message["params"]["seq"])
-                    dropped += message["params"].get("dropped", 0)
-            assert ids == list(range(20))
-            assert len(seqs) + dropped == seq
-            assert seqs[-5:] == list(range(seq - 4, seq + 1))
-            peer.close()
-
-    run(body)
+@in_server(queue_samples=5)
+async def test_replies_keep_their_place_and_are_never_dropped(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch")
+    seq = 0
+    while (queue := server.hub.clients()[0].queue_samples) < 5:
+        seq += 1
+        server.publish(batch("imu0", seq))
+    assert queue == 5
+    for number in range(20):
+        await peer.send(b'{"jsonrpc":"2.0","id":%d,"method":"unheard-of"}\n' % number)
+    (connection,) = server.hub.connections.values()
+    await until(lambda: connection.outbox.queue_replies == 20)
+    for _ in range(20):
+        seq += 1
+        server.publish(batch("imu0", seq))
+    ids: list[int] = []
+    seqs: list[int] = []
+    dropped = 0
+    while not seqs or seqs[-1] != seq:
+        message = await peer.message()
+        if "id" in message:
+            ids.append(message["id"])
+        else:
+            seqs.append(message["params"]["seq"])
+            dropped += message["params"].get("dropped", 0)
+    assert ids == list(range(20))
+    assert len(seqs) + dropped == seq
+    assert seqs[-5:] == list(range(seq - 4, seq + 1))
 
 
-def test_who_asks_without_reading_is_disconnected(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            asking, other = await Peer.greeted(server), await Peer.greeted(server)
-            line = b'{"jsonrpc":"2.0","id":1,"method":"schema"}\n'
+@in_server()
+async def test_who_asks_without_reading_is_disconnected(server: SocketServer) -> None:
+    asking, other = await Peer.greeted(server), await Peer.greeted(server)
+    line = b'{"jsonrpc":"2.0","id":1,"method":"schema"}\n'
 
-            async def ask_on() -> None:
-                while True:
-                    await asking.send(line)
-                    await asyncio.sleep(0)
+    async def ask_on() -> None:
+        while True:
+            await asking.send(line)
+            await asyncio.sleep(0)
 
-            with pytest.raises((BrokenPipeError, ConnectionResetError)):
-                await ask_on()
-            assert server.hub.status().evicted == 1
-            assert len(await other.result("devices")) == 2
-            asking.close()
-            other.close()
-
-    run(body)
+    with pytest.raises((BrokenPipeError, ConnectionResetError)):
+        await ask_on()
+    assert server.hub.status().evicted == 1
+    assert len(await other.result("devices")) == 2
 
 
-def test_a_client_that_leaves_during_publish_harms_nobody(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peers = [await Peer.greeted(server) for _ in range(3)]
-            for peer in peers:
-                await peer.result("watch")
-            await peers[0].result("notify", device="imu0")
-            peers[0].close()
-            peers[1].close()
-            server.publish(batch("imu0", 1))  # the loop had no turn: the server learns of it here
-            server.publish(batch("imu0", 2))
-            assert len(server.hub.connections) == 1
-            assert [(await peers[2].message())["params"]["seq"] for _ in range(2)] == [1, 2]
-            peers[2].close()
-
-    run(body)
+@in_server()
+async def test_a_client_that_leaves_during_publish_harms_nobody(server: SocketServer) -> None:
+    peers = [await Peer.greeted(server) for _ in range(3)]
+    for peer in peers:
+        await peer.result("watch")
+    await peers[0].result("notify", device="imu0")
+    peers[0].close()
+    peers[1].close()
+    server.publish(batch("imu0", 1))  # the loop had no turn: the server learns of it here
+    server.publish(batch("imu0", 2))
+    assert len(server.hub.connections) == 1
+    assert [(await peers[2].message())["params"]["seq"] for _ in range(2)] == [1, 2]
+    peers[2].close()
 
 
-def test_a_descriptor_waits_its_turn_behind_what_is_queued(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path, queue_samples=3) as server:
-            peer = await Peer.greeted(server)
-            await peer.result("watch")
-            fill(server)
-            (connection,) = server.hub.connections.values()
-            await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
-            await until(lambda: bool(connection.wakers))
-            server.publish(batch("imu1", 8000, 2))  # waits behind the reply
-            assert await descriptors(peer, connection) == 1
-            await until(lambda: not connection.outbox.waiting)
-            assert connection.wakers.client_ends == 0  # sent, so the daemon has no copy left
-            data, fds, _flags, _address = socket.recv_fds(peer.sock, 65536, 4)
-            assert b'"seq":8001' in data
-            assert not fds
-            peer.close()
-
-    run(body)
+@in_server(queue_samples=3)
+async def test_a_descriptor_waits_its_turn_behind_what_is_queued(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch")
+    fill(server)
+    (connection,) = server.hub.connections.values()
+    await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
+    await until(lambda: bool(connection.wakers))
+    server.publish(batch("imu1", 8000, 2))  # waits behind the reply
+    assert await descriptors(peer, connection) == 1
+    await until(lambda: not connection.outbox.waiting)
+    assert connection.wakers.client_ends == 0  # sent, so the daemon has no copy left
+    data, fds, _flags, _address = socket.recv_fds(peer.sock, 65536, 4)
+    assert b'"seq":8001' in data
+    assert not fds
 
 
 READ_BYTES = 64
@@ -287,35 +257,29 @@ async def descriptors(peer: Peer, connection: Connection) -> int:
     return len(found)
 
 
-def test_large_answers_reach_a_client_that_ended_its_side(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            (connection,) = server.hub.connections.values()
-            note = encode_notification("big", "x" * 500_000)
-            connection.post(note)
-            peer.sock.shutdown(1)
-            await until(lambda: connection.finishing)
-            assert await peer.body() == note
-            assert await peer.ended()
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_large_answers_reach_a_client_that_ended_its_side(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    (connection,) = server.hub.connections.values()
+    note = encode_notification("big", "x" * 500_000)
+    connection.post(note)
+    peer.sock.shutdown(1)
+    await until(lambda: connection.finishing)
+    assert await peer.body() == note
+    assert await peer.ended()
 
 
-def test_who_lingers_without_reading_is_closed_by_ticks(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            (connection,) = server.hub.connections.values()
-            connection.post(encode_notification("big", "x" * 500_000))
-            connection.finish()
-            for _ in range(30):
-                server.tick(0)
-            assert connection.closed
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_who_lingers_without_reading_is_closed_by_ticks(server: SocketServer) -> None:
+    await Peer.greeted(server)
+    (connection,) = server.hub.connections.values()
+    connection.post(encode_notification("big", "x" * 500_000))
+    connection.finish()
+    for _ in range(LINGER_TICKS - 1):
+        server.tick(0)
+    assert not connection.closed
+    server.tick(0)
+    assert connection.closed
 
 
 class Trickle:
@@ -358,7 +322,7 @@ def drained(sock: socket.socket) -> bytes:
         return b""
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
     rng = random.Random(seed)
 
@@ -425,8 +389,8 @@ def test_what_waits_as_messages_holds_no_samples() -> None:
     theirs.close()
 
 
-BIG_BYTES = 800_000
-"""A `status` of 256 devices."""
+BIG_BYTES = 400_000
+"""A `status` of 128 devices."""
 
 
 def held_bytes(server: SocketServer) -> int:
@@ -435,52 +399,47 @@ def held_bytes(server: SocketServer) -> int:
     return sum(one.outbox.queue_bytes + one.unread_bytes for one in connections)
 
 
-def test_large_replies_that_nobody_reads_stay_within_the_memory_and_a_good_client_gets_its_own(tmp_path: Path) -> None:
+@in_server(memory_mb=8)
+async def test_large_replies_that_nobody_reads_stay_within_the_memory_and_a_good_client_gets_its_own(
+    server: SocketServer,
+) -> None:
     big = "x" * BIG_BYTES
-
-    async def body() -> None:
-        async with serving(tmp_path, memory_mb=16, clients_max=256) as server:
-            good = await Peer.greeted(server)
-            (connection,) = server.hub.connections.values()
-            silent = [await Peer.greeted(server) for _ in range(250)]
-            tracemalloc.start()
-            for one in list(server.hub.connections.values()):
-                if one is not connection:
-                    one.post(encode_notification("big", big))
-                    assert held_bytes(server) <= server.pool.held_bytes <= 16 << 20
-            connection.post(encode_notification("big", big + "good"))  # the largest of all, and the last
-            assert tracemalloc.get_traced_memory()[0] < 16 << 20
-            tracemalloc.stop()
-            evicted = server.hub.status().evicted
-            assert 200 < evicted < 250
-            assert (await good.body()).endswith(b'good"}')
-            assert len(await good.result("devices")) == 2
-            assert not connection.closed
-            for peer in (good, *silent):
-                peer.close()
-            await until(lambda: not server.hub.connections)
-            assert server.pool.held_bytes == 0
-
-    run(body)
+    good = await Peer.greeted(server)
+    (connection,) = server.hub.connections.values()
+    silent = [await Peer.greeted(server) for _ in range(100)]
+    tracemalloc.start()
+    for one in list(server.hub.connections.values()):
+        if one is not connection:
+            one.post(encode_notification("big", big))
+            assert held_bytes(server) <= server.pool.held_bytes <= 8 << 20
+    connection.post(encode_notification("big", big + "good"))  # the largest of all, and the last
+    assert tracemalloc.get_traced_memory()[0] < 8 << 20
+    tracemalloc.stop()
+    evicted = server.hub.status().evicted
+    assert 70 < evicted < 100
+    assert (await good.body()).endswith(b'good"}')
+    assert len(await good.result("devices")) == 2
+    assert not connection.closed
+    for peer in (good, *silent):
+        peer.close()
+    await until(lambda: not server.hub.connections)
+    assert server.pool.held_bytes == 0
 
 
-def test_half_lines_are_counted_and_evicted(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path, memory_mb=8) as server:
-            good = await Peer.greeted(server)
-            silent = [await Peer.greeted(server) for _ in range(120)]
-            for peer in silent:
-                with suppress(ConnectionResetError, BrokenPipeError):
-                    await peer.send(b"x" * 60_000)
-            await until(lambda: server.hub.status().evicted > 40)  # 69 half lines fit into 4 MiB
-            assert held_bytes(server) == server.pool.held_bytes <= 4 << 20
-            assert len(await good.result("devices")) == 2
-            for peer in (good, *silent):
-                peer.close()
-            await until(lambda: not server.hub.connections)
-            assert server.pool.held_bytes == 0
-
-    run(body)
+@in_server(memory_mb=8)
+async def test_half_lines_are_counted_and_evicted(server: SocketServer) -> None:
+    good = await Peer.greeted(server)
+    silent = [await Peer.greeted(server) for _ in range(120)]
+    for peer in silent:
+        with suppress(ConnectionResetError, BrokenPipeError):
+            await peer.send(b"x" * 60_000)
+    await until(lambda: server.hub.status().evicted > 40)  # 69 half lines fit into 4 MiB
+    assert held_bytes(server) == server.pool.held_bytes <= 4 << 20
+    assert len(await good.result("devices")) == 2
+    for peer in (good, *silent):
+        peer.close()
+    await until(lambda: not server.hub.connections)
+    assert server.pool.held_bytes == 0
 
 
 class Blocked:

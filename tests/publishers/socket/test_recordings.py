@@ -3,14 +3,15 @@
 import asyncio
 import os
 import socket
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 
 import pytest
 
 from imud.errors import ServerError
+from imud.event import Event, EventKind
 from imud.formats.jsonrpc import Code, RpcError
 from imud.formats.recording.file import RecordingReader
 from imud.formats.recording.records import EndRecord, Kind, Record, decode_object
@@ -20,7 +21,17 @@ from imud.publishers.socket.recordings import RECORDINGS_MAX
 from imud.publishers.socket.rights import Guard, Rights
 from imud.worker import BusThread
 from tests.publishers.recorder.recording_bench import HandSource
-from tests.support.socket_rig import NOW_NS, Peer, run, serving, until
+from tests.support.socket_rig import NOW_NS, Peer, in_context, in_server, run, serving, until
+
+Recorded = tuple[SocketServer, HandSource]
+
+
+@asynccontextmanager
+async def recording(folder: Path) -> AsyncIterator[Recorded]:
+    """A server with devices whose records the test makes."""
+    source = HandSource()
+    async with serving(folder, recording=source) as server:
+        yield server, source
 
 
 class RecordingPeer(Peer):
@@ -83,113 +94,133 @@ def records_of(data: bytes) -> list[Record]:
     return found
 
 
-def test_a_recording_comes_through_the_descriptor_to_its_regular_end(tmp_path: Path) -> None:
-    async def body() -> None:
-        source = HandSource()
-        source.present = ["imu0", "imu1"]
-        async with serving(tmp_path, recording=source) as server:
-            peer = await RecordingPeer.greeted(server)
-            assert await peer.result("record.start", devices=["imu1", "imu1"]) == {"devices": ["imu1"]}
-            server.tick(NOW_NS)
-            source.deliver()
-            assert await peer.error("record.start") == (
-                -32004, "record.start: this connection records already; record.stop ends that",
-            )  # fmt: skip
-            assert await peer.result("record.stop") == {"stopped": True, "records_dropped": 0}
-            assert await peer.result("record.stop") == {"stopped": False, "records_dropped": 0}
-            found = await recording_of(server, peer)
-            kinds = [record.kind for record in found]
-            assert kinds[:3] == [Kind.SESSION, Kind.CALL, Kind.DEVICE]
-            assert Kind.DATA in kinds
-            assert {record.device for record in found if record.kind in (Kind.DEVICE, Kind.CHECK)} == {1}
-            assert decode_object(found[-1], EndRecord).reason == "it was stopped"
-            assert source.listening == []
-            assert await peer.result("record.start") == {"devices": None}
-            peer.close()
-
-    run(body)
+def open_descriptors() -> int:
+    return len(os.listdir("/proc/self/fd"))
 
 
-def test_it_ends_with_the_connection_and_with_the_descriptor(tmp_path: Path) -> None:
-    async def body() -> None:
-        source = HandSource()
-        async with serving(tmp_path, recording=source) as server:
-            peer = await RecordingPeer.greeted(server)
-            await peer.result("record.start")
-            assert source.listening
-            peer.close()
-            await tick_until(server, lambda: not source.listening)
-            peer = await RecordingPeer.greeted(server)
-            await peer.result("record.start")
-            os.close(peer.fds.pop())
-            await tick_until(server, lambda: not source.listening)
-            await peer.result("record.start")
-            peer.close()
-            await until(lambda: not server.hub.connections)
+@in_context("recorded", recording)
+async def test_a_recording_comes_through_the_descriptor_to_its_regular_end(recorded: Recorded) -> None:
+    server, source = recorded
+    source.present = ["imu0", "imu1"]
+    peer = await RecordingPeer.greeted(server)
+    before = open_descriptors()
+    assert await peer.result("record.start", devices=["imu1", "imu1"]) == {"devices": ["imu1"]}
+    server.tick(NOW_NS)
+    source.deliver()
+    assert await peer.error("record.start") == (
+        -32004, "record.start: this connection records already; record.stop ends that",
+    )  # fmt: skip
+    for device in ("imu0", "imu1"):
+        server.event(Event(NOW_NS, device, EventKind.UP, "found"))
+    server.remove_device("imu1")
+    server.add_device("imu1", 1)
+    server.tick(NOW_NS)
+    server.event(Event(NOW_NS, "imu1", EventKind.DOWN, "gone"))
+    assert await peer.result("record.stop") == {"stopped": True, "records_dropped": 0}
+    assert await peer.result("record.stop") == {"stopped": False, "records_dropped": 0}
+    found = await recording_of(server, peer)
+    kinds = [record.kind for record in found]
+    assert kinds[:3] == [Kind.SESSION, Kind.CALL, Kind.DEVICE]
+    assert Kind.DATA in kinds
+    assert (kinds.count(Kind.EVENT), kinds.count(Kind.DEVICE)) == (2, 2)  # described again when it was added again
+    assert {record.device for record in found if record.kind in (Kind.DEVICE, Kind.CHECK, Kind.EVENT)} == {1}
+    assert decode_object(found[-1], EndRecord).reason == "it was stopped"
+    assert source.listening == []
+    await tick_until(server, lambda: open_descriptors() == before)
+    assert await peer.result("record.start") == {"devices": None}
 
-    run(body)
 
-
-def test_imud_that_stops_ends_it_regularly(tmp_path: Path) -> None:
-    async def body() -> tuple[int, RecordingPeer]:
-        source = HandSource()
-        async with serving(tmp_path, recording=source) as server:
-            peer = await RecordingPeer.greeted(server)
-            await peer.result("record.start")
-            source.deliver()
-        assert source.listening == []
-        return peer.fds.pop(), peer
-
-    fd, peer = run(body)
-    with open(fd, "rb") as file:
-        found = records_of(file.read())
-    assert decode_object(found[-1], EndRecord).reason == "imud stopped"
+@in_context("recorded", recording)
+async def test_it_ends_with_the_connection_and_with_the_descriptor(recorded: Recorded) -> None:
+    server, source = recorded
+    before = open_descriptors()
+    peer = await RecordingPeer.greeted(server)
+    await peer.result("record.start")
+    assert source.listening
     peer.close()
+    await tick_until(server, lambda: not source.listening)
+    assert open_descriptors() == before
+    peer = await RecordingPeer.greeted(server)
+    await peer.result("record.start")
+    os.close(peer.fds.pop())
+    await tick_until(server, lambda: not source.listening)
+    assert open_descriptors() == before + 2  # both ends of the connection
+    await peer.result("record.start")
+    peer.close()
+    await until(lambda: not server.hub.connections)
 
 
-def test_there_are_only_so_many_at_a_time(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stopped", [False, True])
+def test_imud_that_stops_ends_it_regularly(tmp_path: Path, stopped: bool) -> None:
+    """Also a recording that the client stopped and has not read to its end."""
+
     async def body() -> None:
-        async with serving(tmp_path, recording=HandSource()) as server:
-            peers = [await RecordingPeer.greeted(server) for _ in range(RECORDINGS_MAX + 1)]
-            for peer in peers[:-1]:
-                await peer.result("record.start")
-            code, message = await peers[-1].error("record.start")
-            assert code == -32004
-            assert f"{RECORDINGS_MAX} recordings run already" in message
-            peers[0].close()
-            await until(lambda: len(server.hub.connections) == RECORDINGS_MAX)
-            await peers[-1].result("record.start")
-            for peer in peers:
-                peer.close()
+        async with recording(tmp_path) as (server, source):
+            peer = await RecordingPeer.greeted(server)
+            await peer.result("record.start")
+            source.deliver()
+            if stopped:
+                await peer.result("record.stop")
+        assert source.listening == []
+        found = records_of(os.read(peer.fds[0], 1 << 16))
+        assert decode_object(found[-1], EndRecord).reason == ("it was stopped" if stopped else "imud stopped")
 
     run(body)
 
 
-def test_reading_is_not_enough_and_devices_must_be_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            code, message = await peer.error("record.start", devices=["imu7"])
-            assert (code, message) == (-32602, "no device named 'imu7'; there are: imu0, imu1")
-            peer.close()
-            monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
-            peer = await Peer.greeted(server)
-            for method in ("record.start", "record.stop", "record.snapshot"):
-                code, message = await peer.error(method)
-                assert code == -32001
-                assert message.startswith(f"{method}: expected root or a member of")
-            peer.close()
+@in_context("recorded", recording)
+async def test_the_maximum_counts_recordings_that_run_and_those_that_still_send(recorded: Recorded) -> None:
+    server, _source = recorded
+    peers = [await RecordingPeer.greeted(server) for _ in range(RECORDINGS_MAX + 1)]
+    for peer in peers[:-1]:
+        await peer.result("record.start")
+    full = (-32004, f"record.start: {RECORDINGS_MAX} recordings run already, as many as there may be at a time")
+    assert await peers[-1].error("record.start") == full
+    peers[0].close()  # ends at once
+    await until(lambda: len(server.hub.connections) == RECORDINGS_MAX)
+    await peers[-1].result("record.start")
+    for peer in peers[1:3]:  # end with the next tick
+        await peer.result("record.stop")
+    assert await peers[1].error("record.start") == full
+    await recording_of(server, peers[1])
+    await recording_of(server, peers[2])
+    await peers[1].result("record.start")
+    await peers[2].result("record.start")
 
-    run(body)
+
+@in_server()
+async def test_reading_is_not_enough_and_devices_must_be_known(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = await Peer.greeted(server)
+    code, message = await peer.error("record.start", devices=["imu7"])
+    assert (code, message) == (-32602, "no device named 'imu7'; there are: imu0, imu1")
+    monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
+    peer = await Peer.greeted(server)
+    for method in ("record.start", "record.stop", "record.snapshot"):
+        code, message = await peer.error(method)
+        assert code == -32001
+        assert message.startswith(f"{method}: expected root or a member of")
 
 
-def test_a_daemon_without_descriptors_or_threads_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_thread(*_: object) -> None:
+@pytest.mark.parametrize("method", ["record.start", "record.snapshot"])
+def test_a_request_that_fails_leaves_no_descriptor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    def fail(*_: object) -> float:
         raise RuntimeError("can't start new thread")
 
+    def refuse(_sock: socket.socket) -> float:
+        raise ServerError("nothing is kept: it has just begun")
+
+    def no_socket(*_: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    checked: list[int] = []
     refusing: list[bool] = []
 
-    def check_fds(*_: object) -> None:
+    def check_fds(_quota: Quota, fds: Sequence[int]) -> None:
+        checked.extend(fds)
         if refusing:
             raise RpcError(Code.UNAVAILABLE, "none to spare")
 
@@ -198,40 +229,38 @@ def test_a_daemon_without_descriptors_or_threads_says_so(tmp_path: Path, monkeyp
     async def body() -> None:
         async with serving(tmp_path) as server:
             peer = await Peer.greeted(server)
-            monkeypatch.setattr(BusThread, "__init__", no_thread)
-            code, message = await peer.error("record.start")
-            assert (code, message) == (-32004, "record.start: the daemon cannot record: can't start new thread")
+            if method == "record.snapshot":
+                code, message = await peer.error(method)
+                assert code == -32004
+                assert "`recorder: {flight: {enabled: true}}`" in message
+                server.hub.context.snapshots.append(refuse)
+                why = "nothing is kept: it has just begun"
+            else:
+                monkeypatch.setattr(BusThread, "__init__", fail)
+                why = "the daemon cannot record: can't start new thread"
+            before = open_descriptors()
+            for _ in range(2):  # the second needs that the first has given its descriptor back
+                assert await peer.error(method) == (-32004, f"{method}: {why}")
+            assert (open_descriptors(), len(checked), len(set(checked))) == (before, 4, 2)
             refusing.append(True)
-            assert await peer.error("record.start") == (-32004, "none to spare")
-            peer.close()
+            assert await peer.error(method) == (-32004, "none to spare")
+            assert open_descriptors() == before
+            monkeypatch.setattr(socket, "socketpair", no_socket)
+            why = "the daemon cannot make a descriptor: Too many open files"
+            assert await peer.error(method) == (-32004, f"{method}: {why}")
 
     run(body)
 
 
-def test_a_snapshot_is_what_the_flight_recorder_sends(tmp_path: Path) -> None:
+@in_server()
+async def test_a_snapshot_is_what_the_flight_recorder_sends(server: SocketServer) -> None:
     def take(sock: socket.socket) -> float:
         with sock:
             sock.send(b"a snapshot")
         return 299.5
 
-    def refuse(_sock: socket.socket) -> float:
-        raise ServerError("nothing is kept: it has just begun")
-
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await RecordingPeer.greeted(server)
-            code, message = await peer.error("record.snapshot")
-            assert code == -32004
-            assert "`recorder: {flight: {enabled: true}}`" in message
-            server.hub.context.snapshots.append(take)
-            assert await peer.result("record.snapshot") == {"seconds": 299.5}
-            assert os.read(peer.fds[0], 100) == b"a snapshot"
-            assert os.read(peer.fds[0], 100) == b""
-            server.hub.context.snapshots[0] = refuse
-            assert await peer.error("record.snapshot") == (
-                -32004,
-                "record.snapshot: nothing is kept: it has just begun",
-            )
-            peer.close()
-
-    run(body)
+    peer = await RecordingPeer.greeted(server)
+    server.hub.context.snapshots.append(take)
+    assert await peer.result("record.snapshot") == {"seconds": 299.5}
+    assert os.read(peer.fds[0], 100) == b"a snapshot"
+    assert os.read(peer.fds[0], 100) == b""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -15,7 +15,7 @@ from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import LINE_MAX_BYTES, RpcError, parse_request
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.serving import BYTES_BURST
-from tests.support.socket_rig import LIMIT_S, Peer, batch, run, serving
+from tests.support.socket_rig import LIMIT_S, Peer, batch, in_server, run, serving
 
 
 @pytest.mark.parametrize(
@@ -48,18 +48,14 @@ from tests.support.socket_rig import LIMIT_S, Peer, batch, run, serving
         (b'{"jsonrpc":"2.0","id":null,"method":"x"}', -32601, None, "no method 'x'"),
     ],
 )
-def test_bad_lines(tmp_path: Path, line: bytes, code: int, request_id: object, words: str) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.send(line + b"\n")
-            reply = await peer.message()
-            assert (reply["jsonrpc"], reply["id"], reply["error"]["code"]) == ("2.0", request_id, code)
-            assert words in reply["error"]["message"]
-            assert len(await peer.result("devices")) == 2
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_id: object, words: str) -> None:
+    peer = await Peer.greeted(server)
+    await peer.send(line + b"\n")
+    reply = await peer.message()
+    assert (reply["jsonrpc"], reply["id"], reply["error"]["code"]) == ("2.0", request_id, code)
+    assert words in reply["error"]["message"]
+    assert len(await peer.result("devices")) == 2
 
 
 @pytest.mark.parametrize(
@@ -82,19 +78,15 @@ def test_bad_lines(tmp_path: Path, line: bytes, code: int, request_id: object, w
         ("notify", {"device": "imu7"}, "there are: imu0, imu1"),
     ],
 )
-def test_bad_parameters(tmp_path: Path, method: str, params: dict[str, Any], words: str) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            code, message = await peer.error(method, **params)
-            assert code == -32602
-            assert words in message
-            (connection,) = server.hub.connections.values()
-            assert connection.number not in watching(server)
-            assert not connection.wakers
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_bad_parameters(server: SocketServer, method: str, params: dict[str, Any], words: str) -> None:
+    peer = await Peer.greeted(server)
+    code, message = await peer.error(method, **params)
+    assert code == -32602
+    assert words in message
+    (connection,) = server.hub.connections.values()
+    assert connection.number not in watching(server)
+    assert not connection.wakers
 
 
 def watching(server: SocketServer) -> set[int]:
@@ -102,127 +94,93 @@ def watching(server: SocketServer) -> set[int]:
     return {client.number for client in server.hub.clients() if client.encoding}
 
 
-def test_unknown_members_are_ignored(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            line = b'{"later":1,"jsonrpc":"2.0","id":1,"method":"watch","params":{"later":[],"rate_hz":null}}\r\n'
-            await peer.send(line)
-            assert (await peer.message())["result"]["rate_hz"] == 0
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_unknown_members_are_ignored(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    line = b'{"later":1,"jsonrpc":"2.0","id":1,"method":"watch","params":{"later":[],"rate_hz":null}}\r\n'
+    await peer.send(line)
+    assert (await peer.message())["result"]["rate_hz"] == 0
 
 
-def test_notifications_act_and_are_not_answered(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.send(b'{"jsonrpc":"2.0","method":"status"}\n')
-            await peer.send(b'{"jsonrpc":"2.0","method":"nonsense"}\n')
-            await peer.send(b'{"jsonrpc":"2.0","method":"notify","params":{"device":"imu0"}}\n')
-            await peer.send(b'{"jsonrpc":"2.0","method":"watch","params":{"devices":["imu1"]}}\n')
-            await peer.send(b'{"jsonrpc":"2.0","id":9,"method":"devices"}\n')
-            assert (await peer.message())["id"] == 9
-            (connection,) = server.hub.connections.values()
-            assert connection.number in watching(server)
-            assert not connection.wakers
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_notifications_act_and_are_not_answered(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.send(b'{"jsonrpc":"2.0","method":"status"}\n')
+    await peer.send(b'{"jsonrpc":"2.0","method":"nonsense"}\n')
+    await peer.send(b'{"jsonrpc":"2.0","method":"notify","params":{"device":"imu0"}}\n')
+    await peer.send(b'{"jsonrpc":"2.0","method":"watch","params":{"devices":["imu1"]}}\n')
+    await peer.send(b'{"jsonrpc":"2.0","id":9,"method":"devices"}\n')
+    assert (await peer.message())["id"] == 9
+    (connection,) = server.hub.connections.values()
+    assert connection.number in watching(server)
+    assert not connection.wakers
 
 
-def test_half_lines_several_requests_and_blank_lines(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            lines = b"".join(b'{"jsonrpc":"2.0","id":%d,"method":"poll"}\n\r\n\n' % number for number in range(25))
-            await peer.send(lines)  # more than one turn's worth
-            assert [reply["id"] for reply in await peer.messages(25)] == list(range(25))
-            line = b'{"jsonrpc":"2.0","id":"cut","method":"poll"}\n'
-            for cut in range(1, len(line), 7):
-                await peer.send(line[:cut])
-                await asyncio.sleep(0)
-                await peer.send(line[cut:])
-                assert (await peer.message())["id"] == "cut"
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_half_lines_several_requests_and_blank_lines(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    lines = b"".join(b'{"jsonrpc":"2.0","id":%d,"method":"poll"}\n\r\n\n' % number for number in range(25))
+    await peer.send(lines)  # more than one turn's worth
+    assert [reply["id"] for reply in await peer.messages(25)] == list(range(25))
+    line = b'{"jsonrpc":"2.0","id":"cut","method":"poll"}\n'
+    for cut in range(1, len(line), 7):
+        await peer.send(line[:cut])
+        await asyncio.sleep(0)
+        await peer.send(line[cut:])
+        assert (await peer.message())["id"] == "cut"
 
 
-def test_a_client_that_leaves_in_the_middle_of_a_line(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer, other = await Peer.greeted(server), await Peer.greeted(server)
-            await peer.send(b'{"jsonrpc":"2.0","id":1,"meth')
-            peer.close()
-            while len(server.hub.connections) > 1:
-                await asyncio.sleep(0)
-            assert len(await other.result("devices")) == 2
-            other.close()
-
-    run(body)
+@in_server()
+async def test_a_client_that_leaves_in_the_middle_of_a_line(server: SocketServer) -> None:
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    await peer.send(b'{"jsonrpc":"2.0","id":1,"meth')
+    peer.close()
+    while len(server.hub.connections) > 1:
+        await asyncio.sleep(0)
+    assert len(await other.result("devices")) == 2
 
 
 @pytest.mark.parametrize("newline", [b"", b"\n"])
-def test_a_line_over_the_limit_ends_the_connection(tmp_path: Path, newline: bytes) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer, other = await Peer.greeted(server), await Peer.greeted(server)
-            start = b'{"jsonrpc":"2.0","id":1,"method":"poll","x":"'
-            longest = start + b"x" * (LINE_MAX_BYTES - len(start) - 2) + b'"}'
-            await peer.send(longest + b"\n")
-            assert (await peer.message())["id"] == 1
-            await peer.send(b"x" * (LINE_MAX_BYTES + 1) + newline)
-            assert (await peer.message())["error"]["code"] == -32003
-            assert await peer.ended()
-            assert server.hub.status().evicted == 1
-            assert len(await other.result("devices")) == 2
-            peer.close()
-            other.close()
-
-    run(body)
+@in_server()
+async def test_a_line_over_the_limit_ends_the_connection(server: SocketServer, newline: bytes) -> None:
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    start = b'{"jsonrpc":"2.0","id":1,"method":"poll","x":"'
+    longest = start + b"x" * (LINE_MAX_BYTES - len(start) - 2) + b'"}'
+    await peer.send(longest + b"\n")
+    assert (await peer.message())["id"] == 1
+    await peer.send(b"x" * (LINE_MAX_BYTES + 1) + newline)
+    assert (await peer.message())["error"]["code"] == -32003
+    assert await peer.ended()
+    assert server.hub.status().evicted == 1
+    assert len(await other.result("devices")) == 2
 
 
-def test_one_client_s_flood_of_requests_leaves_turns_to_others(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            flood, other = await Peer.greeted(server), await Peer.greeted(server)
-            await flood.send(b'{"jsonrpc":"2.0","id":1,"method":"poll"}\n' * 1000)
-            await other.result("poll")
-            while b"\n" not in flood.buffer:
-                flood.buffer += await asyncio.get_running_loop().sock_recv(flood.sock, 1 << 20)
-            assert flood.buffer.count(b"\n") < 200  # of 1000, when the other was answered
-            flood.close()
-            other.close()
-
-    run(body)
+@in_server()
+async def test_one_client_s_flood_of_requests_leaves_turns_to_others(server: SocketServer) -> None:
+    flood, other = await Peer.greeted(server), await Peer.greeted(server)
+    await flood.send(b'{"jsonrpc":"2.0","id":1,"method":"poll"}\n' * 1000)
+    await other.result("poll")
+    while b"\n" not in flood.buffer:
+        flood.buffer += await asyncio.get_running_loop().sock_recv(flood.sock, 1 << 20)
+    assert flood.buffer.count(b"\n") < 200  # of 1000, when the other was answered
 
 
-def test_deep_arguments_of_a_command_are_refused_before_anything_sees_them(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            deep = b'{"a":' * 974 + b"1" + b"}" * 974
-            params = b'{"device":"imu0","name":"output","arguments":' + deep + b"}"
-            await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":' + params + b"}\n")
-            error = (await peer.message())["error"]
-            assert (error["code"], "nested too deeply" in error["message"]) == (-32700, True)
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_deep_arguments_of_a_command_are_refused_before_anything_sees_them(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    deep = b'{"a":' * 974 + b"1" + b"}" * 974
+    params = b'{"device":"imu0","name":"output","arguments":' + deep + b"}"
+    await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":' + params + b"}\n")
+    error = (await peer.message())["error"]
+    assert (error["code"], "nested too deeply" in error["message"]) == (-32700, True)
 
 
-def test_a_name_that_would_forge_a_line_of_the_log_is_refused(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            for name in ("x\nERROR forged", "x" * 65):
-                code, _ = await peer.error("command", device="imu0", name=name)
-                assert code == -32602
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_a_name_that_would_forge_a_line_of_the_log_is_refused(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    for name in ("x\nERROR forged", "x" * 65):
+        code, _ = await peer.error("command", device="imu0", name=name)
+        assert code == -32602
 
 
 def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -244,61 +202,48 @@ def test_a_mistake_in_an_action_ends_that_client_only(tmp_path: Path, caplog: py
     assert caplog.text.count("an internal error while a client was served") == 1
 
 
-def test_a_mistake_in_answering_ends_that_client_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@in_server()
+async def test_a_mistake_in_answering_ends_that_client_only(
+    server: SocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*_: object) -> None:
         raise RecursionError("deep")
 
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer, other = await Peer.greeted(server), await Peer.greeted(server)
-            with monkeypatch.context() as patch:
-                patch.setattr("imud.publishers.socket.rpc.encode_result", fail)
-                await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"devices"}\n')
-                assert (await peer.message())["error"]["code"] == -32603
-                assert await peer.ended()
-            assert server.hub.status().failed == 1
-            assert len(await other.result("devices")) == 2
-            peer.close()
-            other.close()
-
-    run(body)
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    with monkeypatch.context() as patch:
+        patch.setattr("imud.publishers.socket.rpc.encode_result", fail)
+        await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"devices"}\n')
+        assert (await peer.message())["error"]["code"] == -32603
+        assert await peer.ended()
+    assert server.hub.status().failed == 1
+    assert len(await other.result("devices")) == 2
 
 
-def test_empty_lines_use_up_the_allowance_of_their_client(tmp_path: Path) -> None:
+@in_server()
+async def test_empty_lines_use_up_the_allowance_of_their_client(server: SocketServer) -> None:
     """30 clients with 7 MB of them each kept the daemon busy for minutes."""
-
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer, other = await Peer.greeted(server), await Peer.greeted(server)
-            peer.sock.setblocking(False)
-            written, full = 0, 0
-            while full < 200:  # nothing is read any more
-                try:
-                    written += peer.sock.send(b"\n" * 65_536)
-                    full = 0
-                except BlockingIOError:
-                    full += 1
-                await asyncio.sleep(0)
-            assert written < 2 * BYTES_BURST
-            assert len(await other.result("devices")) == 2
-            peer.close()
-            other.close()
-
-    run(body)
+    peer, other = await Peer.greeted(server), await Peer.greeted(server)
+    peer.sock.setblocking(False)
+    written, full = 0, 0
+    while full < 200:  # nothing is read any more
+        try:
+            written += peer.sock.send(b"\n" * 65_536)
+            full = 0
+        except BlockingIOError:
+            full += 1
+        await asyncio.sleep(0)
+    assert written < 2 * BYTES_BURST
+    assert len(await other.result("devices")) == 2
 
 
-def test_nan_and_infinity_are_null(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.result("watch")
-            nan = batch()
-            values = (float("nan"), float("inf"), -float("inf"))
-            server.publish(Batch("imu0", 0, [replace(nan.samples[0], gyro_rad_s=values)]))
-            assert (await peer.message())["params"]["gyro_rad_s"] == [None, None, None]
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_nan_and_infinity_are_null(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch")
+    nan = batch()
+    values = (float("nan"), float("inf"), -float("inf"))
+    server.publish(Batch("imu0", 0, [replace(nan.samples[0], gyro_rad_s=values)]))
+    assert (await peer.message())["params"]["gyro_rad_s"] == [None, None, None]
 
 
 REQUESTS = st.builds(
@@ -318,7 +263,6 @@ JUNK = (
 )
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
 @given(st.lists(JUNK, max_size=12))
 def test_arbitrary_bytes_never_kill_the_server(tmp_path_factory: pytest.TempPathFactory, chunks: list[bytes]) -> None:
     async def body() -> None:
@@ -340,10 +284,10 @@ def test_arbitrary_bytes_never_kill_the_server(tmp_path_factory: pytest.TempPath
     run(body)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.binary(max_size=100) | st.recursive(
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.sampled_from(["jsonrpc", "id", "method"]), inner),
+    max_leaves=8,
 ).map(lambda value: json.dumps(value).encode()))  # fmt: skip
 def test_a_line_is_a_request_or_a_known_error(line: bytes) -> None:
     with suppress(RpcError):  # nothing else may come out

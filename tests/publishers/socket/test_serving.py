@@ -3,14 +3,15 @@
 import asyncio
 import select
 import socket
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 
 from imud.publishers.socket import serving
 from imud.publishers.socket.serving import Place, Scheduler, TokenBucket
-from tests.support.socket_rig import run, until
+from tests.support.socket_rig import in_context, until
 
 MS = 1_000_000
 
@@ -81,204 +82,164 @@ class SchedulerBench:
         return worker, place
 
 
-@contextmanager
-def scheduling() -> Iterator[SchedulerBench]:
+@asynccontextmanager
+async def scheduling(_folder: Path) -> AsyncIterator[SchedulerBench]:
     rig = SchedulerBench()
-    try:
-        yield rig
-    finally:
-        rig.scheduler.close()
-        for sock in rig.socks:
-            sock.close()
+    yield rig
+    rig.scheduler.close()
+    for sock in rig.socks:
+        sock.close()
 
 
-def playing(body: Callable[[SchedulerBench], None]) -> None:
-    """Run a test that needs no turn of the loop."""
-
-    async def limited() -> None:
-        with scheduling() as rig:
-            body(rig)
-
-    run(limited)
-
-
-def test_a_turn_is_limited_and_other_callbacks_run_in_between() -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            rig.add("busy", 1, 100, MS // 4)[1].line_up()
-            for _ in range(20):
-                asyncio.get_running_loop().call_soon(rig.log.append, "sample")
-                await asyncio.sleep(0)
-            served = "".join("b" if word == "busy" else "." for word in rig.log)
-            assert "b" * 5 not in served  # 4 pieces of 0.25 ms make a turn
-            assert served.count("b") > 40
-
-    run(body)
+@in_context("rig", scheduling)
+async def test_a_turn_is_limited_and_other_callbacks_run_in_between(rig: SchedulerBench) -> None:
+    rig.add("busy", 1, 100, MS // 4)[1].line_up()
+    for _ in range(20):
+        asyncio.get_running_loop().call_soon(rig.log.append, "sample")
+        await asyncio.sleep(0)
+    served = "".join("b" if word == "busy" else "." for word in rig.log)
+    assert "b" * 5 not in served  # 4 pieces of 0.25 ms make a turn
+    assert served.count("b") > 40
 
 
-def test_the_client_that_used_least_is_next_within_its_user_and_among_users() -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            for number in range(8):
-                rig.add(f"many{number}", 1, 50, MS // 4)[1].line_up()
-            rig.add("one", 2, 50, MS // 4)[1].line_up()
-            await until(lambda: len(rig.log) >= 60)
-            assert 26 <= rig.log[:60].count("one") <= 34  # half of the time for each user
-            counts = [rig.log[:60].count(f"many{number}") for number in range(8)]
-            assert max(counts) - min(counts) <= 1
-
-    run(body)
+@in_context("rig", scheduling)
+async def test_the_client_that_used_least_is_next_within_its_user_and_among_users(rig: SchedulerBench) -> None:
+    for number in range(8):
+        rig.add(f"many{number}", 1, 50, MS // 4)[1].line_up()
+    rig.add("one", 2, 50, MS // 4)[1].line_up()
+    await until(lambda: len(rig.log) >= 60)
+    assert 26 <= rig.log[:60].count("one") <= 34  # half of the time for each user
+    counts = [rig.log[:60].count(f"many{number}") for number in range(8)]
+    assert max(counts) - min(counts) <= 1
 
 
-def test_a_newcomer_goes_before_those_that_use_much() -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            for number in range(20):
-                rig.add(f"many{number}", 1, 1000, MS // 2)[1].line_up()
-            await until(lambda: len(rig.log) > 100)
-            before = len(rig.log)
-            rig.add("good", 1, 1, MS // 10)[1].line_up()
-            await until(lambda: "good" in rig.log)
-            assert rig.log.index("good") - before <= 20  # one round of the others at most
-
-    run(body)
+@in_context("rig", scheduling)
+async def test_a_newcomer_goes_before_those_that_use_much(rig: SchedulerBench) -> None:
+    for number in range(20):
+        rig.add(f"many{number}", 1, 1000, MS // 2)[1].line_up()
+    await until(lambda: len(rig.log) > 100)
+    before = len(rig.log)
+    rig.add("good", 1, 1, MS // 10)[1].line_up()
+    await until(lambda: "good" in rig.log)
+    assert rig.log.index("good") - before <= 20  # one round of the others at most
 
 
-def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted() -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            worker, place = rig.add("busy", 1, 1_000_000, 5 * MS)
-            place.line_up()
-            for _ in range(200):
-                await asyncio.sleep(0)
-            used = len(rig.log)
-            assert used * 5 * MS <= serving.CPU_NEW_NS + serving.CPU_PER_S_NS  # then nothing for it any more
-            rig.clock.ns += 500 * MS
-            rig.scheduler.tick()
-            await until(lambda: len(rig.log) > used)
-            for _ in range(serving.OVER_TICKS_MAX + 2):
-                for _ in range(100):
-                    await asyncio.sleep(0)
-                assert not worker.overloads
-                rig.clock.ns += 20 * MS
-                rig.scheduler.tick()
-                if worker.overloads:
-                    break
-            assert worker.overloads == 1
-
-    run(body)
-
-
-def test_bytes_count_too() -> None:
-    def body(rig: SchedulerBench) -> None:
-        _worker, place = rig.add("talker", 1, 5, 0)
-        place.count_bytes(serving.BYTES_BURST)
-        assert not place.is_over
-        place.count_bytes(1)
-        assert place.is_over
-        place.fill(rig.clock() + 1000 * MS)
-        assert not place.is_over
-
-    playing(body)
-
-
-def test_when_the_time_for_serving_is_used_up_only_light_clients_are_served() -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            for number in range(4):
-                rig.add(f"heavy{number}", 1, 10_000, MS // 2)[1].line_up()
-            good, place = rig.add("good", 1, 1, MS // 10)
-            place.fill(rig.clock() + 1000 * MS)  # it has been there, silent, for a second
-            await until(lambda: len(rig.log) >= 8)
-            rig.scheduler.serving_time.use(2_000 * MS)
+@in_context("rig", scheduling)
+async def test_who_asks_too_much_is_parked_put_in_line_by_ticks_and_evicted(rig: SchedulerBench) -> None:
+    worker, place = rig.add("busy", 1, 1_000_000, 5 * MS)
+    place.line_up()
+    for _ in range(200):
+        await asyncio.sleep(0)
+    used = len(rig.log)
+    assert used * 5 * MS <= serving.CPU_NEW_NS + serving.CPU_PER_S_NS  # then nothing for it any more
+    rig.clock.ns += 500 * MS
+    rig.scheduler.tick()
+    await until(lambda: len(rig.log) > used)
+    for _ in range(serving.OVER_TICKS_MAX + 2):
+        for _ in range(100):
             await asyncio.sleep(0)
-            await asyncio.sleep(0)
-            before = len(rig.log)
-            place.line_up()
-            await until(lambda: "good" in rig.log[before:])
-            assert len(rig.log) - before <= 3  # at most the turn that everybody has in 10 ms
-            assert not good.pieces
-
-    run(body)
+        assert not worker.overloads
+        rig.clock.ns += 20 * MS
+        rig.scheduler.tick()
+        if worker.overloads:
+            break
+    assert worker.overloads == 1
 
 
-def test_an_error_ends_that_client_and_no_other(caplog: pytest.LogCaptureFixture) -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            bad, place = rig.add("bad", 1, 2, 1000)
-            bad.error = RecursionError("deep")
-            other, other_place = rig.add("other", 1, 3, 1000)
-            place.line_up()
-            other_place.line_up()
-            await until(lambda: not other.pieces and not bad.pieces)
-            assert [str(error) for error in bad.failures] == ["deep"]
-            assert not other.failures
+@in_context("rig", scheduling)
+async def test_bytes_count_too(rig: SchedulerBench) -> None:
+    _worker, place = rig.add("talker", 1, 5, 0)
+    place.count_bytes(serving.BYTES_BURST)
+    assert not place.is_over
+    place.count_bytes(1)
+    assert place.is_over
+    place.fill(rig.clock() + 1000 * MS)
+    assert not place.is_over
 
-    run(body)
+
+@in_context("rig", scheduling)
+async def test_when_the_time_for_serving_is_used_up_only_light_clients_are_served(rig: SchedulerBench) -> None:
+    for number in range(4):
+        rig.add(f"heavy{number}", 1, 10_000, MS // 2)[1].line_up()
+    good, place = rig.add("good", 1, 1, MS // 10)
+    place.fill(rig.clock() + 1000 * MS)  # it has been there, silent, for a second
+    await until(lambda: len(rig.log) >= 8)
+    rig.scheduler.serving_time.use(2_000 * MS)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    before = len(rig.log)
+    place.line_up()
+    await until(lambda: "good" in rig.log[before:])
+    assert len(rig.log) - before <= 3  # at most the turn that everybody has in 10 ms
+    assert not good.pieces
+
+
+@in_context("rig", scheduling)
+async def test_an_error_ends_that_client_and_no_other(rig: SchedulerBench, caplog: pytest.LogCaptureFixture) -> None:
+    bad, place = rig.add("bad", 1, 2, 1000)
+    bad.error = RecursionError("deep")
+    other, other_place = rig.add("other", 1, 3, 1000)
+    place.line_up()
+    other_place.line_up()
+    await until(lambda: not other.pieces and not bad.pieces)
+    assert [str(error) for error in bad.failures] == ["deep"]
+    assert not other.failures
 
 
 @pytest.mark.parametrize("where", ["on_overload", "on_ready", "wanted_events"])
-def test_an_error_outside_of_a_piece_ends_that_client_too(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None of them may reach the loop, whose handler ends the daemon; `run` fails then."""
-
-    async def body() -> None:
-        with scheduling() as rig:
-            bad, place = rig.add("bad", 1, 10_000 if where == "on_overload" else 1, 5 * MS)
-
-            def broken(*_: object) -> int:
-                raise ZeroDivisionError(where)
-
-            monkeypatch.setattr(bad, where, broken)
-            if where == "on_ready":
-                rig.socks[1].send(b"x")
-            else:
-                place.line_up()
-            for _ in range(serving.OVER_TICKS_MAX + 10):
-                for _ in range(30):
-                    await asyncio.sleep(0)
-                rig.clock.ns += 2 * MS
-                rig.scheduler.tick()
-                if bad.failures:
-                    break
-            assert str(bad.failures[0]) == where
-            other, other_place = rig.add("other", 1, 1, 1000)
-            other_place.line_up()
-            await until(lambda: not other.pieces)
-
-    run(body)
-
-
-def test_a_client_that_cannot_even_be_ended_is_served_no_more(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@in_context("rig", scheduling)
+async def test_an_error_outside_of_a_piece_ends_that_client_too(
+    rig: SchedulerBench, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            bad, place = rig.add("bad", 1, 1000, 1000)
-            bad.error = RecursionError("deep")
+    """None of them may reach the loop, whose handler ends the daemon; `run` fails then."""
+    bad, place = rig.add("bad", 1, 10_000 if where == "on_overload" else 1, 5 * MS)
 
-            def broken(_error: Exception) -> None:
-                raise ZeroDivisionError
+    def broken(*_: object) -> int:
+        raise ZeroDivisionError(where)
 
-            monkeypatch.setattr(bad, "on_failure", broken)
-            other, other_place = rig.add("other", 1, 3, 1000)
-            place.line_up()
-            other_place.line_up()
-            await until(lambda: not other.pieces)
-            assert rig.log.count("bad") == 1
+    monkeypatch.setattr(bad, where, broken)
+    if where == "on_ready":
+        rig.socks[1].send(b"x")
+    else:
+        place.line_up()
+    for _ in range(serving.OVER_TICKS_MAX + 10):
+        for _ in range(30):
+            await asyncio.sleep(0)
+        rig.clock.ns += 2 * MS
+        rig.scheduler.tick()
+        if bad.failures:
+            break
+    assert str(bad.failures[0]) == where
+    other, other_place = rig.add("other", 1, 1, 1000)
+    other_place.line_up()
+    await until(lambda: not other.pieces)
 
-    run(body)
+
+@in_context("rig", scheduling)
+async def test_a_client_that_cannot_even_be_ended_is_served_no_more(
+    rig: SchedulerBench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bad, place = rig.add("bad", 1, 1000, 1000)
+    bad.error = RecursionError("deep")
+
+    def broken(_error: Exception) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(bad, "on_failure", broken)
+    other, other_place = rig.add("other", 1, 3, 1000)
+    place.line_up()
+    other_place.line_up()
+    await until(lambda: not other.pieces)
+    assert rig.log.count("bad") == 1
     assert "served no more" in caplog.text
 
 
-def test_a_client_that_left_is_not_served() -> None:
-    async def body() -> None:
-        with scheduling() as rig:
-            _, place = rig.add("gone", 1, 5, 1000)
-            _, other = rig.add("other", 1, 1, 1000)
-            place.line_up()
-            place.leave()
-            place.leave()
-            other.line_up()
-            await until(lambda: rig.log == ["other"])
-
-    run(body)
+@in_context("rig", scheduling)
+async def test_a_client_that_left_is_not_served(rig: SchedulerBench) -> None:
+    _, place = rig.add("gone", 1, 5, 1000)
+    _, other = rig.add("other", 1, 1, 1000)
+    place.line_up()
+    place.leave()
+    place.leave()
+    other.line_up()
+    await until(lambda: rig.log == ["other"])

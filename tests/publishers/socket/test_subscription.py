@@ -1,11 +1,10 @@
 """Subscriptions: what matches, and the rate of each client and device."""
 
-from pathlib import Path
-
 import pytest
 
+from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.subscription import Form, Subscription
-from tests.support.socket_rig import Peer, batch, run, serving
+from tests.support.socket_rig import Peer, batch, in_server
 
 
 def test_subscription_matches() -> None:
@@ -17,73 +16,56 @@ def test_subscription_matches() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
-def test_rate_is_per_client_and_device(tmp_path: Path, encoding: str) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            slow, fast = await Peer.greeted(server), await Peer.greeted(server)
-            await slow.result("watch", rate_hz=100, encoding=encoding)
-            await fast.result("watch", rate_hz=250.0, encoding=encoding)
-            for first in range(1, 1001, 25):
-                server.publish(batch("imu0", first, 25))
-                server.publish(batch("imu1", first, 25, period_ns=2_000_000))
-            given = {client.number: client.sent + client.queue_samples for client in server.hub.clients()}
-            assert given == {1: 100 + 200, 2: 250 + 500}
-            slow.close()
-            fast.close()
-
-    run(body)
+@in_server()
+async def test_rate_is_per_client_and_device(server: SocketServer, encoding: str) -> None:
+    slow, fast = await Peer.greeted(server), await Peer.greeted(server)
+    await slow.result("watch", rate_hz=100, encoding=encoding)
+    await fast.result("watch", rate_hz=250.0, encoding=encoding)
+    for first in range(1, 1001, 25):
+        server.publish(batch("imu0", first, 25))
+        server.publish(batch("imu1", first, 25, period_ns=2_000_000))
+    given = {client.number: client.sent + client.queue_samples for client in server.hub.clients()}
+    assert given == {1: 100 + 200, 2: 250 + 500}
 
 
-def test_rates_of_clients_are_independent(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peers = [await Peer.greeted(server) for _ in range(3)]
-            for peer, rate_hz in zip(peers, (100, 500, 250), strict=True):
-                await peer.result("watch", rate_hz=rate_hz)
-            for seq in range(1, 12):
-                server.publish(batch("imu0", seq))
-            expected = ([1, 11], [1, 3, 5, 7, 9, 11], [1, 5, 9])
-            for peer, numbers in zip(peers, expected, strict=True):
-                assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
-                peer.close()
-
-    run(body)
+@in_server()
+async def test_rates_of_clients_are_independent(server: SocketServer) -> None:
+    peers = [await Peer.greeted(server) for _ in range(3)]
+    for peer, rate_hz in zip(peers, (100, 500, 250), strict=True):
+        await peer.result("watch", rate_hz=rate_hz)
+    for seq in range(1, 12):
+        server.publish(batch("imu0", seq))
+    expected = ([1, 11], [1, 3, 5, 7, 9, 11], [1, 5, 9])
+    for peer, numbers in zip(peers, expected, strict=True):
+        assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
 
 
-def test_clients_with_one_rate_get_the_same_samples(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            first, second = await Peer.greeted(server), await Peer.greeted(server)
-            await first.result("watch", rate_hz=100)
-            for seq in range(1, 6):
-                server.publish(batch("imu0", seq))
-            await second.result("watch", rate_hz=100, fields=["gyro_rad_s"])
-            for seq in range(6, 32):
-                server.publish(batch("imu0", seq))
-            for peer, numbers in ((first, [1, 11, 21, 31]), (second, [11, 21, 31])):
-                assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
-            first.close()
-            await second.result("watch", rate_hz=500)  # the rate before is forgotten with the last that wanted it
-            for seq in range(32, 37):
-                server.publish(batch("imu0", seq))
-            assert [(await second.message())["params"]["seq"] for _ in range(3)] == [32, 34, 36]
-            second.close()
-
-    run(body)
+@in_server()
+async def test_clients_with_one_rate_get_the_same_samples(server: SocketServer) -> None:
+    first, second = await Peer.greeted(server), await Peer.greeted(server)
+    await first.result("watch", rate_hz=100)
+    for seq in range(1, 6):
+        server.publish(batch("imu0", seq))
+    await second.result("watch", rate_hz=100, fields=["gyro_rad_s"])
+    for seq in range(6, 32):
+        server.publish(batch("imu0", seq))
+    for peer, numbers in ((first, [1, 11, 21, 31]), (second, [11, 21, 31])):
+        assert [(await peer.message())["params"]["seq"] for _ in numbers] == numbers
+    first.close()
+    await second.result("watch", rate_hz=500)  # the rate before is forgotten with the last that wanted it
+    for seq in range(32, 37):
+        server.publish(batch("imu0", seq))
+    assert [(await second.message())["params"]["seq"] for _ in range(3)] == [32, 34, 36]
 
 
-def test_a_change_elsewhere_does_not_disturb_the_pace(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            await peer.result("watch", rate_hz=1)
-            for seq in range(1, 2002):
-                if seq % 100 == 0:
-                    other = await Peer.greeted(server)
-                    await other.result("watch")
-                    other.close()
-                server.publish(batch("imu0", seq))
-            assert [(await peer.message())["params"]["seq"] for _ in range(3)] == [1, 1001, 2001]
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_a_change_elsewhere_does_not_disturb_the_pace(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    await peer.result("watch", rate_hz=1)
+    for seq in range(1, 2002):
+        if seq % 100 == 0:
+            other = await Peer.greeted(server)
+            await other.result("watch")
+            other.close()
+        server.publish(batch("imu0", seq))
+    assert [(await peer.message())["params"]["seq"] for _ in range(3)] == [1, 1001, 2001]

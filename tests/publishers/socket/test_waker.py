@@ -3,17 +3,14 @@
 import asyncio
 import os
 import select
-import signal
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
 from imud.formats.jsonrpc import encode_notification
+from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.waker import BYTE
-from tests.support.socket_rig import Peer, batch, run, serving, until
+from tests.support.socket_rig import Peer, batch, in_server, until
 
 
 async def notified(peer: Peer, device: str = "imu0") -> int:
@@ -41,164 +38,121 @@ def read_all(fd: int) -> bytes | None:
         return None
 
 
-def test_notify_wakes_for_batches_of_one_device(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            fd = await notified(peer)
-            (connection,) = server.hub.connections.values()
-            assert connection.wakers.client_ends == 0  # the daemon keeps no copy
-            server.publish(batch("imu1"))
-            await wakened()
-            assert read_all(fd) is None
-            for first in (1, 3):
-                server.publish(batch("imu0", first, 2))
-                assert read_all(fd) is None  # not yet: shared memory may have its turn after this
-                await wakened()
-                assert read_all(fd) == BYTE
-            other = await notified(peer, "imu1")
-            server.publish(batch("imu1", 2))
-            await wakened()
-            assert (read_all(fd), read_all(other)) == (None, BYTE)
-            peer.close()
-            await until(lambda: not server.hub.connections)
-            assert (read_all(fd), read_all(other)) == (b"", b"")
-            os.close(fd)
-            os.close(other)
-
-    run(body)
+@in_server()
+async def test_notify_wakes_for_batches_of_one_device(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    fd = await notified(peer)
+    (connection,) = server.hub.connections.values()
+    assert connection.wakers.client_ends == 0  # the daemon keeps no copy
+    server.publish(batch("imu1"))
+    await wakened()
+    assert read_all(fd) is None
+    for first in (1, 3):
+        server.publish(batch("imu0", first, 2))
+        assert read_all(fd) is None  # not yet: shared memory may have its turn after this
+        await wakened()
+        assert read_all(fd) == BYTE
+    other = await notified(peer, "imu1")
+    server.publish(batch("imu1", 2))
+    await wakened()
+    assert (read_all(fd), read_all(other)) == (None, BYTE)
+    peer.close()
+    await until(lambda: not server.hub.connections)
+    assert (read_all(fd), read_all(other)) == (b"", b"")
+    os.close(fd)
+    os.close(other)
 
 
-def test_notify_again_ends_the_old_descriptor(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            before = len(os.listdir("/proc/self/fd"))
-            fds = [await notified(peer) for _ in range(5)]
-            assert len(os.listdir("/proc/self/fd")) == before + 5 + 1  # ours, and one of the daemon's
-            server.publish(batch())
-            await wakened()
-            assert [read_all(fd) for fd in fds] == [b"", b"", b"", b"", BYTE]
-            for fd in fds:
-                os.close(fd)
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    before = len(os.listdir("/proc/self/fd"))
+    fds = [await notified(peer) for _ in range(5)]
+    assert len(os.listdir("/proc/self/fd")) == before + 5 + 1  # ours, and one of the daemon's
+    server.publish(batch())
+    await wakened()
+    assert [read_all(fd) for fd in fds] == [b"", b"", b"", b"", BYTE]
+    for fd in fds:
+        os.close(fd)
 
 
-def test_no_client_makes_the_daemon_wait(tmp_path: Path) -> None:
+@pytest.mark.timeout(60)  # a daemon that waits never returns
+@in_server()
+async def test_no_client_makes_the_daemon_wait(server: SocketServer) -> None:
     """One clears O_NONBLOCK of its descriptor and never reads; the others are woken on and on."""
-
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            hostile, other = await Peer.greeted(server), await Peer.greeted(server)
-            held, fd = await notified(hostile), await notified(other)
-            os.set_blocking(held, True)
-            with pytest.raises(BrokenPipeError), socket.socket(fileno=os.dup(held)) as sock:
-                sock.send(b"this is never read")
-            woken = 0
-            for seq in range(1, 301):
-                server.publish(batch("imu0", seq))
-                await wakened()
-                woken += read_all(fd) == BYTE
-            assert woken == 300
-            assert 1 <= len(os.read(held, 4096)) <= 64  # was full; "64 bytes at once are plenty"
-            server.publish(batch("imu0", 301))
-            await wakened()
-            assert read_all(held) == BYTE
-            for end in (held, fd):
-                os.close(end)
-            for peer in (hostile, other):
-                assert len(await peer.result("devices")) == 2
-                peer.close()
-
-    # a daemon that waits never returns: only a signal ends the test then
-    with time_limit():
-        run(body)
+    hostile, other = await Peer.greeted(server), await Peer.greeted(server)
+    held, fd = await notified(hostile), await notified(other)
+    os.set_blocking(held, True)
+    with pytest.raises(BrokenPipeError), socket.socket(fileno=os.dup(held)) as sock:
+        sock.send(b"this is never read")
+    for seq in range(1, 101):
+        server.publish(batch("imu0", seq))
+        await wakened()
+        assert read_all(fd) == BYTE
+    assert 1 <= len(os.read(held, 4096)) <= 64  # was full; "64 bytes at once are plenty"
+    server.publish(batch("imu0", 301))
+    await wakened()
+    assert read_all(held) == BYTE
+    for end in (held, fd):
+        os.close(end)
+    for peer in (hostile, other):
+        assert len(await peer.result("devices")) == 2
 
 
-@contextmanager
-def time_limit() -> Iterator[None]:
-    """Fail instead of hanging in a system call."""
-
-    def fail(_number: int, _frame: object) -> None:
-        raise SystemExit("the daemon waits for a client")  # other exceptions do not leave the event loop
-
-    before = signal.signal(signal.SIGALRM, fail)
-    signal.alarm(5)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
-
-
-def test_a_client_that_closes_its_descriptor_is_not_woken_any_more(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            closing, other = await Peer.greeted(server), await Peer.greeted(server)
-            os.close(await notified(closing))
-            fd = await notified(other)
-            first, second = server.hub.connections.values()
-            for seq in (1, 2):
-                server.publish(batch("imu0", seq))
-                await wakened()
-                assert read_all(fd) == BYTE
-                assert not first.wakers
-            os.close(fd)
-            server.publish(batch("imu0", 3))
-            await wakened()
-            assert not second.wakers
-            server.publish(batch("imu0", 4))
-            assert not server.hub.wakes("imu0")  # no client is left to wake
-            for peer in (closing, other):
-                assert len(await peer.result("devices")) == 2
-                peer.close()
-
-    run(body)
+@in_server()
+async def test_a_client_that_closes_its_descriptor_is_not_woken_any_more(server: SocketServer) -> None:
+    closing, other = await Peer.greeted(server), await Peer.greeted(server)
+    os.close(await notified(closing))
+    fd = await notified(other)
+    first, second = server.hub.connections.values()
+    for seq in (1, 2):
+        server.publish(batch("imu0", seq))
+        await wakened()
+        assert read_all(fd) == BYTE
+        assert not first.wakers
+    os.close(fd)
+    server.publish(batch("imu0", 3))
+    await wakened()
+    assert not second.wakers
+    server.publish(batch("imu0", 4))
+    assert not server.hub.wakes("imu0")  # no client is left to wake
+    for peer in (closing, other):
+        assert len(await peer.result("devices")) == 2
 
 
-def test_unread_replies_do_not_gather_descriptors(tmp_path: Path) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            (connection,) = server.hub.connections.values()
-            connection.post(encode_notification("big", "x" * 500_000))  # the socket is full
-            before = len(os.listdir("/proc/self/fd"))
-            requests = [(number, "imu0" if number < 5 else "imu1") for number in range(6)]
-            for number, device in requests:
-                line = b'{"jsonrpc":"2.0","id":%d,"method":"notify","params":{"device":"%s"}}\n'
-                await peer.send(line % (number, device.encode()))
-            await until(lambda: len(connection.wakers) == 2)
-            assert len(os.listdir("/proc/self/fd")) == before + 4  # both ends of two
-            replies = (await peer.messages(7))[1:]
-            assert ["error" in reply for reply in replies] == [False, True, True, True, True, False]
-            assert "ask again" in replies[1]["error"]["message"]
-            assert replies[1]["error"]["code"] == -32004
-            assert len(os.listdir("/proc/self/fd")) == before + 2
-            os.close(await notified(peer))
-            peer.close()
-
-    run(body)
+@in_server()
+async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) -> None:
+    peer = await Peer.greeted(server)
+    (connection,) = server.hub.connections.values()
+    connection.post(encode_notification("big", "x" * 500_000))  # the socket is full
+    before = len(os.listdir("/proc/self/fd"))
+    requests = [(number, "imu0" if number < 5 else "imu1") for number in range(6)]
+    for number, device in requests:
+        line = b'{"jsonrpc":"2.0","id":%d,"method":"notify","params":{"device":"%s"}}\n'
+        await peer.send(line % (number, device.encode()))
+    await until(lambda: len(connection.wakers) == 2)
+    assert len(os.listdir("/proc/self/fd")) == before + 4  # both ends of two
+    replies = (await peer.messages(7))[1:]
+    assert ["error" in reply for reply in replies] == [False, True, True, True, True, False]
+    assert "ask again" in replies[1]["error"]["message"]
+    assert replies[1]["error"]["code"] == -32004
+    assert len(os.listdir("/proc/self/fd")) == before + 2
+    os.close(await notified(peer))
 
 
-def test_no_descriptor_to_be_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@in_server()
+async def test_no_descriptor_to_be_had(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_arguments: object) -> None:
         raise OSError(24, "Too many open files")
 
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            fd = await notified(peer)
-            with monkeypatch.context() as patch:
-                patch.setattr(socket, "socketpair", refuse)
-                code, message = await peer.error("notify", device="imu0")
-            assert code == -32004
-            assert "Too many open files" in message
-            server.publish(batch())
-            await wakened()
-            assert read_all(fd) == BYTE  # the old one is still there
-            os.close(fd)
-            peer.close()
-
-    run(body)
+    peer = await Peer.greeted(server)
+    fd = await notified(peer)
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "socketpair", refuse)
+        code, message = await peer.error("notify", device="imu0")
+    assert code == -32004
+    assert "Too many open files" in message
+    server.publish(batch())
+    await wakened()
+    assert read_all(fd) == BYTE  # the old one is still there
+    os.close(fd)
