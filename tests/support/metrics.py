@@ -4,6 +4,7 @@ import asyncio
 import socket
 
 import msgspec
+from prometheus_client.parser import text_string_to_metric_families
 
 from imud.contracts.status import (
     LATENCY_BOUNDS_NS,
@@ -20,6 +21,8 @@ from imud.contracts.status import (
 )
 from imud.frames.conventions import Heading
 from imud.ledger import LEDGER_FIELDS
+from imud.publishers.metrics.family import Snapshot
+from imud.publishers.metrics.publisher import Renderer
 from imud.publishers.metrics.rings import MotionValues, RingView
 from imud.sample import Sync
 
@@ -119,3 +122,14 @@ def read_all(connection: socket.socket) -> bytes:
     except ConnectionResetError:
         pass
     return b"".join(parts)
+
+
+def shown(prefix: str, snapshot: Snapshot) -> dict[str, float]:
+    """Values of the metrics whose names begin with `prefix`, by the rest of the name and the values of the labels."""
+    body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
+    lines = [line for metric in text_string_to_metric_families(body) for line in metric.samples]
+    return {
+        " ".join((line.name.removeprefix(prefix), *line.labels.values())): line.value
+        for line in lines
+        if line.name.startswith(prefix)
+    }

@@ -35,7 +35,10 @@ from imud.publishers.metrics.family import (
     MetricType,
     Snapshot,
 )
+from imud.publishers.metrics.mqtt import MQTT_FAMILIES
+from imud.publishers.metrics.outputs import OUTPUT_FAMILIES
 from imud.publishers.metrics.publisher import SAMPLES_PER_TURN, ClientTotals, Renderer
+from imud.publishers.metrics.recorder import FLIGHT_FAMILIES, RECORDER_FAMILIES, RECORDINGS_FAMILIES
 from imud.publishers.metrics.rings import RingView
 from imud.sample import Sync
 from imud.utc.rmc_feed import Refusal
@@ -290,11 +293,8 @@ def test_rings_and_motion_are_shown() -> None:
 
 
 def test_a_contradiction_of_gravity_is_shown() -> None:
-    snapshot = Snapshot((
-        device("good", 0, frame=FRAME), device("bad", 1, frame=msgspec.structs.replace(FRAME, problem="upside down")),
-        device("unknown", 2),
-    ))  # fmt: skip
-    shown = rendered(snapshot)
+    bad = msgspec.structs.replace(FRAME, problem="upside down")
+    shown = rendered(Snapshot((device("good", 0, frame=FRAME), device("bad", 1, frame=bad), device("unknown", 2))))
     assert shown[key("imud_frame_problem", device="good")] == 0
     assert shown[key("imud_frame_problem", device="bad")] == 1
     assert key("imud_frame_problem", device="unknown") not in shown
@@ -436,7 +436,8 @@ def test_names_follow_the_conventions() -> None:
 
 
 def test_names_say_type_and_unit() -> None:
-    for family in FAMILIES:
+    more = (*MQTT_FAMILIES, *OUTPUT_FAMILIES, *RECORDER_FAMILIES, *FLIGHT_FAMILIES, *RECORDINGS_FAMILIES)
+    for family in (*FAMILIES, *more):
         if isinstance(family, Family):
             assert (family.type is MetricType.COUNTER) == family.name.endswith("_total")
             assert (family.type is MetricType.INFO) == family.name.endswith("_info")

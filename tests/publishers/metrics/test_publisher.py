@@ -21,6 +21,7 @@ from imud.errors import ServerError
 from imud.event import Event, EventKind
 from imud.publishers import PUBLISHERS
 from imud.publishers.metrics.publisher import DEVICES_PER_TURN, MetricsPublisher, MetricsSettings
+from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, device, read_all
 from tests.support.rings import DEVICE, Board
 
@@ -33,7 +34,7 @@ def context(status: Callable[[], Sequence[DeviceStatus]] = lambda: DEVICES) -> P
 
 @asynccontextmanager
 async def publisher(
-    context: PublisherContext, snapshot_s: float = 0.05, **settings: object
+    context: PublisherContext, snapshot_s: float = LIMIT_S, **settings: object
 ) -> AsyncIterator[MetricsPublisher]:
     """A started publisher that leaves no thread behind."""
     made = MetricsPublisher(MetricsSettings(**{"port": 0, **settings}), context, snapshot_s=snapshot_s)  # type: ignore[arg-type]  # any key
@@ -46,56 +47,51 @@ async def publisher(
         assert "scrape" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
+@in_loop
+async def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
     threads = []
 
     def status() -> Sequence[DeviceStatus]:
         threads.append(threading.get_ident())
         return DEVICES
 
-    async def run() -> None:
-        async with publisher(context(status)) as served:
-            served.event(Event(1, "front", EventKind.LOSS, ""))
-            served.event(Event(1, "front", EventKind.LOSS, ""))
-            served.event(Event(1, "", EventKind.CONFIGURATION, ""))
-            served.tick(4_000_000_000)
-            line, head, body = await ask(served.port)
-            assert line == "HTTP/1.1 200 OK"
-            assert "Content-Type: text/plain; version=0.0.4" in head
-            assert f"Content-Length: {len(body.encode())}" in head
-            shown = {
-                (line.name, *line.labels.values()): line.value for found in parse_text(body) for line in found.samples
-            }
-            assert shown["imud_samples_total", "rear"] == DEVICES[1].ledger["samples"]
-            assert shown["imud_events_total", "front", "loss"] == 2
-            assert shown["imud_events_total", "", "configuration"] == 1
-            assert shown["imud_heartbeat_age_seconds",] == 1.0
-            served.remove_device("front")
-            assert 'imud_events_total{device="front"' not in (await ask(served.port))[2]
-            _, head, body = await ask(served.port, headers="Accept: application/openmetrics-text; version=1.0.0\r\n")
-            assert "application/openmetrics-text" in head
-            assert body.endswith("# EOF\n")
-
-    asyncio.run(run())
+    async with publisher(context(status)) as served:
+        served.event(Event(1, "front", EventKind.LOSS, ""))
+        served.event(Event(1, "front", EventKind.LOSS, ""))
+        served.event(Event(1, "", EventKind.CONFIGURATION, ""))
+        served.tick(4_000_000_000)
+        line, head, body = await ask(served.port)
+        assert line == "HTTP/1.1 200 OK"
+        assert "Content-Type: text/plain; version=0.0.4" in head
+        assert f"Content-Length: {len(body.encode())}" in head
+        shown = {(line.name, *line.labels.values()): line.value for found in parse_text(body) for line in found.samples}
+        assert shown["imud_samples_total", "rear"] == DEVICES[1].ledger["samples"]
+        assert shown["imud_events_total", "front", "loss"] == 2
+        assert shown["imud_events_total", "", "configuration"] == 1
+        assert shown["imud_heartbeat_age_seconds",] == 1.0
+        served.remove_device("front")
+        assert 'imud_events_total{device="front"' not in (await ask(served.port))[2]
+        _, head, body = await ask(served.port, headers="Accept: application/openmetrics-text; version=1.0.0\r\n")
+        assert "application/openmetrics-text" in head
+        assert body.endswith("# EOF\n")
     assert set(threads) == {threading.get_ident()}
 
 
-def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
-    async def run() -> None:
-        async with publisher(
-            PublisherContext(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
-        ) as served:
-            assert (await ask(served.port, "/scrapes"))[2] == '{"scrapes":0,"age_s":2.0}', "since the start"
-            await ask(served.port)
-            line, head, body = await ask(served.port, "/scrapes")
-            assert line == "HTTP/1.1 200 OK"
-            assert "Content-Type: application/json" in head
-            assert body == '{"scrapes":1,"age_s":4.0}'  # the clock of the test goes on 2 s a look: status, and here
-
-    asyncio.run(run())
+@in_loop
+async def test_scrapes_are_counted_and_asking_for_the_count_is_none() -> None:
+    async with publisher(
+        PublisherContext(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
+    ) as served:
+        assert (await ask(served.port, "/scrapes"))[2] == '{"scrapes":0,"age_s":2.0}', "since the start"
+        await ask(served.port)
+        line, head, body = await ask(served.port, "/scrapes")
+        assert line == "HTTP/1.1 200 OK"
+        assert "Content-Type: application/json" in head
+        assert body == '{"scrapes":1,"age_s":4.0}'  # the clock of the test goes on 2 s a look: status, and here
 
 
-def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
+@in_loop
+async def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
     """Each snapshot takes the loop's time, and who gave up would be served before the one that still waits."""
     seen: list[int] = []
 
@@ -116,20 +112,18 @@ def test_scrapes_that_wait_together_get_one_page_in_each_format() -> None:
                     return True
         return False
 
-    async def run() -> None:
-        async with publisher(context(status), snapshot_s=LIMIT_S) as served:
-            with ThreadPoolExecutor(10) as threads:
-                formats = ["text/plain"] * 9 + ["application/openmetrics-text; version=1.0.0"]
-                answers = [threads.submit(scrape, served.port, accept) for accept in formats]
-                assert all_came(served.port, len(formats))  # the loop stands still until then
-                types = [await asyncio.wrap_future(answer) for answer in answers]
-        assert [each.partition(";")[0] for each in types] == [each.partition(";")[0] for each in formats]
-
-    asyncio.run(run())
+    async with publisher(context(status)) as served:
+        with ThreadPoolExecutor(10) as threads:
+            formats = ["text/plain"] * 9 + ["application/openmetrics-text; version=1.0.0"]
+            answers = [threads.submit(scrape, served.port, accept) for accept in formats]
+            assert all_came(served.port, len(formats))  # the loop stands still until then
+            types = [await asyncio.wrap_future(answer) for answer in answers]
+    assert [each.partition(";")[0] for each in types] == [each.partition(";")[0] for each in formats]
     assert len(seen) == 2
 
 
-def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_loop() -> None:
+@in_loop
+async def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_loop() -> None:
     turn, seen = 0, []
 
     def each_status() -> Iterator[DeviceStatus]:
@@ -143,20 +137,18 @@ def test_a_scrape_of_many_devices_takes_some_of_them_in_each_turn_of_the_loop() 
             turn += 1
             await asyncio.sleep(0)
 
-    async def run() -> None:
-        async with publisher(replace(context(), status_in_turn=each_status)) as served:
-            counting = asyncio.create_task(count_turns())
-            _, _, body = await ask(served.port)
-            counting.cancel()
-            assert f'imud_device_up{{device="imu{2 * DEVICES_PER_TURN}"' in str(body)
-
-    asyncio.run(run())
+    async with publisher(replace(context(), status_in_turn=each_status)) as served:
+        counting = asyncio.create_task(count_turns())
+        _, _, body = await ask(served.port)
+        counting.cancel()
+        assert f'imud_device_up{{device="imu{2 * DEVICES_PER_TURN}"' in str(body)
     assert max(Counter(seen).values()) == DEVICES_PER_TURN
     assert len(set(seen)) == 3
 
 
 @pytest.mark.parametrize("devices", [1, 3 * DEVICES_PER_TURN])
-def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are_looked_at(devices: int) -> None:
+@in_loop
+async def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are_looked_at(devices: int) -> None:
     now_ns = 5_000_000_000
     published: list[MetricsPublisher] = []
 
@@ -165,18 +157,15 @@ def test_a_loop_that_stood_still_is_late_though_it_ticks_while_devices_are_looke
             yield device(f"imu{number}")
             published[0].tick(now_ns)
 
-    async def run() -> None:
-        nonlocal now_ns
-        async with publisher(replace(context(), now_ns=lambda: now_ns, status_in_turn=each_status)) as served:
-            published.append(served)
-            now_ns += 1_500_000_000
-            _, _, body = await ask(served.port)
-            assert "imud_heartbeat_age_seconds 1.5\n" in body
-
-    asyncio.run(run())
+    async with publisher(replace(context(), now_ns=lambda: now_ns, status_in_turn=each_status)) as served:
+        published.append(served)
+        now_ns += 1_500_000_000
+        _, _, body = await ask(served.port)
+        assert "imud_heartbeat_age_seconds 1.5\n" in body
 
 
-def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
+@in_loop
+async def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
     """Samples that are in shared memory when the scrape comes; a device without a ring shows as such."""
     board = Board(tmp_path)
     newest = device(DEVICE, newest_seq=10)
@@ -187,97 +176,69 @@ def test_rings_of_the_daemon_are_read(tmp_path: Path) -> None:
         lambda: [newest], 1, lambda: board.now_ns, rings=board.context.rings, without_ring={"other"}
     )
 
-    async def run() -> None:
-        for motion in (True, False):
-            async with publisher(context, motion=motion) as served:
-                body = (await ask(served.port))[2]
-            assert f'imud_ring_written{{device="{DEVICE}"}} 1.0' in body
-            assert 'imud_ring_written{device="other"} 0.0' in body
-            assert (f'imud_motion_span_seconds{{device="{DEVICE}"}} 0.009' in body) == motion
-            assert (f'imud_acceleration_norm_meters_per_second_squared{{device="{DEVICE}"}}' in body) == motion
-
-    asyncio.run(run())
+    for motion in (True, False):
+        async with publisher(context, motion=motion) as served:
+            body = (await ask(served.port))[2]
+        assert f'imud_ring_written{{device="{DEVICE}"}} 1.0' in body
+        assert 'imud_ring_written{device="other"} 0.0' in body
+        assert (f'imud_motion_span_seconds{{device="{DEVICE}"}} 0.009' in body) == motion
+        assert (f'imud_acceleration_norm_meters_per_second_squared{{device="{DEVICE}"}}' in body) == motion
 
 
-def test_paths_and_methods() -> None:
-    async def run() -> None:
-        async with publisher(context()) as served:
-            assert "/metrics" in (await ask(served.port, "/"))[2]
-            assert (await ask(served.port, "/metrics?x=1"))[0] == "HTTP/1.1 200 OK"
-            assert (await ask(served.port, "/other"))[0] == "HTTP/1.1 404 Not Found"
-            assert (await ask(served.port, method="POST"))[0] == "HTTP/1.1 405 Method Not Allowed"
-            line, head, body = await ask(served.port, method="HEAD")
-            assert line == "HTTP/1.1 200 OK"
-            assert int(head.partition("Content-Length: ")[2].split()[0]) > 1000
-            assert body == ""
-
-    asyncio.run(run())
+@in_loop
+async def test_paths_and_methods() -> None:
+    async with publisher(context()) as served:
+        assert "/metrics" in (await ask(served.port, "/"))[2]
+        assert (await ask(served.port, "/metrics?x=1"))[0] == "HTTP/1.1 200 OK"
+        assert (await ask(served.port, "/other"))[0] == "HTTP/1.1 404 Not Found"
+        assert (await ask(served.port, method="POST"))[0] == "HTTP/1.1 405 Method Not Allowed"
+        line, head, body = await ask(served.port, method="HEAD")
+        assert line == "HTTP/1.1 200 OK"
+        assert int(head.partition("Content-Length: ")[2].split()[0]) > 1000
+        assert body == ""
 
 
-def test_a_loop_that_does_not_answer_gives_503() -> None:
-    async def run() -> None:
-        async with publisher(context()) as served:
-            stuck = await asyncio.to_thread(blocking_ask, served.port)  # answered while the loop is free: fine
-            assert b"200 OK" in stuck
-            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
-                connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
-                assert b"503 Service Unavailable" in read_all(connection)  # the loop is blocked by this very read
-
-    asyncio.run(run())
-
-
-def blocking_ask(port: int) -> bytes:
-    with socket.create_connection(("127.0.0.1", port), LIMIT_S) as connection:
-        connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
-        return read_all(connection)
-
-
-def test_close_while_a_scrape_waits_for_the_loop_does_not_wait() -> None:
-    async def run() -> None:
-        served = MetricsPublisher(MetricsSettings(port=0), context(), snapshot_s=60)
-        served.start()
+@in_loop
+async def test_a_loop_that_does_not_answer_gives_503() -> None:
+    async with publisher(context(), snapshot_s=0.05) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
             connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
-            loop = asyncio.get_running_loop()
-            before = loop.time()
-            served.close()
-            assert loop.time() - before < LIMIT_S
-            assert b"200" not in read_all(connection)
-
-    asyncio.run(run())
+            assert b"503 Service Unavailable" in read_all(connection)  # the loop is blocked by this very read
 
 
-def test_disabled_opens_nothing_and_closes_twice() -> None:
-    async def run() -> None:
-        async with publisher(context(), enabled=False) as served:
-            assert served.port == 0
-
-    asyncio.run(run())
-
-
-def test_port_in_use_is_told() -> None:
-    async def run() -> None:
-        async with publisher(context()) as first:
-            second = MetricsPublisher(MetricsSettings(port=first.port), context())
-            with pytest.raises(
-                ServerError, match=rf"127\.0\.0\.1 port {first.port}: Address already in use; .*ss -ltnp"
-            ):
-                second.start()
-            second.close()
-            assert (await ask(first.port))[0] == "HTTP/1.1 200 OK"
-
-    asyncio.run(run())
+@in_loop
+async def test_close_while_a_scrape_waits_for_the_loop_does_not_wait() -> None:
+    served = MetricsPublisher(MetricsSettings(port=0), context(), snapshot_s=3600)
+    served.start()
+    with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+        connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+        served.close()
+        assert b"200" not in read_all(connection)
 
 
-def test_port_is_free_after_close() -> None:
-    async def run() -> None:
-        async with publisher(context()) as first:
-            port = first.port
-            await ask(port)
-        async with publisher(context(), port=port) as second:
-            assert second.port == port
+@in_loop
+async def test_disabled_opens_nothing_and_closes_twice() -> None:
+    async with publisher(context(), enabled=False) as served:
+        assert served.port == 0
 
-    asyncio.run(run())
+
+@in_loop
+async def test_port_in_use_is_told() -> None:
+    async with publisher(context()) as first:
+        second = MetricsPublisher(MetricsSettings(port=first.port), context())
+        with pytest.raises(ServerError, match=rf"127\.0\.0\.1 port {first.port}: Address already in use; .*ss -ltnp"):
+            second.start()
+        second.close()
+        assert (await ask(first.port))[0] == "HTTP/1.1 200 OK"
+
+
+@in_loop
+async def test_port_is_free_after_close() -> None:
+    async with publisher(context()) as first:
+        port = first.port
+        await ask(port)
+    async with publisher(context(), port=port) as second:
+        assert second.port == port
 
 
 def test_row() -> None:

@@ -13,6 +13,7 @@ import pytest
 from imud.errors import ServerError
 from imud.publishers.metrics import scrape_server
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer, parse_request
+from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, read_all
 
 
@@ -33,79 +34,69 @@ async def hello(_request: HttpRequest) -> HttpResponse:
 
 
 @pytest.mark.parametrize("said", [b"", b"GET", b"GET /metrics HTTP/1.1\r\nHost: x\r\n"])
-def test_silent_or_half_requests_end_in_time(said: bytes) -> None:
-    async def run() -> None:
-        async with server(hello, connection_s=0.05) as served:
-            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as silent:
-                silent.sendall(said)
-                assert read_all(silent) == b""
-
-    asyncio.run(run())
+@in_loop
+async def test_silent_or_half_requests_end_in_time(said: bytes) -> None:
+    async with server(hello, connection_s=0.05) as served:
+        with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as silent:
+            silent.sendall(said)
+            assert read_all(silent) == b""
 
 
-def test_silent_clients_cannot_lock_out_a_scraper() -> None:
-    async def run() -> None:
-        async with server(hello, connections_max=4, connection_s=60) as served:
-            silent = [socket.create_connection(("127.0.0.1", served.port), LIMIT_S) for _ in range(12)]
-            for _ in range(3):
-                assert (await ask(served.port))[2] == "hello"
-            ended = 0
-            for connection in silent[:8]:  # the oldest were ended for the newer ones
-                ended += read_all(connection) == b""
-            assert ended == 8
-            for connection in silent:
-                connection.close()
-
-    asyncio.run(run())
+@in_loop
+async def test_silent_clients_cannot_lock_out_a_scraper() -> None:
+    async with server(hello, connections_max=4, connection_s=60) as served:
+        silent = [socket.create_connection(("127.0.0.1", served.port), LIMIT_S) for _ in range(12)]
+        for _ in range(3):
+            assert (await ask(served.port))[2] == "hello"
+        ended = 0
+        for connection in silent[:8]:  # the oldest were ended for the newer ones
+            ended += read_all(connection) == b""
+        assert ended == 8
+        for connection in silent:
+            connection.close()
 
 
-def test_a_client_that_does_not_read_its_answer_is_ended() -> None:
-    async def much(_request: HttpRequest) -> HttpResponse:
+@in_loop
+async def test_a_client_that_does_not_read_its_answer_is_ended() -> None:
+    asked: list[HttpRequest] = []
+
+    async def much(request: HttpRequest) -> HttpResponse:
+        asked.append(request)
         return HttpResponse("200 OK", b"x" * 50_000_000)
 
-    async def run() -> None:
-        async with server(much, connection_s=0.2) as served:
-            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as deaf:
-                deaf.sendall(b"GET / HTTP/1.1\r\n\r\n")
-                await open_connections(served, 1)
-                await open_connections(served, 0)
-                assert len(read_all(deaf)) < 50_000_000  # what the kernel had taken already
-
-    asyncio.run(run())
-
-
-async def open_connections(served: ScrapeServer, count: int) -> None:
-    """Wait until so many connections are open."""
-    async with asyncio.timeout(LIMIT_S):
-        while served.connections != count:
-            await asyncio.sleep(0.001)
+    async with server(much, connection_s=1.0) as served:
+        with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as deaf:
+            deaf.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            async with asyncio.timeout(LIMIT_S):
+                while not asked or served.connections:
+                    await asyncio.sleep(0.001)
+            assert len(read_all(deaf)) < 50_000_000  # what the kernel had taken already
 
 
 @pytest.mark.parametrize("head", [b"\x00\xff\r\n\r\n", b"GET /\r\n\r\n", b"GET / SPDY/3\r\n\r\n", b"\r\n\r\n"])
-def test_what_is_no_http_gets_400(head: bytes) -> None:
-    async def run() -> None:
-        async with server(hello) as served:
-            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
-                connection.sendall(head)
-                assert await asyncio.to_thread(read_all, connection) == (
-                    b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n"
-                    b"Content-Length: 18\r\nConnection: close\r\n\r\nexpected HTTP/1.1\n"
-                )
-
-    asyncio.run(run())
+@in_loop
+async def test_what_is_no_http_gets_400(head: bytes) -> None:
+    async with server(hello) as served:
+        with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+            connection.sendall(head)
+            assert await asyncio.to_thread(read_all, connection) == (
+                b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n"
+                b"Content-Length: 18\r\nConnection: close\r\n\r\nexpected HTTP/1.1\n"
+            )
 
 
-def test_too_long_a_request_is_ended() -> None:
-    async def run() -> None:
-        async with server(hello) as served:
-            with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
-                connection.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * 4 * scrape_server.REQUEST_BYTES_MAX)
-                assert await asyncio.to_thread(read_all, connection) == b""
-
-    asyncio.run(run())
+@in_loop
+async def test_too_long_a_request_is_ended() -> None:
+    async with server(hello) as served:
+        with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+            connection.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * 4 * scrape_server.REQUEST_BYTES_MAX)
+            assert await asyncio.to_thread(read_all, connection) == b""
 
 
-def test_without_descriptors_the_server_pauses_instead_of_turning_in_circles(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop
+async def test_without_descriptors_the_server_pauses_instead_of_turning_in_circles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     accept, calls_s = socket.socket.accept, list[float]()
 
     def refuse_twice(listener: socket.socket) -> tuple[socket.socket, Any]:
@@ -114,13 +105,10 @@ def test_without_descriptors_the_server_pauses_instead_of_turning_in_circles(mon
             raise OSError(errno.EMFILE, "Too many open files")
         return accept(listener)
 
-    async def run() -> None:
-        async with server(hello) as served:
-            monkeypatch.setattr(scrape_server, "ACCEPT_PAUSE_S", 0.05)
-            monkeypatch.setattr(socket.socket, "accept", refuse_twice)
-            assert (await ask(served.port))[2] == "hello"
-
-    asyncio.run(run())
+    async with server(hello) as served:
+        monkeypatch.setattr(scrape_server, "ACCEPT_PAUSE_S", 0.05)
+        monkeypatch.setattr(socket.socket, "accept", refuse_twice)
+        assert (await ask(served.port))[2] == "hello"
     first_s, second_s, third_s = calls_s
     assert second_s - first_s >= 0.05
     assert third_s - second_s >= 0.05
