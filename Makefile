@@ -24,7 +24,7 @@
 # make lab-debian   boots Debian 12 and 13 with systemd and checks the package there (as root; tests/lab_debian/README.md)
 # make lab-debian-suite   the whole test suite on the own Python, compiler and broker of Debian 13
 # make lab-arm64    the same short on emulated arm64, and unit tests on its Python
-# make attack hostile clients beside a 1 kHz device (ARGS=--short: 80 s; ARGS="--scheduling unit")
+# make attack hostile clients beside a 1 kHz device (ARGS=--short: 70 s; ARGS="--scheduling unit")
 SHELL := /bin/sh
 PYTHON ?= python3
 VENV := .venv

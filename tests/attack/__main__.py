@@ -17,7 +17,7 @@ from tests.attack.attacks import ATTACKS, Attack, Done
 from tests.attack.bounds import FDS_LEFT_LIMIT, FDS_LIMIT, P99_LIMIT_MS, RSS_LIMIT_MB, Measured, exceeded
 from tests.attack.stage import GOOD_UID, HOSTILE_UIDS, LOST_SETTLE_S, PRIORITY, AttackedDaemon, Scheduling
 
-SHORT_S, LONG_S = 2.0, 8.0
+SHORT_S, LONG_S = 1.5, 8.0
 HEAD = (
     f"{'attack':<15}{'clients':>8}{'connects':>9}{'requests':>10}{'MB sent':>8}{'samples':>8}{'lost':>6}{'port':>6}"
     f"{'ledger':>7}{'p50 ms':>8}{'p99 ms':>8}{'max ms':>8}{'smp p99':>8}{'RSS MB':>8}{'fds':>6}{'left':>5}{'CPU %':>6}"
@@ -155,7 +155,7 @@ def main() -> int:
     """Run the attacks."""
     parser = argparse.ArgumentParser(prog="make attack")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(ATTACKS)}; all when left out")
-    parser.add_argument("--short", action="store_true", help="at most 90 s in all, delays not judged, for CI")
+    parser.add_argument("--short", action="store_true", help="at most 75 s in all, delays not judged, for CI")
     parser.add_argument("--seconds", type=float, help="of each attack")
     parser.add_argument(
         "--scheduling", type=Scheduling, choices=list(Scheduling), default=Scheduling.REAL_TIME,

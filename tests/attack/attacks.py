@@ -69,7 +69,6 @@ def end(children: list[subprocess.Popen[str]], seconds: float) -> Done:
 
 
 def hostile(stage: AttackedDaemon, seconds: float, kind: str) -> Done:
-    """Hostile clients alone."""
     return end(start(stage, seconds, kind), seconds)
 
 
@@ -85,7 +84,6 @@ def replug(stage: AttackedDaemon, seconds: float) -> Done:
 
 
 def hang_ups(stage: AttackedDaemon, seconds: float) -> int:
-    """A flood of SIGHUP; how many."""
     end_s, count = monotonic() + seconds, 0
     while monotonic() < end_s and stage.alive:
         stage.signal(signal.SIGHUP)
@@ -95,7 +93,6 @@ def hang_ups(stage: AttackedDaemon, seconds: float) -> int:
 
 
 def reloads(stage: AttackedDaemon, seconds: float) -> Done:
-    """A flood of SIGHUP alone."""
     return Done(deeds=Deeds(requests=hang_ups(stage, seconds)))
 
 

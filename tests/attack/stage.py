@@ -68,17 +68,14 @@ class Scheduling(Enum):
 
     @property
     def daemon_cores(self) -> set[int]:
-        """Where the daemon may run."""
         return set(CORES) if self is Scheduling.UNIT else SERVER_CORE
 
     @property
     def hostile_cores(self) -> set[int]:
-        """Where hostile clients may run."""
         return set(CORES) if self is Scheduling.UNIT else REST_CORES
 
     @property
     def hostile_nice(self) -> int:
-        """Of hostile clients."""
         return 0 if self is Scheduling.UNIT else 10
 
 
@@ -101,13 +98,11 @@ class IdlePort:
         self.plug()
 
     def plug(self) -> None:
-        """Make the port."""
         self._fds = pty.openpty()
         tty.setraw(self._fds[1])
         self.path.symlink_to(os.ttyname(self._fds[1]))
 
     def unplug(self) -> None:
-        """Take it away."""
         self.path.unlink()
         for fd in self._fds:
             os.close(fd)
@@ -127,7 +122,6 @@ class LogPipe:
 
     @property
     def waiting_bytes(self) -> int:
-        """What is in the pipe."""
         size = fcntl.ioctl(self._reader, termios.FIONREAD, bytes(4))
         return int.from_bytes(size, sys.byteorder)
 
@@ -146,7 +140,6 @@ class LogPipe:
             os.close(writer)
 
     def read_on(self) -> None:
-        """Read again."""
         self._reads.set()
 
     def __enter__(self) -> Self:
@@ -232,27 +225,22 @@ class AttackedDaemon:
 
     @property
     def pid(self) -> int:
-        """The daemon's process."""
         return self._daemon.popen.pid
 
     @property
     def alive(self) -> bool:
-        """Whether the daemon runs."""
         return self._daemon.popen.poll() is None
 
     @property
     def rss_mb(self) -> float:
-        """The daemon's resident memory."""
         return rss_mb(self.pid)
 
     @property
     def fds(self) -> int:
-        """The daemon's open descriptors."""
         return len(os.listdir(f"/proc/{self.pid}/fd"))
 
     @property
     def cpu_ns(self) -> int:
-        """CPU time of the daemon so far."""
         return cpu_ns(self.pid)
 
     def figures(self) -> dict[str, Any]:
@@ -281,7 +269,6 @@ class AttackedDaemon:
         return above
 
     def signal(self, number: int) -> None:
-        """Send the daemon a signal."""
         os.kill(self.pid, number)
 
     def spoil_configuration(self) -> None:
@@ -304,7 +291,6 @@ class AttackedDaemon:
         raise TimeoutError(f"the daemon did not change to {devices} more devices within {REPLUG_LIMIT_S:g} s")
 
     def status(self) -> dict[str, Any]:
-        """The state of the socket."""
         with Client(str(self.socket)) as client:
             found = client.call("status")["socket"]
         assert isinstance(found, dict)
