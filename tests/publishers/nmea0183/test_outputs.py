@@ -4,7 +4,9 @@ import asyncio
 import os
 import socket
 import tty
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 
@@ -13,8 +15,9 @@ from imud.errors import ServerError
 from imud.publishers.nmea0183.outputs import CLIENTS_MAX, RETRY_FIRST_NS, STUCK_NS, SerialOutput, TcpOutput, UdpOutput
 from imud.publishers.nmea0183.outputs import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
+from tests.support.socket_rig import in_context
 
-LIMIT_S = 10.0
+LIMIT_S = 60.0
 ONE = b"$HEHDT,98.3,T*2F\r\n"
 BUSY = b"$" + b"x" * 60_000 + b"\r\n"
 
@@ -26,25 +29,38 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0)
 
 
-async def connected(server: TcpOutput) -> socket.socket:
-    """A client that the server has."""
-    before = server.status().readers
-    sock = socket.create_connection(("127.0.0.1", server.port), timeout=LIMIT_S)
-    await until(lambda: server.status().readers == before + 1)
-    return sock
+class Server(TcpOutput):
+    """A server on a free port, with a clock of its own."""
+
+    def __init__(self) -> None:
+        self.clock, self.clients = VirtualClock(), list[socket.socket]()
+        super().__init__("127.0.0.1", 0, self.clock.now_ns)
+        self.open()
+
+    def connect(self) -> socket.socket:
+        self.clients.append(socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S))
+        return self.clients[-1]
+
+    async def connected(self) -> socket.socket:
+        """A client that the server has."""
+        before, sock = self.status().readers, self.connect()
+        await until(lambda: self.status().readers == before + 1)
+        return sock
 
 
-def server(clock: VirtualClock) -> TcpOutput:
-    """A server on a free port."""
-    made = TcpOutput("127.0.0.1", 0, clock.now_ns)
-    made.open()
-    return made
+@asynccontextmanager
+async def serving(_folder: Path) -> AsyncIterator[Server]:
+    made = Server()
+    yield made
+    for client in made.clients:
+        client.close()
+    made.close()
+    made.close()
 
 
-@in_loop
-async def test_every_client_gets_every_sentence() -> None:
-    made = server(VirtualClock())
-    first, second = await connected(made), await connected(made)
+@in_context("made", serving)
+async def test_every_client_gets_every_sentence(made: Server) -> None:
+    first, second = await made.connected(), await made.connected()
     made.put(ONE * 2)
     assert first.recv(100) == second.recv(100) == ONE * 2
     assert made.status().sent == 4
@@ -52,28 +68,21 @@ async def test_every_client_gets_every_sentence() -> None:
     for sock in (first, second):
         sock.close()
     await until(lambda: made.status().readers == 0)
-    made.close()
-    made.close()
 
 
-@in_loop
-async def test_what_a_client_sends_is_ignored() -> None:
-    made = server(VirtualClock())
-    client = await connected(made)
+@in_context("made", serving)
+async def test_what_a_client_sends_is_ignored(made: Server) -> None:
+    client = await made.connected()
     client.sendall(b"?WATCH={}\r\n" * 1000)
     for _ in range(20):
         await asyncio.sleep(0)
     made.put(ONE)
     assert client.recv(100) == ONE
-    client.close()
-    made.close()
 
 
-@in_loop
-async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconnected() -> None:
-    clock = VirtualClock()
-    made = server(clock)
-    client = await connected(made)
+@in_context("made", serving)
+async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconnected(made: Server) -> None:
+    client = await made.connected()
     for _ in range(200):
         made.put(BUSY)
     status = made.status()
@@ -90,37 +99,31 @@ async def test_a_client_that_does_not_read_loses_whole_sentences_and_is_disconne
     assert bytes(got) == BUSY * status.sent
     for _ in range(200):
         made.put(BUSY)
-    clock.advance(STUCK_NS)
-    made.tick(clock.now_ns())
+    made.clock.advance(STUCK_NS)
+    made.tick(made.clock.now_ns())
     assert made.status().readers == 1
-    clock.advance(1)
-    made.tick(clock.now_ns())
+    made.clock.advance(1)
+    made.tick(made.clock.now_ns())
     assert made.status().readers == 0
-    client.close()
-    made.close()
 
 
-@in_loop
-async def test_a_client_stays_while_there_is_nothing_to_send() -> None:
-    clock = VirtualClock()
-    made = server(clock)
-    client = await connected(made)
+@in_context("made", serving)
+async def test_a_client_stays_while_there_is_nothing_to_send(made: Server) -> None:
+    client = await made.connected()
     made.put(ONE)
     assert client.recv(100) == ONE
-    clock.advance(100 * STUCK_NS)  # a device that is away, or a sentence of 0.01 Hz
-    made.tick(clock.now_ns())
+    made.clock.advance(100 * STUCK_NS)  # a device that is away, or a sentence of 0.01 Hz
+    made.tick(made.clock.now_ns())
     assert made.status().readers == 1
     made.put(ONE)
     assert client.recv(100) == ONE
-    client.close()
-    made.close()
 
 
-@in_loop
-async def test_one_client_too_many_is_refused() -> None:
-    made = server(VirtualClock())
-    clients = [await connected(made) for _ in range(CLIENTS_MAX)]
-    one_more = socket.create_connection(("127.0.0.1", made.port), timeout=LIMIT_S)
+@in_context("made", serving)
+async def test_one_client_too_many_is_refused(made: Server) -> None:
+    for _ in range(CLIENTS_MAX):
+        await made.connected()
+    one_more = made.connect()
     one_more.setblocking(False)
     closed: list[bytes] = []
 
@@ -134,17 +137,12 @@ async def test_one_client_too_many_is_refused() -> None:
     await until(is_closed)
     assert closed == [b""]
     assert made.status().readers == CLIENTS_MAX
-    for sock in (*clients, one_more):
-        sock.close()
-    made.close()
 
 
-@in_loop
-async def test_a_port_that_is_taken() -> None:
-    made = server(VirtualClock())
+@in_context("made", serving)
+async def test_a_port_that_is_taken(made: Server) -> None:
     with pytest.raises(ServerError, match=r"nmea0183\.tcp_port"):
         TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
-    made.close()
 
 
 def test_datagrams() -> None:

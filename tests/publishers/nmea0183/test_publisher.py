@@ -5,9 +5,10 @@ import json
 import shutil
 import socket
 import subprocess
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from math import radians
+from typing import Any
 
 import msgspec
 import pynmea2
@@ -25,10 +26,10 @@ from imud.publishers.nmea0183.sentences import Formatter, HeadingReference, make
 from imud.sample import Sample, Sync, Vector3
 from imud.units import NS_PER_MS, NS_PER_S
 from tests.support.event_loops import VirtualClock, in_loop
-from tests.support.socket_rig import device_status
+from tests.support.socket_rig import device_status, in_context
 from tests.support.surroundings import free_port
 
-LIMIT_S = 20.0
+LIMIT_S = 60.0
 NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (make bench-deps)"
 GPSD_VERSION = "" if NO_GPSD else subprocess.check_output(["gpsd", "-V"], text=True).split()[1]
 LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
@@ -71,10 +72,6 @@ class OutputBench:
         self.clock.advance(REFERENCE_NS)
         self.output.tick(self.clock.now_ns())
 
-    def reader(self) -> socket.socket:
-        """A client of the server."""
-        return socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S)
-
     @property
     def port(self) -> int:
         return int(self.output.status()[0].name.rpartition(":")[2])
@@ -96,96 +93,87 @@ class OutputBench:
             )  # fmt: skip
         self.output.publish(Batch(device, 0, samples, frame))
 
+    async def connect(self) -> None:
+        """Connect a client to the server."""
+        self.reader = socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S)
+        async with asyncio.timeout(LIMIT_S):
+            while not self.output.status()[0].readers:
+                await asyncio.sleep(0)
 
-async def received(bench: OutputBench, reader: socket.socket) -> list[str]:
-    """Sentences that have come, without checksums, which are checked."""
-    data = reader.recv(65536).decode()
-    sentences = data.splitlines()
-    for one in sentences:
-        pynmea2.parse(one, check=True)
-    return [one.partition("*")[0].removeprefix("$") for one in sentences]
-
-
-async def ready_reader(bench: OutputBench) -> socket.socket:
-    """A client that the server has accepted."""
-    reader = bench.reader()
-    async with asyncio.timeout(LIMIT_S):
-        while not bench.output.status()[0].readers:
-            await asyncio.sleep(0)
-    return reader
+    def received(self) -> list[str]:
+        """Sentences that the client has got, without checksums, which are checked."""
+        sentences = self.reader.recv(65536).decode().splitlines()
+        for one in sentences:
+            pynmea2.parse(one, check=True)
+        return [one.partition("*")[0].removeprefix("$") for one in sentences]
 
 
-@in_loop
-async def test_each_sentence_has_its_own_rate() -> None:
-    bench = OutputBench(sentences={"HDT": 10.0, "ROT": 4.0})
-    reader = await ready_reader(bench)
-    for _ in range(100):
-        bench.publish(10)
-    got = await received(bench, reader)
-    assert got.count("HCHDT,45.0,T") == 10
-    assert got.count("TIROT,0.0,A") == 4
-    assert len(got) == 14
-    reader.close()
+@asynccontextmanager
+async def sending(**settings: Any) -> AsyncIterator[OutputBench]:
+    """An output with one client."""
+    bench = OutputBench(**settings)
+    await bench.connect()
+    yield bench
+    bench.reader.close()
     bench.output.close()
 
 
+def in_output(**settings: Any) -> Callable[[Callable[..., Awaitable[None]]], Callable[..., None]]:
+    """Run a test in a loop of its own. Its argument `bench` is an output with these settings and one client."""
+    return in_context("bench", lambda _folder: sending(**settings))
+
+
+@in_output(sentences={"HDT": 10.0, "ROT": 4.0})
+async def test_each_sentence_has_its_own_rate(bench: OutputBench) -> None:
+    for _ in range(100):
+        bench.publish(10)
+    got = bench.received()
+    assert got.count("HCHDT,45.0,T") == 10
+    assert got.count("TIROT,0.0,A") == 4
+    assert len(got) == 14
+
+
 @pytest.mark.parametrize("convention", [None, *Convention])
-def test_values_are_those_of_ships_whatever_the_axes_are(convention: Convention | None) -> None:
-    @in_loop
-    async def scene() -> None:
-        bench = OutputBench(sentences={"PASHR": 1.0, "HDG": 1.0, "XDR": 1.0, "ROT": 1.0})
-        reader = await ready_reader(bench)
-        frame = published_frame(None, convention, None, AS_SENT.device)
-        euler, gyro_z = LEFT_45, radians(-2.0)
-        if frame.rotation is not None:
-            as_sent = Sample("bow", 1, 0, 0, Sync.ARRIVAL, 0, 0, euler_rad=euler, gyro_rad_s=(0.0, 0.0, gyro_z))
-            turned = frame.rotation.sample(as_sent)
-            assert turned.euler_rad is not None
-            assert turned.gyro_rad_s is not None
-            euler, gyro_z = turned.euler_rad, turned.gyro_rad_s[2]
-        bench.publish(euler=euler, frame=frame, gyro_z=gyro_z)
-        got = await received(bench, reader)
-        assert got[0] == "PASHR,000001.001,45.00,T,+10.00,+5.00,,,,,0,0"
-        assert got[1] == "HCHDG,42.0,,,3.0,E"
-        rate_deg_min = float(got[3].split(",")[1])
-        assert 115 < rate_deg_min < 122  # 2° a second to starboard about the body's z axis
-        reader.close()
-        bench.output.close()
-
-    scene()
+@in_output(sentences={"PASHR": 1.0, "HDG": 1.0, "XDR": 1.0, "ROT": 1.0})
+async def test_values_are_those_of_ships_whatever_the_axes_are(
+    bench: OutputBench, convention: Convention | None
+) -> None:
+    frame = published_frame(None, convention, None, AS_SENT.device)
+    euler, gyro_z = LEFT_45, radians(-2.0)
+    if frame.rotation is not None:
+        as_sent = Sample("bow", 1, 0, 0, Sync.ARRIVAL, 0, 0, euler_rad=euler, gyro_rad_s=(0.0, 0.0, gyro_z))
+        turned = frame.rotation.sample(as_sent)
+        assert turned.euler_rad is not None
+        assert turned.gyro_rad_s is not None
+        euler, gyro_z = turned.euler_rad, turned.gyro_rad_s[2]
+    bench.publish(euler=euler, frame=frame, gyro_z=gyro_z)
+    got = bench.received()
+    assert got[:2] == ["PASHR,000001.001,45.00,T,+10.00,+5.00,,,,,0,0", "HCHDG,42.0,,,3.0,E"]
+    rate_deg_min = float(got[3].split(",")[1])
+    assert 115 < rate_deg_min < 122  # 2° a second to starboard about the body's z axis
 
 
-@in_loop
-async def test_pynmea2_reads_the_attitude_of_pashr() -> None:
-    bench = OutputBench(sentences={"PASHR": 1.0})
-    reader = await ready_reader(bench)
+@in_output(sentences={"PASHR": 1.0})
+async def test_pynmea2_reads_the_attitude_of_pashr(bench: OutputBench) -> None:
     bench.publish()
     bench.publish(1000, euler=(radians(-20.5), radians(-7.25), radians(100.0)))
-    first, second = (pynmea2.parse(line, check=True) for line in reader.recv(65536).decode().splitlines())
+    first, second = (pynmea2.parse(line, check=True) for line in bench.reader.recv(65536).decode().splitlines())
     for found, heading, roll, pitch in ((first, 45.0, 10.0, 5.0), (second, 260.0, -20.5, -7.25)):
         assert isinstance(found, ASHRATT)
         assert (found.true_heading, found.is_true_heading) == (heading, "T")
         assert (found.roll, found.pitch) == (roll, pitch)
-    reader.close()
-    bench.output.close()
 
 
-@in_loop
-async def test_the_rate_of_turn_is_the_mean_since_the_last() -> None:
-    bench = OutputBench(sentences={"ROT": 10.0})
-    reader = await ready_reader(bench)
+@in_output(sentences={"ROT": 10.0})
+async def test_the_rate_of_turn_is_the_mean_since_the_last(bench: OutputBench) -> None:
     bench.publish(1, euler=(0.0, 0.0, 0.0))
     for number in range(100):  # vibration of 500 Hz about a turn of 1° a second to starboard
         bench.publish(1, euler=(0.0, 0.0, 0.0), gyro_z=radians(-1.0 + (20.0 if number % 2 else -20.0)))
-    assert await received(bench, reader) == ["TIROT,0.0,A", "TIROT,60.0,A"]
-    reader.close()
-    bench.output.close()
+    assert bench.received() == ["TIROT,0.0,A", "TIROT,60.0,A"]
 
 
-@in_loop
-async def test_the_reference_is_looked_up_again() -> None:
-    bench = OutputBench(heading=Heading.RELATIVE, declination_deg=None, sentences={"HDT": 100.0})
-    reader = await ready_reader(bench)
+@in_output(heading=Heading.RELATIVE, declination_deg=None, sentences={"HDT": 100.0})
+async def test_the_reference_is_looked_up_again(bench: OutputBench) -> None:
     bench.publish()
     statuses = bench.context.status()
     known = FrameStatus("", "device", "", "", Heading.TRUE, None, {})
@@ -193,9 +181,7 @@ async def test_the_reference_is_looked_up_again() -> None:
     bench.publish(20)
     bench.tick()
     bench.publish(20)
-    assert await received(bench, reader) == ["HCHDT,45.0,T"]
-    reader.close()
-    bench.output.close()
+    assert bench.received() == ["HCHDT,45.0,T"]
 
 
 @in_loop
@@ -215,11 +201,11 @@ async def test_the_only_device_is_sent_and_of_several_the_named_one(caplog: pyte
     assert named.asked.of == {}
     named.output.add_device("mast", 1)
     named.tick()
-    reader = await ready_reader(named)
+    await named.connect()
     named.publish()
     named.publish(device="mast")
-    assert await received(named, reader) == ["HCHDT,45.0,T"]
-    reader.close()
+    assert named.received() == ["HCHDT,45.0,T"]
+    named.reader.close()
     named.output.close()
 
 
@@ -304,6 +290,7 @@ async def reports(port: int, bench: OutputBench, enough: int) -> tuple[list[dict
     return found, taken
 
 
+@pytest.mark.live
 @pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
 @in_loop
 async def test_gpsd_takes_all_sentences_and_reports_what_it_knows_of_them() -> None:
