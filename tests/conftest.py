@@ -5,9 +5,14 @@ condition with `wait_until`.
 """
 
 import time
-from typing import Final
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import pytest
+
+if TYPE_CHECKING:
+    from tests.support.rings import Board
 
 LIVE_TIMEOUT_S: Final = 300
 """Time limit of a `live` test: several waits of 60 s."""
@@ -54,3 +59,13 @@ def _no_waiting(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
     """Let `time.sleep` fail in a test of logic if it waits for a fixed duration."""
     if not is_live(request.node):
         monkeypatch.setattr(time, "sleep", _refuse_to_wait)
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> "Iterator[Board]":
+    """Yield a publisher of shared memory in a folder of its own."""
+    from tests.support.rings import Board
+
+    made = Board(tmp_path)
+    yield made
+    made.publisher.close()

@@ -1,7 +1,6 @@
 import mmap
 import os
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,27 +12,16 @@ import pytest
 from imud.client.ring import Ring, default_directory
 from imud.errors import LinkMissing, ServerError
 from imud.formats.ring import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode_ledger_block
-from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, encode_slot
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES
 from imud.publishers.socket.waker import Waker
-from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, slot_at
 from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
-
-
-@pytest.fixture(name="board")
-def _board(tmp_path: Path) -> Iterator[Board]:
-    board = Board(tmp_path)
-    yield board
-    board.publisher.close()
 
 
 @pytest.fixture(name="ring")
 def _ring(board: Board) -> Iterator[Ring]:
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         yield ring
-
-
-def slot_at(seq: int) -> int:
-    return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
 
 
 def numbers(ring: Ring) -> tuple[list[int], int]:
@@ -191,24 +179,6 @@ def test_every_sample_is_read_or_missed(board: Board, ring: Ring, seed: int) -> 
             seen, missed = seen + len(got), missed + lost
             assert seen + missed == last
     assert ring.missed == missed
-
-
-def reseal(slot: bytes, seq: int) -> bytes:
-    """`slot` with another number and a CRC that matches."""
-    body = struct.pack("<Q", seq) + slot[8:CRC_OFFSET]
-    return body + zlib.crc32(body).to_bytes(4, "little")
-
-
-WHOLE = encode_slot(make_sample(2), 3)
-TORN = {
-    "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:],
-    "number not there yet": bytes(8) + WHOLE[8:],
-    "payload of another sample": WHOLE[:8] + encode_slot(make_sample(66), 3)[8:],
-    "payload half old": WHOLE[:128] + encode_slot(make_sample(66), 3)[128:],
-    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]),
-    "whole, but of an earlier round": reseal(WHOLE, 2 + SLOTS),
-    "never written": bytes(SLOT_BYTES),
-}
 
 
 @pytest.mark.parametrize("name", TORN)

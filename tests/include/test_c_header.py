@@ -23,11 +23,11 @@ from imud.formats.ring import (
     encode_header,
     encode_ledger_block,
 )
-from imud.formats.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES, encode_slot
+from imud.formats.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS, SYNC_CODES
 from imud.ledger import LEDGER_FIELDS
 from imud.publishers.socket.waker import Waker
 from imud.sample import Sample
-from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
+from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, slot_at
 from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
 
 INCLUDE = Path(__file__).parents[2] / "imud" / "include"
@@ -61,13 +61,6 @@ def _build(tmp_path_factory: pytest.TempPathFactory) -> Build:
         return program
 
     return build
-
-
-@pytest.fixture(name="board")
-def _board(tmp_path: Path) -> Iterator[Board]:
-    board = Board(tmp_path)
-    yield board
-    board.publisher.close()
 
 
 class Reader:
@@ -182,22 +175,6 @@ def test_slow_reader_learns_exactly_what_it_missed(board: Board, reader: Reader,
     for seq in range(first + 1, count + 1):
         assert reader.next() == (seq, 0)
     assert reader.next() == (0, 0)
-
-
-def slot_at(seq: int) -> int:
-    return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
-
-
-WHOLE = encode_slot(make_sample(2), 3)
-TORN = {
-    "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:],
-    "number not there yet": bytes(8) + WHOLE[8:],
-    "payload of another sample": WHOLE[:8] + encode_slot(make_sample(66), 3)[8:],
-    "payload half old": WHOLE[:128] + encode_slot(make_sample(66), 3)[128:],
-    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]),
-    "whole, but of another round": encode_slot(make_sample(2 + SLOTS), 3),
-    "never written": bytes(SLOT_BYTES),
-}
 
 
 @pytest.mark.parametrize("name", TORN)

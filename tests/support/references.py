@@ -4,7 +4,7 @@ The tables of docs/configuration.md come from the settings classes, those of doc
 and docs/settings.md from the drivers' actions, calibrations and device settings, and those of
 docs/shm.md from the layout of shared memory; the one of docs/monitoring.md comes from the rules for Prometheus.
 
-docs/socket.schema.json has the JSON Schema of every message of the UNIX socket (tests/support/socket_schema.py).
+docs/socket.schema.json has the JSON Schema of every message of the UNIX socket (tests/publishers/socket/schema.py).
 """
 
 import ast
@@ -42,8 +42,8 @@ from imud.signals.line_actions import RESET, TRIGGER
 from imud.utc.source import RmcSettings
 from tests.bench import clock_figures
 from tests.monitoring.alert_table import alert_table
+from tests.publishers.socket.schema import socket_schema
 from tests.support.files import ROOT
-from tests.support.socket_schema import socket_schema
 
 # --- docs/configuration.md --------------------------------------------------------------------------------------------
 

@@ -1,13 +1,14 @@
 """Shared memory in a folder of its own, written by a publisher whose clock and ledger the test moves."""
 
 import struct
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
-from imud.formats.ring import OFFSETS
-from imud.formats.slot import SlotField
+from imud.formats.ring import HEADER_BYTES, OFFSETS
+from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, SlotField, encode_slot
 from imud.ledger import Ledger
 from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.sample import Sample, Sync
@@ -17,6 +18,11 @@ SLOTS = 64
 START_NS = 5_000_000_000
 
 
+def slot_at(seq: int) -> int:
+    """Return the offset of the slot of a sequence number."""
+    return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
+
+
 def make_sample(seq: int, device: str = DEVICE) -> Sample:
     """A sample whose every part says which one it is."""
     value = float(seq)
@@ -24,6 +30,25 @@ def make_sample(seq: int, device: str = DEVICE) -> Sample:
         device, seq, seq * 1_000_000, 1000 + seq % 1000, Sync.REGRESSION, seq * 1_000_000 + 500, 10**18 + seq,
         accel_m_s2=(value, value + 0.25, value + 0.5), gyro_rad_s=(-value, 0.0, value), temperature_c=value / 8,
     )  # fmt: skip
+
+
+def _reseal(slot: bytes, seq: int) -> bytes:
+    """Return `slot` with another number and a CRC that matches."""
+    body = struct.pack("<Q", seq) + slot[8:CRC_OFFSET]
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+WHOLE = encode_slot(make_sample(2), 3)
+TORN = {
+    "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:],
+    "number not there yet": bytes(8) + WHOLE[8:],
+    "payload of another sample": WHOLE[:8] + encode_slot(make_sample(66), 3)[8:],
+    "payload half old": WHOLE[:128] + encode_slot(make_sample(66), 3)[128:],
+    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]),
+    "whole, but of another round": _reseal(WHOLE, 2 + SLOTS),
+    "never written": bytes(SLOT_BYTES),
+}
+"""Slots of sample 2 that a reader must not take, by what is wrong."""
 
 
 class Board:

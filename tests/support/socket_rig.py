@@ -41,7 +41,7 @@ from imud.publishers.socket.publisher import SocketServer, SocketSettings
 from imud.publishers.socket.rpc import METHODS
 from imud.runtime import event_loop
 from imud.sample import Sample, Sync
-from tests.support.socket_schema import MessageChecker
+from tests.publishers.socket.schema import MessageChecker
 
 T = TypeVar("T")
 CHECKER = MessageChecker()

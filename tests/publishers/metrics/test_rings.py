@@ -106,12 +106,6 @@ def look(board: Board, newest: int, *, motion: bool = True) -> RingView:
     return reader.look({DEVICE: str(board.path)}, {DEVICE: newest}, board.now_ns)[DEVICE]
 
 
-@pytest.fixture
-def board(tmp_path: Path) -> Board:
-    """A ring of 64 slots; sample n is of n ms and has n m/s² on X."""
-    return Board(tmp_path)
-
-
 def test_a_ring_that_has_wrapped_is_read_in_order(board: Board) -> None:
     board.publish(range(1, 151))
     board.now_ns = 160 * NS_PER_MS

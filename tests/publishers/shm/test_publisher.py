@@ -40,23 +40,12 @@ from imud.publishers import PUBLISHERS
 from imud.publishers.shm import ring
 from imud.publishers.shm.publisher import PUBLISHER, ShmPublisher, ShmSettings
 from tests.support.files import ROOT
-from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
-
-
-@pytest.fixture(name="board")
-def _board(tmp_path: Path) -> Iterator[Board]:
-    board = Board(tmp_path)
-    yield board
-    board.publisher.close()
+from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, slot_at
 
 
 def make(folder: Path, **settings: Any) -> ShmPublisher:
     context = PublisherContext(list, 1, lambda: START_NS)
     return ShmPublisher(ShmSettings(directory=str(folder), slots=SLOTS, **settings), context)
-
-
-def slot_at(seq: int) -> int:
-    return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
 
 
 def test_row() -> None:
@@ -334,7 +323,7 @@ OTHER_DAEMON = """
 import sys, time
 from pathlib import Path
 from tests.support.files import ROOT
-from tests.support.rings import Board
+from tests.support.rings import Board, slot_at, TORN, WHOLE
 board = Board(Path(sys.argv[1]))
 print("ready", flush=True)
 time.sleep(60)

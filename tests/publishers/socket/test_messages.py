@@ -15,10 +15,10 @@ from imud.publishers.shm.publisher import ShmPublisher, ShmSettings
 from imud.publishers.socket.messages import NOTIFICATIONS
 from imud.publishers.socket.publisher import SocketServer
 from imud.publishers.socket.rpc import METHODS
+from tests.publishers.socket.schema import socket_document, socket_schema
 from tests.support.daemon_process import LIMIT_S, sending_daemon
 from tests.support.files import ROOT, hi91
 from tests.support.socket_rig import CHECKER, EPOCH, NOW_NS, Peer, batch, in_server
-from tests.support.socket_schema import socket_document, socket_schema
 
 needs_jsonschema = pytest.mark.skipif(not CHECKER.able, reason="the package jsonschema is not installed")
 UTC_NS = 1_790_000_000_000_000_000 + 1_000_000
